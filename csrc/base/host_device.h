@@ -1,0 +1,10 @@
+#pragma once
+
+// V3DG_HD: this function is compiled for the host and, by nvcc, for the device.
+#ifdef __CUDACC__
+#define V3DG_HD __host__ __device__
+#else
+#define V3DG_HD
+#endif
+
+#define V3DG_INLINE inline __attribute__((always_inline))

@@ -1,0 +1,26 @@
+#pragma once
+
+#include <cassert>
+#include <cstddef>
+
+#include "base/host_device.h"
+
+namespace v3dg {
+
+// Borrowed contiguous elements.
+template <class T>
+struct Span {
+    T* data = nullptr;
+    size_t size = 0;
+
+    V3DG_HD T& operator[](size_t i) const {
+        assert(i < size);
+        return data[i];
+    }
+    V3DG_HD T* begin() const { return data; }
+    V3DG_HD T* end() const { return data + size; }
+    V3DG_HD bool empty() const { return size == 0; }
+    V3DG_HD operator Span<const T>() const { return {data, size}; }
+};
+
+}  // namespace v3dg

@@ -1,0 +1,61 @@
+#pragma once
+
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+
+#include <initializer_list>
+#include <string>
+#include <type_traits>
+
+#include "base/span.h"
+
+namespace v3dg {
+
+namespace py = pybind11;
+
+// An array of exactly this dtype, contiguous; pybind11 refuses others instead of copying (py::arg.noconvert).
+template <class T>
+using ArrayOf = py::array_t<T, py::array::c_style>;
+
+inline std::string shape_text(const py::array& array) {
+    std::string text = "(";
+    for (py::ssize_t i = 0; i < array.ndim(); ++i)
+        text += std::to_string(array.shape(i)) + (array.ndim() == 1 || i + 1 < array.ndim() ? "," : "") +
+                (i + 1 < array.ndim() ? " " : "");
+    return text + ")";
+}
+
+// Borrows `array` after checking that it has `dtype` T, is contiguous, and has `shape` (-1: any length).
+template <class T>
+Span<T> span_of(const py::array& array, const char* name, std::initializer_list<py::ssize_t> shape) {
+    using Value = std::remove_const_t<T>;
+    if (!py::isinstance<py::array_t<Value>>(array))
+        throw py::value_error(std::string(name) + ": expected dtype " +
+                              py::str(py::dtype::of<Value>()).template cast<std::string>() + ", got " +
+                              py::str(array.dtype()).cast<std::string>());
+    bool same = array.ndim() == static_cast<py::ssize_t>(shape.size());
+    std::string wanted = "(";
+    size_t axis = 0;
+    for (const py::ssize_t length : shape) {
+        if (same && length >= 0 && array.shape(axis) != length) same = false;
+        wanted += (length < 0 ? std::string("N") : std::to_string(length)) +
+                  (shape.size() == 1 ? "," : axis + 1 < shape.size() ? ", " : "");
+        ++axis;
+    }
+    if (!same)
+        throw py::value_error(std::string(name) + ": expected shape " + wanted + "), got " + shape_text(array));
+    if (!(array.flags() & py::array::c_style))
+        throw py::value_error(std::string(name) + ": expected a C-contiguous array, got a strided one; call numpy.ascontiguousarray");
+    T* data = std::is_const<T>::value ? static_cast<T*>(const_cast<void*>(array.data()))
+                                      : static_cast<T*>(const_cast<py::array&>(array).mutable_data());
+    return {data, static_cast<size_t>(array.size())};
+}
+
+void bind_cluster(py::module_& m);
+void bind_select(py::module_& m);
+void bind_simplify_init(py::module_& m);
+void bind_ply(py::module_& m);
+void bind_render(py::module_& m);
+void bind_fit_level(py::module_& m);
+
+}  // namespace v3dg

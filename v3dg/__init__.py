@@ -1,0 +1,5 @@
+"""Level of detail for 3D Gaussian Splatting: build bundles of clusters, select a cut, draw it."""
+
+from v3dg._version import __version__
+
+__all__ = ["__version__"]
