@@ -1,0 +1,139 @@
+"""How far apart two pictures are: PSNR, SSIM and FLIP.
+
+All take a reference and a test picture (H,W,3), display values in [0,1] (sRGB as shown, not linear light), as
+NumPy arrays or torch tensors, and are means over the whole picture. Nothing is cropped.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+FLIP_PIXELS_PER_DEGREE = 67.0
+"""A 0.7 m wide 4K display seen from 0.7 m: the viewing condition that FLIP's authors use."""
+
+_SSIM_SIGMA_PX = 1.5
+_SSIM_REACH_PX = 5  # an 11 px window: 3.5 sigma to either side, rounded
+_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2  # the constants of the SSIM paper for values in [0,1]
+
+
+def _picture(name: str, image: Any) -> NDArray[np.floating[Any]]:
+    """The picture as a float NumPy array (H,W,3), on the host, without gradient."""
+    if hasattr(image, "detach"):
+        image = image.detach().cpu().numpy()
+    if not isinstance(image, np.ndarray):
+        raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {type(image).__name__}")
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ValueError(f"{name}: expected shape (H, W, 3) with at least one pixel, got {image.shape}")
+    if not np.issubdtype(image.dtype, np.floating):
+        raise ValueError(
+            f"{name}: expected floats in [0, 1], got {image.dtype}; divide 8-bit pictures by 255"
+        )
+    return image
+
+
+def _pair(reference: Any, test: Any) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
+    a, b = _picture("reference", reference), _picture("test", test)
+    if a.shape != b.shape:
+        raise ValueError(f"test: expected the reference's shape {a.shape}, got {b.shape}")
+    return a, b
+
+
+def psnr(reference: Any, test: Any) -> float:
+    """Compute the peak signal-to-noise ratio in dB, for a peak of 1; infinite for equal pictures.
+
+    Values are compared as they are: clip both to [0,1] first to compare what a screen shows.
+    """
+    a, b = _pair(reference, test)
+    difference = a.astype(np.float64) - b
+    mean_square = float(np.mean(difference * difference))
+    return float("inf") if mean_square == 0 else -10 * float(np.log10(mean_square))
+
+
+def _gaussian_blur(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Blur over the first two axes with SSIM's window; the border is mirrored without repeating the edge."""
+    offsets = np.arange(-_SSIM_REACH_PX, _SSIM_REACH_PX + 1)
+    weights = np.exp(-0.5 * (offsets / _SSIM_SIGMA_PX) ** 2)
+    weights /= weights.sum()
+    for axis in (0, 1):
+        padding = [(0, 0)] * image.ndim
+        padding[axis] = (_SSIM_REACH_PX, _SSIM_REACH_PX)
+        padded = np.pad(image, padding, mode="reflect")
+        size = image.shape[axis]
+        image = np.zeros_like(image)
+        for k, weight in enumerate(weights):
+            image += weight * (padded[k : k + size] if axis == 0 else padded[:, k : k + size])
+    return image
+
+
+def ssim(reference: Any, test: Any) -> float:
+    """Compute the structural similarity, 1 for equal pictures.
+
+    Convention (others differ in the third digit): Gaussian window of 11×11 px with sigma 1.5 px, population
+    variances, mirrored border, mean over all pixels and channels, values in [0,1] and not clipped.
+
+    Raises:
+        ValueError: A side is shorter than 6 px, less than half a window.
+
+    Source: Wang et al., Image quality assessment: from error visibility to structural similarity, 2004.
+    """
+    a, b = (x.astype(np.float64) for x in _pair(reference, test))
+    if min(a.shape[:2]) <= _SSIM_REACH_PX:
+        raise ValueError(f"reference: expected at least {_SSIM_REACH_PX + 1} px a side, got {a.shape}")
+    mean_a, mean_b = _gaussian_blur(a), _gaussian_blur(b)
+    variance_a = np.maximum(_gaussian_blur(a * a) - mean_a * mean_a, 0)
+    variance_b = np.maximum(_gaussian_blur(b * b) - mean_b * mean_b, 0)
+    covariance = _gaussian_blur(a * b) - mean_a * mean_b
+    luminance = (2 * mean_a * mean_b + _SSIM_C1) / (mean_a**2 + mean_b**2 + _SSIM_C1)
+    structure = (2 * covariance + _SSIM_C2) / (variance_a + variance_b + _SSIM_C2)
+    return float(np.mean(luminance * structure))
+
+
+def _flip(reference: Any, test: Any, *, magma: bool) -> NDArray[np.float32]:
+    import flip_evaluator
+
+    # Fresh arrays: the evaluator is free to write into what it gets.
+    a, b = (np.clip(x, 0, 1).astype(np.float32, order="C") for x in _pair(reference, test))
+    parameters = {"ppd": FLIP_PIXELS_PER_DEGREE}
+    error, _, _ = flip_evaluator.evaluate(a, b, "LDR", applyMagma=magma, parameters=parameters)
+    return np.asarray(error, dtype=np.float32)
+
+
+def flip_map(reference: Any, test: Any) -> NDArray[np.float32]:
+    """Compute LDR-FLIP per pixel at 67 pixels per degree: (H,W), 0 where no difference is seen, at most 1.
+
+    Pictures are clipped to [0,1] first.
+
+    Source: Andersson et al., FLIP: a difference evaluator for alternating images, HPG 2020; by its authors'
+    package.
+    """
+    return _flip(reference, test, magma=False).reshape(reference.shape[0], reference.shape[1])
+
+
+def flip(reference: Any, test: Any) -> float:
+    """Compute the mean of `flip_map`."""
+    return float(np.mean(flip_map(reference, test), dtype=np.float64))
+
+
+def error_image(reference: Any, test: Any) -> NDArray[np.float32]:
+    """Draw `flip_map` in the magma colours that FLIP is usually shown in, (H,W,3): black is no difference."""
+    return _flip(reference, test, magma=True)
+
+
+def box_downsample(image: Any, factor: int) -> Any:
+    """Average blocks of ``factor`` × ``factor`` pixels: (H,W,...) to (H/factor,W/factor,...), array kind kept.
+
+    Raises:
+        ValueError: ``factor`` is not positive, or does not divide the height and the width.
+    """
+    if factor < 1:
+        raise ValueError(f"factor: expected at least 1, got {factor}")
+    height, width = image.shape[0], image.shape[1]
+    if height % factor or width % factor:
+        raise ValueError(f"image: expected a height and width divisible by {factor}, got {height} x {width}")
+    blocks = image.reshape(height // factor, factor, width // factor, factor, *image.shape[2:])
+    return blocks.mean((1, 3))
