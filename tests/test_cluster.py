@@ -1,0 +1,174 @@
+import itertools
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from reference import cluster as reference
+
+from v3dg import _core
+
+# Few distinct values, so that axes, coordinates and whole points tie.
+coarse_means = hnp.arrays(
+    np.float32,
+    st.tuples(st.integers(0, 60), st.just(3)),
+    elements=st.sampled_from([-1.0, -0.0, 0.0, 0.5, 2.0]),
+)
+finite = st.floats(-(2.0**100), 2.0**100, width=32)
+any_means = hnp.arrays(np.float32, st.tuples(st.integers(0, 40), st.just(3)), elements=finite)
+
+
+@given(means=st.one_of(coarse_means, any_means), cluster_size=st.integers(1, 9))
+def test_split_agrees_with_reference(means, cluster_size):
+    order, leaf_offset = _core.median_split(means, cluster_size)
+    leaves = reference.median_split(means, cluster_size)
+    np.testing.assert_array_equal(leaf_offset, np.cumsum([0] + [len(leaf) for leaf in leaves]))
+    np.testing.assert_array_equal(order, [i for leaf in leaves for i in leaf])
+
+
+@given(num_points=st.integers(0, 3000), cluster_size=st.integers(1, 500), seed=st.integers(0, 2**32 - 1))
+def test_leaves_partition_the_points_evenly(num_points, cluster_size, seed):
+    means = np.random.default_rng(seed).normal(size=(num_points, 3)).astype(np.float32)
+    order, leaf_offset = _core.median_split(means, cluster_size)
+    sizes = np.diff(leaf_offset)
+    num_leaves = len(sizes)
+    assert num_leaves & (num_leaves - 1) == 0
+    assert sizes.max() <= cluster_size
+    assert sizes.max() - sizes.min() <= 1
+    assert num_leaves == 1 or -(-num_points // (num_leaves // 2)) > cluster_size  # no deeper than needed
+    np.testing.assert_array_equal(np.sort(order), np.arange(num_points))
+    for first, last in itertools.pairwise(leaf_offset):
+        assert (np.diff(order[first:last]) > 0).all()
+
+
+def test_identical_points_split_by_index():
+    order, leaf_offset = _core.median_split(np.ones((10, 3), np.float32), 3)
+    np.testing.assert_array_equal(order, np.arange(10))
+    np.testing.assert_array_equal(leaf_offset, [0, 3, 5, 8, 10])
+
+
+def test_large_split_agrees_with_itself_moved():
+    means = np.random.default_rng(1).integers(-4096, 4096, size=(100_000, 3)).astype(np.float32)
+    order, leaf_offset = _core.median_split(means, 64)
+    moved_order, moved_offset = _core.median_split(means + np.float32(8192), 64)
+    np.testing.assert_array_equal(order, moved_order)
+    np.testing.assert_array_equal(leaf_offset, moved_offset)
+
+
+@pytest.mark.parametrize(
+    ("means", "cluster_size", "message"),
+    [
+        (np.zeros((4, 2), np.float32), 2, r"means: expected shape \(N, 3\), got \(4, 2\)"),
+        (np.zeros((4, 3)), 2, "means: expected dtype float32, got float64"),
+        (np.zeros((4, 3), np.float32), 0, "cluster_size: expected at least 1, got 0"),
+        (np.full((4, 3), np.nan, np.float32), 2, "means: expected finite values, got nan in row 0"),
+        (np.zeros((8, 3), np.float32)[::2], 2, "means: expected a C-contiguous array"),
+    ],
+)
+def test_split_refuses_bad_input(means, cluster_size, message):
+    with pytest.raises(ValueError, match=message):
+        _core.median_split(means, cluster_size)
+
+
+def random_offset(rng, count, num_segments):
+    inner = np.sort(rng.integers(0, count + 1, size=num_segments - 1))
+    return np.concatenate([[0], inner, [count]]).astype(np.int64)
+
+
+def reaches(ball, spheres):
+    """Distance from the ball's centre to the far side of each sphere, in double precision."""
+    ball, spheres = ball.astype(np.float64), spheres.astype(np.float64)
+    return np.linalg.norm(spheres[:, :3] - ball[:3], axis=1) + spheres[:, 3]
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(1, 200),
+    num_segments=st.integers(1, 5),
+    origin=st.sampled_from([0.0, 1.0, 1e3, 1e6]),
+    size=st.sampled_from([1e-6, 1.0, 1e4]),
+)
+def test_balls_contain_their_spheres_with_margin(seed, count, num_segments, origin, size):
+    rng = np.random.default_rng(seed)
+    means = (origin + size * rng.normal(size=(count, 3))).astype(np.float32)
+    radii = (size * rng.exponential(0.1, size=count)).astype(np.float32)
+    spheres = np.concatenate([means, radii[:, None]], axis=1)
+    offset = random_offset(rng, count, num_segments)
+    of_points = _core.bounding_ball_of_points(means, radii, offset)
+    np.testing.assert_array_equal(of_points, _core.bounding_ball_of_balls(spheres, offset))
+    for ball, (first, last) in zip(of_points, itertools.pairwise(offset), strict=True):
+        if first < last:
+            assert ball[3] >= reaches(ball, spheres[first:last]).max() * (1 + 3.9e-6)
+        assert ball[3] >= 1e-15
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 100))
+def test_ball_is_nearly_the_smallest(seed, count):
+    rng = np.random.default_rng(seed)
+    # Points on a unit sphere and their opposites: the smallest ball is the unit ball.
+    half = rng.normal(size=(count, 3))
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    means = np.concatenate([half, -half, 0.9 * half]).astype(np.float32)
+    ball = _core.bounding_ball_of_points(means, np.zeros(len(means), np.float32), np.array([0, len(means)]))
+    assert ball[0, 3] <= 1.005
+
+
+def test_ball_of_two_balls_is_exact():
+    balls = np.array([[0, 0, 0, 1], [4, 0, 0, 2]], np.float32)
+    ball = _core.bounding_ball_of_balls(balls, np.array([0, 2]))
+    np.testing.assert_allclose(ball, [[2.5, 0, 0, 3.5]], rtol=2e-3, atol=1e-6)
+
+
+def test_ball_of_nested_balls_is_the_outer_one():
+    balls = np.array([[0, 0, 0, 5], [1, 0, 0, 0.5], [0, 0, 0, 1]], np.float32)
+    ball = _core.bounding_ball_of_balls(balls, np.array([0, 3]))
+    np.testing.assert_allclose(ball, [[0, 0, 0, 5]], rtol=1e-3, atol=1e-3)
+
+
+def test_empty_and_single_segments():
+    none = np.zeros((0, 3), np.float32)
+    assert _core.bounding_ball_of_points(none, none[:, 0].copy(), np.array([0])).shape == (0, 4)
+    np.testing.assert_array_equal(
+        _core.bounding_ball_of_points(none, none[:, 0].copy(), np.array([0, 0])),
+        np.array([[0, 0, 0, 1e-15]], np.float32),
+    )
+    one = _core.bounding_ball_of_points(
+        np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.array([0, 1])
+    )
+    np.testing.assert_array_equal(one, np.array([[1, 1, 1, 1e-15]], np.float32))
+
+
+@pytest.mark.parametrize("offset", [[0, 3], [1, 2], [0, 2, 1, 2], []])
+def test_balls_refuse_bad_boundaries(offset):
+    with pytest.raises(ValueError, match="offset: expected ascending boundaries from 0 to 2"):
+        _core.bounding_ball_of_balls(np.zeros((2, 4), np.float32), np.array(offset, np.int64))
+
+
+DIGEST = """
+import hashlib, numpy as np
+from v3dg import _core
+rng = np.random.default_rng(5)
+means = np.round(rng.normal(size=(200_000, 3)), 2).astype(np.float32)
+order, leaf_offset = _core.median_split(means, 100)
+radii = rng.exponential(0.01, size=len(means)).astype(np.float32)
+ball = _core.bounding_ball_of_points(means[order], radii, leaf_offset)
+print(hashlib.sha256(order.tobytes() + leaf_offset.tobytes() + ball.tobytes()).hexdigest())
+"""
+
+
+def test_number_of_threads_changes_nothing():
+    digests = [
+        subprocess.run(
+            [sys.executable, "-c", DIGEST],
+            env={**os.environ, "OMP_NUM_THREADS": threads},
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        for threads in ("1", "2", "3")
+    ]
+    assert len(set(digests)) == 1
