@@ -1,0 +1,145 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v3dg.cameras import Camera, turntable
+
+coordinate = st.floats(-1e3, 1e3)
+vector = st.tuples(coordinate, coordinate, coordinate).map(np.array)
+
+
+def pixel(camera, point):
+    view = camera.viewmat @ [*point, 1.0]
+    u, v, w = camera.K @ view[:3]
+    return np.array([u / w, v / w]), view[2]
+
+
+@given(eye=vector, direction=vector.filter(lambda v: np.linalg.norm(v) > 1e-3), up=vector)
+def test_look_at_centres_the_target(eye, direction, up):
+    length = np.linalg.norm(direction)
+    if np.linalg.norm(np.cross(direction, up)) < 1e-3 * length * max(np.linalg.norm(up), 1e-3):
+        return
+    camera = Camera.look_at(eye, eye + direction, up, width=640, height=480)
+    np.testing.assert_allclose(camera.position, eye, atol=1e-9)
+    uv, depth = pixel(camera, eye + direction)
+    np.testing.assert_allclose(uv, [320, 240], atol=1e-6)
+    np.testing.assert_allclose(depth, length, rtol=1e-9)
+    rotation = camera.viewmat[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) > 0
+
+
+def test_look_at_has_up_upwards_and_right_to_the_right():
+    camera = Camera.look_at((0, -5, 0), (0, 0, 0), (0, 0, 1), math.pi / 2, width=200, height=100)
+    np.testing.assert_allclose(pixel(camera, (0, 0, 1))[0], [100, 30])  # y is down: above is a smaller row
+    np.testing.assert_allclose(pixel(camera, (1, 0, 0))[0], [120, 50])
+    np.testing.assert_allclose(pixel(camera, (5, 0, 0))[0], [200, 50])  # half the field of view
+
+
+def test_blender_camera_looks_along_minus_z():
+    matrix = np.eye(4)
+    matrix[:3, 3] = (1, 2, 3)
+    camera = Camera.from_blender(matrix, math.pi / 2, 200, 100)
+    np.testing.assert_allclose(camera.position, (1, 2, 3))
+    uv, depth = pixel(camera, (1, 2, 1))
+    np.testing.assert_allclose((*uv, depth), (100, 50, 2))
+    np.testing.assert_allclose(pixel(camera, (1, 3, 1))[0], [100, 0], atol=1e-9)  # y up in Blender
+    assert camera.fy == camera.fx
+    two_fields = Camera.from_blender(matrix, math.pi / 2, 200, 100, fov_y=math.pi / 2)
+    assert two_fields.fy == pytest.approx(50)
+
+
+@given(eye=vector, seed=st.integers(0, 2**32 - 1))
+def test_blender_camera_agrees_with_look_at(eye, seed):
+    target = eye + np.random.default_rng(seed).normal(size=3)
+    camera = Camera.look_at(eye, target, (0.1, 0.2, 1.0), 0.9, width=64, height=48)
+    to_world = np.linalg.inv(camera.viewmat)
+    to_world[:3, 1:3] *= -1
+    again = Camera.from_blender(to_world.astype(np.float32), 0.9, 64, 48)
+    np.testing.assert_allclose(again.viewmat, camera.viewmat, atol=1e-3)
+    np.testing.assert_allclose(again.K, camera.K)
+
+
+def test_scaled_camera_sees_the_same():
+    camera = Camera.look_at((1, 2, 3), (0, 0, 0), width=30, height=20)
+    double = camera.scaled(2)
+    assert (double.width, double.height) == (60, 40)
+    np.testing.assert_allclose(pixel(double, (0.1, 0.2, 0.3))[0], 2 * pixel(camera, (0.1, 0.2, 0.3))[0])
+    np.testing.assert_array_equal(double.viewmat, camera.viewmat)
+
+
+@given(center=vector, n=st.integers(0, 8), elevation=st.floats(-1.5, 1.5), up=vector)
+def test_turntable_keeps_its_distance(center, n, elevation, up):
+    if np.linalg.norm(up) < 1e-3:
+        return
+    cameras = turntable(center, 3.0, n, elevation, up=up)
+    assert len(cameras) == n
+    axis = up / np.linalg.norm(up)
+    for camera in cameras:
+        offset = camera.position - center
+        np.testing.assert_allclose(np.linalg.norm(offset), 3.0, rtol=1e-6)
+        np.testing.assert_allclose(offset @ axis, 3.0 * math.sin(elevation), atol=1e-6)
+
+
+def test_matrices_are_copied():
+    viewmat = np.eye(4)
+    camera = Camera(viewmat, np.eye(3), 8, 8)
+    viewmat[0, 3] = 5
+    assert camera.viewmat[0, 3] == 0
+
+
+def with_entry(matrix, entry, value):
+    matrix = np.array(matrix, dtype=float)
+    matrix[entry] = value
+    return matrix
+
+
+GOOD = {"viewmat": np.eye(4), "K": np.eye(3), "width": 8, "height": 8}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"viewmat": np.eye(3)}, r"viewmat: expected shape \(4, 4\), got \(3, 3\)"),
+        ({"viewmat": "wide"}, r"viewmat: expected numbers of shape \(4, 4\), got str"),
+        ({"viewmat": with_entry(np.eye(4), (0, 3), np.nan)}, "viewmat: expected finite numbers, got nan"),
+        ({"viewmat": 2 * np.eye(4)}, "viewmat: expected a rotation"),
+        ({"viewmat": np.diag([1.0, 1.0, -1.0, 1.0])}, "viewmat: expected a rotation"),
+        ({"viewmat": with_entry(np.eye(4), (3, 0), 1)}, "viewmat: expected the last row 0 0 0 1, got"),
+        ({"K": with_entry(np.eye(3), (0, 0), -1)}, "K: expected positive focal lengths, got -1 and 1"),
+        ({"K": with_entry(np.eye(3), (0, 1), 1)}, "K: expected .* got a matrix with skew"),
+        ({"width": 0}, "width: expected a positive whole number, got 0"),
+        ({"width": 8.5}, "width: expected a positive whole number, got 8.5"),
+        ({"height": -1}, "height: expected a positive whole number, got -1"),
+        ({"near": 0.0}, "near: expected a positive number, got 0.0"),
+        ({"near": math.inf}, "near: expected a positive number, got inf"),
+    ],
+)
+def test_camera_refuses_bad_values(change, message):
+    with pytest.raises(ValueError, match=message):
+        Camera(**{**GOOD, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"target": (1, 1, 1)}, "target: expected a point away from the eye"),
+        ({"up": (2, 2, 2)}, "up: expected a direction that is not along the view"),
+        ({"up": (0, 0, 0)}, "up: expected a direction that is not along the view"),
+        ({"fov_x": 0.0}, "fov_x: expected radians between 0 and pi, got 0.0"),
+        ({"fov_x": 3.2}, "fov_x: expected radians between 0 and pi, got 3.2"),
+        ({"fov_x": math.nan}, "fov_x: expected radians between 0 and pi, got nan"),
+    ],
+)
+def test_look_at_refuses_bad_values(change, message):
+    good = {"eye": (1, 1, 1), "target": (0, 0, 0), "up": (0, 0, 1), "width": 8, "height": 8}
+    with pytest.raises(ValueError, match=message):
+        Camera.look_at(**{**good, **change})
+
+
+def test_blender_camera_refuses_a_scale():
+    with pytest.raises(ValueError, match="transform_matrix: expected a rotation"):
+        Camera.from_blender(np.diag([2.0, 2.0, 2.0, 1.0]), 0.8, 8, 8)

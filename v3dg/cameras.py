@@ -1,0 +1,258 @@
+"""Pinhole cameras: made from matrices, from two points, from Blender's convention, or on a turntable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Floats: TypeAlias = npt.NDArray[np.float64]
+VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
+MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
+
+DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
+# How far the rows of a rotation may be from orthonormal: matrices are often stored as float32 text.
+ROTATION_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Pinhole camera in the OpenCV convention: x right, y down, z forward.
+
+    Pixel (i, j) has its centre at (i + ½, j + ½). Matrices are copied, in double precision.
+
+    Args:
+        viewmat: (4, 4) world to camera, a rotation and a translation.
+        K: (3, 3) focal lengths and principal point in px, without skew.
+        width: Image width in px.
+        height: Image height in px.
+        near: Gaussians whose mean lies nearer than this depth are not drawn; > 0.
+
+    Raises:
+        ValueError: A shape or a value is not as above.
+    """
+
+    viewmat: Floats
+    K: Floats
+    width: int
+    height: int
+    near: float = 0.01
+
+    def __post_init__(self) -> None:
+        viewmat = _floats(self.viewmat, "viewmat", (4, 4))
+        rotation = viewmat[:3, :3]
+        if (
+            np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE
+            or np.linalg.det(rotation) < 0
+        ):
+            raise ValueError(
+                "viewmat: expected a rotation in the upper left 3x3, got a matrix that scales, "
+                "shears or mirrors; put scale into the scene instead"
+            )
+        if not np.array_equal(viewmat[3], [0.0, 0.0, 0.0, 1.0]):
+            raise ValueError(f"viewmat: expected the last row 0 0 0 1, got {_text(viewmat[3])}")
+        K = _floats(self.K, "K", (3, 3))
+        if not (K[0, 0] > 0 and K[1, 1] > 0):
+            raise ValueError(f"K: expected positive focal lengths, got {K[0, 0]:g} and {K[1, 1]:g}")
+        if K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0.0, 0.0, 1.0]):
+            raise ValueError(
+                "K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got a matrix with skew or scale"
+            )
+        near = float(self.near)
+        if not (near > 0 and math.isfinite(near)):
+            raise ValueError(f"near: expected a positive number, got {self.near}")
+        object.__setattr__(self, "viewmat", viewmat)
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "width", _positive_int(self.width, "width"))
+        object.__setattr__(self, "height", _positive_int(self.height, "height"))
+        object.__setattr__(self, "near", near)
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: VectorLike,
+        target: VectorLike,
+        up: VectorLike = (0.0, 0.0, 1.0),
+        fov_x: float = DEFAULT_FOV_X,
+        *,
+        width: int,
+        height: int,
+        near: float = 0.01,
+    ) -> Camera:
+        """Make a camera at ``eye`` that has ``target`` at the image's centre and ``up`` upwards.
+
+        Args:
+            eye: (3,) position in the world.
+            target: (3,) point in the world, not at the eye.
+            up: (3,) direction in the world, not along the view.
+            fov_x: Horizontal field of view in radians; pixels are square.
+
+        Raises:
+            ValueError: The target is at the eye, or ``up`` lies along the view direction.
+        """
+        position, goal = _floats(eye, "eye", (3,)), _floats(target, "target", (3,))
+        up_vector = _floats(up, "up", (3,))
+        distance = np.linalg.norm(goal - position)
+        if not distance > 0:
+            raise ValueError(f"target: expected a point away from the eye, got {_text(goal)} for both")
+        forward = (goal - position) / distance
+        right = np.cross(forward, up_vector)
+        length = np.linalg.norm(right)
+        if not length > 1e-9 * np.linalg.norm(up_vector):
+            raise ValueError(f"up: expected a direction that is not along the view, got {_text(up_vector)}")
+        right /= length
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        return cls(_rigid(rotation, position), _intrinsics(fov_x, None, width, height), width, height, near)
+
+    @classmethod
+    def from_blender(
+        cls,
+        transform_matrix: MatrixLike,
+        fov_x: float,
+        width: int,
+        height: int,
+        fov_y: float | None = None,
+        *,
+        near: float = 0.01,
+    ) -> Camera:
+        """Make a camera from a camera-to-world matrix in Blender's convention: x right, y up, z backward.
+
+        Args:
+            transform_matrix: (4, 4) camera to world; the nearest rotation is taken.
+            fov_x: Horizontal field of view in radians.
+            fov_y: Vertical field of view in radians; square pixels if None.
+        """
+        matrix = _floats(transform_matrix, "transform_matrix", (4, 4))
+        axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
+        if np.abs(axes.T @ axes - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(axes) < 0:
+            raise ValueError(
+                "transform_matrix: expected a rotation in the upper left 3x3, got a matrix that scales, "
+                "shears or mirrors"
+            )
+        left, _, right = np.linalg.svd(axes)
+        return cls(
+            _rigid((left @ right).T, matrix[:3, 3]),
+            _intrinsics(fov_x, fov_y, width, height),
+            width,
+            height,
+            near,
+        )
+
+    @property
+    def position(self) -> Floats:
+        """(3,) the eye in the world."""
+        eye = -np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3])
+        return np.asarray(eye, dtype=np.float64)
+
+    @property
+    def fx(self) -> float:
+        return float(self.K[0, 0])
+
+    @property
+    def fy(self) -> float:
+        return float(self.K[1, 1])
+
+    @property
+    def cx(self) -> float:
+        return float(self.K[0, 2])
+
+    @property
+    def cy(self) -> float:
+        return float(self.K[1, 2])
+
+    def scaled(self, factor: int) -> Camera:
+        """Return this camera with ``factor`` times the resolution, for supersampling."""
+        factor = _positive_int(factor, "factor")
+        K = self.K * np.array([[factor], [factor], [1.0]])
+        return replace(self, K=K, width=self.width * factor, height=self.height * factor)
+
+    def __repr__(self) -> str:
+        return (
+            f"Camera({self.width}x{self.height}, eye={_text(self.position)}, fx={self.fx:g}, fy={self.fy:g})"
+        )
+
+
+def turntable(
+    center: VectorLike,
+    radius: float,
+    n: int,
+    elevation: float = 0.35,
+    *,
+    up: VectorLike = (0.0, 0.0, 1.0),
+    fov_x: float = DEFAULT_FOV_X,
+    width: int = 800,
+    height: int = 800,
+    near: float = 0.01,
+) -> list[Camera]:
+    """Make ``n`` cameras evenly spaced on a circle around ``center``, all looking at it.
+
+    Args:
+        center: (3,) point in the world.
+        radius: Distance from the centre; > 0.
+        elevation: Angle above the plane through the centre, in radians, between -π/2 and π/2.
+        up: (3,) axis of the turntable.
+        fov_x: Horizontal field of view in radians.
+    """
+    middle, axis = _floats(center, "center", (3,)), _floats(up, "up", (3,))
+    if not (radius > 0 and math.isfinite(radius)):
+        raise ValueError(f"radius: expected a positive number, got {radius}")
+    if not abs(elevation) < math.pi / 2:
+        raise ValueError(f"elevation: expected an angle between -pi/2 and pi/2, got {elevation}")
+    if not np.linalg.norm(axis) > 0:
+        raise ValueError(f"up: expected a direction, got {_text(axis)}")
+    axis /= np.linalg.norm(axis)
+    # The world's axis least along `up`, made perpendicular to it.
+    start = np.eye(3)[np.argmin(np.abs(axis))]
+    start = start - axis * (axis @ start)
+    start /= np.linalg.norm(start)
+    side = np.cross(axis, start)
+    cameras = []
+    for i in range(n):
+        angle = 2 * math.pi * i / n
+        outwards = math.cos(elevation) * (math.cos(angle) * start + math.sin(angle) * side)
+        eye = middle + radius * (outwards + math.sin(elevation) * axis)
+        cameras.append(Camera.look_at(eye, middle, axis, fov_x, width=width, height=height, near=near))
+    return cameras
+
+
+def _rigid(rotation: Floats, eye: Floats) -> Floats:
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ eye
+    return viewmat
+
+
+def _intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Floats:
+    width, height = _positive_int(width, "width"), _positive_int(height, "height")
+    for name, fov in (("fov_x", fov_x), ("fov_y", fov_y)):
+        if fov is not None and not 0 < fov < math.pi:
+            raise ValueError(f"{name}: expected radians between 0 and pi, got {fov}")
+    fx = 0.5 * width / math.tan(0.5 * fov_x)
+    fy = fx if fov_y is None else 0.5 * height / math.tan(0.5 * fov_y)
+    return np.array([[fx, 0.0, 0.5 * width], [0.0, fy, 0.5 * height], [0.0, 0.0, 1.0]])
+
+
+def _floats(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected numbers of shape {shape}, got {type(value).__name__}") from error
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
+    return array
+
+
+def _positive_int(value: Any, name: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"{name}: expected a positive whole number, got {value!r}")
+    return int(value)
+
+
+def _text(vector: Floats) -> str:
+    return "(" + ", ".join(f"{v:g}" for v in vector) + ")"
