@@ -2,5 +2,7 @@
 
 from v3dg._version import __version__
 from v3dg.cameras import Camera, turntable
+from v3dg.gaussians import Gaussians
+from v3dg.io import load, save
 
-__all__ = ["Camera", "__version__", "turntable"]
+__all__ = ["Camera", "Gaussians", "__version__", "load", "save", "turntable"]

@@ -1,7 +1,83 @@
+#include <cerrno>
+#include <system_error>
+
 #include "bindings/args.h"
+#include "ply/ply.h"
 
 namespace v3dg {
 
-void bind_ply(py::module_&) {}
+namespace {
+
+// The name of a file as the system wants it, and as messages show it.
+struct Path {
+    explicit Path(py::object path) : shown(path) {
+        PyObject* bytes = nullptr;
+        if (!PyUnicode_FSConverter(path.ptr(), &bytes)) throw py::error_already_set();
+        encoded = py::reinterpret_steal<py::bytes>(bytes);
+    }
+    py::object shown;
+    py::bytes encoded;
+};
+
+// Calls body(path) without the interpreter lock and gives what goes wrong the file's name.
+template <class Body>
+auto with_path(const Path& path, const Body& body) {
+    const char* name = PyBytes_AS_STRING(path.encoded.ptr());
+    try {
+        const py::gil_scoped_release unlocked;
+        return body(name);
+    } catch (const PlyError& error) {
+        const py::str message = py::str("{}: {}").format(path.shown, error.what());
+        PyErr_SetObject(PyExc_ValueError, message.ptr());
+        throw py::error_already_set();
+    } catch (const std::system_error& error) {
+        errno = error.code().value();
+        PyErr_SetFromErrnoWithFilenameObject(PyExc_OSError, path.shown.ptr());
+        throw py::error_already_set();
+    }
+}
+
+py::tuple ply_read(const py::object& path_object) {
+    const Path path(path_object);
+    const PlyFile ply = with_path(path, open_ply);
+    const auto n = static_cast<py::ssize_t>(ply.num_gaussians());
+    const auto k = static_cast<py::ssize_t>(ply.num_sh);
+    ArrayOf<float> means({n, py::ssize_t(3)}), quats({n, py::ssize_t(4)}), scales({n, py::ssize_t(3)}), opacities(n),
+        sh({n, k, py::ssize_t(3)});
+    const PlyGaussians<float> out = {span_of<float>(means, "means", {n, 3}), span_of<float>(quats, "quats", {n, 4}),
+                                     span_of<float>(scales, "scales", {n, 3}),
+                                     span_of<float>(opacities, "opacities", {n}), span_of<float>(sh, "sh", {n, k, 3})};
+    with_path(path, [&](const char*) { read_ply(ply, out); });
+    return py::make_tuple(means, quats, scales, opacities, sh);
+}
+
+PlyEncoding encoding_of(const std::string& name) {
+    if (name == "ascii") return PlyEncoding::ascii;
+    if (name == "binary_little_endian") return PlyEncoding::binary_little_endian;
+    if (name == "binary_big_endian") return PlyEncoding::binary_big_endian;
+    throw py::value_error("encoding: expected binary_little_endian, binary_big_endian or ascii, got " + quoted(name));
+}
+
+void ply_write(const py::object& path, const py::array& means, const py::array& quats, const py::array& scales,
+               const py::array& opacities, const py::array& sh, const std::string& encoding) {
+    const PlyEncoding chosen = encoding_of(encoding);
+    const py::ssize_t n = means.ndim() > 0 ? means.shape(0) : 0;
+    const py::ssize_t k = sh.ndim() > 1 ? sh.shape(1) : 0;
+    if (k != 1 && k != 4 && k != 9 && k != 16)
+        throw py::value_error("sh: expected shape (N, K, 3) with K 1, 4, 9 or 16, got " + shape_text(sh));
+    const PlyGaussians<const float> in = {
+        span_of<const float>(means, "means", {n, 3}), span_of<const float>(quats, "quats", {n, 4}),
+        span_of<const float>(scales, "scales", {n, 3}), span_of<const float>(opacities, "opacities", {n}),
+        span_of<const float>(sh, "sh", {n, k, 3})};
+    with_path(Path(path), [&](const char* name) { write_ply(name, in, chosen, static_cast<size_t>(k)); });
+}
+
+}  // namespace
+
+void bind_ply(py::module_& m) {
+    using namespace py::literals;
+    m.def("ply_read", ply_read, "path"_a);
+    m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "encoding"_a);
+}
 
 }  // namespace v3dg

@@ -1,0 +1,34 @@
+#pragma once
+
+#include <cstddef>
+#include <exception>
+#include <mutex>
+
+namespace v3dg {
+
+// Carries an exception out of a parallel loop: of all that were thrown, the one of the lowest index.
+class FirstError {
+public:
+    template <class Body>
+    void run(size_t index, const Body& body) noexcept {
+        try {
+            body();
+        } catch (...) {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (!error_ || index < index_) {
+                error_ = std::current_exception();
+                index_ = index;
+            }
+        }
+    }
+    void rethrow() const {
+        if (error_) std::rethrow_exception(error_);
+    }
+
+private:
+    std::mutex mutex_;
+    std::exception_ptr error_;
+    size_t index_ = 0;
+};
+
+}  // namespace v3dg

@@ -1,0 +1,160 @@
+#include "ply/ply_header.h"
+
+#include <algorithm>
+#include <charconv>
+
+namespace v3dg {
+
+namespace {
+
+constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real ones have a few kilobytes
+
+std::vector<std::string> words_of(const std::string& line) {
+    const char* kSpace = " \t\r\v\f";
+    std::vector<std::string> words;
+    size_t first = line.find_first_not_of(kSpace);
+    while (first != std::string::npos) {
+        const size_t last = std::min(line.find_first_of(kSpace, first), line.size());
+        words.push_back(line.substr(first, last - first));
+        first = line.find_first_not_of(kSpace, last);
+    }
+    return words;
+}
+
+PlyType parse_type(const std::string& name) {
+    static const std::pair<const char*, PlyType> kTypes[] = {
+        {"char", PlyType::int8},       {"int8", PlyType::int8},       {"uchar", PlyType::uint8},
+        {"uint8", PlyType::uint8},     {"short", PlyType::int16},     {"int16", PlyType::int16},
+        {"ushort", PlyType::uint16},   {"uint16", PlyType::uint16},   {"int", PlyType::int32},
+        {"int32", PlyType::int32},     {"uint", PlyType::uint32},     {"uint32", PlyType::uint32},
+        {"float", PlyType::float32},   {"float32", PlyType::float32}, {"double", PlyType::float64},
+        {"float64", PlyType::float64},
+    };
+    for (const auto& [text, type] : kTypes)
+        if (name == text) return type;
+    throw PlyError("expected a scalar type such as float, found " + quoted(name));
+}
+
+PlyEncoding parse_format(const std::vector<std::string>& words) {
+    if (words.size() != 3 || words[2] != "1.0")
+        throw PlyError("expected a format and the version 1.0, found " + std::to_string(words.size() - 1) +
+                       " words" + (words.size() > 2 ? " and version " + quoted(words[2]) : ""));
+    if (words[1] == "ascii") return PlyEncoding::ascii;
+    if (words[1] == "binary_little_endian") return PlyEncoding::binary_little_endian;
+    if (words[1] == "binary_big_endian") return PlyEncoding::binary_big_endian;
+    throw PlyError("expected format ascii, binary_little_endian or binary_big_endian, found " + quoted(words[1]));
+}
+
+PlyElement parse_element(const std::vector<std::string>& words) {
+    if (words.size() != 3)
+        throw PlyError("expected 'element NAME COUNT', found " + std::to_string(words.size()) + " words");
+    PlyElement element;
+    element.name = words[1];
+    const char* end = words[2].data() + words[2].size();
+    const auto [stop, error] = std::from_chars(words[2].data(), end, element.count);
+    if (error != std::errc() || stop != end)
+        throw PlyError("expected a count of element " + quoted(words[1]) + ", found " + quoted(words[2]));
+    return element;
+}
+
+PlyProperty parse_property(const std::vector<std::string>& words) {
+    PlyProperty property;
+    property.is_list = words.size() > 1 && words[1] == "list";
+    if (words.size() != (property.is_list ? 5u : 3u))
+        throw PlyError(std::string("expected 'property ") +
+                       (property.is_list ? "list COUNT_TYPE TYPE NAME'" : "TYPE NAME'") + ", found " +
+                       std::to_string(words.size()) + " words");
+    property.type = parse_type(words[words.size() - 2]);
+    property.name = words.back();
+    if (property.is_list) {
+        property.count_type = parse_type(words[2]);
+        if (property.count_type == PlyType::float32 || property.count_type == PlyType::float64)
+            throw PlyError("expected an integer type for the length of a list, found " + quoted(words[2]));
+    }
+    return property;
+}
+
+// One header at a time: lines go in, a header comes out.
+struct HeaderParser {
+    PlyHeader header;
+    bool has_format = false;
+
+    // Returns whether this was the last line.
+    bool take(const std::string& line) {
+        const std::vector<std::string> words = words_of(line);
+        if (words.empty() || words[0] == "comment" || words[0] == "obj_info") return false;
+        if (words[0] == "format") {
+            if (has_format) throw PlyError("expected one line 'format', found a second");
+            header.encoding = parse_format(words);
+            has_format = true;
+        } else if (words[0] == "element") {
+            header.elements.push_back(parse_element(words));
+        } else if (words[0] == "property") {
+            if (header.elements.empty()) throw PlyError("expected an element before the first property, found none");
+            header.elements.back().properties.push_back(parse_property(words));
+        } else if (words[0] == "end_header") {
+            if (!has_format) throw PlyError("expected a line 'format' before end_header, found none");
+            return true;
+        } else {
+            throw PlyError("expected format, element, property or end_header, found " + quoted(words[0]));
+        }
+        return false;
+    }
+};
+
+}  // namespace
+
+bool PlyElement::has_lists() const {
+    return std::any_of(properties.begin(), properties.end(), [](const PlyProperty& p) { return p.is_list; });
+}
+
+size_t PlyElement::min_row_bytes() const {
+    size_t bytes = 0;
+    for (const PlyProperty& property : properties) bytes += size_of(property.is_list ? property.count_type : property.type);
+    return bytes;
+}
+
+std::string quoted(const std::string& text) {
+    constexpr size_t kMaxLength = 40;
+    std::string shown = text.substr(0, kMaxLength);
+    for (char& c : shown)
+        if (c < ' ' || c > '~') c = '?';
+    return "'" + shown + (text.size() > kMaxLength ? "..." : "") + "'";
+}
+
+PlyHeader read_ply_header(const PosixFile& file) {
+    HeaderParser parser;
+    std::string text;
+    size_t line_begin = 0;
+    for (size_t line_number = 1;; ++line_number) {
+        size_t line_end = text.find('\n', line_begin);
+        bool at_end = false;
+        while (line_end == std::string::npos && text.size() < kMaxHeaderBytes && !at_end) {
+            const size_t searched = text.size();
+            text.resize(std::max<size_t>(8192, 2 * searched));
+            text.resize(searched + file.read_at(searched, &text[searched], text.size() - searched));
+            at_end = text.size() == searched;
+            line_end = text.find('\n', searched);
+        }
+        if (line_end == std::string::npos) line_end = text.size();
+        std::string line = text.substr(line_begin, line_end - line_begin);
+        if (!line.empty() && line.back() == '\r') line.pop_back();
+        if (line_number == 1 && line != "ply")
+            throw PlyError("expected a first line 'ply', found " +
+                           (text.empty() ? "an empty file" : quoted(line)));
+        try {
+            if (line_number > 1 && parser.take(line)) {
+                parser.header.size = std::min(line_end + 1, text.size());
+                return std::move(parser.header);
+            }
+        } catch (const PlyError& error) {
+            throw PlyError("header line " + std::to_string(line_number) + ": " + error.what());
+        }
+        if (line_end >= text.size())
+            throw PlyError("expected end_header within the first " + std::to_string(kMaxHeaderBytes) +
+                           " bytes, found none in " + std::to_string(text.size()));
+        line_begin = line_end + 1;
+    }
+}
+
+}  // namespace v3dg

@@ -1,0 +1,75 @@
+#pragma once
+
+#include <cerrno>
+#include <cstddef>
+#include <system_error>
+
+#include <fcntl.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+namespace v3dg {
+
+// An open file. Reads and writes name their offset, so several threads can share it.
+// Failures throw std::system_error with errno's code.
+class PosixFile {
+public:
+    static PosixFile open(const char* path) {
+        // O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+        return PosixFile(::open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK));
+    }
+    static PosixFile create(const char* path) {
+        return PosixFile(::open(path, O_WRONLY | O_CLOEXEC | O_CREAT | O_EXCL, 0666));
+    }
+    PosixFile(PosixFile&& other) noexcept : descriptor_(other.descriptor_) { other.descriptor_ = -1; }
+    PosixFile& operator=(PosixFile&&) = delete;
+    ~PosixFile() {
+        if (descriptor_ >= 0) ::close(descriptor_);
+    }
+
+    struct stat status() const {
+        struct stat status = {};
+        check(::fstat(descriptor_, &status));
+        return status;
+    }
+
+    // Returns how many bytes were read: fewer than `size` only at the end of the file.
+    size_t read_at(size_t offset, char* bytes, size_t size) const {
+        size_t done = 0;
+        while (done < size) {
+            const ssize_t got = ::pread(descriptor_, bytes + done, size - done, static_cast<off_t>(offset + done));
+            if (got < 0 && errno == EINTR) continue;
+            check(got);
+            if (got == 0) break;
+            done += static_cast<size_t>(got);
+        }
+        return done;
+    }
+
+    void write_at(size_t offset, const char* bytes, size_t size) const {
+        size_t done = 0;
+        while (done < size) {
+            const ssize_t put = ::pwrite(descriptor_, bytes + done, size - done, static_cast<off_t>(offset + done));
+            if (put < 0 && errno == EINTR) continue;
+            check(put);
+            done += static_cast<size_t>(put);
+        }
+    }
+
+    // Some file systems report a failed write only here.
+    void close() {
+        const int descriptor = descriptor_;
+        descriptor_ = -1;
+        check(::close(descriptor));
+    }
+
+private:
+    explicit PosixFile(int descriptor) : descriptor_(descriptor) { check(descriptor); }
+    static void check(ssize_t result) {
+        if (result < 0) throw std::system_error(errno, std::generic_category());
+    }
+
+    int descriptor_;
+};
+
+}  // namespace v3dg

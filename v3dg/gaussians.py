@@ -1,0 +1,185 @@
+"""Gaussians: the arrays of one asset, with their shapes and units."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+Array: TypeAlias = Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
+
+_NAMES = ("means", "quats", "scales", "opacities", "sh")
+_NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients a channel -> degree
+
+
+def _is_tensor(value: object) -> bool:
+    """Whether `value` is a torch tensor, found out without importing torch."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return "a NumPy array"
+    return "a torch tensor" if _is_tensor(value) else type(value).__name__
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Gaussians:
+    """N 3D Gaussians: NumPy arrays or torch tensors, float32, C-contiguous, all of one kind on one device.
+
+    Args:
+        means: (N, 3) centres, in world units of the asset's own frame.
+        quats: (N, 4) rotations as w, x, y, z; need not have length one.
+        scales: (N, 3) standard deviations along the rotated axes, in world units; not their logs.
+        opacities: (N,) in [0, 1]; not logits.
+        sh: (N, K, 3) spherical harmonics of RGB, K = (degree + 1)², degree 0 to 3; colour is their value in
+            the view direction plus ½.
+
+    Kinds, shapes, dtypes and layout are checked here, values are not. Nothing is copied.
+
+    Raises:
+        TypeError: an argument is not an array, or NumPy and torch are mixed.
+        ValueError: wrong shape, dtype, device or memory layout.
+    """
+
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    sh: Array
+
+    def __post_init__(self) -> None:
+        for name in _NAMES:
+            _check_kind(name, getattr(self, name), self.means)
+        if self.means.ndim != 2 or self.means.shape[1] != 3:
+            raise ValueError(f"means: expected shape (N, 3), got {tuple(self.means.shape)}")
+        num = self.means.shape[0]
+        for name, shape in (("quats", (num, 4)), ("scales", (num, 3)), ("opacities", (num,))):
+            got = tuple(getattr(self, name).shape)
+            if got != shape:
+                raise ValueError(f"{name}: expected shape {shape} to go with means {(num, 3)}, got {got}")
+        got = tuple(self.sh.shape)
+        if len(got) != 3 or got[0] != num or got[1] not in _NUM_SH or got[2] != 3:
+            raise ValueError(f"sh: expected shape ({num}, K, 3) with K 1, 4, 9 or 16, got {got}")
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    def __repr__(self) -> str:
+        where = f"torch {self.means.device}" if _is_tensor(self.means) else "numpy"
+        return f"Gaussians({len(self)}, sh_degree={self.sh_degree}, {where})"
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return _NUM_SH[int(self.sh.shape[1])]
+
+    def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
+        """Take the gaussians that a slice, an array of M indices or a mask of N booleans names, in its order.
+
+        A slice of step 1 shares memory with this object; everything else is copied.
+
+        Raises:
+            TypeError: the index is a single number, or not made of integers or booleans.
+            ValueError: the index has more than one dimension.
+            IndexError: out of range, or a mask of another length.
+        """
+        if isinstance(index, slice):
+            if index.step not in (None, 1):  # torch knows no negative steps
+                index = np.arange(*index.indices(len(self)))
+        else:
+            index = _index_array(index)
+        if not _is_tensor(self.means):
+            return self._map(lambda array: np.ascontiguousarray(array[index]))
+        import torch
+
+        if isinstance(index, np.ndarray):
+            index = torch.from_numpy(np.ascontiguousarray(index)).to(self.means.device)
+        return self._map(lambda tensor: tensor[index].contiguous())
+
+    @staticmethod
+    def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+        """Join sets of gaussians of one SH degree and one kind, in order.
+
+        Raises:
+            ValueError: no parts, or parts of different degrees.
+            TypeError: a part is not Gaussians, or NumPy and torch are mixed.
+        """
+        parts = list(parts)
+        if not parts:
+            raise ValueError("parts: expected at least one Gaussians, got none")
+        for i, part in enumerate(parts):
+            if not isinstance(part, Gaussians):
+                raise TypeError(f"parts[{i}]: expected Gaussians, got {type(part).__name__}")
+            _check_kind(f"parts[{i}].means", part.means, parts[0].means)
+            if part.sh_degree != parts[0].sh_degree:
+                raise ValueError(
+                    f"parts[{i}]: expected SH degree {parts[0].sh_degree} like parts[0], got {part.sh_degree}"
+                )
+        join: Any = np.concatenate
+        if _is_tensor(parts[0].means):
+            import torch
+
+            join = torch.cat
+        return Gaussians(*(join([getattr(part, name) for part in parts]) for name in _NAMES))
+
+    def numpy(self) -> Gaussians:
+        """Return the same gaussians as NumPy arrays, without gradients; copied only from another device."""
+        if not _is_tensor(self.means):
+            return self
+        return self._map(lambda tensor: tensor.detach().cpu().numpy())
+
+    def torch(self, device: Any = None) -> Gaussians:
+        """Return the same gaussians as torch tensors on `device` (None: where they are, NumPy's on the CPU).
+
+        Copied only when they move or when a NumPy array is read-only; gradients flow through a move.
+        """
+        import torch
+
+        def tensor(array: Any) -> Any:
+            if isinstance(array, np.ndarray):
+                array = torch.from_numpy(array if array.flags.writeable else array.copy())
+            return array if device is None else array.to(device)
+
+        return self._map(tensor)
+
+    def _map(self, function: Any) -> Gaussians:
+        return Gaussians(*(function(getattr(self, name)) for name in _NAMES))
+
+
+def _check_kind(name: str, array: Any, like: Any) -> None:
+    """Raise unless `array` is a contiguous float32 array of the kind and on the device of `like`."""
+    if not isinstance(array, np.ndarray) and not _is_tensor(array):
+        raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {_kind(array)}")
+    if _is_tensor(array) != _is_tensor(like):
+        raise TypeError(f"{name}: expected {_kind(like)} like the others, got {_kind(array)}")
+    dtype = str(array.dtype).removeprefix("torch.")
+    if dtype != "float32":
+        raise ValueError(f"{name}: expected dtype float32, got {dtype}; convert it first")
+    if _is_tensor(array):
+        if array.device != like.device:
+            raise ValueError(f"{name}: expected device {like.device} like the others, got {array.device}")
+        if not array.is_contiguous():
+            raise ValueError(f"{name}: expected a contiguous tensor, got a strided one; call .contiguous()")
+    elif not array.flags.c_contiguous:
+        raise ValueError(
+            f"{name}: expected a C-contiguous array, got a strided one; call numpy.ascontiguousarray"
+        )
+
+
+def _index_array(index: Any) -> np.ndarray[Any, Any]:
+    array = np.asarray(index.detach().cpu().numpy() if _is_tensor(index) else index)
+    if array.ndim == 1 and array.size == 0 and array.dtype.kind == "f":
+        array = array.astype(np.intp)  # an empty list says nothing about its kind
+    if array.ndim == 0 or array.dtype.kind not in "iub":
+        raise TypeError(
+            f"index: expected a slice, integers or booleans, got {_kind(index)}"
+            + (f" of dtype {array.dtype}" if array.ndim else "; for one gaussian use a slice of length 1")
+        )
+    if array.ndim != 1:
+        raise ValueError(f"index: expected one dimension, got shape {array.shape}")
+    return array if array.dtype.kind == "b" else array.astype(np.int64)
