@@ -125,7 +125,7 @@ def error_image(reference: Any, test: Any) -> NDArray[np.float32]:
 
 
 def box_downsample(image: Any, factor: int) -> Any:
-    """Average blocks of ``factor`` × ``factor`` pixels: (H,W,...) to (H/factor,W/factor,...), array kind kept.
+    """Average ``factor`` × ``factor`` blocks: (H,W,...) to (H/factor,W/factor,...), array kind kept.
 
     Raises:
         ValueError: ``factor`` is not positive, or does not divide the height and the width.

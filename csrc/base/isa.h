@@ -14,9 +14,9 @@ const char* isa_name(Isa isa);
 
 // Declares `declaration` in each instruction set's namespace.
 #if defined(__x86_64__)
-#define V3DG_DECLARE_PER_ISA(declaration)              \
-    namespace isa_baseline { declaration; }            \
-    namespace isa_avx2 { declaration; }                \
+#define V3DG_DECLARE_PER_ISA(declaration)   \
+    namespace isa_baseline { declaration; } \
+    namespace isa_avx2 { declaration; }     \
     namespace isa_avx512 { declaration; }
 #define V3DG_DISPATCH_ISA(function, ...)                                                     \
     (::v3dg::active_isa() == ::v3dg::Isa::avx512 ? ::v3dg::isa_avx512::function(__VA_ARGS__) \

@@ -38,14 +38,18 @@ Span<T> span_of(const py::array& array, const char* name, std::initializer_list<
     size_t axis = 0;
     for (const py::ssize_t length : shape) {
         if (same && length >= 0 && array.shape(axis) != length) same = false;
-        wanted += (length < 0 ? std::string("N") : std::to_string(length)) +
-                  (shape.size() == 1 ? "," : axis + 1 < shape.size() ? ", " : "");
+        wanted += length < 0 ? "N" : std::to_string(length);
+        if (axis + 1 < shape.size()) wanted += ", ";
+        if (shape.size() == 1) wanted += ",";
         ++axis;
     }
     if (!same)
-        throw py::value_error(std::string(name) + ": expected shape " + wanted + "), got " + shape_text(array));
+        throw py::value_error(std::string(name) + ": expected shape " + wanted + "), got " +
+                              shape_text(array));
     if (!(array.flags() & py::array::c_style))
-        throw py::value_error(std::string(name) + ": expected a C-contiguous array, got a strided one; call numpy.ascontiguousarray");
+        throw py::value_error(
+            std::string(name) +
+            ": expected a C-contiguous array, got a strided one; call numpy.ascontiguousarray");
     T* data = std::is_const<T>::value ? static_cast<T*>(const_cast<void*>(array.data()))
                                       : static_cast<T*>(const_cast<py::array&>(array).mutable_data());
     return {data, static_cast<size_t>(array.size())};

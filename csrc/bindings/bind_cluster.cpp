@@ -17,8 +17,8 @@ py::tuple median_split(const py::array& means, int64_t cluster_size) {
         throw py::value_error("means: expected fewer than 2^32 rows, got " + std::to_string(count));
     for (size_t i = 0; i < values.size; ++i)
         if (!std::isfinite(values[i]))
-            throw py::value_error("means: expected finite values, got " + std::to_string(values[i]) + " in row " +
-                                  std::to_string(i / 3));
+            throw py::value_error("means: expected finite values, got " + std::to_string(values[i]) +
+                                  " in row " + std::to_string(i / 3));
     const int depth = num_halvings(count, static_cast<size_t>(cluster_size));
     py::array_t<int64_t> order(static_cast<py::ssize_t>(count));
     py::array_t<int64_t> leaf_offset((py::ssize_t(1) << depth) + 1);
@@ -46,8 +46,7 @@ Span<const int64_t> offsets_of(const py::array& offset, const char* name, size_t
 std::vector<Sphere> spheres_of(const py::array& means, const py::array& radii) {
     const Span<const float> centers = span_of<const float>(means, "means", {-1, 3});
     const size_t count = centers.size / 3;
-    const Span<const float> radius =
-        span_of<const float>(radii, "radii", {static_cast<py::ssize_t>(count)});
+    const Span<const float> radius = span_of<const float>(radii, "radii", {static_cast<py::ssize_t>(count)});
     std::vector<Sphere> spheres(count);
     for (size_t i = 0; i < count; ++i)
         spheres[i] = {centers[3 * i], centers[3 * i + 1], centers[3 * i + 2], radius[i]};

@@ -4,7 +4,9 @@
 PYBIND11_MODULE(_core, m) {
     m.doc() = "Compiled operations of v3dg; the public interface is the package v3dg.";
     m.attr("has_cuda") = V3DG_WITH_CUDA != 0;
-    m.def("isa", [] { return v3dg::isa_name(v3dg::active_isa()); }, "Instruction set that the CPU half runs on.");
+    m.def(
+        "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },
+        "Instruction set that the CPU half runs on.");
     v3dg::bind_cluster(m);
     v3dg::bind_select(m);
     v3dg::bind_simplify_init(m);

@@ -95,7 +95,7 @@ double center_core(const Sphere* core, size_t count, Center* center) {
     for (int step = 2; step < kCoreSteps; ++step) {
         const Sphere& sphere = core[far];
         const double distance = radius - sphere.radius;
-        if (distance <= 0.0) break;  // concentric: nothing to move towards
+        if (distance <= 0.0) break;                    // concentric: nothing to move towards
         const double move = radius / distance / step;  // the far side of the sphere, not its centre
         at.x += (sphere.x - at.x) * move;
         at.y += (sphere.y - at.y) * move;
@@ -160,8 +160,8 @@ void cpu::bound_spheres(Span<const Sphere> spheres, Span<const int64_t> offset, 
     parallel_for(ball.size, 16, [&](size_t s) {
         const Sphere* first = spheres.data + offset[s];
         const size_t count = offset[s + 1] - offset[s];
-        ball[s] = count == 0 ? Sphere{0, 0, 0, kMinRadius}
-                             : ball_at(center_of(first, count), first, count, margin);
+        ball[s] =
+            count == 0 ? Sphere{0, 0, 0, kMinRadius} : ball_at(center_of(first, count), first, count, margin);
     });
 }
 
