@@ -1,0 +1,84 @@
+"""Check that the compiled module runs on every x86-64 processor.
+
+Some sources are compiled once per instruction set, and every object holds copies of the inline functions
+that it uses. Had the linker kept such a copy from an AVX object, code that runs everywhere would call it.
+So: without entering the namespaces isa_avx2 and isa_avx512, no function can be reached that holds an
+instruction beyond plain x86-64.
+
+    python .ci/check_isa.py build/*/_core*.so      (not stripped)
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import dataclass, field
+
+FUNCTION = re.compile(r"^([0-9a-f]+) <(.*)>:$")
+TARGET = re.compile(r"\b([0-9a-f]+) <")
+# VEX and EVEX instructions begin with v, but so do two old ones; k* work on AVX-512 masks; the rest is BMI.
+WIDE = re.compile(
+    r"^(v(?!er[rw]\b)|k(add|and|mov|not|or|shift|test|unpck|xnor|xor)"
+    r"|andn|bextr|blsi|blsr|blsmsk|bzhi|mulx|pdep|pext|rorx|sarx|shlx|shrx|movbe|lzcnt|popcnt)"
+)
+
+
+@dataclass
+class Function:
+    name: str
+    wide: list[str] = field(default_factory=list)
+    targets: set[str] = field(default_factory=set)
+
+    @property
+    def is_dispatched(self) -> bool:
+        return "isa_avx2" in self.name or "isa_avx512" in self.name
+
+
+def disassemble(path: str) -> dict[str, Function]:
+    """All functions by address, in hexadecimal without leading zeros."""
+    command = ["objdump", "-d", "-C", "-w", "--no-show-raw-insn", path]
+    functions: dict[str, Function] = {}
+    function = Function("")
+    for line in subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines():
+        if match := FUNCTION.match(line):
+            function = functions[match[1].lstrip("0")] = Function(match[2])
+        elif "\t" in line:
+            instruction = line.split("\t", 1)[1].strip()
+            if WIDE.match(instruction):
+                function.wide.append(instruction)
+            function.targets.update(TARGET.findall(instruction))
+    return functions
+
+
+def main(path: str) -> int:
+    functions = disassemble(path)
+    dispatched = sum(function.is_dispatched for function in functions.values())
+    if not dispatched:
+        print(f"{path}: found no function of isa_avx2 or isa_avx512; is the file stripped?")
+        return 1
+    # What no instruction refers to is called through tables or from outside.
+    called = {t for address, f in functions.items() for t in f.targets if t != address}
+    todo = [address for address, f in functions.items() if address not in called and not f.is_dispatched]
+    caller = dict.fromkeys(todo, "")
+    wrong = 0
+    while todo:
+        address = todo.pop()
+        function = functions[address]
+        if function.wide:
+            wrong += 1
+            print(f"{function.name}\n    holds {function.wide[0]!r}\n    called by {caller[address]}")
+            continue
+        for target in function.targets:
+            if target in functions and target not in caller and not functions[target].is_dispatched:
+                caller[target] = function.name
+                todo.append(target)
+    print(
+        f"{path}: {len(functions)} functions, {dispatched} in isa_avx2 or isa_avx512, "
+        f"{len(caller)} reached without them, {wrong} of these hold wide instructions"
+    )
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))
