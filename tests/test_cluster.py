@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from reference import cluster as reference
 
+from reference import cluster as reference
 from v3dg import _core
 
 # Few distinct values, so that axes, coordinates and whole points tie.
