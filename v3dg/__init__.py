@@ -9,8 +9,9 @@ if _find_spec("v3dg._core") is None:
     )
 
 from v3dg._version import __version__
+from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
 
-__all__ = ["Camera", "Gaussians", "__version__", "load", "save", "turntable"]
+__all__ = ["Bundle", "Camera", "Clusters", "Gaussians", "Groups", "__version__", "load", "save", "turntable"]
