@@ -136,6 +136,7 @@ PlyHeader read_ply_header(const PosixFile& file) {
             at_end = text.size() == searched;
             line_end = text.find('\n', searched);
         }
+        const bool is_cut = line_end == std::string::npos && text.size() >= kMaxHeaderBytes;
         if (line_end == std::string::npos) line_end = text.size();
         std::string line = text.substr(line_begin, line_end - line_begin);
         if (!line.empty() && line.back() == '\r') line.pop_back();
@@ -143,7 +144,7 @@ PlyHeader read_ply_header(const PosixFile& file) {
             throw PlyError("expected a first line 'ply', found " +
                            (text.empty() ? "an empty file" : quoted(line)));
         try {
-            if (line_number > 1 && parser.take(line)) {
+            if (line_number > 1 && !is_cut && parser.take(line)) {
                 parser.header.size = std::min(line_end + 1, text.size());
                 return std::move(parser.header);
             }

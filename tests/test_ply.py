@@ -1,0 +1,674 @@
+"""Reading and writing 3DGS .ply files. NumPy makes the files and says what they mean, not ours."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v3dg import Gaussians, load, save
+
+NAMES = ("means", "quats", "scales", "opacities", "sh")
+ENCODINGS = ("ascii", "binary_little_endian", "binary_big_endian")
+PLY_TYPES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "int16",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint32",
+    "f4": "float",
+    "f8": "double",
+}
+
+
+def property_names(degree: int) -> list[str]:
+    num_rest = 3 * ((degree + 1) ** 2 - 1)
+    return (
+        ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"]
+        + [f"f_rest_{i}" for i in range(num_rest)]
+        + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    )
+
+
+@dataclass
+class Element:
+    """Columns of one element; a column of lists is a list of arrays."""
+
+    name: str
+    columns: dict[str, np.ndarray | list[np.ndarray]]
+    count_type: str = "u1"
+    count: int = field(init=False)
+
+    def __post_init__(self):
+        self.count = len(next(iter(self.columns.values()))) if self.columns else 0
+
+    def header(self) -> list[str]:
+        lines = [f"element {self.name} {self.count}"]
+        for name, column in self.columns.items():
+            if isinstance(column, list):
+                item = PLY_TYPES[column[0].dtype.str[1:]] if column else "float"
+                lines.append(f"property list {PLY_TYPES[self.count_type]} {item} {name}")
+            else:
+                lines.append(f"property {PLY_TYPES[column.dtype.str[1:]]} {name}")
+        return lines
+
+    def body(self, encoding: str, newline: str) -> bytes:
+        rows = []
+        for i in range(self.count):
+            values: list[np.ndarray] = []
+            for column in self.columns.values():
+                if isinstance(column, list):
+                    values.append(np.array(len(column[i]), self.count_type))
+                    values.extend(column[i])
+                else:
+                    values.append(column[i])
+            if encoding == "ascii":
+                rows.append((" ".join(str(value) for value in values) + newline).encode())
+            else:
+                order = "<" if encoding == "binary_little_endian" else ">"
+                rows.extend(np.array(value, order + value.dtype.str[1:]).tobytes() for value in values)
+        return b"".join(rows)
+
+
+def ply_bytes(elements: Sequence[Element], encoding: str, newline: str = "\n") -> bytes:
+    lines = ["ply", f"format {encoding} 1.0", "comment made by a test"]
+    for element in elements:
+        lines += element.header()
+    lines += ["end_header"]
+    header = "".join(line + newline for line in lines).encode()
+    return header + b"".join(element.body(encoding, newline) for element in elements)
+
+
+def random_columns(num: int, degree: int, seed: int = 0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {name: rng.normal(size=num).astype(np.float32) for name in property_names(degree)}
+
+
+def expected_gaussians(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the columns of a file mean, in float64."""
+
+    def stacked(*names: str) -> np.ndarray:
+        return np.stack([columns[name].astype(np.float64) for name in names], axis=-1)
+
+    num_rest = sum(name.startswith("f_rest_") for name in columns)
+    sh = stacked("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :]
+    if num_rest:
+        rest = stacked(*(f"f_rest_{i}" for i in range(num_rest)))
+        sh = np.concatenate([sh, rest.reshape(len(rest), 3, num_rest // 3).transpose(0, 2, 1)], axis=1)
+    quats = stacked("rot_0", "rot_1", "rot_2", "rot_3")
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    return {
+        "means": stacked("x", "y", "z"),
+        "quats": np.divide(quats, length, out=quats, where=length > 0),
+        "scales": np.exp(stacked("scale_0", "scale_1", "scale_2")),
+        "opacities": 1 / (1 + np.exp(-columns["opacity"].astype(np.float64))),
+        "sh": sh,
+    }
+
+
+def random_gaussians(num: int, degree: int, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    quats = rng.normal(size=(num, 4))
+    arrays = {
+        "means": rng.normal(scale=10, size=(num, 3)),
+        "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "scales": np.exp(rng.uniform(-12, 5, size=(num, 3))),
+        "opacities": rng.uniform(size=num),
+        "sh": rng.normal(size=(num, (degree + 1) ** 2, 3)),
+    }
+    return Gaussians(**{name: array.astype(np.float32) for name, array in arrays.items()})
+
+
+def assert_close(got: Gaussians, wanted: Gaussians | dict[str, np.ndarray], *, scale_error: float) -> None:
+    """Means and SH agree exactly, what is computed up to rounding."""
+    for name in NAMES:
+        value = wanted[name] if isinstance(wanted, dict) else getattr(wanted, name)
+        assert getattr(got, name).shape == value.shape
+        assert getattr(got, name).dtype == np.float32
+        # Opacities and quaternions: two roundings to float32 of values up to 1.
+        bounds = {"scales": (scale_error, 0), "opacities": (0, 1.2e-7), "quats": (0, 1.2e-7)}
+        rtol, atol = bounds.get(name, (0, 0))
+        value = np.asarray(value, np.float32)
+        np.testing.assert_allclose(getattr(got, name), value, rtol=rtol, atol=atol, err_msg=name)
+
+
+# A log scale of up to 12 is rounded to float32: 12 * 2^-24 on the log, the same relative error on the scale.
+ROUND_TRIP_SCALE_ERROR = 8e-7
+# The same double, from two libraries' exp, rounded once to float32.
+READ_SCALE_ERROR = 1.2e-7
+
+
+@given(
+    num=st.integers(0, 20),
+    degree=st.integers(0, 3),
+    encoding=st.sampled_from(ENCODINGS),
+    seed=st.integers(0, 99),
+)
+def test_what_is_written_reads_back(tmp_path_factory, num, degree, encoding, seed):
+    gaussians = random_gaussians(num, degree, seed)
+    path = tmp_path_factory.getbasetemp() / "round_trip.ply"
+    save(path, gaussians, encoding=encoding)
+    assert_close(load(path), gaussians, scale_error=ROUND_TRIP_SCALE_ERROR)
+
+
+@st.composite
+def layouts(draw):
+    """(bytes of a file, meaning of its columns): any order, types, encoding, line ends, extra content."""
+    num = draw(st.integers(0, 6))
+    columns = random_columns(num, draw(st.integers(0, 3)), draw(st.integers(0, 99)))
+    main_type = draw(st.sampled_from(["f4", "f8"]))
+    columns = {name: column.astype(main_type) for name, column in columns.items()}
+    for name in draw(st.sets(st.sampled_from(sorted(columns)), max_size=4)):
+        kind = draw(st.sampled_from(sorted(PLY_TYPES)))
+        low, high = (0, 5) if kind[0] == "u" else (-5, 5)
+        columns[name] = np.random.default_rng(0).integers(low, high, num).astype(kind)
+    vertex: dict[str, np.ndarray | list[np.ndarray]] = dict(columns)
+    if draw(st.booleans()):
+        vertex |= {"nx": np.zeros(num, "f4"), "red": np.full(num, 255, "u1")}
+    if draw(st.booleans()):
+        vertex["neighbours"] = [np.arange(i % 3, dtype="i4") for i in range(num)]
+    order = draw(st.permutations(sorted(vertex)))
+    elements = [Element("vertex", {name: vertex[name] for name in order})]
+
+    count_type = draw(st.sampled_from(["u1", "i1", "u2", "i4", "u4"]))
+    num_others = draw(st.integers(0, 4))
+    fixed = Element("chunk", {"low": np.ones(num_others, "f8"), "flag": np.ones(num_others, "i2")})
+    with_lists = Element(
+        "face",
+        {"indices": [np.arange(i, dtype="u2") for i in range(num_others)], "area": np.ones(num_others, "f4")},
+        count_type,
+    )
+    for element in (fixed, with_lists, Element("nothing", {})):
+        place = draw(st.sampled_from(["before", "after", "absent"]))
+        if place == "before":
+            elements.insert(0, element)
+        elif place == "after":
+            elements.append(element)
+    encoding = draw(st.sampled_from(ENCODINGS))
+    newline = draw(st.sampled_from(["\n", "\r\n"]))
+    return ply_bytes(elements, encoding, newline), expected_gaussians(columns)
+
+
+@given(layout=layouts())
+def test_reads_any_layout(tmp_path_factory, layout):
+    content, expected = layout
+    path = tmp_path_factory.getbasetemp() / "layout.ply"
+    path.write_bytes(content)
+    assert_close(load(path), expected, scale_error=READ_SCALE_ERROR)
+
+
+def test_all_blocks_and_all_threads_agree_with_one_row_at_a_time(tmp_path):
+    columns = random_columns(20_000, 1)
+    path = tmp_path / "many.ply"
+    for encoding in ("binary_little_endian", "ascii"):
+        path.write_bytes(ply_bytes([Element("vertex", columns)], encoding))
+        assert_close(load(path), expected_gaussians(columns), scale_error=READ_SCALE_ERROR)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_many_blocks_are_written_in_order(tmp_path, encoding):
+    gaussians = random_gaussians(50_000, 0)
+    save(tmp_path / "many.ply", gaussians, encoding=encoding)
+    assert_close(load(tmp_path / "many.ply"), gaussians, scale_error=ROUND_TRIP_SCALE_ERROR)
+
+
+def test_rest_coefficients_are_channel_by_channel_in_the_file(tmp_path):
+    sh = np.arange(12, dtype=np.float32).reshape(1, 4, 3)  # coefficient k, channel c holds 3 k + c
+    one = random_gaussians(1, 1)
+    path = tmp_path / "one.ply"
+    save(path, Gaussians(one.means, one.quats, one.scales, one.opacities, sh), encoding="ascii")
+    lines = path.read_text().splitlines()
+    names = [line.split()[2] for line in lines if line.startswith("property")]
+    row = dict(zip(names, lines[-1].split(), strict=True))
+    assert [row[f"f_dc_{i}"] for i in range(3)] == ["0", "1", "2"]
+    assert [row[f"f_rest_{i}"] for i in range(9)] == ["3", "6", "9", "4", "7", "10", "5", "8", "11"]
+    np.testing.assert_array_equal(load(path).sh, sh)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_gsply_reads_what_we_write(tmp_path, degree):
+    gaussians = random_gaussians(300, degree)
+    save(tmp_path / "ours.ply", gaussians)
+    theirs = gsply.plyread(str(tmp_path / "ours.ply"))
+    np.testing.assert_array_equal(theirs.means, gaussians.means)
+    np.testing.assert_array_equal(theirs.quats, gaussians.quats)
+    np.testing.assert_array_equal(theirs.sh0, gaussians.sh[:, 0])
+    if degree:
+        np.testing.assert_array_equal(theirs.shN.reshape(300, -1, 3), gaussians.sh[:, 1:])
+    np.testing.assert_allclose(theirs.scales, np.log(gaussians.scales), rtol=1e-6, atol=1e-6)
+    logits = np.log(gaussians.opacities / (1 - gaussians.opacities.astype(np.float64)))
+    np.testing.assert_allclose(theirs.opacities, logits, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_we_read_what_gsply_writes(tmp_path, degree):
+    columns = random_columns(300, degree)
+    expected = expected_gaussians(columns)
+    sh = expected["sh"].astype(np.float32)
+    gsply.plywrite(
+        str(tmp_path / "theirs.ply"),
+        np.stack([columns[name] for name in "xyz"], 1),
+        np.stack([columns[f"scale_{i}"] for i in range(3)], 1),
+        np.stack([columns[f"rot_{i}"] for i in range(4)], 1),
+        columns["opacity"],
+        sh[:, 0],
+        sh[:, 1:] if degree else None,
+    )
+    assert_close(load(tmp_path / "theirs.ply"), expected, scale_error=READ_SCALE_ERROR)
+
+
+def test_zero_and_one_are_written_finite_and_read_back_exactly(tmp_path):
+    tiny, below_one = np.float32(1e-45), np.nextafter(np.float32(1), np.float32(0))
+    gaussians = Gaussians(
+        means=np.zeros((4, 3), np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (4, 1)),
+        scales=np.tile(np.float32([0, tiny, 1]), (4, 1)),
+        opacities=np.float32([0, tiny, below_one, 1]),
+        sh=np.zeros((4, 1, 3), np.float32),
+    )
+    for encoding in ENCODINGS:
+        save(tmp_path / "ends.ply", gaussians, encoding=encoding)
+        back = load(tmp_path / "ends.ply")
+        np.testing.assert_array_equal(back.scales, gaussians.scales)
+        np.testing.assert_array_equal(back.opacities, gaussians.opacities)
+    save(tmp_path / "ends.ply", gaussians)
+    stored = gsply.plyread(str(tmp_path / "ends.ply"))
+    np.testing.assert_array_equal(stored.opacities[[0, 3]], [-110, 20])
+    np.testing.assert_array_equal(stored.scales[:, 0], -110)
+    assert np.isfinite(stored.scales).all()
+    assert np.isfinite(stored.opacities).all()
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_values_that_are_not_finite_pass_through(tmp_path, encoding):
+    gaussians = random_gaussians(4, 1)
+    gaussians.means[0] = np.inf, -np.inf, np.nan
+    gaussians.scales[1] = np.inf, np.nan, 1
+    gaussians.opacities[2] = np.nan
+    gaussians.quats[3] = np.nan, 1, 2, np.inf
+    gaussians.sh[3, 1] = np.nan
+    save(tmp_path / "wild.ply", gaussians, encoding=encoding)
+    assert_close(load(tmp_path / "wild.ply"), gaussians, scale_error=ROUND_TRIP_SCALE_ERROR)
+
+
+def test_zero_quaternions_stay_and_others_are_normalised(tmp_path):
+    gaussians = random_gaussians(4, 0)
+    gaussians.quats[:] = [[0, 0, 0, 0], [3, 0, 0, 4], [0, 1e-44, 0, 0], [0, 0, -3e38, 3e38]]
+    save(tmp_path / "quats.ply", gaussians)
+    half = np.sqrt(0.5)
+    wanted = np.float32([[0, 0, 0, 0], [0.6, 0, 0, 0.8], [0, 1, 0, 0], [0, 0, -half, half]])
+    np.testing.assert_array_equal(load(tmp_path / "quats.ply").quats, wanted)
+
+
+def test_normalised_quaternions_are_not_touched_again(tmp_path):
+    gaussians = random_gaussians(5000, 0)
+    save(tmp_path / "quats.ply", gaussians)
+    np.testing.assert_array_equal(load(tmp_path / "quats.ply").quats, gaussians.quats)
+
+
+def test_tensors_are_written_like_arrays(tmp_path):
+    pytest.importorskip("torch")
+    gaussians = random_gaussians(10, 1)
+    save(tmp_path / "numpy.ply", gaussians)
+    tensors = gaussians.torch()
+    tensors.means.requires_grad_()
+    save(tmp_path / "torch.ply", tensors)
+    assert (tmp_path / "numpy.ply").read_bytes() == (tmp_path / "torch.ply").read_bytes()
+
+
+def header(*lines: str, format_line: str = "format binary_little_endian 1.0") -> bytes:
+    return "".join(f"{line}\n" for line in ("ply", format_line, *lines, "end_header")).encode()
+
+
+def vertex_lines(count: object = 1, degree: int = 0) -> list[str]:
+    return [f"element vertex {count}", *(f"property float {name}" for name in property_names(degree))]
+
+
+ASCII = "format ascii 1.0"
+ROW_BYTES = 14 * 4
+
+HOSTILE = {
+    "empty file": (b"", "expected a first line 'ply', found an empty file"),
+    "bad magic": (b"PLY\n" + header()[4:], "expected a first line 'ply', found 'PLY'"),
+    "no text": (bytes(range(256)) * 9, "expected a first line 'ply', found '????"),
+    "one endless line": (b"ply" + b"a" * 2_000_000, "expected a first line 'ply', found 'plyaaaa"),
+    "no end": (header()[:-11], "expected end_header within the first 1048576 bytes, found none in 36"),
+    "endless header": (
+        b"ply\n" + b"comment a\n" * 300_000,
+        "expected end_header within the first 1048576 bytes, found none in",
+    ),
+    "format missing": (
+        b"ply\nelement vertex 0\nend_header\n",
+        "header line 3: expected a line 'format' before end_header, found none",
+    ),
+    "format twice": (header(ASCII), "header line 3: expected one line 'format', found a second"),
+    "format unknown": (
+        header(format_line="format binary_pdp_endian 1.0"),
+        "header line 2: expected format ascii, binary_little_endian or binary_big_endian, found 'binary_pdp",
+    ),
+    "version": (
+        header(format_line="format ascii 2.0"),
+        "header line 2: expected a format and the version 1.0",
+    ),
+    "unknown keyword": (
+        header("vertices 3"),
+        "header line 3: expected format, element, property or end_header",
+    ),
+    "element without count": (
+        header("element vertex"),
+        "header line 3: expected 'element NAME COUNT', found 2",
+    ),
+    "negative count": (
+        header(*vertex_lines(-5)),
+        "header line 3: expected a count of element 'vertex', found '-5'",
+    ),
+    "fractional count": (header(*vertex_lines("1e9")), "expected a count of element 'vertex', found '1e9'"),
+    "count beyond 64 bits": (
+        header(*vertex_lines(10**20)),
+        "expected a count of element 'vertex', found '1000",
+    ),
+    "count that overflows": (
+        header(*vertex_lines(2**64 - 1)) + b"\0" * ROW_BYTES,
+        "expected 18446744073709551615 rows of element 'vertex' with 56 bytes each, found 56 bytes",
+    ),
+    "huge count": (
+        header(*vertex_lines(10**9)) + b"\0" * 100,
+        "expected 1000000000 rows of element 'vertex' with 56 bytes each, found 100 bytes",
+    ),
+    "huge count, ascii": (
+        header(*vertex_lines(10**9), format_line=ASCII) + b"0 " * 100,
+        "expected 1000000000 rows of element 'vertex' with at least 28 bytes each, found 200 bytes",
+    ),
+    "huge element before": (
+        header("element face 99999999999", "property int a", *vertex_lines()) + b"\0" * 100,
+        "expected 99999999999 rows of element 'face' with 4 bytes each, found 100 bytes",
+    ),
+    "truncated": (
+        header(*vertex_lines(2)) + b"\0" * (2 * ROW_BYTES - 1),
+        "expected 2 rows of element 'vertex' with 56 bytes each, found 111 bytes",
+    ),
+    "property before element": (
+        header("property float x"),
+        "header line 3: expected an element before the first",
+    ),
+    "property without name": (
+        header("element vertex 0", "property float"),
+        "header line 4: expected 'property TYPE",
+    ),
+    "unknown type": (
+        header("element vertex 0", "property float128 x"),
+        "header line 4: expected a scalar type such as float, found 'float128'",
+    ),
+    "list with float length": (
+        header("element vertex 0", "property list float int x"),
+        "header line 4: expected an integer type for the length of a list, found 'float'",
+    ),
+    "no vertex": (header("element face 0"), "expected one element 'vertex', found 0"),
+    "two vertices": (header(*vertex_lines(0), *vertex_lines(0)), "expected one element 'vertex', found 2"),
+    "duplicate property": (
+        header(*vertex_lines(0), "property float x"),
+        "expected each vertex property once, found 'x' twice",
+    ),
+    "duplicate extra property": (
+        header(*vertex_lines(0), "property float n", "property list uchar int n"),
+        "expected each vertex property once, found 'n' twice",
+    ),
+    "missing property": (
+        header(*(line for line in vertex_lines(0) if not line.endswith("rot_2"))),
+        "expected vertex properties rot_2, found 'x', 'y', 'z', 'f_dc_0', 'f_dc_1', 'f_dc_2',"
+        " 'opacity', 'scale_0' and 5 more",
+    ),
+    "mesh": (
+        header("element vertex 0", "property float x", "property float y", "property float z"),
+        "found 'x', 'y', 'z'; this is not a file of gaussians",
+    ),
+    "compressed": (
+        header("element vertex 0", "property uint packed_position"),
+        "this is a compressed .ply, decompress it first",
+    ),
+    "list for a number": (
+        header("element vertex 0", *("property list uchar float x", *vertex_lines(0)[2:])),
+        "expected a number as vertex property 'x', found a list",
+    ),
+    "f_rest of no degree": (
+        header(*vertex_lines(0), *(f"property float f_rest_{i}" for i in range(10))),
+        "expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), found 10",
+    ),
+    "f_rest of degree 4": (header(*vertex_lines(0, 4)), "expected 0, 9, 24 or 45 properties f_rest_*"),
+    "f_rest with a gap": (
+        header(*vertex_lines(0, 1), "property float y2").replace(b"f_rest_8", b"f_rest_9"),
+        "expected vertex properties f_rest_8, found",
+    ),
+    "f_rest without a number": (
+        header(*vertex_lines(0, 1)).replace(b"f_rest_8", b"f_rest_x"),
+        "expected vertex properties f_rest_8, found",
+    ),
+    "ascii with a short row": (
+        header(*vertex_lines(2), format_line=ASCII) + b"0 " * 14 + b"\n" + b"0 " * 13,
+        "vertex 1: expected 14 numbers, found 13",
+    ),
+    "ascii with a long row": (
+        header(*vertex_lines(1), format_line=ASCII) + b"0 " * 15,
+        "vertex 0: expected 14 numbers, found 15",
+    ),
+    "ascii with too few rows": (
+        header(*vertex_lines(3), format_line=ASCII) + (b"0.00 " * 14 + b"\n\n") * 2,
+        "expected 3 lines for element 'vertex', found 2",
+    ),
+    "ascii with too few rows before": (
+        header("element a 9", "property int a", *vertex_lines(0), format_line=ASCII)
+        + b"12345678901234567890",
+        "expected 9 lines for element 'a', found 1",
+    ),
+    "ascii with a word": (
+        header(*vertex_lines(1), format_line=ASCII) + b"0 " * 13 + b"0x1F\n",
+        "vertex 0: expected a number, found '0x1F'",
+    ),
+    "ascii with a control character": (
+        header(*vertex_lines(1), format_line=ASCII) + b"0 " * 13 + b"\x1b[31m\xff\n",
+        "vertex 0: expected a number, found '?[31m?'",
+    ),
+    "ascii with a list that is too long": (
+        header(*vertex_lines(1), "property list uchar int n", format_line=ASCII) + b"0 " * 14 + b"1e300 1 2",
+        "vertex 0: expected at least 15 numbers, found 17",
+    ),
+    "ascii with a list of negative length": (
+        header(*vertex_lines(1), "property list uchar int n", format_line=ASCII) + b"0 " * 14 + b"-1",
+        "vertex 0: expected a length of list 'n', found -1",
+    ),
+    "ascii in one line of many megabytes": (
+        header(*vertex_lines(1), format_line=ASCII) + b"0 " * 3_000_000,
+        "expected lines of at most 4194304 bytes, found a longer one",
+    ),
+    "list that ends after the file": (
+        header("element face 1", "property list uint double n", *vertex_lines(0)) + b"\xff" * 40,
+        "expected 1 rows of element 'face', found the end of the file in row 0",
+    ),
+    "list of negative length": (
+        header("element face 1", "property list char double n", *vertex_lines(0)) + b"\xff" * 40,
+        "expected a length of list 'n' in row 0, found -1",
+    ),
+    "vertex with lists, truncated": (
+        header(*vertex_lines(2), "property list uchar int n") + b"\1" * (2 * 57),
+        "expected 2 rows of element 'vertex', found the end of the file in row 1",
+    ),
+    "name with a line feed's looks": (
+        header("element vertex 0", "property float " + "\x07" * 100),
+        "found '????????????????????????????????????????...'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_broken_files_are_refused_with_what_is_wrong(tmp_path, case):
+    content, message = HOSTILE[case]
+    path = tmp_path / "broken.ply"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        load(path)
+    text = str(error.value)
+    assert text.startswith(f"{path}: ")
+    assert text.isprintable()  # hence one line
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_every_cut_of_a_file_is_refused(tmp_path, encoding):
+    face = Element("face", {"indices": [np.arange(2, dtype="i4")]})
+    content = ply_bytes([face, Element("vertex", random_columns(2, 0))], encoding)
+    path = tmp_path / "cut.ply"
+    # The last number of a text is still a number when its last digits are gone.
+    last = content.rfind(b" ") + 1 if encoding == "ascii" else len(content)
+    body = content.index(b"end_header")
+    for size in (*range(0, body, 7), *range(body, last)):
+        path.write_bytes(content[:size])
+        with pytest.raises(ValueError, match="expected"):
+            load(path)
+
+
+@given(
+    encoding=st.sampled_from(ENCODINGS),
+    edits=st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), min_size=1, max_size=4),
+    with_list=st.booleans(),
+)
+def test_changed_bytes_never_do_worse_than_an_error(tmp_path_factory, encoding, edits, with_list):
+    columns: dict = random_columns(2, 1)
+    if with_list:
+        columns = {"n": [np.arange(2, dtype="i4")] * 2, **columns}
+    content = bytearray(ply_bytes([Element("vertex", columns)], encoding))
+    for place, value in edits:
+        content[place % len(content)] = value
+    path = tmp_path_factory.getbasetemp() / "changed.ply"
+    path.write_bytes(content)
+    try:
+        assert len(load(path)) <= len(content)
+    except ValueError as error:
+        assert str(error).startswith(f"{path}: ")  # noqa: PT017 (either outcome is right)
+
+
+def test_missing_files_and_folders_keep_their_own_errors(tmp_path):
+    with pytest.raises(FileNotFoundError) as error:
+        load(tmp_path / "absent.ply")
+    assert error.value.filename == str(tmp_path / "absent.ply")
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(IsADirectoryError):
+        load(tmp_path / "folder.ply")
+    with pytest.raises(IsADirectoryError):
+        save(tmp_path / "folder.ply", random_gaussians(1, 0))
+    with pytest.raises(FileNotFoundError) as error:
+        save(tmp_path / "absent" / "a.ply", random_gaussians(1, 0))
+    assert error.value.filename == str(tmp_path / "absent" / "a.ply")
+
+
+def test_a_pipe_is_refused_without_waiting(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ply")
+    with pytest.raises(ValueError, match="expected a regular file, found a device or a pipe"):
+        load(tmp_path / "pipe.ply")
+
+
+def test_other_suffixes_are_refused(tmp_path):
+    for call in (lambda path: load(path), lambda path: save(path, random_gaussians(1, 0))):
+        with pytest.raises(
+            ValueError, match=r"a\.splat: expected a file name that ends in \.ply, got '\.splat'"
+        ):
+            call(tmp_path / "a.splat")
+
+
+def test_unusual_names_work(tmp_path):
+    path = os.path.join(
+        os.fspath(tmp_path), "ünï \udcff.PLY"
+    )  # the surrogate stands for a byte that is no UTF-8
+    save(path, random_gaussians(3, 0))
+    assert len(load(path)) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda g: g.scales.__setitem__((2, 1), -1), r"scales\[2\]: expected values >= 0, got -1"),
+        (lambda g: g.opacities.__setitem__(7, 1.5), r"opacities\[7\]: expected values in \[0, 1\], got 1\.5"),
+        (
+            lambda g: g.opacities.__setitem__(7, -0.5),
+            r"opacities\[7\]: expected values in \[0, 1\], got -0\.5",
+        ),
+    ],
+)
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_failed_save_changes_nothing(tmp_path, change, message, encoding):
+    gaussians = random_gaussians(10, 0)
+    path = tmp_path / "kept.ply"
+    path.write_bytes(b"before")
+    change(gaussians)
+    with pytest.raises(ValueError, match=message):
+        save(path, gaussians, encoding=encoding)
+    assert path.read_bytes() == b"before"
+    assert os.listdir(tmp_path) == ["kept.ply"]
+
+
+def test_save_refuses_what_it_cannot_write(tmp_path):
+    with pytest.raises(ValueError, match=r"encoding: expected binary_little_endian, .* got 'text'"):
+        save(tmp_path / "a.ply", random_gaussians(1, 0), encoding="text")
+    with pytest.raises(TypeError, match="gaussians: expected Gaussians, got int"):
+        save(tmp_path / "a.ply", 3)
+    assert os.listdir(tmp_path) == []
+
+
+def test_save_writes_through_links_and_obeys_the_umask(tmp_path):
+    (tmp_path / "link.ply").symlink_to("real.ply")
+    old = os.umask(0o027)
+    try:
+        save(tmp_path / "link.ply", random_gaussians(3, 0))
+    finally:
+        os.umask(old)
+    assert (tmp_path / "link.ply").is_symlink()
+    assert (tmp_path / "real.ply").stat().st_mode & 0o777 == 0o640
+    assert len(load(tmp_path / "real.ply")) == 3
+
+
+PEAK_MEMORY = """
+import sys
+from pathlib import Path
+import v3dg
+
+def peak():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
+
+start = peak()
+gaussians = v3dg.load(sys.argv[1])
+loaded = peak()
+v3dg.save(sys.argv[2], gaussians)
+print(loaded - start, peak() - loaded)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's account of peak memory")
+def test_reading_needs_the_result_and_writing_next_to_nothing(tmp_path):
+    num = 400_000
+    names = property_names(3)
+    text = f"ply\nformat binary_little_endian 1.0\nelement vertex {num}\n"
+    text += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    with open(tmp_path / "big.ply", "wb") as file:
+        file.write(text.encode())
+        for _ in range(10):
+            file.write(np.ones((num // 10, len(names)), "<f4").tobytes())
+    command = [sys.executable, "-c", PEAK_MEMORY, str(tmp_path / "big.ply"), str(tmp_path / "copy.ply")]
+    # Each thread has a buffer, half a megabyte for writing; with more threads the bound would grow.
+    environment = {**os.environ, "OMP_NUM_THREADS": "4"}
+    environment["PYTHONPATH"] = str(Path(__import__("v3dg").__file__).parents[1])
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    read_bytes, write_bytes = map(int, done.stdout.split())
+    file_bytes = (tmp_path / "big.ply").stat().st_size
+    # The promise is twice the file. The arrays are as large as the file; 16 MiB is left for buffers (4 x 0.25
+    # MiB), thread stacks and what the allocator rounds up. A reader that held the file as well would need 2.
+    assert read_bytes < file_bytes + 16 * 2**20 < 1.2 * file_bytes
+    assert write_bytes < 16 * 2**20
+    assert (tmp_path / "copy.ply").stat().st_size == file_bytes
