@@ -42,11 +42,12 @@ py::tuple ply_read(const py::object& path_object) {
     const PlyFile ply = with_path(path, open_ply);
     const auto n = static_cast<py::ssize_t>(ply.num_gaussians());
     const auto k = static_cast<py::ssize_t>(ply.num_sh);
-    ArrayOf<float> means({n, py::ssize_t(3)}), quats({n, py::ssize_t(4)}), scales({n, py::ssize_t(3)}), opacities(n),
-        sh({n, k, py::ssize_t(3)});
-    const PlyGaussians<float> out = {span_of<float>(means, "means", {n, 3}), span_of<float>(quats, "quats", {n, 4}),
-                                     span_of<float>(scales, "scales", {n, 3}),
-                                     span_of<float>(opacities, "opacities", {n}), span_of<float>(sh, "sh", {n, k, 3})};
+    ArrayOf<float> means({n, py::ssize_t(3)}), quats({n, py::ssize_t(4)}), scales({n, py::ssize_t(3)}),
+        opacities(n), sh({n, k, py::ssize_t(3)});
+    const PlyGaussians<float> out = {
+        span_of<float>(means, "means", {n, 3}), span_of<float>(quats, "quats", {n, 4}),
+        span_of<float>(scales, "scales", {n, 3}), span_of<float>(opacities, "opacities", {n}),
+        span_of<float>(sh, "sh", {n, k, 3})};
     with_path(path, [&](const char*) { read_ply(ply, out); });
     return py::make_tuple(means, quats, scales, opacities, sh);
 }
@@ -55,11 +56,13 @@ PlyEncoding encoding_of(const std::string& name) {
     if (name == "ascii") return PlyEncoding::ascii;
     if (name == "binary_little_endian") return PlyEncoding::binary_little_endian;
     if (name == "binary_big_endian") return PlyEncoding::binary_big_endian;
-    throw py::value_error("encoding: expected binary_little_endian, binary_big_endian or ascii, got " + quoted(name));
+    throw py::value_error("encoding: expected binary_little_endian, binary_big_endian or ascii, got " +
+                          quoted(name));
 }
 
-void ply_write(const py::object& path, const py::array& means, const py::array& quats, const py::array& scales,
-               const py::array& opacities, const py::array& sh, const std::string& encoding) {
+void ply_write(const py::object& path, const py::array& means, const py::array& quats,
+               const py::array& scales, const py::array& opacities, const py::array& sh,
+               const std::string& encoding) {
     const PlyEncoding chosen = encoding_of(encoding);
     const py::ssize_t n = means.ndim() > 0 ? means.shape(0) : 0;
     const py::ssize_t k = sh.ndim() > 1 ? sh.shape(1) : 0;
@@ -77,7 +80,8 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
 void bind_ply(py::module_& m) {
     using namespace py::literals;
     m.def("ply_read", ply_read, "path"_a);
-    m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "encoding"_a);
+    m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
+          "encoding"_a);
 }
 
 }  // namespace v3dg

@@ -8,7 +8,7 @@ namespace v3dg {
 
 // Carries an exception out of a parallel loop: of all that were thrown, the one of the lowest index.
 class FirstError {
-public:
+  public:
     template <class Body>
     void run(size_t index, const Body& body) noexcept {
         try {
@@ -25,7 +25,7 @@ public:
         if (error_) std::rethrow_exception(error_);
     }
 
-private:
+  private:
     std::mutex mutex_;
     std::exception_ptr error_;
     size_t index_ = 0;

@@ -41,15 +41,15 @@ struct PlyFile {
 // Throws std::system_error when the file cannot be read, PlyError when it is not a 3DGS file.
 PlyFile open_ply(const char* path);
 
-// Reads all gaussians. Quaternions are normalised, but those of length zero or not finite stay as stored, as do
-// those of length one up to rounding (so that reading what was written changes nothing).
-// Besides `out` it needs a few megabytes. Throws like open_ply; `out` is then partly written.
+// Reads all gaussians. Quaternions are normalised, but those of length zero or not finite stay as stored, as
+// do those of length one up to rounding (so that reading what was written changes nothing). Besides `out` it
+// needs a few megabytes. Throws like open_ply; `out` is then partly written.
 void read_ply(const PlyFile& ply, const PlyGaussians<float>& out);
 
-// Creates `path`, which must not exist yet. Opacity 1 is written as logit 20, opacity 0 as logit -110, scale 0
-// as log -110: finite, and read back as exactly 1, 0 and 0.
-// Throws std::system_error, or std::invalid_argument for a negative scale or an opacity outside [0, 1]; the
-// file is then incomplete.
-void write_ply(const char* path, const PlyGaussians<const float>& gaussians, PlyEncoding encoding, size_t num_sh);
+// Creates `path`, which must not exist yet. Opacity 1 is written as logit 20, opacity 0 as logit -110, scale
+// 0 as log -110: finite, and read back as exactly 1, 0 and 0. Throws std::system_error, or
+// std::invalid_argument for a negative scale or an opacity outside [0, 1]; the file is then incomplete.
+void write_ply(const char* path, const PlyGaussians<const float>& gaussians, PlyEncoding encoding,
+               size_t num_sh);
 
 }  // namespace v3dg

@@ -42,7 +42,8 @@ PlyEncoding parse_format(const std::vector<std::string>& words) {
     if (words[1] == "ascii") return PlyEncoding::ascii;
     if (words[1] == "binary_little_endian") return PlyEncoding::binary_little_endian;
     if (words[1] == "binary_big_endian") return PlyEncoding::binary_big_endian;
-    throw PlyError("expected format ascii, binary_little_endian or binary_big_endian, found " + quoted(words[1]));
+    throw PlyError("expected format ascii, binary_little_endian or binary_big_endian, found " +
+                   quoted(words[1]));
 }
 
 PlyElement parse_element(const std::vector<std::string>& words) {
@@ -90,7 +91,8 @@ struct HeaderParser {
         } else if (words[0] == "element") {
             header.elements.push_back(parse_element(words));
         } else if (words[0] == "property") {
-            if (header.elements.empty()) throw PlyError("expected an element before the first property, found none");
+            if (header.elements.empty())
+                throw PlyError("expected an element before the first property, found none");
             header.elements.back().properties.push_back(parse_property(words));
         } else if (words[0] == "end_header") {
             if (!has_format) throw PlyError("expected a line 'format' before end_header, found none");
@@ -110,7 +112,8 @@ bool PlyElement::has_lists() const {
 
 size_t PlyElement::min_row_bytes() const {
     size_t bytes = 0;
-    for (const PlyProperty& property : properties) bytes += size_of(property.is_list ? property.count_type : property.type);
+    for (const PlyProperty& property : properties)
+        bytes += size_of(property.is_list ? property.count_type : property.type);
     return bytes;
 }
 

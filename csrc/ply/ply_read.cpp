@@ -20,12 +20,13 @@ namespace v3dg {
 
 namespace {
 
-constexpr size_t kBlockBytes = size_t(1) << 18;  // what one thread reads and converts at a time: fits its cache
+constexpr size_t kBlockBytes = size_t(1)
+                               << 18;  // what one thread reads and converts at a time: fits its cache
 constexpr size_t kChunkBytes = size_t(1) << 22;  // what all threads convert together when one has to cut rows
-constexpr double kUnitTolerance = 1e-6;          // of a squared length; a rounded unit quaternion is off by 3e-7
+constexpr double kUnitTolerance = 1e-6;  // of a squared length; a rounded unit quaternion is off by 3e-7
 
-// Where in a row the number for one slot of a gaussian is found. Slots: mean, quat, scale, opacity, then sh in
-// memory's order.
+// Where in a row the number for one slot of a gaussian is found. Slots: mean, quat, scale, opacity, then sh
+// in memory's order.
 struct Field {
     size_t property;  // among the vertex element's
     size_t offset;    // bytes from the start of the row, lists left out
@@ -64,7 +65,8 @@ std::string missing_text(const PlyElement& vertex, const std::vector<std::string
     if (vertex.properties.size() > kMaxNames)
         text += " and " + std::to_string(vertex.properties.size() - kMaxNames) + " more";
     for (const PlyProperty& property : vertex.properties)
-        if (property.name == "packed_position") return text + "; this is a compressed .ply, decompress it first";
+        if (property.name == "packed_position")
+            return text + "; this is a compressed .ply, decompress it first";
     return text + (missing.size() < 4 ? "" : "; this is not a file of gaussians");
 }
 
@@ -74,18 +76,20 @@ std::vector<Field> fields_of(const PlyElement& vertex, size_t num_sh) {
     size_t offset = 0;
     for (size_t p = 0; p < vertex.properties.size(); ++p) {
         const PlyProperty& property = vertex.properties[p];
-        const bool is_new = property.is_list
-                                ? lists.insert(property.name).second && !field_from_name.count(property.name)
-                                : field_from_name.insert({property.name, {p, offset, property.type}}).second &&
-                                      !lists.count(property.name);
-        if (!is_new) throw PlyError("expected each vertex property once, found " + quoted(property.name) + " twice");
+        const bool is_new =
+            property.is_list ? lists.insert(property.name).second && !field_from_name.count(property.name)
+                             : field_from_name.insert({property.name, {p, offset, property.type}}).second &&
+                                   !lists.count(property.name);
+        if (!is_new)
+            throw PlyError("expected each vertex property once, found " + quoted(property.name) + " twice");
         if (!property.is_list) offset += size_of(property.type);
     }
     std::vector<Field> fields;
     std::vector<std::string> missing;
     for (const std::string& name : slot_names(num_sh)) {
         const auto found = field_from_name.find(name);
-        if (lists.count(name)) throw PlyError("expected a number as vertex property " + quoted(name) + ", found a list");
+        if (lists.count(name))
+            throw PlyError("expected a number as vertex property " + quoted(name) + ", found a list");
         if (found == field_from_name.end())
             missing.push_back(name);
         else
@@ -129,7 +133,8 @@ bool is_swapped(PlyEncoding encoding) {
 template <class Load>
 void store_gaussian(const Load& load, size_t i, size_t num_sh, const PlyGaussians<float>& out) {
     for (size_t j = 0; j < 3; ++j) out.means[3 * i + j] = static_cast<float>(load(kMean + j));
-    for (size_t j = 0; j < 3; ++j) out.scales[3 * i + j] = static_cast<float>(std::exp(double(load(kScale + j))));
+    for (size_t j = 0; j < 3; ++j)
+        out.scales[3 * i + j] = static_cast<float>(std::exp(double(load(kScale + j))));
     out.opacities[i] = static_cast<float>(1 / (1 + std::exp(-double(load(kOpacity)))));
     float* sh = out.sh.data + 3 * num_sh * i;
     for (size_t j = 0; j < 3 * num_sh; ++j) sh[j] = static_cast<float>(load(kSh + j));
@@ -147,15 +152,17 @@ void store_gaussian(const Load& load, size_t i, size_t num_sh, const PlyGaussian
 
 // Rows of binary numbers of fixed size, lists left out.
 class RowDecoder {
-public:
+  public:
     RowDecoder(const PlyFile& ply, const PlyGaussians<float>& out)
-        : fields_(fields_of(ply.vertex, ply.num_sh)), num_sh_(ply.num_sh), is_swapped_(is_swapped(ply.encoding)),
+        : fields_(fields_of(ply.vertex, ply.num_sh)),
+          num_sh_(ply.num_sh),
+          is_swapped_(is_swapped(ply.encoding)),
           out_(out) {
         for (const PlyProperty& property : ply.vertex.properties)
             if (!property.is_list) row_bytes_ += size_of(property.type);
-        is_native_float_ = !is_swapped_ && std::all_of(fields_.begin(), fields_.end(), [](const Field& field) {
-            return field.type == PlyType::float32;
-        });
+        is_native_float_ =
+            !is_swapped_ && std::all_of(fields_.begin(), fields_.end(),
+                                        [](const Field& field) { return field.type == PlyType::float32; });
     }
     size_t row_bytes() const { return row_bytes_; }
 
@@ -180,7 +187,7 @@ public:
         }
     }
 
-private:
+  private:
     std::vector<Field> fields_;
     size_t num_sh_;
     bool is_swapped_;
@@ -191,15 +198,16 @@ private:
 
 // The bytes of a file one after another.
 class ByteReader {
-public:
+  public:
     ByteReader(const PosixFile& file, size_t offset, size_t file_bytes)
         : file_(file), offset_(offset), file_bytes_(file_bytes), buffer_(kBlockBytes) {}
 
     size_t offset() const { return offset_; }
     void skip(size_t size, const PlyElement& element, uint64_t row) {
         if (size > file_bytes_ - offset_)
-            throw PlyError("expected " + std::to_string(element.count) + " rows of element " + quoted(element.name) +
-                           ", found the end of the file in row " + std::to_string(row));
+            throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
+                           quoted(element.name) + ", found the end of the file in row " +
+                           std::to_string(row));
         offset_ += size;
     }
     // Valid until the next call. At most kBlockBytes.
@@ -214,7 +222,7 @@ public:
         return buffer_.data() + (begin - buffer_begin_);
     }
 
-private:
+  private:
     const PosixFile& file_;
     size_t offset_;
     size_t file_bytes_;
@@ -228,10 +236,12 @@ void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool 
     for (const PlyProperty& property : element.properties) {
         if (property.is_list) {
             const size_t count_bytes = size_of(property.count_type);
-            const double count = load_scalar(reader.take(count_bytes, element, row), property.count_type, is_swapped);
+            const double count =
+                load_scalar(reader.take(count_bytes, element, row), property.count_type, is_swapped);
             if (count < 0)
                 throw PlyError("expected a length of list " + quoted(property.name) + " in row " +
-                               std::to_string(row) + ", found " + std::to_string(static_cast<int64_t>(count)));
+                               std::to_string(row) + ", found " +
+                               std::to_string(static_cast<int64_t>(count)));
             reader.skip(static_cast<size_t>(count) * size_of(property.type), element, row);
         } else if (packed) {
             const size_t size = size_of(property.type);
@@ -252,13 +262,13 @@ bool is_space(char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\v' |
 
 // The lines of a text that are not blank.
 class LineReader {
-public:
+  public:
     LineReader(const PosixFile& file, size_t offset) : file_(file), offset_(offset), buffer_(kChunkBytes) {}
 
     size_t offset() const { return offset_ - (end_ - begin_); }
 
-    // Some of the next lines, at least one and at most `max_lines`; none at the end of the file. Valid until the
-    // next call.
+    // Some of the next lines, at least one and at most `max_lines`; none at the end of the file. Valid until
+    // the next call.
     const std::vector<Line>& next(uint64_t max_lines) {
         lines_.clear();
         bool at_end = false;
@@ -266,7 +276,8 @@ public:
             cut_lines(max_lines, at_end);
             if (!lines_.empty() || at_end) break;
             if (begin_ == 0 && end_ == buffer_.size())
-                throw PlyError("expected lines of at most " + std::to_string(kChunkBytes) + " bytes, found a longer one");
+                throw PlyError("expected lines of at most " + std::to_string(kChunkBytes) +
+                               " bytes, found a longer one");
             std::memmove(buffer_.data(), buffer_.data() + begin_, end_ - begin_);
             end_ -= begin_;
             begin_ = 0;
@@ -278,7 +289,7 @@ public:
         return lines_;
     }
 
-private:
+  private:
     void cut_lines(uint64_t max_lines, bool at_end) {
         while (begin_ < end_ && lines_.size() < max_lines) {
             const char* text = buffer_.data();
@@ -300,7 +311,7 @@ private:
 
 // The numbers of one line, one after another.
 class NumberReader {
-public:
+  public:
     struct EndOfLine {};
 
     NumberReader(Line line, uint64_t row) : rest_(line), row_(row) {}
@@ -338,7 +349,7 @@ public:
     }
     size_t num_read() const { return num_read_; }
 
-private:
+  private:
     Line rest_;
     uint64_t row_;
     size_t num_read_ = 0;
@@ -359,16 +370,16 @@ void parse_row(Line line, uint64_t row, const PlyElement& vertex, double* value_
                 value_from_property[p] = rounded_to(vertex.properties[p].type, numbers.next());
         }
     } catch (const NumberReader::EndOfLine&) {
-        throw PlyError("vertex " + std::to_string(row) + ": expected " + (vertex.has_lists() ? "at least " : "") +
-                       std::to_string(vertex.properties.size()) + " numbers, found " +
-                       std::to_string(numbers.num_read()));
+        throw PlyError("vertex " + std::to_string(row) + ": expected " +
+                       (vertex.has_lists() ? "at least " : "") + std::to_string(vertex.properties.size()) +
+                       " numbers, found " + std::to_string(numbers.num_read()));
     }
     numbers.expect_end();
 }
 
 [[noreturn]] void throw_too_few(const PlyElement& element, uint64_t found) {
-    throw PlyError("expected " + std::to_string(element.count) + " lines for element " + quoted(element.name) +
-                   ", found " + std::to_string(found));
+    throw PlyError("expected " + std::to_string(element.count) + " lines for element " +
+                   quoted(element.name) + ", found " + std::to_string(found));
 }
 
 size_t skip_text(const PosixFile& file, size_t offset, const PlyElement& element) {
@@ -388,9 +399,10 @@ void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
     const size_t row_bytes = is_text ? 2 * element.properties.size() : element.min_row_bytes();
     const size_t left = ply.file_bytes - offset + (is_text ? 1 : 0);
     if (row_bytes != 0 && element.count > left / row_bytes)
-        throw PlyError("expected " + std::to_string(element.count) + " rows of element " + quoted(element.name) +
-                       " with " + (is_text || element.has_lists() ? "at least " : "") + std::to_string(row_bytes) +
-                       " bytes each, found " + std::to_string(ply.file_bytes - offset) + " bytes");
+        throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
+                       quoted(element.name) + " with " + (is_text || element.has_lists() ? "at least " : "") +
+                       std::to_string(row_bytes) + " bytes each, found " +
+                       std::to_string(ply.file_bytes - offset) + " bytes");
 }
 
 // Returns the offset after the element that begins at `offset`.
@@ -460,7 +472,8 @@ void read_text(const PlyFile& ply, const PlyGaussians<float>& out) {
             error.run(r, [&] {
                 double* row = values.data() + omp_get_thread_num() * num_properties;
                 parse_row(lines[r], first + r, ply.vertex, row);
-                store_gaussian([&](size_t slot) { return row[fields[slot].property]; }, first + r, ply.num_sh, out);
+                store_gaussian([&](size_t slot) { return row[fields[slot].property]; }, first + r, ply.num_sh,
+                               out);
             });
         }
         error.rethrow();

@@ -1,5 +1,5 @@
-// Rows are converted in blocks by all threads. Binary blocks have a known place, so each thread writes its own;
-// text is converted a few blocks at a time and written in order.
+// Rows are converted in blocks by all threads. Binary blocks have a known place, so each thread writes its
+// own; text is converted a few blocks at a time and written in order.
 
 #include <algorithm>
 #include <charconv>
@@ -23,15 +23,15 @@ namespace {
 constexpr size_t kBlockRows = 2048;  // half a megabyte at SH degree 3
 constexpr size_t kTextBlocks = 16;   // that are in memory together
 
-// Finite stand-ins for infinities, beyond the logs and logits of all other float32 values (-103.3 and 16.6 are
-// the outermost) and far enough that exp and the sigmoid round to exactly 0 and 1, also in float32.
+// Finite stand-ins for infinities, beyond the logs and logits of all other float32 values (-103.3 and 16.6
+// are the outermost) and far enough that exp and the sigmoid round to exactly 0 and 1, also in float32.
 constexpr float kLogOfZero = -110;
 constexpr float kLogitOfOne = 20;
 
 std::string header_text(size_t num_gaussians, size_t num_sh, PlyEncoding encoding) {
     const char* kNames[] = {"ascii", "binary_little_endian", "binary_big_endian"};
-    std::string text = std::string("ply\nformat ") + kNames[static_cast<int>(encoding)] + " 1.0\nelement vertex " +
-                       std::to_string(num_gaussians) + "\n";
+    std::string text = std::string("ply\nformat ") + kNames[static_cast<int>(encoding)] +
+                       " 1.0\nelement vertex " + std::to_string(num_gaussians) + "\n";
     const auto add = [&](const std::string& name, size_t count) {
         for (size_t i = 0; i < count; ++i) text += "property float " + name + std::to_string(i) + "\n";
     };
@@ -45,8 +45,8 @@ std::string header_text(size_t num_gaussians, size_t num_sh, PlyEncoding encodin
 }
 
 [[noreturn]] void throw_value(const char* name, size_t i, const char* wanted, float got) {
-    throw std::invalid_argument(std::string(name) + "[" + std::to_string(i) + "]: expected " + wanted + ", got " +
-                                std::to_string(got));
+    throw std::invalid_argument(std::string(name) + "[" + std::to_string(i) + "]: expected " + wanted +
+                                ", got " + std::to_string(got));
 }
 
 float log_scale(float scale, size_t i) {
@@ -80,7 +80,8 @@ void store_bytes(const float* values, size_t count, PlyEncoding encoding, unsign
         uint32_t bits;
         std::memcpy(&bits, values + v, sizeof(bits));
         if (encoding == PlyEncoding::binary_big_endian)
-            for (size_t b = 0; b < 4; ++b) bytes[4 * v + b] = static_cast<unsigned char>(bits >> (24 - 8 * b));
+            for (size_t b = 0; b < 4; ++b)
+                bytes[4 * v + b] = static_cast<unsigned char>(bits >> (24 - 8 * b));
         else
             for (size_t b = 0; b < 4; ++b) bytes[4 * v + b] = static_cast<unsigned char>(bits >> (8 * b));
     }
@@ -119,7 +120,8 @@ struct Writer {
     void write_binary() const {
         const size_t row_bytes = 4 * num_values();
         const int num_threads = static_cast<int>(std::min<size_t>(omp_get_max_threads(), num_blocks()));
-        const std::unique_ptr<unsigned char[]> buffers(new unsigned char[num_threads * kBlockRows * row_bytes]);
+        const std::unique_ptr<unsigned char[]> buffers(
+            new unsigned char[num_threads * kBlockRows * row_bytes]);
         FirstError error;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(num_threads)
         for (size_t block = 0; block < num_blocks(); ++block) {
@@ -130,7 +132,8 @@ struct Writer {
                     store_bytes(row, num_values(), encoding, end);
                     end += row_bytes;
                 });
-                file.write_at(offset + block * kBlockRows * row_bytes, reinterpret_cast<char*>(begin), end - begin);
+                file.write_at(offset + block * kBlockRows * row_bytes, reinterpret_cast<char*>(begin),
+                              end - begin);
             });
         }
         error.rethrow();
@@ -160,7 +163,8 @@ struct Writer {
 
 }  // namespace
 
-void write_ply(const char* path, const PlyGaussians<const float>& gaussians, PlyEncoding encoding, size_t num_sh) {
+void write_ply(const char* path, const PlyGaussians<const float>& gaussians, PlyEncoding encoding,
+               size_t num_sh) {
     const size_t num_gaussians = gaussians.opacities.size;
     PosixFile file = PosixFile::create(path);
     const std::string header = header_text(num_gaussians, num_sh, encoding);

@@ -13,7 +13,7 @@ namespace v3dg {
 // An open file. Reads and writes name their offset, so several threads can share it.
 // Failures throw std::system_error with errno's code.
 class PosixFile {
-public:
+  public:
     static PosixFile open(const char* path) {
         // O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
         return PosixFile(::open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK));
@@ -37,7 +37,8 @@ public:
     size_t read_at(size_t offset, char* bytes, size_t size) const {
         size_t done = 0;
         while (done < size) {
-            const ssize_t got = ::pread(descriptor_, bytes + done, size - done, static_cast<off_t>(offset + done));
+            const ssize_t got =
+                ::pread(descriptor_, bytes + done, size - done, static_cast<off_t>(offset + done));
             if (got < 0 && errno == EINTR) continue;
             check(got);
             if (got == 0) break;
@@ -49,7 +50,8 @@ public:
     void write_at(size_t offset, const char* bytes, size_t size) const {
         size_t done = 0;
         while (done < size) {
-            const ssize_t put = ::pwrite(descriptor_, bytes + done, size - done, static_cast<off_t>(offset + done));
+            const ssize_t put =
+                ::pwrite(descriptor_, bytes + done, size - done, static_cast<off_t>(offset + done));
             if (put < 0 && errno == EINTR) continue;
             check(put);
             done += static_cast<size_t>(put);
@@ -63,7 +65,7 @@ public:
         check(::close(descriptor));
     }
 
-private:
+  private:
     explicit PosixFile(int descriptor) : descriptor_(descriptor) { check(descriptor); }
     static void check(ssize_t result) {
         if (result < 0) throw std::system_error(errno, std::generic_category());
