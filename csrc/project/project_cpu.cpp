@@ -1,0 +1,168 @@
+#include "project/project.h"
+
+// A vector of gaussians at a time: lanes are neighbours in the planes.
+
+namespace v3dg {
+namespace V3DG_ISA {
+
+template <class T>
+static V3DG_INLINE Gaussian3d<Vec<T>> load_gaussians(const GaussianPlanes<T>& m, uint64_t i) {
+    Gaussian3d<Vec<T>> g;
+    for (int k = 0; k < 3; ++k) g.mean[k] = load(m.mean[k] + i);
+    for (int k = 0; k < 4; ++k) g.quat[k] = load(m.quat[k] + i);
+    for (int k = 0; k < 3; ++k) g.scale[k] = load(m.scale[k] + i);
+    g.opacity = load(m.opacity + i);
+    return g;
+}
+
+template <class V>
+static V3DG_INLINE auto to_int(V x) {
+    return __builtin_convertvector(x, decltype(x < x));
+}
+template <class V>
+static V3DG_INLINE auto floor_to_int(V x) {
+    const auto i = to_int(x);
+    return i + (x < __builtin_convertvector(i, V));  // a comparison that holds is -1
+}
+template <class V>
+static V3DG_INLINE auto ceil_to_int(V x) {
+    const auto i = to_int(x);
+    return i - (x > __builtin_convertvector(i, V));
+}
+
+template <class T>
+size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera, Record<T>* records,
+               uint32_t* source, uint32_t source_base, uint64_t& in_frustum) {
+    using V = Vec<T>;
+    constexpr int kWidth = kLanes<T>;
+    const GaussianPlanes<T>& model = *draw.model;
+    const V zero = V{};
+    const V huge = all_lanes<V>(T(1e30));
+    size_t num_records = 0;
+    for (uint64_t done = 0; done < count; done += kWidth) {
+        const uint64_t at = draw.first + skip + done;
+        const unsigned lanes = count - done >= kWidth ? (1u << kWidth) - 1 : (1u << (count - done)) - 1;
+        const Gaussian3d<V> g = load_gaussians(model, at);
+        const ModelView<T>& mv = draw.view;
+        const V depth = mv.linear[6] * g.mean[0] + mv.linear[7] * g.mean[1] + mv.linear[8] * g.mean[2] + mv.translation[2];
+        const auto in_front = depth >= all_lanes<V>(camera.near_depth);
+        if ((bits_of(in_front) & lanes) == 0) continue;
+        Projection<V> s;
+        const Ellipse<V> e = project_gaussian(g, mv, camera, draw.filter_px2, draw.compensate, s);
+
+        // Where alpha falls to 1/255: |L d|² = reach.
+        const V reach = e.log2_opacity - T(kLog2MinAlpha);
+        const V half_x = sqrt_of(reach * s.c11) * T(1 / kFalloffScale);
+        const V half_y = sqrt_of(reach * s.c22) * T(1 / kFalloffScale);
+        const auto drawable = in_front & (g.opacity >= all_lanes<V>(T(kMinAlpha))) & (reach >= zero) & (s.det > zero) &
+                              (s.det < huge) & (half_x < huge) & (half_y < huge);
+        const auto meets = drawable & (e.u + half_x > zero) & (e.u - half_x < all_lanes<V>(camera.width)) &
+                           (e.v + half_y > zero) & (e.v - half_y < all_lanes<V>(camera.height));
+        const unsigned meets_bits = bits_of(meets) & lanes;
+        in_frustum += __builtin_popcount(meets_bits);
+        if (meets_bits == 0) continue;
+
+        // Pixel centres within the extent; a hair more, so that the blend step alone decides.
+        const V hair_x = half_x * T(1e-5) + T(2e-3), hair_y = half_y * T(1e-5) + T(2e-3);
+        const V low = all_lanes<V>(T(-1));
+        const auto x0 = ceil_to_int(max_of(low, e.u - half_x - hair_x - T(0.5)));
+        const auto x1 = floor_to_int(min_of(all_lanes<V>(camera.width), e.u + half_x + hair_x - T(0.5)));
+        const auto y0 = ceil_to_int(max_of(low, e.v - half_y - hair_y - T(0.5)));
+        const auto y1 = floor_to_int(min_of(all_lanes<V>(camera.height), e.v + half_y + hair_y - T(0.5)));
+        unsigned kept = bits_of(meets & (x0 <= x1) & (y0 <= y1)) & lanes;
+        if (kept == 0) continue;
+
+        V sh[3 * kMaxShBases], color[3];
+        const int num_sh = 3 * num_sh_bases(model.sh_degree);
+        for (int k = 0; k < num_sh; ++k) sh[k] = load(model.sh[k] + at);
+        color_of_sh(model.sh_degree, g.mean, mv, sh, color);
+
+        const int last_x = static_cast<int>(camera.width) - 1, last_y = static_cast<int>(camera.height) - 1;
+        while (kept != 0) {
+            const int i = __builtin_ctz(kept);
+            kept &= kept - 1;
+            const int first_px = static_cast<int>(x0[i]), last_px = static_cast<int>(x1[i]);
+            const int first_py = static_cast<int>(y0[i]), last_py = static_cast<int>(y1[i]);
+            if (first_px > last_x || first_py > last_y || last_px < 0 || last_py < 0) continue;
+            Record<T>& r = records[num_records];
+            r.u = e.u[i];
+            r.v = e.v[i];
+            r.l11 = e.l11[i];
+            r.l12 = e.l12[i];
+            r.l22 = e.l22[i];
+            r.log2_opacity = e.log2_opacity[i];
+            for (int c = 0; c < 3; ++c) r.color[c] = color[c][i];
+            r.depth = e.depth[i];
+            r.x0 = static_cast<uint16_t>(first_px < 0 ? 0 : first_px);
+            r.y0 = static_cast<uint16_t>(first_py < 0 ? 0 : first_py);
+            r.x1 = static_cast<uint16_t>(last_px > last_x ? last_x : last_px);
+            r.y1 = static_cast<uint16_t>(last_py > last_y ? last_y : last_py);
+            if (source != nullptr) source[num_records] = source_base + static_cast<uint32_t>(done) + i;
+            ++num_records;
+        }
+    }
+    return num_records;
+}
+
+// Scattered gaussians: lanes are filled one by one, which is small beside the arithmetic.
+template <class T>
+void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordGradient<T>* d_records, size_t count,
+                      const Pinhole<T>& camera, const GaussianGradients<T>& out) {
+    using V = Vec<T>;
+    constexpr size_t kWidth = kLanes<T>;
+    const GaussianPlanes<T>& m = *draw.model;
+    const int num_sh = 3 * num_sh_bases(m.sh_degree);
+    for (size_t done = 0; done < count; done += kWidth) {
+        const size_t lanes = count - done < kWidth ? count - done : kWidth;
+        Gaussian3d<V> g{};
+        V sh[3 * kMaxShBases] = {};
+        Ellipse<V> d{};
+        V d_color[3] = {};
+        for (size_t i = 0; i < kWidth; ++i) {
+            // Spare lanes repeat the first gaussian with no gradient.
+            const size_t at = done + (i < lanes ? i : 0);
+            const uint64_t s = draw.first + source[at];
+            for (int k = 0; k < 3; ++k) g.mean[k][i] = m.mean[k][s];
+            for (int k = 0; k < 4; ++k) g.quat[k][i] = m.quat[k][s];
+            for (int k = 0; k < 3; ++k) g.scale[k][i] = m.scale[k][s];
+            g.opacity[i] = m.opacity[s];
+            for (int k = 0; k < num_sh; ++k) sh[k][i] = m.sh[k][s];
+            if (i >= lanes) continue;
+            const RecordGradient<T>& r = d_records[at];
+            d.u[i] = r.ellipse.u;
+            d.v[i] = r.ellipse.v;
+            d.l11[i] = r.ellipse.l11;
+            d.l12[i] = r.ellipse.l12;
+            d.l22[i] = r.ellipse.l22;
+            d.log2_opacity[i] = r.ellipse.log2_opacity;
+            d.depth[i] = r.ellipse.depth;
+            for (int c = 0; c < 3; ++c) d_color[c][i] = r.color[c];
+        }
+        Projection<V> s;
+        const Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.filter_px2, draw.compensate, s);
+        V color[3], d_sh[3 * kMaxShBases];
+        color_of_sh(m.sh_degree, g.mean, draw.view, sh, color);
+        Gaussian3d<V> d_g = project_gaussian_vjp(g, draw.view, camera, draw.filter_px2, draw.compensate, s, e, d);
+        color_of_sh_vjp(m.sh_degree, g.mean, draw.view, sh, color, d_color, d_g.mean, d_sh);
+        for (size_t i = 0; i < lanes; ++i) {
+            const uint64_t at = source[done + i];
+            for (int k = 0; k < 3; ++k) out.means[3 * at + k] = d_g.mean[k][i];
+            for (int k = 0; k < 4; ++k) out.quats[4 * at + k] = d_g.quat[k][i];
+            for (int k = 0; k < 3; ++k) out.scales[3 * at + k] = d_g.scale[k][i];
+            out.opacities[at] = d_g.opacity[i];
+            for (int k = 0; k < num_sh; ++k) out.sh[num_sh * at + k] = d_sh[k][i];
+        }
+    }
+}
+
+#define V3DG_INSTANTIATE(T)                                                                                       \
+    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Pinhole<T>&, Record<T>*, uint32_t*,      \
+                               uint32_t, uint64_t&);                                                              \
+    template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, size_t,          \
+                                      const Pinhole<T>&, const GaussianGradients<T>&);
+V3DG_INSTANTIATE(float)
+V3DG_INSTANTIATE(double)
+#undef V3DG_INSTANTIATE
+
+}  // namespace V3DG_ISA
+}  // namespace v3dg

@@ -1,0 +1,115 @@
+#include "rasterize/rasterize.h"
+
+#include "rasterize/tile.h"
+
+namespace v3dg {
+namespace V3DG_ISA {
+
+// Far enough ahead that a record arrives from memory before it is its turn.
+constexpr size_t kPrefetch = 12;
+
+template <class T>
+static V3DG_INLINE void prefetch(const Record<T>* records, const uint64_t* entry, size_t i, size_t count) {
+    if (i + kPrefetch >= count) return;
+    const char* at = reinterpret_cast<const char*>(records + record_of(entry[i + kPrefetch]));
+    __builtin_prefetch(at);
+    __builtin_prefetch(at + sizeof(Record<T>) - 1);
+}
+
+template <class T, bool kWithDepth>
+static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top, int width,
+                       int height, TilePlanes<T>& tile) {
+    const BlockPixels<T> pixels;
+    uint64_t alive = clear_tile(tile, left, top, width, height, kWithDepth);
+    for (size_t i = 0; i < count && alive != 0; ++i) {
+        prefetch(records, entry, i, count);
+        const Record<T>& g = records[record_of(entry[i])];
+        const uint64_t blocks = blocks_of(g, left, top) & alive;
+        if (blocks != 0) blend_record<T, kWithDepth>(g, blocks, left, top, pixels, tile, alive);
+    }
+}
+
+// Calls visit(place in the tile, place in the picture) for the pixels of a tile that are in the picture.
+template <class Visit>
+static V3DG_INLINE void for_each_pixel(int left, int top, int width, int height, const Visit& visit) {
+    for (int y = top; y < top + kTileSize && y < height; ++y)
+        for (int x = left; x < left + kTileSize && x < width; ++x) {
+            const int bx = (x - left) / kBlockSize, by = (y - top) / kBlockSize;
+            visit((by * kTileBlocks + bx) * kBlockPixels + (y - top) % kBlockSize * kBlockSize + (x - left) % kBlockSize,
+                  static_cast<size_t>(y) * width + x);
+        }
+}
+
+template <class T>
+void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
+                    const Picture<T>& picture) {
+    TilePlanes<T> tile;
+    if (picture.depth != nullptr)
+        blend_tile<T, true>(records, entry, count, left, top, picture.width, picture.height, tile);
+    else
+        blend_tile<T, false>(records, entry, count, left, top, picture.width, picture.height, tile);
+    for_each_pixel(left, top, picture.width, picture.height, [&](int p, size_t out) {
+        const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
+        for (int c = 0; c < 3; ++c) picture.color[3 * out + c] = tile.color[c][p] + t * picture.background[c];
+        picture.alpha[out] = 1 - t;
+        if (picture.depth != nullptr) picture.depth[out] = t < 1 ? tile.depth[p] / (1 - t) : T(0);
+    });
+}
+
+template <class T, bool kWithDepth>
+static void backward(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
+                     const Picture<T>& picture, const PictureGradient<T>& d_picture, RecordGradient<T>* d_entry,
+                     T* d_background) {
+    TilePlanes<T> tile;
+    blend_tile<T, kWithDepth>(records, entry, count, left, top, picture.width, picture.height, tile);
+    TileGradient<T> grad = {};
+    for_each_pixel(left, top, picture.width, picture.height, [&](int p, size_t out) {
+        const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
+        T d_weight = d_picture.alpha[out], total = 0;
+        for (int c = 0; c < 3; ++c) {
+            const T d = d_picture.color[3 * out + c];
+            grad.d_color[c][p] = d;
+            d_weight -= d * picture.background[c];
+            total += d * tile.color[c][p];
+            d_background[c] += d * t;
+        }
+        if (kWithDepth && t < 1) {
+            const T d = d_picture.depth[out] / (1 - t);
+            grad.d_depth[p] = d;
+            d_weight -= d * tile.depth[p] / (1 - t);
+            total += d * tile.depth[p];
+        }
+        grad.d_weight[p] = d_weight;
+        grad.total[p] = total + d_weight * (1 - t);
+    });
+    const BlockPixels<T> pixels;
+    uint64_t alive = clear_tile(tile, left, top, picture.width, picture.height, false);
+    for (size_t i = 0; i < count && alive != 0; ++i) {
+        prefetch(records, entry, i, count);
+        const Record<T>& g = records[record_of(entry[i])];
+        const uint64_t blocks = blocks_of(g, left, top) & alive;
+        if (blocks != 0)
+            blend_record_vjp<T, kWithDepth>(g, blocks, left, top, pixels, grad, tile, alive, d_entry[i]);
+    }
+}
+
+template <class T>
+void rasterize_tile_backward(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
+                             const Picture<T>& picture, const PictureGradient<T>& d_picture,
+                             RecordGradient<T>* d_entry, T* d_background) {
+    if (d_picture.depth != nullptr)
+        backward<T, true>(records, entry, count, left, top, picture, d_picture, d_entry, d_background);
+    else
+        backward<T, false>(records, entry, count, left, top, picture, d_picture, d_entry, d_background);
+}
+
+#define V3DG_INSTANTIATE(T)                                                                                         \
+    template void rasterize_tile<T>(const Record<T>*, const uint64_t*, size_t, int, int, const Picture<T>&);        \
+    template void rasterize_tile_backward<T>(const Record<T>*, const uint64_t*, size_t, int, int,                   \
+                                             const Picture<T>&, const PictureGradient<T>&, RecordGradient<T>*, T*);
+V3DG_INSTANTIATE(float)
+V3DG_INSTANTIATE(double)
+#undef V3DG_INSTANTIATE
+
+}  // namespace V3DG_ISA
+}  // namespace v3dg

@@ -1,0 +1,46 @@
+#pragma once
+
+#include <cstdlib>
+#include <new>
+#include <utility>
+
+#include "base/span.h"
+
+namespace v3dg {
+
+// Owned elements of a plain type, not initialised. Grows by forgetting what it held.
+template <class T>
+class Buffer {
+public:
+    Buffer() = default;
+    explicit Buffer(size_t size) { reserve(size); }
+    Buffer(Buffer&& other) noexcept : data_(std::exchange(other.data_, nullptr)), capacity_(std::exchange(other.capacity_, 0)) {}
+    Buffer& operator=(Buffer&& other) noexcept {
+        std::swap(data_, other.data_);
+        std::swap(capacity_, other.capacity_);
+        return *this;
+    }
+    ~Buffer() { std::free(data_); }
+
+    // Room for `size` elements; throws std::bad_alloc when there is none.
+    T* reserve(size_t size) {
+        if (size > capacity_) {
+            std::free(data_);
+            data_ = nullptr;
+            capacity_ = 0;
+            const size_t bytes = (size * sizeof(T) + 63) / 64 * 64;
+            data_ = static_cast<T*>(std::aligned_alloc(64, bytes));
+            if (data_ == nullptr) throw std::bad_alloc();
+            capacity_ = size;
+        }
+        return data_;
+    }
+    T* data() const { return data_; }
+    size_t capacity() const { return capacity_; }
+
+private:
+    T* data_ = nullptr;
+    size_t capacity_ = 0;
+};
+
+}  // namespace v3dg

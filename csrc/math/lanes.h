@@ -1,0 +1,186 @@
+#pragma once
+
+// The few elementary operations that formulas need, for a scalar and, in sources compiled per instruction
+// set, for a SIMD vector of them. A formula written with these and `mask ? a : b` runs as either.
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+
+#include "base/host_device.h"
+
+#if defined(V3DG_ISA) && defined(__x86_64__)
+#include <immintrin.h>
+#endif
+
+namespace v3dg {
+
+V3DG_HD inline float sqrt_of(float x) { return ::sqrtf(x); }
+V3DG_HD inline double sqrt_of(double x) { return ::sqrt(x); }
+V3DG_HD inline float exp2_of(float x) { return ::exp2f(x); }
+V3DG_HD inline double exp2_of(double x) { return ::exp2(x); }
+V3DG_HD inline float log2_of(float x) { return ::log2f(x); }
+V3DG_HD inline double log2_of(double x) { return ::log2(x); }
+
+// The scalar behind V, which is a scalar or a vector of them.
+template <class V>
+struct LaneOf {
+    using type = V;
+};
+template <class V>
+using Lane = typename LaneOf<V>::type;
+
+#ifdef V3DG_ISA
+
+#if defined(__AVX512F__)
+constexpr int kVectorBytes = 64;
+#elif defined(__AVX2__)
+constexpr int kVectorBytes = 32;
+#else
+constexpr int kVectorBytes = 16;
+#endif
+
+template <class T>
+struct VecOf {
+    typedef T type __attribute__((vector_size(kVectorBytes)));
+};
+template <class T>
+using Vec = typename VecOf<T>::type;
+template <class T>
+constexpr int kLanes = kVectorBytes / static_cast<int>(sizeof(T));
+
+typedef int32_t IntVec32 __attribute__((vector_size(kVectorBytes)));
+typedef int64_t IntVec64 __attribute__((vector_size(kVectorBytes)));
+
+template <>
+struct LaneOf<Vec<float>> {
+    using type = float;
+};
+template <>
+struct LaneOf<Vec<double>> {
+    using type = double;
+};
+
+V3DG_INLINE Vec<float> sqrt_of(Vec<float> x) {
+#if defined(__AVX512F__)
+    return (Vec<float>)_mm512_sqrt_ps((__m512)x);
+#elif defined(__AVX2__)
+    return (Vec<float>)_mm256_sqrt_ps((__m256)x);
+#elif defined(__SSE2__)
+    return (Vec<float>)_mm_sqrt_ps((__m128)x);
+#else
+    for (int i = 0; i < kLanes<float>; ++i) x[i] = ::sqrtf(x[i]);
+    return x;
+#endif
+}
+V3DG_INLINE Vec<double> sqrt_of(Vec<double> x) {
+    for (int i = 0; i < kLanes<double>; ++i) x[i] = ::sqrt(x[i]);
+    return x;
+}
+
+// Bit i is set where lane i of a comparison holds.
+V3DG_INLINE unsigned bits_of(IntVec32 mask) {
+#if defined(__AVX512F__)
+    return _mm512_movepi32_mask((__m512i)mask);
+#elif defined(__AVX2__)
+    return static_cast<unsigned>(_mm256_movemask_ps((__m256)mask));
+#elif defined(__SSE2__)
+    return static_cast<unsigned>(_mm_movemask_ps((__m128)mask));
+#else
+    unsigned bits = 0;
+    for (int i = 0; i < kLanes<float>; ++i) bits |= unsigned(mask[i] & 1) << i;
+    return bits;
+#endif
+}
+V3DG_INLINE unsigned bits_of(IntVec64 mask) {
+    unsigned bits = 0;
+    for (int i = 0; i < kLanes<double>; ++i) bits |= unsigned(mask[i] & 1) << i;
+    return bits;
+}
+
+// 2^x for x <= 127, relative error below 2^-22; 0 below -126. The integer part of x goes into the exponent, a
+// polynomial of least maximum relative error on [-1/2, 1/2] gives the rest.
+V3DG_INLINE Vec<float> exp2_of(Vec<float> x) {
+    const Vec<float> low = Vec<float>{} - 126.0f;
+    const IntVec32 tiny = x < low;
+    x = tiny ? low : x;
+    const Vec<float> magic = Vec<float>{} + 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer
+    const Vec<float> shifted = x + magic;
+    const Vec<float> f = x - (shifted - magic);
+    Vec<float> p = f * 0.00132647f + 0.00967151f;
+    p = p * f + 0.05550734f;
+    p = p * f + 0.24022242f;
+    p = p * f + 0.69314698f;
+    p = p * f + 1.0f;
+    const IntVec32 exponent = ((IntVec32)shifted - (IntVec32)magic) << 23;
+    return tiny ? Vec<float>{} : (Vec<float>)((IntVec32)p + exponent);
+}
+V3DG_INLINE Vec<double> exp2_of(Vec<double> x) {
+    for (int i = 0; i < kLanes<double>; ++i) x[i] = ::exp2(x[i]);
+    return x;
+}
+
+// log2 of positive normal x, error below 2e-7 * max(1, |log2 x|).
+V3DG_INLINE Vec<float> log2_of(Vec<float> x) {
+    // x = m * 2^k with m in [sqrt(1/2), sqrt(2)); then atanh((m - 1) / (m + 1)), fitted.
+    const IntVec32 bits = (IntVec32)x - 0x3f3504f3;
+    const IntVec32 k = bits >> 23;
+    const Vec<float> m = (Vec<float>)((bits & 0x007fffff) + 0x3f3504f3);
+    const Vec<float> s = (m - 1.0f) / (m + 1.0f);
+    const Vec<float> s2 = s * s;
+    Vec<float> p = s2 * 0.34070591f + 0.41167448f;
+    p = p * s2 + 0.57708354f;
+    p = p * s2 + 0.96179667f;
+    p = p * s2 + 2.88539008f;
+    return s * p + __builtin_convertvector(k, Vec<float>);
+}
+V3DG_INLINE Vec<double> log2_of(Vec<double> x) {
+    for (int i = 0; i < kLanes<double>; ++i) x[i] = ::log2(x[i]);
+    return x;
+}
+
+V3DG_INLINE float sum_of(Vec<float> x) {
+#if defined(__AVX512F__)
+    return _mm512_reduce_add_ps((__m512)x);
+#else
+    float sum = 0;
+    for (int i = 0; i < kLanes<float>; ++i) sum += x[i];
+    return sum;
+#endif
+}
+V3DG_INLINE double sum_of(Vec<double> x) {
+    double sum = 0;
+    for (int i = 0; i < kLanes<double>; ++i) sum += x[i];
+    return sum;
+}
+
+template <class T>
+V3DG_INLINE Vec<T> load(const T* p) {
+    Vec<T> v;
+    std::memcpy(&v, p, sizeof v);
+    return v;
+}
+template <class T>
+V3DG_INLINE void store(T* p, Vec<T> v) {
+    std::memcpy(p, &v, sizeof v);
+}
+
+#endif  // V3DG_ISA
+
+template <class V>
+V3DG_HD V3DG_INLINE V max_of(V a, V b) {
+    return a > b ? a : b;
+}
+template <class V>
+V3DG_HD V3DG_INLINE V min_of(V a, V b) {
+    return a < b ? a : b;
+}
+
+// The same number in every lane.
+template <class V>
+V3DG_HD V3DG_INLINE V all_lanes(Lane<V> x) {
+    return V{} + x;
+}
+
+}  // namespace v3dg

@@ -1,0 +1,74 @@
+#pragma once
+
+// Real spherical harmonics of degree 0 to 3, in the order and with the signs that .ply assets are stored in.
+// A gaussian's colour is max(0, 1/2 + sum of coefficient * basis(view direction)).
+
+#include "math/lanes.h"
+
+namespace v3dg {
+
+constexpr int kMaxShBases = 16;
+
+V3DG_HD constexpr int num_sh_bases(int degree) { return (degree + 1) * (degree + 1); }
+
+// Values of the bases in the unit direction (x, y, z).
+template <class V>
+V3DG_HD V3DG_INLINE void sh_bases(int degree, V x, V y, V z, V basis[kMaxShBases]) {
+    using T = Lane<V>;
+    basis[0] = all_lanes<V>(T(0.28209479177387814));
+    if (degree < 1) return;
+    const T c1 = T(0.4886025119029199);
+    basis[1] = -c1 * y;
+    basis[2] = c1 * z;
+    basis[3] = -c1 * x;
+    if (degree < 2) return;
+    const V xx = x * x, yy = y * y, zz = z * z;
+    basis[4] = T(1.0925484305920792) * x * y;
+    basis[5] = T(-1.0925484305920792) * y * z;
+    basis[6] = T(0.31539156525252005) * (2 * zz - xx - yy);
+    basis[7] = T(-1.0925484305920792) * x * z;
+    basis[8] = T(0.5462742152960396) * (xx - yy);
+    if (degree < 3) return;
+    basis[9] = T(-0.5900435899266435) * y * (3 * xx - yy);
+    basis[10] = T(2.890611442640554) * x * y * z;
+    basis[11] = T(-0.4570457994644658) * y * (4 * zz - xx - yy);
+    basis[12] = T(0.3731763325901154) * z * (2 * zz - 3 * xx - 3 * yy);
+    basis[13] = T(-0.4570457994644658) * x * (4 * zz - xx - yy);
+    basis[14] = T(1.445305721320277) * z * (xx - yy);
+    basis[15] = T(-0.5900435899266435) * x * (xx - 3 * yy);
+}
+
+// Gradient of the unit direction from that of the bases.
+template <class V>
+V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxShBases], V g_dir[3]) {
+    using T = Lane<V>;
+    V gx = V{}, gy = V{}, gz = V{};
+    if (degree >= 1) {
+        const T c1 = T(0.4886025119029199);
+        gy -= c1 * g[1];
+        gz += c1 * g[2];
+        gx -= c1 * g[3];
+    }
+    if (degree >= 2) {
+        const T a = T(1.0925484305920792), b = T(0.31539156525252005), c = T(0.5462742152960396);
+        gx += a * y * g[4] - 2 * b * x * g[6] - a * z * g[7] + 2 * c * x * g[8];
+        gy += a * x * g[4] - a * z * g[5] - 2 * b * y * g[6] - 2 * c * y * g[8];
+        gz += -a * y * g[5] + 4 * b * z * g[6] - a * x * g[7];
+    }
+    if (degree >= 3) {
+        const V xx = x * x, yy = y * y, zz = z * z;
+        const T a = T(0.5900435899266435), b = T(2.890611442640554), c = T(0.4570457994644658);
+        const T d = T(0.3731763325901154), e = T(1.445305721320277);
+        gx += -6 * a * x * y * g[9] + b * y * z * g[10] + 2 * c * x * y * g[11] - 6 * d * x * z * g[12] -
+              c * (4 * zz - 3 * xx - yy) * g[13] + 2 * e * x * z * g[14] - 3 * a * (xx - yy) * g[15];
+        gy += -3 * a * (xx - yy) * g[9] + b * x * z * g[10] - c * (4 * zz - xx - 3 * yy) * g[11] -
+              6 * d * y * z * g[12] + 2 * c * x * y * g[13] - 2 * e * y * z * g[14] + 6 * a * x * y * g[15];
+        gz += b * x * y * g[10] - 8 * c * y * z * g[11] + d * (6 * zz - 3 * xx - 3 * yy) * g[12] -
+              8 * c * x * z * g[13] + e * (xx - yy) * g[14];
+    }
+    g_dir[0] = gx;
+    g_dir[1] = gy;
+    g_dir[2] = gz;
+}
+
+}  // namespace v3dg

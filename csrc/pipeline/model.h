@@ -1,0 +1,50 @@
+#pragma once
+
+#include "base/buffer.h"
+#include "base/parallel_for.h"
+#include "base/span.h"
+#include "project/project.h"
+
+namespace v3dg {
+
+// Gaussians as users hold them: rows of (N, 3), (N, 4), (N, 3), (N,), (N, bases, 3).
+template <class T>
+struct GaussianRows {
+    Span<const T> means, quats, scales, opacities, sh;
+    int sh_degree;
+    size_t size() const { return opacities.size; }
+};
+
+// Gaussians as the rasterizer reads them: owned planes.
+template <class T>
+class Model {
+public:
+    explicit Model(const GaussianRows<T>& rows) : size_(rows.size()) {
+        const size_t num_sh = 3 * num_sh_bases(rows.sh_degree);
+        const size_t stride = size_ + kPlanePadding;
+        T* plane = storage_.reserve((11 + num_sh) * stride);
+        const auto add = [&](Span<const T> source, size_t width, const T** planes) {
+            for (size_t k = 0; k < width; ++k) {
+                planes[k] = plane;
+                parallel_for(size_, 65536, [&, k](size_t i) { plane[i] = source.data[i * width + k]; });
+                for (size_t i = size_; i < stride; ++i) plane[i] = T(0);
+                plane += stride;
+            }
+        };
+        add(rows.means, 3, planes_.mean);
+        add(rows.quats, 4, planes_.quat);
+        add(rows.scales, 3, planes_.scale);
+        add(rows.opacities, 1, &planes_.opacity);
+        add(rows.sh, num_sh, planes_.sh);
+        planes_.sh_degree = rows.sh_degree;
+    }
+    const GaussianPlanes<T>& planes() const { return planes_; }
+    size_t size() const { return size_; }
+
+private:
+    size_t size_;
+    Buffer<T> storage_;
+    GaussianPlanes<T> planes_{};
+};
+
+}  // namespace v3dg

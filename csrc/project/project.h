@@ -1,0 +1,75 @@
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "base/isa.h"
+#include "project/project_math.h"
+
+namespace v3dg {
+
+constexpr int kTileSize = 32;  // px; pictures are drawn tile by tile
+
+// Gaussians of one model, a plane an attribute. Planes hold `kPlanePadding` elements more than there are
+// gaussians, so that a vector load may run past the last.
+constexpr size_t kPlanePadding = 16;
+template <class T>
+struct GaussianPlanes {
+    const T* mean[3];
+    const T* quat[4];
+    const T* scale[3];
+    const T* opacity;
+    const T* sh[3 * kMaxShBases];  // base by base, three channels each
+    int sh_degree;
+};
+
+// A run of gaussians of one model, placed in front of the camera.
+template <class T>
+struct Draw {
+    const GaussianPlanes<T>* model;
+    uint64_t first, count;
+    ModelView<T> view;
+    T filter_px2;
+    bool compensate;  // opacity for what the filter adds
+};
+
+// One gaussian on the image, ready to blend. A reader finds the meaning of L in project_math.h.
+template <class T>
+struct Record {
+    T u, v, l11, l12, l22, log2_opacity;
+    T color[3];
+    T depth;
+    // First and last pixel whose centre the gaussian can reach, cut to the image.
+    uint16_t x0, x1, y0, y1;
+};
+
+// Gradients of the ellipse and colour of one record.
+template <class T>
+struct RecordGradient {
+    Ellipse<T> ellipse;
+    T color[3];
+};
+
+// Gradients of gaussians, each (N,) or (N, k) row major, and of the SH coefficients (N, bases, 3).
+template <class T>
+struct GaussianGradients {
+    T *means, *quats, *scales, *opacities, *sh;
+};
+
+// Projects gaussians [skip, skip + count) of a draw and writes a record, in order, for each one that reaches a
+// pixel centre: in front of the near plane, alpha of at least 1/255 somewhere, a positive finite determinant.
+// `source` (or null) receives `source_base` plus the gaussian's place in the draw. Returns the number of
+// records and adds to `in_frustum` the gaussians whose extent meets the image, whether or not they reach a
+// pixel centre.
+V3DG_DECLARE_PER_ISA(template <class T> size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count,
+                                                       const Pinhole<T>& camera, Record<T>* records,
+                                                       uint32_t* source, uint32_t source_base,
+                                                       uint64_t& in_frustum))
+
+// Writes the gradients of the `count` gaussians `source` (places in a single draw) from those of their records.
+V3DG_DECLARE_PER_ISA(template <class T> void project_backward(const Draw<T>& draw, const uint32_t* source,
+                                                              const RecordGradient<T>* d_records, size_t count,
+                                                              const Pinhole<T>& camera,
+                                                              const GaussianGradients<T>& out))
+
+}  // namespace v3dg

@@ -1,0 +1,200 @@
+#pragma once
+
+// The inner loops of the rasterizer, on one tile of 32 x 32 pixels that stays in the first-level cache.
+//
+// A tile is 8 x 8 blocks of 4 x 4 pixels, one bit a block in a 64-bit mask: which blocks a gaussian may touch,
+// and which still have a pixel that has not stopped. A gaussian whose mask has no live block costs a few
+// integer operations.
+
+#include <cstdint>
+
+#include "project/project.h"
+#include "rasterize/rasterize_math.h"
+
+namespace v3dg {
+namespace V3DG_ISA {
+
+constexpr int kBlockSize = 4;
+constexpr int kBlockPixels = kBlockSize * kBlockSize;
+constexpr int kTileBlocks = kTileSize / kBlockSize;
+constexpr int kTilePixels = kTileSize * kTileSize;
+
+// Planes of a tile, block after block, 16 pixels each.
+template <class T>
+struct TilePlanes {
+    alignas(64) T transmittance[kTilePixels];
+    alignas(64) T color[3][kTilePixels];
+    alignas(64) T depth[kTilePixels];  // sum of weight * depth
+};
+
+// What the way back reads of each pixel, and the sums it keeps.
+template <class T>
+struct TileGradient {
+    alignas(64) T d_color[3][kTilePixels];
+    alignas(64) T d_depth[kTilePixels];   // by sum of weight * depth
+    alignas(64) T d_weight[kTilePixels];  // by every weight alike: alpha, and the background it hides
+    alignas(64) T total[kTilePixels];     // sum over gaussians of weight * (gradient by that weight)
+};
+
+// Blocks of the tile at (left, top) that the record's pixel box touches.
+template <class T>
+V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
+    const int x0 = (g.x0 > left ? g.x0 - left : 0) >> 2;
+    const int y0 = (g.y0 > top ? g.y0 - top : 0) >> 2;
+    const int x1 = (g.x1 - left < kTileSize ? g.x1 - left : kTileSize - 1) >> 2;
+    const int y1 = (g.y1 - top < kTileSize ? g.y1 - top : kTileSize - 1) >> 2;
+    const uint64_t row = (0xffu >> (7 - x1)) & (0xffu << x0);
+    const uint64_t rows = (~uint64_t(0) >> (8 * (7 - y1))) & (~uint64_t(0) << (8 * y0));
+    return (row * 0x0101010101010101u) & rows;
+}
+
+// Sets the planes to an empty picture and returns the blocks with a pixel inside width x height. Pixels
+// outside count as stopped.
+template <class T>
+inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, int width, int height, bool with_depth) {
+    uint64_t alive = 0;
+    for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
+        const int x = left + kBlockSize * (block % kTileBlocks), y = top + kBlockSize * (block / kTileBlocks);
+        if (x >= width || y >= height) continue;
+        alive |= uint64_t(1) << block;
+        for (int i = 0; i < kBlockPixels; ++i) {
+            const int p = kBlockPixels * block + i;
+            const bool inside = x + i % kBlockSize < width && y + i / kBlockSize < height;
+            tile.transmittance[p] = inside ? T(1) : T(-1);
+            tile.color[0][p] = tile.color[1][p] = tile.color[2][p] = T(0);
+            if (with_depth) tile.depth[p] = T(0);
+        }
+    }
+    return alive;
+}
+
+template <class T>
+struct BlockPixels {
+    alignas(64) T x[kBlockPixels], y[kBlockPixels];  // centres, from the block's corner
+    BlockPixels() {
+        for (int i = 0; i < kBlockPixels; ++i) {
+            x[i] = T(i % kBlockSize) + T(0.5);
+            y[i] = T(i / kBlockSize) + T(0.5);
+        }
+    }
+};
+
+// Blends one record over the live blocks of a tile; clears the bits of blocks that have stopped.
+template <class T, bool kWithDepth>
+V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int top, const BlockPixels<T>& pixels,
+                              TilePlanes<T>& tile, uint64_t& alive) {
+    using V = Vec<T>;
+    const V l11 = all_lanes<V>(g.l11), l12 = all_lanes<V>(g.l12), l22 = all_lanes<V>(g.l22);
+    const V log2_opacity = all_lanes<V>(g.log2_opacity);
+    const V red = all_lanes<V>(g.color[0]), green = all_lanes<V>(g.color[1]), blue = all_lanes<V>(g.color[2]);
+    const T u = g.u - T(left), v = g.v - T(top);
+    while (blocks != 0) {
+        const int block = __builtin_ctzll(blocks);
+        blocks &= blocks - 1;
+        const V center_u = all_lanes<V>(u - T(kBlockSize * (block % kTileBlocks)));
+        const V center_v = all_lanes<V>(v - T(kBlockSize * (block / kTileBlocks)));
+        unsigned touched = 0;
+        V alpha[kBlockPixels / kLanes<T>];
+        for (int part = 0; part < kBlockPixels / kLanes<T>; ++part) {
+            const V x = load(pixels.x + part * kLanes<T>), y = load(pixels.y + part * kLanes<T>);
+            const Falloff<V> f = falloff_at(x, y, center_u, center_v, l11, l12, l22, log2_opacity);
+            touched |= bits_of(contributes(f));
+            alpha[part] = alpha_of(f);
+        }
+        if (touched == 0) continue;
+        unsigned live = 0;
+        for (int part = 0; part < kBlockPixels / kLanes<T>; ++part) {
+            const int p = kBlockPixels * block + part * kLanes<T>;
+            V t = load(tile.transmittance + p);
+            const V weight = blend_weight(alpha[part], t);
+            store(tile.transmittance + p, t);
+            live |= bits_of(t > V{});
+            store(tile.color[0] + p, load(tile.color[0] + p) + weight * red);
+            store(tile.color[1] + p, load(tile.color[1] + p) + weight * green);
+            store(tile.color[2] + p, load(tile.color[2] + p) + weight * blue);
+            if (kWithDepth) store(tile.depth + p, load(tile.depth + p) + weight * g.depth);
+        }
+        if (live == 0) alive &= ~(uint64_t(1) << block);
+    }
+}
+
+// The way back through one record: the same steps on the same numbers, front to back, so that the same pixels
+// take part. `tile` is replayed (transmittance; color[0] holds the running sum); returns false where no pixel
+// of the tile took part.
+template <class T, bool kWithDepth>
+V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left, int top,
+                                  const BlockPixels<T>& pixels, const TileGradient<T>& grad, TilePlanes<T>& tile,
+                                  uint64_t& alive, RecordGradient<T>& out) {
+    using V = Vec<T>;
+    const V l11 = all_lanes<V>(g.l11), l12 = all_lanes<V>(g.l12), l22 = all_lanes<V>(g.l22);
+    const V log2_opacity = all_lanes<V>(g.log2_opacity);
+    const T u = g.u - T(left), v = g.v - T(top);
+    V s_t1 = V{}, s_t2 = V{}, s_t1_dx = V{}, s_t1_dy = V{}, s_t2_dy = V{}, s_exponent = V{};
+    V s_color[3] = {V{}, V{}, V{}}, s_depth = V{};
+    bool took_part = false;
+    while (blocks != 0) {
+        const int block = __builtin_ctzll(blocks);
+        blocks &= blocks - 1;
+        const V center_u = all_lanes<V>(u - T(kBlockSize * (block % kTileBlocks)));
+        const V center_v = all_lanes<V>(v - T(kBlockSize * (block / kTileBlocks)));
+        unsigned touched = 0, live = 0;
+        for (int part = 0; part < kBlockPixels / kLanes<T>; ++part) {
+            const V x = load(pixels.x + part * kLanes<T>), y = load(pixels.y + part * kLanes<T>);
+            const Falloff<V> f = falloff_at(x, y, center_u, center_v, l11, l12, l22, log2_opacity);
+            const int p = kBlockPixels * block + part * kLanes<T>;
+            const V before = load(tile.transmittance + p);
+            if (bits_of(contributes(f)) == 0) {
+                live |= bits_of(before > V{});
+                continue;
+            }
+            touched = 1;
+            const V alpha = alpha_of(f);
+            V t = before;
+            const V weight = blend_weight(alpha, t);
+            store(tile.transmittance + p, t);
+            live |= bits_of(t > V{});
+
+            V by_weight = load(grad.d_weight + p);
+            for (int c = 0; c < 3; ++c) {
+                const V d = load(grad.d_color[c] + p);
+                by_weight += d * g.color[c];
+                s_color[c] += d * weight;
+            }
+            if (kWithDepth) {
+                const V d = load(grad.d_depth + p);
+                by_weight += d * g.depth;
+                s_depth += d * weight;
+            }
+            const V running = load(tile.color[0] + p) + weight * by_weight;
+            store(tile.color[0] + p, running);
+            // alpha takes its weight and dims all that is behind: (total - running) is what they give.
+            const V d_alpha = before * by_weight - (load(grad.total + p) - running) / (1 - alpha);
+            const auto moves = (weight > V{}) & (alpha < all_lanes<V>(T(kMaxAlpha)));
+            const V d_exponent = moves ? T(kLn2) * alpha * d_alpha : V{};
+            const V d_t1 = -2 * f.t1 * d_exponent, d_t2 = -2 * f.t2 * d_exponent;
+            s_exponent += d_exponent;
+            s_t1 += d_t1;
+            s_t2 += d_t2;
+            s_t1_dx += d_t1 * f.dx;
+            s_t1_dy += d_t1 * f.dy;
+            s_t2_dy += d_t2 * f.dy;
+        }
+        took_part |= touched != 0;
+        if (live == 0) alive &= ~(uint64_t(1) << block);
+    }
+    if (!took_part) return false;
+    // t1 = l11 dx + l12 dy and t2 = l22 dy, with dx = x - u and dy = y - v.
+    const T d_t1 = sum_of(s_t1), d_t2 = sum_of(s_t2);
+    out.ellipse.u = -g.l11 * d_t1;
+    out.ellipse.v = -g.l12 * d_t1 - g.l22 * d_t2;
+    out.ellipse.l11 = sum_of(s_t1_dx);
+    out.ellipse.l12 = sum_of(s_t1_dy);
+    out.ellipse.l22 = sum_of(s_t2_dy);
+    out.ellipse.log2_opacity = sum_of(s_exponent);
+    for (int c = 0; c < 3; ++c) out.color[c] = sum_of(s_color[c]);
+    out.ellipse.depth = kWithDepth ? sum_of(s_depth) : T(0);
+    return true;
+}
+
+}  // namespace V3DG_ISA
+}  // namespace v3dg

@@ -1,0 +1,46 @@
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "base/buffer.h"
+#include "project/project.h"
+
+namespace v3dg {
+
+// Tiles of kTileSize pixels that cover an image, row by row.
+struct TileGrid {
+    int columns, rows;
+    TileGrid(int width, int height)
+        : columns((width + kTileSize - 1) / kTileSize), rows((height + kTileSize - 1) / kTileSize) {}
+    size_t size() const { return static_cast<size_t>(columns) * rows; }
+};
+
+// Records in runs, one run a chunk of the draw list: chunk c holds records[first[c] .. first[c] + count[c]).
+struct RecordChunks {
+    const uint64_t* first;
+    const uint32_t* count;
+    size_t size;
+};
+
+// The records that touch each tile, in the order of the chunks: tile t has entries offset[t] to offset[t + 1].
+// An entry is a record's place in its low half; its high half, which orders entries within a tile by depth, is
+// the bits of the float32 depth.
+struct TileLists {
+    Buffer<uint64_t> offset;
+    Buffer<uint64_t> entry;
+    Buffer<uint64_t> cursor;  // scratch: (chunk, tile)
+    uint64_t num_entries = 0;
+};
+
+template <class T>
+void tile_bin(const Record<T>* records, const RecordChunks& chunks, const TileGrid& grid, TileLists& out);
+
+// Sorts one tile's entries by depth, ties by record. `scratch` has room for as many.
+// Double-precision records are ordered by their own depth, which float32 bits do not hold.
+template <class T>
+void sort_tile(const Record<T>* records, uint64_t* entry, size_t count, uint64_t* scratch);
+
+inline uint32_t record_of(uint64_t entry) { return static_cast<uint32_t>(entry); }
+
+}  // namespace v3dg
