@@ -1,0 +1,439 @@
+#include "fit_group/fit_group.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+#include "adam/adam_math.h"
+#include "rasterize/tile.h"
+
+// One thread fits one group, start to end. The group's frame has its ball at the origin with radius 1, so step
+// sizes mean the same for every group and nothing is lost far from the world's origin.
+
+namespace v3dg {
+namespace V3DG_ISA {
+
+constexpr int kPlanes = 4;  // red, green, blue, alpha
+
+static int tiles_across(const FitView& view) { return (view.size + kTileSize - 1) / kTileSize; }
+
+// Group frame to view.
+static ModelView<float> view_of_group(const FitConfig& config, const FitView& view) {
+    ModelView<float> mv{};
+    for (int i = 0; i < 9; ++i) mv.linear[i] = view.rotation[i];
+    mv.translation[2] = config.distance;
+    for (int i = 0; i < 3; ++i) mv.eye[i] = -view.rotation[6 + i] * config.distance;
+    return mv;
+}
+
+// World to view, the ball scaled to radius 1.
+static ModelView<float> view_of_world(const FitConfig& config, const FitGroup& group, const FitView& view) {
+    ModelView<float> mv = view_of_group(config, view);
+    const double shrink = 1 / static_cast<double>(group.radius);
+    for (int i = 0; i < 3; ++i) {
+        double offset = 0;
+        for (int k = 0; k < 3; ++k) {
+            offset += static_cast<double>(view.rotation[3 * i + k]) * group.center[k];
+            mv.linear[3 * i + k] = static_cast<float>(view.rotation[3 * i + k] * shrink);
+        }
+        mv.translation[i] = static_cast<float>(mv.translation[i] - offset * shrink);
+        mv.eye[i] = static_cast<float>(group.center[i] + static_cast<double>(group.radius) * mv.eye[i]);
+    }
+    return mv;
+}
+
+static Pinhole<float> camera_of(const FitView& view, float scale) {
+    const float size = scale * static_cast<float>(view.size);
+    return {scale * view.focal, scale * view.focal, scale * view.cx, scale * view.cy, size, size, 1e-3f};
+}
+
+// Projects a draw and sorts what is seen by depth; returns how many.
+static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& camera, FitScratch& scratch) {
+    Record<float>* records = scratch.records.reserve(draw.count);
+    uint32_t* source = scratch.source.reserve(draw.count);
+    uint64_t unused = 0;
+    const size_t count = project<float>(draw, 0, draw.count, camera, records, source, 0, unused);
+    uint64_t* order = scratch.order.reserve(count);
+    for (size_t i = 0; i < count; ++i) {
+        uint32_t bits;
+        std::memcpy(&bits, &records[i].depth, sizeof bits);
+        order[i] = uint64_t(bits) << 32 | i;
+    }
+    sort_tile(records, order, count, scratch.order_scratch.reserve(count));
+    return count;
+}
+
+static void blend_sorted(const FitScratch& scratch, size_t count, int left, int top, int size, TilePlanes<float>& tile) {
+    const BlockPixels<float> pixels;
+    uint64_t alive = clear_tile(tile, left, top, size, size, false);
+    for (size_t i = 0; i < count && alive != 0; ++i) {
+        const Record<float>& g = scratch.records.data()[record_of(scratch.order.data()[i])];
+        if (g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize) continue;
+        const uint64_t blocks = blocks_of(g, left, top) & alive;
+        if (blocks != 0) blend_record<float, false>(g, blocks, left, top, pixels, tile, alive);
+    }
+}
+
+static int place_in_tile(int x, int y) {
+    return (y / kBlockSize * kTileBlocks + x / kBlockSize) * kBlockPixels + y % kBlockSize * kBlockSize + x % kBlockSize;
+}
+
+void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget& target, const FitView& view,
+                FitScratch& scratch, FitImage& image) {
+    const int ss = config.supersample;
+    const Draw<float> draw{target.model, group.target_first, group.target_count, view_of_world(config, group, view),
+                           target.filter_px2, target.compensate};
+    const size_t count = project_sorted(draw, camera_of(view, static_cast<float>(ss)), scratch);
+    const int across = tiles_across(view);
+    image.assign(static_cast<size_t>(across) * across * kPlanes * kTilePixels, 0.0f);
+    const float share = 1.0f / static_cast<float>(ss * ss);
+    TilePlanes<float> tile;
+    for (int top = 0; top < ss * view.size; top += kTileSize)
+        for (int left = 0; left < ss * view.size; left += kTileSize) {
+            blend_sorted(scratch, count, left, top, ss * view.size, tile);
+            for (int y = 0; y < kTileSize && top + y < ss * view.size; ++y)
+                for (int x = 0; x < kTileSize && left + x < ss * view.size; ++x) {
+                    const int px = (left + x) / ss, py = (top + y) / ss, p = place_in_tile(x, y);
+                    float* planes = image.data() + static_cast<size_t>(py / kTileSize * across + px / kTileSize) * kPlanes * kTilePixels;
+                    const int out = place_in_tile(px % kTileSize, py % kTileSize);
+                    for (int c = 0; c < 3; ++c) planes[c * kTilePixels + out] += share * tile.color[c][p];
+                    planes[3 * kTilePixels + out] += share * (1 - std::fabs(tile.transmittance[p]));
+                }
+        }
+}
+
+// The parameters of one group, one flat array in the order means, quats, log scales, logits, sh; a gradient and
+// two moments of the same shape.
+class Student {
+public:
+    Student(const FitConfig& config, const FitGroup& group, const FitRows& rows)
+        : config_(config), group_(group), n_(group.count), num_sh_(3 * num_sh_bases(rows.sh_degree)) {
+        const size_t size = n_ * (11 + num_sh_);
+        const size_t padded = (size + kPlanePadding) / kPlanePadding * kPlanePadding;
+        value_.assign(padded, 0);
+        gradient_.assign(padded, 0);
+        m_.assign(padded, 0);
+        v_.assign(padded, 0);
+        float* p = value_.data();
+        const float inverse = 1 / group.radius;
+        for (size_t i = 0; i < n_; ++i)
+            for (int k = 0; k < 3; ++k) *p++ = (rows.means[3 * (group.first + i) + k] - group.center[k]) * inverse;
+        p = std::copy_n(rows.quats + 4 * group.first, 4 * n_, p);
+        for (size_t i = 0; i < 3 * n_; ++i)
+            *p++ = std::log(std::max(rows.scales[3 * group.first + i] * inverse, kLeastScale));
+        for (size_t i = 0; i < n_; ++i) {
+            const float o = std::min(std::max(rows.opacities[group.first + i], kLeastOpacity), 1 - kLeastOpacity);
+            *p++ = std::log(o / (1 - o));
+        }
+        std::copy_n(rows.sh + num_sh_ * group.first, num_sh_ * n_, p);
+        plane_size_ = n_ + kPlanePadding;
+        planes_.assign((11 + num_sh_) * plane_size_, 0);
+        float* plane = planes_.data();
+        const auto next = [&] {
+            const float* here = plane;
+            plane += plane_size_;
+            return here;
+        };
+        for (auto& q : model_.mean) q = next();
+        for (auto& q : model_.quat) q = next();
+        for (auto& q : model_.scale) q = next();
+        model_.opacity = next();
+        for (size_t k = 0; k < num_sh_; ++k) model_.sh[k] = next();
+        model_.sh_degree = rows.sh_degree;
+        activate();
+    }
+
+    Draw<float> draw(const FitView& view) const {
+        return {&model_, 0, n_, view_of_group(config_, view), config_.filter_px2, config_.compensate};
+    }
+
+    void clear_gradient() { std::fill(gradient_.begin(), gradient_.end(), 0.0f); }
+
+    // Adds the gradients of records to those of the parameters.
+    void add_gradient(const Draw<float>& draw, const Pinhole<float>& camera, const uint32_t* source,
+                      const RecordGradient<float>* d_records, size_t count) {
+        by_value_.resize(gradient_.size());
+        float* g = by_value_.data();
+        const GaussianGradients<float> out{g, g + 3 * n_, g + 7 * n_, g + 10 * n_, g + 11 * n_};
+        project_backward<float>(draw, source, d_records, count, camera, out);
+        for (size_t i = 0; i < count; ++i) {
+            const size_t at = source[i];
+            for (int k = 0; k < 3; ++k) gradient_[3 * at + k] += out.means[3 * at + k];
+            for (int k = 0; k < 4; ++k) gradient_[3 * n_ + 4 * at + k] += out.quats[4 * at + k];
+            for (int k = 0; k < 3; ++k)
+                gradient_[7 * n_ + 3 * at + k] += out.scales[3 * at + k] * model_.scale[k][at];
+            const float o = model_.opacity[at];
+            gradient_[10 * n_ + at] += out.opacities[at] * o * (1 - o);
+            for (size_t k = 0; k < num_sh_; ++k)
+                gradient_[11 * n_ + num_sh_ * at + k] += out.sh[num_sh_ * at + k];
+        }
+    }
+
+    void step(int index) {
+        const double progress = config_.steps > 1 ? static_cast<double>(index) / (config_.steps - 1) : 0;
+        const float decay = static_cast<float>(std::pow(config_.final_step, progress));
+        correction1_ = static_cast<float>(1 / (1 - std::pow(kAdamBeta1, index + 1)));
+        correction2_ = static_cast<float>(1 / (1 - std::pow(kAdamBeta2, index + 1)));
+        const float position = config_.position_in_world ? config_.step_position / group_.radius : config_.step_position;
+        size_t at = 0;
+        at = adam(at, 3 * n_, decay * position);
+        at = adam(at, 4 * n_, decay * config_.step_quat);
+        at = adam(at, 3 * n_, decay * config_.step_log_scale);
+        at = adam(at, n_, decay * config_.step_logit);
+        if (num_sh_ == 3) {
+            adam(at, 3 * n_, decay * config_.step_sh0);
+        } else {
+            for (size_t i = 0; i < n_; ++i) {
+                at = adam(at, 3, decay * config_.step_sh0);
+                at = adam(at, num_sh_ - 3, decay * config_.step_sh_rest);
+            }
+        }
+        activate();
+    }
+
+    // Writes the values back in world units; false, and nothing written, if one of them is not finite.
+    bool write(const FitRows& rows) const {
+        for (size_t i = 0; i < n_ * (11 + num_sh_); ++i)
+            if (!std::isfinite(value_[i])) return false;
+        const size_t first = group_.first;
+        for (size_t i = 0; i < n_; ++i) {
+            for (int k = 0; k < 3; ++k) {
+                rows.means[3 * (first + i) + k] = static_cast<float>(
+                    group_.center[k] + static_cast<double>(group_.radius) * value_[3 * i + k]);
+                rows.scales[3 * (first + i) + k] = group_.radius * model_.scale[k][i];
+            }
+            const float* q = &value_[3 * n_ + 4 * i];
+            const float length = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+            for (int k = 0; k < 4; ++k) rows.quats[4 * (first + i) + k] = length > 0 ? q[k] / length : float(k == 0);
+            rows.opacities[first + i] = model_.opacity[i];
+        }
+        std::copy_n(&value_[11 * n_], num_sh_ * n_, rows.sh + num_sh_ * first);
+        return true;
+    }
+
+private:
+    static constexpr float kLeastScale = 1e-5f;    // of the radius: far below what a pixel shows
+    static constexpr float kLeastOpacity = 1e-4f;  // keeps the logit finite and movable
+
+    size_t adam(size_t begin, size_t count, float step_size) {
+        size_t i = begin;
+        const size_t end = begin + count;
+        for (; i + kLanes<float> <= end; i += kLanes<float>) {
+            Vec<float> m = load(&m_[i]), v = load(&v_[i]);
+            const Vec<float> next = adam_step(load(&value_[i]), load(&gradient_[i]), m, v, step_size, correction1_, correction2_);
+            store(&m_[i], m);
+            store(&v_[i], v);
+            store(&value_[i], next);
+        }
+        for (; i < end; ++i)
+            value_[i] = adam_step(value_[i], gradient_[i], m_[i], v_[i], step_size, correction1_, correction2_);
+        return end;
+    }
+
+    // Parameters to the planes that are drawn.
+    void activate() {
+        const float* p = value_.data();
+        float* plane = planes_.data();
+        const auto spread = [&](size_t width) {
+            for (size_t k = 0; k < width; ++k, plane += plane_size_)
+                for (size_t i = 0; i < n_; ++i) plane[i] = p[width * i + k];
+            p += width * n_;
+        };
+        const auto map = [&](float* at, auto f) {
+            for (size_t i = 0; i < n_; i += kLanes<float>) store(at + i, f(load(at + i)));
+        };
+        constexpr float kLog2e = 1.4426950408889634f;
+        spread(3);
+        spread(4);
+        float* scales = plane;
+        spread(3);
+        // No scale outgrows the ball, none vanishes: a value that ran away could not come back.
+        const auto low = all_lanes<Vec<float>>(-20.0f), high = all_lanes<Vec<float>>(1.0f);
+        for (int k = 0; k < 3; ++k)
+            map(scales + k * plane_size_, [&](Vec<float> x) { return exp2_of(min_of(high, max_of(low, x * kLog2e))); });
+        float* opacities = plane;
+        spread(1);
+        const auto least = all_lanes<Vec<float>>(-60.0f), most = all_lanes<Vec<float>>(60.0f);
+        map(opacities, [&](Vec<float> x) { return 1 / (1 + exp2_of(min_of(most, max_of(least, x * -kLog2e)))); });
+        spread(num_sh_);
+    }
+
+    const FitConfig& config_;
+    const FitGroup& group_;
+    size_t n_, num_sh_, plane_size_ = 0;
+    std::vector<float> value_, gradient_, by_value_, m_, v_, planes_;
+    GaussianPlanes<float> model_{};
+    float correction1_ = 1, correction2_ = 1;
+};
+
+// Draws the student, compares it with its target and, on the way back, adds to its gradient.
+class Comparison {
+public:
+    Comparison(const FitConfig& config) : config_(config) {}
+
+    // Mean |difference| of colour and alpha of one view.
+    void residual(const Student& student, const FitView& view, const FitImage& target, double error[2]) {
+        draw(student, view);
+        const int across = tiles_across(view);
+        for (int t = 0; t < across * across; ++t) compare(t, view, target, nullptr, error);
+    }
+
+    void add_gradient(Student& student, const FitView& view, const FitImage& target) {
+        const size_t count = draw(student, view);
+        const int across = tiles_across(view);
+        d_records_.assign(count, RecordGradient<float>{});
+        grad_.resize(tiles_.size());
+        double unused[2] = {0, 0};
+        for (int t = 0; t < across * across; ++t) compare(t, view, target, &grad_[t], unused);
+        if (config_.loss.dssim > 0) add_dssim(view, target);
+        const BlockPixels<float> pixels;
+        for (int t = 0; t < across * across; ++t) {
+            const int left = t % across * kTileSize, top = t / across * kTileSize;
+            TilePlanes<float>& tile = tiles_[t];
+            TileGradient<float>& grad = grad_[t];
+            for (int p = 0; p < kTilePixels; p += kLanes<float>) {
+                const Vec<float> t_now = load(tile.transmittance + p);
+                const Vec<float> covered = 1 - (t_now < Vec<float>{} ? -t_now : t_now);
+                Vec<float> total = load(grad.d_weight + p) * covered;
+                for (int c = 0; c < 3; ++c) total += load(grad.d_color[c] + p) * load(tile.color[c] + p);
+                store(grad.total + p, total);
+            }
+            uint64_t alive = clear_tile(tile, left, top, view.size, view.size, false);
+            for (size_t i = 0; i < count && alive != 0; ++i) {
+                const uint32_t r = record_of(scratch_.order.data()[i]);
+                const Record<float>& g = scratch_.records.data()[r];
+                if (g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize) continue;
+                const uint64_t blocks = blocks_of(g, left, top) & alive;
+                RecordGradient<float> d;
+                if (blocks == 0 || !blend_record_vjp<float, false>(g, blocks, left, top, pixels, grad, tile, alive, d))
+                    continue;
+                d_records_[r] += d;
+            }
+        }
+        student.add_gradient(student.draw(view), camera_of(view, 1), scratch_.source.data(), d_records_.data(), count);
+    }
+
+private:
+    size_t draw(const Student& student, const FitView& view) {
+        const size_t count = project_sorted(student.draw(view), camera_of(view, 1), scratch_);
+        const int across = tiles_across(view);
+        tiles_.resize(static_cast<size_t>(across) * across);
+        for (int t = 0; t < across * across; ++t)
+            blend_sorted(scratch_, count, t % across * kTileSize, t / across * kTileSize, view.size, tiles_[t]);
+        return count;
+    }
+
+    // L1 parts of the loss in one tile: adds to the sums and, if wanted, writes the gradient of its pixels.
+    void compare(int t, const FitView& view, const FitImage& target, TileGradient<float>* grad, double error[2]) {
+        using V = Vec<float>;
+        const int across = tiles_across(view);
+        const int left = t % across * kTileSize, top = t / across * kTileSize;
+        const float num_pixels = static_cast<float>(view.size) * static_cast<float>(view.size);
+        const float d_color = config_.loss.l1 / (3 * num_pixels), d_alpha = config_.loss.alpha / num_pixels;
+        const float* planes = target.data() + static_cast<size_t>(t) * kPlanes * kTilePixels;
+        const TilePlanes<float>& tile = tiles_[t];
+        V color_sum = V{}, alpha_sum = V{};
+        const auto sign = [](V x, float size) { return x > V{} ? all_lanes<V>(size) : (x < V{} ? all_lanes<V>(-size) : V{}); };
+        const auto magnitude = [](V x) { return x < V{} ? -x : x; };
+        for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
+            const bool inside = left + block % kTileBlocks * kBlockSize < view.size && top + block / kTileBlocks * kBlockSize < view.size;
+            for (int p = block * kBlockPixels; p < (block + 1) * kBlockPixels; p += kLanes<float>) {
+                if (!inside) {
+                    if (grad == nullptr) continue;
+                    for (int c = 0; c < 3; ++c) store(grad->d_color[c] + p, V{});
+                    store(grad->d_weight + p, V{});
+                    continue;
+                }
+                for (int c = 0; c < 3; ++c) {
+                    const V difference = load(tile.color[c] + p) - load(planes + c * kTilePixels + p);
+                    color_sum += magnitude(difference);
+                    if (grad != nullptr) store(grad->d_color[c] + p, sign(difference, d_color));
+                }
+                const V transmittance = magnitude(load(tile.transmittance + p));
+                const V difference = 1 - transmittance - load(planes + 3 * kTilePixels + p);
+                alpha_sum += magnitude(difference);
+                if (grad != nullptr) store(grad->d_weight + p, sign(difference, d_alpha));
+            }
+        }
+        error[0] += sum_of(color_sum) / (3 * num_pixels);
+        error[1] += sum_of(alpha_sum) / num_pixels;
+    }
+
+    // Adds the D-SSIM part to the gradient, in rows of pixels.
+    void add_dssim(const FitView& view, const FitImage& target) {
+        const int size = view.size, across = tiles_across(view);
+        const size_t n = static_cast<size_t>(size) * size;
+        rows_.resize(3 * n);
+        for (int c = 0; c < 3; ++c) {
+            for (int y = 0; y < size; ++y)
+                for (int x = 0; x < size; ++x) {
+                    const int t = y / kTileSize * across + x / kTileSize, p = place_in_tile(x % kTileSize, y % kTileSize);
+                    rows_[y * size + x] = tiles_[t].color[c][p];
+                    rows_[n + y * size + x] = target[(static_cast<size_t>(t) * kPlanes + c) * kTilePixels + p];
+                }
+            std::fill_n(rows_.begin() + 2 * n, n, 0.0f);
+            dssim(rows_.data(), rows_.data() + n, size, size, config_.loss.dssim / 3, rows_.data() + 2 * n, ssim_);
+            for (int y = 0; y < size; ++y)
+                for (int x = 0; x < size; ++x)
+                    grad_[y / kTileSize * across + x / kTileSize].d_color[c][place_in_tile(x % kTileSize, y % kTileSize)] +=
+                        rows_[2 * n + y * size + x];
+        }
+    }
+
+    const FitConfig& config_;
+    FitScratch scratch_;
+    std::vector<TilePlanes<float>> tiles_;
+    std::vector<TileGradient<float>> grad_;
+    std::vector<RecordGradient<float>> d_records_;
+    std::vector<float> rows_;
+    SsimScratch ssim_;
+};
+
+// Views on which start and result are compared, and the residual is measured.
+constexpr int kResidualViews = 16;
+
+void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& target, const FitImage* targets,
+               const FitRows& rows, float error[2], const std::atomic<bool>& cancel) {
+    Student student(config, group, rows);
+    Comparison comparison(config);
+    FitScratch target_scratch;
+    FitImage fresh;
+    const auto measure = [&](const Student& s, double sum[2]) {
+        sum[0] = sum[1] = 0;
+        const int count = config.num_views > 0 ? std::min(config.num_views, kResidualViews) : kResidualViews;
+        for (int i = 0; i < count; ++i) {
+            // Spread over the lattice; fresh views take numbers that no step takes.
+            const uint64_t index = config.num_views > 0 ? static_cast<uint64_t>(i) * config.num_views / count : ~uint64_t(0) - i;
+            const FitView view = fit_view(config, group, index);
+            if (config.num_views == 0) fit_target(config, group, target, view, target_scratch, fresh);
+            comparison.residual(s, view, config.num_views > 0 ? targets[index] : fresh, sum);
+        }
+        sum[0] /= count;
+        sum[1] /= count;
+    };
+    double start[2], end[2];
+    measure(student, start);
+    uint64_t next_view = 0;
+    for (int s = 0; s < config.steps && !cancel.load(std::memory_order_relaxed); ++s) {
+        student.clear_gradient();
+        for (int b = 0; b < config.views_per_step; ++b, ++next_view) {
+            if (config.num_views > 0) {
+                // A step prime to the number of views visits all of them, neighbours far apart.
+                const uint64_t index = next_view * 29 % static_cast<uint64_t>(config.num_views);
+                comparison.add_gradient(student, fit_view(config, group, index), targets[index]);
+            } else {
+                const FitView view = fit_view(config, group, next_view);
+                fit_target(config, group, target, view, target_scratch, fresh);
+                comparison.add_gradient(student, view, fresh);
+            }
+        }
+        student.step(s);
+    }
+    measure(student, end);
+    const auto loss_of = [&](const double e[2]) { return config.loss.l1 * e[0] + config.loss.alpha * e[1]; };
+    const bool better = loss_of(end) <= loss_of(start) && student.write(rows);
+    for (int k = 0; k < 2; ++k) error[k] = static_cast<float>(better ? end[k] : start[k]);
+}
+
+}  // namespace V3DG_ISA
+}  // namespace v3dg

@@ -151,18 +151,7 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
         for (uint32_t i = 0; i < count; ++i) {
             const Record<T>& r = records[first + i];
             const uint64_t pairs = num_tiles_of(r);
-            RecordGradient<T>& sum = d_records[i];
-            for (uint64_t p = 0; p < pairs; ++p) {
-                const RecordGradient<T>& d = d_pair[pair_first[first + i] + p];
-                sum.ellipse.u += d.ellipse.u;
-                sum.ellipse.v += d.ellipse.v;
-                sum.ellipse.l11 += d.ellipse.l11;
-                sum.ellipse.l12 += d.ellipse.l12;
-                sum.ellipse.l22 += d.ellipse.l22;
-                sum.ellipse.log2_opacity += d.ellipse.log2_opacity;
-                sum.ellipse.depth += d.ellipse.depth;
-                for (int k = 0; k < 3; ++k) sum.color[k] += d.color[k];
-            }
+            for (uint64_t p = 0; p < pairs; ++p) d_records[i] += d_pair[pair_first[first + i] + p];
         }
         V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(), count, camera, out);
     });

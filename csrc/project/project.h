@@ -48,6 +48,18 @@ template <class T>
 struct RecordGradient {
     Ellipse<T> ellipse;
     T color[3];
+
+    RecordGradient& operator+=(const RecordGradient& d) {
+        ellipse.u += d.ellipse.u;
+        ellipse.v += d.ellipse.v;
+        ellipse.l11 += d.ellipse.l11;
+        ellipse.l12 += d.ellipse.l12;
+        ellipse.l22 += d.ellipse.l22;
+        ellipse.log2_opacity += d.ellipse.log2_opacity;
+        ellipse.depth += d.ellipse.depth;
+        for (int c = 0; c < 3; ++c) color[c] += d.color[c];
+        return *this;
+    }
 };
 
 // Gradients of gaussians, each (N,) or (N, k) row major, and of the SH coefficients (N, bases, 3).
