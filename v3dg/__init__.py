@@ -13,5 +13,22 @@ from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
+from v3dg.scene import Scene, read_scene, write_scene
+from v3dg.select import Selection, select
 
-__all__ = ["Bundle", "Camera", "Clusters", "Gaussians", "Groups", "__version__", "load", "save", "turntable"]
+__all__ = [
+    "Bundle",
+    "Camera",
+    "Clusters",
+    "Gaussians",
+    "Groups",
+    "Scene",
+    "Selection",
+    "__version__",
+    "load",
+    "read_scene",
+    "save",
+    "select",
+    "turntable",
+    "write_scene",
+]

@@ -1,0 +1,65 @@
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "select/select_math.h"
+
+namespace v3dg {
+
+// A pinhole camera in the world, in double precision.
+struct SelectCamera {
+    double rotation[9];  // world to camera, rows
+    double eye[3];
+    double fx, fy, cx, cy, width, height, near;  // px; near in world units
+};
+
+// Similarity transforms p -> scale * rotation p + position.
+struct InstanceTable {
+    Span<const int32_t> bundle;   // [I] which ClusterTable
+    Span<const double> position;  // [I * 3]
+    Span<const double> rotation;  // [I * 9] rows
+    Span<const double> scale;     // [I]
+};
+
+// The camera in the frame of one instance: composed in double precision, then rounded.
+// Frustum planes lie pad_px outside the image.
+InstanceView view_from_instance(const SelectCamera& camera, const InstanceTable& instances, size_t i,
+                                double pad_px);
+
+// Chooses the clusters of all instances that are just detailed enough for one view: exactly one on every path
+// from a leaf to its root, when balls nest and weights never decrease towards the root.
+//
+// Selected pairs are in ascending order of instance, then cluster. Pairs outside the frustum are left out,
+// unless they could touch a pixel. Both halves give the same bits for any number of threads.
+//
+// Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the footprint and the
+// nesting balls are ours.
+struct SelectInput {
+    Span<const ClusterTable> bundles;
+    InstanceTable instances;
+    SelectCamera camera;
+    SelectRule rule;
+};
+
+struct SelectOutput {
+    std::vector<int32_t> instance, cluster;  // [S]
+    int64_t num_gaussians = 0;
+};
+
+namespace cpu {
+void select(const SelectInput& in, SelectOutput& out);
+
+// Metric of every group of every instance, px2. The bundle of instance i has its metrics at metric_offset[i].
+void group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric);
+}  // namespace cpu
+
+namespace cuda {
+// How many devices there are; 0 without a driver.
+int num_devices();
+
+// Host memory in and out. Throws std::runtime_error when CUDA reports an error.
+void select(const SelectInput& in, SelectOutput& out);
+}  // namespace cuda
+
+}  // namespace v3dg

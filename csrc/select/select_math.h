@@ -1,0 +1,125 @@
+#pragma once
+
+// Formulas of selection, compiled without contraction on both halves so that they give the same bits.
+//
+// Every comparison of a metric with the tolerance goes through fits(), and a cluster is drawn when its own
+// group fits and the group above does not: what one test accepts, the other refuses.
+
+#include <cfloat>
+#include <cmath>
+#include <cstdint>
+
+#include "base/host_device.h"
+#include "base/span.h"
+
+namespace v3dg {
+
+struct Ball {
+    float x, y, z, radius;
+};
+
+struct Box {
+    float lo[3], hi[3];
+};
+
+enum class Footprint {
+    solid_angle,  // what the ball covers of the sphere around the eye; turning the camera changes nothing
+    paper,        // pi r^2 fx fy / depth^2; Yang et al., SIGGRAPH 2025
+};
+
+constexpr int kNumPlanes = 5;
+
+// A frustum plane pushed outwards. A point is outside by normal . p + offset, if that is positive.
+struct Plane {
+    float normal[3], offset;
+    // A gaussian's image reaches this much farther, per unit of its box's half depth, than the box itself,
+    // because its projection is linearised at its mean.
+    float guard;
+};
+
+// One camera as one instance sees it: in the instance's own frame and units.
+struct InstanceView {
+    float eye[3];
+    float forward[3];  // unit length
+    Plane plane[kNumPlanes];
+};
+
+// What selection reads of a bundle: G groups, C clusters. Group -1 is none.
+struct ClusterTable {
+    Span<const Ball> ball;             // [G] contains the balls of the groups below it
+    Span<const float> weight;          // [G] per px2, never decreasing towards the root
+    Span<const int32_t> own_group;     // [C] group that made the cluster; -1: always fits
+    Span<const int32_t> parent_group;  // [C] group that replaces the cluster; -1: nothing does
+    Span<const Box> box;               // [C] what the cluster draws, without the filter
+    Span<const int64_t> offset;        // [C + 1] gaussians of each cluster
+    Span<const int32_t> top_group;     // groups that no other group replaces
+    Span<const int32_t> top_cluster;   // clusters that no group replaces
+    Box bounds;                        // of all boxes
+    float pad_px;                      // how far the filter reaches, and a pixel
+};
+
+struct SelectRule {
+    float focal_px2;  // fx fy
+    float tolerance_px2;
+    Footprint footprint;
+    bool culls;  // drop what lies outside the frustum
+};
+
+// Screen area that the ball covers, px2. +inf when the eye is inside, or where there is no number.
+V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view, const SelectRule& rule) {
+    constexpr float kPi = 3.14159265358979f;
+    const float dx = ball.x - view.eye[0], dy = ball.y - view.eye[1], dz = ball.z - view.eye[2];
+    const float radius2 = ball.radius * ball.radius;
+    if (rule.footprint == Footprint::paper) {
+        const float depth = dx * view.forward[0] + dy * view.forward[1] + dz * view.forward[2];
+        const float area = kPi * (radius2 / (depth * depth)) * rule.focal_px2;
+        return area >= 0.0f ? area : INFINITY;
+    }
+    const float x2 = radius2 / (dx * dx + dy * dy + dz * dz);
+    if (!(x2 < 1.0f)) return INFINITY;
+    return 2.0f * kPi * x2 / (1.0f + sqrtf(1.0f - x2)) * rule.focal_px2;
+}
+
+// Screen area, px2, that one gaussian of the clusters made by group g stands for.
+V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
+                                const SelectRule& rule) {
+    return footprint_px2(table.ball[g], view, rule) * table.weight[g];
+}
+
+V3DG_HD inline bool fits(const ClusterTable& table, int32_t g, const InstanceView& view,
+                         const SelectRule& rule) {
+    return metric_px2(table, g, view, rule) <= rule.tolerance_px2;
+}
+
+// Whether nothing of the gaussians in the box can touch a pixel. False where there is no number.
+V3DG_HD inline bool is_outside(const Box& box, const InstanceView& view) {
+    float center[3], half[3], extent[3];
+    for (int a = 0; a < 3; ++a) {
+        center[a] = 0.5f * box.lo[a] + 0.5f * box.hi[a];
+        half[a] = 0.5f * box.hi[a] - 0.5f * box.lo[a];
+        extent[a] = fabsf(center[a]) + half[a];
+    }
+    const float half_depth = fabsf(view.forward[0]) * half[0] + fabsf(view.forward[1]) * half[1] +
+                             fabsf(view.forward[2]) * half[2];
+    for (int p = 0; p < kNumPlanes; ++p) {
+        const Plane& plane = view.plane[p];
+        const float nx = plane.normal[0], ny = plane.normal[1], nz = plane.normal[2];
+        const float middle = nx * center[0] + ny * center[1] + nz * center[2] + plane.offset;
+        const float spread = fabsf(nx) * half[0] + fabsf(ny) * half[1] + fabsf(nz) * half[2];
+        const float terms = fabsf(nx) * extent[0] + fabsf(ny) * extent[1] + fabsf(nz) * extent[2];
+        const float rounding = 16.0f * FLT_EPSILON * (terms + fabsf(plane.offset));
+        if (middle - spread > plane.guard * half_depth + rounding) return true;
+    }
+    return false;
+}
+
+// Whether the clusters that nothing replaces are the cut. The paper's footprint does not grow towards the
+// root, so that a group may fail to fit below one that does.
+V3DG_HD inline bool top_fits(const ClusterTable& table, const InstanceView& view, const SelectRule& rule) {
+    if (rule.footprint == Footprint::paper) return false;
+    for (size_t i = 0; i < table.top_group.size; ++i)
+        if (!fits(table, table.top_group[i], view, rule)) return false;
+    return true;
+}
+
+}  // namespace v3dg

@@ -1,0 +1,149 @@
+"""Bundles with a real layout in space, random poses and cameras: what selection is tested on."""
+
+import itertools
+
+import numpy as np
+
+from v3dg import Bundle, Camera, Clusters, Gaussians, Groups, Scene, _core
+
+REACH = 3.33  # standard deviations until an opaque gaussian falls below 1/255
+
+
+def rotation_matrices(quats):
+    """(N,3,3) of (N,4) w x y z of any length."""
+    w, x, y, z = (np.asarray(quats, np.float64) / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    return np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    ).transpose(2, 0, 1)
+
+
+def covariances(gaussians):
+    axes = rotation_matrices(gaussians.quats) * gaussians.scales[:, None, :].astype(np.float64)
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def box_of(gaussians):
+    """(2,3) float32, rounded outwards: means and their reach."""
+    if len(gaussians) == 0:
+        return np.zeros((2, 3), np.float32)
+    reach = REACH * np.sqrt(np.diagonal(covariances(gaussians), axis1=1, axis2=2))
+    lo, hi = (gaussians.means - reach).min(axis=0), (gaussians.means + reach).max(axis=0)
+    lo32, hi32 = lo.astype(np.float32), hi.astype(np.float32)
+    return np.stack([np.nextafter(lo32, np.float32(-np.inf)), np.nextafter(hi32, np.float32(np.inf))])
+
+
+def blob(rng, count, *, origin=0.0, size=1.0, sh_degree=0):
+    """Gaussians of all shapes in and around a ball; some are needles or plates."""
+    scales = size * np.exp(rng.normal(-3, 1, (count, 1)) + rng.normal(0, 1, (count, 3)))
+    quats = rng.normal(size=(count, 4)) + 1e-3
+    return Gaussians(
+        means=(np.asarray(origin) + size * rng.normal(size=(count, 3))).astype(np.float32),
+        quats=quats.astype(np.float32),
+        scales=scales.astype(np.float32),
+        opacities=rng.uniform(0.05, 1, count).astype(np.float32),
+        sh=rng.normal(size=(count, (sh_degree + 1) ** 2, 3)).astype(np.float32),
+    )
+
+
+def lod_bundle(rng, asset, cluster_size, *, group_size=2, past_root=2, filter_px2=0.1):
+    """A bundle with the layout that a build gives: median split, groups of neighbours, half the gaussians up.
+
+    A group of ``group_size`` clusters is thinned to half as many clusters, at least one; from one cluster on,
+    ``past_root`` further levels halve it.
+    """
+    order, leaf_offset = _core.median_split(asset.means, cluster_size)
+    level = [asset.subset(order[a:b]) for a, b in itertools.pairwise(leaf_offset)]
+    # A unit: clusters made by one group, that group (-1: none), the ball that must be contained.
+    units = [([cluster], -1, None) for cluster in level]
+    clusters, balls, weights, group_level, group_parent, links = [], [], [], [], [], []
+    depth = 0
+    while True:
+        is_last = len(units) == 1 and (depth > 0 or len(level) == 1) and past_root == 0
+        made = []
+        members = max(1, group_size // max(1, len(units[0][0])))
+        runs = [units[i : i + members] for i in range(0, len(units), members)]
+        for run in runs:
+            g = -1 if is_last else len(balls)
+            below = [cluster for unit, _, _ in run for cluster in unit]
+            for unit, own, _ in run:
+                for cluster in unit:
+                    clusters.append(cluster)
+                    links.append((own, g, depth))
+                if own >= 0:
+                    group_parent[own] = g
+            if is_last:
+                continue
+            together = Gaussians.concatenate(below)
+            inner = [ball for _, own, ball in run if own >= 0]
+            if inner:
+                stacked = np.ascontiguousarray(np.stack(inner))
+                ball = _core.bounding_ball_of_balls(stacked, np.array([0, len(inner)]))[0]
+            else:
+                radii = np.ascontiguousarray(together.scales.max(axis=1, initial=0.0))
+                ball = _core.bounding_ball_of_points(together.means, radii, np.array([0, len(together)]))[0]
+            keep = together.subset(np.sort(rng.permutation(len(together))[: max(1, len(together) // 2)]))
+            num_made = max(1, len(below) // 2)
+            parts = [keep.subset(part) for part in np.array_split(np.arange(len(keep)), num_made)]
+            below_weights = [weights[own] for _, own, _ in run if own >= 0]
+            balls.append(ball)
+            weights.append(max([1 / max(1, len(keep)), *below_weights]))
+            group_level.append(depth + 1)
+            group_parent.append(-1)
+            made.append((parts, g, ball))
+        if is_last:
+            break
+        if len(units) == 1:
+            past_root -= 1
+        units, depth = made, depth + 1
+    table = np.array(links, np.int32).reshape(-1, 3)
+    own, parent, levels = (np.ascontiguousarray(column) for column in table.T)
+    offset = np.concatenate([[0], np.cumsum([len(c) for c in clusters])]).astype(np.int64)
+    return Bundle(
+        Clusters(
+            offset=offset,
+            level=levels,
+            own_group=own,
+            parent_group=parent,
+            box=np.stack([box_of(c) for c in clusters]),
+            filter_px2=np.where(levels > 0, filter_px2, 0).astype(np.float32),
+            antialiased=(levels > 0).astype(np.uint8),
+        ),
+        Groups(
+            ball=np.array(balls, np.float32).reshape(-1, 4),
+            weight=np.array(weights, np.float32),
+            parent=np.array(group_parent, np.int32),
+            level=np.array(group_level, np.int32),
+            error=np.full((len(balls), 2), np.nan, np.float32),
+        ),
+        Gaussians.concatenate(clusters),
+    )
+
+
+def random_scene(rng, bundle, count, *, spread=5.0, origin=0.0, log_scale=1.0):
+    scene = Scene()
+    scene.add(
+        bundle,
+        positions=np.asarray(origin) + spread * rng.normal(size=(count, 3)),
+        quaternions=rng.normal(size=(count, 4)) + 1e-6,
+        scales=np.exp(log_scale * rng.normal(size=count)),
+    )
+    return scene
+
+
+def random_camera(rng, *, distance=5.0, origin=0.0, width=64, height=48, **change):
+    eye = np.asarray(origin) + distance * rng.normal(size=3)
+    target = np.asarray(origin) + rng.normal(size=3)
+    fov_x = float(rng.uniform(0.2, 2.4))
+    return Camera.look_at(eye, target, rng.normal(size=3), fov_x, width=width, height=height, **change)
+
+
+def turned(camera, rng):
+    """The camera with another view direction."""
+    axis = rng.normal(size=3)
+    return Camera.look_at(
+        camera.position, camera.position + axis, rng.normal(size=3), width=camera.width, height=camera.height
+    )
