@@ -204,7 +204,7 @@ class ByteReader {
 
     size_t offset() const { return offset_; }
     void skip(size_t size, const PlyElement& element, uint64_t row) {
-        if (size > file_bytes_ - offset_)
+        if (size > file_bytes_ - std::min(offset_, file_bytes_))
             throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
                            quoted(element.name) + ", found the end of the file in row " +
                            std::to_string(row));
@@ -397,12 +397,11 @@ void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
     const bool is_text = ply.encoding == PlyEncoding::ascii;
     // A number and what separates it from the next are two characters; the last may end with the file.
     const size_t row_bytes = is_text ? 2 * element.properties.size() : element.min_row_bytes();
-    const size_t left = ply.file_bytes - offset + (is_text ? 1 : 0);
-    if (row_bytes != 0 && element.count > left / row_bytes)
+    const size_t left = ply.file_bytes - std::min(offset, ply.file_bytes);  // it may have grown since
+    if (row_bytes != 0 && element.count > (left + (is_text ? 1 : 0)) / row_bytes)
         throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
                        quoted(element.name) + " with " + (is_text || element.has_lists() ? "at least " : "") +
-                       std::to_string(row_bytes) + " bytes each, found " +
-                       std::to_string(ply.file_bytes - offset) + " bytes");
+                       std::to_string(row_bytes) + " bytes each, found " + std::to_string(left) + " bytes");
 }
 
 // Returns the offset after the element that begins at `offset`.

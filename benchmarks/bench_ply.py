@@ -1,0 +1,99 @@
+"""How fast .ply files are read and written, and how much memory that takes."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+import v3dg
+
+
+@dataclass
+class Config:
+    num_gaussians: int = 1_000_000
+    sh_degree: int = 0
+    repeats: int = 5
+    seed: int = 0
+    json: bool = False
+
+
+def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
+    rng = np.random.default_rng(seed)
+    quats = rng.standard_normal((num, 4), np.float32)
+    return v3dg.Gaussians(
+        means=rng.standard_normal((num, 3), np.float32),
+        quats=quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        scales=np.exp(rng.standard_normal((num, 3), np.float32) - 5),
+        opacities=rng.random(num, np.float32),
+        sh=rng.standard_normal((num, (degree + 1) ** 2, 3), np.float32),
+    )
+
+
+def peak_bytes() -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
+
+
+def seconds(repeats: int, run: Callable[[], object]) -> list[float]:
+    times = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return times[1:]  # the first one warms up
+
+
+def main(config: Config) -> None:
+    gaussians = random_gaussians(config.num_gaussians, config.sh_degree, config.seed)
+    here = Path(__file__).parent
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True)
+    report: dict[str, object] = {
+        "commit": commit.stdout.strip(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} threads",
+        "isa": v3dg._core.isa(),
+        "num_gaussians": config.num_gaussians,
+        "sh_degree": config.sh_degree,
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bench.ply"
+        before = peak_bytes()
+        v3dg.save(path, gaussians)
+        after_save = peak_bytes()
+        back = v3dg.load(path)
+        report["file_megabytes"] = file_megabytes = path.stat().st_size / 1e6
+        report["save_peak_over_file"] = (after_save - before) / path.stat().st_size
+        report["load_peak_over_file"] = (peak_bytes() - after_save) / path.stat().st_size
+        report["largest_relative_scale_error"] = float(np.max(np.abs(back.scales / gaussians.scales - 1)))
+        report["largest_opacity_error"] = float(np.max(np.abs(back.opacities - gaussians.opacities)))
+        if not np.array_equal(back.sh, gaussians.sh) or not np.array_equal(back.means, gaussians.means):
+            raise SystemExit("what was read is not what was written")
+        del back
+        for name, run in (
+            ("save", lambda: v3dg.save(path, gaussians)),
+            ("load", lambda: v3dg.load(path)),
+        ):
+            times = seconds(config.repeats, run)
+            report[f"{name}_ms"] = [
+                round(1e3 * t, 2) for t in (min(times), statistics.median(times), max(times))
+            ]
+            report[f"{name}_megabytes_a_second"] = file_megabytes / statistics.median(times)
+    if config.json:
+        print(json.dumps(report))
+    else:
+        for key, value in report.items():
+            print(f"{key:30} {value:.4g}" if isinstance(value, float) else f"{key:30} {value}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
