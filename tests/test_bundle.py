@@ -3,6 +3,7 @@ import errno
 import hashlib
 import json
 import os
+import pickle
 import re
 from pathlib import Path
 
@@ -221,6 +222,14 @@ def test_reads_go_on_where_the_system_stops(saved, monkeypatch):
     preadv = os.preadv
     monkeypatch.setattr(os, "preadv", lambda fd, buffers, offset: preadv(fd, [buffers[0][:100]], offset))
     assert_same_gaussians(Bundle.open(path).gaussians, bundle.gaussians)
+
+
+def test_copies_go_through_pickle(saved):
+    bundle, path = saved
+    for original in (bundle, Bundle.open(path)):
+        copy = pickle.loads(pickle.dumps(original))
+        assert_same_tables(copy, bundle)
+        assert_same_gaussians(copy.gaussians, bundle.gaussians)
 
 
 # Lazy
@@ -462,8 +471,8 @@ def with_metadata(**values):
         (with_entry("pages", shape=[-4096]), "pages: expected a tensor"),
         (with_entry("pages", shape=[True]), "pages: expected a tensor"),
         (with_entry("pages", shape=[4096.0]), "pages: expected a tensor"),
-        (with_entry("pages", shape=[2**70]), "tensors: expected at most"),
-        (with_entry("clusters.level", shape=[2**62]), "tensors: expected at most"),
+        (with_entry("pages", shape=[2**70]), "size: expected more than"),
+        (with_entry("clusters.level", shape=[2**62]), "size: expected more than"),
         (with_entry("groups.parent", shape=[0]), "clusters.level|groups.ball|pages|clusters.offset"),
         (with_entry("pages", data_offsets=[0, 0]), "pages: expected"),
         (with_entry("groups.ball", dtype="F64"), "groups.ball: expected"),
@@ -533,7 +542,7 @@ BIG = 2**31 - 1
         ("groups.error", 0, -1, r"groups.error\[0\]: expected 0 or more"),
         ("pages.offset", 1, 0, r"pages.offset\[1\]: expected 4096 for its clusters, got 0"),
         ("pages.offset", -1, 2**63 - 1, r"pages.offset\[\d+\]: expected"),
-        ("pages.bytes", 0, 2**62, r"pages|tensors"),
+        ("pages.bytes", 0, 2**62, r"pages|size"),
         ("pages.first_cluster", 1, 0, r"pages.first_cluster\[1\]: expected"),
         ("pages.num_clusters", 0, -1, r"pages.num_clusters\[0\]: expected"),
     ],
@@ -721,6 +730,14 @@ def test_a_ball_that_barely_sticks_out_is_refused():
     ball[above, 3] = np.float32(needed * (1 - 1e-6))
     with pytest.raises(ValueError, match=r"groups.ball\[0\]: expected a ball inside that of group"):
         Bundle(bundle.clusters, dataclasses.replace(bundle.groups, ball=ball), bundle.gaussians)
+
+
+def test_config_that_no_reader_would_accept_is_refused(saved):
+    bundle, path = saved
+    large = Bundle(bundle.clusters, bundle.groups, bundle.gaussians, {"note": "x" * (1 << 20)})
+    with pytest.raises(ValueError, match="config: expected at most 1048576 bytes of JSON"):
+        large.save(path)
+    assert_same_gaussians(Bundle.open(path).gaussians, bundle.gaussians)
 
 
 @pytest.mark.parametrize("config", [{"a": float("nan")}, {"a": {1, 2}}, {"a": np.float32(1)}])

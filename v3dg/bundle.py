@@ -195,6 +195,12 @@ class Bundle:
         pages = (_attributes(self.read_page(page)) for page in range(self.num_pages))
         bundle_file.write(path, tables, pages, sh_degree=self.sh_degree, config_json=self._config_json)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what is in memory, and of a file its path: the copy opens it again."""
+        if self._file is not None:
+            return Bundle.open, (os.path.abspath(self._file.path),)
+        return Bundle, (self.clusters, self.groups, self._gaussians, self.config)
+
     @property
     def path(self) -> str | None:
         """File that the bundle was opened from, if it was."""

@@ -29,7 +29,7 @@ VERSION = 1
 ALIGNMENT_BYTES = 4096  # of a page in the file: the memory page, so that a page maps or loads directly
 HASH_BYTES = 16
 
-_MAX_HEADER_BYTES = 16 << 20  # the header holds 20 entries and the config; more is damage or an attack
+_MAX_HEADER_BYTES = 1 << 20  # the header holds 20 entries and the config; more is damage or an attack
 _READ_BYTES = 1 << 30  # one read call moves at most 2 GiB - 4 KiB
 _DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
 _SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
@@ -303,7 +303,10 @@ class BundleFile:
                 self._fail(f"{name}: expected a tensor with one side, got {_short(entry)}")
             counts.append(shape[0])
         if max(counts) > self.num_bytes:
-            self._fail(f"tensors: expected at most {self.num_bytes} elements, got {max(counts)}; truncated?")
+            self._fail(
+                f"size: expected more than {_short(max(counts))} bytes for its tensors, got {self.num_bytes}; "
+                "the file is truncated"
+            )
         expected = _entries(*counts)
         for name, entry in expected.items():
             if header.get(name) != entry:
