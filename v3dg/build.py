@@ -1,0 +1,515 @@
+"""Build a bundle from an asset: split it into clusters, then halve and fit level after level."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import threading
+import time
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _core
+from v3dg.bundle import Bundle, Clusters, Groups
+from v3dg.gaussians import Gaussians
+from v3dg.rasterize import rows_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+# Standard deviations at which a gaussian of opacity 1 falls to an alpha of 1/255, and never draws beyond.
+REACH_SIGMAS = 3.33
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """How a bundle is built. The defaults are ours, with the reasons in docs/levels.md; `paper()` is V3DG's.
+
+    Attributes:
+        cluster_size: Most gaussians in a cluster of level 0.
+        group_size: Clusters that are simplified together, a power of two; 2 makes a tree.
+        min_clusters: Levels stop before there are fewer clusters than this ...
+        min_gaussians: ... or fewer gaussians than this.
+        init: Start of a coarser cluster: "merge" pairs of alike gaussians, or "prune" the less important half.
+        prune_growth: Factor for the scales of gaussians that survive pruning.
+        targets: What a level is fitted to: the "leaves" under it or the "previous" level.
+        steps: Steps of Adam for each group; 0 keeps the start.
+        views_per_step: Views that one step looks at.
+        num_views: Views of a group, drawn once; 0 draws a fresh random one each time.
+        supersample: Targets are drawn this much larger and box-averaged.
+        image_size: Side of the views in px; 0 shows a group at the size at which it will be selected.
+        px2_per_gaussian: That size: px² of the group's footprint for each gaussian that it is simplified to.
+        distance: From the camera to the centre of the group, in radii.
+        filter_px2: Variance of the low-pass that the coarser levels are drawn with, px².
+        asset_filter_px2: The same for level 0: what the asset was trained with (0.3 for the original 3DGS).
+        asset_antialiased: Whether the asset was trained with opacities compensated for its filter.
+        loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
+        step_position: Step size of positions, in radii of the group, or in world units if
+            `position_in_world`; the others are of log scales, quaternions, logits and SH coefficients.
+        final_step: What the step sizes have fallen to in the end, exponentially.
+    """
+
+    cluster_size: int = 256
+    group_size: int = 2
+    min_clusters: int = 1
+    min_gaussians: int = 4
+    init: Literal["merge", "prune"] = "merge"
+    prune_growth: float = 2 ** (1 / 6)
+    targets: Literal["leaves", "previous"] = "leaves"
+    steps: int = 400
+    views_per_step: int = 2
+    num_views: int = 64
+    supersample: int = 4
+    image_size: int = 0
+    px2_per_gaussian: float = 1.0
+    distance: float = 4.0
+    filter_px2: float = 0.1
+    asset_filter_px2: float = 0.0
+    asset_antialiased: bool = False
+    loss_l1: float = 1.0
+    loss_dssim: float = 0.0
+    loss_alpha: float = 0.5
+    step_position: float = 0.005
+    position_in_world: bool = False
+    step_log_scale: float = 0.02
+    step_quat: float = 0.02
+    step_logit: float = 0.05
+    step_sh0: float = 0.02
+    step_sh_rest: float = 0.005
+    final_step: float = 0.1
+
+    def __post_init__(self) -> None:
+        def require(name: str, good: bool, expected: str) -> None:
+            if not good:
+                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
+
+        for name in ("cluster_size", "min_clusters", "min_gaussians", "views_per_step", "supersample"):
+            require(name, getattr(self, name) >= 1, "at least 1")
+        for name in ("steps", "num_views", "image_size"):
+            require(name, getattr(self, name) >= 0, "at least 0")
+        for name in ("px2_per_gaussian", "prune_growth", "final_step"):
+            require(name, 0 < getattr(self, name) < math.inf, "a positive number")
+        for field in fields(self):
+            if field.name.startswith(("loss_", "step_")) or field.name.endswith("filter_px2"):
+                require(field.name, 0 <= getattr(self, field.name) < math.inf, "a number of at least 0")
+        size = self.group_size
+        require("group_size", size >= 2 and size & (size - 1) == 0, "a power of two of at least 2")
+        require("init", self.init in ("merge", "prune"), "'merge' or 'prune'")
+        require("targets", self.targets in ("leaves", "previous"), "'leaves' or 'previous'")
+        require("distance", self.distance > 1.1, "more than 1.1 radii, so that the camera is outside the ball")
+
+    @staticmethod
+    def paper(**changes: Any) -> BuildConfig:
+        """The settings of the paper and its code (V3DG, section 3.2 and 5.1), with `changes` to them.
+
+        4,096 gaussians a cluster, two clusters a group, stop at two clusters; prune, grow scales by 2^(1/6);
+        640 fresh random views of 64 x 64 px at four radii, against the previous level, without a filter;
+        0.8 L1 + 0.2 D-SSIM + 0.1 alpha.
+        """
+        return replace(
+            BuildConfig(
+                cluster_size=4096,
+                group_size=2,
+                min_clusters=2,
+                init="prune",
+                targets="previous",
+                steps=640,
+                views_per_step=1,
+                num_views=0,
+                supersample=1,
+                image_size=64,
+                filter_px2=0.0,
+                loss_l1=0.8,
+                loss_dssim=0.2,
+                loss_alpha=0.1,
+                step_position=1.6e-5,
+                position_in_world=True,
+                step_log_scale=5e-3,
+                step_quat=1e-3,
+                step_logit=5e-2,
+                step_sh0=2.5e-3,
+                step_sh_rest=2.5e-3 / 20,
+                final_step=1.0,
+            ),
+            **changes,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """One level while it is built: clusters in order, and for each the group that made it."""
+
+    gaussians: Gaussians
+    offset: npt.NDArray[np.int64]  # (clusters + 1,)
+    # Of the groups that made the clusters; at level 0 every cluster is its own.
+    group_of_cluster: npt.NDArray[np.int32]
+    leaf_range: npt.NDArray[np.int64]  # (groups, 2) gaussians of level 0 under each
+    ball: npt.NDArray[np.float32]  # (groups, 4), nested, for selection
+    weight: npt.NDArray[np.float32]  # (groups,) of its footprint
+    error: npt.NDArray[np.float32]  # (groups, 2)
+
+
+def build_bundle(
+    asset: Gaussians,
+    *,
+    config: BuildConfig | None = None,
+    seed: int = 0,
+    progress: bool = True,
+    device: Literal["auto", "cpu"] = "auto",
+    resume_path: str | os.PathLike[str] | None = None,
+) -> Bundle:
+    """Build all levels of one asset (V3DG, algorithm 1; what we do differently is in docs/levels.md).
+
+    The same asset, config and seed give the same bundle, bit for bit, whatever the number of threads (on one
+    instruction set: wider vectors round differently).
+
+    Args:
+        asset: At least one gaussian, all values finite.
+        config: Settings; ours by default.
+        seed: Of the views that groups are fitted to.
+        progress: Show a bar with groups done, time left and the loss of the level.
+        device: "auto" and "cpu" build on the CPU, the only device of this version.
+        resume_path: Where to keep finished levels until the bundle is done; a build of the same asset, config
+            and seed that finds them there goes on from them.
+
+    Raises:
+        ValueError: The asset is empty or has values that are not finite, or a setting is wrong.
+        KeyboardInterrupt: Ctrl-C; threads have stopped, finished levels are at `resume_path`.
+    """
+    config = config or BuildConfig()
+    if device not in ("auto", "cpu"):
+        raise ValueError(f"device: expected 'auto' or 'cpu', got {device!r}; this version builds on the CPU")
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed: expected 0 to 2^63 - 1, got {seed}")
+    rows = rows_of(asset.numpy())
+    _check_drawable(rows)
+    store = _Checkpoint(resume_path, rows, config, seed)
+    levels = store.load()
+    if not levels:
+        levels = [_leaves(Gaussians(*rows), config)]
+    bar = _Bar(levels, config, progress)
+    try:
+        while (shape := _next_shape(levels[-1], config)) is not None:
+            levels.append(_simplify(levels, shape, config, seed, bar))
+            store.save(levels)
+    finally:
+        bar.close()
+    bundle = _assemble(levels, config, seed)
+    store.remove()
+    return bundle
+
+
+def _check_drawable(rows: tuple[Any, ...]) -> None:
+    if len(rows[0]) == 0:
+        raise ValueError("asset: expected at least one gaussian, got none")
+    for name, values in zip(("means", "quats", "scales", "opacities", "sh"), rows, strict=True):
+        good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        if name in ("scales", "opacities"):
+            good &= (values >= 0).reshape(len(values), -1).all(axis=1)
+        if not good.all():
+            raise ValueError(
+                f"asset: {int((~good).sum())} of {len(good)} gaussians have {name} that are negative or not "
+                f"finite, the first is number {int(np.argmin(good))}; remove them"
+            )
+
+
+def _leaves(asset: Gaussians, config: BuildConfig) -> _Level:
+    order, offset = _core.median_split(asset.means, config.cluster_size)
+    gaussians = asset.subset(order)
+    count = len(offset) - 1
+    ball = _core.bounding_ball_of_points(gaussians.means, gaussians.scales.max(axis=1), offset)
+    return _Level(
+        gaussians,
+        offset,
+        np.arange(count, dtype=np.int32),
+        np.stack([offset[:-1], offset[1:]], axis=1),
+        ball,
+        np.zeros(count, np.float32),
+        np.zeros((count, 2), np.float32),
+    )
+
+
+def _next_shape(level: _Level, config: BuildConfig) -> tuple[int, int] | None:
+    """Groups that the level's clusters form, and clusters each makes; None at the last level."""
+    clusters = len(level.offset) - 1
+    num_groups = max(1, clusters // config.group_size)
+    made = max(1, clusters // num_groups // 2)
+    fewer = len(level.gaussians) // 2
+    if num_groups * made < config.min_clusters or fewer < config.min_gaussians:
+        return None
+    return num_groups, made
+
+
+def _simplify(
+    levels: list[_Level], shape: tuple[int, int], config: BuildConfig, seed: int, bar: _Bar
+) -> _Level:
+    below = levels[-1]
+    num_groups, clusters_made = shape
+    per_group = (len(below.offset) - 1) // num_groups
+    offset = np.ascontiguousarray(below.offset[::per_group])
+    out_offset = np.concatenate([[0], np.cumsum((np.diff(offset) + 1) // 2)])
+    method = _core.merge if config.init == "merge" else _core.prune
+    growth = () if config.init == "merge" else (config.prune_growth,)
+    rows = method(*rows_of(below.gaussians), offset, out_offset, *growth)
+
+    # Groups nest: this level's are runs of whole groups of the level below.
+    first_group = below.group_of_cluster[np.arange(num_groups) * per_group]
+    last_group = below.group_of_cluster[np.arange(1, num_groups + 1) * per_group - 1]
+    child_offset = np.append(first_group, last_group[-1] + 1).astype(np.int64)
+    ball = _core.bounding_ball_of_balls(below.ball, child_offset)
+    leaf_range = np.stack([below.leaf_range[first_group, 0], below.leaf_range[last_group, 1]], axis=1)
+    # Balls of balls are larger than balls of gaussians. What a gaussian stands for goes by the latter, and so
+    # does the picture that is fitted; the weight may not fall towards the root, or the cut would not be exact.
+    leaves = levels[0].gaussians
+    tight = _core.bounding_ball_of_points(
+        leaves.means, leaves.scales.max(axis=1), np.append(leaf_range[:, 0], leaf_range[-1, 1])
+    )
+    share = np.minimum(1.0, (tight[:, 3].astype(np.float64) / ball[:, 3]) ** 2) / np.diff(out_offset)
+    weight = np.maximum(share.astype(np.float32), np.maximum.reduceat(below.weight, child_offset[:-1]))
+
+    from_leaves = config.targets == "leaves"
+    target = levels[0] if from_leaves else below
+    own_filter = from_leaves or len(levels) == 1
+    error = np.zeros((num_groups, 2), np.float32)
+    fit = _fit_config(config, seed, len(levels))
+    _run_fit(
+        bar,
+        num_groups,
+        lambda progress: _core.fit_level(
+            fit,
+            _core.Model(*rows_of(target.gaussians)),
+            config.asset_filter_px2 if own_filter else config.filter_px2,
+            config.asset_antialiased if own_filter else True,
+            leaf_range if from_leaves else np.stack([offset[:-1], offset[1:]], axis=1),
+            np.stack([out_offset[:-1], out_offset[1:]], axis=1),
+            tight,
+            np.arange(num_groups, dtype=np.int64),
+            *rows,
+            error,
+            progress,
+        ),
+    )
+    gaussians, cluster_offset = _split_groups(Gaussians(*rows), out_offset, clusters_made)
+    return _Level(
+        gaussians,
+        cluster_offset,
+        np.repeat(np.arange(num_groups, dtype=np.int32), clusters_made),
+        leaf_range,
+        ball,
+        weight,
+        error,
+    )
+
+
+def _split_groups(
+    gaussians: Gaussians, offset: npt.NDArray[np.int64], parts: int
+) -> tuple[Gaussians, npt.NDArray[np.int64]]:
+    """Split each group's gaussians into `parts` clusters."""
+    if parts == 1:
+        return gaussians, offset
+    orders, counts = [], []
+    for first, last in zip(offset[:-1], offset[1:], strict=True):
+        size = max(1, -(-int(last - first) // parts))
+        order, cuts = _core.median_split(gaussians.means[first:last], size)
+        orders.append(order + first)
+        counts.append(np.diff(cuts))
+    return gaussians.subset(np.concatenate(orders)), np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+
+
+def _fit_config(config: BuildConfig, seed: int, level: int) -> Any:
+    fit = _core.FitConfig()
+    for name in (
+        *("steps", "views_per_step", "num_views", "supersample", "image_size", "px2_per_gaussian", "distance"),
+        *("filter_px2", "step_position", "position_in_world", "step_log_scale", "step_quat", "step_logit"),
+        *("step_sh0", "step_sh_rest", "final_step"),
+    ):
+        setattr(fit, name, getattr(config, name))
+    fit.loss = _core.LossWeights(config.loss_l1, config.loss_dssim, config.loss_alpha)
+    fit.compensate = True
+    # Every level has views of its own.
+    fit.seed = seed * 64 + level
+    return fit
+
+
+def _run_fit(bar: _Bar, num_groups: int, fit: Callable[[Any], None]) -> None:
+    """Run `fit` on a thread of its own, so that Ctrl-C and the bar stay alive while it computes."""
+    state = _core.FitProgress()
+    failure: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            fit(state)
+        except BaseException as error:
+            failure.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        while thread.is_alive():
+            thread.join(0.1)
+            bar.show(state, num_groups)
+    except BaseException:
+        state.cancel()
+        thread.join()
+        raise
+    if failure:
+        raise failure[0]
+
+
+class _Bar:
+    """Progress over all groups of all levels."""
+
+    def __init__(self, levels: list[_Level], config: BuildConfig, visible: bool) -> None:
+        self._bar: Any = None
+        if not visible:
+            return
+        from tqdm import tqdm
+
+        # Work goes with the gaussians that are fitted: each level has half of the one below.
+        total = len(levels[0].gaussians)
+        self._bar = tqdm(total=total, unit="gaussian", unit_scale=True, desc="build", smoothing=0.1)
+        self._level, self._fitted, self._start = len(levels), 0.0, time.monotonic()
+        for level in levels[1:]:
+            self._bar.update(len(level.gaussians))
+
+    def show(self, state: Any, num_groups: int) -> None:
+        if self._bar is None or not state.groups_done:
+            return
+        loss = state.loss_sum / state.groups_done
+        self._bar.set_postfix_str(f"groups {state.groups_done}/{num_groups}, loss {loss:.4f}")
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+
+class _Checkpoint:
+    """Finished levels in a file, written whole after each level and gone once the bundle is made."""
+
+    def __init__(
+        self, path: str | os.PathLike[str] | None, rows: tuple[Any, ...], config: BuildConfig, seed: int
+    ) -> None:
+        self._path = None if path is None else Path(path)
+        if self._path is None:
+            return
+        digest = hashlib.blake2b(digest_size=16)
+        for array in rows:
+            digest.update(str(array.shape).encode())
+            digest.update(np.ascontiguousarray(array))
+        digest.update(json.dumps([asdict(config), seed, _core.isa()], sort_keys=True).encode())
+        self._key = digest.hexdigest()
+
+    def load(self) -> list[_Level]:
+        if self._path is None or not self._path.exists():
+            return []
+        try:
+            with np.load(self._path, allow_pickle=False) as data:
+                if str(data["key"]) != self._key:
+                    raise ValueError(
+                        f"{self._path}: holds levels of another asset, config or seed; remove it to start again"
+                    )
+                return [self._unpack(data, f"{i}.") for i in range(int(data["levels"]))]
+        except (OSError, KeyError, EOFError) as error:
+            raise ValueError(
+                f"{self._path}: expected levels of an interrupted build, could not read them "
+                f"({error}); remove it to start again"
+            ) from error
+
+    @staticmethod
+    def _unpack(data: Any, prefix: str) -> _Level:
+        gaussians = Gaussians(*(data[f"{prefix}{f.name}"] for f in fields(Gaussians)))
+        return _Level(gaussians, *(data[f"{prefix}{f.name}"] for f in fields(_Level)[1:]))
+
+    def save(self, levels: list[_Level]) -> None:
+        if self._path is None:
+            return
+        arrays: dict[str, Any] = {"key": self._key, "levels": len(levels)}
+        for i, level in enumerate(levels):
+            for f in fields(Gaussians):
+                arrays[f"{i}.{f.name}"] = getattr(level.gaussians, f.name)
+            for f in fields(_Level)[1:]:
+                arrays[f"{i}.{f.name}"] = getattr(level, f.name)
+        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.tmp")
+        try:
+            with open(temporary, "wb") as file:
+                np.savez(file, **arrays)
+            os.replace(temporary, self._path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+
+def _boxes(gaussians: Gaussians, offset: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+    """(clusters, 2, 3) lower and upper corner of what each cluster draws."""
+    w, x, y, z = (gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True).clip(1e-30)).T
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    sigma = np.sqrt(np.einsum("ikn,nk->ni", rotation.astype(np.float64) ** 2, gaussians.scales.astype(np.float64) ** 2))
+    # A little more than the reach, for the rounding of the corners.
+    reach = REACH_SIGMAS * 1.0001 * sigma + 1e-6 * np.abs(gaussians.means)
+    low = np.minimum.reduceat(gaussians.means - reach, offset[:-1], axis=0)
+    high = np.maximum.reduceat(gaussians.means + reach, offset[:-1], axis=0)
+    return np.stack([low, high], axis=1).astype(np.float32)
+
+
+def _assemble(levels: list[_Level], config: BuildConfig, seed: int) -> Bundle:
+    cluster_level, own, parent, boxes, offsets = [], [], [], [], [np.zeros(1, np.int64)]
+    group_parent = []
+    first_group = [0]
+    for level in levels[1:]:
+        first_group.append(first_group[-1] + len(level.ball))
+    for i, level in enumerate(levels):
+        count = len(level.offset) - 1
+        cluster_level.append(np.full(count, i, np.int32))
+        offsets.append(offsets[-1][-1] + level.offset[1:])
+        boxes.append(_boxes(level.gaussians, level.offset))
+        own.append(np.full(count, -1, np.int32) if i == 0 else level.group_of_cluster + np.int32(first_group[i - 1]))
+        if i + 1 == len(levels):
+            parent.append(np.full(count, -1, np.int32))
+            if i > 0:
+                group_parent.append(np.full(len(level.ball), -1, np.int32))
+            break
+        num_groups = len(levels[i + 1].ball)
+        consumer = np.repeat(np.arange(num_groups, dtype=np.int32), count // num_groups) + np.int32(first_group[i])
+        parent.append(consumer)
+        if i > 0:
+            up = np.zeros(len(level.ball), np.int32)
+            up[level.group_of_cluster] = consumer
+            group_parent.append(up)
+    def joined(parts: list[Any], dtype: Any, *shape: int) -> Any:
+        return np.concatenate(parts).astype(dtype) if parts else np.zeros((0, *shape), dtype)
+
+    fine = len(levels[0].offset) - 1
+    count = sum(len(level.offset) - 1 for level in levels)
+    clusters = Clusters(
+        offset=np.concatenate(offsets),
+        level=joined(cluster_level, np.int32),
+        own_group=joined(own, np.int32),
+        parent_group=joined(parent, np.int32),
+        box=joined(boxes, np.float32, 2, 3),
+        filter_px2=np.where(np.arange(count) < fine, config.asset_filter_px2, config.filter_px2).astype(np.float32),
+        antialiased=np.where(np.arange(count) < fine, config.asset_antialiased, True).astype(np.uint8),
+    )
+    groups = Groups(
+        ball=joined([level.ball for level in levels[1:]], np.float32, 4),
+        weight=joined([level.weight for level in levels[1:]], np.float32),
+        parent=joined(group_parent, np.int32),
+        level=joined([np.full(len(level.ball), i, np.int32) for i, level in enumerate(levels[1:], 1)], np.int32),
+        error=joined([level.error for level in levels[1:]], np.float32, 2),
+    )
+    gaussians = Gaussians.concatenate([level.gaussians for level in levels])
+    return Bundle(clusters, groups, gaussians, {"build": asdict(config), "seed": seed, "asset_gaussians": len(levels[0].gaussians)})
