@@ -304,7 +304,7 @@ class BundleFile:
             counts.append(shape[0])
         if max(counts) > self.num_bytes:
             self._fail(
-                f"size: expected more than {_short(max(counts))} bytes for its tensors, got {self.num_bytes}; "
+                f"size: expected more than {_short(max(counts))} bytes for tensors, got {self.num_bytes}; "
                 "the file is truncated"
             )
         expected = _entries(*counts)

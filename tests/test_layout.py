@@ -1,0 +1,99 @@
+"""The source tree keeps its layout: what is missing or forgotten in it is named here."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import v3dg
+
+ROOT = Path(__file__).parent.parent
+CSRC = ROOT / "csrc"
+NOT_OPERATIONS = {"base", "math", "pipeline", "bindings"}
+HOST_ONLY = {"ply"}  # reads and writes files: no kernel will ever exist
+FORMULAS_ONLY = {"adam"}  # used inside another operation's loop
+TESTED_WITH = {"adam": "fit_group", "loss": "fit_group"}
+NO_TEST_YET = {"fit_group", "project", "rasterize", "simplify_init", "tile_bin"}
+
+OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)
+SOURCES = sorted(str(p.relative_to(ROOT)) for p in CSRC.rglob("*") if p.suffix in {".cpp", ".cu"})
+MODULES = sorted((ROOT / "v3dg").glob("*.py"))
+
+
+def test_cmake_lists_every_source_once():
+    listed = re.findall(r"\bcsrc/[\w/]+\.(?:cpp|cu)\b", (ROOT / "CMakeLists.txt").read_text(encoding="utf-8"))
+    assert sorted(listed) == SOURCES
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_operation_has_a_contract_and_a_cpu_half(operation):
+    names = {p.name for p in (CSRC / operation).iterdir() if p.stat().st_size}
+    if operation in FORMULAS_ONLY:
+        assert names == {f"{operation}_math.h"}
+        return
+    assert f"{operation}.h" in names
+    if operation not in HOST_ONLY:
+        assert f"{operation}_cpu.cpp" in names
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_operation_has_a_test(operation):
+    name = TESTED_WITH.get(operation, operation)
+    if name not in NO_TEST_YET:
+        assert (ROOT / "tests" / f"test_{name}.py").is_file()
+
+
+def test_headers_are_included_once():
+    headers = [*CSRC.rglob("*.h"), *CSRC.rglob("*.cuh")]
+    assert [str(p) for p in headers if "#pragma once" not in p.read_text(encoding="utf-8")] == []
+
+
+def test_only_the_build_flag_decides_on_cuda():
+    """Host sources know of CUDA only through V3DG_WITH_CUDA and the contracts."""
+    hosts = [p for p in CSRC.rglob("*") if p.suffix in {".cpp", ".h"} and p.name != "host_device.h"]
+    assert [
+        str(p) for p in hosts if re.search(r"__CUDACC__|cuda_runtime", p.read_text(encoding="utf-8"))
+    ] == []
+
+
+def imports_when_loaded(path):
+    """Modules that a Python file imports as it is loaded, not inside functions or for type checkers."""
+    names, statements = set(), list(ast.parse(path.read_text(encoding="utf-8")).body)
+    while statements:
+        statement = statements.pop()
+        if isinstance(statement, ast.Import):
+            names |= {alias.name for alias in statement.names}
+        elif isinstance(statement, ast.ImportFrom):
+            names.add(statement.module)
+            names |= {f"{statement.module}.{alias.name}" for alias in statement.names}
+        elif isinstance(statement, ast.If) and "TYPE_CHECKING" in ast.unparse(statement.test):
+            statements += statement.orelse
+        elif not isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            statements += [child for child in ast.iter_child_nodes(statement) if isinstance(child, ast.stmt)]
+    return names
+
+
+def test_modules_do_not_import_in_a_circle():
+    own = {f"v3dg.{path.stem}" for path in MODULES if path.stem != "__init__"}
+    below = {
+        f"v3dg.{path.stem}": imports_when_loaded(path) & own for path in MODULES if path.stem != "__init__"
+    }
+    while below:
+        ready = {name for name, imported in below.items() if not imported & below.keys()}
+        assert ready, f"import each other: {sorted(below)}"
+        below = {name: imported for name, imported in below.items() if name not in ready}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
+def test_no_module_needs_torch_to_load(path):
+    assert not [name for name in imports_when_loaded(path) if name.split(".")[0] == "torch"]
+
+
+def test_loading_the_package_loads_no_torch(tmp_path):
+    command = "import sys, v3dg; sys.exit('torch' in sys.modules)"
+    environment = os.environ | {"PYTHONPATH": str(Path(v3dg.__file__).parent.parent)}
+    subprocess.run([sys.executable, "-c", command], cwd=tmp_path, env=environment, check=True)
