@@ -166,7 +166,7 @@ def read_scene(
         root = _Node(
             json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant), path.name, ""
         )
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path.name}: expected JSON, got a file that does not parse: {error}") from error
     known = dict(bundles or {})
     if isinstance(root.value, dict) and "asset" in root.value and "format" not in root.value:
@@ -296,7 +296,7 @@ class _Node:
 
 
 def _refuse_constant(name: str) -> Any:
-    raise json.JSONDecodeError(f"{name} is not a JSON number", name, 0)
+    raise ValueError(f"{name} is not a JSON number")
 
 
 def _read_scene(root: _Node, folder: Path, known: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:

@@ -67,8 +67,9 @@ void select_instance(const SelectInput& in, size_t i, std::vector<uint8_t>& fits
     const ClusterTable& table = in.bundles[in.instances.bundle[i]];
     const InstanceView view = view_from_instance(in.camera, in.instances, i, table.pad_px);
     if (in.rule.culls && is_outside(table.bounds, view)) return;
+    const bool culls = in.rule.culls && !is_inside(table.bounds, view);
     const auto draw = [&](int32_t c) {
-        if (in.rule.culls && is_outside(table.box[c], view)) return;
+        if (culls && is_outside(table.box[c], view)) return;
         out.instance.push_back(static_cast<int32_t>(i));
         out.cluster.push_back(c);
         out.num_gaussians += table.offset[c + 1] - table.offset[c];

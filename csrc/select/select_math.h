@@ -91,26 +91,42 @@ V3DG_HD inline bool fits(const ClusterTable& table, int32_t g, const InstanceVie
     return metric_px2(table, g, view, rule) <= rule.tolerance_px2;
 }
 
+// Where a box lies as seen from one plane, in units of the plane's normal.
+struct PlaneSide {
+    float nearest, farthest;  // signed distance of the box's innermost and outermost corner
+    float reach;              // how far gaussians may reach inwards of the box, and bound on rounding
+};
+
+V3DG_HD inline PlaneSide side_of(const Box& box, const InstanceView& view, int p) {
+    const Plane& plane = view.plane[p];
+    float middle = plane.offset, spread = 0.0f, terms = fabsf(plane.offset), half_depth = 0.0f;
+    for (int a = 0; a < 3; ++a) {
+        const float center = 0.5f * box.lo[a] + 0.5f * box.hi[a];
+        const float half = 0.5f * box.hi[a] - 0.5f * box.lo[a];
+        middle += plane.normal[a] * center;
+        spread += fabsf(plane.normal[a]) * half;
+        terms += fabsf(plane.normal[a]) * (fabsf(center) + half);
+        half_depth += fabsf(view.forward[a]) * half;
+    }
+    return {middle - spread, middle + spread, plane.guard * half_depth + 16.0f * FLT_EPSILON * terms};
+}
+
 // Whether nothing of the gaussians in the box can touch a pixel. False where there is no number.
 V3DG_HD inline bool is_outside(const Box& box, const InstanceView& view) {
-    float center[3], half[3], extent[3];
-    for (int a = 0; a < 3; ++a) {
-        center[a] = 0.5f * box.lo[a] + 0.5f * box.hi[a];
-        half[a] = 0.5f * box.hi[a] - 0.5f * box.lo[a];
-        extent[a] = fabsf(center[a]) + half[a];
-    }
-    const float half_depth = fabsf(view.forward[0]) * half[0] + fabsf(view.forward[1]) * half[1] +
-                             fabsf(view.forward[2]) * half[2];
     for (int p = 0; p < kNumPlanes; ++p) {
-        const Plane& plane = view.plane[p];
-        const float nx = plane.normal[0], ny = plane.normal[1], nz = plane.normal[2];
-        const float middle = nx * center[0] + ny * center[1] + nz * center[2] + plane.offset;
-        const float spread = fabsf(nx) * half[0] + fabsf(ny) * half[1] + fabsf(nz) * half[2];
-        const float terms = fabsf(nx) * extent[0] + fabsf(ny) * extent[1] + fabsf(nz) * extent[2];
-        const float rounding = 16.0f * FLT_EPSILON * (terms + fabsf(plane.offset));
-        if (middle - spread > plane.guard * half_depth + rounding) return true;
+        const PlaneSide side = side_of(box, view, p);
+        if (side.nearest > side.reach) return true;
     }
     return false;
+}
+
+// Whether no box within this one is outside. False where there is no number.
+V3DG_HD inline bool is_inside(const Box& box, const InstanceView& view) {
+    for (int p = 0; p < kNumPlanes; ++p) {
+        const PlaneSide side = side_of(box, view, p);
+        if (!(side.farthest + side.reach < 0.0f)) return false;
+    }
+    return true;
 }
 
 // Whether the clusters that nothing replaces are the cut. The paper's footprint does not grow towards the
