@@ -13,6 +13,7 @@ from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
+from v3dg.rasterize import Raster, rasterize
 from v3dg.scene import Scene, read_scene, write_scene
 from v3dg.select import Selection, select
 
@@ -22,10 +23,12 @@ __all__ = [
     "Clusters",
     "Gaussians",
     "Groups",
+    "Raster",
     "Scene",
     "Selection",
     "__version__",
     "load",
+    "rasterize",
     "read_scene",
     "save",
     "select",

@@ -1,0 +1,130 @@
+"""How far apart two answers may be, each bound with its reason; and the comparisons that use them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Bound:
+    """|got - expected| <= absolute + relative * |expected|, element by element."""
+
+    relative: float
+    absolute: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class PictureBound:
+    """Colour and alpha: `absolute` at every pixel, `mean` over all. Depth: `relative_depth` at every pixel.
+
+    A pixel where an alpha lies within the relative distance `band` of 1/255, or a transmittance of 1e-4, may
+    be decided either way. Such pixels are held to `flip`; at most `share` of all pixels may need that.
+    """
+
+    absolute: float
+    mean: float
+    relative_depth: float
+    band: float
+    share: float
+    reason: str
+    # A gaussian more or less at 1/255 changes a pixel by 1/255 of the colours' range (up to 4 here); one more
+    # or less where a pixel stops by the transmittance before it, at most 1e-4 / (1 - 0.999).
+    flip: float = 0.4
+
+
+@dataclass(frozen=True)
+class GradientBound:
+    """Relative L2 distance and cosine over one whole input."""
+
+    relative_l2: float
+    cosine: float
+    reason: str
+
+
+PROJECTION_DOUBLE = Bound(
+    relative=1e-7,
+    absolute=1e-8,
+    reason="float64 on both sides. gsplat takes the determinant as a difference, which for aspect 30 (more "
+    "after foreshortening) loses five of its sixteen digits; gradients square that loss.",
+)
+PICTURE_DOUBLE = PictureBound(
+    absolute=1e-9,
+    mean=1e-11,
+    relative_depth=1e-9,
+    band=1e-8,
+    share=0.0,
+    reason="float64 on both sides, the order of operations differs; needles of aspect 1e3 lose six digits.",
+)
+PICTURE_FLOAT = PictureBound(
+    absolute=1e-4,
+    mean=1e-6,
+    relative_depth=1e-4,
+    band=1e-4,
+    share=0.01,
+    reason="float32 against float64: a mean is off by 1e-6 px to 1e-5 px, which moves the falloff of the "
+    "narrowest gaussians (0.1 px) by 3 sigma * 1e-5 / 0.1. Depth is divided by an alpha of 1/255, itself 1 "
+    "minus a number that is rounded to 6e-8. Measured: 2e-5, 3e-7, 3e-5.",
+)
+NEEDLES_FLOAT = PictureBound(
+    absolute=1e-3,
+    mean=2e-6,
+    relative_depth=1e-3,
+    band=1e-3,
+    share=0.01,
+    reason="As PICTURE_FLOAT, with gaussians of aspect 1e3 that are 0.005 px wide without a filter. "
+    "Measured: 3e-4, 7e-7, 4e-4.",
+)
+GRADIENT_DOUBLE = Bound(
+    relative=1e-7,
+    absolute=1e-9,
+    reason="The same derivatives in float64 by another route; absolute where terms of order 1 cancel.",
+)
+FINITE_DIFFERENCE = Bound(
+    relative=2e-6,
+    absolute=1e-8,
+    reason="Central differences of step 1e-6 in float64: rounding leaves 1e-16 / 1e-6 of the picture's sum.",
+)
+GRADIENT_FLOAT = GradientBound(
+    relative_l2=2e-3,
+    cosine=0.99999,
+    reason="Sums over pixels in float32; single pixels flip at the cut-offs.",
+)
+
+
+def assert_close(got, expected, bound: Bound) -> None:
+    np.testing.assert_allclose(got, expected, rtol=bound.relative, atol=bound.absolute, err_msg=bound.reason)
+
+
+def assert_pictures_agree(raster, picture, bound: PictureBound) -> None:
+    """Compare a v3dg.Raster (NumPy or torch) with a reference Picture."""
+    color, alpha, depth = (np.asarray(x, np.float64) for x in (raster.color, raster.alpha, raster.depth))
+    assert color.shape == picture.color.shape
+    assert alpha.shape == depth.shape == picture.alpha.shape
+    error = np.maximum(np.abs(color - picture.color).max(axis=2), np.abs(alpha - picture.alpha))
+    depth_error = np.abs(depth - picture.depth) / np.where(picture.depth > 0, picture.depth, 1)
+    assert np.isfinite(error).all()
+    assert np.isfinite(depth_error).all()
+    is_off = (error > bound.absolute) | (depth_error > bound.relative_depth)
+    may_flip = picture.cutoff_distance <= bound.band
+    wrong = is_off & ~may_flip
+    if wrong.any():
+        i, j = np.unravel_index(np.argmax(np.where(wrong, error, -1)), error.shape)
+        raise AssertionError(
+            f"{wrong.sum()} of {wrong.size} pixels are off; worst at row {i}, column {j}: "
+            f"colour {color[i, j]} for {picture.color[i, j]}, alpha {alpha[i, j]} for {picture.alpha[i, j]}, "
+            f"depth {depth[i, j]} for {picture.depth[i, j]}, largest depth error {depth_error[wrong].max()}; "
+            f"bound: {bound}"
+        )
+    assert error.max(initial=0) <= bound.flip
+    assert is_off.sum() <= max(bound.share * is_off.size, 2 if bound.share else 0)
+    assert error[~may_flip].mean() <= bound.mean if (~may_flip).any() else True
+
+
+def assert_gradients_agree(got, expected, bound: GradientBound) -> None:
+    got, expected = (np.asarray(x, np.float64).ravel() for x in (got, expected))
+    norm = np.linalg.norm(expected)
+    assert np.linalg.norm(got - expected) <= bound.relative_l2 * norm, bound
+    assert got @ expected >= bound.cosine * np.linalg.norm(got) * norm, bound

@@ -1,0 +1,555 @@
+import hashlib
+import math
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import scenes
+import v3dg
+from compare import (
+    FINITE_DIFFERENCE,
+    GRADIENT_DOUBLE,
+    GRADIENT_FLOAT,
+    NEEDLES_FLOAT,
+    PICTURE_DOUBLE,
+    PICTURE_FLOAT,
+    assert_close,
+    assert_gradients_agree,
+    assert_pictures_agree,
+)
+from reference import rasterize as reference
+
+CAMERAS = pytest.mark.parametrize("camera", scenes.CAMERAS.values(), ids=scenes.CAMERAS.keys())
+MODES = pytest.mark.parametrize(
+    "mode",
+    [
+        {},
+        {"filter_px2": 0.3},
+        {"filter_px2": 0.1, "antialiased": True},
+        {"filter_px2": 0.3, "antialiased": True, "background": (0.2, 0.9, 0.4)},
+    ],
+    ids=["plain", "filter", "antialiased", "background"],
+)
+INPUTS = (*scenes.NAMES, "background")
+
+
+@pytest.fixture
+def torch():
+    return pytest.importorskip("torch")
+
+
+def draw_double(torch, gaussians, camera, **mode):
+    return v3dg.rasterize(scenes.doubles(gaussians, torch=torch), camera, **mode)
+
+
+def digest(raster):
+    arrays = (np.ascontiguousarray(a) for a in (raster.color, raster.alpha, raster.depth))
+    return hashlib.sha256(b"".join(a.tobytes() for a in arrays)).hexdigest()
+
+
+# Agreement with the reference
+
+
+@CAMERAS
+@MODES
+@pytest.mark.parametrize("sh_degree", range(4))
+def test_picture_in_double_is_the_references(torch, camera, mode, sh_degree):
+    gaussians = scenes.random_gaussians(sh_degree, camera, 100, aspect=1e3, sh_degree=sh_degree)
+    picture = reference.rasterize(gaussians, camera, **mode)
+    assert_pictures_agree(draw_double(torch, gaussians, camera, **mode), picture, PICTURE_DOUBLE)
+
+
+@CAMERAS
+@MODES
+@pytest.mark.parametrize("sh_degree", range(4))
+def test_picture_is_the_references(camera, mode, sh_degree):
+    gaussians = scenes.random_gaussians(10 + sh_degree, camera, 100, sh_degree=sh_degree)
+    picture = reference.rasterize(gaussians, camera, **mode)
+    assert (picture.alpha > 0).mean() > 0.5
+    assert_pictures_agree(v3dg.rasterize(gaussians, camera, **mode), picture, PICTURE_FLOAT)
+
+
+@MODES
+def test_many_gaussians_over_many_tiles(torch, mode):
+    camera = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
+    gaussians = scenes.trained_like(20, camera, 1500)
+    picture = reference.rasterize(gaussians, camera, **mode)
+    assert picture.num_blended.max() > 20
+    assert picture.is_stopped.any() or mode.get("antialiased")
+    assert_pictures_agree(draw_double(torch, gaussians, camera, **mode), picture, PICTURE_DOUBLE)
+    assert_pictures_agree(v3dg.rasterize(gaussians, camera, **mode), picture, NEEDLES_FLOAT)
+
+
+@MODES
+@pytest.mark.parametrize("name", scenes.degenerate())
+def test_degenerate_scene_is_the_references(torch, mode, name):
+    gaussians, camera = scenes.degenerate()[name], scenes.CAMERAS["plain"]
+    picture = reference.rasterize(gaussians, camera, **mode)
+    assert_pictures_agree(draw_double(torch, gaussians, camera, **mode), picture, PICTURE_DOUBLE)
+    assert_pictures_agree(v3dg.rasterize(gaussians, camera, **mode), picture, NEEDLES_FLOAT)
+
+
+@pytest.mark.parametrize("name", scenes.poison())
+@MODES
+def test_gaussian_without_meaning_is_not_drawn(name, mode):
+    camera = scenes.CAMERAS["plain"]
+    good = scenes.random_gaussians(3, camera, 20)
+    alone = v3dg.rasterize(good, camera, **mode)
+    with_poison = v3dg.Gaussians.concatenate([scenes.poison()[name], good])
+    assert digest(v3dg.rasterize(with_poison, camera, **mode)) == digest(alone)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_color_without_meaning_stays_where_the_gaussian_is(value):
+    camera = scenes.CAMERAS["plain"]
+    here = scenes.gaussians([-0.4, 0, 2.0], color=(value, 0.5, 0.5))
+    there = scenes.gaussians([0.5, 0, 2.0])
+    both = v3dg.rasterize(v3dg.Gaussians.concatenate([here, there]), camera)
+    right = v3dg.rasterize(there, camera)
+    np.testing.assert_array_equal(both.color[:, 30:], right.color[:, 30:])
+
+
+@pytest.mark.parametrize("num", [1, 2, 7, 8, 9, 15, 16, 17, 31, 33])
+def test_every_count_of_gaussians(num):
+    camera = scenes.CAMERAS["posed"]
+    gaussians = scenes.random_gaussians(num, camera, num, sh_degree=1)
+    picture = reference.rasterize(gaussians, camera, filter_px2=0.1)
+    assert_pictures_agree(v3dg.rasterize(gaussians, camera, filter_px2=0.1), picture, PICTURE_FLOAT)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (31, 33), (32, 32), (33, 31), (64, 65), (129, 3)])
+def test_every_image_size(size):
+    camera = scenes.camera(*size, fx=40.0)
+    gaussians = scenes.random_gaussians(7, camera, 60, size_px=(1, 8))
+    picture = reference.rasterize(gaussians, camera)
+    assert_pictures_agree(v3dg.rasterize(gaussians, camera), picture, PICTURE_FLOAT)
+
+
+@st.composite
+def wild_gaussian(draw):
+    """One gaussian anywhere, of any shape, seen by any of the cameras."""
+    log_scale = st.floats(-5, 1.5)
+    place = st.floats(-3, 3, width=32)
+    return scenes.gaussians(
+        [draw(place), draw(place), draw(st.floats(-1, 4, width=32))],
+        quats=[draw(st.floats(-1, 1)) for _ in range(3)] + [draw(st.floats(0.1, 1))],
+        scales=[10.0 ** draw(log_scale) for _ in range(3)],
+        opacities=draw(st.floats(0, 1)),
+    )
+
+
+@given(
+    gaussian=wild_gaussian(),
+    size=st.tuples(st.integers(1, 70), st.integers(1, 70)),
+    center=st.tuples(st.floats(-20, 90), st.floats(-20, 90)),
+    filter_px2=st.sampled_from([0.0, 0.1, 0.3]),
+)
+@settings(max_examples=200)
+def test_tiles_lose_no_pixel_of_any_gaussian(gaussian, size, center, filter_px2):
+    torch = pytest.importorskip("torch")
+    camera = scenes.camera(*size, fx=30.0, fy=45.0, cx=center[0], cy=center[1])
+    picture = reference.rasterize(gaussian, camera, filter_px2=filter_px2)
+    assert_pictures_agree(
+        draw_double(torch, gaussian, camera, filter_px2=filter_px2), picture, PICTURE_DOUBLE
+    )
+
+
+# Properties
+
+
+def test_gaussian_nearer_than_near_is_not_drawn():
+    at = scenes.gaussians([[0, 0, 0.5]], scales=0.01)
+    for near, drawn in ((0.499, True), (0.5, True), (0.501, False)):
+        alpha = v3dg.rasterize(at, scenes.camera(near=near)).alpha
+        assert (alpha.max() > 0) == drawn
+
+
+def test_background_is_composed_last():
+    camera = scenes.CAMERAS["plain"]
+    gaussians = scenes.random_gaussians(4, camera, 30)
+    black = v3dg.rasterize(gaussians, camera)
+    shown = v3dg.rasterize(gaussians, camera, background=(0.25, 1.0, 2.0))
+    np.testing.assert_array_equal(shown.alpha, black.alpha)
+    np.testing.assert_array_equal(shown.depth, black.depth)
+    np.testing.assert_allclose(
+        shown.color, black.color + (1 - black.alpha)[..., None] * [0.25, 1.0, 2.0], atol=1e-6
+    )
+
+
+def test_empty_set_shows_the_background():
+    raster = v3dg.rasterize(
+        scenes.gaussians(np.zeros((0, 3))), scenes.camera(5, 3), background=(0.1, 0.2, 0.3)
+    )
+    np.testing.assert_array_equal(raster.color, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (3, 5, 3)))
+    assert not raster.alpha.any()
+    assert not raster.depth.any()
+
+
+def test_equal_depths_are_drawn_in_the_order_of_their_index():
+    camera = scenes.camera(33, 33)
+    red, blue = [1.0, 0, 0], [0, 0, 1.0]
+    for colors in ([red, blue], [blue, red]):
+        pair = scenes.gaussians([[0, 0, 2.0]] * 2, opacities=0.7, color=colors)
+        center = v3dg.rasterize(pair, camera).color[16, 16]
+        expected = 0.7 * np.array(colors[0]) + 0.3 * 0.7 * np.array(colors[1])
+        np.testing.assert_allclose(center, expected, atol=2e-6)
+
+
+def test_order_of_the_arrays_does_not_matter():
+    camera = scenes.CAMERAS["off_centre"]
+    gaussians = scenes.trained_like(6, camera, 300)
+    order = np.random.default_rng(0).permutation(300)
+    assert digest(v3dg.rasterize(gaussians, camera)) == digest(
+        v3dg.rasterize(gaussians.subset(order), camera)
+    )
+
+
+def test_gaussians_out_of_sight_change_nothing():
+    camera = scenes.CAMERAS["plain"]
+    seen = scenes.random_gaussians(9, camera, 50)
+    unseen = scenes.gaussians(
+        [[0, 0, -2], [50, 0, 1], [0, -50, 1], [0, 0, 2], [0, 0, 3.0]],
+        scales=[[1.0] * 3, [0.1] * 3, [0.1] * 3, [1.0] * 3, [0.0] * 3],
+        opacities=[1, 1, 1, 0, 1],
+    )
+    alone = digest(v3dg.rasterize(seen, camera))
+    assert digest(v3dg.rasterize(v3dg.Gaussians.concatenate([unseen, seen]), camera)) == alone
+    assert digest(v3dg.rasterize(v3dg.Gaussians.concatenate([seen, unseen]), camera)) == alone
+
+
+def test_moving_world_and_camera_together_changes_only_rounding():
+    camera = scenes.CAMERAS["posed"]
+    gaussians = scenes.random_gaussians(5, camera, 100)
+    shift = np.array([4.0, -2.0, 8.0])
+    viewmat = camera.viewmat.copy()
+    viewmat[:3, 3] -= viewmat[:3, :3] @ shift
+    moved = scenes.replaced(gaussians, means=gaussians.means + shift.astype(np.float32))
+    there = v3dg.Camera(viewmat, camera.K, camera.width, camera.height)
+    picture = reference.rasterize(gaussians, camera, filter_px2=0.3)
+    assert_pictures_agree(v3dg.rasterize(moved, there, filter_px2=0.3), picture, PICTURE_FLOAT)
+
+
+def test_antialiased_keeps_what_a_small_gaussian_adds_to_the_picture():
+    camera = scenes.camera(33, 33)
+    tiny = scenes.gaussians([0.003, 0.002, 2.0], scales=0.02, opacities=0.5)  # half a pixel
+    sharp, soft = (v3dg.rasterize(tiny, camera, **m).alpha.sum() for m in ({}, {"filter_px2": 0.3}))
+    kept = v3dg.rasterize(tiny, camera, filter_px2=0.3, antialiased=True).alpha.sum()
+    assert soft > 1.5 * sharp
+    assert abs(kept - sharp) < 0.1 * sharp
+
+
+# Kinds of arrays and wrong arguments
+
+
+def test_numpy_in_numpy_out():
+    raster = v3dg.rasterize(scenes.gaussians([0, 0, 1.0]), scenes.camera(20, 10))
+    for array, shape in ((raster.color, (10, 20, 3)), (raster.alpha, (10, 20)), (raster.depth, (10, 20))):
+        assert isinstance(array, np.ndarray)
+        assert array.dtype == np.float32
+        assert array.shape == shape
+
+
+@pytest.mark.parametrize("mode", [{}, {"filter_px2": 0.3, "antialiased": True, "background": (1, 0.5, 0)}])
+def test_torch_in_torch_out(torch, mode):
+    camera = scenes.CAMERAS["off_centre"]
+    gaussians = scenes.random_gaussians(2, camera, 40, sh_degree=2)
+    raster = v3dg.rasterize(gaussians.torch(), camera, **mode)
+    for tensor in (raster.color, raster.alpha, raster.depth):
+        assert isinstance(tensor, torch.Tensor)
+        assert tensor.dtype == torch.float32
+        assert not tensor.requires_grad
+    assert digest(raster) == digest(v3dg.rasterize(gaussians, camera, **mode))
+
+
+def test_inputs_are_left_as_they_were(torch):
+    camera = scenes.CAMERAS["plain"]
+    gaussians = scenes.random_gaussians(2, camera, 40, sh_degree=2)
+    before = [getattr(gaussians, n).copy() for n in scenes.NAMES]
+    tensors = gaussians.torch()
+    tensors.means.requires_grad_()
+    v3dg.rasterize(gaussians, camera)
+    v3dg.rasterize(tensors, camera).color.sum().backward()
+    for name, array in zip(scenes.NAMES, before, strict=True):
+        np.testing.assert_array_equal(getattr(gaussians, name), array)
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"),
+    [
+        ({"filter_px2": -0.1}, "filter_px2: expected"),
+        ({"filter_px2": math.nan}, "filter_px2: expected"),
+        ({"background": (1.0, 2.0)}, "background: expected three"),
+        ({"background": (1.0, 2.0, 3.0, 4.0)}, "background: expected three"),
+    ],
+)
+def test_wrong_arguments_are_refused(mode, message):
+    with pytest.raises(ValueError, match=message):
+        v3dg.rasterize(scenes.gaussians([0, 0, 1.0]), scenes.camera(), **mode)
+
+
+# Gradients
+
+
+def weighted_sum(torch, raster, seed=0):
+    """A number that every pixel of colour, alpha and depth has a part in."""
+    rng = np.random.default_rng(seed)
+    parts = [raster.color, raster.alpha, raster.depth] if hasattr(raster, "color") else raster
+    return sum((p * torch.from_numpy(rng.normal(size=tuple(p.shape))).to(p.dtype)).sum() for p in parts)
+
+
+def leaves(torch, gaussians, background, dtype):
+    """The five inputs and the background as leaf tensors."""
+    arrays = [getattr(gaussians, name) for name in scenes.NAMES] + [background]
+    return [torch.tensor(np.asarray(a), dtype=dtype, requires_grad=True) for a in arrays]
+
+
+def draw_leaves(inputs, camera, **mode):
+    g = SimpleNamespace(**dict(zip(scenes.NAMES, inputs[:5], strict=True)))
+    return v3dg.rasterize(g, camera, background=inputs[5], **mode)
+
+
+GRADIENT_MODES = pytest.mark.parametrize(
+    "mode",
+    [{}, {"filter_px2": 0.3}, {"filter_px2": 0.1, "antialiased": True}],
+    ids=["plain", "filter", "antialiased"],
+)
+BACKGROUND = (0.3, -0.2, 0.8)
+
+
+@CAMERAS
+@GRADIENT_MODES
+def test_gradients_in_double_are_those_of_autograd(torch, camera, mode):
+    from reference import rasterize_torch
+
+    gaussians = scenes.random_gaussians(30, camera, 40, size_px=(0.5, 10), sh_degree=3, opacity=(0.02, 1.2))
+    inputs = leaves(torch, gaussians, BACKGROUND, torch.float64)
+    got = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
+    raster = rasterize_torch.rasterize(*inputs, camera, **mode)
+    expected = torch.autograd.grad(weighted_sum(torch, raster), inputs)
+    for name, g, e in zip(INPUTS, got, expected, strict=True):
+        assert e.abs().max() > 0, name
+        assert_close(g.numpy(), e.numpy(), GRADIENT_DOUBLE)
+
+
+def smooth_scene(camera, mode, num=8, sh_degree=3):
+    return scenes.first_smooth(
+        lambda seed: scenes.random_gaussians(
+            seed, camera, num, size_px=(1.5, 6), aspect=8, sh_degree=sh_degree, margin=-0.1
+        ),
+        camera,
+        **mode,
+    )
+
+
+SMOOTH_CAMERAS = {
+    "off_centre": scenes.camera(21, 17, fx=20.0, cx=6.5, cy=14.0, pose=scenes.pose(2)),
+    "non_square": scenes.camera(14, 22, fx=15.0, fy=30.0, cx=7.0, cy=9.5, pose=scenes.pose(3)),
+    "clamped": scenes.camera(16, 16, fx=30.0, cx=-20.0, cy=40.0, pose=scenes.pose(4)),
+}
+
+
+@pytest.mark.parametrize("name", SMOOTH_CAMERAS)
+@GRADIENT_MODES
+def test_gradients_are_finite_differences(torch, name, mode):
+    camera = SMOOTH_CAMERAS[name]
+    gaussians = smooth_scene(camera, mode)
+    picture = reference.rasterize(gaussians, camera, **mode)
+    assert (picture.alpha > 0).mean() > 0.5
+    assert (picture.contribution > 0).all()
+    inputs = leaves(torch, gaussians, BACKGROUND, torch.float64)
+    gradients = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
+    generator = torch.Generator().manual_seed(0)
+    step = 1e-6
+    for i, (input_name, gradient) in enumerate(zip(INPUTS, gradients, strict=True)):
+        rows = gradient.reshape(len(gradient), -1)
+        assert (rows.abs().max(dim=1).values > 0).all(), f"{input_name}: rows without gradient"
+        for _ in range(4):
+            direction = torch.randn(inputs[i].shape, generator=generator, dtype=torch.float64)
+            if input_name == "scales":
+                direction *= inputs[i].detach()  # steps in proportion: no scale changes sign
+            values = []
+            for sign in (1, -1):
+                moved = [t.detach() for t in inputs]
+                moved[i] = moved[i] + sign * step * direction
+                values.append(weighted_sum(torch, draw_leaves(moved, camera, **mode)).item())
+            measured = (values[0] - values[1]) / (2 * step)
+            size = gradient.norm().item() * direction.norm().item()
+            error = abs((gradient * direction).sum().item() - measured)
+            assert error <= FINITE_DIFFERENCE.relative * size + FINITE_DIFFERENCE.absolute, input_name
+
+
+def test_each_coordinate_is_its_finite_difference(torch):
+    camera = SMOOTH_CAMERAS["off_centre"]
+    mode = {"filter_px2": 0.1, "antialiased": True}
+    gaussians = smooth_scene(camera, mode, num=3)
+    inputs = leaves(torch, gaussians, BACKGROUND, torch.float64)
+    gradients = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
+    step = 1e-6
+    for i, gradient in enumerate(gradients):
+        for k in range(gradient.numel()):
+            values = []
+            for sign in (1, -1):
+                moved = [t.detach().clone() for t in inputs]
+                moved[i].view(-1)[k] += sign * step
+                values.append(weighted_sum(torch, draw_leaves(moved, camera, **mode)).item())
+            measured = (values[0] - values[1]) / (2 * step)
+            assert abs(gradient.reshape(-1)[k].item() - measured) <= (
+                FINITE_DIFFERENCE.relative * gradient.norm().item() + 1e-7
+            ), (INPUTS[i], k)
+
+
+@CAMERAS
+@GRADIENT_MODES
+def test_gradients_in_float_are_those_in_double(torch, camera, mode):
+    gaussians = scenes.random_gaussians(40, camera, 200, size_px=(0.5, 8), sh_degree=3)
+    gradients = []
+    for dtype in (torch.float32, torch.float64):
+        inputs = leaves(torch, gaussians, BACKGROUND, dtype)
+        gradients.append(
+            torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
+        )
+    for name, single, double in zip(INPUTS, *gradients, strict=True):
+        assert single.dtype == torch.float32
+        assert double.abs().max() > 0, name
+        assert_gradients_agree(single, double, GRADIENT_FLOAT)
+
+
+@pytest.mark.parametrize("which", ["color", "alpha", "depth"])
+def test_each_output_has_gradients_of_its_own(torch, which):
+    from reference import rasterize_torch
+
+    camera = scenes.CAMERAS["posed"]
+    gaussians = scenes.random_gaussians(31, camera, 20, sh_degree=1)
+    inputs = leaves(torch, gaussians, BACKGROUND, torch.float64)
+    ours = getattr(draw_leaves(inputs, camera, filter_px2=0.3), which)
+    color, alpha, depth = rasterize_torch.rasterize(*inputs, camera, filter_px2=0.3)
+    theirs = {"color": color, "alpha": alpha, "depth": depth}[which]
+    got = torch.autograd.grad(weighted_sum(torch, [ours]), inputs)
+    expected = torch.autograd.grad(weighted_sum(torch, [theirs]), inputs, allow_unused=True)
+    assert expected[0].abs().max() > 0
+    for g, e in zip(got, expected, strict=True):
+        assert_close(g.numpy(), 0 * g.numpy() if e is None else e.numpy(), GRADIENT_DOUBLE)
+
+
+def test_gaussians_that_are_not_drawn_have_zero_gradients(torch):
+    camera = scenes.CAMERAS["plain"]
+    seen = scenes.random_gaussians(9, camera, 10)
+    unseen = [
+        *scenes.poison().values(),
+        scenes.degenerate()["behind"],
+        scenes.degenerate()["opacity_below_threshold"],
+    ]
+    gaussians = v3dg.Gaussians.concatenate([seen, *unseen])
+    inputs = leaves(torch, gaussians, BACKGROUND, torch.float32)
+    gradients = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, filter_px2=0.1)), inputs)
+    alone = leaves(torch, seen, BACKGROUND, torch.float32)
+    expected = torch.autograd.grad(weighted_sum(torch, draw_leaves(alone, camera, filter_px2=0.1)), alone)
+    for g, e in zip(gradients[:5], expected[:5], strict=True):
+        np.testing.assert_array_equal(g[:10].numpy(), e.numpy())
+        assert not g[10:].any()
+
+
+@pytest.mark.parametrize("name", scenes.degenerate())
+@GRADIENT_MODES
+def test_gradients_of_degenerate_scenes_are_finite(torch, name, mode):
+    camera = scenes.CAMERAS["plain"]
+    inputs = leaves(torch, scenes.degenerate()[name], BACKGROUND, torch.float32)
+    gradients = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
+    for g, i in zip(gradients, inputs, strict=True):
+        assert g.shape == i.shape
+        assert g.isfinite().all()
+
+
+def test_gradient_descent_finds_a_moved_gaussian(torch):
+    camera = scenes.camera(32, 32, fx=30.0)
+    target = v3dg.rasterize(scenes.gaussians([0.15, -0.1, 2.0], scales=0.2), camera)
+    start = scenes.gaussians([0.0, 0.0, 2.0], scales=0.25).torch()
+    start.means.requires_grad_()
+    optimizer = torch.optim.Adam([start.means], lr=0.02)
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.97)
+    goal = torch.from_numpy(target.color)
+    for _ in range(150):
+        optimizer.zero_grad()
+        (v3dg.rasterize(start, camera).color - goal).square().sum().backward()
+        optimizer.step()
+        decay.step()
+    x, y, depth = start.means.detach()[0].tolist()
+    np.testing.assert_allclose([x / depth, y / depth], [0.075, -0.05], atol=0.001)
+    np.testing.assert_allclose(
+        depth, 2.5, atol=0.05
+    )  # larger than the target: it goes where it looks as small
+
+
+# The same on every run and machine
+
+RUN = """
+import sys
+import numpy as np, scenes, v3dg
+camera = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
+gaussians = scenes.trained_like(20, camera, 1500)
+out = []
+for _ in range(2):
+    raster = v3dg.rasterize(gaussians, camera, filter_px2=0.1, antialiased=True, background=(0.1, 0.2, 0.3))
+    out.append([raster.color, raster.alpha, raster.depth])
+if sys.argv[2] == "gradients":
+    from test_rasterize import draw_leaves, leaves, weighted_sum
+    import torch
+    for arrays in out:
+        inputs = leaves(torch, gaussians, (0.1, 0.2, 0.3), torch.float32)
+        loss = weighted_sum(torch, draw_leaves(inputs, camera, filter_px2=0.1, antialiased=True))
+        arrays += [g.numpy() for g in torch.autograd.grad(loss, inputs)]
+for a, b in zip(*out):
+    np.testing.assert_array_equal(a, b)
+np.savez(sys.argv[1], *out[0])
+"""
+
+
+def run_elsewhere(path, what, **environment):
+    """Arrays that RUN makes in a process of its own, or None where the processor lacks the instructions."""
+    here = os.path.dirname(os.path.abspath(__file__))
+    root = os.path.dirname(os.path.dirname(os.path.abspath(v3dg.__file__)))
+    paths = os.pathsep.join([here, root, os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, str(path), what],
+        env={**os.environ, "PYTHONPATH": paths, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if "this processor has no" in done.stderr:
+        return None
+    assert done.returncode == 0, done.stderr
+    with np.load(path) as file:
+        return [file[key] for key in file.files]
+
+
+def test_number_of_threads_changes_nothing(torch, tmp_path):
+    one, two, five = (
+        run_elsewhere(tmp_path / f"{n}.npz", "gradients", OMP_NUM_THREADS=n) for n in ("1", "2", "5")
+    )
+    assert all(np.abs(a).max() > 0 for a in one)
+    for a, b, c in zip(one, two, five, strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, c)
+
+
+@pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
+def test_every_instruction_set_draws_the_reference(tmp_path, isa):
+    arrays = run_elsewhere(tmp_path / "out.npz", "picture", V3DG_ISA=isa)
+    if arrays is None:
+        pytest.skip(f"this processor has no {isa}")
+    camera = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
+    picture = reference.rasterize(
+        scenes.trained_like(20, camera, 1500),
+        camera,
+        filter_px2=0.1,
+        antialiased=True,
+        background=(0.1, 0.2, 0.3),
+    )
+    assert_pictures_agree(v3dg.Raster(*arrays), picture, NEEDLES_FLOAT)
