@@ -1,3 +1,5 @@
+import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -12,7 +14,7 @@ from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, covariances, lod_bundle, random_camera, random_scene, rotation_matrices, turned
 from v3dg import Bundle, Camera, Gaussians, Scene, _core, select
-from v3dg.select import group_metrics
+from v3dg.select import _product, group_metrics
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 seeds = st.integers(0, 2**32 - 1)
@@ -48,6 +50,15 @@ def tolerances_of(draw, scene, camera):
     metrics = np.concatenate([*group_metrics(scene, camera), np.zeros(1, np.float32)])
     exact = float(draw(st.sampled_from(sorted(set(metrics.tolist())))))
     return draw(st.sampled_from([0.0, exact, np.inf, 1e-3, 0.5, 1e4]))
+
+
+def test_many_random_trials_have_no_violation(capsys):
+    path = Path(__file__).parents[1] / "benchmarks" / "exact_cut.py"
+    spec = importlib.util.spec_from_file_location("exact_cut", path)
+    exact_cut = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(exact_cut)
+    assert exact_cut.main(["--trials", "200000", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["violations"] == 0
 
 
 @settings(max_examples=300)
@@ -233,6 +244,32 @@ def test_frustum_never_drops_what_a_pixel_shows(seed, distance, off_center):
         filter_px2 = float(bundle.clusters.filter_px2[c])
         for mean, covariance in zip(*frames(gaussians, scene, i, camera), strict=True):
             assert not reference.touches_image(mean, covariance, filter_px2, camera)
+
+
+@pytest.mark.parametrize("side", range(4))
+def test_frustum_keeps_needles_whose_image_leans_in(side):
+    # The needle lies beside the image and along its edge, past the eye. Its projection is linearised at its
+    # mean, outside the image, so its picture lies across the edge although the needle itself does not.
+    asset = Gaussians(
+        means=np.zeros((1, 3), np.float32),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        scales=np.array([[0.001, 0.001, 1.3]], np.float32),
+        opacities=np.ones(1, np.float32),
+        sh=np.ones((1, 1, 3), np.float32),
+    )
+    bundle = lod_bundle(np.random.default_rng(0), asset, 1, past_root=0)
+    eighth, quarter = np.array([np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0]), side * np.pi / 4
+    about_view = np.array([np.cos(quarter), 0, 0, np.sin(quarter)])
+    turn = rotation_matrices(about_view[None])[0]
+    scene = Scene()
+    scene.add(bundle, turn @ [1.2, 0, 1], quaternions=_product(about_view[None], eighth[None])[0])
+    camera = Camera(np.eye(4), [[50, 0, 50], [0, 50, 50], [0, 0, 1]], 100, 100)
+    mean, covariance = (values[0] for values in frames(asset, scene, 0, camera))
+    assert reference.touches_image(mean, covariance, 0.0, camera)
+    assert len(select(scene, camera, tolerance=1.0)) == 1
+    away = Scene()
+    away.add(bundle, turn @ [2.5, 0, 1], quaternions=scene.quaternions)
+    assert len(select(away, camera, tolerance=1.0)) == 0
 
 
 def test_frustum_drops_most_of_what_lies_outside():
