@@ -348,16 +348,23 @@ def _run_fit(bar: _Bar, num_groups: int, fit: Callable[[Any], None]) -> None:
         except BaseException as error:
             failure.append(error)
 
+        finally:
+            done.set()
+
+    # Not Thread.join: Ctrl-C during it can make Python 3.11 take the thread for finished while it runs.
+    done = threading.Event()
     thread = threading.Thread(target=work)
     thread.start()
     try:
-        while thread.is_alive():
-            thread.join(0.1)
+        while not done.wait(0.1):
             bar.show(state, num_groups)
+        bar.show(state, num_groups)
     except BaseException:
         state.cancel()
+        done.wait()
         thread.join()
         raise
+    thread.join()
     if failure:
         raise failure[0]
 
