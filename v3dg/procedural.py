@@ -241,7 +241,7 @@ def _ground_height(points: Array, noise: _Noise) -> Array:
 def _ground(n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
     """Moss: a closed layer of discs and a fur of needles on it."""
     n_base = n // 3
-    disc = _revolve(lambda t: (1.03 * t, np.zeros_like(t)), n_base)
+    disc = _revolve(lambda t: (1.18 * t, np.zeros_like(t)), n_base)  # under the neighbours' rims too
     points = disc.points.copy()
     points[:, 2] = _ground_height(points, noise)
     e = 1e-3
