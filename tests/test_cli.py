@@ -1,0 +1,202 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import v3dg
+from v3dg import cli
+from v3dg.procedural import make_asset
+
+# The package under test, wherever the command starts.
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
+COMMAND = [sys.executable, "-m", "v3dg.cli"]
+
+
+def run(*arguments, cwd=None):
+    command = [*COMMAND, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=ENVIRONMENT)
+
+
+def fails(code, message, *arguments, cwd):
+    """Runs a command that must fail with one line on stderr, an exit code and nothing new in the folder."""
+    before = sorted(os.listdir(cwd))
+    done = run(*arguments, cwd=cwd)
+    assert done.returncode == code, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("v3dg: error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert sorted(os.listdir(cwd)) == before
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with an asset, a bundle and a scene of three instances and two cameras."""
+    folder = tmp_path_factory.mktemp("cli")
+    v3dg.save(folder / "tuft.ply", make_asset(1000))
+    done = run("build", "tuft.ply", "--quiet", "--json", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    (folder / "build.json").write_text(done.stdout)
+    scene = {
+        "format": "v3dg-scene",
+        "version": 1,
+        "bundles": {"tuft": "tuft.v3dg"},
+        "instances": [{"bundle": "tuft", "position": [2 * i, 0, 0]} for i in range(3)],
+        "cameras": [
+            {"name": "near", "width": 48, "height": 32, "eye": [0, -4, 2], "target": [1, 0, 0.4]},
+            {"name": "far away", "width": 32, "height": 32, "eye": [0, -40, 9], "target": [2, 0, 0]},
+        ],
+    }
+    (folder / "scene.json").write_text(json.dumps(scene))
+    (folder / "broken.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n")
+    return folder
+
+
+def test_version():
+    done = run("--version")
+    assert done.returncode == 0
+    assert done.stdout.split() == ["v3dg", v3dg.__version__]
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["build", "--help"], ["demo", "--help"]])
+def test_help(arguments):
+    done = run(*arguments)
+    assert done.returncode == 0
+    assert "usage: v3dg" in done.stdout
+
+
+def test_module_runs_too():
+    command = [sys.executable, "-m", "v3dg", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT)
+    assert done.stdout.split() == ["v3dg", v3dg.__version__]
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys, v3dg.cli; "
+        "print([m for m in ('torch', 'PIL', 'flip_evaluator', 'matplotlib', 'scipy') if m in sys.modules])"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=ENVIRONMENT)
+    assert done.stdout.strip() == "[]"
+
+
+def test_build_reports_what_it_wrote(folder):
+    result = json.loads((folder / "build.json").read_text())
+    bundle = v3dg.Bundle.open(folder / "tuft.v3dg")
+    assert result["output"] == "tuft.v3dg"
+    assert result["asset_gaussians"] == 1000
+    assert result["levels"] == bundle.num_levels > 1
+    assert result["gaussians"] == bundle.num_gaussians
+    assert result["bytes"] == (folder / "tuft.v3dg").stat().st_size
+    assert not (folder / "tuft.v3dg.partial").exists()
+
+
+def test_same_seed_and_any_number_of_threads_give_the_same_file(folder, tmp_path):
+    done = run("build", folder / "tuft.ply", "-o", tmp_path / "one.v3dg", "--threads", 1, "--quiet")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "one.v3dg").read_bytes() == (folder / "tuft.v3dg").read_bytes()
+    assert os.listdir(tmp_path) == ["one.v3dg"]
+
+
+def test_info_of_a_bundle(folder):
+    text = run("info", folder / "tuft.v3dg")
+    assert text.returncode == 0, text.stderr
+    assert "colour error" in text.stdout
+    result = json.loads(run("info", folder / "tuft.v3dg", "--json").stdout)
+    assert result["kind"] == "bundle"
+    assert result["levels"][0]["gaussians"] == 1000
+
+
+def test_info_of_an_asset(folder):
+    assert "1,000 gaussians, SH degree 1" in run("info", folder / "tuft.ply").stdout
+    result = json.loads(run("info", folder / "tuft.ply", "--json").stdout)
+    assert (result["kind"], result["gaussians"], result["sh_degree"]) == ("asset", 1000, 1)
+
+
+def test_info_of_a_scene(folder):
+    assert "far away" in run("info", folder / "scene.json").stdout
+    result = json.loads(run("info", folder / "scene.json", "--json").stdout)
+    assert (result["instances"], result["gaussians_at_full_detail"]) == (3, 3000)
+
+
+@pytest.mark.parametrize("subject", ["tuft.ply", "tuft.v3dg"])
+def test_render_turntable(folder, tmp_path, subject):
+    done = run(
+        *("render", folder / subject, "-o", tmp_path / "out.png", "--views", 2, "--size", 64, 48),
+        *("--background", 1, 1, 1, "--json"),
+    )
+    assert done.returncode == 0, done.stderr
+    pictures = json.loads(done.stdout)["pictures"]
+    assert sorted(os.listdir(tmp_path)) == ["out_0.png", "out_1.png"]
+    for picture in pictures:
+        with Image.open(picture["picture"]) as image:
+            pixels = np.asarray(image)
+        assert pixels.shape == (48, 64, 3)
+        assert (pixels[0, 0] == 255).all(), "the background shows in the corner"
+        assert (pixels[20:28, 28:36] != 255).any(), "and the subject in the middle"
+        assert picture["gaussians_in_frustum"] > 0
+
+
+def test_render_scene(folder, tmp_path):
+    done = run("render", folder / "scene.json", "-o", tmp_path / "out.png", "--tolerance", 0)
+    assert done.returncode == 0, done.stderr
+    assert "select ms" in done.stdout
+    assert sorted(os.listdir(tmp_path)) == ["out_far_away.png", "out_near.png"]
+    done = run("render", folder / "scene.json", "-o", tmp_path / "one.jpg", "--camera", "near")
+    assert done.returncode == 0, done.stderr
+    with Image.open(tmp_path / "one.jpg") as picture:
+        assert picture.size == (48, 32)
+
+
+def test_wrong_usage(folder):
+    fails(2, "bild", "bild", cwd=folder)
+    fails(2, "v3dg build --help", "build", cwd=folder)
+    fails(2, "--config", "build", "tuft.ply", "--config", "best", cwd=folder)
+    fails(2, "--seed", "build", "tuft.ply", "--seed", "many", cwd=folder)
+    fails(2, "--cluster-sise", "build", "tuft.ply", "--cluster-sise", "3", cwd=folder)
+    fails(2, "--threads: expected at least 1", "build", "tuft.ply", "--threads", "0", cwd=folder)
+    fails(2, "--camera", "render", "tuft.ply", "--camera", "near", cwd=folder)
+
+
+def test_failures(folder):
+    fails(1, "nothing.ply", "build", "nothing.ply", cwd=folder)
+    fails(1, "broken.ply", "build", "broken.ply", cwd=folder)
+    fails(1, "broken.ply", "info", "broken.ply", cwd=folder)
+    fails(1, "expected a file name ending in .v3dg", "build", "tuft.ply", "-o", "tuft.zip", cwd=folder)
+    fails(1, "create it first", "build", "tuft.ply", "-o", "no/tuft.v3dg", cwd=folder)
+    fails(1, "create it first", "render", "tuft.ply", "-o", "no/tuft.png", cwd=folder)
+    fails(1, ".png", "render", "tuft.ply", "-o", "tuft.gif", cwd=folder)
+    fails(1, "tolerance", "render", "tuft.v3dg", "--tolerance", "-1", cwd=folder)
+    fails(1, "near, far away", "render", "scene.json", "--camera", "left", cwd=folder)
+    fails(1, "num_gaussians", "demo", "--gaussians", "3", cwd=folder)
+
+
+def test_interrupt_leaves_no_bundle_and_says_so(tmp_path):
+    v3dg.save(tmp_path / "big.ply", make_asset(60_000))
+    command = [*COMMAND, "build", "big.ply", "--quiet"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    time.sleep(2.5)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert stderr.startswith("v3dg: error: interrupted")
+    assert not (tmp_path / "big.v3dg").exists()
+
+
+def test_closed_pipe_is_quiet(folder):
+    command = f"{sys.executable} -m v3dg.cli info tuft.v3dg --json | head -c 1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=folder, env=ENVIRONMENT)
+    assert done.stderr == ""
+
+
+def test_main_returns_the_exit_code(capsys):
+    assert cli.main(["--version"]) == 0
+    assert cli.main(["info", "nowhere.v3dg"]) == 1
+    assert "nowhere.v3dg" in capsys.readouterr().err

@@ -1,0 +1,322 @@
+"""The main job without a download: build a bundle, place it 2,000 times, draw it from near to far.
+
+The result is one picture: the full asset above, the selected cut below, a column a distance, each with the
+gaussians drawn, the time and the error. The error is that against the full asset at twice the resolution,
+box-averaged.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from v3dg.build import BuildConfig, build_bundle
+from v3dg.cameras import Camera
+from v3dg.metrics import box_downsample, flip, psnr
+from v3dg.pictures import check_picture_path, write_picture
+from v3dg.procedural import make_asset, place_field
+from v3dg.render import DEFAULT_TOLERANCE, render
+from v3dg.scene import Scene
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from PIL.ImageDraw import ImageDraw
+
+# Distance from the eye to the tuft in the middle, in radii of a tuft, and height of the view in radians.
+VIEWS = ((3.3, 0.36), (8.0, 0.36), (20.0, 0.36), (46.0, 0.38), (95.0, 0.42))
+SUPERSAMPLING = 2
+AZIMUTH = 0.62  # rad; the sun is then to the left, behind the camera
+SKY_TOP, SKY_BOTTOM = np.array([0.34, 0.55, 0.80]), np.array([0.86, 0.90, 0.91])
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One drawn picture's numbers."""
+
+    gaussians: int  # in the frustum
+    gaussians_selected: int
+    select_ms: float
+    draw_ms: float
+    flip: float
+    psnr: float
+
+    @property
+    def milliseconds(self) -> float:
+        """Select and draw."""
+        return self.select_ms + self.draw_ms
+
+
+@dataclass(frozen=True)
+class Column:
+    """One distance: the full asset and the cut of the bundle."""
+
+    distance: float
+    full: Panel
+    bundle: Panel
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo made and measured."""
+
+    picture: str
+    asset_gaussians: int
+    instances: int
+    levels: int
+    bundle_gaussians: int
+    tolerance: float
+    threads: int
+    build_seconds: float
+    seconds: float
+    columns: tuple[Column, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return asdict(self)
+
+
+def view_camera(distance: float, elevation: float, width: int, height: int) -> Camera:
+    """Look at the middle of the meadow, from near at toadstool height, from far at the whole hill."""
+    near = 1 / (1 + (distance / 12) ** 2)
+    target = np.array([0.0, 0.0, 0.42 * near])
+    direction = np.array(
+        [
+            np.sin(AZIMUTH) * np.cos(elevation),
+            -np.cos(AZIMUTH) * np.cos(elevation),
+            np.sin(elevation),
+        ]
+    )
+    return Camera.look_at(target + distance * direction, target, width=width, height=height)
+
+
+def _sky(height: int, width: int) -> NDArray[np.float64]:
+    ramp = np.linspace(0, 1, height)[:, None, None] ** 0.8
+    return np.broadcast_to(SKY_TOP * (1 - ramp) + SKY_BOTTOM * ramp, (height, width, 3))
+
+
+def _over_sky(color: Any, alpha: Any) -> NDArray[np.float32]:
+    picture = color + (1 - alpha[..., None]) * _sky(*alpha.shape)
+    clipped: NDArray[np.float32] = np.clip(picture, 0, 1).astype(np.float32)
+    return clipped
+
+
+def run_demo(
+    output: str | os.PathLike[str] = "v3dg_demo.png",
+    *,
+    num_gaussians: int = 50_000,
+    instances: int = 2000,
+    size: tuple[int, int] = (380, 440),
+    tolerance: float = DEFAULT_TOLERANCE,
+    seed: int = 0,
+    config: BuildConfig | None = None,
+    views: tuple[tuple[float, float], ...] = VIEWS,
+    progress: bool = True,
+) -> DemoResult:
+    """Build the procedural asset, place it, draw and measure every distance, and write the picture.
+
+    Args:
+        num_gaussians: Of the asset.
+        size: Width and height of one panel in px.
+        views: Distance and elevation of every column.
+
+    Raises:
+        ValueError: The picture cannot be written to ``output``, or an argument is out of range.
+    """
+    from tqdm import tqdm
+
+    start = time.perf_counter()
+    path = check_picture_path(output)
+    width, height = size
+    asset = make_asset(num_gaussians, seed=seed)
+    built = time.perf_counter()
+    bundle = build_bundle(asset, config=config or BuildConfig(), seed=seed, progress=progress)
+    build_seconds = time.perf_counter() - built
+    scene = Scene()
+    positions, quaternions, scales = place_field(instances, seed=seed)
+    scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
+
+    columns, pictures = [], []
+    with tqdm(total=3 * len(views), desc="draw", unit="picture", leave=False, disable=not progress) as bar:
+        for distance, elevation in views:
+            camera = view_camera(distance, elevation, width, height)
+            sharp = render(scene, camera.scaled(SUPERSAMPLING), tolerance=0.0)
+            truth = _over_sky(*(box_downsample(x, SUPERSAMPLING) for x in (sharp.color, sharp.alpha)))
+            del sharp
+            bar.update()
+
+            def measure(allowed: float, camera: Camera = camera, truth: Any = truth) -> tuple[Panel, Any]:
+                image = render(scene, camera, tolerance=allowed)
+                picture = _over_sky(image.color, image.alpha)
+                stats = image.stats
+                bar.update()
+                panel = Panel(
+                    gaussians=stats.gaussians_in_frustum,
+                    gaussians_selected=stats.gaussians_selected,
+                    select_ms=stats.select_ms,
+                    draw_ms=stats.draw_ms,
+                    flip=flip(truth, picture),
+                    psnr=psnr(truth, picture),
+                )
+                return panel, picture
+
+            full, full_picture = measure(0.0)
+            ours, our_picture = measure(tolerance)
+            columns.append(Column(distance, full, ours))
+            pictures.append((full_picture, our_picture))
+
+    result = DemoResult(
+        picture=str(path),
+        asset_gaussians=len(asset),
+        instances=instances,
+        levels=bundle.num_levels,
+        bundle_gaussians=bundle.num_gaussians,
+        tolerance=tolerance,
+        threads=_num_threads(),
+        build_seconds=build_seconds,
+        seconds=time.perf_counter() - start,
+        columns=tuple(columns),
+    )
+    write_picture(path, _poster(result, pictures))
+    return result
+
+
+def _num_threads() -> int:
+    """CPU threads that OpenMP takes."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
+    return int(wanted) if wanted.isdigit() and int(wanted) else len(os.sched_getaffinity(0))
+
+
+def count_text(count: int) -> str:
+    """A count to three digits: 940, 12.3 k, 4.56 M."""
+    for factor, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if count >= factor:
+            value = count / factor
+            return f"{value:.{2 if value < 10 else 1 if value < 100 else 0}f}{unit}"
+    return str(count)
+
+
+def time_text(milliseconds: float) -> str:
+    """A time to two or three digits: 34 ms, 1.25 s."""
+    return (
+        f"{milliseconds:.0f} ms"
+        if milliseconds < 1000
+        else f"{milliseconds / 1000:.{2 if milliseconds < 9995 else 1}f} s"
+    )
+
+
+def table_text(result: DemoResult) -> str:
+    """The numbers of the picture as a table."""
+    lines = [
+        f"{result.instances:,} instances of {result.asset_gaussians:,} gaussians, "
+        f"{result.levels} levels built in {result.build_seconds:.1f} s",
+        "",
+        f"{'':>9} {'full asset':-^34}  {'v3dg':-^34}",
+        f"{'distance':>9}" + f" {'gaussians':>10} {'select+draw':>12} {'FLIP':>10} " * 2,
+    ]
+    for column in result.columns:
+        cells = (
+            f" {count_text(p.gaussians):>10} {time_text(p.milliseconds):>12} {p.flip:>10.4f} "
+            for p in (column.full, column.bundle)
+        )
+        lines.append(f"{column.distance:>9g}" + "".join(cells))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+_PAPER, _INK, _QUIET, _RULE = (16, 18, 22), (238, 240, 243), (140, 147, 158), (44, 48, 56)
+_ACCENT = (126, 211, 153)
+_MARGIN, _GAP, _HEAD, _TITLE, _CAPTION, _FOOT = 44, 14, 118, 40, 84, 52
+
+
+def _poster(result: DemoResult, pictures: list[tuple[Any, Any]]) -> NDArray[np.uint8]:
+    """Lay the pictures out with their numbers, as 8-bit RGB."""
+    from PIL import Image, ImageDraw
+
+    from v3dg.pictures import to_8bit
+
+    height, width = pictures[0][0].shape[:2]
+    row = _TITLE + height + _CAPTION
+    sheet = Image.new(
+        "RGB",
+        (
+            2 * _MARGIN + len(pictures) * width + (len(pictures) - 1) * _GAP,
+            _HEAD + 2 * row + _FOOT,
+        ),
+        _PAPER,
+    )
+    draw = ImageDraw.Draw(sheet)
+    right = sheet.width - _MARGIN
+    placed = result.instances * result.asset_gaussians
+    _text(draw, (_MARGIN, 34), "v3dg", 44, _INK)
+    motto = "a meadow from near to far: all gaussians, or just enough of them"
+    _text(draw, (_MARGIN + 128, 38), motto, 21, _INK)
+    line = (
+        f"{result.instances:,} tufts of {result.asset_gaussians:,} gaussians, {count_text(placed)} in all; "
+        f"bundle of {result.levels} levels built in {result.build_seconds:.0f} s; "
+        f"{result.threads} CPU threads"
+    )
+    _text(draw, (_MARGIN + 128, 66), line, 17, _QUIET)
+
+    for index, (column, pair) in enumerate(zip(result.columns, pictures, strict=True)):
+        left = _MARGIN + index * (width + _GAP)
+        for kind, picture in enumerate(pair):
+            top = _HEAD + kind * row
+            panel = column.bundle if kind else column.full
+            if index == 0:
+                name = ("Full asset, every gaussian", "v3dg, just detailed enough")[kind]
+                _text(draw, (left, top + 9), name, 19, _ACCENT if kind else _INK)
+            if kind == 0:
+                label = f"distance {column.distance:g}"
+                _text(draw, (left + width, top + 11), label, 16, _QUIET, anchor="ra")
+            elif index:
+                fewer = _factor_text(column.full.gaussians, column.bundle.gaussians)
+                faster = _factor_text(column.full.milliseconds, column.bundle.milliseconds)
+                label = f"{fewer} fewer, {faster} faster"
+                _text(draw, (left + width, top + 11), label, 16, _ACCENT, anchor="ra")
+            sheet.paste(Image.fromarray(to_8bit(picture)), (left, top + _TITLE))
+            _caption(draw, left, top + _TITLE + height + 12, width, panel, _ACCENT if kind else _INK)
+    note = (
+        "gaussians: those in the view.  time: select + draw.  "
+        "FLIP: mean difference seen, 67 pixels per degree, to the full asset at twice the resolution, "
+        "box-averaged."
+    )
+    draw.line([(_MARGIN, sheet.height - _FOOT - 2), (right, sheet.height - _FOOT - 2)], fill=_RULE)
+    _text(draw, (_MARGIN, sheet.height - _FOOT + 12), note, 15, _QUIET)
+    return np.asarray(sheet)
+
+
+def _factor_text(more: float, less: float) -> str:
+    factor = more / max(less, 1e-6)
+    return f"{factor:,.{0 if factor >= 10 else 1}f}x"
+
+
+def _caption(
+    draw: ImageDraw, left: int, top: int, width: int, panel: Panel, colour: tuple[int, int, int]
+) -> None:
+    """Three numbers with their names below a picture."""
+    cells = (
+        ("gaussians", count_text(panel.gaussians)),
+        ("time", time_text(panel.milliseconds)),
+        ("FLIP", f"{panel.flip:.3f}"),
+    )
+    size = min(24, max(9, width // 15))
+    for place, (name, value) in zip((0.0, 0.42, 0.76), cells, strict=True):
+        x = left + round(place * width)
+        _text(draw, (x, top), value, size, colour)
+        _text(draw, (x, top + size + 6), name, max(8, size * 5 // 8), _QUIET)
+
+
+def _text(
+    draw: ImageDraw,
+    at: tuple[int, int],
+    text: str,
+    size: int,
+    colour: tuple[int, int, int],
+    anchor: str = "la",
+) -> None:
+    from PIL import ImageFont
+
+    draw.text(at, text, font=ImageFont.load_default(size), fill=colour, anchor=anchor)
