@@ -2,11 +2,23 @@
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent
+import pytest
 
-if not any((ROOT / "v3dg").glob("_core.*.so")):
+ROOT = Path(__file__).resolve().parent
+IS_COMPILED_HERE = any((ROOT / "v3dg").glob("_core.*.so"))
+
+if not IS_COMPILED_HERE:
     # `python -m pytest` puts the folder that it runs in first, where v3dg/ would hide the installed package.
     sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != ROOT]
-    os.environ["PYTHONSAFEPATH"] = "1"  # the same for the processes that tests start
+
+
+@pytest.fixture(scope="session", autouse=not IS_COMPILED_HERE)
+def outside_the_source_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the source folder out of the way of the Pythons that tests start, too."""
+    before = Path.cwd()
+    os.chdir(tmp_path_factory.mktemp("elsewhere"))
+    yield
+    os.chdir(before)
