@@ -7,7 +7,6 @@ import json
 import math
 import os
 import threading
-import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -281,6 +280,7 @@ def _simplify(
     _run_fit(
         bar,
         num_groups,
+        int(out_offset[-1]),
         lambda progress: _core.fit_level(
             fit,
             _core.Model(*rows_of(target.gaussians)),
@@ -337,7 +337,7 @@ def _fit_config(config: BuildConfig, seed: int, level: int) -> Any:
     return fit
 
 
-def _run_fit(bar: _Bar, num_groups: int, fit: Callable[[Any], None]) -> None:
+def _run_fit(bar: _Bar, num_groups: int, num_gaussians: int, fit: Callable[[Any], None]) -> None:
     """Run `fit` on a thread of its own, so that Ctrl-C and the bar stay alive while it computes."""
     state = _core.FitProgress()
     failure: list[BaseException] = []
@@ -357,8 +357,7 @@ def _run_fit(bar: _Bar, num_groups: int, fit: Callable[[Any], None]) -> None:
     thread.start()
     try:
         while not done.wait(0.1):
-            bar.show(state, num_groups)
-        bar.show(state, num_groups)
+            bar.show(state, num_groups, num_gaussians)
     except BaseException:
         state.cancel()
         done.wait()
@@ -367,6 +366,7 @@ def _run_fit(bar: _Bar, num_groups: int, fit: Callable[[Any], None]) -> None:
     thread.join()
     if failure:
         raise failure[0]
+    bar.finish_level(num_gaussians)
 
 
 class _Bar:
@@ -378,18 +378,24 @@ class _Bar:
             return
         from tqdm import tqdm
 
-        # Work goes with the gaussians that are fitted: each level has half of the one below.
+        # Work goes with the gaussians that are fitted: each level has half of the one below, rounded up.
         total = len(levels[0].gaussians)
         self._bar = tqdm(total=total, unit="gaussian", unit_scale=True, desc="build", smoothing=0.1)
-        self._level, self._fitted, self._start = len(levels), 0.0, time.monotonic()
-        for level in levels[1:]:
-            self._bar.update(len(level.gaussians))
+        self._finished = self._bar.initial = sum(len(level.gaussians) for level in levels[1:])
 
-    def show(self, state: Any, num_groups: int) -> None:
+    def show(self, state: Any, num_groups: int, num_gaussians: int) -> None:
+        """Show a level of which some groups are done."""
         if self._bar is None or not state.groups_done:
             return
         loss = state.loss_sum / state.groups_done
-        self._bar.set_postfix_str(f"groups {state.groups_done}/{num_groups}, loss {loss:.4f}")
+        done = self._finished + num_gaussians * state.groups_done // num_groups
+        self._bar.set_postfix_str(f"groups {state.groups_done}/{num_groups}, loss {loss:.4f}", refresh=False)
+        self._bar.update(min(done, self._bar.total) - self._bar.n)
+
+    def finish_level(self, num_gaussians: int) -> None:
+        if self._bar is not None:
+            self._finished += num_gaussians
+            self._bar.update(min(self._finished, self._bar.total) - self._bar.n)
 
     def close(self) -> None:
         if self._bar is not None:
