@@ -11,8 +11,9 @@ import io
 import json
 import os
 import sys
+import textwrap
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, cast
@@ -298,7 +299,8 @@ def _bundle_info(path: Path, bundle: Bundle) -> tuple[dict[str, Any], str]:
         *_table(("level", "clusters", "gaussians", "size", "colour error", "alpha error"), rows),
     ]
     if result["config"]:
-        lines += ["", "built with " + ", ".join(f"{k}={_plain(v)}" for k, v in result["config"].items())]
+        settings = ", ".join(f"{name}={value}" for name, value in _settings(result["config"]))
+        lines += ["", *textwrap.wrap(f"built with {settings}", 100, break_on_hyphens=False)]
     return result, "\n".join(lines)
 
 
@@ -431,7 +433,7 @@ def _turntable(subject: Bundle | Gaussians, options: Render) -> dict[str, Camera
     centre = (low + high) / 2
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-6)
     narrow = math.tan(DEFAULT_FOV_X / 2) * min(1.0, options.size[1] / options.size[0])
-    distance = 1.08 * radius / math.sin(math.atan(narrow))
+    distance = 0.9 * radius / math.sin(math.atan(narrow))
     axis = np.eye(3)["xyz".index(options.up[-1])] * (-1 if options.up[0] == "-" else 1)
     cameras = turntable(
         centre,
@@ -493,8 +495,13 @@ def _number(value: float | None) -> str:
     return "-" if value is None or value != value else f"{value:.4f}"
 
 
-def _plain(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
+def _settings(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Names and values of a bundle's config, without its nesting."""
+    for name, value in config.items():
+        if isinstance(value, dict):
+            yield from _settings(value)
+        else:
+            yield name, value if isinstance(value, str) else json.dumps(value)
 
 
 def _safe(name: str) -> str:

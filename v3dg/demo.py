@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # Distance from the eye to the tuft in the middle, in radii of a tuft, and height of the view in radians.
 VIEWS = ((3.3, 0.36), (8.0, 0.36), (20.0, 0.36), (46.0, 0.38), (95.0, 0.42))
 SUPERSAMPLING = 2
-AZIMUTH = 0.62  # rad; the sun is then to the left, behind the camera
+AZIMUTH = 0.80  # rad; the sun is then behind the camera, and no row of tufts lies along the view
 SKY_TOP, SKY_BOTTOM = np.array([0.34, 0.55, 0.80]), np.array([0.86, 0.90, 0.91])
 
 

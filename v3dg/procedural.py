@@ -756,7 +756,7 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
 def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Array]:
     """Place tufts on a round hill, so close that moss covers it, each turned and sized differently.
 
-    The first stands at the origin, upright. Toadstools do not grow into one another.
+    The first stands at the origin, upright. Toadstools of two tufts seldom meet.
 
     Returns:
         Positions (count,3), quaternions (count,4) w,x,y,z and scales (count,), float64; from the middle
@@ -773,7 +773,7 @@ def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Arra
     i, j = (x.ravel() for x in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)))
     plane = spacing * np.stack([i + 0.5 * j, np.sqrt(0.75) * j], -1)
     plane = plane[np.argsort(np.hypot(plane[:, 0], plane[:, 1]), kind="stable")[:count]]
-    plane[1:] += rng.uniform(-0.15, 0.15, (count - 1, 2))
+    plane[1:] += rng.uniform(-0.2, 0.2, (count - 1, 2))
 
     rim = spacing * np.sqrt(max(count, 7) * np.sqrt(0.75) / np.pi)
     waves = rng.uniform(0, 2 * np.pi, (2, 3))
