@@ -263,14 +263,14 @@ def _simplify(
     child_offset = np.append(first_group, last_group[-1] + 1).astype(np.int64)
     ball = _core.bounding_ball_of_balls(below.ball, child_offset)
     leaf_range = np.stack([below.leaf_range[first_group, 0], below.leaf_range[last_group, 1]], axis=1)
-    # Balls of balls are larger than balls of gaussians. What a gaussian stands for goes by the latter, and so
-    # does the picture that is fitted; the weight may not fall towards the root, or the cut would not be exact.
+    # Balls of balls are larger than balls of gaussians, which are what the fit looks at.
     leaves = levels[0].gaussians
     tight = _core.bounding_ball_of_points(
         leaves.means, leaves.scales.max(axis=1), np.append(leaf_range[:, 0], leaf_range[-1, 1])
     )
-    share = np.minimum(1.0, (tight[:, 3].astype(np.float64) / ball[:, 3]) ** 2) / np.diff(out_offset)
-    weight = np.maximum(share.astype(np.float32), np.maximum.reduceat(below.weight, child_offset[:-1]))
+    weight = np.maximum(
+        (1 / np.diff(out_offset)).astype(np.float32), np.maximum.reduceat(below.weight, child_offset[:-1])
+    )
 
     from_leaves = config.targets == "leaves"
     target = levels[0] if from_leaves else below
