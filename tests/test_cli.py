@@ -149,7 +149,7 @@ def test_render_scene(folder, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "select ms" in done.stdout
     assert sorted(os.listdir(tmp_path)) == ["out_far_away.png", "out_near.png"]
-    done = run("render", folder / "scene.json", "-o", tmp_path / "one.jpg", "--camera", "near")
+    done = run("render", folder / "scene.json", "-o", tmp_path / "one.jpg", "--camera", 0)
     assert done.returncode == 0, done.stderr
     with Image.open(tmp_path / "one.jpg") as picture:
         assert picture.size == (48, 32)

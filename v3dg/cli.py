@@ -75,7 +75,7 @@ class Render:
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
     """Picture to write, .png or .jpg; several get a number or the camera's name. Default: as the subject."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Draw only this camera of a scene file."""
+    """Draw only this camera of a scene file: its name, or its place in the file, from 0."""
     views: int = 1
     """Views around the turntable."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
@@ -403,10 +403,17 @@ def _subject_and_cameras(options: Render) -> tuple[Scene | Bundle | Gaussians, d
             )
         if options.camera is None:
             return scene, cameras
-        if options.camera not in cameras:
-            known = ", ".join(list(cameras)[:8])
-            raise ValueError(f"--camera: expected one of {known}, got {options.camera}")
-        return scene, {options.camera: cameras[options.camera]}
+        names = list(cameras)
+        name = options.camera
+        if name not in cameras and name.isdecimal() and int(name) < len(names):
+            name = names[int(name)]
+        if name not in cameras:
+            known = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+            raise ValueError(
+                f"--camera: expected one of {known}, or 0 to {len(names) - 1}, got {options.camera}; "
+                f"see `v3dg info {options.subject}`"
+            )
+        return scene, {name: cameras[name]}
     if options.camera is not None:
         raise _UsageError("--camera: expected a scene file (.json) to take it from; leave it out")
     subject = _load(options.subject)
