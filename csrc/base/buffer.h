@@ -11,10 +11,11 @@ namespace v3dg {
 // Owned elements of a plain type, not initialised. Grows by forgetting what it held.
 template <class T>
 class Buffer {
-public:
+  public:
     Buffer() = default;
     explicit Buffer(size_t size) { reserve(size); }
-    Buffer(Buffer&& other) noexcept : data_(std::exchange(other.data_, nullptr)), capacity_(std::exchange(other.capacity_, 0)) {}
+    Buffer(Buffer&& other) noexcept
+        : data_(std::exchange(other.data_, nullptr)), capacity_(std::exchange(other.capacity_, 0)) {}
     Buffer& operator=(Buffer&& other) noexcept {
         std::swap(data_, other.data_);
         std::swap(capacity_, other.capacity_);
@@ -38,7 +39,7 @@ public:
     T* data() const { return data_; }
     size_t capacity() const { return capacity_; }
 
-private:
+  private:
     T* data_ = nullptr;
     size_t capacity_ = 0;
 };

@@ -14,9 +14,9 @@ const char* isa_name(Isa isa);
 
 // Repeats a declaration in each instruction set's namespace.
 #if defined(__x86_64__)
-#define V3DG_DECLARE_PER_ISA(...)                      \
-    namespace isa_baseline { __VA_ARGS__; }            \
-    namespace isa_avx2 { __VA_ARGS__; }                \
+#define V3DG_DECLARE_PER_ISA(...)           \
+    namespace isa_baseline { __VA_ARGS__; } \
+    namespace isa_avx2 { __VA_ARGS__; }     \
     namespace isa_avx512 { __VA_ARGS__; }
 #define V3DG_DISPATCH_ISA(function, ...)                                                     \
     (::v3dg::active_isa() == ::v3dg::Isa::avx512 ? ::v3dg::isa_avx512::function(__VA_ARGS__) \

@@ -6,7 +6,7 @@
 
 namespace v3dg {
 
-// Random numbers by counter: the same (seed, stream, counter) gives the same number on every device and thread.
+// Random numbers by counter: the same (seed, stream, counter) gives the same number everywhere.
 V3DG_HD inline uint64_t random_bits(uint64_t seed, uint64_t stream, uint64_t counter) {
     // Three rounds of the splitmix64 finaliser, one for each argument.
     uint64_t x = seed;

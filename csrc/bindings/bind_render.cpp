@@ -10,16 +10,19 @@ namespace v3dg {
 using namespace py::literals;
 
 template <class T>
-static std::shared_ptr<Model<T>> make_model(const py::array& means, const py::array& quats, const py::array& scales,
-                                            const py::array& opacities, const py::array& sh) {
+static std::shared_ptr<Model<T>> make_model(const py::array& means, const py::array& quats,
+                                            const py::array& scales, const py::array& opacities,
+                                            const py::array& sh) {
     const py::ssize_t n = opacities.ndim() == 1 ? opacities.shape(0) : -1;
     const py::ssize_t bases = sh.ndim() == 3 ? sh.shape(1) : -1;
     int degree = 0;
     while (degree <= 3 && num_sh_bases(degree) != bases) ++degree;
-    if (degree > 3) throw py::value_error("sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got " + shape_text(sh));
-    const GaussianRows<T> rows{span_of<const T>(means, "means", {n, 3}),   span_of<const T>(quats, "quats", {n, 4}),
-                               span_of<const T>(scales, "scales", {n, 3}), span_of<const T>(opacities, "opacities", {n}),
-                               span_of<const T>(sh, "sh", {n, bases, 3}),  degree};
+    if (degree > 3)
+        throw py::value_error("sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got " + shape_text(sh));
+    const GaussianRows<T> rows{
+        span_of<const T>(means, "means", {n, 3}),   span_of<const T>(quats, "quats", {n, 4}),
+        span_of<const T>(scales, "scales", {n, 3}), span_of<const T>(opacities, "opacities", {n}),
+        span_of<const T>(sh, "sh", {n, bases, 3}),  degree};
     py::gil_scoped_release unlocked;
     return std::make_shared<Model<T>>(rows);
 }
@@ -28,7 +31,8 @@ static std::shared_ptr<Model<T>> make_model(const py::array& means, const py::ar
 template <class T>
 static Pinhole<T> pinhole_of(const std::array<double, 5>& k, int width, int height) {
     if (width < 1 || height < 1 || width > UINT16_MAX || height > UINT16_MAX)
-        throw py::value_error("width, height: expected 1 to 65535 px, got " + std::to_string(width) + " x " + std::to_string(height));
+        throw py::value_error("width, height: expected 1 to 65535 px, got " + std::to_string(width) + " x " +
+                              std::to_string(height));
     return {T(k[0]), T(k[1]), T(k[2]), T(k[3]), T(width), T(height), T(k[4])};
 }
 
@@ -47,9 +51,15 @@ struct PictureArrays {
     py::array_t<T> color, alpha, depth;
     Picture<T> picture;
     PictureArrays(int width, int height, const std::array<double, 3>& background, bool with_depth)
-        : color({height, width, 3}), alpha({height, width}), depth({with_depth ? height : 0, with_depth ? width : 0}) {
-        picture = {width, height, {T(background[0]), T(background[1]), T(background[2])},
-                   color.mutable_data(), alpha.mutable_data(), with_depth ? depth.mutable_data() : nullptr};
+        : color({height, width, 3}),
+          alpha({height, width}),
+          depth({with_depth ? height : 0, with_depth ? width : 0}) {
+        picture = {width,
+                   height,
+                   {T(background[0]), T(background[1]), T(background[2])},
+                   color.mutable_data(),
+                   alpha.mutable_data(),
+                   with_depth ? depth.mutable_data() : nullptr};
     }
     py::object depth_or_none() const { return picture.depth == nullptr ? py::none() : py::object(depth); }
 };
@@ -72,9 +82,10 @@ struct Tape {
 };
 
 template <class T>
-static py::tuple rasterize(std::shared_ptr<Model<T>> model, const std::array<double, 15>& view, double filter_px2,
-                           bool compensate, const std::array<double, 5>& k, int width, int height,
-                           const std::array<double, 3>& background, bool with_depth, bool keep_tape) {
+static py::tuple rasterize(std::shared_ptr<Model<T>> model, const std::array<double, 15>& view,
+                           double filter_px2, bool compensate, const std::array<double, 5>& k, int width,
+                           int height, const std::array<double, 3>& background, bool with_depth,
+                           bool keep_tape) {
     auto tape = std::make_shared<Tape<T>>();
     tape->model = model;
     tape->draw = {&model->planes(), 0, model->size(), view_of<T>(view.data()), T(filter_px2), compensate};
@@ -97,7 +108,8 @@ static py::tuple rasterize_backward(const Tape<T>& tape, const py::array& d_colo
                                     const py::object& d_depth) {
     const py::ssize_t h = tape.height, w = tape.width;
     const PictureGradient<T> d_picture{
-        span_of<const T>(d_color, "d_color", {h, w, 3}).data, span_of<const T>(d_alpha, "d_alpha", {h, w}).data,
+        span_of<const T>(d_color, "d_color", {h, w, 3}).data,
+        span_of<const T>(d_alpha, "d_alpha", {h, w}).data,
         d_depth.is_none() ? nullptr : span_of<const T>(py::array(d_depth), "d_depth", {h, w}).data};
     const py::ssize_t n = static_cast<py::ssize_t>(tape.model->size());
     const py::ssize_t bases = num_sh_bases(tape.model->planes().sh_degree);
@@ -106,15 +118,16 @@ static py::tuple rasterize_backward(const Tape<T>& tape, const py::array& d_colo
         std::fill_n(a.mutable_data(), a.size(), T(0));
         return a;
     };
-    py::array_t<T> means = zeros({n, 3}), quats = zeros({n, 4}), scales = zeros({n, 3}), opacities = zeros({n}),
-                   sh = zeros({n, bases, 3}), background = zeros({3});
+    py::array_t<T> means = zeros({n, 3}), quats = zeros({n, 4}), scales = zeros({n, 3}),
+                   opacities = zeros({n}), sh = zeros({n, bases, 3}), background = zeros({3});
     const GaussianGradients<T> out{means.mutable_data(), quats.mutable_data(), scales.mutable_data(),
                                    opacities.mutable_data(), sh.mutable_data()};
     T* d_background = background.mutable_data();
     {
         py::gil_scoped_release unlocked;
-        const Picture<T> picture{tape.width, tape.height, {T(tape.background[0]), T(tape.background[1]), T(tape.background[2])},
-                                 nullptr, nullptr, nullptr};
+        const Picture<T> picture{
+            tape.width, tape.height, {T(tape.background[0]), T(tape.background[1]), T(tape.background[2])},
+            nullptr,    nullptr,     nullptr};
         render_backward<T>(tape.draw, tape.camera, picture, d_picture, tape.workspace, out, d_background);
     }
     return py::make_tuple(means, quats, scales, opacities, sh, background);
@@ -122,7 +135,7 @@ static py::tuple rasterize_backward(const Tape<T>& tape, const py::array& d_colo
 
 // A workspace lent to one caller at a time, kept from frame to frame; a second caller gets one of its own.
 class SharedWorkspace {
-public:
+  public:
     std::unique_ptr<Workspace<float>> take() {
         const std::lock_guard<std::mutex> lock(mutex_);
         return kept_ ? std::move(kept_) : std::make_unique<Workspace<float>>();
@@ -132,7 +145,7 @@ public:
         kept_ = std::move(workspace);
     }
 
-private:
+  private:
     std::mutex mutex_;
     std::unique_ptr<Workspace<float>> kept_;
 };
@@ -154,17 +167,19 @@ static BundleClusters clusters_of(const py::handle& item) {
             span_of<const uint8_t>(t[3].cast<py::array>(), "antialiased", {c})};
 }
 
-static py::tuple render_selection(const py::list& bundles, const py::array& instance_bundle, const py::array& views,
-                                  const py::array& instance_ids, const py::array& cluster_ids,
-                                  const std::array<double, 5>& k, int width, int height,
-                                  const std::array<double, 3>& background, bool with_depth) {
+static py::tuple render_selection(const py::list& bundles, const py::array& instance_bundle,
+                                  const py::array& views, const py::array& instance_ids,
+                                  const py::array& cluster_ids, const std::array<double, 5>& k, int width,
+                                  int height, const std::array<double, 3>& background, bool with_depth) {
     static SharedWorkspace shared;
     std::vector<BundleClusters> tables;
     for (const py::handle& item : bundles) tables.push_back(clusters_of(item));
     const Span<const int32_t> bundle_of = span_of<const int32_t>(instance_bundle, "instance_bundle", {-1});
-    const Span<const double> view = span_of<const double>(views, "views", {static_cast<py::ssize_t>(bundle_of.size), 15});
+    const Span<const double> view =
+        span_of<const double>(views, "views", {static_cast<py::ssize_t>(bundle_of.size), 15});
     const Span<const int32_t> instances = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
-    const Span<const int32_t> clusters = span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instances.size)});
+    const Span<const int32_t> clusters =
+        span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instances.size)});
     const Pinhole<float> camera = pinhole_of<float>(k, width, height);
 
     // Neighbouring clusters of one instance are neighbours in memory: one draw.
@@ -172,13 +187,17 @@ static py::tuple render_selection(const py::list& bundles, const py::array& inst
     int32_t last_instance = -1;
     for (size_t s = 0; s < instances.size; ++s) {
         const int32_t i = instances[s], c = clusters[s];
-        if (i < 0 || static_cast<size_t>(i) >= bundle_of.size || bundle_of[i] < 0 || static_cast<size_t>(bundle_of[i]) >= tables.size())
-            throw py::value_error("instance_ids: expected ids of the scene's instances, got " + std::to_string(i));
+        if (i < 0 || static_cast<size_t>(i) >= bundle_of.size || bundle_of[i] < 0 ||
+            static_cast<size_t>(bundle_of[i]) >= tables.size())
+            throw py::value_error("instance_ids: expected ids of the scene's instances, got " +
+                                  std::to_string(i));
         const BundleClusters& b = tables[bundle_of[i]];
         if (c < 0 || static_cast<size_t>(c) >= b.filter_px2.size)
-            throw py::value_error("cluster_ids: expected ids of the bundle's clusters, got " + std::to_string(c));
+            throw py::value_error("cluster_ids: expected ids of the bundle's clusters, got " +
+                                  std::to_string(c));
         const uint64_t first = b.offset[c], last = b.offset[c + 1];
-        if (last < first || last > b.model->size()) throw py::value_error("offset: expected ranges of the bundle's gaussians");
+        if (last < first || last > b.model->size())
+            throw py::value_error("offset: expected ranges of the bundle's gaussians");
         const float filter = b.filter_px2[c];
         const bool compensate = b.compensate[c] != 0;
         if (i == last_instance) {
@@ -188,7 +207,8 @@ static py::tuple render_selection(const py::list& bundles, const py::array& inst
                 continue;
             }
         }
-        draws.push_back({&b.model->planes(), first, last - first, view_of<float>(view.data + 15 * static_cast<size_t>(i)), filter, compensate});
+        draws.push_back({&b.model->planes(), first, last - first,
+                         view_of<float>(view.data + 15 * static_cast<size_t>(i)), filter, compensate});
         last_instance = i;
     }
     PictureArrays<float> out(width, height, background, with_depth);
@@ -207,17 +227,19 @@ static void bind_precision(py::module_& m, const char* model_name, const char* t
     py::class_<Model<T>, std::shared_ptr<Model<T>>>(m, model_name, "Gaussians laid out for the rasterizer.")
         .def(py::init(&make_model<T>), "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a)
         .def("__len__", &Model<T>::size);
-    py::class_<Tape<T>, std::shared_ptr<Tape<T>>>(m, tape_name, "What rasterize leaves for rasterize_backward.");
-    m.def("rasterize", &rasterize<T>, "model"_a, "view"_a, "filter_px2"_a, "compensate"_a, "intrinsics"_a, "width"_a,
-          "height"_a, "background"_a, "with_depth"_a, "keep_tape"_a);
+    py::class_<Tape<T>, std::shared_ptr<Tape<T>>>(m, tape_name,
+                                                  "What rasterize leaves for rasterize_backward.");
+    m.def("rasterize", &rasterize<T>, "model"_a, "view"_a, "filter_px2"_a, "compensate"_a, "intrinsics"_a,
+          "width"_a, "height"_a, "background"_a, "with_depth"_a, "keep_tape"_a);
     m.def("rasterize_backward", &rasterize_backward<T>, "tape"_a, "d_color"_a, "d_alpha"_a, "d_depth"_a);
 }
 
 void bind_render(py::module_& m) {
     bind_precision<float>(m, "Model", "Tape");
     bind_precision<double>(m, "ModelDouble", "TapeDouble");
-    m.def("render_selection", &render_selection, "bundles"_a, "instance_bundle"_a, "views"_a, "instance_ids"_a,
-          "cluster_ids"_a, "intrinsics"_a, "width"_a, "height"_a, "background"_a, "with_depth"_a);
+    m.def("render_selection", &render_selection, "bundles"_a, "instance_bundle"_a, "views"_a,
+          "instance_ids"_a, "cluster_ids"_a, "intrinsics"_a, "width"_a, "height"_a, "background"_a,
+          "with_depth"_a);
 }
 
 }  // namespace v3dg

@@ -16,7 +16,7 @@ struct Window {
     }
 };
 
-// Both passes of the separable window; its transpose too, since it is symmetric and zeros lie beyond the border.
+// Both passes of the separable window; its own transpose, since it is symmetric and zeros lie outside.
 static void blur(const float* in, int width, int height, float* rows, float* out) {
     static const Window window;
     for (int y = 0; y < height; ++y)

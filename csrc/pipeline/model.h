@@ -18,7 +18,7 @@ struct GaussianRows {
 // Gaussians as the rasterizer reads them: owned planes.
 template <class T>
 class Model {
-public:
+  public:
     explicit Model(const GaussianRows<T>& rows) : size_(rows.size()) {
         const size_t num_sh = 3 * num_sh_bases(rows.sh_degree);
         const size_t stride = size_ + kPlanePadding;
@@ -41,7 +41,7 @@ public:
     const GaussianPlanes<T>& planes() const { return planes_; }
     size_t size() const { return size_; }
 
-private:
+  private:
     size_t size_;
     Buffer<T> storage_;
     GaussianPlanes<T> planes_{};

@@ -37,7 +37,9 @@ RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
     std::vector<uint64_t> begin(draws.size() + 1, 0);
     for (size_t d = 0; d < draws.size(); ++d) begin[d + 1] = begin[d] + draws[d].count;
     const uint64_t total = begin.back();
-    if (total > UINT32_MAX) throw std::length_error("gaussians: expected at most 4294967295 in one picture, got " + std::to_string(total));
+    if (total > UINT32_MAX)
+        throw std::length_error("gaussians: expected at most 4294967295 in one picture, got " +
+                                std::to_string(total));
     const TileGrid grid(picture.width, picture.height);
     const uint64_t chunk = chunk_size(total, grid.size());
     const size_t num_chunks = (total + chunk - 1) / chunk;
@@ -57,7 +59,8 @@ RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
         for (uint64_t at = first; at < last; ++d) {
             const uint64_t stop = std::min(last, begin[d + 1]);
             if (stop > at)
-                count += V3DG_DISPATCH_ISA(project<T>, draws[d], at - begin[d], stop - at, camera, records + first + count,
+                count += V3DG_DISPATCH_ISA(project<T>, draws[d], at - begin[d], stop - at, camera,
+                                           records + first + count,
                                            source == nullptr ? nullptr : source + first + count,
                                            static_cast<uint32_t>(at - begin[d]), in_frustum);
             at = stop;
@@ -105,8 +108,8 @@ static uint64_t num_tiles_of(const Record<T>& r) {
 
 template <class T>
 void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Picture<T>& picture,
-                     const PictureGradient<T>& d_picture, const Workspace<T>& ws, const GaussianGradients<T>& out,
-                     T d_background[3]) {
+                     const PictureGradient<T>& d_picture, const Workspace<T>& ws,
+                     const GaussianGradients<T>& out, T d_background[3]) {
     const TileGrid grid(picture.width, picture.height);
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
@@ -132,12 +135,15 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
             const size_t count = offset[t + 1] - offset[t];
             const int column = t % grid.columns, row = t / grid.columns;
             d_entry.assign(count, RecordGradient<T>{});
-            V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, entry + offset[t], count, kTileSize * column,
-                              kTileSize * row, picture, d_picture, d_entry.data(), &d_background_of_tile[3 * t]);
+            V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, entry + offset[t], count,
+                              kTileSize * column, kTileSize * row, picture, d_picture, d_entry.data(),
+                              &d_background_of_tile[3 * t]);
             for (size_t e = 0; e < count; ++e) {
                 const uint32_t r = record_of(entry[offset[t] + e]);
-                const int x0 = records[r].x0 / kTileSize, x1 = records[r].x1 / kTileSize, y0 = records[r].y0 / kTileSize;
-                d_pair[pair_first[r] + static_cast<uint64_t>(row - y0) * (x1 - x0 + 1) + (column - x0)] = d_entry[e];
+                const int x0 = records[r].x0 / kTileSize, x1 = records[r].x1 / kTileSize,
+                          y0 = records[r].y0 / kTileSize;
+                d_pair[pair_first[r] + static_cast<uint64_t>(row - y0) * (x1 - x0 + 1) + (column - x0)] =
+                    d_entry[e];
             }
         }
     }
@@ -153,16 +159,17 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
             const uint64_t pairs = num_tiles_of(r);
             for (uint64_t p = 0; p < pairs; ++p) d_records[i] += d_pair[pair_first[first + i] + p];
         }
-        V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(), count, camera, out);
+        V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(), count,
+                          camera, out);
     });
 }
 
-#define V3DG_INSTANTIATE(T)                                                                                     \
-    template RenderCounts render<T>(const std::vector<Draw<T>>&, const Pinhole<T>&, const Picture<T>&, bool,    \
-                                    Workspace<T>&);                                                             \
-    template void render_backward<T>(const Draw<T>&, const Pinhole<T>&, const Picture<T>&,                      \
-                                     const PictureGradient<T>&, const Workspace<T>&, const GaussianGradients<T>&, \
-                                     T*);
+#define V3DG_INSTANTIATE(T)                                                                                  \
+    template RenderCounts render<T>(const std::vector<Draw<T>>&, const Pinhole<T>&, const Picture<T>&, bool, \
+                                    Workspace<T>&);                                                          \
+    template void render_backward<T>(const Draw<T>&, const Pinhole<T>&, const Picture<T>&,                   \
+                                     const PictureGradient<T>&, const Workspace<T>&,                         \
+                                     const GaussianGradients<T>&, T*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

@@ -68,20 +68,20 @@ struct GaussianGradients {
     T *means, *quats, *scales, *opacities, *sh;
 };
 
-// Projects gaussians [skip, skip + count) of a draw and writes a record, in order, for each one that reaches a
-// pixel centre: in front of the near plane, alpha of at least 1/255 somewhere, a positive finite determinant.
-// `source` (or null) receives `source_base` plus the gaussian's place in the draw. Returns the number of
-// records and adds to `in_frustum` the gaussians whose extent meets the image, whether or not they reach a
-// pixel centre.
+// Projects gaussians [skip, skip + count) of a draw and writes a record, in order, for each one that reaches
+// a pixel centre: in front of the near plane, alpha of at least 1/255 somewhere, a positive finite
+// determinant. `source` (or null) receives `source_base` plus the gaussian's place in the draw. Returns the
+// number of records and adds to `in_frustum` the gaussians whose extent meets the image, whether or not they
+// reach a pixel centre.
 V3DG_DECLARE_PER_ISA(template <class T> size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count,
                                                        const Pinhole<T>& camera, Record<T>* records,
                                                        uint32_t* source, uint32_t source_base,
                                                        uint64_t& in_frustum))
 
-// Writes the gradients of the `count` gaussians `source` (places in a single draw) from those of their records.
+// Writes the gradients of the `count` gaussians `source` (places in one draw) from those of their records.
 V3DG_DECLARE_PER_ISA(template <class T> void project_backward(const Draw<T>& draw, const uint32_t* source,
-                                                              const RecordGradient<T>* d_records, size_t count,
-                                                              const Pinhole<T>& camera,
+                                                              const RecordGradient<T>* d_records,
+                                                              size_t count, const Pinhole<T>& camera,
                                                               const GaussianGradients<T>& out))
 
 }  // namespace v3dg

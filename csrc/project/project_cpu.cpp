@@ -31,8 +31,8 @@ static V3DG_INLINE auto ceil_to_int(V x) {
 }
 
 template <class T>
-size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera, Record<T>* records,
-               uint32_t* source, uint32_t source_base, uint64_t& in_frustum) {
+size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
+               Record<T>* records, uint32_t* source, uint32_t source_base, uint64_t& in_frustum) {
     using V = Vec<T>;
     constexpr int kWidth = kLanes<T>;
     const GaussianPlanes<T>& model = *draw.model;
@@ -44,7 +44,8 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         const unsigned lanes = count - done >= kWidth ? (1u << kWidth) - 1 : (1u << (count - done)) - 1;
         const Gaussian3d<V> g = load_gaussians(model, at);
         const ModelView<T>& mv = draw.view;
-        const V depth = mv.linear[6] * g.mean[0] + mv.linear[7] * g.mean[1] + mv.linear[8] * g.mean[2] + mv.translation[2];
+        const V depth = mv.linear[6] * g.mean[0] + mv.linear[7] * g.mean[1] + mv.linear[8] * g.mean[2] +
+                        mv.translation[2];
         const auto in_front = depth >= all_lanes<V>(camera.near_depth);
         if ((bits_of(in_front) & lanes) == 0) continue;
         Projection<V> s;
@@ -54,8 +55,8 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         const V reach = e.log2_opacity - T(kLog2MinAlpha);
         const V half_x = sqrt_of(reach * s.c11) * T(1 / kFalloffScale);
         const V half_y = sqrt_of(reach * s.c22) * T(1 / kFalloffScale);
-        const auto drawable = in_front & (g.opacity >= all_lanes<V>(T(kMinAlpha))) & (reach >= zero) & (s.det > zero) &
-                              (s.det < huge) & (half_x < huge) & (half_y < huge);
+        const auto drawable = in_front & (g.opacity >= all_lanes<V>(T(kMinAlpha))) & (reach >= zero) &
+                              (s.det > zero) & (s.det < huge) & (half_x < huge) & (half_y < huge);
         const auto meets = drawable & (e.u + half_x > zero) & (e.u - half_x < all_lanes<V>(camera.width)) &
                            (e.v + half_y > zero) & (e.v - half_y < all_lanes<V>(camera.height));
         const unsigned meets_bits = bits_of(meets) & lanes;
@@ -106,8 +107,8 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
 
 // Scattered gaussians: lanes are filled one by one, which is small beside the arithmetic.
 template <class T>
-void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordGradient<T>* d_records, size_t count,
-                      const Pinhole<T>& camera, const GaussianGradients<T>& out) {
+void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordGradient<T>* d_records,
+                      size_t count, const Pinhole<T>& camera, const GaussianGradients<T>& out) {
     using V = Vec<T>;
     constexpr size_t kWidth = kLanes<T>;
     const GaussianPlanes<T>& m = *draw.model;
@@ -142,7 +143,8 @@ void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordG
         const Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.filter_px2, draw.compensate, s);
         V color[3], d_sh[3 * kMaxShBases];
         color_of_sh(m.sh_degree, g.mean, draw.view, sh, color);
-        Gaussian3d<V> d_g = project_gaussian_vjp(g, draw.view, camera, draw.filter_px2, draw.compensate, s, e, d);
+        Gaussian3d<V> d_g =
+            project_gaussian_vjp(g, draw.view, camera, draw.filter_px2, draw.compensate, s, e, d);
         color_of_sh_vjp(m.sh_degree, g.mean, draw.view, sh, color, d_color, d_g.mean, d_sh);
         for (size_t i = 0; i < lanes; ++i) {
             const uint64_t at = source[done + i];
@@ -155,10 +157,10 @@ void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordG
     }
 }
 
-#define V3DG_INSTANTIATE(T)                                                                                       \
-    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Pinhole<T>&, Record<T>*, uint32_t*,      \
-                               uint32_t, uint64_t&);                                                              \
-    template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, size_t,          \
+#define V3DG_INSTANTIATE(T)                                                                                  \
+    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Pinhole<T>&, Record<T>*, uint32_t*, \
+                               uint32_t, uint64_t&);                                                         \
+    template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, size_t,     \
                                       const Pinhole<T>&, const GaussianGradients<T>&);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)

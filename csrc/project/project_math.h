@@ -12,11 +12,11 @@
 
 namespace v3dg {
 
-constexpr double kMinAlpha = 1.0 / 255;      // contributions below it are skipped
-constexpr double kMaxAlpha = 0.999;          // alpha is cut here
-constexpr double kMinTransmittance = 1e-4;   // a pixel stops before it would fall to this
+constexpr double kMinAlpha = 1.0 / 255;     // contributions below it are skipped
+constexpr double kMaxAlpha = 0.999;         // alpha is cut here
+constexpr double kMinTransmittance = 1e-4;  // a pixel stops before it would fall to this
 constexpr double kLog2MinAlpha = -7.994353436858858;
-constexpr double kFovMargin = 0.3;           // of the half field of view: where the Jacobian is clamped
+constexpr double kFovMargin = 0.3;  // of the half field of view: where the Jacobian is clamped
 constexpr double kLn2 = 0.6931471805599453;
 constexpr double kFalloffScale = 0.8493218002880191;  // sqrt(log2(e) / 2): exp(-d²/2) = 2^-(scale d)²
 
@@ -178,7 +178,8 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g, c
     V d_p[3];
     d_p[0] = d_slope_x * inv_z;
     d_p[1] = d_slope_y * inv_z;
-    d_p[2] = d.depth - inv_z * (dot3(s.a1, d_a1) + dot3(s.a2, d_a2) + true_x * d_slope_x + true_y * d_slope_y);
+    d_p[2] =
+        d.depth - inv_z * (dot3(s.a1, d_a1) + dot3(s.a2, d_a2) + true_x * d_slope_x + true_y * d_slope_y);
 
     for (int i = 0; i < 3; ++i)
         out.mean[i] = mv.linear[i] * d_p[0] + mv.linear[3 + i] * d_p[1] + mv.linear[6 + i] * d_p[2];
@@ -187,7 +188,8 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g, c
     for (int k = 0; k < 3; ++k) {
         out.scale[k] = V{};
         for (int i = 0; i < 3; ++i) {
-            const V d_rs = mv.linear[i] * d_m[k] + mv.linear[3 + i] * d_m[3 + k] + mv.linear[6 + i] * d_m[6 + k];
+            const V d_rs =
+                mv.linear[i] * d_m[k] + mv.linear[3 + i] * d_m[3 + k] + mv.linear[6 + i] * d_m[6 + k];
             out.scale[k] += r[3 * i + k] * d_rs;
             d_r[3 * i + k] = g.scale[k] * d_rs;
         }
@@ -199,7 +201,8 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g, c
 // Colour in the direction from the camera's position in model space. `sh` holds the coefficients of one
 // gaussian (or of one a lane), base by base, three channels each.
 template <class V, class T>
-V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelView<T>& mv, const V* sh, V color[3]) {
+V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelView<T>& mv, const V* sh,
+                                     V color[3]) {
     V basis[kMaxShBases];
     V dir[3] = {mean[0] - mv.eye[0], mean[1] - mv.eye[1], mean[2] - mv.eye[2]};
     if (degree > 0) {

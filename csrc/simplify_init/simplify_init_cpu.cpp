@@ -19,7 +19,8 @@ static void copy_row(const RowsIn& in, int64_t from, const RowsOut& out, int64_t
     for (int k = 0; k < in.num_sh; ++k) out.sh[in.num_sh * to + k] = in.sh[in.num_sh * from + k];
 }
 
-void prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset, float growth, const RowsOut& out) {
+void prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset, float growth,
+           const RowsOut& out) {
     constexpr int kCellHalvings = 3;
     parallel_for(in_offset.size - 1, 1, [&](size_t g) {
         const int64_t first = in_offset[g], count = in_offset[g + 1] - first;
@@ -30,7 +31,8 @@ void prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> 
         cpu::median_split({reinterpret_cast<const Point*>(in.means + 3 * first), size_t(count)}, halvings,
                           {order.data(), order.size()}, {cell.data(), cell.size()});
         std::vector<float> score(count);
-        for (int64_t i = 0; i < count; ++i) score[i] = prune_score(in.scales + 3 * (first + i), in.opacities[first + i]);
+        for (int64_t i = 0; i < count; ++i)
+            score[i] = prune_score(in.scales + 3 * (first + i), in.opacities[first + i]);
         std::vector<int64_t> kept;
         for (size_t c = 0; c + 1 < cell.size(); ++c) {
             // Shares are rounded so that they add up to what is wanted.
@@ -41,7 +43,8 @@ void prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> 
             kept.insert(kept.end(), order.begin() + cell[c], order.begin() + cell[c] + share);
         }
         std::sort(kept.begin(), kept.end());
-        for (size_t i = 0; i < kept.size(); ++i) copy_row(in, first + kept[i], out, out_offset[g] + int64_t(i), growth);
+        for (size_t i = 0; i < kept.size(); ++i)
+            copy_row(in, first + kept[i], out, out_offset[g] + int64_t(i), growth);
     });
 }
 
@@ -95,7 +98,8 @@ struct Pair {
 
 }  // namespace
 
-void merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset, const RowsOut& out) {
+void merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
+           const RowsOut& out) {
     parallel_for(in_offset.size - 1, 1, [&](size_t g) {
         const int64_t first = in_offset[g], count = in_offset[g + 1] - first;
         const int64_t wanted = out_offset[g + 1] - out_offset[g];
@@ -123,7 +127,8 @@ void merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> 
             n.rows = {i};
             row_weight[i] = n.weight;
         }
-        const double extent2 = (high[0] - low[0]) * (high[0] - low[0]) + (high[1] - low[1]) * (high[1] - low[1]) +
+        const double extent2 = (high[0] - low[0]) * (high[0] - low[0]) +
+                               (high[1] - low[1]) * (high[1] - low[1]) +
                                (high[2] - low[2]) * (high[2] - low[2]);
         const double inverse_spacing2 = extent2 > 0 ? static_cast<double>(wanted) / extent2 : 0;
 

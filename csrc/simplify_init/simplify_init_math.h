@@ -64,7 +64,8 @@ V3DG_HD inline void scale_and_quat_of(const double cov[6], double scale[3], doub
             }
     }
     for (int k = 0; k < 3; ++k) scale[k] = sqrt(a[k][k] > 0 ? a[k][k] : 0);
-    const double det = e[0][0] * (e[1][1] * e[2][2] - e[1][2] * e[2][1]) - e[0][1] * (e[1][0] * e[2][2] - e[1][2] * e[2][0]) +
+    const double det = e[0][0] * (e[1][1] * e[2][2] - e[1][2] * e[2][1]) -
+                       e[0][1] * (e[1][0] * e[2][2] - e[1][2] * e[2][0]) +
                        e[0][2] * (e[1][0] * e[2][1] - e[1][1] * e[2][0]);
     if (det < 0)
         for (int k = 0; k < 3; ++k) e[k][2] = -e[k][2];
@@ -77,7 +78,8 @@ V3DG_HD inline void scale_and_quat_of(const double cov[6], double scale[3], doub
     const double h = sqrt(four[largest]) / 2, f = 1 / (4 * h);
     const double yz = (e[2][1] - e[1][2]) * f, zx = (e[0][2] - e[2][0]) * f, xy = (e[1][0] - e[0][1]) * f;
     const double sxy = (e[0][1] + e[1][0]) * f, sxz = (e[0][2] + e[2][0]) * f, syz = (e[1][2] + e[2][1]) * f;
-    const double by_largest[4][4] = {{h, yz, zx, xy}, {yz, h, sxy, sxz}, {zx, sxy, h, syz}, {xy, sxz, syz, h}};
+    const double by_largest[4][4] = {
+        {h, yz, zx, xy}, {yz, h, sxy, sxz}, {zx, sxy, h, syz}, {xy, sxz, syz, h}};
     for (int k = 0; k < 4; ++k) quat[k] = by_largest[largest][k];
 }
 

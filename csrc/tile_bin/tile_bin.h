@@ -23,8 +23,8 @@ struct RecordChunks {
     size_t size;
 };
 
-// The records that touch each tile, in the order of the chunks: tile t has entries offset[t] to offset[t + 1].
-// An entry is a record's place in its low half; its high half, which orders entries within a tile by depth, is
+// The records that touch each tile t, in the order of the chunks: entries offset[t] to offset[t + 1]. An
+// entry is a record's place in its low half; its high half, which orders entries within a tile by depth, is
 // the bits of the float32 depth.
 struct TileLists {
     Buffer<uint64_t> offset;

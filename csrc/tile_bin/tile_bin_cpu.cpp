@@ -26,7 +26,8 @@ void tile_bin(const Record<T>* records, const RecordChunks& chunks, const TileGr
         uint64_t* row = cursor + c * num_tiles;
         std::memset(row, 0, num_tiles * sizeof *row);
         const Record<T>* record = records + chunks.first[c];
-        for (uint32_t i = 0; i < chunks.count[c]; ++i) for_each_tile(record[i], grid, [&](size_t t) { ++row[t]; });
+        for (uint32_t i = 0; i < chunks.count[c]; ++i)
+            for_each_tile(record[i], grid, [&](size_t t) { ++row[t]; });
     });
     std::memset(offset, 0, (num_tiles + 1) * sizeof *offset);
     for (size_t c = 0; c < chunks.size; ++c)
@@ -46,7 +47,8 @@ void tile_bin(const Record<T>* records, const RecordChunks& chunks, const TileGr
             const float depth = static_cast<float>(records[place].depth);
             uint32_t bits;  // positive floats order as their bits do
             std::memcpy(&bits, &depth, sizeof bits);
-            for_each_tile(records[place], grid, [&](size_t t) { entry[row[t]++] = uint64_t(bits) << 32 | place; });
+            for_each_tile(records[place], grid,
+                          [&](size_t t) { entry[row[t]++] = uint64_t(bits) << 32 | place; });
         }
     });
 }
