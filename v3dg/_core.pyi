@@ -72,3 +72,122 @@ def group_metrics(
     near: float,
     footprint: str,
 ) -> tuple[Float32, NDArray[np.int64]]: ...
+
+# simplify_init
+def prune(
+    means: NDArray[Any],
+    quats: NDArray[Any],
+    scales: NDArray[Any],
+    opacities: NDArray[Any],
+    sh: NDArray[Any],
+    in_offset: NDArray[Any],
+    out_offset: NDArray[Any],
+    growth: float,
+) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
+def merge(
+    means: NDArray[Any],
+    quats: NDArray[Any],
+    scales: NDArray[Any],
+    opacities: NDArray[Any],
+    sh: NDArray[Any],
+    in_offset: NDArray[Any],
+    out_offset: NDArray[Any],
+) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
+
+# render
+class Model:
+    def __init__(
+        self,
+        means: NDArray[Any],
+        quats: NDArray[Any],
+        scales: NDArray[Any],
+        opacities: NDArray[Any],
+        sh: NDArray[Any],
+    ) -> None: ...
+    def __len__(self) -> int: ...
+
+class ModelDouble:
+    def __init__(
+        self,
+        means: NDArray[Any],
+        quats: NDArray[Any],
+        scales: NDArray[Any],
+        opacities: NDArray[Any],
+        sh: NDArray[Any],
+    ) -> None: ...
+    def __len__(self) -> int: ...
+
+class Tape: ...
+class TapeDouble: ...
+
+# filter_px2, compensate, intrinsics, width, height, background, with_depth, keep_tape
+def rasterize(
+    model: Model | ModelDouble, view: NDArray[Any], *options: Any
+) -> tuple[NDArray[Any], NDArray[Any], Any, dict[str, Any], Any]: ...
+def rasterize_backward(
+    tape: Tape | TapeDouble, d_color: NDArray[Any], d_alpha: NDArray[Any], d_depth: NDArray[Any] | None
+) -> tuple[NDArray[Any], ...]: ...
+def render_selection(
+    bundles: list[Any],
+    instance_bundle: NDArray[Any],
+    views: NDArray[Any],
+    instance_ids: NDArray[Any],
+    cluster_ids: NDArray[Any],
+    intrinsics: list[float],
+    width: int,
+    height: int,
+    background: list[float],
+    with_depth: bool,
+) -> tuple[Float32, Float32, Any, dict[str, Any]]: ...
+
+# fit_level
+class LossWeights:
+    def __init__(self, l1: float, dssim: float, alpha: float) -> None: ...
+
+class FitConfig:
+    steps: int
+    views_per_step: int
+    num_views: int
+    supersample: int
+    image_size: int
+    px2_per_gaussian: float
+    distance: float
+    filter_px2: float
+    compensate: bool
+    loss: LossWeights
+    step_position: float
+    step_log_scale: float
+    step_quat: float
+    step_logit: float
+    step_sh0: float
+    step_sh_rest: float
+    position_in_world: bool
+    final_step: float
+    seed: int
+    def __init__(self) -> None: ...
+
+class FitProgress:
+    def __init__(self) -> None: ...
+    @property
+    def groups_done(self) -> int: ...
+    @property
+    def loss_sum(self) -> float: ...
+    def cancel(self) -> None: ...
+
+def fit_level(
+    config: FitConfig,
+    target: Model,
+    target_filter_px2: float,
+    target_compensate: bool,
+    target_range: NDArray[Any],
+    range: NDArray[Any],
+    ball: NDArray[Any],
+    stream: NDArray[Any],
+    means: NDArray[Any],
+    quats: NDArray[Any],
+    scales: NDArray[Any],
+    opacities: NDArray[Any],
+    sh: NDArray[Any],
+    error: NDArray[Any],
+    progress: FitProgress,
+) -> None: ...
