@@ -9,27 +9,35 @@ if _find_spec("v3dg._core") is None:
     )
 
 from v3dg._version import __version__
+from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
 from v3dg.rasterize import Raster, rasterize
+from v3dg.render import DEFAULT_TOLERANCE, Image, Stats, render
 from v3dg.scene import Scene, read_scene, write_scene
 from v3dg.select import Selection, select
 
 __all__ = [
+    "DEFAULT_TOLERANCE",
+    "BuildConfig",
     "Bundle",
     "Camera",
     "Clusters",
     "Gaussians",
     "Groups",
+    "Image",
     "Raster",
     "Scene",
     "Selection",
+    "Stats",
     "__version__",
+    "build_bundle",
     "load",
     "rasterize",
     "read_scene",
+    "render",
     "save",
     "select",
     "turntable",

@@ -1,5 +1,6 @@
 """Types of the compiled module."""
 
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -73,29 +74,10 @@ def group_metrics(
     footprint: str,
 ) -> tuple[Float32, NDArray[np.int64]]: ...
 
-# simplify_init
-def prune(
-    means: NDArray[Any],
-    quats: NDArray[Any],
-    scales: NDArray[Any],
-    opacities: NDArray[Any],
-    sh: NDArray[Any],
-    in_offset: NDArray[Any],
-    out_offset: NDArray[Any],
-    growth: float,
-) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
-def merge(
-    means: NDArray[Any],
-    quats: NDArray[Any],
-    scales: NDArray[Any],
-    opacities: NDArray[Any],
-    sh: NDArray[Any],
-    in_offset: NDArray[Any],
-    out_offset: NDArray[Any],
-) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
-
 # render
 class Model:
+    """Gaussians laid out for the rasterizer."""
+
     def __init__(
         self,
         means: NDArray[Any],
@@ -107,6 +89,8 @@ class Model:
     def __len__(self) -> int: ...
 
 class ModelDouble:
+    """The same in double precision."""
+
     def __init__(
         self,
         means: NDArray[Any],
@@ -117,28 +101,60 @@ class ModelDouble:
     ) -> None: ...
     def __len__(self) -> int: ...
 
-class Tape: ...
+class Tape:
+    """What rasterize leaves for rasterize_backward."""
+
 class TapeDouble: ...
 
-# filter_px2, compensate, intrinsics, width, height, background, with_depth, keep_tape
+# The signature is the same in both precisions; arrays are of the model's.
 def rasterize(
-    model: Model | ModelDouble, view: NDArray[Any], *options: Any
-) -> tuple[NDArray[Any], NDArray[Any], Any, dict[str, Any], Any]: ...
-def rasterize_backward(
-    tape: Tape | TapeDouble, d_color: NDArray[Any], d_alpha: NDArray[Any], d_depth: NDArray[Any] | None
-) -> tuple[NDArray[Any], ...]: ...
-def render_selection(
-    bundles: list[Any],
-    instance_bundle: NDArray[Any],
-    views: NDArray[Any],
-    instance_ids: NDArray[Any],
-    cluster_ids: NDArray[Any],
-    intrinsics: list[float],
+    model: Model | ModelDouble,
+    view: Sequence[float] | NDArray[np.float64],
+    filter_px2: float,
+    compensate: bool,
+    intrinsics: Sequence[float],
     width: int,
     height: int,
-    background: list[float],
+    background: Sequence[float],
     with_depth: bool,
-) -> tuple[Float32, Float32, Any, dict[str, Any]]: ...
+    keep_tape: bool,
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any], Any]: ...
+def rasterize_backward(
+    tape: Tape | TapeDouble, d_color: NDArray[Any], d_alpha: NDArray[Any], d_depth: NDArray[Any] | None
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]: ...
+def render_selection(
+    bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
+    instance_bundle: NDArray[np.int32],
+    views: NDArray[np.float64],
+    instance_ids: NDArray[np.int32],
+    cluster_ids: NDArray[np.int32],
+    intrinsics: Sequence[float],
+    width: int,
+    height: int,
+    background: Sequence[float],
+    with_depth: bool,
+) -> tuple[Float32, Float32, Float32, dict[str, Any]]: ...
+
+# simplify_init
+def prune(
+    means: NDArray[Any],
+    quats: NDArray[Any],
+    scales: NDArray[Any],
+    opacities: NDArray[Any],
+    sh: NDArray[Any],
+    in_offset: NDArray[np.int64],
+    out_offset: NDArray[np.int64],
+    growth: float,
+) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
+def merge(
+    means: NDArray[Any],
+    quats: NDArray[Any],
+    scales: NDArray[Any],
+    opacities: NDArray[Any],
+    sh: NDArray[Any],
+    in_offset: NDArray[np.int64],
+    out_offset: NDArray[np.int64],
+) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
 
 # fit_level
 class LossWeights:
@@ -164,30 +180,31 @@ class FitConfig:
     position_in_world: bool
     final_step: float
     seed: int
-    def __init__(self) -> None: ...
 
 class FitProgress:
-    def __init__(self) -> None: ...
+    """How far fit_level has come; shared with the thread that waits for it."""
+
     @property
     def groups_done(self) -> int: ...
     @property
     def loss_sum(self) -> float: ...
     def cancel(self) -> None: ...
 
+# Writes the result over the start (means, ..., sh), and the residuals into `error`.
 def fit_level(
     config: FitConfig,
     target: Model,
     target_filter_px2: float,
     target_compensate: bool,
-    target_range: NDArray[Any],
-    range: NDArray[Any],
-    ball: NDArray[Any],
-    stream: NDArray[Any],
-    means: NDArray[Any],
-    quats: NDArray[Any],
-    scales: NDArray[Any],
-    opacities: NDArray[Any],
-    sh: NDArray[Any],
-    error: NDArray[Any],
+    target_range: NDArray[np.int64],
+    range: NDArray[np.int64],
+    ball: Float32,
+    stream: NDArray[np.int64],
+    means: Float32,
+    quats: Float32,
+    scales: Float32,
+    opacities: Float32,
+    sh: Float32,
+    error: Float32,
     progress: FitProgress,
 ) -> None: ...
