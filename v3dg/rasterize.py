@@ -51,8 +51,8 @@ def rasterize(
         camera: Pinhole camera.
         filter_px2: Variance of the low-pass filter in screen space, px²; 0.3 draws assets that were trained
             with the original 3DGS code as they were trained.
-        antialiased: Scale opacities by sqrt(det before / det after the filter) (Mip-Splatting, eq. 9), so that
-            the filter spreads a gaussian without adding to it.
+        antialiased: Scale opacities by sqrt(det before / det after the filter) (Mip-Splatting, eq. 9), so
+            that the filter spreads a gaussian without adding to it.
         background: Three numbers, or a tensor of them.
 
     Raises:
@@ -91,12 +91,16 @@ def view_of_world(camera: Camera) -> Any:
     return np.concatenate([v[:3, :3].ravel(), v[:3, 3], -v[:3, :3].T @ v[:3, 3]])
 
 
-def _rasterize_torch(gaussians: Gaussians, camera: Camera, options: tuple[Any, ...], background: Any) -> Raster:
+def _rasterize_torch(
+    gaussians: Gaussians, camera: Camera, options: tuple[float, bool, list[float], int, int], background: Any
+) -> Raster:
     import torch
 
     rows = rows_of(gaussians)
     if any(r.is_cuda for r in rows):
-        raise RuntimeError("gaussians: this version rasterizes on the CPU only; call gaussians.to('cpu') first")
+        raise RuntimeError(
+            "gaussians: this version rasterizes on the CPU only; call gaussians.to('cpu') first"
+        )
     double = rows[0].dtype == torch.float64
     model_type = _core.ModelDouble if double else _core.Model
     bg = torch.as_tensor(background, dtype=rows[0].dtype)
@@ -116,4 +120,5 @@ def _rasterize_torch(gaussians: Gaussians, camera: Camera, options: tuple[Any, .
             arrays = [np.ascontiguousarray(g.detach().numpy()) for g in gradients]
             return tuple(torch.from_numpy(g) for g in _core.rasterize_backward(ctx.tape, *arrays))
 
-    return Raster(*Rasterize.apply(*rows, bg))
+    apply: Any = Rasterize.apply
+    return Raster(*apply(*rows, bg))
