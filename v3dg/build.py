@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import operator
 import os
 import threading
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core
+from v3dg._version import __version__
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.gaussians import Gaussians
 from v3dg.rasterize import rows_of
@@ -24,6 +27,12 @@ if TYPE_CHECKING:
 
 # Standard deviations at which a gaussian of opacity 1 falls to an alpha of 1/255, and never draws beyond.
 REACH_SIGMAS = 3.33
+
+# Of a side of a picture, in pixels.
+_MAX_IMAGE_SIZE = 65535
+
+# Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
+_GROUPS_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
@@ -88,7 +97,19 @@ class BuildConfig:
             if not good:
                 raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
 
-        for name in ("cluster_size", "min_clusters", "min_gaussians", "views_per_step", "supersample"):
+        kinds: dict[Any, tuple[Any, str]] = {
+            "int": (int, "a whole number"),
+            "float": ((int, float), "a number"),
+            "bool": (bool, "True or False"),
+        }
+        for field in fields(self):
+            if field.type in kinds:
+                kind, expected = kinds[field.type]
+                value = getattr(self, field.name)
+                is_flag = isinstance(value, bool)
+                require(field.name, isinstance(value, kind) and is_flag == (kind is bool), expected)
+        require("cluster_size", self.cluster_size >= 2, "at least 2")
+        for name in ("min_clusters", "min_gaussians", "views_per_step", "supersample"):
             require(name, getattr(self, name) >= 1, "at least 1")
         for name in ("steps", "num_views", "image_size"):
             require(name, getattr(self, name) >= 0, "at least 0")
@@ -97,6 +118,11 @@ class BuildConfig:
         for field in fields(self):
             if field.name.startswith(("loss_", "step_")) or field.name.endswith("filter_px2"):
                 require(field.name, 0 <= getattr(self, field.name) < math.inf, "a number of at least 0")
+        require(
+            "image_size",
+            self.image_size * self.supersample <= _MAX_IMAGE_SIZE,
+            f"at most {_MAX_IMAGE_SIZE} px with `supersample` times as many pixels",
+        )
         size = self.group_size
         require("group_size", size >= 2 and size & (size - 1) == 0, "a power of two of at least 2")
         require("init", self.init in ("merge", "prune"), "'merge' or 'prune'")
@@ -153,6 +179,9 @@ class _Level:
     weight: npt.NDArray[np.float32]  # (groups,) of its footprint
     error: npt.NDArray[np.float32]  # (groups, 2)
 
+    def next_shape(self, config: BuildConfig) -> tuple[int, int] | None:
+        return _next_shape(len(self.offset) - 1, len(self.gaussians), config)
+
 
 def build_bundle(
     asset: Gaussians,
@@ -172,7 +201,7 @@ def build_bundle(
         asset: At least one gaussian, all values finite.
         config: Settings; ours by default.
         seed: Of the views that groups are fitted to.
-        progress: Show a bar with groups done, time left and the loss of the level.
+        progress: Show a bar with the level, its groups done, the time left and their mean loss.
         device: "auto" and "cpu" build on the CPU, the only device of this version.
         resume_path: Where to keep finished levels until the bundle is done; a build of the same asset, config
             and seed that finds them there goes on from them.
@@ -184,8 +213,11 @@ def build_bundle(
     config = config or BuildConfig()
     if device not in ("auto", "cpu"):
         raise ValueError(f"device: expected 'auto' or 'cpu', got {device!r}; this version builds on the CPU")
-    if not 0 <= seed < 2**63:
-        raise ValueError(f"seed: expected 0 to 2^63 - 1, got {seed}")
+    if not isinstance(progress, bool):
+        raise TypeError(f"progress: expected True or False, got {progress!r}")
+    seed = operator.index(seed)
+    if not 0 <= seed < 2**58:
+        raise ValueError(f"seed: expected 0 to 2^58 - 1, got {seed}")
     rows = rows_of(asset.numpy())
     _check_drawable(rows)
     store = _Checkpoint(resume_path, rows, config, seed)
@@ -194,7 +226,7 @@ def build_bundle(
         levels = [_leaves(Gaussians(*rows), config)]
     bar = _Bar(levels, config, progress)
     try:
-        while (shape := _next_shape(levels[-1], config)) is not None:
+        while (shape := levels[-1].next_shape(config)) is not None:
             levels.append(_simplify(levels, shape, config, seed, bar))
             store.save(levels)
     finally:
@@ -209,12 +241,17 @@ def _check_drawable(rows: tuple[Any, ...]) -> None:
         raise ValueError("asset: expected at least one gaussian, got none")
     for name, values in zip(("means", "quats", "scales", "opacities", "sh"), rows, strict=True):
         good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        if name in ("scales", "opacities"):
-            good &= (values >= 0).reshape(len(values), -1).all(axis=1)
+        expected = "finite numbers"
+        if name == "scales":
+            good &= (values >= 0).all(axis=1)
+            expected = "numbers of at least 0"
+        elif name == "opacities":
+            good &= (values >= 0) & (values <= 1)
+            expected = "numbers from 0 to 1"
         if not good.all():
             raise ValueError(
-                f"asset: {int((~good).sum())} of {len(good)} gaussians have {name} that are negative or not "
-                f"finite, the first is number {int(np.argmin(good))}; remove them"
+                f"asset: expected {name} that are {expected}, got others in {int((~good).sum())} of "
+                f"{len(good)} gaussians, the first is number {int(np.argmin(good))}; remove them"
             )
 
 
@@ -234,15 +271,25 @@ def _leaves(asset: Gaussians, config: BuildConfig) -> _Level:
     )
 
 
-def _next_shape(level: _Level, config: BuildConfig) -> tuple[int, int] | None:
-    """Groups that the level's clusters form, and clusters each makes; None at the last level."""
-    clusters = len(level.offset) - 1
+def _next_shape(clusters: int, gaussians: int, config: BuildConfig) -> tuple[int, int] | None:
+    """Groups that a level's clusters form, and clusters each makes; None after the last level."""
     num_groups = max(1, clusters // config.group_size)
     made = max(1, clusters // num_groups // 2)
-    fewer = len(level.gaussians) // 2
-    if num_groups * made < config.min_clusters or fewer < config.min_gaussians:
+    if num_groups * made < config.min_clusters or gaussians // 2 < config.min_gaussians:
         return None
     return num_groups, made
+
+
+def _sizes_ahead(sizes: npt.NDArray[np.int64], config: BuildConfig) -> list[int]:
+    """Gaussians of each level above one whose clusters have `sizes`."""
+    ahead = []
+    while (shape := _next_shape(len(sizes), int(sizes.sum()), config)) is not None:
+        num_groups, made = shape
+        sizes = (sizes.reshape(num_groups, -1).sum(axis=1) + 1) // 2
+        ahead.append(int(sizes.sum()))
+        while len(sizes) < num_groups * made:
+            sizes = np.stack([(sizes + 1) // 2, sizes // 2], axis=1).ravel()
+    return ahead
 
 
 def _simplify(
@@ -253,9 +300,7 @@ def _simplify(
     per_group = (len(below.offset) - 1) // num_groups
     offset = np.ascontiguousarray(below.offset[::per_group])
     out_offset = np.concatenate([[0], np.cumsum((np.diff(offset) + 1) // 2)])
-    method = _core.merge if config.init == "merge" else _core.prune
-    growth = () if config.init == "merge" else (config.prune_growth,)
-    rows = method(*rows_of(below.gaussians), offset, out_offset, *growth)
+    rows = _start(below.gaussians, offset, out_offset, config)
 
     # Groups nest: this level's are runs of whole groups of the level below.
     first_group = below.group_of_cluster[np.arange(num_groups) * per_group]
@@ -277,10 +322,9 @@ def _simplify(
     own_filter = from_leaves or len(levels) == 1
     error = np.zeros((num_groups, 2), np.float32)
     fit = _fit_config(config, seed, len(levels))
+    bar.start_level(len(levels), num_groups, int(out_offset[-1]))
     _run_fit(
         bar,
-        num_groups,
-        int(out_offset[-1]),
         lambda progress: _core.fit_level(
             fit,
             _core.Model(*rows_of(target.gaussians)),
@@ -307,6 +351,25 @@ def _simplify(
     )
 
 
+def _start(
+    gaussians: Gaussians,
+    offset: npt.NDArray[np.int64],
+    out_offset: npt.NDArray[np.int64],
+    config: BuildConfig,
+) -> tuple[Any, Any, Any, Any, Any]:
+    """The rows that groups start from: their gaussians halved, from `offset` to `out_offset`."""
+    parts = []
+    for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
+        cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
+        rows = rows_of(gaussians.subset(slice(cuts[0], cuts[-1])))
+        if config.init == "merge":
+            parts.append(_core.merge(*rows, cuts - cuts[0], out_cuts - out_cuts[0]))
+        else:
+            parts.append(_core.prune(*rows, cuts - cuts[0], out_cuts - out_cuts[0], config.prune_growth))
+    means, quats, scales, opacities, sh = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return means, quats, scales, opacities, sh
+
+
 def _split_groups(
     gaussians: Gaussians, offset: npt.NDArray[np.int64], parts: int
 ) -> tuple[Gaussians, npt.NDArray[np.int64]]:
@@ -314,7 +377,7 @@ def _split_groups(
     if parts == 1:
         return gaussians, offset
     orders, counts = [], []
-    for first, last in zip(offset[:-1], offset[1:], strict=True):
+    for first, last in pairwise(offset):
         size = max(1, -(-int(last - first) // parts))
         order, cuts = _core.median_split(gaussians.means[first:last], size)
         orders.append(order + first)
@@ -337,40 +400,39 @@ def _fit_config(config: BuildConfig, seed: int, level: int) -> Any:
     return fit
 
 
-def _run_fit(bar: _Bar, num_groups: int, num_gaussians: int, fit: Callable[[Any], None]) -> None:
+def _run_fit(bar: _Bar, fit: Callable[[_core.FitProgress], None]) -> None:
     """Run `fit` on a thread of its own, so that Ctrl-C and the bar stay alive while it computes."""
     state = _core.FitProgress()
     failure: list[BaseException] = []
+    done = threading.Event()
 
     def work() -> None:
         try:
             fit(state)
         except BaseException as error:
             failure.append(error)
-
         finally:
             done.set()
 
-    # Not Thread.join: Ctrl-C during it can make Python 3.11 take the thread for finished while it runs.
-    done = threading.Event()
     thread = threading.Thread(target=work)
-    thread.start()
     try:
+        thread.start()
+        # Not Thread.join: Ctrl-C during it can make Python 3.11 take the thread for finished while it runs.
         while not done.wait(0.1):
-            bar.show(state, num_groups, num_gaussians)
+            bar.show(state)
     except BaseException:
         state.cancel()
-        done.wait()
-        thread.join()
+        while thread.is_alive():
+            done.wait(0.1)
         raise
     thread.join()
     if failure:
         raise failure[0]
-    bar.finish_level(num_gaussians)
+    bar.show(state)
 
 
 class _Bar:
-    """Progress over all groups of all levels."""
+    """One bar over all levels; it advances by fitted gaussians, which is what time goes with."""
 
     def __init__(self, levels: list[_Level], config: BuildConfig, visible: bool) -> None:
         self._bar: Any = None
@@ -378,24 +440,35 @@ class _Bar:
             return
         from tqdm import tqdm
 
-        # Work goes with the gaussians that are fitted: each level has half of the one below, rounded up.
-        total = len(levels[0].gaussians)
-        self._bar = tqdm(total=total, unit="gaussian", unit_scale=True, desc="build", smoothing=0.1)
-        self._finished = self._bar.initial = sum(len(level.gaussians) for level in levels[1:])
+        ahead = _sizes_ahead(np.diff(levels[-1].offset), config)
+        before = sum(len(level.gaussians) for level in levels[1:])
+        self._last_level = len(levels) - 1 + len(ahead)
+        self._num_groups = self._num_gaussians = 0
+        self._finished = before
+        self._bar = tqdm(
+            total=before + sum(ahead),
+            initial=before,
+            unit=" gaussians",
+            unit_scale=True,
+            smoothing=0.1,
+            dynamic_ncols=True,
+        )
 
-    def show(self, state: Any, num_groups: int, num_gaussians: int) -> None:
-        """Show a level of which some groups are done."""
-        if self._bar is None or not state.groups_done:
+    def start_level(self, level: int, num_groups: int, num_gaussians: int) -> None:
+        if self._bar is None:
             return
-        loss = state.loss_sum / state.groups_done
-        done = self._finished + num_gaussians * state.groups_done // num_groups
-        self._bar.set_postfix_str(f"groups {state.groups_done}/{num_groups}, loss {loss:.4f}", refresh=False)
-        self._bar.update(min(done, self._bar.total) - self._bar.n)
+        self._finished += self._num_gaussians
+        self._num_groups, self._num_gaussians = num_groups, num_gaussians
+        self._bar.set_description(f"level {level}/{self._last_level}")
 
-    def finish_level(self, num_gaussians: int) -> None:
-        if self._bar is not None:
-            self._finished += num_gaussians
-            self._bar.update(min(self._finished, self._bar.total) - self._bar.n)
+    def show(self, state: _core.FitProgress) -> None:
+        """Show how many groups of the level are done."""
+        groups_done = state.groups_done
+        if self._bar is None or groups_done == 0:
+            return
+        loss = state.loss_sum / groups_done
+        self._bar.set_postfix_str(f"groups {groups_done}/{self._num_groups}, loss {loss:.4f}", refresh=False)
+        self._bar.update(self._finished + self._num_gaussians * groups_done // self._num_groups - self._bar.n)
 
     def close(self) -> None:
         if self._bar is not None:
@@ -411,28 +484,41 @@ class _Checkpoint:
         self._path = None if path is None else Path(path)
         if self._path is None:
             return
+        if not self._path.parent.is_dir():
+            raise ValueError(f"resume_path: expected a file in an existing folder, got {self._path}")
+        # One name, so that what a killed build left is written over and not left for ever.
+        self._temporary = self._path.with_name(f".{self._path.name}.tmp")
         digest = hashlib.blake2b(digest_size=16)
         for array in rows:
             digest.update(str(array.shape).encode())
-            digest.update(np.ascontiguousarray(array))
-        digest.update(json.dumps([asdict(config), seed, _core.isa()], sort_keys=True).encode())
+            digest.update(np.ascontiguousarray(array).data)
+        digest.update(json.dumps([asdict(config), seed, _core.isa(), __version__], sort_keys=True).encode())
         self._key = digest.hexdigest()
 
     def load(self) -> list[_Level]:
         if self._path is None or not self._path.exists():
             return []
         try:
-            with np.load(self._path, allow_pickle=False) as data:
-                if str(data["key"]) != self._key:
-                    raise ValueError(
-                        f"{self._path}: holds levels of another asset, config or seed; remove it to start again"
-                    )
-                return [self._unpack(data, f"{i}.") for i in range(int(data["levels"]))]
-        except (OSError, KeyError, EOFError) as error:
+            levels = self._read(self._path)
+        except Exception as error:  # what a damaged archive raises has no common type
             raise ValueError(
                 f"{self._path}: expected levels of an interrupted build, could not read them "
                 f"({error}); remove it to start again"
             ) from error
+        if levels is None:
+            raise ValueError(
+                f"{self._path}: holds levels of another asset, config, seed or version; "
+                "remove it to start again"
+            )
+        return levels
+
+    def _read(self, path: Path) -> list[_Level] | None:
+        with np.load(path, allow_pickle=False) as data:
+            if str(data["key"]) != self._key:
+                return None
+            if (damaged := data.zip.testzip()) is not None:
+                raise ValueError(f"{damaged} is damaged")
+            return [self._unpack(data, f"{i}.") for i in range(int(data["levels"]))]
 
     @staticmethod
     def _unpack(data: Any, prefix: str) -> _Level:
@@ -448,16 +534,16 @@ class _Checkpoint:
                 arrays[f"{i}.{f.name}"] = getattr(level.gaussians, f.name)
             for f in fields(_Level)[1:]:
                 arrays[f"{i}.{f.name}"] = getattr(level, f.name)
-        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.tmp")
         try:
-            with open(temporary, "wb") as file:
+            with open(self._temporary, "wb") as file:
                 np.savez(file, **arrays)
-            os.replace(temporary, self._path)
+            os.replace(self._temporary, self._path)
         finally:
-            temporary.unlink(missing_ok=True)
+            self._temporary.unlink(missing_ok=True)
 
     def remove(self) -> None:
         if self._path is not None:
+            self._temporary.unlink(missing_ok=True)
             self._path.unlink(missing_ok=True)
 
 
