@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <numeric>
 
 #include "adam/adam_math.h"
 #include "rasterize/tile.h"
@@ -414,12 +415,14 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
     double start[2], end[2];
     measure(student, start);
     uint64_t next_view = 0;
+    // A stride prime to the number of views visits all of them, neighbours far apart.
+    int stride = 29;
+    while (std::gcd(stride, config.num_views) > 1) ++stride;
     for (int s = 0; s < config.steps && !cancel.load(std::memory_order_relaxed); ++s) {
         student.clear_gradient();
         for (int b = 0; b < config.views_per_step; ++b, ++next_view) {
             if (config.num_views > 0) {
-                // A step prime to the number of views visits all of them, neighbours far apart.
-                const uint64_t index = next_view * 29 % static_cast<uint64_t>(config.num_views);
+                const uint64_t index = next_view * stride % static_cast<uint64_t>(config.num_views);
                 comparison.add_gradient(student, fit_view(config, group, index), targets[index]);
             } else {
                 const FitView view = fit_view(config, group, next_view);

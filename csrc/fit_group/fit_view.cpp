@@ -47,8 +47,9 @@ FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index)
         random_rotation(uniform(0), uniform(1), uniform(2), turn);
         multiply(lattice, turn, rotation);
     } else {
-        const uint64_t base = 16 + 8 * index;
-        random_rotation(uniform(base + 3), uniform(base + 4), uniform(base + 5), rotation);
+        // Far from the numbers that shift the picture.
+        const uint64_t base = (uint64_t(1) << 63) + 4 * index;
+        random_rotation(uniform(base), uniform(base + 1), uniform(base + 2), rotation);
     }
 
     FitView view;
