@@ -75,7 +75,7 @@ class BuildConfig:
     num_views: int = 64
     supersample: int = 4
     image_size: int = 0
-    px2_per_gaussian: float = 1.0
+    px2_per_gaussian: float = 1.5
     distance: float = 4.0
     filter_px2: float = 0.1
     asset_filter_px2: float = 0.0

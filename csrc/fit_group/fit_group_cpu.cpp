@@ -70,7 +70,7 @@ static void blend_sorted(const FitScratch& scratch, size_t count, int left, int 
     for (size_t i = 0; i < count && alive != 0; ++i) {
         const Record<float>& g = scratch.records.data()[record_of(scratch.order.data()[i])];
         if (g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize) continue;
-        const uint64_t blocks = blocks_of(g, left, top) & alive;
+        const uint64_t blocks = blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
         if (blocks != 0) blend_record<float, false>(g, blocks, left, top, pixels, tile, alive);
     }
 }
@@ -304,7 +304,7 @@ public:
                 const uint32_t r = record_of(scratch_.order.data()[i]);
                 const Record<float>& g = scratch_.records.data()[r];
                 if (g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize) continue;
-                const uint64_t blocks = blocks_of(g, left, top) & alive;
+                const uint64_t blocks = blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
                 RecordGradient<float> d;
                 if (blocks == 0 || !blend_record_vjp<float, false>(g, blocks, left, top, pixels, grad, tile, alive, d))
                     continue;

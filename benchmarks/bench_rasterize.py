@@ -1,0 +1,72 @@
+"""One asset that fills the picture: frames a second and the stages of a frame, with its error to double precision."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import record
+import tyro
+
+import v3dg
+from v3dg import _core
+from v3dg.cameras import Camera
+from v3dg.procedural import make_asset
+from v3dg.rasterize import intrinsics, rows_of, view_of_world
+
+
+@dataclass
+class Config:
+    asset: Path | None = None
+    """A .ply file; by default the procedural asset."""
+    size: int = 800
+    repeats: int = 20
+    output: str | None = None
+
+
+def camera_that_fills(gaussians: v3dg.Gaussians, size: int) -> Camera:
+    """Look at the asset from above its front, so that it fills a square picture."""
+    low, high = np.quantile(gaussians.means, [0.01, 0.99], axis=0)
+    center, extent = (low + high) / 2, np.linalg.norm(high - low)
+    eye = center + extent * np.array([0.0, -0.42, 0.7])
+    return Camera.look_at(eye, center, (0.0, 0.0, 1.0), fov_x=0.785, width=size, height=size)
+
+
+def main(config: Config) -> None:
+    gaussians = make_asset() if config.asset is None else v3dg.load(config.asset)
+    camera = camera_that_fills(gaussians, config.size)
+    options = (view_of_world(camera), 0.0, False, intrinsics(camera), camera.width, camera.height, [0.0] * 3, False, False)
+    model = _core.Model(*rows_of(gaussians))
+    times, stages = [], []
+    for _ in range(config.repeats + 3):
+        start = time.perf_counter()
+        color, alpha, _, counts, _ = _core.rasterize(model, *options)
+        times.append(time.perf_counter() - start)
+        stages.append(counts)
+    exact = _core.rasterize(_core.ModelDouble(*(a.astype(np.float64) for a in rows_of(gaussians))), *options)[0]
+    median = statistics.median(times[3:])
+    result = {
+        "gaussians": len(gaussians),
+        "size": config.size,
+        "covered": round(float((alpha > 0.5).mean()), 3),
+        "frame_ms": round(1e3 * median, 2),
+        "frame_ms_fastest": round(1e3 * min(times), 2),
+        "frames_per_second": round(1 / median, 1),
+        **{
+            f"{stage}_ms": round(1e3 * statistics.median(s[f"{stage}_seconds"] for s in stages[3:]), 2)
+            for stage in ("project", "bin", "rasterize")
+        },
+        "records": counts["records"],
+        "entries": counts["entries"],
+        "largest_error": float(np.abs(color - exact).max()),
+        "mean_error": float(np.abs(color - exact).mean()),
+    }
+    print(result)
+    record.write(config.output, result)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
