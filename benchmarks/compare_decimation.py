@@ -1,9 +1,14 @@
 """Our levels against splat-transform's decimation, at equal counts, with our renderer.
 
-Each count is drawn at two sizes: where selection takes that level (a footprint of one px² per gaussian, tolerance
-1), and at a fixed size that is far larger than the coarse levels are meant for. The truth is the whole asset at
-twice the resolution, box-averaged. Levels of the bundle halve, so a count that is not a level takes the next
-level below it: ours never has more gaussians.
+Each count is drawn at three sizes, of which the first two have px² in proportion to the count:
+ball: one px² per gaussian of the footprint of the ball around the whole asset; one level of ours.
+cut: where the cut at tolerance 1, cluster by cluster, has that many gaussians; that cut of ours. Smaller, for
+    the balls of groups overlap.
+large: a fixed size, far larger than the coarse levels are meant for; one level of ours.
+
+The truth is the whole asset at twice the resolution, box-averaged; beside it stands what the asset itself
+reaches at one sample a pixel. Levels halve, rounding up cluster by cluster, so a count is met by the largest
+level that has at most 1 % more gaussians.
 
 Make the decimated files first (splat-transform 3.7.0; names as below, in one directory):
 
@@ -23,7 +28,9 @@ import numpy as np
 import tyro
 
 import v3dg
+from v3dg.build import build_bundle
 from v3dg.metrics import box_downsample, flip, psnr
+from v3dg.render import render
 
 
 @dataclass
@@ -71,61 +78,79 @@ def draw(gaussians: v3dg.Gaussians, camera: v3dg.Camera, filter_px2: float, anti
     return np.clip(raster.color, 0, 1)
 
 
+def footprint_of_cut(config: Config, bundle: v3dg.Bundle, ball: np.ndarray, count: int) -> float:
+    """Footprint of the ball at which the cut at tolerance 1 has `count` gaussians averaged over views."""
+    low, high = 1.0, 64.0 * count
+    for _ in range(24):
+        middle = math.sqrt(low * high)
+        cameras = [camera_at(config, ball, view, middle) for view in range(config.views)]
+        mean = np.mean([v3dg.select(bundle, c, tolerance=1.0).num_gaussians for c in cameras])
+        low, high = (middle, high) if mean <= count else (low, middle)
+    return low
+
+
 def main(config: Config) -> None:
     asset = v3dg.load(config.asset)
     start = time.perf_counter()
-    bundle = v3dg.Bundle.open(config.bundle) if config.bundle else v3dg.build_bundle(asset)
+    bundle = v3dg.Bundle.open(config.bundle) if config.bundle else build_bundle(asset)
     build_seconds = time.perf_counter() - start
     counts = [len(bundle.level_gaussians(level)) for level in range(bundle.num_levels)]
-    reach = np.linalg.norm(asset.means - asset.means.mean(axis=0), axis=1)
-    box = np.stack([asset.means.min(axis=0), asset.means.max(axis=0)])
-    center = box.mean(axis=0)
-    radius = float(np.linalg.norm(asset.means - center, axis=1).max())
-    ball = np.array([*center, radius])
-    del reach
+    center = (asset.means.min(axis=0) + asset.means.max(axis=0)) / 2
+    ball = np.array([*center, np.linalg.norm(asset.means - center, axis=1).max()])
 
     rows: list[dict[str, Any]] = []
     for percent in config.percent:
         theirs = v3dg.load(config.decimated / f"{config.asset.stem}_{percent}.ply")
-        level = next(k for k, count in enumerate(counts) if count <= max(len(theirs), counts[-1]))
+        num = len(theirs)
+        level = next(k for k, count in enumerate(counts) if count <= max(1.01 * num, counts[-1]))
         ours = bundle.level_gaussians(level)
         first = bundle.level_range(level)[0]
         own_filter = float(bundle.clusters.filter_px2[first]), bool(bundle.clusters.antialiased[first])
-        for where, footprint in (("selected", float(len(theirs))), ("large", None)):
-            scores: dict[str, list[float]] = {"ours_psnr": [], "ours_flip": [], "theirs_psnr": [], "theirs_flip": []}
+        footprints = {"ball": float(num), "cut": footprint_of_cut(config, bundle, ball, num), "large": None}
+        for where, footprint in footprints.items():
+            scores: dict[str, list[float]] = {}
             for view in range(config.views):
                 camera = camera_at(config, ball, view, footprint)
                 truth = box_downsample(draw(asset, camera.scaled(2), 0.0, False), 2)
-                # Theirs as the asset is drawn, or with our filter if that suits it better.
-                theirs_best = max(
-                    (draw(theirs, camera, *options) for options in ((0.0, False), own_filter)),
-                    key=lambda image: psnr(truth, image),  # noqa: B023
-                )
-                for who, image in (("ours", draw(ours, camera, *own_filter)), ("theirs", theirs_best)):
-                    scores[who + "_psnr"].append(psnr(truth, image))
-                    scores[who + "_flip"].append(flip(truth, image))
-            rows.append(
-                {
-                    "percent": float(percent),
-                    "where": where,
-                    "size_px": camera.width,
-                    "ours_gaussians": len(ours),
-                    "theirs_gaussians": len(theirs),
+                images = {
+                    "asset": draw(asset, camera, 0.0, False),
+                    "theirs": draw(theirs, camera, 0.0, False),
                 }
-                | {key: float(np.mean(values)) for key, values in scores.items()}
-            )
+                # Theirs as the asset is drawn, or with our filter where that suits it better.
+                filtered = draw(theirs, camera, *own_filter)
+                if psnr(truth, filtered) > psnr(truth, images["theirs"]):
+                    images["theirs"] = filtered
+                if where == "cut":
+                    drawn = render(bundle, camera, tolerance=1.0)
+                    images["ours"] = np.clip(drawn.color, 0, 1)
+                    scores.setdefault("ours_gaussians", []).append(drawn.stats.gaussians_selected)
+                else:
+                    images["ours"] = draw(ours, camera, *own_filter)
+                    scores.setdefault("ours_gaussians", []).append(len(ours))
+                for who, image in images.items():
+                    scores.setdefault(who + "_psnr", []).append(psnr(truth, image))
+                    scores.setdefault(who + "_flip", []).append(flip(truth, image))
+            row = {
+                "percent": float(percent),
+                "where": where,
+                "size_px": camera.width,
+                "theirs_gaussians": num,
+            }
+            rows.append(row | {key: float(np.mean(values)) for key, values in scores.items()})
     if config.json:
         print(json.dumps({"asset": config.asset.name, "build_seconds": build_seconds, "rows": rows}))
         return
     print(f"{config.asset.name}: {len(asset)} gaussians, {config.views} views; levels of {counts}")
-    print("   %  where      px | ours: count  PSNR dB    FLIP | splat-transform: count  PSNR dB    FLIP | wins")
+    print(
+        "    % where   px |  ours: count      dB    FLIP | theirs: count     dB    FLIP | asset: dB    FLIP"
+    )
     for r in rows:
+        text = f"{r['percent']:5g} {r['where']:5s} {r['size_px']:4d} "
+        for who in ("ours", "theirs"):
+            text += f"| {r[who + '_gaussians']:12.0f}  {r[who + '_psnr']:6.2f}  {r[who + '_flip']:.4f} "
         wins = (r["ours_psnr"] > r["theirs_psnr"]) + (r["ours_flip"] < r["theirs_flip"])
-        print(
-            f"{r['percent']:5g}  {r['where']:8s} {r['size_px']:4d} | {r['ours_gaussians']:11d}  "
-            f"{r['ours_psnr']:7.2f}  {r['ours_flip']:.4f} | {r['theirs_gaussians']:22d}  {r['theirs_psnr']:7.2f}  "
-            f"{r['theirs_flip']:.4f} | {('no', 'one of two', 'yes')[wins]}"
-        )
+        text += f"|    {r['asset_psnr']:6.2f}  {r['asset_flip']:.4f} "
+        print(text + f"| ours wins: {('no', 'one of two', 'yes')[wins]}")
 
 
 if __name__ == "__main__":
