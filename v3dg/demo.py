@@ -212,7 +212,7 @@ def table_text(result: DemoResult) -> str:
     """The numbers of the picture as a table."""
     lines = [
         f"{result.instances:,} instances of {result.asset_gaussians:,} gaussians, "
-        f"{result.levels} levels built in {result.build_seconds:.1f} s",
+        f"{result.levels} levels built in {result.build_seconds:.1f} s, tolerance {result.tolerance:g} px²",
         "",
         f"{'':>9} {'full asset':-^34}  {'v3dg':-^34}",
         f"{'distance':>9}" + f" {'gaussians':>10} {'select+draw':>12} {'FLIP':>10} " * 2,
@@ -256,7 +256,7 @@ def _poster(result: DemoResult, pictures: list[tuple[Any, Any]]) -> NDArray[np.u
     line = (
         f"{result.instances:,} tufts of {result.asset_gaussians:,} gaussians, {count_text(placed)} in all; "
         f"bundle of {result.levels} levels built in {result.build_seconds:.0f} s; "
-        f"{result.threads} CPU threads"
+        f"{result.threads} CPU threads; tolerance {result.tolerance:g} square px"
     )
     _text(draw, (_MARGIN + 128, 66), line, 17, _QUIET)
 
