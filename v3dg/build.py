@@ -513,7 +513,8 @@ class _Checkpoint:
         return levels
 
     def _read(self, path: Path) -> list[_Level] | None:
-        with np.load(path, allow_pickle=False) as data:
+        # Opened here, since numpy leaves the file of a damaged archive open.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
             if str(data["key"]) != self._key:
                 return None
             if (damaged := data.zip.testzip()) is not None:

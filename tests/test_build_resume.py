@@ -1,0 +1,200 @@
+"""Builds that are interrupted, killed, gone on with; and the checkpoints that they leave."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import v3dg
+import v3dg.build
+from v3dg import BuildConfig, build_bundle
+from v3dg.procedural import make_asset
+
+CONFIG = BuildConfig(cluster_size=32, steps=400)
+# Runs for days; only the first level's checkpoint would end it.
+ENDLESS = replace(CONFIG, steps=2_000_000_000)
+SCRIPT = """
+import sys
+import v3dg
+from v3dg.procedural import make_asset
+asset = make_asset(num_gaussians=1000, seed=0)
+config = v3dg.BuildConfig(cluster_size=32, steps=int(sys.argv[1]))
+print("ready", flush=True)
+try:
+    bundle = v3dg.build_bundle(asset, config=config, seed=7, progress=False, resume_path=sys.argv[2])
+except KeyboardInterrupt:
+    sys.exit(130)
+bundle.save(sys.argv[3])
+"""
+# Generous: a build that did not listen would take days.
+PATIENCE = 60
+
+
+@pytest.fixture(scope="module")
+def asset():
+    return make_asset(num_gaussians=1000, seed=0)
+
+
+def bytes_of(bundle, folder):
+    path = folder / "bytes.v3dg"
+    bundle.save(path)
+    return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def whole(asset, tmp_path_factory):
+    """The bundle of a build that nothing interrupts."""
+    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False)
+    return bytes_of(bundle, tmp_path_factory.mktemp("whole"))
+
+
+@contextmanager
+def started_build(config, folder):
+    """A build in a process of its own; killed at the end if it still runs."""
+    environment = os.environ | {"PYTHONPATH": str(Path(v3dg.__file__).parent.parent)}
+    arguments = [str(config.steps), str(folder / "levels"), str(folder / "out.v3dg")]
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, *arguments],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        # As from a terminal, whatever the tests themselves were started with.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    try:
+        assert process.stdout.readline() == "ready\n"
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def wait_for_new(path, process, before=None):
+    """Until `path` is another file than `before`; what it is then, or None if the process ended first."""
+    while process.poll() is None:
+        if path.exists() and (now := path.stat().st_ino) != before:
+            return now
+        time.sleep(0.002)
+    return None
+
+
+def names_in(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_ctrl_c_ends_a_build_at_once(tmp_path):
+    with started_build(ENDLESS, tmp_path) as process:
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+    assert names_in(tmp_path) == []
+
+
+def test_interrupted_build_resumes_to_the_same_bytes(asset, whole, tmp_path):
+    with started_build(CONFIG, tmp_path) as process:
+        assert wait_for_new(tmp_path / "levels", process)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 130
+    assert names_in(tmp_path) == ["levels"]
+    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False, resume_path=tmp_path / "levels")
+    assert names_in(tmp_path) == []
+    assert bytes_of(bundle, tmp_path) == whole
+
+
+def test_killed_builds_resume_to_the_same_bytes(asset, whole, tmp_path):
+    levels = tmp_path / "levels"
+    seen = None
+    for _ in range(3):
+        with started_build(CONFIG, tmp_path) as process:
+            seen = wait_for_new(levels, process, seen)
+            process.kill()
+            process.wait()
+        # At most one more than the finished levels: what was being written.
+        assert set(names_in(tmp_path)) <= {"levels", ".levels.tmp"}
+    (tmp_path / ".levels.tmp").write_bytes(b"half a file")
+    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False, resume_path=levels)
+    assert names_in(tmp_path) == []
+    assert bytes_of(bundle, tmp_path) == whole
+
+
+QUICK = BuildConfig(cluster_size=64, steps=0)
+
+
+@pytest.fixture
+def checkpoint(asset, tmp_path, monkeypatch):
+    """All levels of a build that was interrupted before it could put them together."""
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(v3dg.build, "_assemble", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "levels")
+    return tmp_path / "levels"
+
+
+def test_finished_levels_are_not_built_again(asset, checkpoint, monkeypatch):
+    def fail(*_):
+        raise AssertionError("built a level again")
+
+    monkeypatch.setattr(v3dg.build, "_simplify", fail)
+    assert build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint).num_levels > 3
+
+
+@pytest.mark.parametrize("changed", ["asset", "config", "seed", "version"])
+def test_checkpoint_of_another_build_is_refused(asset, checkpoint, changed, monkeypatch):
+    before = checkpoint.read_bytes()
+    config, seed = QUICK, 0
+    if changed == "asset":
+        asset = make_asset(num_gaussians=1000, seed=1)
+    elif changed == "config":
+        config = replace(config, distance=4.5)
+    elif changed == "seed":
+        seed = 1
+    else:
+        monkeypatch.setattr(v3dg.build, "__version__", "0.0.0")
+    with pytest.raises(ValueError, match="another asset, config, seed or version; remove it to start again"):
+        build_bundle(asset, config=config, seed=seed, progress=False, resume_path=checkpoint)
+    assert checkpoint.read_bytes() == before
+
+
+def test_damaged_checkpoint_is_named(asset, checkpoint, tmp_path):
+    good = checkpoint.read_bytes()
+    expected = bytes_of(build_bundle(asset, config=QUICK, progress=False), tmp_path)
+    rng = np.random.default_rng(0)
+    damaged = {f"first {n} bytes": good[:n] for n in (0, 1, 30, len(good) // 2, len(good) - 1)}
+    damaged |= {"text": b"not an archive", "zeros": bytes(1000), "array": b"\x93NUMPY\x01\x00" + bytes(90)}
+    # Names, lengths and checksums stand at both ends, levels in between.
+    for place in (*rng.integers(0, len(good), 20), *rng.integers(len(good) - 3000, len(good), 30)):
+        flipped = bytearray(good)
+        flipped[place] ^= 1 << rng.integers(8)
+        damaged[f"bit flipped in byte {place} of {len(good)}"] = bytes(flipped)
+    refused = []
+    for damage, content in damaged.items():
+        checkpoint.write_bytes(content)
+        try:
+            bundle = build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
+        except ValueError as error:
+            refused.append(str(error))
+        else:  # a bit without meaning, such as a date
+            assert bytes_of(bundle, tmp_path) == expected, damage
+    assert len(refused) > len(damaged) / 2
+    assert [message for message in refused if not message.endswith("remove it to start again")] == []
+
+
+def test_resume_path_needs_a_folder(asset, tmp_path):
+    with pytest.raises(ValueError, match="resume_path: expected a file in an existing folder"):
+        build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "no" / "levels")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(ValueError, match="could not read them"):
+        build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "folder")
