@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 # px² of screen that one gaussian of a coarser cluster may stand for; docs/levels.md has the error it gives.
-DEFAULT_TOLERANCE = 0.5
+DEFAULT_TOLERANCE = 3.0
 
 
 @dataclass(frozen=True)
