@@ -140,12 +140,14 @@ class SharedWorkspace {
         const std::lock_guard<std::mutex> lock(mutex_);
         return kept_ ? std::move(kept_) : std::make_unique<Workspace<float>>();
     }
+    // Keeps what the next frame is likely to need, but does not sit on the memory of an exceptional one.
     void give_back(std::unique_ptr<Workspace<float>> workspace) {
+        constexpr size_t kMostRecords = size_t(16) << 20;
         const std::lock_guard<std::mutex> lock(mutex_);
-        kept_ = std::move(workspace);
+        if (workspace->records.capacity() <= kMostRecords) kept_ = std::move(workspace);
     }
 
-  private:
+private:
     std::mutex mutex_;
     std::unique_ptr<Workspace<float>> kept_;
 };
