@@ -251,11 +251,11 @@ private:
         // No scale outgrows the ball, none vanishes: a value that ran away could not come back.
         const auto low = all_lanes<Vec<float>>(-20.0f), high = all_lanes<Vec<float>>(1.0f);
         for (int k = 0; k < 3; ++k)
-            map(scales + k * plane_size_, [&](Vec<float> x) { return exp2_of(min_of(high, max_of(low, x * kLog2e))); });
+            map(scales + k * plane_size_, [&](Vec<float> x) { return exp2_in_range(min_of(high, max_of(low, x * kLog2e))); });
         float* opacities = plane;
         spread(1);
         const auto least = all_lanes<Vec<float>>(-60.0f), most = all_lanes<Vec<float>>(60.0f);
-        map(opacities, [&](Vec<float> x) { return 1 / (1 + exp2_of(min_of(most, max_of(least, x * -kLog2e)))); });
+        map(opacities, [&](Vec<float> x) { return 1 / (1 + exp2_in_range(min_of(most, max_of(least, x * -kLog2e)))); });
         spread(num_sh_);
     }
 

@@ -18,8 +18,8 @@ namespace v3dg {
 
 V3DG_HD inline float sqrt_of(float x) { return ::sqrtf(x); }
 V3DG_HD inline double sqrt_of(double x) { return ::sqrt(x); }
-V3DG_HD inline float exp2_of(float x) { return ::exp2f(x); }
-V3DG_HD inline double exp2_of(double x) { return ::exp2(x); }
+V3DG_HD inline float exp2_in_range(float x) { return ::exp2f(x); }
+V3DG_HD inline double exp2_in_range(double x) { return ::exp2(x); }
 V3DG_HD inline float log2_of(float x) { return ::log2f(x); }
 V3DG_HD inline double log2_of(double x) { return ::log2(x); }
 
@@ -99,12 +99,9 @@ V3DG_INLINE unsigned bits_of(IntVec64 mask) {
     return bits;
 }
 
-// 2^x for x <= 127, relative error below 2^-22; 0 below -126. The integer part of x goes into the exponent, a
-// polynomial of least maximum relative error on [-1/2, 1/2] gives the rest.
-V3DG_INLINE Vec<float> exp2_of(Vec<float> x) {
-    const Vec<float> low = Vec<float>{} - 126.0f;
-    const IntVec32 tiny = x < low;
-    x = tiny ? low : x;
+// 2^x for x in [-126, 127], relative error below 2^-22; anything for others. The integer part of x goes into the
+// exponent, a polynomial of least maximum relative error on [-1/2, 1/2] gives the rest.
+V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
     const Vec<float> magic = Vec<float>{} + 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer
     const Vec<float> shifted = x + magic;
     const Vec<float> f = x - (shifted - magic);
@@ -113,10 +110,9 @@ V3DG_INLINE Vec<float> exp2_of(Vec<float> x) {
     p = p * f + 0.24022242f;
     p = p * f + 0.69314698f;
     p = p * f + 1.0f;
-    const IntVec32 exponent = ((IntVec32)shifted - (IntVec32)magic) << 23;
-    return tiny ? Vec<float>{} : (Vec<float>)((IntVec32)p + exponent);
+    return (Vec<float>)((IntVec32)p + (((IntVec32)shifted - (IntVec32)magic) << 23));
 }
-V3DG_INLINE Vec<double> exp2_of(Vec<double> x) {
+V3DG_INLINE Vec<double> exp2_in_range(Vec<double> x) {
     for (int i = 0; i < kLanes<double>; ++i) x[i] = ::exp2(x[i]);
     return x;
 }
@@ -167,6 +163,28 @@ V3DG_INLINE void store(T* p, Vec<T> v) {
 }
 
 #endif  // V3DG_ISA
+
+#if defined(V3DG_ISA) && defined(__SSE2__)
+// What the templates below say, in one instruction.
+V3DG_INLINE Vec<float> max_of(Vec<float> a, Vec<float> b) {
+#if defined(__AVX512F__)
+    return (Vec<float>)_mm512_max_ps((__m512)a, (__m512)b);
+#elif defined(__AVX2__)
+    return (Vec<float>)_mm256_max_ps((__m256)a, (__m256)b);
+#else
+    return (Vec<float>)_mm_max_ps((__m128)a, (__m128)b);
+#endif
+}
+V3DG_INLINE Vec<float> min_of(Vec<float> a, Vec<float> b) {
+#if defined(__AVX512F__)
+    return (Vec<float>)_mm512_min_ps((__m512)a, (__m512)b);
+#elif defined(__AVX2__)
+    return (Vec<float>)_mm256_min_ps((__m256)a, (__m256)b);
+#else
+    return (Vec<float>)_mm_min_ps((__m128)a, (__m128)b);
+#endif
+}
+#endif
 
 template <class V>
 V3DG_HD V3DG_INLINE V max_of(V a, V b) {

@@ -32,12 +32,12 @@ static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t c
 // Calls visit(place in the tile, place in the picture) for the pixels of a tile that are in the picture.
 template <class Visit>
 static V3DG_INLINE void for_each_pixel(int left, int top, int width, int height, const Visit& visit) {
-    for (int y = top; y < top + kTileSize && y < height; ++y)
-        for (int x = left; x < left + kTileSize && x < width; ++x) {
-            const int bx = (x - left) / kBlockSize, by = (y - top) / kBlockSize;
-            visit((by * kTileBlocks + bx) * kBlockPixels + (y - top) % kBlockSize * kBlockSize + (x - left) % kBlockSize,
-                  static_cast<size_t>(y) * width + x);
-        }
+    for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
+        const int x0 = left + block % kTileBlocks * kBlockSize, y0 = top + block / kTileBlocks * kBlockSize;
+        for (int y = y0; y < y0 + kBlockSize && y < height; ++y)
+            for (int x = x0; x < x0 + kBlockSize && x < width; ++x)
+                visit(block * kBlockPixels + (y - y0) * kBlockSize + (x - x0), static_cast<size_t>(y) * width + x);
+    }
 }
 
 template <class T>

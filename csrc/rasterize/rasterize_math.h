@@ -34,7 +34,7 @@ V3DG_HD V3DG_INLINE auto contributes(const Falloff<V>& f) {
 
 template <class V>
 V3DG_HD V3DG_INLINE V alpha_of(const Falloff<V>& f) {
-    const V alpha = min_of(exp2_of(f.exponent), all_lanes<V>(Lane<V>(kMaxAlpha)));
+    const V alpha = min_of(exp2_in_range(f.exponent), all_lanes<V>(Lane<V>(kMaxAlpha)));
     return contributes(f) ? alpha : V{};
 }
 
@@ -44,8 +44,7 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t) {
     const V next = t * (1 - alpha);
     const auto goes_on = next > all_lanes<V>(Lane<V>(kMinTransmittance));
     const V weight = goes_on ? alpha * t : V{};
-    const V stopped = t > V{} ? -t : t;
-    t = goes_on ? next : stopped;
+    t = goes_on ? next : min_of(t, -t);
     return weight;
 }
 
