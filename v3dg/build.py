@@ -70,12 +70,12 @@ class BuildConfig:
     init: Literal["merge", "prune"] = "merge"
     prune_growth: float = 2 ** (1 / 6)
     targets: Literal["leaves", "previous"] = "leaves"
-    steps: int = 400
+    steps: int = 800
     views_per_step: int = 2
     num_views: int = 64
     supersample: int = 4
     image_size: int = 0
-    px2_per_gaussian: float = 1.5
+    px2_per_gaussian: float = 2.0
     distance: float = 4.0
     filter_px2: float = 0.1
     asset_filter_px2: float = 0.0
@@ -85,11 +85,11 @@ class BuildConfig:
     loss_alpha: float = 0.5
     step_position: float = 0.005
     position_in_world: bool = False
-    step_log_scale: float = 0.02
+    step_log_scale: float = 0.04
     step_quat: float = 0.02
     step_logit: float = 0.05
-    step_sh0: float = 0.02
-    step_sh_rest: float = 0.005
+    step_sh0: float = 0.04
+    step_sh_rest: float = 0.01
     final_step: float = 0.1
 
     def __post_init__(self) -> None:
