@@ -417,7 +417,7 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
     uint64_t next_view = 0;
     // A stride prime to the number of views visits all of them, neighbours far apart.
     int stride = 29;
-    while (std::gcd(stride, config.num_views) > 1) ++stride;
+    while (config.num_views > 1 && std::gcd(stride, config.num_views) > 1) ++stride;
     for (int s = 0; s < config.steps && !cancel.load(std::memory_order_relaxed); ++s) {
         student.clear_gradient();
         for (int b = 0; b < config.views_per_step; ++b, ++next_view) {
