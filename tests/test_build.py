@@ -1,0 +1,380 @@
+"""Whole builds: what a bundle is made of, and how well its levels look."""
+
+import hashlib
+import math
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import scenes
+import v3dg
+from reference import project as reference_project
+from v3dg import BuildConfig, Camera, Gaussians, build_bundle, metrics, rasterize, render, select
+from v3dg.procedural import make_asset
+
+SMALL = BuildConfig(cluster_size=32, steps=10)
+TABLES = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
+
+
+def build(asset, config=SMALL, **options):
+    return build_bundle(asset, config=config, progress=False, **options)
+
+
+@pytest.fixture(scope="module")
+def asset():
+    return make_asset(num_gaussians=1200, seed=0)
+
+
+@pytest.fixture(scope="module")
+def bundle(asset):
+    return build(asset)
+
+
+def everything_in(bundle):
+    """All arrays of a bundle by name."""
+    arrays = {f"{t}.{n}": getattr(getattr(bundle, t), n) for t in TABLES for n in vars(getattr(bundle, t))}
+    return arrays | {name: getattr(bundle.gaussians, name) for name in scenes.NAMES}
+
+
+def same(bundle, other):
+    a, b = everything_in(bundle), everything_in(other)
+    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
+
+
+def ball_around(gaussians):
+    """Centre and radius of a ball that holds all that is drawn, and is not empty."""
+    low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
+    radius = float(np.linalg.norm(high - low)) / 2 + 3 * float(gaussians.scales.max())
+    return (low + high).astype(np.float64) / 2, radius or 1.0
+
+
+def camera_at(center, radius, direction, footprint_px2):
+    """From four radii away, the ball covering about so many px²."""
+    side = max(4, math.ceil(2.2 * math.sqrt(footprint_px2 / math.pi)))
+    fov = 2 * math.atan(1.1 * math.tan(math.asin(1 / 4)))
+    eye = center + 4 * radius * np.asarray(direction) / np.linalg.norm(direction)
+    return Camera.look_at(eye, center, [0.1, 0.2, 1.0], fov_x=fov, width=side, height=side, near=0.1 * radius)
+
+
+def held_out_psnr(asset, bundle, level):
+    """PSNR of a level, drawn as large as it is selected, to the supersampled asset."""
+    gaussians, (center, radius) = bundle.level_gaussians(level), ball_around(asset)
+    first = bundle.level_range(level).start
+    options = {
+        "filter_px2": float(bundle.clusters.filter_px2[first]),
+        "antialiased": bool(bundle.clusters.antialiased[first]),
+    }
+    errors = []
+    for direction in np.random.default_rng(99).normal(size=(8, 3)):
+        camera = camera_at(center, radius, direction, len(gaussians))
+        truth = metrics.box_downsample(rasterize(asset, camera.scaled(4)).color, 4)
+        errors.append(np.mean((truth - rasterize(gaussians, camera, **options).color) ** 2))
+    return -10 * math.log10(np.mean(errors))
+
+
+# ---- the same build
+
+
+THREADS_SCRIPT = """
+import sys
+import v3dg
+from v3dg.procedural import make_asset
+config = v3dg.BuildConfig(cluster_size=32, steps=10)
+v3dg.build_bundle(make_asset(num_gaussians=1200, seed=0), config=config, progress=False).save(sys.argv[1])
+"""
+
+
+def test_same_file_on_any_number_of_threads(bundle, tmp_path):
+    bundle.save(tmp_path / "here.v3dg")
+    files = [tmp_path / "here.v3dg"]
+    for threads in (1, 2, 4):
+        files.append(tmp_path / f"{threads}.v3dg")
+        environment = os.environ | {
+            "PYTHONPATH": str(Path(v3dg.__file__).parent.parent),
+            "OMP_NUM_THREADS": str(threads),
+        }
+        command = [sys.executable, "-c", THREADS_SCRIPT, str(files[-1])]
+        subprocess.run(command, cwd=tmp_path, env=environment, check=True)
+    assert len({hashlib.sha256(file.read_bytes()).hexdigest() for file in files}) == 1
+
+
+def test_another_seed_builds_another_bundle(asset, bundle):
+    assert same(build(asset, seed=0), bundle)
+    assert not same(build(asset, seed=1), bundle)
+
+
+def test_largest_seed_is_its_own(asset):
+    largest = 2**58 - 1
+    assert not same(build(asset, seed=largest), build(asset, seed=largest - 1))
+    for seed in (-1, largest + 1):
+        with pytest.raises(ValueError, match="seed: expected 0 to 2\\^58 - 1"):
+            build(asset, seed=seed)
+
+
+# ---- what it is made of
+
+
+@pytest.mark.parametrize("num_gaussians", [1000, 1023, 1025])
+@pytest.mark.parametrize("group_size", [2, 8])
+def test_each_level_has_half_of_the_one_below(num_gaussians, group_size):
+    asset = make_asset(num_gaussians=1100, seed=3).subset(slice(num_gaussians))
+    bundle = build(asset, replace(SMALL, steps=0, group_size=group_size))
+    sizes = [len(bundle.level_gaussians(level)) for level in range(bundle.num_levels)]
+    clusters = [len(bundle.level_range(level)) for level in range(bundle.num_levels)]
+    assert sizes[0] == num_gaussians
+    for level in range(1, bundle.num_levels):
+        groups = int((bundle.groups.level == level).sum())
+        assert sizes[level - 1] / 2 <= sizes[level] <= (sizes[level - 1] + groups) / 2
+        assert clusters[level] == max(1, clusters[level - 1] // 2)
+        assert groups == max(1, clusters[level - 1] // group_size)
+    assert sizes[-1] // 2 < SMALL.min_gaussians <= sizes[-1]
+
+
+def test_level_zero_is_the_asset(asset, bundle):
+    rows = [np.concatenate([getattr(g, n).reshape(len(g), -1) for n in scenes.NAMES], axis=1)
+            for g in (asset, bundle.level_gaussians(0))]  # fmt: skip
+    np.testing.assert_array_equal(*(r[np.lexsort(r.T)] for r in rows))
+
+
+def test_gaussians_stay_within_their_ranges(asset, bundle):
+    g = bundle.gaussians
+    assert (g.scales >= 0).all()
+    assert ((g.opacities >= 0) & (g.opacities <= 1)).all()
+    coarse = g.subset(slice(len(asset), None))
+    np.testing.assert_allclose(np.linalg.norm(coarse.quats, axis=1), 1, rtol=1e-5)
+    assert (coarse.scales > 0).all()
+
+
+def test_weights_and_balls_grow_towards_the_root(bundle):
+    groups = bundle.groups
+    child = np.flatnonzero(groups.parent >= 0)
+    parent = groups.parent[child]
+    assert (groups.weight[parent] >= groups.weight[child]).all()
+    a, b = groups.ball[child].astype(np.float64), groups.ball[parent].astype(np.float64)
+    assert (np.linalg.norm(a[:, :3] - b[:, :3], axis=1) + a[:, 3] <= b[:, 3]).all()
+
+
+@pytest.mark.parametrize("moved", [0.0, 1e4])
+def test_boxes_hold_all_that_is_drawn(asset, moved):
+    bundle = build(scenes.replaced(asset, means=asset.means + np.float32(moved)))
+    g = bundle.gaussians
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    # Where alpha falls to 1/255.
+    sigmas = np.sqrt(2 * np.log(np.maximum(255 * g.opacities.astype(np.float64), 1)))
+    axes = reference_project.rotation(g.quats) * (g.scales * sigmas[:, None])[:, None, :]
+    points = g.means[:, None, :] + directions @ axes.transpose(0, 2, 1)
+    cluster = np.repeat(np.arange(len(bundle.clusters)), np.diff(bundle.clusters.offset))
+    low, high = bundle.clusters.box[cluster, 0, None], bundle.clusters.box[cluster, 1, None]
+    assert ((points >= low) & (points <= high)).all()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colours_of_all_degrees_survive_to_the_coarsest_level(degree):
+    rng = np.random.default_rng(degree)
+    num_bases = (degree + 1) ** 2
+    means = rng.uniform(-1, 1, (600, 3))
+    sh = np.broadcast_to(rng.normal(0, 0.3, (num_bases, 3)), (600, num_bases, 3))
+    asset = scenes.gaussians(means, scales=0.2, opacities=0.5, sh=sh.astype(np.float32))
+    bundle = build(asset, replace(SMALL, steps=0))
+    last = bundle.level_gaussians(bundle.num_levels - 1)
+    np.testing.assert_allclose(last.sh, asset.sh[: len(last)], rtol=1e-5, atol=1e-6)
+    # Fitting makes up for lost overlap with brightness, but has no reason to turn what the view changes.
+    fitted = build(asset)
+    assert fitted.sh_degree == degree
+    fitted_last = fitted.level_gaussians(fitted.num_levels - 1)
+    np.testing.assert_allclose(fitted_last.sh.mean(axis=0)[1:], asset.sh[0, 1:], atol=0.1)
+
+
+# ---- any asset
+
+
+def degenerate_assets():
+    rng = np.random.default_rng(5)
+    many = scenes.random_gaussians(1, scenes.CAMERAS["plain"], 150, sh_degree=1)
+
+    def scaled(factor, shift=0.0):
+        return scenes.replaced(
+            many,
+            means=(many.means * np.float32(factor) + np.float32(shift)),
+            scales=many.scales * np.float32(factor),
+        )
+
+    same_place = np.tile([1, 2, 3], (100, 1))
+    return {
+        "one": many.subset(slice(1)),
+        "two": many.subset(slice(2)),
+        "three": many.subset(slice(3)),
+        "seven": many.subset(slice(7)),
+        "same_place": scenes.gaussians(same_place),
+        "same_place_no_size": scenes.gaussians(same_place, scales=0.0),
+        "no_size": scenes.replaced(many, scales=np.zeros_like(many.scales)),
+        "flat": scenes.replaced(many, scales=many.scales * np.float32([1, 1, 0])),
+        "lines": scenes.replaced(many, scales=many.scales * np.float32([1, 0, 0])),
+        "on_a_line": scenes.gaussians(np.linspace(0, 1, 90)[:, None] * [1, 2, 3], scales=0.01),
+        "unseen": scenes.replaced(many, opacities=np.zeros_like(many.opacities)),
+        "solid": scenes.replaced(many, opacities=np.ones_like(many.opacities)),
+        "zero_quats": scenes.replaced(many, quats=np.zeros_like(many.quats)),
+        "long_quats": scenes.replaced(many, quats=many.quats * np.float32(1e6)),
+        "far_away": scaled(1, 1e7),
+        "far_away_and_small": scaled(1e-3, 1e7),
+        "tiny": scaled(1e-6),
+        "large": scaled(1e6),
+        "huge": scaled(1e12),
+        "one_giant": scenes.replaced(
+            many, scales=np.where(np.arange(150)[:, None] == 3, np.float32(1e4), many.scales)
+        ),
+        "bright": scenes.replaced(many, sh=many.sh * np.float32(1e6)),
+        "duplicates": Gaussians.concatenate([many.subset(slice(20))] * 5),
+        "all_sizes": scenes.replaced(
+            many, scales=np.exp(rng.uniform(-25, 5, many.scales.shape)).astype(np.float32)
+        ),
+    }
+
+
+DEGENERATE = degenerate_assets()
+
+
+@pytest.mark.parametrize("init", ["merge", "prune"])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_any_asset_is_built_selected_and_drawn(name, init):
+    asset = DEGENERATE[name]
+    config = BuildConfig(cluster_size=8, steps=3, views_per_step=1, num_views=8, min_gaussians=1, init=init)
+    bundle = build(asset, config)
+    for array_name, array in everything_in(bundle).items():
+        assert np.isfinite(array).all(), array_name
+    assert len(bundle.level_gaussians(bundle.num_levels - 1)) == 1
+    center, radius = ball_around(asset)
+    for tolerance in (0.0, 0.5, 1e9):
+        camera = camera_at(center, radius, [1, 0.3, 0.2], 300.0)
+        num = select(bundle, camera, tolerance=tolerance).num_gaussians
+        assert 1 <= num <= len(asset)
+        image = render(bundle, camera, tolerance=tolerance)
+        assert all(np.isfinite(picture).all() for picture in (image.color, image.alpha, image.depth))
+
+
+def test_asset_without_gaussians_is_refused():
+    with pytest.raises(ValueError, match="asset: expected at least one gaussian, got none"):
+        build(scenes.gaussians(np.zeros((0, 3))))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("means", np.nan, "finite numbers"),
+        ("quats", np.inf, "finite numbers"),
+        ("sh", -np.inf, "finite numbers"),
+        ("scales", np.nan, "numbers of at least 0"),
+        ("scales", -0.1, "numbers of at least 0"),
+        ("opacities", 1.1, "numbers from 0 to 1"),
+        ("opacities", np.nan, "numbers from 0 to 1"),
+    ],
+)
+def test_asset_with_wrong_values_is_refused(asset, name, value, expected):
+    wrong = np.array(getattr(asset, name))
+    wrong.reshape(len(wrong), -1)[[17, 40], -1] = value
+    message = (
+        f"asset: expected {name} that are {expected}, got others in 2 of 1200 gaussians, "
+        "the first is number 17; remove them"
+    )
+    with pytest.raises(ValueError, match=message):
+        build(scenes.replaced(asset, **{name: wrong}))
+
+
+# ---- settings
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cluster_size": 1}, "cluster_size: expected at least 2, got 1"),
+        ({"cluster_size": 64.0}, "cluster_size: expected a whole number, got 64.0"),
+        ({"steps": -1}, "steps: expected at least 0, got -1"),
+        ({"steps": True}, "steps: expected a whole number, got True"),
+        ({"views_per_step": 0}, "views_per_step: expected at least 1, got 0"),
+        ({"num_views": -1}, "num_views: expected at least 0, got -1"),
+        ({"supersample": 0}, "supersample: expected at least 1, got 0"),
+        ({"image_size": 20_000}, "image_size: expected at most 65535 px with `supersample` times as many"),
+        ({"min_gaussians": 0}, "min_gaussians: expected at least 1, got 0"),
+        ({"group_size": 1}, "group_size: expected a power of two of at least 2, got 1"),
+        ({"group_size": 6}, "group_size: expected a power of two of at least 2, got 6"),
+        ({"init": "best"}, "init: expected 'merge' or 'prune', got 'best'"),
+        ({"targets": "root"}, "targets: expected 'leaves' or 'previous', got 'root'"),
+        ({"distance": 1.0}, "distance: expected more than 1.1 radii"),
+        ({"distance": math.nan}, "distance: expected more than 1.1 radii"),
+        ({"filter_px2": -0.1}, "filter_px2: expected a number of at least 0, got -0.1"),
+        ({"asset_filter_px2": math.inf}, "asset_filter_px2: expected a number of at least 0, got inf"),
+        ({"loss_l1": "1"}, "loss_l1: expected a number, got '1'"),
+        ({"step_quat": math.nan}, "step_quat: expected a number of at least 0, got nan"),
+        ({"px2_per_gaussian": 0}, "px2_per_gaussian: expected a positive number, got 0"),
+        ({"final_step": 0.0}, "final_step: expected a positive number, got 0.0"),
+        ({"position_in_world": 1}, "position_in_world: expected True or False, got 1"),
+    ],
+)
+def test_wrong_settings_are_named(changes, message):
+    with pytest.raises(ValueError, match="^" + message.replace(".", "\\.")):
+        BuildConfig(**changes)
+
+
+def test_wrong_options_are_named(asset):
+    with pytest.raises(ValueError, match="device: expected 'auto' or 'cpu', got 'gpu'"):
+        build(asset, device="gpu")
+    with pytest.raises(TypeError, match="progress: expected True or False, got 'yes'"):
+        build_bundle(asset, progress="yes")
+    with pytest.raises(TypeError):
+        build(asset, seed=0.5)
+
+
+@pytest.mark.parametrize("group_size", [2, 4, 8, 32])
+@pytest.mark.parametrize("changes", [{}, {"prune_growth": 1.0}, {"init": "merge", "targets": "leaves"}])
+def test_paper_settings_build(asset, group_size, changes):
+    config = BuildConfig.paper(cluster_size=1200 // 16, group_size=group_size, steps=2, **changes)
+    bundle = build(asset, config)
+    # Down to two clusters, in place of a root.
+    clusters = [len(bundle.level_range(level)) for level in range(bundle.num_levels)]
+    assert clusters == [16, 8, 4, 2]
+    assert bundle.config["build"]["group_size"] == group_size
+    camera = camera_at(*ball_around(asset), [0.3, 1, 0.2], 400.0)
+    assert np.isfinite(render(bundle, camera).color).all()
+
+
+def test_paper_fit_reduces_the_error(asset):
+    config = BuildConfig.paper(cluster_size=300)
+    start, fitted = (build(asset, replace(config, steps=steps)) for steps in (0, 100))
+    assert held_out_psnr(asset, fitted, 1) > held_out_psnr(asset, start, 1)
+
+
+# ---- quality
+
+
+def test_fit_is_never_worse_than_its_start(asset):
+    config = replace(SMALL, num_views=16)
+    start = build(asset, replace(config, steps=0)).groups
+    # Steps so long that fits run away; those of the first level have the same start in all.
+    for change in ({}, {"step_position": 10.0, "step_logit": 50.0}, {"step_log_scale": 5.0, "step_sh0": 9.0}):
+        fitted = build(asset, replace(config, **change)).groups
+        weights = [config.loss_l1, config.loss_alpha]
+        first = start.level == 1
+        assert (fitted.error[first] @ weights <= start.error[first] @ weights).all()
+        assert np.isfinite(fitted.error).all()
+
+
+def test_runaway_fit_leaves_the_start(asset):
+    runaway = replace(SMALL, steps=3, step_position=1e6, step_logit=1e6, step_log_scale=1e6, step_sh0=1e6)
+    fitted, start = (build(asset, c).level_gaussians(1) for c in (runaway, replace(SMALL, steps=0)))
+    np.testing.assert_allclose(fitted.means, start.means, atol=1e-6)
+    np.testing.assert_allclose(fitted.opacities, start.opacities, atol=1e-3)
+    np.testing.assert_allclose(fitted.sh, start.sh, atol=1e-6)
+
+
+def test_fit_gains_over_merging_alone(asset):
+    """In dB, at the size of selection, on views that no fit saw. Measured: 1.3, 1.4, 1.0."""
+    merged, fitted = (build(asset, BuildConfig(cluster_size=64, steps=steps)) for steps in (0, 200))
+    for level in (1, 2, 3):
+        assert held_out_psnr(asset, fitted, level) > held_out_psnr(asset, merged, level) + 0.6
