@@ -12,7 +12,7 @@
 
 namespace v3dg {
 
-// How a group is fitted ("local splatting", V3DG section 3.2 and DESIGN of ours in docs/levels.md).
+// How a group is fitted ("local splatting": V3DG, section 3.2, and docs/levels.md for what we do differently).
 struct FitConfig {
     int steps;
     int views_per_step;
@@ -73,7 +73,6 @@ struct FitScratch {
     Buffer<Record<float>> records;
     Buffer<uint32_t> source;
     Buffer<uint64_t> order, order_scratch;
-    std::vector<float> values;
 };
 
 // View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random; fresh ones anywhere.
