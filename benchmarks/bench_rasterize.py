@@ -1,4 +1,4 @@
-"""One asset that fills the picture: frames a second and the stages of a frame, with its error to double precision."""
+"""One asset that fills the picture: frames a second, stages of a frame, and its error to double precision."""
 
 from __future__ import annotations
 
@@ -38,7 +38,17 @@ def camera_that_fills(gaussians: v3dg.Gaussians, size: int) -> Camera:
 def main(config: Config) -> None:
     gaussians = make_asset() if config.asset is None else v3dg.load(config.asset)
     camera = camera_that_fills(gaussians, config.size)
-    options = (view_of_world(camera), 0.0, False, intrinsics(camera), camera.width, camera.height, [0.0] * 3, False, False)
+    options = (
+        view_of_world(camera),
+        0.0,
+        False,
+        intrinsics(camera),
+        camera.width,
+        camera.height,
+        [0.0] * 3,
+        False,
+        False,
+    )
     model = _core.Model(*rows_of(gaussians))
     times, stages = [], []
     for _ in range(config.repeats + 3):
@@ -46,7 +56,9 @@ def main(config: Config) -> None:
         color, alpha, _, counts, _ = _core.rasterize(model, *options)
         times.append(time.perf_counter() - start)
         stages.append(counts)
-    exact = _core.rasterize(_core.ModelDouble(*(a.astype(np.float64) for a in rows_of(gaussians))), *options)[0]
+    exact = _core.rasterize(_core.ModelDouble(*(a.astype(np.float64) for a in rows_of(gaussians))), *options)[
+        0
+    ]
     median = statistics.median(times[3:])
     result = {
         "gaussians": len(gaussians),

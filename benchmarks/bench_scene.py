@@ -68,7 +68,13 @@ def main(config: Config) -> None:
             )
     record.write(
         config.output,
-        {"camera": name, "width": camera.width, "height": camera.height, "build": bundle.config, "frames": rows},
+        {
+            "camera": name,
+            "width": camera.width,
+            "height": camera.height,
+            "build": bundle.config,
+            "frames": rows,
+        },
     )
 
 

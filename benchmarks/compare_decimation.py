@@ -2,8 +2,8 @@
 
 Each count is drawn at three sizes, of which the first two have px² in proportion to the count:
 ball: one px² per gaussian of the footprint of the ball around the whole asset; one level of ours.
-cut: where the cut at the default tolerance, cluster by cluster, has that many gaussians; that cut of ours. This
-    is the size at which the levels are selected.
+cut: where the cut at the default tolerance, cluster by cluster, has that many gaussians; that cut of ours.
+    This is the size at which the levels are selected.
 large: a fixed size, far larger than the coarse levels are meant for; one level of ours.
 
 The truth is the whole asset at twice the resolution, box-averaged; beside it stands what the asset itself
@@ -79,12 +79,14 @@ def draw(gaussians: v3dg.Gaussians, camera: v3dg.Camera, filter_px2: float, anti
 
 
 def footprint_of_cut(config: Config, bundle: v3dg.Bundle, ball: np.ndarray, count: int) -> float:
-    """Footprint of the ball at which the cut at the default tolerance has `count` gaussians averaged over views."""
+    """Footprint of the ball at which the default cut has `count` gaussians, averaged over views."""
     low, high = 1.0, 64.0 * count
     for _ in range(24):
         middle = math.sqrt(low * high)
         cameras = [camera_at(config, ball, view, middle) for view in range(config.views)]
-        mean = np.mean([v3dg.select(bundle, c, tolerance=v3dg.DEFAULT_TOLERANCE).num_gaussians for c in cameras])
+        mean = np.mean(
+            [v3dg.select(bundle, c, tolerance=v3dg.DEFAULT_TOLERANCE).num_gaussians for c in cameras]
+        )
         low, high = (middle, high) if mean <= count else (low, middle)
     return low
 

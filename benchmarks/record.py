@@ -17,7 +17,9 @@ def provenance() -> dict[str, Any]:
     """Commit, command, processor, threads and instruction set of this run."""
     folder = Path(__file__).parent
     commit = subprocess.run(
-        ["git", "-C", folder, "describe", "--always", "--dirty", "--abbrev=12"], capture_output=True, text=True
+        ["git", "-C", folder, "describe", "--always", "--dirty", "--abbrev=12"],
+        capture_output=True,
+        text=True,
     ).stdout.strip()
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]

@@ -1,7 +1,7 @@
 """What each choice of the build gives: one change at a time, drawn in a layout of many instances.
 
-The table of docs/levels.md: Gaussians in the frustum, FLIP and PSNR against a given picture at three tolerances,
-and the processor seconds of the build.
+The table of docs/levels.md: Gaussians in the frustum, FLIP and PSNR against a given picture at three
+tolerances, and the processor seconds of the build.
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ def main(config: Config) -> None:
     rows = []
     for change in config.only or tuple(CHANGES):
         start = time.process_time()
-        bundle = v3dg.build_bundle(asset, config=replace(v3dg.BuildConfig(), **CHANGES[change]), progress=False)
+        bundle = v3dg.build_bundle(
+            asset, config=replace(v3dg.BuildConfig(), **CHANGES[change]), progress=False
+        )
         row: dict[str, Any] = {"change": change, "build_cpu_seconds": round(time.process_time() - start, 1)}
         scene, cameras = v3dg.read_scene(config.layout, bundles={name: bundle})
         camera = list(cameras.values())[config.camera]
@@ -80,7 +82,8 @@ def main(config: Config) -> None:
             )
         rows.append(row)
         cells = "".join(
-            f" | {f['gaussians_in_frustum'] / 1e6:.2f} M {f['flip']:.4f} {f['psnr']:.2f}" for f in row["frames"]
+            f" | {f['gaussians_in_frustum'] / 1e6:.2f} M {f['flip']:.4f} {f['psnr']:.2f}"
+            for f in row["frames"]
         )
         print(f"{change:26s} {row['build_cpu_seconds']:6.1f} s{cells}", flush=True)
     record.write(config.output, {"asset_gaussians": len(asset), "rows": rows})

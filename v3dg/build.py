@@ -44,7 +44,7 @@ class BuildConfig:
         group_size: Clusters that are simplified together, a power of two; 2 makes a tree.
         min_clusters: Levels stop before there are fewer clusters than this ...
         min_gaussians: ... or fewer gaussians than this.
-        init: Start of a coarser cluster: "merge" pairs of alike gaussians, or "prune" the less important half.
+        init: Start of a coarser cluster: "merge" alike gaussians in pairs, or "prune" the lesser half.
         prune_growth: Factor for the scales of gaussians that survive pruning.
         targets: What a level is fitted to: the "leaves" under it or the "previous" level.
         steps: Steps of Adam for each group; 0 keeps the start.
@@ -127,7 +127,9 @@ class BuildConfig:
         require("group_size", size >= 2 and size & (size - 1) == 0, "a power of two of at least 2")
         require("init", self.init in ("merge", "prune"), "'merge' or 'prune'")
         require("targets", self.targets in ("leaves", "previous"), "'leaves' or 'previous'")
-        require("distance", self.distance > 1.1, "more than 1.1 radii, so that the camera is outside the ball")
+        require(
+            "distance", self.distance > 1.1, "more than 1.1 radii, so that the camera is outside the ball"
+        )
 
     @staticmethod
     def paper(**changes: Any) -> BuildConfig:
@@ -388,7 +390,15 @@ def _split_groups(
 def _fit_config(config: BuildConfig, seed: int, level: int) -> Any:
     fit = _core.FitConfig()
     for name in (
-        *("steps", "views_per_step", "num_views", "supersample", "image_size", "px2_per_gaussian", "distance"),
+        *(
+            "steps",
+            "views_per_step",
+            "num_views",
+            "supersample",
+            "image_size",
+            "px2_per_gaussian",
+            "distance",
+        ),
         *("filter_px2", "step_position", "position_in_world", "step_log_scale", "step_quat", "step_logit"),
         *("step_sh0", "step_sh_rest", "final_step"),
     ):
@@ -558,7 +568,9 @@ def _boxes(gaussians: Gaussians, offset: npt.NDArray[np.int64]) -> npt.NDArray[n
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    sigma = np.sqrt(np.einsum("ikn,nk->ni", rotation.astype(np.float64) ** 2, gaussians.scales.astype(np.float64) ** 2))
+    sigma = np.sqrt(
+        np.einsum("ikn,nk->ni", rotation.astype(np.float64) ** 2, gaussians.scales.astype(np.float64) ** 2)
+    )
     # A little more than the reach, for the rounding of the corners.
     reach = REACH_SIGMAS * 1.0001 * sigma + 1e-6 * np.abs(gaussians.means)
     low = np.minimum.reduceat(gaussians.means - reach, offset[:-1], axis=0)
@@ -577,19 +589,24 @@ def _assemble(levels: list[_Level], config: BuildConfig, seed: int) -> Bundle:
         cluster_level.append(np.full(count, i, np.int32))
         offsets.append(offsets[-1][-1] + level.offset[1:])
         boxes.append(_boxes(level.gaussians, level.offset))
-        own.append(np.full(count, -1, np.int32) if i == 0 else level.group_of_cluster + np.int32(first_group[i - 1]))
+        own.append(
+            np.full(count, -1, np.int32) if i == 0 else level.group_of_cluster + np.int32(first_group[i - 1])
+        )
         if i + 1 == len(levels):
             parent.append(np.full(count, -1, np.int32))
             if i > 0:
                 group_parent.append(np.full(len(level.ball), -1, np.int32))
             break
         num_groups = len(levels[i + 1].ball)
-        consumer = np.repeat(np.arange(num_groups, dtype=np.int32), count // num_groups) + np.int32(first_group[i])
+        consumer = np.repeat(np.arange(num_groups, dtype=np.int32), count // num_groups) + np.int32(
+            first_group[i]
+        )
         parent.append(consumer)
         if i > 0:
             up = np.zeros(len(level.ball), np.int32)
             up[level.group_of_cluster] = consumer
             group_parent.append(up)
+
     def joined(parts: list[Any], dtype: Any, *shape: int) -> Any:
         return np.concatenate(parts).astype(dtype) if parts else np.zeros((0, *shape), dtype)
 
@@ -601,15 +618,24 @@ def _assemble(levels: list[_Level], config: BuildConfig, seed: int) -> Bundle:
         own_group=joined(own, np.int32),
         parent_group=joined(parent, np.int32),
         box=joined(boxes, np.float32, 2, 3),
-        filter_px2=np.where(np.arange(count) < fine, config.asset_filter_px2, config.filter_px2).astype(np.float32),
+        filter_px2=np.where(np.arange(count) < fine, config.asset_filter_px2, config.filter_px2).astype(
+            np.float32
+        ),
         antialiased=np.where(np.arange(count) < fine, config.asset_antialiased, True).astype(np.uint8),
     )
     groups = Groups(
         ball=joined([level.ball for level in levels[1:]], np.float32, 4),
         weight=joined([level.weight for level in levels[1:]], np.float32),
         parent=joined(group_parent, np.int32),
-        level=joined([np.full(len(level.ball), i, np.int32) for i, level in enumerate(levels[1:], 1)], np.int32),
+        level=joined(
+            [np.full(len(level.ball), i, np.int32) for i, level in enumerate(levels[1:], 1)], np.int32
+        ),
         error=joined([level.error for level in levels[1:]], np.float32, 2),
     )
     gaussians = Gaussians.concatenate([level.gaussians for level in levels])
-    return Bundle(clusters, groups, gaussians, {"build": asdict(config), "seed": seed, "asset_gaussians": len(levels[0].gaussians)})
+    return Bundle(
+        clusters,
+        groups,
+        gaussians,
+        {"build": asdict(config), "seed": seed, "asset_gaussians": len(levels[0].gaussians)},
+    )

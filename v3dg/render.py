@@ -31,8 +31,8 @@ class Stats:
 
     Attributes:
         gaussians_selected: Gaussians of the selected clusters.
-        gaussians_in_frustum: Of them, those in front of the near plane whose extent meets the image, before any
-            finer cull.
+        gaussians_in_frustum: Of them, those in front of the near plane whose extent meets the image, before
+            any finer cull.
         select_ms: Time to choose the clusters.
         draw_ms: Time to draw them.
     """

@@ -10,9 +10,9 @@ using namespace py::literals;
 
 static void fit_level_arrays(const FitConfig& config, const std::shared_ptr<Model<float>>& target,
                              float target_filter_px2, bool target_compensate, const py::array& target_range,
-                             const py::array& range, const py::array& ball, const py::array& stream, py::array& means,
-                             py::array& quats, py::array& scales, py::array& opacities, py::array& sh,
-                             py::array& error, FitProgress& progress) {
+                             const py::array& range, const py::array& ball, const py::array& stream,
+                             py::array& means, py::array& quats, py::array& scales, py::array& opacities,
+                             py::array& sh, py::array& error, FitProgress& progress) {
     const py::ssize_t num_groups = range.ndim() == 2 ? range.shape(0) : 0;
     const py::ssize_t n = opacities.ndim() == 1 ? opacities.shape(0) : 0;
     const int degree = target->planes().sh_degree;
@@ -20,31 +20,41 @@ static void fit_level_arrays(const FitConfig& config, const std::shared_ptr<Mode
     const Span<const int64_t> own = span_of<const int64_t>(range, "range", {num_groups, 2});
     const Span<const float> balls = span_of<const float>(ball, "ball", {num_groups, 4});
     const Span<const int64_t> streams = span_of<const int64_t>(stream, "stream", {num_groups});
-    const FitRows rows{span_of<float>(means, "means", {n, 3}).data,   span_of<float>(quats, "quats", {n, 4}).data,
-                       span_of<float>(scales, "scales", {n, 3}).data, span_of<float>(opacities, "opacities", {n}).data,
-                       span_of<float>(sh, "sh", {n, num_sh_bases(degree), 3}).data, degree};
+    const FitRows rows{span_of<float>(means, "means", {n, 3}).data,
+                       span_of<float>(quats, "quats", {n, 4}).data,
+                       span_of<float>(scales, "scales", {n, 3}).data,
+                       span_of<float>(opacities, "opacities", {n}).data,
+                       span_of<float>(sh, "sh", {n, num_sh_bases(degree), 3}).data,
+                       degree};
     float* errors = span_of<float>(error, "error", {num_groups, 2}).data;
     std::vector<FitGroup> groups;
     for (py::ssize_t g = 0; g < num_groups; ++g) {
         const int64_t bounds[4] = {targets[2 * g], targets[2 * g + 1], own[2 * g], own[2 * g + 1]};
-        if (bounds[0] < 0 || bounds[1] < bounds[0] || bounds[1] > static_cast<int64_t>(target->size()) || bounds[2] < 0 ||
-            bounds[3] < bounds[2] || bounds[3] > n)
-            throw py::value_error("range: expected [first, last) within the gaussians, group " + std::to_string(g) + " is not");
-        FitGroup group{static_cast<uint64_t>(bounds[0]), static_cast<uint64_t>(bounds[1] - bounds[0]),
-                       static_cast<uint64_t>(bounds[2]), static_cast<uint64_t>(bounds[3] - bounds[2]),
-                       {balls[4 * g], balls[4 * g + 1], balls[4 * g + 2]}, balls[4 * g + 3],
+        if (bounds[0] < 0 || bounds[1] < bounds[0] || bounds[1] > static_cast<int64_t>(target->size()) ||
+            bounds[2] < 0 || bounds[3] < bounds[2] || bounds[3] > n)
+            throw py::value_error("range: expected [first, last) within the gaussians, group " +
+                                  std::to_string(g) + " is not");
+        FitGroup group{static_cast<uint64_t>(bounds[0]),
+                       static_cast<uint64_t>(bounds[1] - bounds[0]),
+                       static_cast<uint64_t>(bounds[2]),
+                       static_cast<uint64_t>(bounds[3] - bounds[2]),
+                       {balls[4 * g], balls[4 * g + 1], balls[4 * g + 2]},
+                       balls[4 * g + 3],
                        static_cast<uint64_t>(streams[g])};
-        if (!(group.radius > 0)) throw py::value_error("ball: expected a positive radius, group " + std::to_string(g) + " has none");
+        if (!(group.radius > 0))
+            throw py::value_error("ball: expected a positive radius, group " + std::to_string(g) +
+                                  " has none");
         groups.push_back(group);
     }
     py::gil_scoped_release unlocked;
-    fit_level(config, {groups.data(), groups.size()}, {&target->planes(), target_filter_px2, target_compensate}, rows,
-              errors, progress);
+    fit_level(config, {groups.data(), groups.size()},
+              {&target->planes(), target_filter_px2, target_compensate}, rows, errors, progress);
 }
 
 void bind_fit_level(py::module_& m) {
     py::class_<LossWeights>(m, "LossWeights")
-        .def(py::init([](float l1, float dssim, float alpha) { return LossWeights{l1, dssim, alpha}; }), "l1"_a, "dssim"_a, "alpha"_a);
+        .def(py::init([](float l1, float dssim, float alpha) { return LossWeights{l1, dssim, alpha}; }),
+             "l1"_a, "dssim"_a, "alpha"_a);
     py::class_<FitConfig>(m, "FitConfig")
         .def(py::init<>([] { return FitConfig{}; }))
         .def_readwrite("steps", &FitConfig::steps)
@@ -71,9 +81,9 @@ void bind_fit_level(py::module_& m) {
         .def_property_readonly("groups_done", [](const FitProgress& p) { return p.groups_done.load(); })
         .def_property_readonly("loss_sum", [](const FitProgress& p) { return p.loss_sum.load(); })
         .def("cancel", [](FitProgress& p) { p.cancel = true; });
-    m.def("fit_level", &fit_level_arrays, "config"_a, "target"_a, "target_filter_px2"_a, "target_compensate"_a,
-          "target_range"_a, "range"_a, "ball"_a, "stream"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
-          "error"_a, "progress"_a);
+    m.def("fit_level", &fit_level_arrays, "config"_a, "target"_a, "target_filter_px2"_a,
+          "target_compensate"_a, "target_range"_a, "range"_a, "ball"_a, "stream"_a, "means"_a, "quats"_a,
+          "scales"_a, "opacities"_a, "sh"_a, "error"_a, "progress"_a);
 }
 
 }  // namespace v3dg

@@ -147,7 +147,7 @@ class SharedWorkspace {
         if (workspace->records.capacity() <= kMostRecords) kept_ = std::move(workspace);
     }
 
-private:
+  private:
     std::mutex mutex_;
     std::unique_ptr<Workspace<float>> kept_;
 };

@@ -12,16 +12,17 @@
 
 namespace v3dg {
 
-// How a group is fitted ("local splatting": V3DG, section 3.2, and docs/levels.md for what we do differently).
+// How a group is fitted ("local splatting": V3DG, section 3.2, and docs/levels.md for what we do
+// differently).
 struct FitConfig {
     int steps;
     int views_per_step;
-    int num_views;        // fixed views, cached; 0: a fresh one each time
-    int supersample;      // targets are drawn this much larger and box-averaged
-    int image_size;       // px; 0: as large as the group is when it is selected
+    int num_views;           // fixed views, cached; 0: a fresh one each time
+    int supersample;         // targets are drawn this much larger and box-averaged
+    int image_size;          // px; 0: as large as the group is when it is selected
     float px2_per_gaussian;  // of the ball's footprint, where image_size is 0
-    float distance;       // of the camera from the centre, in radii
-    float filter_px2;     // of the gaussians that are fitted, with compensated opacity
+    float distance;          // of the camera from the centre, in radii
+    float filter_px2;        // of the gaussians that are fitted, with compensated opacity
     bool compensate;
     LossWeights loss;
     // Step sizes of Adam: position in radii or, if `position_in_world`, in world units; the last step takes

@@ -8,8 +8,8 @@
 #include "adam/adam_math.h"
 #include "rasterize/tile.h"
 
-// One thread fits one group, start to end. The group's frame has its ball at the origin with radius 1, so step
-// sizes mean the same for every group and nothing is lost far from the world's origin.
+// One thread fits one group, start to end. The group's frame has its ball at the origin with radius 1, so
+// step sizes mean the same for every group and nothing is lost far from the world's origin.
 
 namespace v3dg {
 namespace V3DG_ISA {
@@ -64,7 +64,8 @@ static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& came
     return count;
 }
 
-static void blend_sorted(const FitScratch& scratch, size_t count, int left, int top, int size, TilePlanes<float>& tile) {
+static void blend_sorted(const FitScratch& scratch, size_t count, int left, int top, int size,
+                         TilePlanes<float>& tile) {
     const BlockPixels<float> pixels;
     uint64_t alive = clear_tile(tile, left, top, size, size, false);
     for (size_t i = 0; i < count && alive != 0; ++i) {
@@ -76,14 +77,16 @@ static void blend_sorted(const FitScratch& scratch, size_t count, int left, int 
 }
 
 static int place_in_tile(int x, int y) {
-    return (y / kBlockSize * kTileBlocks + x / kBlockSize) * kBlockPixels + y % kBlockSize * kBlockSize + x % kBlockSize;
+    return (y / kBlockSize * kTileBlocks + x / kBlockSize) * kBlockPixels + y % kBlockSize * kBlockSize +
+           x % kBlockSize;
 }
 
 void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget& target, const FitView& view,
                 FitScratch& scratch, FitImage& image) {
     const int ss = config.supersample;
-    const Draw<float> draw{target.model, group.target_first, group.target_count, view_of_world(config, group, view),
-                           target.filter_px2, target.compensate};
+    const Draw<float> draw{target.model,       group.target_first,
+                           group.target_count, view_of_world(config, group, view),
+                           target.filter_px2,  target.compensate};
     const size_t count = project_sorted(draw, camera_of(view, static_cast<float>(ss)), scratch);
     const int across = tiles_across(view);
     image.assign(static_cast<size_t>(across) * across * kPlanes * kTilePixels, 0.0f);
@@ -95,7 +98,9 @@ void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget&
             for (int y = 0; y < kTileSize && top + y < ss * view.size; ++y)
                 for (int x = 0; x < kTileSize && left + x < ss * view.size; ++x) {
                     const int px = (left + x) / ss, py = (top + y) / ss, p = place_in_tile(x, y);
-                    float* planes = image.data() + static_cast<size_t>(py / kTileSize * across + px / kTileSize) * kPlanes * kTilePixels;
+                    float* planes =
+                        image.data() +
+                        static_cast<size_t>(py / kTileSize * across + px / kTileSize) * kPlanes * kTilePixels;
                     const int out = place_in_tile(px % kTileSize, py % kTileSize);
                     for (int c = 0; c < 3; ++c) planes[c * kTilePixels + out] += share * tile.color[c][p];
                     planes[3 * kTilePixels + out] += share * (1 - std::fabs(tile.transmittance[p]));
@@ -103,10 +108,10 @@ void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget&
         }
 }
 
-// The parameters of one group, one flat array in the order means, quats, log scales, logits, sh; a gradient and
-// two moments of the same shape.
+// The parameters of one group, one flat array in the order means, quats, log scales, logits, sh; a gradient
+// and two moments of the same shape.
 class Student {
-public:
+  public:
     Student(const FitConfig& config, const FitGroup& group, const FitRows& rows)
         : config_(config), group_(group), n_(group.count), num_sh_(3 * num_sh_bases(rows.sh_degree)) {
         const size_t size = n_ * (11 + num_sh_);
@@ -118,12 +123,14 @@ public:
         float* p = value_.data();
         const float inverse = 1 / group.radius;
         for (size_t i = 0; i < n_; ++i)
-            for (int k = 0; k < 3; ++k) *p++ = (rows.means[3 * (group.first + i) + k] - group.center[k]) * inverse;
+            for (int k = 0; k < 3; ++k)
+                *p++ = (rows.means[3 * (group.first + i) + k] - group.center[k]) * inverse;
         p = std::copy_n(rows.quats + 4 * group.first, 4 * n_, p);
         for (size_t i = 0; i < 3 * n_; ++i)
             *p++ = std::log(std::max(rows.scales[3 * group.first + i] * inverse, kLeastScale));
         for (size_t i = 0; i < n_; ++i) {
-            const float o = std::min(std::max(rows.opacities[group.first + i], kLeastOpacity), 1 - kLeastOpacity);
+            const float o =
+                std::min(std::max(rows.opacities[group.first + i], kLeastOpacity), 1 - kLeastOpacity);
             *p++ = std::log(o / (1 - o));
         }
         std::copy_n(rows.sh + num_sh_ * group.first, num_sh_ * n_, p);
@@ -175,7 +182,8 @@ public:
         const float decay = static_cast<float>(std::pow(config_.final_step, progress));
         correction1_ = static_cast<float>(1 / (1 - std::pow(kAdamBeta1, index + 1)));
         correction2_ = static_cast<float>(1 / (1 - std::pow(kAdamBeta2, index + 1)));
-        const float position = config_.position_in_world ? config_.step_position / group_.radius : config_.step_position;
+        const float position =
+            config_.position_in_world ? config_.step_position / group_.radius : config_.step_position;
         size_t at = 0;
         at = adam(at, 3 * n_, decay * position);
         at = adam(at, 4 * n_, decay * config_.step_quat);
@@ -205,14 +213,15 @@ public:
             }
             const float* q = &value_[3 * n_ + 4 * i];
             const float length = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-            for (int k = 0; k < 4; ++k) rows.quats[4 * (first + i) + k] = length > 0 ? q[k] / length : float(k == 0);
+            for (int k = 0; k < 4; ++k)
+                rows.quats[4 * (first + i) + k] = length > 0 ? q[k] / length : float(k == 0);
             rows.opacities[first + i] = model_.opacity[i];
         }
         std::copy_n(&value_[11 * n_], num_sh_ * n_, rows.sh + num_sh_ * first);
         return true;
     }
 
-private:
+  private:
     static constexpr float kLeastScale = 1e-5f;    // of the radius: far below what a pixel shows
     static constexpr float kLeastOpacity = 1e-4f;  // keeps the logit finite and movable
 
@@ -221,13 +230,15 @@ private:
         const size_t end = begin + count;
         for (; i + kLanes<float> <= end; i += kLanes<float>) {
             Vec<float> m = load(&m_[i]), v = load(&v_[i]);
-            const Vec<float> next = adam_step(load(&value_[i]), load(&gradient_[i]), m, v, step_size, correction1_, correction2_);
+            const Vec<float> next =
+                adam_step(load(&value_[i]), load(&gradient_[i]), m, v, step_size, correction1_, correction2_);
             store(&m_[i], m);
             store(&v_[i], v);
             store(&value_[i], next);
         }
         for (; i < end; ++i)
-            value_[i] = adam_step(value_[i], gradient_[i], m_[i], v_[i], step_size, correction1_, correction2_);
+            value_[i] =
+                adam_step(value_[i], gradient_[i], m_[i], v_[i], step_size, correction1_, correction2_);
         return end;
     }
 
@@ -251,11 +262,13 @@ private:
         // No scale outgrows the ball, none vanishes: a value that ran away could not come back.
         const auto low = all_lanes<Vec<float>>(-20.0f), high = all_lanes<Vec<float>>(1.0f);
         for (int k = 0; k < 3; ++k)
-            map(scales + k * plane_size_, [&](Vec<float> x) { return exp2_in_range(min_of(high, max_of(low, x * kLog2e))); });
+            map(scales + k * plane_size_,
+                [&](Vec<float> x) { return exp2_in_range(min_of(high, max_of(low, x * kLog2e))); });
         float* opacities = plane;
         spread(1);
         const auto least = all_lanes<Vec<float>>(-60.0f), most = all_lanes<Vec<float>>(60.0f);
-        map(opacities, [&](Vec<float> x) { return 1 / (1 + exp2_in_range(min_of(most, max_of(least, x * -kLog2e)))); });
+        map(opacities,
+            [&](Vec<float> x) { return 1 / (1 + exp2_in_range(min_of(most, max_of(least, x * -kLog2e)))); });
         spread(num_sh_);
     }
 
@@ -269,7 +282,7 @@ private:
 
 // Draws the student, compares it with its target and, on the way back, adds to its gradient.
 class Comparison {
-public:
+  public:
     Comparison(const FitConfig& config) : config_(config) {}
 
     // Mean |difference| of colour and alpha of one view.
@@ -303,29 +316,34 @@ public:
             for (size_t i = 0; i < count && alive != 0; ++i) {
                 const uint32_t r = record_of(scratch_.order.data()[i]);
                 const Record<float>& g = scratch_.records.data()[r];
-                if (g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize) continue;
+                if (g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize)
+                    continue;
                 const uint64_t blocks = blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
                 RecordGradient<float> d;
-                if (blocks == 0 || !blend_record_vjp<float, false>(g, blocks, left, top, pixels, grad, tile, alive, d))
+                if (blocks == 0 ||
+                    !blend_record_vjp<float, false>(g, blocks, left, top, pixels, grad, tile, alive, d))
                     continue;
                 d_records_[r] += d;
             }
         }
-        student.add_gradient(student.draw(view), camera_of(view, 1), scratch_.source.data(), d_records_.data(), count);
+        student.add_gradient(student.draw(view), camera_of(view, 1), scratch_.source.data(),
+                             d_records_.data(), count);
     }
 
-private:
+  private:
     size_t draw(const Student& student, const FitView& view) {
         const size_t count = project_sorted(student.draw(view), camera_of(view, 1), scratch_);
         const int across = tiles_across(view);
         tiles_.resize(static_cast<size_t>(across) * across);
         for (int t = 0; t < across * across; ++t)
-            blend_sorted(scratch_, count, t % across * kTileSize, t / across * kTileSize, view.size, tiles_[t]);
+            blend_sorted(scratch_, count, t % across * kTileSize, t / across * kTileSize, view.size,
+                         tiles_[t]);
         return count;
     }
 
     // L1 parts of the loss in one tile: adds to the sums and, if wanted, writes the gradient of its pixels.
-    void compare(int t, const FitView& view, const FitImage& target, TileGradient<float>* grad, double error[2]) {
+    void compare(int t, const FitView& view, const FitImage& target, TileGradient<float>* grad,
+                 double error[2]) {
         using V = Vec<float>;
         const int across = tiles_across(view);
         const int left = t % across * kTileSize, top = t / across * kTileSize;
@@ -334,10 +352,13 @@ private:
         const float* planes = target.data() + static_cast<size_t>(t) * kPlanes * kTilePixels;
         const TilePlanes<float>& tile = tiles_[t];
         V color_sum = V{}, alpha_sum = V{};
-        const auto sign = [](V x, float size) { return x > V{} ? all_lanes<V>(size) : (x < V{} ? all_lanes<V>(-size) : V{}); };
+        const auto sign = [](V x, float size) {
+            return x > V{} ? all_lanes<V>(size) : (x < V{} ? all_lanes<V>(-size) : V{});
+        };
         const auto magnitude = [](V x) { return x < V{} ? -x : x; };
         for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
-            const bool inside = left + block % kTileBlocks * kBlockSize < view.size && top + block / kTileBlocks * kBlockSize < view.size;
+            const bool inside = left + block % kTileBlocks * kBlockSize < view.size &&
+                                top + block / kTileBlocks * kBlockSize < view.size;
             for (int p = block * kBlockPixels; p < (block + 1) * kBlockPixels; p += kLanes<float>) {
                 if (!inside) {
                     if (grad == nullptr) continue;
@@ -368,15 +389,19 @@ private:
         for (int c = 0; c < 3; ++c) {
             for (int y = 0; y < size; ++y)
                 for (int x = 0; x < size; ++x) {
-                    const int t = y / kTileSize * across + x / kTileSize, p = place_in_tile(x % kTileSize, y % kTileSize);
+                    const int t = y / kTileSize * across + x / kTileSize,
+                              p = place_in_tile(x % kTileSize, y % kTileSize);
                     rows_[y * size + x] = tiles_[t].color[c][p];
-                    rows_[n + y * size + x] = target[(static_cast<size_t>(t) * kPlanes + c) * kTilePixels + p];
+                    rows_[n + y * size + x] =
+                        target[(static_cast<size_t>(t) * kPlanes + c) * kTilePixels + p];
                 }
             std::fill_n(rows_.begin() + 2 * n, n, 0.0f);
-            dssim(rows_.data(), rows_.data() + n, size, size, config_.loss.dssim / 3, rows_.data() + 2 * n, ssim_);
+            dssim(rows_.data(), rows_.data() + n, size, size, config_.loss.dssim / 3, rows_.data() + 2 * n,
+                  ssim_);
             for (int y = 0; y < size; ++y)
                 for (int x = 0; x < size; ++x)
-                    grad_[y / kTileSize * across + x / kTileSize].d_color[c][place_in_tile(x % kTileSize, y % kTileSize)] +=
+                    grad_[y / kTileSize * across + x / kTileSize]
+                        .d_color[c][place_in_tile(x % kTileSize, y % kTileSize)] +=
                         rows_[2 * n + y * size + x];
         }
     }
@@ -393,8 +418,9 @@ private:
 // Views on which start and result are compared, and the residual is measured.
 constexpr int kResidualViews = 16;
 
-void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& target, const FitImage* targets,
-               const FitRows& rows, float error[2], const std::atomic<bool>& cancel) {
+void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& target,
+               const FitImage* targets, const FitRows& rows, float error[2],
+               const std::atomic<bool>& cancel) {
     Student student(config, group, rows);
     Comparison comparison(config);
     FitScratch target_scratch;
@@ -404,7 +430,8 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
         const int count = config.num_views > 0 ? std::min(config.num_views, kResidualViews) : kResidualViews;
         for (int i = 0; i < count; ++i) {
             // Spread over the lattice; fresh views take numbers that no step takes.
-            const uint64_t index = config.num_views > 0 ? static_cast<uint64_t>(i) * config.num_views / count : ~uint64_t(0) - i;
+            const uint64_t index =
+                config.num_views > 0 ? static_cast<uint64_t>(i) * config.num_views / count : ~uint64_t(0) - i;
             const FitView view = fit_view(config, group, index);
             if (config.num_views == 0) fit_target(config, group, target, view, target_scratch, fresh);
             comparison.residual(s, view, config.num_views > 0 ? targets[index] : fresh, sum);

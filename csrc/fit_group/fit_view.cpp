@@ -14,7 +14,8 @@ constexpr double kMarginPx = 2.5;
 
 static void multiply(const double a[9], const double b[9], double out[9]) {
     for (int i = 0; i < 3; ++i)
-        for (int k = 0; k < 3; ++k) out[3 * i + k] = a[3 * i] * b[k] + a[3 * i + 1] * b[3 + k] + a[3 * i + 2] * b[6 + k];
+        for (int k = 0; k < 3; ++k)
+            out[3 * i + k] = a[3 * i] * b[k] + a[3 * i + 1] * b[3 + k] + a[3 * i + 2] * b[6 + k];
 }
 
 // Uniform rotation from three uniform numbers (Shoemake 1992).
@@ -37,7 +38,8 @@ FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index)
         const double angle = index * kPi * (3 - std::sqrt(5.0)), roll = 2 * kPi * uniform(16 + 3 * index);
         const double forward[3] = {r * std::cos(angle), r * std::sin(angle), z};
         const double side[3] = {-std::sin(angle), std::cos(angle), 0};
-        const double up[3] = {forward[1] * side[2] - forward[2] * side[1], forward[2] * side[0] - forward[0] * side[2],
+        const double up[3] = {forward[1] * side[2] - forward[2] * side[1],
+                              forward[2] * side[0] - forward[0] * side[2],
                               forward[0] * side[1] - forward[1] * side[0]};
         for (int k = 0; k < 3; ++k) {
             lattice[k] = std::cos(roll) * side[k] + std::sin(roll) * up[k];

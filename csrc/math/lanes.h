@@ -99,8 +99,8 @@ V3DG_INLINE unsigned bits_of(IntVec64 mask) {
     return bits;
 }
 
-// 2^x for x in [-126, 127], relative error below 2^-22; anything for others. The integer part of x goes into the
-// exponent, a polynomial of least maximum relative error on [-1/2, 1/2] gives the rest.
+// 2^x for x in [-126, 127], relative error below 2^-22; anything for others. The integer part of x goes into
+// the exponent, a polynomial of least maximum relative error on [-1/2, 1/2] gives the rest.
 V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
     const Vec<float> magic = Vec<float>{} + 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer
     const Vec<float> shifted = x + magic;

@@ -17,8 +17,8 @@ static V3DG_INLINE void prefetch(const Record<T>* records, const uint64_t* entry
 }
 
 template <class T, bool kWithDepth>
-static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top, int width,
-                       int height, TilePlanes<T>& tile) {
+static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
+                       int width, int height, TilePlanes<T>& tile) {
     const BlockPixels<T> pixels;
     uint64_t alive = clear_tile(tile, left, top, width, height, kWithDepth);
     for (size_t i = 0; i < count && alive != 0; ++i) {
@@ -36,7 +36,8 @@ static V3DG_INLINE void for_each_pixel(int left, int top, int width, int height,
         const int x0 = left + block % kTileBlocks * kBlockSize, y0 = top + block / kTileBlocks * kBlockSize;
         for (int y = y0; y < y0 + kBlockSize && y < height; ++y)
             for (int x = x0; x < x0 + kBlockSize && x < width; ++x)
-                visit(block * kBlockPixels + (y - y0) * kBlockSize + (x - x0), static_cast<size_t>(y) * width + x);
+                visit(block * kBlockPixels + (y - y0) * kBlockSize + (x - x0),
+                      static_cast<size_t>(y) * width + x);
     }
 }
 
@@ -58,8 +59,8 @@ void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t coun
 
 template <class T, bool kWithDepth>
 static void backward(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
-                     const Picture<T>& picture, const PictureGradient<T>& d_picture, RecordGradient<T>* d_entry,
-                     T* d_background) {
+                     const Picture<T>& picture, const PictureGradient<T>& d_picture,
+                     RecordGradient<T>* d_entry, T* d_background) {
     TilePlanes<T> tile;
     blend_tile<T, kWithDepth>(records, entry, count, left, top, picture.width, picture.height, tile);
     TileGradient<T> grad = {};
@@ -103,10 +104,11 @@ void rasterize_tile_backward(const Record<T>* records, const uint64_t* entry, si
         backward<T, false>(records, entry, count, left, top, picture, d_picture, d_entry, d_background);
 }
 
-#define V3DG_INSTANTIATE(T)                                                                                         \
-    template void rasterize_tile<T>(const Record<T>*, const uint64_t*, size_t, int, int, const Picture<T>&);        \
-    template void rasterize_tile_backward<T>(const Record<T>*, const uint64_t*, size_t, int, int,                   \
-                                             const Picture<T>&, const PictureGradient<T>&, RecordGradient<T>*, T*);
+#define V3DG_INSTANTIATE(T)                                                                                  \
+    template void rasterize_tile<T>(const Record<T>*, const uint64_t*, size_t, int, int, const Picture<T>&); \
+    template void rasterize_tile_backward<T>(const Record<T>*, const uint64_t*, size_t, int, int,            \
+                                             const Picture<T>&, const PictureGradient<T>&,                   \
+                                             RecordGradient<T>*, T*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

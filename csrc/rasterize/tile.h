@@ -2,9 +2,9 @@
 
 // The inner loops of the rasterizer, on one tile of 32 x 32 pixels that stays in the first-level cache.
 //
-// A tile is 8 x 8 blocks of 4 x 4 pixels, one bit a block in a 64-bit mask: which blocks a gaussian may touch,
-// and which still have a pixel that has not stopped. A gaussian whose mask has no live block costs a few
-// integer operations.
+// A tile is 8 x 8 blocks of 4 x 4 pixels, one bit a block in a 64-bit mask: which blocks a gaussian may
+// touch, and which still have a pixel that has not stopped. A gaussian whose mask has no live block costs a
+// few integer operations.
 
 #include <cstdint>
 
@@ -65,7 +65,8 @@ V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, ui
     for (int row = 0; row < kTileBlocks; ++row) {
         const T low = T(kBlockSize * row) - v, high = low + T(kBlockSize - 1);
         const T a = min_of(max_of(rightmost, low), high), b = min_of(max_of(-rightmost, low), high);
-        const T left_a = max_of(reach - g.l22 * g.l22 * a * a, T(0)), left_b = max_of(reach - g.l22 * g.l22 * b * b, T(0));
+        const T left_a = max_of(reach - g.l22 * g.l22 * a * a, T(0)),
+                left_b = max_of(reach - g.l22 * g.l22 * b * b, T(0));
         const T half_a = sqrt_of(left_a) * inverse, half_b = sqrt_of(left_b) * inverse;
         const T hair = T(1e-2) + T(1e-3) * (half_a + half_b);
         const T x0 = min_of(max_of(u + slope * b - half_b - hair, T(-1)), T(kTileSize));
@@ -115,8 +116,8 @@ struct BlockPixels {
 
 // Blends one record over the live blocks of a tile; clears the bits of blocks that have stopped.
 template <class T, bool kWithDepth>
-V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int top, const BlockPixels<T>& pixels,
-                              TilePlanes<T>& tile, uint64_t& alive) {
+V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int top,
+                              const BlockPixels<T>& pixels, TilePlanes<T>& tile, uint64_t& alive) {
     using V = Vec<T>;
     const V l11 = all_lanes<V>(g.l11), l12 = all_lanes<V>(g.l12), l22 = all_lanes<V>(g.l22);
     const V log2_opacity = all_lanes<V>(g.log2_opacity);
@@ -157,8 +158,8 @@ V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int
 // of the tile took part.
 template <class T, bool kWithDepth>
 V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left, int top,
-                                  const BlockPixels<T>& pixels, const TileGradient<T>& grad, TilePlanes<T>& tile,
-                                  uint64_t& alive, RecordGradient<T>& out) {
+                                  const BlockPixels<T>& pixels, const TileGradient<T>& grad,
+                                  TilePlanes<T>& tile, uint64_t& alive, RecordGradient<T>& out) {
     using V = Vec<T>;
     const V l11 = all_lanes<V>(g.l11), l12 = all_lanes<V>(g.l12), l22 = all_lanes<V>(g.l22);
     const V log2_opacity = all_lanes<V>(g.log2_opacity);

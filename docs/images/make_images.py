@@ -1,4 +1,4 @@
-"""Make donutsea.jpg: a window of a layout, as truth, with all gaussians and with our cut at two tolerances."""
+"""Make donutsea.jpg: a window of a layout as truth, with all gaussians and with our cut twice."""
 
 from __future__ import annotations
 
@@ -48,7 +48,9 @@ def main(config: Config) -> None:
     sheet = Image.new("RGB", (2 * w + 6, 2 * (h + bar)), "#101214")
     for i, (title, color) in enumerate(panels):
         x, y = i % 2 * (w + 6), i // 2 * (h + bar)
-        picture = Image.fromarray((color * 255 + 0.5).astype(np.uint8)).resize((w, h), Image.Resampling.NEAREST)
+        picture = Image.fromarray((color * 255 + 0.5).astype(np.uint8)).resize(
+            (w, h), Image.Resampling.NEAREST
+        )
         sheet.paste(picture, (x, y + bar))
         ImageDraw.Draw(sheet).text((x + 8, y + 6), title, fill="#e8e8e8", font=font)
     sheet.save(config.output, quality=85)
