@@ -93,6 +93,18 @@ GRADIENT_FLOAT = GradientBound(
     reason="Sums over pixels in float32; single pixels flip at the cut-offs.",
 )
 
+MERGE_FLOAT = Bound(
+    relative=2e-5,
+    absolute=3e-6,
+    reason="Computed in float64 from and to float32; squares of scales and rotations lose a few ulps. "
+    "Absolute for what is compared in units of the largest.",
+)
+DSSIM_FLOAT = Bound(
+    relative=2e-3,
+    absolute=2e-5,
+    reason="Variances are differences of float32 blurs of squares, 6e-8 against the constant 0.03^2 = 9e-4.",
+)
+
 
 def assert_close(got, expected, bound: Bound) -> None:
     np.testing.assert_allclose(got, expected, rtol=bound.relative, atol=bound.absolute, err_msg=bound.reason)

@@ -17,7 +17,7 @@ NOT_OPERATIONS = {"base", "math", "pipeline", "bindings"}
 HOST_ONLY = {"ply"}  # reads and writes files: no kernel will ever exist
 FORMULAS_ONLY = {"adam"}  # used inside another operation's loop
 TESTED_WITH = {"adam": "fit_group", "loss": "fit_group"}
-NO_TEST_YET = {"fit_group", "project", "rasterize", "simplify_init", "tile_bin"}
+NO_TEST_YET = {"fit_group", "tile_bin"}
 
 OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)
 SOURCES = sorted(str(p.relative_to(ROOT)) for p in CSRC.rglob("*") if p.suffix in {".cpp", ".cu"})

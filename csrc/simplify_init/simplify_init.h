@@ -26,8 +26,7 @@ void prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> 
 
 // Joins pairs of gaussians, cheapest first, until as many are left as wanted. A pair becomes the gaussian
 // with the same first and second moments, each weighted by opacity times surface area, and the same area
-// times opacity as far as an opacity of 1 allows; it costs what its members differ in place, shape and
-// colour.
+// times opacity as far as an opacity of 1 allows; it costs what its members differ in place and colour.
 void merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
            const RowsOut& out);
 
