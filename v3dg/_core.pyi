@@ -208,3 +208,6 @@ def fit_level(
     error: Float32,
     progress: FitProgress,
 ) -> None: ...
+
+# loss
+def dssim(picture: Float32, target: Float32) -> tuple[float, Float32]: ...

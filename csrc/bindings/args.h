@@ -62,5 +62,6 @@ void bind_simplify_init(py::module_& m);
 void bind_ply(py::module_& m);
 void bind_render(py::module_& m);
 void bind_fit_level(py::module_& m);
+void bind_loss(py::module_& m);
 
 }  // namespace v3dg

@@ -13,4 +13,5 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_ply(m);
     v3dg::bind_render(m);
     v3dg::bind_fit_level(m);
+    v3dg::bind_loss(m);
 }

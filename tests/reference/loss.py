@@ -1,0 +1,37 @@
+"""The loss of local splatting on torch tensors of any precision, and 1 - SSIM in it."""
+
+from __future__ import annotations
+
+import torch
+
+
+def window() -> torch.Tensor:
+    """(11, 11) gaussian of sigma 1.5 that sums to 1."""
+    x = torch.arange(-5, 6, dtype=torch.float64)
+    line = torch.exp(-(x**2) / (2 * 1.5**2))
+    return torch.outer(line, line) / line.sum() ** 2
+
+
+def dssim(picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Mean of 1 - SSIM over one channel (H, W), zeros beyond the border (Wang et al. 2004)."""
+
+    def blur(image: torch.Tensor) -> torch.Tensor:
+        kernel = window().to(image.dtype)[None, None]
+        return torch.nn.functional.conv2d(image[None, None], kernel, padding=5)[0, 0]
+
+    mean_x, mean_y = blur(picture), blur(target)
+    var_x, var_y = blur(picture**2) - mean_x**2, blur(target**2) - mean_y**2
+    covariance = blur(picture * target) - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    ssim = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    ssim = ssim / ((mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2))
+    return (1 - ssim).mean()
+
+
+def loss(color, alpha, target_color, target_alpha, weights) -> torch.Tensor:
+    """L1 on premultiplied colour (H, W, 3), 1 - SSIM of it, L1 on alpha (H, W); `weights` in this order."""
+    l1, ssim, on_alpha = weights
+    total = l1 * (color - target_color).abs().mean() + on_alpha * (alpha - target_alpha).abs().mean()
+    if ssim:
+        total = total + ssim * sum(dssim(color[..., c], target_color[..., c]) for c in range(3)) / 3
+    return total

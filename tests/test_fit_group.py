@@ -1,0 +1,385 @@
+"""Fitting groups to pictures of what they stand for: views, loss, steps."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import scenes
+from compare import DSSIM_FLOAT, FIT_FLOAT, assert_close
+from v3dg import BuildConfig, Camera, Gaussians, _core, rasterize
+from v3dg.build import _fit_config
+from v3dg.rasterize import rows_of
+
+torch = pytest.importorskip("torch")
+
+from reference import loss as reference  # noqa: E402
+
+# One view size, and nothing that smooths or shifts the pictures.
+PLAIN = BuildConfig(image_size=32, supersample=1, filter_px2=0.0, num_views=16, views_per_step=1)
+FROZEN = dict.fromkeys(
+    ("step_position", "step_log_scale", "step_quat", "step_logit", "step_sh0", "step_sh_rest"), 0.0
+)
+CENTER, RADIUS = np.float32([3.0, -2.0, 1.0]), 0.5
+
+
+def fit(start, target, config, *, seed=0, stream=0, progress=None, target_filter_px2=0.0):
+    """Fit one group in the ball (CENTER, RADIUS); the result and its residual, mean |colour| and |alpha|."""
+    rows = [np.array(row) for row in rows_of(start)]
+    error = np.full((1, 2), -1, np.float32)
+    _core.fit_level(
+        _fit_config(config, seed, 0),
+        _core.Model(*rows_of(target)),
+        target_filter_px2,
+        False,
+        np.array([[0, len(target)]]),
+        np.array([[0, len(start)]]),
+        np.array([[*CENTER, RADIUS]], np.float32),
+        np.array([stream]),
+        *rows,
+        error,
+        progress or _core.FitProgress(),
+    )
+    return Gaussians(*rows), error[0]
+
+
+def in_ball(seed, num, **changes):
+    """Gaussians all over the ball."""
+    rng = np.random.default_rng(seed)
+    means = rng.normal(size=(num, 3))
+    means *= (
+        RADIUS * 0.8 * rng.uniform(0, 1, (num, 1)) ** (1 / 3) / np.linalg.norm(means, axis=1, keepdims=True)
+    )
+    g = scenes.gaussians(
+        CENTER + means,
+        quats=rng.normal(size=(num, 4)),
+        scales=RADIUS * np.exp(rng.uniform(-3.5, -1.5, (num, 3))),
+        opacities=rng.uniform(0.2, 0.9, num),
+        color=rng.uniform(0, 1, (num, 3)),
+    )
+    return scenes.replaced(g, **changes)
+
+
+def ball(opacity, color, scale=0.3, sh=None):
+    """One round gaussian at the centre: it looks the same from everywhere, except for `sh` above degree 0."""
+    return scenes.gaussians(CENTER, scales=scale * RADIUS, opacities=opacity, color=color, sh=sh)
+
+
+def with_bases(g, degree):
+    sh = np.zeros((len(g), (degree + 1) ** 2, 3), np.float32)
+    sh[:, :1] = g.sh
+    return scenes.replaced(g, sh=sh)
+
+
+def view_of_ball(config, direction=(0, 0, 1)):
+    """What any view of PLAIN is, but for a turn."""
+    eye = CENTER.astype(np.float64) - config.distance * RADIUS * np.asarray(direction, np.float64)
+    fov = 2 * math.atan(64 / 2 / 88.9)
+    return Camera.look_at(
+        eye, CENTER, [0, 1, 0.1], fov_x=fov, width=config.image_size, height=config.image_size
+    )
+
+
+# ---- views and residual
+
+
+def test_residual_of_what_matches_is_nothing():
+    g = in_ball(0, 30)
+    out, error = fit(g, g, replace(PLAIN, steps=0))
+    assert (error < 2e-6).all()
+    np.testing.assert_allclose(out.means, g.means, rtol=1e-6)
+
+
+def test_residual_is_the_mean_difference_in_colour_and_alpha():
+    start, target = ball(0.4, (0.2, 0.9, 0.1)), ball(0.9, (0.7, 0.3, 0.6), scale=0.4)
+    pictures = [rasterize(g, view_of_ball(PLAIN)) for g in (start, target)]
+    _, error = fit(start, target, replace(PLAIN, steps=0))
+    assert_close(error[0], np.abs(pictures[0].color - pictures[1].color).mean(), FIT_FLOAT)
+    assert_close(error[1], np.abs(pictures[0].alpha - pictures[1].alpha).mean(), FIT_FLOAT)
+
+
+def test_targets_are_supersampled():
+    """A gaussian between the pixel centres of a picture is seen at four times the size."""
+    speck = ball(0.9, (1, 1, 1), scale=0.004)
+    nothing = ball(0.0, (0, 0, 0))
+    camera = view_of_ball(PLAIN).scaled(4)
+    expected = rasterize(speck, camera).alpha.reshape(32, 4, 32, 4).mean()
+    _, error = fit(nothing, speck, replace(PLAIN, steps=0, supersample=4))
+    assert_close(error[1], expected, FIT_FLOAT)
+
+
+def mean_colour_over_views(coefficient, config, **options):
+    """Of one SH coefficient over the views of a residual, in standard deviations over the sphere."""
+    sh = np.zeros((1, 16, 3), np.float32)
+    sh[0, 0] = 0.5 / scenes.SH_C0  # a colour of 1, which keeps all of them above 0
+    sh[0, coefficient] = 0.2
+    bright, nothing = ball(0.9, (1, 1, 1), sh=sh), with_bases(ball(0.0, (0, 0, 0)), 3)
+    _, error = fit(nothing, bright, replace(config, steps=0), **options)
+    return (error[0] / error[1] - 1) / (0.2 * scenes.SH_C0)
+
+
+@pytest.mark.parametrize("num_views", [14, 16])  # all of them are in the residual
+def test_fixed_views_lie_evenly_on_the_sphere(num_views):
+    """Up to degree 3, functions on the sphere average out as they do not over 16 random views."""
+    config = replace(PLAIN, num_views=num_views)
+    means = [mean_colour_over_views(k, config, seed=seed) for k in range(1, 16) for seed in range(3)]
+    assert np.abs(means).max() < 0.2
+    assert np.sqrt(np.mean(np.square(means))) < 0.08  # 0.25 if they were random
+
+
+def test_fresh_views_are_random_and_uniform():
+    config = replace(PLAIN, num_views=0)
+    for k in (*range(1, 9), 12, 15):
+        means = np.array([mean_colour_over_views(k, config, stream=stream) for stream in range(100)])
+        assert abs(means.mean()) < 4 * 0.25 / 10  # 4 sigma of 100 means over 16
+        assert 0.7 < means.std() / 0.25 < 1.3
+
+
+def test_seed_and_stream_change_the_views():
+    _, first = fit(ball(0, (0, 0, 0)), in_ball(1, 20), replace(PLAIN, steps=0))
+    for options in ({"seed": 1}, {"stream": 1}):
+        _, other = fit(ball(0, (0, 0, 0)), in_ball(1, 20), replace(PLAIN, steps=0), **options)
+        assert not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize("num_views", [1, 4, 29, 58, 64])
+def test_every_view_is_looked_at(num_views):
+    """What only some directions show is learnt from views all around."""
+    sh = np.zeros((1, 4, 3), np.float32)
+    sh[0, 0], sh[0, 1:] = 1.0, np.float32([[0.5], [-0.4], [0.3]])
+    target = ball(0.9, (0, 0, 0), sh=sh)
+    start = with_bases(scenes.replaced(target, sh=sh[:, :1].copy()), 1)
+    config = replace(
+        PLAIN, **FROZEN | {"step_sh_rest": 0.02}, num_views=num_views, steps=200, final_step=0.01
+    )
+    fitted, _ = fit(start, target, config)
+    close = np.abs(fitted.sh - sh).max() < 0.03
+    assert close == (num_views > 1)
+
+
+# ---- loss
+
+
+def noise(seed, *shape):
+    return np.random.default_rng(seed).uniform(0, 1, shape).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("picture", "target"),
+    [
+        (noise(0, 23, 31), noise(1, 23, 31)),
+        (noise(2, 1, 1), noise(3, 1, 1)),
+        (noise(4, 3, 40), noise(5, 3, 40)),
+        (noise(6, 16, 16), np.zeros((16, 16), np.float32)),
+        (np.full((20, 20), 0.5, np.float32), np.full((20, 20), 0.4, np.float32)),
+        (np.linspace(0, 1, 900, dtype=np.float32).reshape(30, 30), noise(7, 30, 30)),
+    ],
+)
+def test_dssim_and_its_gradient_agree_with_reference(picture, target):
+    value, gradient = _core.dssim(picture, target)
+    exact = torch.tensor(picture, dtype=torch.float64, requires_grad=True)
+    expected = reference.dssim(exact, torch.tensor(target, dtype=torch.float64))
+    expected.backward()
+    assert_close(value, expected.item(), DSSIM_FLOAT)
+    size = exact.grad.abs().max().item()
+    assert_close(gradient / size, exact.grad.numpy() / size, DSSIM_FLOAT)
+
+
+def test_reference_gradient_agrees_with_finite_differences():
+    target = torch.tensor(noise(8, 4, 6), dtype=torch.float64)
+    picture = torch.tensor(noise(9, 4, 6), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: reference.dssim(x, target), picture)
+
+
+def test_dssim_of_equal_pictures_is_nothing():
+    value, gradient = _core.dssim(noise(10, 20, 20), noise(10, 20, 20))
+    assert abs(value) < 1e-6
+    assert np.abs(gradient).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("picture", "target"),
+    [
+        (np.zeros((3, 3)), np.zeros((3, 3), np.float32)),
+        (np.zeros((3, 3), np.float32), np.zeros((3, 4), np.float32)),
+        (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)),
+    ],
+)
+def test_wrong_pictures_are_refused(picture, target):
+    with pytest.raises(ValueError, match=r"picture: expected|target: expected"):
+        _core.dssim(picture, target)
+
+
+# ---- steps
+
+
+@pytest.mark.parametrize("weights", [(1.0, 0.0, 0.5), (0.8, 0.2, 0.1), (0.0, 1.0, 0.0)])
+@pytest.mark.parametrize("views_per_step", [1, 3])
+def test_steps_are_those_of_adam(weights, views_per_step):
+    """A ball that looks the same from everywhere, fitted by torch.optim.Adam on differentiable pictures."""
+    steps = 25
+    config = replace(
+        PLAIN,
+        **FROZEN | {"step_logit": 0.05, "step_sh0": 0.03},
+        **dict(zip(("loss_l1", "loss_dssim", "loss_alpha"), weights, strict=True)),
+        steps=steps,
+        views_per_step=views_per_step,
+    )
+    start, target = ball(0.3, (0.2, 0.9, 0.35)), ball(0.8, (0.6, 0.5, 0.3), scale=0.35)
+    fitted, _ = fit(start, target, config)
+
+    camera = view_of_ball(config)
+    goal = scenes.doubles(target, torch=torch)
+    goal = rasterize(goal, camera)
+    g = scenes.doubles(start, torch=torch)
+    logit = torch.logit(g.opacities).requires_grad_()
+    sh = g.sh.clone().requires_grad_()
+    optimizer = torch.optim.Adam(
+        [{"params": [logit], "lr": config.step_logit}, {"params": [sh], "lr": config.step_sh0}], eps=1e-15
+    )
+    decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda s: config.final_step ** (s / (steps - 1)))
+    for _ in range(steps):
+        g.opacities, g.sh = torch.sigmoid(logit), sh
+        drawn = rasterize(g, camera)
+        optimizer.zero_grad()
+        reference.loss(drawn.color, drawn.alpha, goal.color, goal.alpha, weights).backward()
+        optimizer.step()
+        decay.step()
+    assert_close(fitted.opacities, torch.sigmoid(logit).detach().numpy(), FIT_FLOAT)
+    assert_close(fitted.sh, sh.detach().numpy(), FIT_FLOAT)
+
+
+def test_first_step_has_the_sizes_that_were_set():
+    """Adam's first step is as long as set, whatever the gradient."""
+    steps = {"step_position": 1e-3, "step_log_scale": 2e-3, "step_logit": 3e-3, "step_sh0": 4e-3}
+    start, target = in_ball(2, 12), in_ball(3, 12)
+    config = replace(
+        PLAIN, **FROZEN | steps | {"step_sh_rest": 5e-3}, steps=1, views_per_step=16, image_size=64
+    )
+    start, target = with_bases(start, 1), with_bases(target, 1)
+    fitted, _ = fit(start, target, config)
+    assert not np.array_equal(fitted.sh, start.sh)  # it was better than the start
+
+    def logit(x):
+        return np.log(x / (1 - x))
+
+    changes = {
+        "step_position": (fitted.means - start.means) / RADIUS,
+        "step_log_scale": np.log(fitted.scales / start.scales),
+        "step_logit": logit(fitted.opacities) - logit(start.opacities),
+        "step_sh0": fitted.sh[:, 0] - start.sh[:, 0],
+        "step_sh_rest": fitted.sh[:, 1:] - start.sh[:, 1:],
+    }
+    for name, change in changes.items():
+        np.testing.assert_allclose(np.abs(change), getattr(config, name), rtol=0.01, err_msg=name)
+
+
+def test_position_steps_in_world_units():
+    config = replace(
+        PLAIN, **FROZEN | {"step_position": 1e-3}, position_in_world=True, steps=1, image_size=64
+    )
+    start = in_ball(2, 12)
+    fitted, _ = fit(start, in_ball(3, 12), config)
+    np.testing.assert_allclose(np.abs(fitted.means - start.means), 1e-3, rtol=0.01)
+
+
+@pytest.mark.parametrize("changes", [{}, {"num_views": 0}, {"image_size": 0}, {"loss_dssim": 0.2}])
+def test_longer_fits_come_closer(changes):
+    start, target = in_ball(4, 20), in_ball(5, 60)
+    config = replace(PLAIN, supersample=2, filter_px2=0.1, **changes)
+    loss = [
+        fit(start, target, replace(config, steps=steps))[1] @ [config.loss_l1, config.loss_alpha]
+        for steps in (0, 20, 200)
+    ]
+    assert loss[1] < 0.9 * loss[0]
+    assert loss[2] < 0.9 * loss[1]
+
+
+def test_result_no_better_than_its_start_is_thrown_away():
+    target = in_ball(6, 20)
+    start = scenes.replaced(target, sh=target.sh + np.float32(0.05))  # far better than nothing at all
+    _, before = fit(start, target, replace(PLAIN, steps=0))
+    for step in ("step_position", "step_log_scale", "step_logit", "step_sh0"):
+        out, error = fit(start, target, replace(PLAIN, **FROZEN | {step: 1e8}, steps=5))
+        assert all(np.array_equal(getattr(out, n), getattr(start, n)) for n in scenes.NAMES), step
+        np.testing.assert_array_equal(error, before)
+
+
+def test_groups_do_not_touch_each_other():
+    """Two groups at once give what each gives alone, with its own stream."""
+    starts, targets = [in_ball(8, 12), in_ball(9, 7)], [in_ball(10, 30), in_ball(11, 20)]
+    config = replace(PLAIN, steps=10)
+    alone = [fit(s, t, config, stream=i) for i, (s, t) in enumerate(zip(starts, targets, strict=True))]
+    both = [np.array(row) for row in rows_of(Gaussians.concatenate(starts))]
+    error = np.zeros((2, 2), np.float32)
+    progress = _core.FitProgress()
+    _core.fit_level(
+        _fit_config(config, 0, 0),
+        _core.Model(*rows_of(Gaussians.concatenate(targets))),
+        *(0.0, False),
+        *(np.array([[0, 30], [30, 50]]), np.array([[0, 12], [12, 19]])),
+        np.array([[*CENTER, RADIUS]] * 2, np.float32),
+        np.arange(2),
+        *both,
+        error,
+        progress,
+    )
+    for name, row in zip(scenes.NAMES, both, strict=True):
+        np.testing.assert_array_equal(row, np.concatenate([getattr(g, name) for g, _ in alone]))
+    np.testing.assert_array_equal(error, [e for _, e in alone])
+    assert progress.groups_done == 2
+    np.testing.assert_allclose(
+        progress.loss_sum, (error @ [config.loss_l1, config.loss_alpha]).sum(), rtol=1e-6
+    )
+
+
+def test_cancelled_fit_does_nothing():
+    progress = _core.FitProgress()
+    progress.cancel()
+    start = in_ball(12, 10)
+    out, _ = fit(start, in_ball(13, 10), PLAIN, progress=progress)
+    assert np.array_equal(out.means, start.means)
+    assert progress.groups_done == 0
+
+
+def test_no_groups_are_legal():
+    rows = [np.array(row) for row in rows_of(in_ball(14, 0))]
+    empty = np.zeros((0, 2), np.int64)
+    _core.fit_level(
+        *(_fit_config(PLAIN, 0, 0), _core.Model(*rows_of(in_ball(14, 0))), 0.0, False, empty, empty),
+        *(np.zeros((0, 4), np.float32), np.zeros(0, np.int64), *rows, np.zeros((0, 2), np.float32)),
+        _core.FitProgress(),
+    )
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (4, [[0, 11]], "range: expected \\[first, last\\) within the gaussians, group 0 is not"),
+        (5, [[3, 2]], "range: expected \\[first, last\\) within the gaussians, group 0 is not"),
+        (5, [[-1, 2]], "range: expected \\[first, last\\) within the gaussians, group 0 is not"),
+        (4, [[0, 5], [5, 10]], "target_range: expected shape"),
+        (7, [0, 1], "stream: expected shape"),
+    ],
+)
+def test_wrong_groups_are_named(place, value, message):
+    rows = [np.array(row) for row in rows_of(in_ball(15, 10))]
+    arguments = [
+        *(_fit_config(PLAIN, 0, 0), _core.Model(*rows), 0.0, False),
+        *(np.array([[0, 10]]), np.array([[0, 10]]), np.array([[0, 0, 0, 1]], np.float32), np.array([0])),
+        *(*rows, np.zeros((1, 2), np.float32), _core.FitProgress()),
+    ]
+    arguments[place] = np.array(value)
+    with pytest.raises(ValueError, match=message):
+        _core.fit_level(*arguments)
+
+
+def test_group_without_extent_is_named():
+    rows = [np.array(row) for row in rows_of(in_ball(15, 10))]
+    with pytest.raises(ValueError, match="ball: expected a positive radius, group 0 has none"):
+        _core.fit_level(
+            *(_fit_config(PLAIN, 0, 0), _core.Model(*rows), 0.0, False),
+            *(np.array([[0, 10]]), np.array([[0, 10]]), np.zeros((1, 4), np.float32), np.array([0])),
+            *(*rows, np.zeros((1, 2), np.float32), _core.FitProgress()),
+        )
