@@ -378,3 +378,23 @@ def test_fit_gains_over_merging_alone(asset):
     merged, fitted = (build(asset, BuildConfig(cluster_size=64, steps=steps)) for steps in (0, 200))
     for level in (1, 2, 3):
         assert held_out_psnr(asset, fitted, level) > held_out_psnr(asset, merged, level) + 0.6
+
+
+# ---- progress
+
+
+def test_bar_counts_all_levels_ahead(asset, capsys):
+    bundle = build_bundle(asset, config=replace(SMALL, group_size=4), progress=True)
+    out, err = capsys.readouterr()
+    assert out == ""
+    # One bar that ends complete: all coarser gaussians, all levels, the last group, its loss.
+    last = err.strip().split("\r")[-1]
+    coarser = bundle.num_gaussians - len(asset)
+    assert last.startswith(f"level {bundle.num_levels - 1}/{bundle.num_levels - 1}: 100%")
+    assert f"{coarser / 1000:.2f}k/{coarser / 1000:.2f}k" in last
+    assert "groups 1/1, loss 0.0" in last
+
+
+def test_no_bar_unless_wanted(asset, capfd):
+    build_bundle(asset, config=SMALL, progress=False)
+    assert capfd.readouterr() == ("", "")
