@@ -77,7 +77,7 @@ class BuildConfig:
     image_size: int = 0
     px2_per_gaussian: float = 2.0
     distance: float = 4.0
-    filter_px2: float = 0.1
+    filter_px2: float = 0.05
     asset_filter_px2: float = 0.0
     asset_antialiased: bool = False
     loss_l1: float = 1.0
