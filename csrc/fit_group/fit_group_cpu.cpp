@@ -425,13 +425,18 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
     Comparison comparison(config);
     FitScratch target_scratch;
     FitImage fresh;
+    // A stride prime to the number of fixed views visits all of them, neighbours far apart.
+    uint64_t stride = 29;
+    while (config.num_views > 1 && std::gcd(stride, static_cast<uint64_t>(config.num_views)) > 1) ++stride;
+    const auto fixed_view = [&](uint64_t visit) {
+        return visit * stride % static_cast<uint64_t>(config.num_views);
+    };
     const auto measure = [&](const Student& s, double sum[2]) {
         sum[0] = sum[1] = 0;
         const int count = config.num_views > 0 ? std::min(config.num_views, kResidualViews) : kResidualViews;
         for (int i = 0; i < count; ++i) {
-            // Spread over the lattice; fresh views take numbers that no step takes.
-            const uint64_t index =
-                config.num_views > 0 ? static_cast<uint64_t>(i) * config.num_views / count : ~uint64_t(0) - i;
+            // Fresh views take numbers that no step takes.
+            const uint64_t index = config.num_views > 0 ? fixed_view(i) : ~uint64_t(0) - i;
             const FitView view = fit_view(config, group, index);
             if (config.num_views == 0) fit_target(config, group, target, view, target_scratch, fresh);
             comparison.residual(s, view, config.num_views > 0 ? targets[index] : fresh, sum);
@@ -442,14 +447,11 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
     double start[2], end[2];
     measure(student, start);
     uint64_t next_view = 0;
-    // A stride prime to the number of views visits all of them, neighbours far apart.
-    int stride = 29;
-    while (config.num_views > 1 && std::gcd(stride, config.num_views) > 1) ++stride;
     for (int s = 0; s < config.steps && !cancel.load(std::memory_order_relaxed); ++s) {
         student.clear_gradient();
         for (int b = 0; b < config.views_per_step; ++b, ++next_view) {
             if (config.num_views > 0) {
-                const uint64_t index = next_view * stride % static_cast<uint64_t>(config.num_views);
+                const uint64_t index = fixed_view(next_view);
                 comparison.add_gradient(student, fit_view(config, group, index), targets[index]);
             } else {
                 const FitView view = fit_view(config, group, next_view);
@@ -461,7 +463,7 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
     }
     measure(student, end);
     const auto loss_of = [&](const double e[2]) { return config.loss.l1 * e[0] + config.loss.alpha * e[1]; };
-    const bool better = loss_of(end) <= loss_of(start) && student.write(rows);
+    const bool better = config.steps > 0 && loss_of(end) <= loss_of(start) && student.write(rows);
     for (int k = 0; k < 2; ++k) error[k] = static_cast<float>(better ? end[k] : start[k]);
 }
 
