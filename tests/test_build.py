@@ -71,7 +71,8 @@ def held_out_psnr(asset, bundle, level):
     }
     errors = []
     for direction in np.random.default_rng(99).normal(size=(8, 3)):
-        camera = camera_at(center, radius, direction, len(gaussians))
+        footprint = BuildConfig().px2_per_gaussian * len(gaussians)
+        camera = camera_at(center, radius, direction, footprint)
         truth = metrics.box_downsample(rasterize(asset, camera.scaled(4)).color, 4)
         errors.append(np.mean((truth - rasterize(gaussians, camera, **options).color) ** 2))
     return -10 * math.log10(np.mean(errors))
@@ -374,7 +375,7 @@ def test_runaway_fit_leaves_the_start(asset):
 
 
 def test_fit_gains_over_merging_alone(asset):
-    """In dB, at the size of selection, on views that no fit saw. Measured: 1.3, 1.4, 1.0."""
+    """In dB, at the size of selection, on views that no fit saw. Measured: 1.5, 1.5, 0.7."""
     merged, fitted = (build(asset, BuildConfig(cluster_size=64, steps=steps)) for steps in (0, 200))
     for level in (1, 2, 3):
         assert held_out_psnr(asset, fitted, level) > held_out_psnr(asset, merged, level) + 0.6
