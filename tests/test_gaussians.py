@@ -4,7 +4,7 @@ import re
 import numpy as np
 import pytest
 
-from v3dg import Gaussians
+from v3dg import Camera, Gaussians, rasterize
 
 NAMES = ("means", "quats", "scales", "opacities", "sh")
 
@@ -227,3 +227,19 @@ def test_refuses_wrong_tensors(sh, message):
     tensors = {name: torch.from_numpy(array) for name, array in random_arrays(4).items()}
     with pytest.raises(ValueError, match=re.escape(message)):
         Gaussians(**{**tensors, "sh": sh(torch)})
+
+
+def test_double_precision_tensors_are_drawn_in_double_precision():
+    torch = pytest.importorskip("torch")
+    g = Gaussians(
+        means=torch.zeros(1, 3, dtype=torch.float64),
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64),
+        scales=torch.full((1, 3), 0.3, dtype=torch.float64),
+        opacities=torch.full((1,), 0.7, dtype=torch.float64),
+        sh=torch.ones(1, 1, 3, dtype=torch.float64, requires_grad=True),
+    )
+    camera = Camera.look_at((0, -3, 0), (0, 0, 0), width=8, height=8)
+    color = rasterize(g, camera).color
+    assert color.dtype == torch.float64
+    color.sum().backward()
+    assert g.sh.grad.abs().sum() > 0

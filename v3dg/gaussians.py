@@ -31,6 +31,8 @@ def _kind(value: object) -> str:
 class Gaussians:
     """N 3D Gaussians: NumPy arrays or torch tensors, float32, C-contiguous, all of one kind on one device.
 
+    Torch tensors may all be float64 instead, which `rasterize` then computes in; all else wants float32.
+
     Args:
         means: (N, 3) centres, in world units of the asset's own frame.
         quats: (N, 4) rotations as w, x, y, z; need not have length one.
@@ -152,14 +154,15 @@ class Gaussians:
 
 
 def _check_kind(name: str, array: Any, like: Any) -> None:
-    """Raise unless `array` is a contiguous float32 array of the kind and on the device of `like`."""
+    """Raise unless `array` is contiguous, float32 (tensors: or float64), of the kind and device of `like`."""
     if not isinstance(array, np.ndarray) and not _is_tensor(array):
         raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {_kind(array)}")
     if _is_tensor(array) != _is_tensor(like):
         raise TypeError(f"{name}: expected {_kind(like)} like the others, got {_kind(array)}")
-    dtype = str(array.dtype).removeprefix("torch.")
-    if dtype != "float32":
-        raise ValueError(f"{name}: expected dtype float32, got {dtype}; convert it first")
+    dtype, first = (str(a.dtype).removeprefix("torch.") for a in (array, like))
+    wanted = "float64" if _is_tensor(array) and first == "float64" else "float32"
+    if dtype != wanted:
+        raise ValueError(f"{name}: expected dtype {wanted}, got {dtype}; convert it first")
     if _is_tensor(array):
         if array.device != like.device:
             raise ValueError(f"{name}: expected device {like.device} like the others, got {array.device}")
