@@ -200,3 +200,14 @@ def test_main_returns_the_exit_code(capsys):
     assert cli.main(["--version"]) == 0
     assert cli.main(["info", "nowhere.v3dg"]) == 1
     assert "nowhere.v3dg" in capsys.readouterr().err
+
+
+def test_levels_are_kept_when_the_bundle_cannot_be_saved(folder, tmp_path):
+    (tmp_path / "tuft.v3dg").mkdir()  # where the bundle should go
+    done = run("build", folder / "tuft.ply", "-o", "tuft.v3dg", "--quiet", cwd=tmp_path)
+    assert done.returncode == 1
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert (tmp_path / "tuft.v3dg.partial").exists()
+    (tmp_path / "tuft.v3dg").rmdir()
+    assert run("build", folder / "tuft.ply", "--resume", "-o", "tuft.v3dg", cwd=tmp_path).returncode == 0
+    assert sorted(os.listdir(tmp_path)) == ["tuft.v3dg"]

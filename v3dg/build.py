@@ -205,8 +205,8 @@ def build_bundle(
         seed: Of the views that groups are fitted to.
         progress: Show a bar with the level, its groups done, the time left and their mean loss.
         device: "auto" and "cpu" build on the CPU, the only device of this version.
-        resume_path: Where to keep finished levels until the bundle is done; a build of the same asset, config
-            and seed that finds them there goes on from them.
+        resume_path: Where to keep finished levels; a build of the same asset, config and seed that finds them
+            there goes on from them. The file stays: remove it once the bundle is saved.
 
     Raises:
         ValueError: The asset is empty or has values that are not finite, or a setting is wrong.
@@ -233,9 +233,7 @@ def build_bundle(
             store.save(levels)
     finally:
         bar.close()
-    bundle = _assemble(levels, config, seed)
-    store.remove()
-    return bundle
+    return _assemble(levels, config, seed)
 
 
 def _check_drawable(rows: tuple[Any, ...]) -> None:
@@ -486,7 +484,7 @@ class _Bar:
 
 
 class _Checkpoint:
-    """Finished levels in a file, written whole after each level and gone once the bundle is made."""
+    """Finished levels in a file, written whole after each level."""
 
     def __init__(
         self, path: str | os.PathLike[str] | None, rows: tuple[Any, ...], config: BuildConfig, seed: int
@@ -551,11 +549,6 @@ class _Checkpoint:
             os.replace(self._temporary, self._path)
         finally:
             self._temporary.unlink(missing_ok=True)
-
-    def remove(self) -> None:
-        if self._path is not None:
-            self._temporary.unlink(missing_ok=True)
-            self._path.unlink(missing_ok=True)
 
 
 def _boxes(gaussians: Gaussians, offset: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
