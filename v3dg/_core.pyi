@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 Float32: TypeAlias = NDArray[np.float32]
 
 has_cuda: bool
+reach_sigmas: float
 
 def isa() -> str: ...
 def ply_read(path: str) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...

@@ -21,12 +21,10 @@ from v3dg._version import __version__
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.gaussians import Gaussians
 from v3dg.rasterize import rows_of
+from v3dg.scene import rotation_from_quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-# Standard deviations at which a gaussian of opacity 1 falls to an alpha of 1/255, and never draws beyond.
-REACH_SIGMAS = 3.33
 
 # Of a side of a picture, in pixels.
 _MAX_IMAGE_SIZE = 65535
@@ -553,19 +551,11 @@ class _Checkpoint:
 
 def _boxes(gaussians: Gaussians, offset: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
     """(clusters, 2, 3) lower and upper corner of what each cluster draws."""
-    w, x, y, z = (gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True).clip(1e-30)).T
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    sigma = np.sqrt(
-        np.einsum("ikn,nk->ni", rotation.astype(np.float64) ** 2, gaussians.scales.astype(np.float64) ** 2)
-    )
+    quats = gaussians.quats.astype(np.float64)
+    rotation = rotation_from_quaternion(quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-30))
+    sigma = np.sqrt(np.einsum("nik,nk->ni", rotation**2, gaussians.scales.astype(np.float64) ** 2))
     # A little more than the reach, for the rounding of the corners.
-    reach = REACH_SIGMAS * 1.0001 * sigma + 1e-6 * np.abs(gaussians.means)
+    reach = _core.reach_sigmas * 1.0001 * sigma + 1e-6 * np.abs(gaussians.means)
     low = np.minimum.reduceat(gaussians.means - reach, offset[:-1], axis=0)
     high = np.maximum.reduceat(gaussians.means + reach, offset[:-1], axis=0)
     return np.stack([low, high], axis=1).astype(np.float32)

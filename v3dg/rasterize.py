@@ -99,7 +99,7 @@ def _rasterize_torch(
     rows = rows_of(gaussians)
     if any(r.is_cuda for r in rows):
         raise RuntimeError(
-            "gaussians: this version rasterizes on the CPU only; call gaussians.to('cpu') first"
+            "gaussians: this version rasterizes on the CPU only; call gaussians.torch('cpu') first"
         )
     double = rows[0].dtype == torch.float64
     model_type = _core.ModelDouble if double else _core.Model

@@ -6,6 +6,7 @@
 #include <stdexcept>
 
 #include "bindings/args.h"
+#include "project/project_math.h"
 #include "select/select.h"
 
 namespace v3dg {
@@ -40,10 +41,9 @@ class BoundTable {
         table_.offset = offsets;
         find_top();
         find_bounds();
-        // A gaussian of opacity 1 falls below 1/255 at 3.33 standard deviations.
         float filter = 0.0f;
         for (const float value : filters) filter = std::max(filter, value);
-        table_.pad_px = 3.33f * std::sqrt(filter) + 1.0f;
+        table_.pad_px = static_cast<float>(kReachSigmas) * std::sqrt(filter) + 1.0f;
     }
 
     BoundTable(const BoundTable&) = delete;

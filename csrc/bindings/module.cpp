@@ -1,8 +1,10 @@
 #include "base/isa.h"
 #include "bindings/args.h"
+#include "project/project_math.h"
 
 PYBIND11_MODULE(_core, m) {
     m.doc() = "Compiled operations of v3dg; the public interface is the package v3dg.";
+    m.attr("reach_sigmas") = v3dg::kReachSigmas;
     m.attr("has_cuda") = V3DG_WITH_CUDA != 0;
     m.def(
         "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },

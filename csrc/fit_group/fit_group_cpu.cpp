@@ -64,14 +64,18 @@ static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& came
     return count;
 }
 
+static bool misses_tile(const Record<float>& g, int left, int top) {
+    return g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize;
+}
+
 static void blend_sorted(const FitScratch& scratch, size_t count, int left, int top, int size,
                          TilePlanes<float>& tile) {
     const BlockPixels<float> pixels;
     uint64_t alive = clear_tile(tile, left, top, size, size, false);
     for (size_t i = 0; i < count && alive != 0; ++i) {
         const Record<float>& g = scratch.records.data()[record_of(scratch.order.data()[i])];
-        if (g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize) continue;
-        const uint64_t blocks = blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
+        if (misses_tile(g, left, top)) continue;
+        const uint64_t blocks = live_blocks(g, left, top, alive);
         if (blocks != 0) blend_record<float, false>(g, blocks, left, top, pixels, tile, alive);
     }
 }
@@ -316,9 +320,8 @@ class Comparison {
             for (size_t i = 0; i < count && alive != 0; ++i) {
                 const uint32_t r = record_of(scratch_.order.data()[i]);
                 const Record<float>& g = scratch_.records.data()[r];
-                if (g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize)
-                    continue;
-                const uint64_t blocks = blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
+                if (misses_tile(g, left, top)) continue;
+                const uint64_t blocks = live_blocks(g, left, top, alive);
                 RecordGradient<float> d;
                 if (blocks == 0 ||
                     !blend_record_vjp<float, false>(g, blocks, left, top, pixels, grad, tile, alive, d))

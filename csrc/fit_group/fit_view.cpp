@@ -3,10 +3,10 @@
 
 #include "base/random.h"
 #include "fit_group/fit_group.h"
+#include "math/solid_angle.h"
 
 namespace v3dg {
 
-constexpr double kPi = 3.141592653589793;
 // The paper's code looks at a 64 px image with a focal length of 88.9 px.
 constexpr double kFocalPerSize = 88.9 / 64;
 // Room around the ball for what its gaussians draw beyond it.
@@ -63,8 +63,8 @@ FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index)
     } else {
         // The focal length at which the ball's footprint (select_math.h) has the wanted number of px².
         const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
-        const double solid_angle = 2 * kPi * x2 / (1 + std::sqrt(1 - x2));
-        focal = std::sqrt(static_cast<double>(group.count) * config.px2_per_gaussian / solid_angle);
+        focal =
+            std::sqrt(static_cast<double>(group.count) * config.px2_per_gaussian / solid_angle_of_ball(x2));
         const double radius_px = focal * std::sqrt(x2 / (1 - x2));
         view.size = 4 * static_cast<int>(std::ceil((radius_px + kMarginPx) / 2));  // whole blocks of 4 px
         shift_x = uniform(16 + 3 * index + 1) - 0.5;

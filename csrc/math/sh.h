@@ -8,6 +8,7 @@
 namespace v3dg {
 
 constexpr int kMaxShBases = 16;
+constexpr double kShBase0 = 0.28209479177387814;  // the same in every direction
 
 V3DG_HD constexpr int num_sh_bases(int degree) { return (degree + 1) * (degree + 1); }
 
@@ -15,7 +16,7 @@ V3DG_HD constexpr int num_sh_bases(int degree) { return (degree + 1) * (degree +
 template <class V>
 V3DG_HD V3DG_INLINE void sh_bases(int degree, V x, V y, V z, V basis[kMaxShBases]) {
     using T = Lane<V>;
-    basis[0] = all_lanes<V>(T(0.28209479177387814));
+    basis[0] = all_lanes<V>(T(kShBase0));
     if (degree < 1) return;
     const T c1 = T(0.4886025119029199);
     basis[1] = -c1 * y;

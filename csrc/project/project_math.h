@@ -16,7 +16,8 @@ constexpr double kMinAlpha = 1.0 / 255;     // contributions below it are skippe
 constexpr double kMaxAlpha = 0.999;         // alpha is cut here
 constexpr double kMinTransmittance = 1e-4;  // a pixel stops before it would fall to this
 constexpr double kLog2MinAlpha = -7.994353436858858;
-constexpr double kFovMargin = 0.3;  // of the half field of view: where the Jacobian is clamped
+constexpr double kFovMargin = 0.3;     // of the half field of view: where the Jacobian is clamped
+constexpr double kReachSigmas = 3.33;  // where opacity 1 has fallen below 1/255
 constexpr double kLn2 = 0.6931471805599453;
 constexpr double kFalloffScale = 0.8493218002880191;  // sqrt(log2(e) / 2): exp(-d²/2) = 2^-(scale d)²
 

@@ -24,7 +24,7 @@ static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t c
     for (size_t i = 0; i < count && alive != 0; ++i) {
         prefetch(records, entry, i, count);
         const Record<T>& g = records[record_of(entry[i])];
-        const uint64_t blocks = blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
+        const uint64_t blocks = live_blocks(g, left, top, alive);
         if (blocks != 0) blend_record<T, kWithDepth>(g, blocks, left, top, pixels, tile, alive);
     }
 }
@@ -88,7 +88,7 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
     for (size_t i = 0; i < count && alive != 0; ++i) {
         prefetch(records, entry, i, count);
         const Record<T>& g = records[record_of(entry[i])];
-        const uint64_t blocks = blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
+        const uint64_t blocks = live_blocks(g, left, top, alive);
         if (blocks != 0)
             blend_record_vjp<T, kWithDepth>(g, blocks, left, top, pixels, grad, tile, alive, d_entry[i]);
     }

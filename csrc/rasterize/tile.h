@@ -83,6 +83,12 @@ V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, ui
     return blocks & mask;
 }
 
+// Blocks of the tile that are alive and that the record, whose box must meet the tile, may change.
+template <class T>
+V3DG_INLINE uint64_t live_blocks(const Record<T>& g, int left, int top, uint64_t alive) {
+    return blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
+}
+
 // Sets the planes to an empty picture and returns the blocks with a pixel inside width x height. Pixels
 // outside count as stopped.
 template <class T>

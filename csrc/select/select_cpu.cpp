@@ -5,6 +5,7 @@
 #include <algorithm>
 
 #include "base/parallel_for.h"
+#include "project/project_math.h"
 
 namespace v3dg {
 
@@ -46,8 +47,8 @@ InstanceView view_from_instance(const SelectCamera& camera, const InstanceTable&
         const double middle = is_x ? camera.cx : camera.cy;
         const double edge_px = sign > 0 ? size - middle : middle;
         const double slope = (edge_px + pad_px) / focal;
-        // The projection is linearised no farther out than 0.15 of the image's size.
-        const double linearised = (edge_px + 0.15 * size) / focal;
+        // The projection is linearised no farther out than this.
+        const double linearised = (edge_px + kFovMargin * size / 2) / focal;
         const double* axis = axes + (is_x ? 0 : 3);
         Plane& plane = view.plane[1 + side];
         for (int k = 0; k < 3; ++k)

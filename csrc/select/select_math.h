@@ -11,6 +11,7 @@
 
 #include "base/host_device.h"
 #include "base/span.h"
+#include "math/solid_angle.h"
 
 namespace v3dg {
 
@@ -67,17 +68,16 @@ struct SelectRule {
 
 // Screen area that the ball covers, px2. +inf when the eye is inside, or where there is no number.
 V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view, const SelectRule& rule) {
-    constexpr float kPi = 3.14159265358979f;
     const float dx = ball.x - view.eye[0], dy = ball.y - view.eye[1], dz = ball.z - view.eye[2];
     const float radius2 = ball.radius * ball.radius;
     if (rule.footprint == Footprint::paper) {
         const float depth = dx * view.forward[0] + dy * view.forward[1] + dz * view.forward[2];
-        const float area = kPi * (radius2 / (depth * depth)) * rule.focal_px2;
+        const float area = float(kPi) * (radius2 / (depth * depth)) * rule.focal_px2;
         return area >= 0.0f ? area : INFINITY;
     }
     const float x2 = radius2 / (dx * dx + dy * dy + dz * dz);
     if (!(x2 < 1.0f)) return INFINITY;
-    return 2.0f * kPi * x2 / (1.0f + sqrtf(1.0f - x2)) * rule.focal_px2;
+    return solid_angle_of_ball(x2) * rule.focal_px2;
 }
 
 // Screen area, px2, that one gaussian of the clusters made by group g stands for.

@@ -7,6 +7,7 @@
 
 #include "base/parallel_for.h"
 #include "cluster/cluster.h"
+#include "math/sh.h"
 #include "simplify_init/simplify_init_math.h"
 
 namespace v3dg {
@@ -114,7 +115,7 @@ void merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> 
             for (int k = 0; k < 3; ++k) {
                 n.mean[k] = in.means[3 * r + k];
                 scale[k] = in.scales[3 * r + k];
-                n.color[k] = 0.28209479177387814 * in.sh[in.num_sh * r + k];
+                n.color[k] = kShBase0 * in.sh[in.num_sh * r + k];
                 low[k] = std::min(low[k], n.mean[k]);
                 high[k] = std::max(high[k], n.mean[k]);
             }
