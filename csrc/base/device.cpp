@@ -1,0 +1,71 @@
+#include "base/device.h"
+
+#include <mutex>
+#include <string>
+#include <vector>
+
+namespace v3dg {
+namespace cuda {
+
+void check(cudaError_t error, const char* what) {
+    if (error == cudaSuccess) return;
+    cudaGetLastError();  // a later call must not report this error again
+    throw std::runtime_error(std::string("cuda: ") + what + " failed: " + cudaGetErrorString(error));
+}
+
+// A pool of our own, so that how long we keep memory is nobody else's affair.
+static cudaMemPool_t pool_of_current_device() {
+    static std::mutex mutex;
+    static std::vector<cudaMemPool_t> pools;
+    int device = 0;
+    check(cudaGetDevice(&device), "cudaGetDevice");
+    const std::lock_guard<std::mutex> lock(mutex);
+    if (pools.size() <= static_cast<size_t>(device)) pools.resize(device + 1, nullptr);
+    if (pools[device] == nullptr) {
+        cudaMemPoolProps properties{};
+        properties.allocType = cudaMemAllocationTypePinned;
+        properties.location.type = cudaMemLocationTypeDevice;
+        properties.location.id = device;
+        cudaMemPool_t pool;
+        check(cudaMemPoolCreate(&pool, &properties), "cudaMemPoolCreate");
+        // What is given back stays ours until somebody runs out; mapping it anew costs milliseconds.
+        uint64_t keep = uint64_t(1) << 30;
+        check(cudaMemPoolSetAttribute(pool, cudaMemPoolAttrReleaseThreshold, &keep),
+              "cudaMemPoolSetAttribute");
+        pools[device] = pool;
+    }
+    return pools[device];
+}
+
+static std::string mebibytes(size_t bytes) { return std::to_string((bytes >> 20) + 1) + " MiB"; }
+
+void* allocate(size_t bytes, cudaStream_t stream) {
+    if (bytes == 0) return nullptr;
+    const cudaMemPool_t pool = pool_of_current_device();
+    void* pointer = nullptr;
+    cudaError_t error = cudaMallocFromPoolAsync(&pointer, bytes, pool, stream);
+    if (error == cudaErrorMemoryAllocation) {
+        // What the pool kept may be in pieces, and other streams may still be about to give back.
+        cudaGetLastError();
+        check(cudaDeviceSynchronize(), "cudaDeviceSynchronize");
+        check(cudaMemPoolTrimTo(pool, 0), "cudaMemPoolTrimTo");
+        error = cudaMallocFromPoolAsync(&pointer, bytes, pool, stream);
+    }
+    if (error == cudaErrorMemoryAllocation) {
+        cudaGetLastError();
+        size_t free_bytes = 0, total = 0;
+        check(cudaMemGetInfo(&free_bytes, &total), "cudaMemGetInfo");
+        throw OutOfMemory("cuda: out of memory: asked for " + mebibytes(bytes) + ", free are " +
+                          mebibytes(free_bytes) + " of " + mebibytes(total));
+    }
+    check(error, "cudaMallocFromPoolAsync");
+    return pointer;
+}
+
+void release(void* pointer, cudaStream_t stream) noexcept {
+    // At exit the driver may be gone before us, and then so is the memory.
+    if (pointer != nullptr && cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
+}
+
+}  // namespace cuda
+}  // namespace v3dg

@@ -1,0 +1,79 @@
+#pragma once
+
+// Memory and errors of the CUDA half. Sources that include it are built only with CUDA.
+
+#include <cuda_runtime.h>
+
+#include <stdexcept>
+#include <utility>
+
+#include "base/span.h"
+
+namespace v3dg {
+namespace cuda {
+
+// The device has no room; what() names what was asked for and what was free.
+struct OutOfMemory : std::runtime_error {
+    using std::runtime_error::runtime_error;
+};
+
+// Throws std::runtime_error with CUDA's own words unless the call succeeded; `what` names it.
+void check(cudaError_t error, const char* what);
+
+// Stream-ordered memory of the current device, from a pool that keeps what is given back for the next caller.
+// Throws OutOfMemory.
+void* allocate(size_t bytes, cudaStream_t stream);
+void release(void* pointer, cudaStream_t stream) noexcept;
+
+// Owned elements of a plain type on the device, not initialised. Grows by forgetting what it held. Whoever
+// uses it on several streams orders them.
+template <class T>
+class DeviceBuffer {
+  public:
+    DeviceBuffer() = default;
+    DeviceBuffer(size_t size, cudaStream_t stream) { reserve(size, stream); }
+    DeviceBuffer(Span<const T> host, cudaStream_t stream) { copy_from(host, stream); }
+    DeviceBuffer(DeviceBuffer&& other) noexcept { swap(other); }
+    DeviceBuffer& operator=(DeviceBuffer&& other) noexcept {
+        swap(other);
+        return *this;
+    }
+    ~DeviceBuffer() { release(data_, stream_); }
+
+    // Room for `size` elements, allocated and given back in the order of `stream`.
+    T* reserve(size_t size, cudaStream_t stream) {
+        if (size > capacity_) {
+            release(data_, stream_);
+            data_ = nullptr;
+            capacity_ = 0;
+            data_ = static_cast<T*>(allocate(size * sizeof(T), stream));
+            capacity_ = size;
+        }
+        stream_ = stream;
+        return data_;
+    }
+    // The host's memory may be reused on return.
+    T* copy_from(Span<const T> host, cudaStream_t stream) {
+        reserve(host.size, stream);
+        if (host.size > 0)
+            check(cudaMemcpyAsync(data_, host.data, host.size * sizeof(T), cudaMemcpyHostToDevice, stream),
+                  "cudaMemcpyAsync to the device");
+        return data_;
+    }
+    T* data() const { return data_; }
+    size_t capacity() const { return capacity_; }
+
+  private:
+    void swap(DeviceBuffer& other) noexcept {
+        std::swap(data_, other.data_);
+        std::swap(capacity_, other.capacity_);
+        std::swap(stream_, other.stream_);
+    }
+
+    T* data_ = nullptr;
+    size_t capacity_ = 0;
+    cudaStream_t stream_ = nullptr;
+};
+
+}  // namespace cuda
+}  // namespace v3dg
