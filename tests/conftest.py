@@ -1,16 +1,23 @@
 import pytest
 from hypothesis import settings
 
-from v3dg import _core
+from v3dg import _device
 
 # A shared machine can stall for longer than any deadline that would still mean something.
 settings.register_profile("v3dg", deadline=None, print_blob=True)
 settings.load_profile("v3dg")
 
 
+@pytest.fixture(scope="session", params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request):
+    """Each device in turn; devices.py brings arrays there and back."""
+    return request.param
+
+
 def pytest_collection_modifyitems(items):
-    if _core.num_cuda_devices() > 0:
+    missing = _device.missing_for_cuda()
+    if missing is None:
         return
     for item in items:
         if item.get_closest_marker("gpu"):
-            item.add_marker(pytest.mark.skip(reason="no CUDA device, or built without CUDA"))
+            item.add_marker(pytest.mark.skip(reason=missing))

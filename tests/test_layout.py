@@ -50,12 +50,25 @@ def test_headers_are_included_once():
     assert [str(p) for p in headers if "#pragma once" not in p.read_text(encoding="utf-8")] == []
 
 
-def test_only_the_build_flag_decides_on_cuda():
-    """Host sources know of CUDA only through V3DG_WITH_CUDA and the contracts."""
-    hosts = [p for p in CSRC.rglob("*") if p.suffix in {".cpp", ".h"} and p.name != "host_device.h"]
-    assert [
-        str(p) for p in hosts if re.search(r"__CUDACC__|cuda_runtime", p.read_text(encoding="utf-8"))
-    ] == []
+def cmake_list(name):
+    """Sources in a list of CMakeLists.txt."""
+    text = (ROOT / "CMakeLists.txt").read_text(encoding="utf-8")
+    return re.search(rf"set\({name}\s([^)]*)\)", text)[1].split()
+
+
+def test_host_sources_know_nothing_of_the_cuda_runtime():
+    """What is compiled without CUDA, too, sees CUDA only through the contracts or behind V3DG_WITH_CUDA."""
+    behind_the_flag = re.compile(r"^#if V3DG_WITH_CUDA$.*?^#(?:else|endif)", re.MULTILINE | re.DOTALL)
+    todo = {
+        CSRC.parent / s for n in ("V3DG_SIMD_SOURCES", "V3DG_SOURCES", "V3DG_BINDINGS") for s in cmake_list(n)
+    }
+    seen = set()
+    while todo:
+        path = todo.pop()
+        seen.add(path)
+        text = behind_the_flag.sub("", path.read_text(encoding="utf-8"))
+        assert path.name == "host_device.h" or not re.search(r"__CUDACC__|cuda_runtime", text), path
+        todo |= {CSRC / name for name in re.findall(r'^#include "(.+)"', text, re.MULTILINE)} - seen
 
 
 def imports_when_loaded(path):

@@ -1,0 +1,29 @@
+"""Arrays on either device: NumPy's on the CPU, torch tensors on CUDA. For tests that run on both."""
+
+import numpy as np
+
+from v3dg import Gaussians
+
+
+def on(device, value):
+    """The array or the gaussians on `device`; a tuple or list of them becomes a tuple."""
+    if isinstance(value, (tuple, list)):
+        return tuple(on(device, v) for v in value)
+    if device == "cpu":
+        return value.numpy() if isinstance(value, Gaussians) else host(value)
+    import torch
+
+    if isinstance(value, Gaussians):
+        return value.torch(device)
+    if isinstance(value, np.ndarray):
+        value = torch.from_numpy(np.array(value))
+    return value.to(device)
+
+
+def host(value):
+    """The same as NumPy: of an array, gaussians, or a tuple or list of them."""
+    if isinstance(value, (tuple, list)):
+        return tuple(host(v) for v in value)
+    if isinstance(value, Gaussians):
+        return value.numpy()
+    return value if isinstance(value, np.ndarray) else value.detach().cpu().numpy()
