@@ -36,8 +36,6 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
     using V = Vec<T>;
     constexpr int kWidth = kLanes<T>;
     const GaussianPlanes<T>& model = *draw.model;
-    const V zero = V{};
-    const V huge = all_lanes<V>(T(1e30));
     size_t num_records = 0;
     for (uint64_t done = 0; done < count; done += kWidth) {
         const uint64_t at = draw.first + skip + done;
@@ -51,25 +49,19 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         Projection<V> s;
         const Ellipse<V> e = project_gaussian(g, mv, camera, draw.filter_px2, draw.compensate, s);
 
-        // Where alpha falls to 1/255: |L d|² = reach.
-        const V reach = e.log2_opacity - T(kLog2MinAlpha);
-        const V half_x = sqrt_of(reach * s.c11) * T(1 / kFalloffScale);
-        const V half_y = sqrt_of(reach * s.c22) * T(1 / kFalloffScale);
-        const auto drawable = in_front & (g.opacity >= all_lanes<V>(T(kMinAlpha))) & (reach >= zero) &
-                              (s.det > zero) & (s.det < huge) & (half_x < huge) & (half_y < huge);
-        const auto meets = drawable & (e.u + half_x > zero) & (e.u - half_x < all_lanes<V>(camera.width)) &
-                           (e.v + half_y > zero) & (e.v - half_y < all_lanes<V>(camera.height));
+        V half_x, half_y;
+        const auto drawable = in_front & extent_of(g.opacity, e, s, half_x, half_y);
+        const auto meets =
+            drawable & meets_image(e.u, half_x, camera.width) & meets_image(e.v, half_y, camera.height);
         const unsigned meets_bits = bits_of(meets) & lanes;
         in_frustum += __builtin_popcount(meets_bits);
         if (meets_bits == 0) continue;
 
-        // Pixel centres within the extent; a hair more, so that the blend step alone decides.
-        const V hair_x = half_x * T(1e-5) + T(2e-3), hair_y = half_y * T(1e-5) + T(2e-3);
-        const V low = all_lanes<V>(T(-1));
-        const auto x0 = ceil_to_int(max_of(low, e.u - half_x - hair_x - T(0.5)));
-        const auto x1 = floor_to_int(min_of(all_lanes<V>(camera.width), e.u + half_x + hair_x - T(0.5)));
-        const auto y0 = ceil_to_int(max_of(low, e.v - half_y - hair_y - T(0.5)));
-        const auto y1 = floor_to_int(min_of(all_lanes<V>(camera.height), e.v + half_y + hair_y - T(0.5)));
+        V low_x, high_x, low_y, high_y;
+        pixel_span(e.u, half_x, camera.width, low_x, high_x);
+        pixel_span(e.v, half_y, camera.height, low_y, high_y);
+        const auto x0 = ceil_to_int(low_x), x1 = floor_to_int(high_x);
+        const auto y0 = ceil_to_int(low_y), y1 = floor_to_int(high_y);
         unsigned kept = bits_of(meets & (x0 <= x1) & (y0 <= y1)) & lanes;
         if (kept == 0) continue;
 

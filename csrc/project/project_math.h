@@ -131,6 +131,36 @@ V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const Mo
     return e;
 }
 
+// How far from its centre, px, alpha is 1/255 or more: where |L d|² = log2 of alpha at the centre over 1/255.
+// Returns whether it is anywhere; the extent means nothing where it is not.
+template <class V>
+V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Projection<V>& s, V& half_x,
+                                   V& half_y) {
+    using T = Lane<V>;
+    const V huge = all_lanes<V>(T(1e30));
+    const V reach = e.log2_opacity - all_lanes<V>(T(kLog2MinAlpha));
+    half_x = sqrt_of(reach * s.c11) * T(1 / kFalloffScale);
+    half_y = sqrt_of(reach * s.c22) * T(1 / kFalloffScale);
+    return (opacity >= all_lanes<V>(T(kMinAlpha))) & (reach >= V{}) & (s.det > V{}) & (s.det < huge) &
+           (half_x < huge) & (half_y < huge);
+}
+
+// Whether what reaches `half` from `center` meets (0, size).
+template <class V>
+V3DG_HD V3DG_INLINE auto meets_image(V center, V half, Lane<V> size) {
+    return (center + half > V{}) & (center - half < all_lanes<V>(size));
+}
+
+// The pixels from ceil(low) to floor(high) have their centres within `half` of `center`, or a hair farther,
+// so that the blend step alone decides. From -1 or 0 to size - 1 or size.
+template <class V>
+V3DG_HD V3DG_INLINE void pixel_span(V center, V half, Lane<V> size, V& low, V& high) {
+    using T = Lane<V>;
+    const V hair = half * T(1e-5) + T(2e-3);
+    low = max_of(all_lanes<V>(T(-1)), center - half - hair - T(0.5));
+    high = min_of(all_lanes<V>(size), center + half + hair - T(0.5));
+}
+
 // Gradients of the gaussian's mean, quaternion, scales and opacity from those of its ellipse.
 template <class V, class T>
 V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g, const ModelView<T>& mv,

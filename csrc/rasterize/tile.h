@@ -56,21 +56,15 @@ constexpr int kFewBlocks = 5;
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;
-    const T reach = g.log2_opacity - T(kLog2MinAlpha);
-    const T inverse = 1 / g.l11, slope = -g.l12 * inverse;
-    // Height above the centre at which the ellipse reaches farthest right; farthest left is opposite.
-    const T rightmost = -g.l12 * sqrt_of(reach) / (g.l22 * sqrt_of(g.l12 * g.l12 + g.l22 * g.l22));
+    const EllipseRows<T> ellipse = ellipse_rows(g.l11, g.l12, g.l22, g.log2_opacity);
     const T u = g.u - T(left) - T(0.5), v = g.v - T(top) - T(0.5);
     int first[kTileBlocks], last[kTileBlocks];
     for (int row = 0; row < kTileBlocks; ++row) {
-        const T low = T(kBlockSize * row) - v, high = low + T(kBlockSize - 1);
-        const T a = min_of(max_of(rightmost, low), high), b = min_of(max_of(-rightmost, low), high);
-        const T left_a = max_of(reach - g.l22 * g.l22 * a * a, T(0)),
-                left_b = max_of(reach - g.l22 * g.l22 * b * b, T(0));
-        const T half_a = sqrt_of(left_a) * inverse, half_b = sqrt_of(left_b) * inverse;
-        const T hair = T(1e-2) + T(1e-3) * (half_a + half_b);
-        const T x0 = min_of(max_of(u + slope * b - half_b - hair, T(-1)), T(kTileSize));
-        const T x1 = min_of(max_of(u + slope * a + half_a + hair, T(-1)), T(kTileSize));
+        const T low = T(kBlockSize * row) - v;
+        T x0, x1;
+        row_extent(ellipse, low, low + T(kBlockSize - 1), x0, x1);
+        x0 = min_of(max_of(u + x0, T(-1)), T(kTileSize));
+        x1 = min_of(max_of(u + x1, T(-1)), T(kTileSize));
         first[row] = static_cast<int>(max_of(x0, T(0))) >> 2;
         last[row] = x1 < 0 ? -1 : static_cast<int>(x1) >> 2;
     }
