@@ -1,0 +1,24 @@
+#pragma once
+
+#include "base/device.h"
+#include "pipeline/frame_types.h"
+
+namespace v3dg {
+namespace cuda {
+
+// What the way back needs of the blend; every pointer is on the device.
+struct RasterTape {
+    // As long as the entries, each tile's at its tile_first: its records in the order they were blended.
+    uint32_t* order;
+    // [num_tiles] How many entries of `order` were written: all, or those up to a place where no pixel of the
+    // tile could change any more.
+    uint32_t* blended;
+};
+
+// Blends each tile's list into the pictures that lists.images name; every pixel is written. Overwrites
+// lists.entries and lists.scratch. Does nothing where the counters are over a capacity. The result does not
+// depend on the order of the entries within a tile's list. `tape` may be null.
+void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t stream);
+
+}  // namespace cuda
+}  // namespace v3dg
