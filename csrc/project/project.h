@@ -49,7 +49,7 @@ struct RecordGradient {
     Ellipse<T> ellipse;
     T color[3];
 
-    RecordGradient& operator+=(const RecordGradient& d) {
+    V3DG_HD RecordGradient& operator+=(const RecordGradient& d) {
         ellipse.u += d.ellipse.u;
         ellipse.v += d.ellipse.v;
         ellipse.l11 += d.ellipse.l11;

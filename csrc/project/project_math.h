@@ -249,7 +249,7 @@ V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelVie
     }
 }
 
-// Adds to `d_mean` and sets `d_sh` from the gradient of the colour.
+// Adds to `d_mean` and sets `d_sh` from the gradient of the colour. `d_sh` may be `sh` itself.
 template <class V, class T>
 V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V mean[3], const ModelView<T>& mv, const V* sh,
                                          const V color[3], const V d_color[3], V d_mean[3], V* d_sh) {
@@ -266,8 +266,8 @@ V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V mean[3], const Mode
     for (int c = 0; c < 3; ++c) {
         const V d = color[c] > V{} ? d_color[c] : V{};
         for (int b = 0; b < num_sh_bases(degree); ++b) {
-            d_sh[3 * b + c] = basis[b] * d;
             d_basis[b] += sh[3 * b + c] * d;
+            d_sh[3 * b + c] = basis[b] * d;
         }
     }
     if (degree == 0) return;

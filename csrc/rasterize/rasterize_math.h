@@ -82,4 +82,36 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t) {
     return weight;
 }
 
+// Gradient by the exponent of a gaussian that was blended with `alpha` and `weight` where the transmittance
+// was `before`. `by_weight` is the gradient by its weight, `behind` what all gaussians behind it give: the
+// sum of their weights times the gradients by them.
+template <class V>
+V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V behind) {
+    // alpha takes its weight and dims all that is behind.
+    const V d_alpha = before * by_weight - behind / (1 - alpha);
+    const auto moves = (weight > V{}) & (alpha < all_lanes<V>(Lane<V>(kMaxAlpha)));
+    return moves ? Lane<V>(kLn2) * alpha * d_alpha : V{};
+}
+
+// Sums over pixels of the gradients by what the exponent is made of.
+template <class T>
+struct FalloffSums {
+    T exponent, t1, t2;
+    T t1_dx, t1_dy, t2_dy;  // gradient by t1 times dx, ...
+};
+
+// Gradient of the ellipse: t1 = l11 dx + l12 dy and t2 = l22 dy, with dx = x - u and dy = y - v.
+template <class T>
+V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSums<T>& d) {
+    Ellipse<T> out;
+    out.u = -l11 * d.t1;
+    out.v = -l12 * d.t1 - l22 * d.t2;
+    out.l11 = d.t1_dx;
+    out.l12 = d.t1_dy;
+    out.l22 = d.t2_dy;
+    out.log2_opacity = d.exponent;
+    out.depth = T(0);
+    return out;
+}
+
 }  // namespace v3dg

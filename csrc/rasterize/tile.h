@@ -202,10 +202,8 @@ V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left,
             }
             const V running = load(tile.color[0] + p) + weight * by_weight;
             store(tile.color[0] + p, running);
-            // alpha takes its weight and dims all that is behind: (total - running) is what they give.
-            const V d_alpha = before * by_weight - (load(grad.total + p) - running) / (1 - alpha);
-            const auto moves = (weight > V{}) & (alpha < all_lanes<V>(T(kMaxAlpha)));
-            const V d_exponent = moves ? T(kLn2) * alpha * d_alpha : V{};
+            const V d_exponent =
+                exponent_vjp(alpha, before, weight, by_weight, load(grad.total + p) - running);
             const V d_t1 = -2 * f.t1 * d_exponent, d_t2 = -2 * f.t2 * d_exponent;
             s_exponent += d_exponent;
             s_t1 += d_t1;
@@ -218,14 +216,9 @@ V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left,
         if (live == 0) alive &= ~(uint64_t(1) << block);
     }
     if (!took_part) return false;
-    // t1 = l11 dx + l12 dy and t2 = l22 dy, with dx = x - u and dy = y - v.
-    const T d_t1 = sum_of(s_t1), d_t2 = sum_of(s_t2);
-    out.ellipse.u = -g.l11 * d_t1;
-    out.ellipse.v = -g.l12 * d_t1 - g.l22 * d_t2;
-    out.ellipse.l11 = sum_of(s_t1_dx);
-    out.ellipse.l12 = sum_of(s_t1_dy);
-    out.ellipse.l22 = sum_of(s_t2_dy);
-    out.ellipse.log2_opacity = sum_of(s_exponent);
+    out.ellipse = falloff_vjp(g.l11, g.l12, g.l22,
+                              FalloffSums<T>{sum_of(s_exponent), sum_of(s_t1), sum_of(s_t2), sum_of(s_t1_dx),
+                                             sum_of(s_t1_dy), sum_of(s_t2_dy)});
     for (int c = 0; c < 3; ++c) out.color[c] = sum_of(s_color[c]);
     out.ellipse.depth = kWithDepth ? sum_of(s_depth) : T(0);
     return true;
