@@ -1,0 +1,276 @@
+// A block takes a tile, a warp 8 x 4 of its pixels, a lane one pixel; they walk the tile's list front to back
+// as the forward pass did.
+//
+// The sums over a warp's pixels are made for kRows gaussians at once: a lane stores what its pixel gives to
+// each of them, then lanes take over a row of 8 pixels of one gaussian each. That costs a fifth of adding up
+// across lanes gaussian by gaussian.
+
+#include "base/launch.cuh"
+#include "rasterize/rasterize_backward.h"
+#include "rasterize/rasterize_math.h"
+
+namespace v3dg {
+namespace cuda {
+
+namespace {
+
+constexpr int kWarps = kFrameTileWidth * kFrameTileHeight / 32;
+constexpr int kThreads = 32 * kWarps;
+constexpr int kWarpWidth = 8, kWarpHeight = 4;  // px
+constexpr int kWarpColumns = kFrameTileWidth / kWarpWidth;
+constexpr int kBatch = 128;   // entries
+constexpr int kPairs = 1024;  // (entry, warp) pairs of a batch
+constexpr int kHeld = 8;      // gaussians whose sums a warp makes at once
+constexpr int kValues = sizeof(RecordGradient<float>) / sizeof(float);
+static_assert(kHeld * kWarpHeight == 32, "a lane sums one row of one gaussian");
+static_assert(kPairs >= kWarps, "one entry fits");
+
+// What a pixel gives to a gaussian.
+struct Share {
+    float d_exponent, weight;
+};
+
+struct Shared {
+    Record<float> record[kBatch];
+    uint32_t slot[kBatch];
+    uint32_t first_pair[kBatch];
+    uint32_t warps[kBatch];      // bit w: warp w may blend the entry
+    uint32_t took_part[kBatch];  // bit w: it did
+    uint32_t pairs_of_warp[kBatch / 32];
+    uint32_t alive;  // bit w: warp w has a pixel that has not stopped
+    float4 d_color[kWarps][kWarpHeight]
+                  [kWarpWidth + 1];  // and by depth; the spare column is against conflicts
+    Share share[kWarps][kHeld][33];
+    float pair[kPairs][kValues];
+    float d_background[kWarps][3];
+};
+
+// Parts of the tile, one bit a warp, that the record may reach.
+__device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
+    const int x0 = max(g.x0 - left, 0) / kWarpWidth, x1 = min(g.x1 - left, kFrameTileWidth - 1) / kWarpWidth;
+    const int y0 = max(g.y0 - top, 0) / kWarpHeight, y1 = min(g.y1 - top, kFrameTileHeight - 1) / kWarpHeight;
+    const EllipseRows<float> ellipse = ellipse_rows(g.l11, g.l12, g.l22, g.log2_opacity);
+    const float u = g.u - left, v = g.v - top;  // from the tile's corner, whose pixels' centres are at 1/2
+    uint32_t warps = 0;
+    for (int y = y0; y <= y1; ++y) {
+        float low, high;
+        row_extent(ellipse, kWarpHeight * y + 0.5f - v, kWarpHeight * y + kWarpHeight - 0.5f - v, low, high);
+        for (int x = x0; x <= x1; ++x)
+            if (u + high >= kWarpWidth * x + 0.5f && u + low <= kWarpWidth * x + kWarpWidth - 0.5f)
+                warps |= 1u << (y * kWarpColumns + x);
+    }
+    return warps;
+}
+
+// What a pixel needs on the way back.
+struct Pixel {
+    float x, y;
+    float d_color[3], d_depth, d_weight;
+    float total, running;  // sum over gaussians of weight * (gradient by that weight): all, and so far
+    float transmittance;
+};
+
+// Reads the pixel at (column, row) of the picture; adds to `d_background`.
+__device__ Pixel read_pixel(const RasterizeBackwardInput& in, int column, int row, float d_background[3]) {
+    Pixel p{column + 0.5f, row + 0.5f, {0, 0, 0}, 0, 0, 0, 0, -1};
+    if (column >= in.image.width || row >= in.image.height) return p;
+    const size_t at = static_cast<size_t>(row) * in.image.width + column;
+    const float alpha = in.image.alpha[at], t = 1 - alpha;
+    p.transmittance = 1;
+    p.d_weight = in.d_picture.alpha[at];
+    for (int c = 0; c < 3; ++c) {
+        const float d = in.d_picture.color[3 * at + c];
+        p.d_color[c] = d;
+        p.d_weight -= d * in.image.background[c];
+        p.total += d * (in.image.color[3 * at + c] - t * in.image.background[c]);
+        d_background[c] = d * t;
+    }
+    if (in.d_picture.depth != nullptr && alpha > 0) {
+        const float depth = in.image.depth[at];
+        p.d_depth = in.d_picture.depth[at] / alpha;
+        p.d_weight -= p.d_depth * depth;
+        p.total += p.d_depth * depth * alpha;
+    }
+    p.total += p.d_weight * alpha;
+    return p;
+}
+
+// Sums over the warp's pixels for the gaussians it holds; `entry` is the place in the batch of the one this
+// lane works on. Lane = row of pixels * kHeld + gaussian.
+template <bool kWithDepth>
+__device__ void add_up(Shared& s, int warp, int held, int entry, float left, float top) {
+    const int lane = threadIdx.x % 32, gaussian = lane % kHeld, row = lane / kHeld;
+    __syncwarp();
+    const Record<float>& g = s.record[entry];
+    const float u = g.u, v = g.v, l11 = g.l11, l12 = g.l12, l22 = g.l22;
+    const Share* shares = &s.share[warp][gaussian][kWarpWidth * row];
+    const float4* d_colors = s.d_color[warp][row];
+    float sum = 0, sum_t1 = 0, sum_t1_dx = 0, color[3] = {0, 0, 0}, depth = 0;
+    Falloff<float> f;
+#pragma unroll
+    for (int i = 0; i < kWarpWidth; ++i) {
+        const Share share = shares[i];
+        const float4 d_color = d_colors[i];
+        f = falloff_at(left + i, top + row, u, v, l11, l12, l22, 0.0f);
+        const float d_t1 = share.d_exponent * f.t1;
+        sum += share.d_exponent;
+        sum_t1 += d_t1;
+        sum_t1_dx += d_t1 * f.dx;
+        color[0] += d_color.x * share.weight;
+        color[1] += d_color.y * share.weight;
+        color[2] += d_color.z * share.weight;
+        if (kWithDepth) depth += d_color.w * share.weight;
+    }
+    // The exponent is less by t1² + t2².
+    FalloffSums<float> sums;
+    sums.exponent = sum;
+    sums.t1 = -2 * sum_t1;
+    sums.t1_dx = -2 * sum_t1_dx;
+    sums.t1_dy = sums.t1 * f.dy;
+    sums.t2 = -2 * f.t2 * sum;
+    sums.t2_dy = sums.t2 * f.dy;
+    const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums);
+
+    // Over the rows: lanes trade halves twice, so that row r is left with the values from 3 r on.
+    float value[12] = {d.u,   d.v,      d.l11,    d.l12,    d.l22, d.log2_opacity,
+                       depth, color[0], color[1], color[2], 0,     0};
+#pragma unroll
+    for (int half = 6, rows = 2; rows > 0; half /= 2, rows /= 2) {
+        const bool upper = (row & rows) != 0;
+#pragma unroll
+        for (int i = 0; i < half; ++i) {
+            const float kept = upper ? value[i + half] : value[i], sent = upper ? value[i] : value[i + half];
+            value[i] = kept + __shfl_xor_sync(kAllLanes, sent, rows * kHeld);
+        }
+    }
+    if (gaussian < held) {
+        const uint32_t pair = s.first_pair[entry] + __popc(s.warps[entry] & ((1u << warp) - 1));
+#pragma unroll
+        for (int i = 0; i < 3; ++i)
+            if (3 * row + i < kValues) s.pair[pair][3 * row + i] = value[i];
+        if (row == 0) atomicOr(&s.took_part[entry], 1u << warp);
+    }
+    __syncwarp();
+}
+
+// Takes this warp's pixels through the batch.
+template <bool kWithDepth>
+__device__ void blend_batch_vjp(Shared& s, int warp, int num, Pixel& p, float left, float top) {
+    const int lane = threadIdx.x % 32;
+    int held = 0, entry = 0;
+    bool alive = true;
+    for (int first = 0; first < num && alive; first += 32) {
+        const bool meets = first + lane < num && (s.warps[first + lane] >> warp & 1) != 0;
+        for (unsigned todo = __ballot_sync(kAllLanes, meets); todo != 0; todo &= todo - 1) {
+            const int i = first + __ffs(todo) - 1;
+            const Record<float>& g = s.record[i];
+            const Falloff<float> f = falloff_at(p.x, p.y, g.u, g.v, g.l11, g.l12, g.l22, g.log2_opacity);
+            if (!__any_sync(kAllLanes, contributes(f) && p.transmittance > 0)) continue;
+            const float alpha = alpha_of(f), before = p.transmittance;
+            const float weight = blend_weight(alpha, p.transmittance);
+            float by_weight = p.d_weight;
+            for (int c = 0; c < 3; ++c) by_weight += p.d_color[c] * g.color[c];
+            if (kWithDepth) by_weight += p.d_depth * g.depth;
+            p.running += weight * by_weight;
+            s.share[warp][held][lane] = {exponent_vjp(alpha, before, weight, by_weight, p.total - p.running),
+                                         weight};
+            if (lane % kHeld == held) entry = i;
+            if (++held == kHeld) {
+                add_up<kWithDepth>(s, warp, held, entry, left, top);
+                held = 0;
+            }
+        }
+        alive = __any_sync(kAllLanes, p.transmittance > 0) != 0;
+    }
+    if (held > 0) add_up<kWithDepth>(s, warp, held, entry, left, top);
+    if (!alive && lane == 0) atomicAnd(&s.alive, ~(1u << warp));
+}
+
+template <bool kWithDepth>
+__global__ void __launch_bounds__(kThreads, 2)
+    rasterize_backward_kernel(RasterizeBackwardInput in, GradientSlots slots, float* d_background_of_tile) {
+    Shared& s = *reinterpret_cast<Shared*>(shared_memory());
+    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    const int tile_column = blockIdx.x % in.image.tile_columns, tile_row = blockIdx.x / in.image.tile_columns;
+    const int left = tile_column * kFrameTileWidth, top = tile_row * kFrameTileHeight;
+    const int warp_left = left + warp % kWarpColumns * kWarpWidth,
+              warp_top = top + warp / kWarpColumns * kWarpHeight;
+
+    float d_background[3] = {0, 0, 0};
+    Pixel p = read_pixel(in, warp_left + lane % kWarpWidth, warp_top + lane / kWarpWidth, d_background);
+    s.d_color[warp][lane / kWarpWidth][lane % kWarpWidth] =
+        make_float4(p.d_color[0], p.d_color[1], p.d_color[2], p.d_depth);
+    for (int c = 0; c < 3; ++c) {
+        const float sum = warp_sum(d_background[c]);
+        if (lane == 0) s.d_background[warp][c] = sum;
+    }
+    if (threadIdx.x == 0) s.alive = (1u << kWarps) - 1;
+    __syncthreads();
+    if (threadIdx.x < 3) {
+        float sum = 0;
+        for (int w = 0; w < kWarps; ++w) sum += s.d_background[w][threadIdx.x];
+        d_background_of_tile[3 * blockIdx.x + threadIdx.x] = sum;
+    }
+
+    const uint32_t* order = in.order + in.tile_first[blockIdx.x];
+    const int count = in.blended[blockIdx.x];
+    for (int first = 0; first < count && s.alive != 0;) {
+        uint32_t end_pair = 0;
+        if (threadIdx.x < kBatch) {
+            uint32_t warps = 0;
+            if (first + static_cast<int>(threadIdx.x) < count) {
+                const uint32_t r = order[first + threadIdx.x];
+                const Record<float> g = in.records[r];
+                s.record[threadIdx.x] = g;
+                s.slot[threadIdx.x] = slots.first[r] + slot_of_tile(g, tile_column, tile_row);
+                warps = warps_of(g, left, top) & s.alive;
+            }
+            s.warps[threadIdx.x] = warps;
+            s.took_part[threadIdx.x] = 0;
+            end_pair = __popc(warps);
+            for (int offset = 1; offset < 32; offset *= 2) {
+                const uint32_t other = __shfl_up_sync(kAllLanes, end_pair, offset);
+                if (lane >= offset) end_pair += other;
+            }
+            if (lane == 31) s.pairs_of_warp[warp] = end_pair;
+        }
+        __syncthreads();
+        if (threadIdx.x < kBatch) {
+            for (int w = 0; w < warp; ++w) end_pair += s.pairs_of_warp[w];
+            s.first_pair[threadIdx.x] = end_pair - __popc(s.warps[threadIdx.x]);
+        }
+        // The entries of the batch whose pairs there is room for.
+        const int num = __syncthreads_count(static_cast<int>(threadIdx.x) < min(kBatch, count - first) &&
+                                            end_pair <= kPairs);
+        blend_batch_vjp<kWithDepth>(s, warp, num, p, warp_left + 0.5f, warp_top + 0.5f);
+        __syncthreads();
+        for (int i = threadIdx.x; i < num * kValues; i += kThreads) {
+            const int entry = i / kValues, value = i % kValues;
+            const uint32_t took_part = s.took_part[entry];
+            if (took_part == 0) continue;
+            uint32_t pair = s.first_pair[entry];
+            float sum = 0;
+            for (uint32_t warps = s.warps[entry]; warps != 0; warps &= warps - 1, ++pair)
+                if ((took_part & warps & (~warps + 1)) != 0) sum += s.pair[pair][value];
+            const uint32_t slot = s.slot[entry];
+            reinterpret_cast<float*>(slots.slot + slot)[value] = sum;
+            if (value == 0) slots.is_touched[slot] = 1;
+        }
+        __syncthreads();
+        first += num;
+    }
+}
+
+}  // namespace
+
+void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
+                        float* d_background_of_tile, cudaStream_t stream) {
+    const unsigned num_tiles = in.image.tile_columns * in.image.tile_rows;
+    launch(
+        "rasterize_backward",
+        in.d_picture.depth != nullptr ? &rasterize_backward_kernel<true> : &rasterize_backward_kernel<false>,
+        num_tiles, kThreads, sizeof(Shared), stream, in, slots, d_background_of_tile);
+}
+
+}  // namespace cuda
+}  // namespace v3dg
