@@ -3,9 +3,8 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <numeric>
 
-#include "adam/adam_math.h"
+#include "fit_group/fit_group_math.h"
 #include "rasterize/tile.h"
 
 // One thread fits one group, start to end. The group's frame has its ball at the origin with radius 1, so
@@ -17,36 +16,6 @@ namespace V3DG_ISA {
 constexpr int kPlanes = 4;  // red, green, blue, alpha
 
 static int tiles_across(const FitView& view) { return (view.size + kTileSize - 1) / kTileSize; }
-
-// Group frame to view.
-static ModelView<float> view_of_group(const FitConfig& config, const FitView& view) {
-    ModelView<float> mv{};
-    for (int i = 0; i < 9; ++i) mv.linear[i] = view.rotation[i];
-    mv.translation[2] = config.distance;
-    for (int i = 0; i < 3; ++i) mv.eye[i] = -view.rotation[6 + i] * config.distance;
-    return mv;
-}
-
-// World to view, the ball scaled to radius 1.
-static ModelView<float> view_of_world(const FitConfig& config, const FitGroup& group, const FitView& view) {
-    ModelView<float> mv = view_of_group(config, view);
-    const double shrink = 1 / static_cast<double>(group.radius);
-    for (int i = 0; i < 3; ++i) {
-        double offset = 0;
-        for (int k = 0; k < 3; ++k) {
-            offset += static_cast<double>(view.rotation[3 * i + k]) * group.center[k];
-            mv.linear[3 * i + k] = static_cast<float>(view.rotation[3 * i + k] * shrink);
-        }
-        mv.translation[i] = static_cast<float>(mv.translation[i] - offset * shrink);
-        mv.eye[i] = static_cast<float>(group.center[i] + static_cast<double>(group.radius) * mv.eye[i]);
-    }
-    return mv;
-}
-
-static Pinhole<float> camera_of(const FitView& view, float scale) {
-    const float size = scale * static_cast<float>(view.size);
-    return {scale * view.focal, scale * view.focal, scale * view.cx, scale * view.cy, size, size, 1e-3f};
-}
 
 // Projects a draw and sorts what is seen by depth; returns how many.
 static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& camera, FitScratch& scratch) {
@@ -130,13 +99,8 @@ class Student {
             for (int k = 0; k < 3; ++k)
                 *p++ = (rows.means[3 * (group.first + i) + k] - group.center[k]) * inverse;
         p = std::copy_n(rows.quats + 4 * group.first, 4 * n_, p);
-        for (size_t i = 0; i < 3 * n_; ++i)
-            *p++ = std::log(std::max(rows.scales[3 * group.first + i] * inverse, kLeastScale));
-        for (size_t i = 0; i < n_; ++i) {
-            const float o =
-                std::min(std::max(rows.opacities[group.first + i], kLeastOpacity), 1 - kLeastOpacity);
-            *p++ = std::log(o / (1 - o));
-        }
+        for (size_t i = 0; i < 3 * n_; ++i) *p++ = log_of_scale(rows.scales[3 * group.first + i] * inverse);
+        for (size_t i = 0; i < n_; ++i) *p++ = logit_of_opacity(rows.opacities[group.first + i]);
         std::copy_n(rows.sh + num_sh_ * group.first, num_sh_ * n_, p);
         plane_size_ = n_ + kPlanePadding;
         planes_.assign((11 + num_sh_) * plane_size_, 0);
@@ -182,23 +146,18 @@ class Student {
     }
 
     void step(int index) {
-        const double progress = config_.steps > 1 ? static_cast<double>(index) / (config_.steps - 1) : 0;
-        const float decay = static_cast<float>(std::pow(config_.final_step, progress));
-        correction1_ = static_cast<float>(1 / (1 - std::pow(kAdamBeta1, index + 1)));
-        correction2_ = static_cast<float>(1 / (1 - std::pow(kAdamBeta2, index + 1)));
-        const float position =
-            config_.position_in_world ? config_.step_position / group_.radius : config_.step_position;
+        const FitStep step = fit_step(config_, index);
         size_t at = 0;
-        at = adam(at, 3 * n_, decay * position);
-        at = adam(at, 4 * n_, decay * config_.step_quat);
-        at = adam(at, 3 * n_, decay * config_.step_log_scale);
-        at = adam(at, n_, decay * config_.step_logit);
+        at = adam(at, 3 * n_, position_step(config_, group_, step), step);
+        at = adam(at, 4 * n_, step.quat, step);
+        at = adam(at, 3 * n_, step.log_scale, step);
+        at = adam(at, n_, step.logit, step);
         if (num_sh_ == 3) {
-            adam(at, 3 * n_, decay * config_.step_sh0);
+            adam(at, 3 * n_, step.sh0, step);
         } else {
             for (size_t i = 0; i < n_; ++i) {
-                at = adam(at, 3, decay * config_.step_sh0);
-                at = adam(at, num_sh_ - 3, decay * config_.step_sh_rest);
+                at = adam(at, 3, step.sh0, step);
+                at = adam(at, num_sh_ - 3, step.sh_rest, step);
             }
         }
         activate();
@@ -226,23 +185,20 @@ class Student {
     }
 
   private:
-    static constexpr float kLeastScale = 1e-5f;    // of the radius: far below what a pixel shows
-    static constexpr float kLeastOpacity = 1e-4f;  // keeps the logit finite and movable
-
-    size_t adam(size_t begin, size_t count, float step_size) {
+    size_t adam(size_t begin, size_t count, float step_size, const FitStep& step) {
         size_t i = begin;
         const size_t end = begin + count;
         for (; i + kLanes<float> <= end; i += kLanes<float>) {
             Vec<float> m = load(&m_[i]), v = load(&v_[i]);
-            const Vec<float> next =
-                adam_step(load(&value_[i]), load(&gradient_[i]), m, v, step_size, correction1_, correction2_);
+            const Vec<float> next = adam_step(load(&value_[i]), load(&gradient_[i]), m, v, step_size,
+                                              step.correction1, step.correction2);
             store(&m_[i], m);
             store(&v_[i], v);
             store(&value_[i], next);
         }
         for (; i < end; ++i)
-            value_[i] =
-                adam_step(value_[i], gradient_[i], m_[i], v_[i], step_size, correction1_, correction2_);
+            value_[i] = adam_step(value_[i], gradient_[i], m_[i], v_[i], step_size, step.correction1,
+                                  step.correction2);
         return end;
     }
 
@@ -258,21 +214,15 @@ class Student {
         const auto map = [&](float* at, auto f) {
             for (size_t i = 0; i < n_; i += kLanes<float>) store(at + i, f(load(at + i)));
         };
-        constexpr float kLog2e = 1.4426950408889634f;
         spread(3);
         spread(4);
         float* scales = plane;
         spread(3);
-        // No scale outgrows the ball, none vanishes: a value that ran away could not come back.
-        const auto low = all_lanes<Vec<float>>(-20.0f), high = all_lanes<Vec<float>>(1.0f);
         for (int k = 0; k < 3; ++k)
-            map(scales + k * plane_size_,
-                [&](Vec<float> x) { return exp2_in_range(min_of(high, max_of(low, x * kLog2e))); });
+            map(scales + k * plane_size_, [](Vec<float> x) { return scale_of_log(x); });
         float* opacities = plane;
         spread(1);
-        const auto least = all_lanes<Vec<float>>(-60.0f), most = all_lanes<Vec<float>>(60.0f);
-        map(opacities,
-            [&](Vec<float> x) { return 1 / (1 + exp2_in_range(min_of(most, max_of(least, x * -kLog2e)))); });
+        map(opacities, [](Vec<float> x) { return opacity_of_logit(x); });
         spread(num_sh_);
     }
 
@@ -281,7 +231,6 @@ class Student {
     size_t n_, num_sh_, plane_size_ = 0;
     std::vector<float> value_, gradient_, by_value_, m_, v_, planes_;
     GaussianPlanes<float> model_{};
-    float correction1_ = 1, correction2_ = 1;
 };
 
 // Draws the student, compares it with its target and, on the way back, adds to its gradient.
@@ -355,9 +304,6 @@ class Comparison {
         const float* planes = target.data() + static_cast<size_t>(t) * kPlanes * kTilePixels;
         const TilePlanes<float>& tile = tiles_[t];
         V color_sum = V{}, alpha_sum = V{};
-        const auto sign = [](V x, float size) {
-            return x > V{} ? all_lanes<V>(size) : (x < V{} ? all_lanes<V>(-size) : V{});
-        };
         const auto magnitude = [](V x) { return x < V{} ? -x : x; };
         for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
             const bool inside = left + block % kTileBlocks * kBlockSize < view.size &&
@@ -372,12 +318,12 @@ class Comparison {
                 for (int c = 0; c < 3; ++c) {
                     const V difference = load(tile.color[c] + p) - load(planes + c * kTilePixels + p);
                     color_sum += magnitude(difference);
-                    if (grad != nullptr) store(grad->d_color[c] + p, sign(difference, d_color));
+                    if (grad != nullptr) store(grad->d_color[c] + p, l1_vjp(difference, d_color));
                 }
                 const V transmittance = magnitude(load(tile.transmittance + p));
                 const V difference = 1 - transmittance - load(planes + 3 * kTilePixels + p);
                 alpha_sum += magnitude(difference);
-                if (grad != nullptr) store(grad->d_weight + p, sign(difference, d_alpha));
+                if (grad != nullptr) store(grad->d_weight + p, l1_vjp(difference, d_alpha));
             }
         }
         error[0] += sum_of(color_sum) / (3 * num_pixels);
@@ -418,9 +364,6 @@ class Comparison {
     SsimScratch ssim_;
 };
 
-// Views on which start and result are compared, and the residual is measured.
-constexpr int kResidualViews = 16;
-
 void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& target,
                const FitImage* targets, const FitRows& rows, float error[2],
                const std::atomic<bool>& cancel) {
@@ -428,18 +371,12 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
     Comparison comparison(config);
     FitScratch target_scratch;
     FitImage fresh;
-    // A stride prime to the number of fixed views visits all of them, neighbours far apart.
-    uint64_t stride = 29;
-    while (config.num_views > 1 && std::gcd(stride, static_cast<uint64_t>(config.num_views)) > 1) ++stride;
-    const auto fixed_view = [&](uint64_t visit) {
-        return visit * stride % static_cast<uint64_t>(config.num_views);
-    };
+    const uint64_t stride = visiting_stride(config);
     const auto measure = [&](const Student& s, double sum[2]) {
         sum[0] = sum[1] = 0;
-        const int count = config.num_views > 0 ? std::min(config.num_views, kResidualViews) : kResidualViews;
+        const int count = num_residual_views(config);
         for (int i = 0; i < count; ++i) {
-            // Fresh views take numbers that no step takes.
-            const uint64_t index = config.num_views > 0 ? fixed_view(i) : ~uint64_t(0) - i;
+            const uint64_t index = residual_view(config, stride, i);
             const FitView view = fit_view(config, group, index);
             if (config.num_views == 0) fit_target(config, group, target, view, target_scratch, fresh);
             comparison.residual(s, view, config.num_views > 0 ? targets[index] : fresh, sum);
@@ -453,20 +390,17 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
     for (int s = 0; s < config.steps && !cancel.load(std::memory_order_relaxed); ++s) {
         student.clear_gradient();
         for (int b = 0; b < config.views_per_step; ++b, ++next_view) {
-            if (config.num_views > 0) {
-                const uint64_t index = fixed_view(next_view);
-                comparison.add_gradient(student, fit_view(config, group, index), targets[index]);
-            } else {
-                const FitView view = fit_view(config, group, next_view);
-                fit_target(config, group, target, view, target_scratch, fresh);
-                comparison.add_gradient(student, view, fresh);
-            }
+            const uint64_t index = visited_view(config, stride, next_view);
+            const FitView view = fit_view(config, group, index);
+            if (config.num_views == 0) fit_target(config, group, target, view, target_scratch, fresh);
+            comparison.add_gradient(student, view, config.num_views > 0 ? targets[index] : fresh);
         }
         student.step(s);
     }
     measure(student, end);
-    const auto loss_of = [&](const double e[2]) { return config.loss.l1 * e[0] + config.loss.alpha * e[1]; };
-    const bool better = config.steps > 0 && loss_of(end) <= loss_of(start) && student.write(rows);
+    const bool better = config.steps > 0 &&
+                        residual_loss(config.loss, end) <= residual_loss(config.loss, start) &&
+                        student.write(rows);
     for (int k = 0; k < 2; ++k) error[k] = static_cast<float>(better ? end[k] : start[k]);
 }
 

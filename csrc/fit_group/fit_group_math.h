@@ -1,0 +1,199 @@
+#pragma once
+
+// What both halves need to fit a group: its views, the parameters that Adam moves, the sizes of its steps.
+
+#include <numeric>
+
+#include "adam/adam_math.h"
+#include "base/random.h"
+#include "fit_group/fit_group.h"
+#include "loss/loss_math.h"
+#include "math/solid_angle.h"
+#include "project/project_math.h"
+
+namespace v3dg {
+
+// ---- views
+
+// The paper's code looks at a 64 px image with a focal length of 88.9 px.
+constexpr double kFocalPerSize = 88.9 / 64;
+// Room around the ball for what its gaussians draw beyond it.
+constexpr double kMarginPx = 2.5;
+// Views on which start and result are compared, and the residual is measured.
+constexpr int kResidualViews = 16;
+
+V3DG_HD V3DG_INLINE void multiply(const double a[9], const double b[9], double out[9]) {
+    for (int i = 0; i < 3; ++i)
+        for (int k = 0; k < 3; ++k)
+            out[3 * i + k] = a[3 * i] * b[k] + a[3 * i + 1] * b[3 + k] + a[3 * i + 2] * b[6 + k];
+}
+
+// Uniform rotation from three uniform numbers (Shoemake 1992).
+V3DG_HD V3DG_INLINE void random_rotation(double u0, double u1, double u2, double r[9]) {
+    const double a = sqrt_of(1 - u0), b = sqrt_of(u0), s = 2 * kPi * u1, t = 2 * kPi * u2;
+    const double x = a * ::sin(s), y = a * ::cos(s), z = b * ::sin(t), w = b * ::cos(t);
+    r[0] = 1 - 2 * (y * y + z * z);
+    r[1] = 2 * (x * y - w * z);
+    r[2] = 2 * (x * z + w * y);
+    r[3] = 2 * (x * y + w * z);
+    r[4] = 1 - 2 * (x * x + z * z);
+    r[5] = 2 * (y * z - w * x);
+    r[6] = 2 * (x * z - w * y);
+    r[7] = 2 * (y * z + w * x);
+    r[8] = 1 - 2 * (x * x + y * y);
+}
+
+// View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random; fresh ones anywhere.
+V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGroup& group, uint64_t index) {
+    const auto uniform = [&](uint64_t counter) { return random_uniform(config.seed, group.stream, counter); };
+    double rotation[9];
+    if (config.num_views > 0) {
+        // A Fibonacci lattice of directions, each with a random roll, all turned together.
+        double lattice[9], turn[9];
+        const double z = 1 - (2.0 * static_cast<double>(index) + 1) / config.num_views,
+                     r = sqrt_of(max_of(0.0, 1 - z * z));
+        const double angle = static_cast<double>(index) * kPi * (3 - sqrt_of(5.0)),
+                     roll = 2 * kPi * uniform(16 + 3 * index);
+        const double forward[3] = {r * ::cos(angle), r * ::sin(angle), z};
+        const double side[3] = {-::sin(angle), ::cos(angle), 0};
+        const double up[3] = {forward[1] * side[2] - forward[2] * side[1],
+                              forward[2] * side[0] - forward[0] * side[2],
+                              forward[0] * side[1] - forward[1] * side[0]};
+        for (int k = 0; k < 3; ++k) {
+            lattice[k] = ::cos(roll) * side[k] + ::sin(roll) * up[k];
+            lattice[3 + k] = ::cos(roll) * up[k] - ::sin(roll) * side[k];
+            lattice[6 + k] = forward[k];
+        }
+        random_rotation(uniform(0), uniform(1), uniform(2), turn);
+        multiply(lattice, turn, rotation);
+    } else {
+        // Far from the numbers that shift the picture.
+        const uint64_t base = (uint64_t(1) << 63) + 4 * index;
+        random_rotation(uniform(base), uniform(base + 1), uniform(base + 2), rotation);
+    }
+
+    FitView view;
+    for (int i = 0; i < 9; ++i) view.rotation[i] = static_cast<float>(rotation[i]);
+    double focal, shift_x = 0, shift_y = 0;
+    if (config.image_size > 0) {
+        view.size = config.image_size;
+        focal = kFocalPerSize * config.image_size;
+    } else {
+        // The focal length at which the ball's footprint (select_math.h) has the wanted number of px².
+        const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
+        focal = sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian / solid_angle_of_ball(x2));
+        const double radius_px = focal * sqrt_of(x2 / (1 - x2));
+        view.size = 4 * static_cast<int>(::ceil((radius_px + kMarginPx) / 2));  // whole blocks of 4 px
+        shift_x = uniform(16 + 3 * index + 1) - 0.5;
+        shift_y = uniform(16 + 3 * index + 2) - 0.5;
+    }
+    view.focal = static_cast<float>(focal);
+    view.cx = static_cast<float>(view.size / 2.0 + shift_x);
+    view.cy = static_cast<float>(view.size / 2.0 + shift_y);
+    return view;
+}
+
+// A group looks at fixed views again and again, and at a fresh one each time. Which one at which visit:
+// `stride` is prime to the number of fixed views, so that all are visited, neighbours far apart.
+inline uint64_t visiting_stride(const FitConfig& config) {
+    const auto num_views = static_cast<uint64_t>(config.num_views);
+    uint64_t stride = 29;
+    while (num_views > 1 && std::gcd(stride, num_views) > 1) ++stride;
+    return stride;
+}
+V3DG_HD inline uint64_t visited_view(const FitConfig& config, uint64_t stride, uint64_t visit) {
+    return config.num_views > 0 ? visit * stride % static_cast<uint64_t>(config.num_views) : visit;
+}
+
+// Of those on which the residual is measured. Fresh ones take numbers that no step takes.
+V3DG_HD inline int num_residual_views(const FitConfig& config) {
+    return config.num_views > 0 && config.num_views < kResidualViews ? config.num_views : kResidualViews;
+}
+V3DG_HD inline uint64_t residual_view(const FitConfig& config, uint64_t stride, int i) {
+    return config.num_views > 0 ? visited_view(config, stride, i) : ~uint64_t(0) - i;
+}
+
+// Group frame to view.
+V3DG_HD V3DG_INLINE ModelView<float> view_of_group(const FitConfig& config, const FitView& view) {
+    ModelView<float> mv{};
+    for (int i = 0; i < 9; ++i) mv.linear[i] = view.rotation[i];
+    mv.translation[2] = config.distance;
+    for (int i = 0; i < 3; ++i) mv.eye[i] = -view.rotation[6 + i] * config.distance;
+    return mv;
+}
+
+// World to view, the ball scaled to radius 1.
+V3DG_HD V3DG_INLINE ModelView<float> view_of_world(const FitConfig& config, const FitGroup& group,
+                                                   const FitView& view) {
+    ModelView<float> mv = view_of_group(config, view);
+    const double shrink = 1 / static_cast<double>(group.radius);
+    for (int i = 0; i < 3; ++i) {
+        double offset = 0;
+        for (int k = 0; k < 3; ++k) {
+            offset += static_cast<double>(view.rotation[3 * i + k]) * group.center[k];
+            mv.linear[3 * i + k] = static_cast<float>(view.rotation[3 * i + k] * shrink);
+        }
+        mv.translation[i] = static_cast<float>(mv.translation[i] - offset * shrink);
+        mv.eye[i] = static_cast<float>(group.center[i] + static_cast<double>(group.radius) * mv.eye[i]);
+    }
+    return mv;
+}
+
+V3DG_HD V3DG_INLINE Pinhole<float> camera_of(const FitView& view, float scale) {
+    const float size = scale * static_cast<float>(view.size);
+    return {scale * view.focal, scale * view.focal, scale * view.cx, scale * view.cy, size, size, 1e-3f};
+}
+
+// ---- parameters
+
+constexpr float kLeastScale = 1e-5f;    // of the radius: far below what a pixel shows
+constexpr float kLeastOpacity = 1e-4f;  // keeps the logit finite and movable
+constexpr float kLog2e = 1.4426950408889634f;
+
+V3DG_HD V3DG_INLINE float log_of_scale(float scale) { return ::logf(max_of(scale, kLeastScale)); }
+V3DG_HD V3DG_INLINE float logit_of_opacity(float opacity) {
+    const float o = min_of(max_of(opacity, kLeastOpacity), 1 - kLeastOpacity);
+    return ::logf(o / (1 - o));
+}
+
+// No scale outgrows the ball, none vanishes: a value that ran away could not come back.
+template <class V>
+V3DG_HD V3DG_INLINE V scale_of_log(V x) {
+    return exp2_in_range(min_of(all_lanes<V>(1.0f), max_of(all_lanes<V>(-20.0f), x * kLog2e)));
+}
+template <class V>
+V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
+    return 1 / (1 + exp2_in_range(min_of(all_lanes<V>(60.0f), max_of(all_lanes<V>(-60.0f), x * -kLog2e))));
+}
+
+// ---- steps
+
+// What one step of Adam takes.
+struct FitStep {
+    float position, quat, log_scale, logit, sh0, sh_rest;  // position in the units of the config
+    float correction1, correction2;
+};
+
+inline FitStep fit_step(const FitConfig& config, int index) {
+    const double progress = config.steps > 1 ? static_cast<double>(index) / (config.steps - 1) : 0;
+    const float decay = static_cast<float>(std::pow(config.final_step, progress));
+    return {decay * config.step_position,
+            decay * config.step_quat,
+            decay * config.step_log_scale,
+            decay * config.step_logit,
+            decay * config.step_sh0,
+            decay * config.step_sh_rest,
+            static_cast<float>(1 / (1 - std::pow(kAdamBeta1, index + 1))),
+            static_cast<float>(1 / (1 - std::pow(kAdamBeta2, index + 1)))};
+}
+
+V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& group, const FitStep& step) {
+    return config.position_in_world ? step.position / group.radius : step.position;
+}
+
+// What start and result are compared by, from the mean |difference| of colour and alpha.
+V3DG_HD inline double residual_loss(const LossWeights& loss, const double error[2]) {
+    return loss.l1 * error[0] + loss.alpha * error[1];
+}
+
+}  // namespace v3dg

@@ -1,0 +1,48 @@
+#pragma once
+
+// What both halves need of the loss: a pixel at a time.
+
+#include "math/lanes.h"
+
+namespace v3dg {
+
+constexpr int kSsimRadius = 5;
+
+// Weight of the pixel `offset` away in the normalised Gaussian window of 11, sigma 1.5.
+V3DG_HD V3DG_INLINE float ssim_weight(int offset) {
+    const float weight[kSsimRadius + 1] = {0.26601171f,  0.21300554f,  0.10936069f,
+                                           0.036000773f, 0.007598758f, 0.0010283801f};
+    return weight[offset < 0 ? -offset : offset];
+}
+
+// The window's sums around a pixel over a picture x and its target y.
+struct SsimSums {
+    float x, y, xx, yy, xy;
+};
+
+// Structural similarity (Wang et al. 2004, constants 0.01² and 0.03²), and its derivatives by the sums of x,
+// x² and xy.
+struct Ssim {
+    float value, d_x, d_xx, d_xy;
+};
+
+V3DG_HD inline Ssim ssim_of(const SsimSums& s) {
+    constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
+    const float a1 = 2 * s.x * s.y + kC1, a2 = 2 * (s.xy - s.x * s.y) + kC2;
+    const float b1 = s.x * s.x + s.y * s.y + kC1;
+    const float b2 = s.xx - s.x * s.x + s.yy - s.y * s.y + kC2;
+    Ssim out;
+    out.value = a1 * a2 / (b1 * b2);
+    out.d_x = 2 * s.y * (a2 - a1) / (b1 * b2) - 2 * s.x * out.value * (1 / b1 - 1 / b2);
+    out.d_xx = -out.value / b2;
+    out.d_xy = 2 * a1 / (b1 * b2);
+    return out;
+}
+
+// Gradient of weight * |difference|.
+template <class V>
+V3DG_HD V3DG_INLINE V l1_vjp(V difference, Lane<V> weight) {
+    return difference > V{} ? all_lanes<V>(weight) : (difference < V{} ? all_lanes<V>(-weight) : V{});
+}
+
+}  // namespace v3dg
