@@ -4,6 +4,7 @@
 // the screen, thousands for the targets of local splatting.
 
 #include <cstdint>
+#include <cstring>
 
 #include "project/project.h"
 
@@ -49,11 +50,42 @@ struct FrameCounters {
     unsigned long long items, gaussians, in_frustum, records, entries;
 };
 
-// A gaussian in the list of a tile. Lists are blended by ascending depth, ties by record.
+// A gaussian in the list of a tile, in a word whose order is the order of blending: 26 bits of depth, the 28
+// bits of the record, which break ties, and 10 of where in the tile it is.
 struct TileEntry {
-    uint32_t depth_bits;  // of a positive float, so they order as it does
-    uint32_t record;
+    unsigned long long key;
 };
+constexpr int kEntryRecordBits = 28, kEntryBoxBits = 10;
+constexpr unsigned long long kMostFrameRecords = 1ull << kEntryRecordBits;
+constexpr int kEntryBlockSize = 4;  // px; the box counts in blocks
+
+// The record's depth is at least the camera's near depth; its box meets the tile, which is one of the
+// image's. A step of the key is 5e-7 of the depth; the last one is 32 octaves behind near.
+V3DG_HD inline TileEntry tile_entry(const Record<float>& r, uint32_t record, const FrameImage& image,
+                                    uint32_t tile) {
+    const uint32_t in_image = tile - image.first_tile, columns = static_cast<uint32_t>(image.tile_columns);
+    const int left = static_cast<int>(in_image % columns) * kFrameTileWidth;
+    const int top = static_cast<int>(in_image / columns) * kFrameTileHeight;
+    const uint32_t x0 = static_cast<uint32_t>(max_of(r.x0 - left, 0)) / kEntryBlockSize;
+    const uint32_t x1 = static_cast<uint32_t>(min_of(r.x1 - left, kFrameTileWidth - 1)) / kEntryBlockSize;
+    const uint32_t y0 = static_cast<uint32_t>(max_of(r.y0 - top, 0)) / kEntryBlockSize;
+    const uint32_t y1 = static_cast<uint32_t>(min_of(r.y1 - top, kFrameTileHeight - 1)) / kEntryBlockSize;
+    uint32_t depth_bits, near_bits;  // of positive floats, so they order as they do
+    std::memcpy(&depth_bits, &r.depth, sizeof depth_bits);
+    std::memcpy(&near_bits, &image.camera.near_depth, sizeof near_bits);
+    const unsigned long long depth_key = min_of((depth_bits - near_bits) >> 2, (1u << 26) - 1);
+    return {(depth_key << kEntryRecordBits | record) << kEntryBoxBits | (x0 | x1 << 3 | y0 << 6 | y1 << 8)};
+}
+V3DG_HD inline uint32_t record_of(TileEntry e) {
+    return static_cast<uint32_t>(e.key >> kEntryBoxBits) & static_cast<uint32_t>(kMostFrameRecords - 1);
+}
+// A bit for each 4 x 4 pixels of the tile, row by row, that the record's box meets.
+V3DG_HD inline uint32_t blocks_of(TileEntry e) {
+    const uint32_t box = static_cast<uint32_t>(e.key);
+    const uint32_t columns = (2u << (box >> 3 & 7)) - (1u << (box & 7));
+    const uint32_t below = box >> 6 & 3, last = box >> 8 & 3;
+    return columns * (0x01010101u >> (8 * (3 - last)) & 0x01010101u << (8 * below));
+}
 
 // Input of the blend stage.
 struct FrameLists {
@@ -64,7 +96,7 @@ struct FrameLists {
     const unsigned long long* tile_first;  // [num_tiles + 1] into entries
     TileEntry *entries, *scratch;          // each tile's in any order
     const FrameCounters* counters;
-    unsigned long long record_capacity, entry_capacity;
+    unsigned long long record_capacity, entry_capacity;  // records: at most kMostFrameRecords
 };
 
 }  // namespace cuda

@@ -15,7 +15,7 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-using Key = unsigned long long;  // depth bits, then record
+using Key = unsigned long long;  // of a TileEntry
 
 constexpr int kPixels = kFrameTileWidth * kFrameTileHeight;
 constexpr int kThreads = kPixels;
@@ -70,8 +70,6 @@ struct Shared {
     uint32_t warp_sum[kWarps];
     Level level[kMostLevels];
 };
-
-__device__ Key key_of(TileEntry e) { return static_cast<Key>(e.depth_bits) << 32 | e.record; }
 
 // Adds a thread's extremes and count to the block's, which start_extremes emptied a barrier ago.
 __device__ void start_extremes(Shared& s) {
@@ -129,7 +127,7 @@ __device__ Buckets spread(const TileEntry* from, TileEntry* to, uint32_t first, 
     __syncthreads();
     Key lowest = ~Key(0), highest = 0;
     for (uint32_t i = first + threadIdx.x; i < last; i += kThreads) {
-        const Key key = key_of(from[i]);
+        const Key key = from[i].key;
         lowest = key < lowest ? key : lowest;
         highest = key > highest ? key : highest;
     }
@@ -137,12 +135,12 @@ __device__ Buckets spread(const TileEntry* from, TileEntry* to, uint32_t first, 
     __syncthreads();
     const Buckets buckets = buckets_over(s.lowest, s.highest, kLog2Buckets);
     for (uint32_t i = first + threadIdx.x; i < last; i += kThreads)
-        atomicAdd(&s.bucket[buckets.of(key_of(from[i]))], 1u);
+        atomicAdd(&s.bucket[buckets.of(from[i].key)], 1u);
     __syncthreads();
     scan_buckets(s);
     for (uint32_t i = first + threadIdx.x; i < last; i += kThreads) {
         const TileEntry entry = from[i];
-        to[first + atomicAdd(&s.bucket[buckets.of(key_of(entry))], 1u)] = entry;
+        to[first + atomicAdd(&s.bucket[buckets.of(entry.key)], 1u)] = entry;
     }
     __syncthreads();
     return buckets;
@@ -181,7 +179,7 @@ __device__ void sort_piece(const Key (&key)[kPieceLoads], const bool (&held)[kPi
         const uint32_t first = s.bucket[bucket[k]], last = s.bucket[bucket[k] + 1];
         uint32_t rank = first;
         for (uint32_t i = first; i < last; ++i) rank += s.key[i] < key[k];
-        s.order[rank] = static_cast<uint32_t>(key[k]);
+        s.order[rank] = record_of(TileEntry{key[k]});
     }
     __syncthreads();
 }
@@ -272,7 +270,7 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
         // The next piece: what is left of the level, or as many whole buckets as fit.
         uint32_t beyond = 0;  // bucket that the piece ends before
         uint32_t last = level.end;
-        if (!whole && depth > 0) beyond = level.buckets.of(key_of(from[done + kPiece]));
+        if (!whole && depth > 0) beyond = level.buckets.of(from[done + kPiece].key);
         Key key[kPieceLoads];
         bool held[kPieceLoads];
         Key lowest = ~Key(0), highest = 0;
@@ -283,7 +281,7 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
             for (int k = 0; k < kPieceLoads; ++k) {
                 const uint32_t i = done + k * kThreads + threadIdx.x;
                 held[k] = i < level.end;
-                key[k] = held[k] ? key_of(from[i]) : 0;
+                key[k] = held[k] ? from[i].key : 0;
                 if (!whole) held[k] = level.buckets.of(key[k]) < beyond;
                 if (!held[k]) continue;
                 lowest = key[k] < lowest ? key[k] : lowest;
@@ -304,7 +302,7 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
                 __syncthreads();
                 uint32_t in_bucket = 0;
                 for (uint32_t i = done + threadIdx.x; i < level.end; i += kThreads)
-                    in_bucket += level.buckets.of(key_of(from[i])) == beyond;
+                    in_bucket += level.buckets.of(from[i].key) == beyond;
                 add_extremes(s, 0, 0, in_bucket);
                 __syncthreads();
                 end = done + s.count;
