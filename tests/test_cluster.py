@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from devices import host, on
 from reference import cluster as reference
-from v3dg import _core
+from v3dg import _core, _operations
 
 # Few distinct values, so that axes, coordinates and whole points tie.
 coarse_means = hnp.arrays(
@@ -22,18 +23,28 @@ finite = st.floats(-(2.0**100), 2.0**100, width=32)
 any_means = hnp.arrays(np.float32, st.tuples(st.integers(0, 40), st.just(3)), elements=finite)
 
 
+def median_split(device, means, cluster_size):
+    order, leaf_offset = _operations.median_split(on(device, means), cluster_size)
+    return host(order), leaf_offset
+
+
+def split_segments(device, means, offset, depth):
+    order, leaf_offset = _operations.split_segments(on(device, means), offset, depth)
+    return host(order), leaf_offset
+
+
 @given(means=st.one_of(coarse_means, any_means), cluster_size=st.integers(1, 9))
-def test_split_agrees_with_reference(means, cluster_size):
-    order, leaf_offset = _core.median_split(means, cluster_size)
+def test_split_agrees_with_reference(device, means, cluster_size):
+    order, leaf_offset = median_split(device, means, cluster_size)
     leaves = reference.median_split(means, cluster_size)
     np.testing.assert_array_equal(leaf_offset, np.cumsum([0] + [len(leaf) for leaf in leaves]))
     np.testing.assert_array_equal(order, [i for leaf in leaves for i in leaf])
 
 
 @given(num_points=st.integers(0, 3000), cluster_size=st.integers(1, 500), seed=st.integers(0, 2**32 - 1))
-def test_leaves_partition_the_points_evenly(num_points, cluster_size, seed):
+def test_leaves_partition_the_points_evenly(device, num_points, cluster_size, seed):
     means = np.random.default_rng(seed).normal(size=(num_points, 3)).astype(np.float32)
-    order, leaf_offset = _core.median_split(means, cluster_size)
+    order, leaf_offset = median_split(device, means, cluster_size)
     sizes = np.diff(leaf_offset)
     num_leaves = len(sizes)
     assert num_leaves & (num_leaves - 1) == 0
@@ -45,18 +56,45 @@ def test_leaves_partition_the_points_evenly(num_points, cluster_size, seed):
         assert (np.diff(order[first:last]) > 0).all()
 
 
-def test_identical_points_split_by_index():
-    order, leaf_offset = _core.median_split(np.ones((10, 3), np.float32), 3)
+def test_identical_points_split_by_index(device):
+    order, leaf_offset = median_split(device, np.ones((10, 3), np.float32), 3)
     np.testing.assert_array_equal(order, np.arange(10))
     np.testing.assert_array_equal(leaf_offset, [0, 3, 5, 8, 10])
 
 
-def test_large_split_agrees_with_itself_moved():
+def test_large_split_agrees_with_itself_moved(device):
     means = np.random.default_rng(1).integers(-4096, 4096, size=(100_000, 3)).astype(np.float32)
-    order, leaf_offset = _core.median_split(means, 64)
-    moved_order, moved_offset = _core.median_split(means + np.float32(8192), 64)
+    order, leaf_offset = median_split(device, means, 64)
+    moved_order, moved_offset = median_split(device, means + np.float32(8192), 64)
     np.testing.assert_array_equal(order, moved_order)
     np.testing.assert_array_equal(leaf_offset, moved_offset)
+
+
+@given(
+    lengths=st.lists(st.integers(0, 40), max_size=6), depth=st.integers(0, 5), seed=st.integers(0, 2**32 - 1)
+)
+def test_segments_split_as_if_alone(device, lengths, depth, seed):
+    offset = np.cumsum([0, *lengths])
+    means = np.random.default_rng(seed).integers(-3, 3, size=(offset[-1], 3)).astype(np.float32)
+    order, leaf_offset = split_segments(device, means, offset, depth)
+    assert len(leaf_offset) == len(lengths) * 2**depth + 1
+    for s, (first, last) in enumerate(itertools.pairwise(offset)):
+        alone, alone_offset = split_segments("cpu", means[first:last], np.array([0, last - first]), depth)
+        np.testing.assert_array_equal(order[first:last], first + alone)
+        np.testing.assert_array_equal(
+            leaf_offset[s * 2**depth : (s + 1) * 2**depth + 1], first + alone_offset
+        )
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("decimals", [1, 6])
+def test_large_splits_are_the_same_on_both_devices(decimals):
+    means = np.round(np.random.default_rng(2).normal(size=(150_000, 3)), decimals).astype(np.float32)
+    for split, argument in ((median_split, (100,)), (split_segments, (np.arange(0, 150_001, 300), 3))):
+        for got, expected in zip(
+            split("cuda", means, *argument), split("cpu", means, *argument), strict=True
+        ):
+            np.testing.assert_array_equal(got, expected)
 
 
 @pytest.mark.parametrize(
@@ -71,12 +109,22 @@ def test_large_split_agrees_with_itself_moved():
 )
 def test_split_refuses_bad_input(means, cluster_size, message):
     with pytest.raises(ValueError, match=message):
-        _core.median_split(means, cluster_size)
+        _operations.median_split(means, cluster_size)
+
+
+@pytest.mark.parametrize("offset", [[0, 3], [1, 4], [0, 3, 2, 4], []])
+def test_split_refuses_bad_boundaries(offset):
+    with pytest.raises(ValueError, match="offset: expected ascending boundaries from 0 to 4"):
+        _core.median_split(np.zeros((4, 3), np.float32), np.array(offset, np.int64), 1)
 
 
 def random_offset(rng, count, num_segments):
     inner = np.sort(rng.integers(0, count + 1, size=num_segments - 1))
     return np.concatenate([[0], inner, [count]]).astype(np.int64)
+
+
+def bound(device, spheres, offset):
+    return host(_operations.bound_spheres(on(device, np.asarray(spheres, np.float32)), np.array(offset)))
 
 
 def reaches(ball, spheres):
@@ -92,70 +140,73 @@ def reaches(ball, spheres):
     origin=st.sampled_from([0.0, 1.0, 1e3, 1e6]),
     size=st.sampled_from([1e-6, 1.0, 1e4]),
 )
-def test_balls_contain_their_spheres_with_margin(seed, count, num_segments, origin, size):
+def test_balls_contain_their_spheres_with_margin(device, seed, count, num_segments, origin, size):
     rng = np.random.default_rng(seed)
     means = (origin + size * rng.normal(size=(count, 3))).astype(np.float32)
     radii = (size * rng.exponential(0.1, size=count)).astype(np.float32)
     spheres = np.concatenate([means, radii[:, None]], axis=1)
     offset = random_offset(rng, count, num_segments)
-    of_points = _core.bounding_ball_of_points(means, radii, offset)
-    np.testing.assert_array_equal(of_points, _core.bounding_ball_of_balls(spheres, offset))
-    for ball, (first, last) in zip(of_points, itertools.pairwise(offset), strict=True):
+    balls = bound(device, spheres, offset)
+    np.testing.assert_array_equal(balls, bound("cpu", spheres, offset))
+    for ball, (first, last) in zip(balls, itertools.pairwise(offset), strict=True):
         if first < last:
             assert ball[3] >= reaches(ball, spheres[first:last]).max() * (1 + 3.9e-6)
         assert ball[3] >= 1e-15
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 100))
-def test_ball_is_nearly_the_smallest(seed, count):
+def test_ball_is_nearly_the_smallest(device, seed, count):
     rng = np.random.default_rng(seed)
     # Points on a unit sphere and their opposites: the smallest ball is the unit ball.
     half = rng.normal(size=(count, 3))
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    means = np.concatenate([half, -half, 0.9 * half]).astype(np.float32)
-    ball = _core.bounding_ball_of_points(means, np.zeros(len(means), np.float32), np.array([0, len(means)]))
-    assert ball[0, 3] <= 1.005
+    spheres = np.pad(np.concatenate([half, -half, 0.9 * half]), ((0, 0), (0, 1)))
+    assert bound(device, spheres, [0, len(spheres)])[0, 3] <= 1.005
 
 
-def test_ball_of_two_balls_is_exact():
-    balls = np.array([[0, 0, 0, 1], [4, 0, 0, 2]], np.float32)
-    ball = _core.bounding_ball_of_balls(balls, np.array([0, 2]))
+def test_ball_of_two_balls_is_exact(device):
+    ball = bound(device, [[0, 0, 0, 1], [4, 0, 0, 2]], [0, 2])
     np.testing.assert_allclose(ball, [[2.5, 0, 0, 3.5]], rtol=2e-3, atol=1e-6)
 
 
-def test_ball_of_nested_balls_is_the_outer_one():
-    balls = np.array([[0, 0, 0, 5], [1, 0, 0, 0.5], [0, 0, 0, 1]], np.float32)
-    ball = _core.bounding_ball_of_balls(balls, np.array([0, 3]))
+def test_ball_of_nested_balls_is_the_outer_one(device):
+    ball = bound(device, [[0, 0, 0, 5], [1, 0, 0, 0.5], [0, 0, 0, 1]], [0, 3])
     np.testing.assert_allclose(ball, [[0, 0, 0, 5]], rtol=1e-3, atol=1e-3)
 
 
-def test_empty_and_single_segments():
-    none = np.zeros((0, 3), np.float32)
-    assert _core.bounding_ball_of_points(none, none[:, 0].copy(), np.array([0])).shape == (0, 4)
+def test_empty_and_single_segments(device):
+    none = np.zeros((0, 4))
+    assert bound(device, none, [0]).shape == (0, 4)
+    np.testing.assert_array_equal(bound(device, none, [0, 0]), np.float32([[0, 0, 0, 1e-15]]))
     np.testing.assert_array_equal(
-        _core.bounding_ball_of_points(none, none[:, 0].copy(), np.array([0, 0])),
-        np.array([[0, 0, 0, 1e-15]], np.float32),
+        bound(device, [[1, 1, 1, 0]], [0, 0, 1, 1]),
+        np.float32([[0, 0, 0, 1e-15], [1, 1, 1, 1e-15], [0, 0, 0, 1e-15]]),
     )
-    one = _core.bounding_ball_of_points(
-        np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.array([0, 1])
-    )
-    np.testing.assert_array_equal(one, np.array([[1, 1, 1, 1e-15]], np.float32))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("decimals", [1, 6])
+def test_large_balls_are_the_same_on_both_devices(decimals):
+    rng = np.random.default_rng(3)
+    spheres = np.round(np.abs(rng.normal(size=(60_000, 4))), decimals)
+    offset = np.concatenate([[0, 20_000, 20_000], np.arange(20_001, 60_001, 77), [60_000]])
+    np.testing.assert_array_equal(bound("cuda", spheres, offset), bound("cpu", spheres, offset))
 
 
 @pytest.mark.parametrize("offset", [[0, 3], [1, 2], [0, 2, 1, 2], []])
 def test_balls_refuse_bad_boundaries(offset):
     with pytest.raises(ValueError, match="offset: expected ascending boundaries from 0 to 2"):
-        _core.bounding_ball_of_balls(np.zeros((2, 4), np.float32), np.array(offset, np.int64))
+        _core.bound_spheres(np.zeros((2, 4), np.float32), np.array(offset, np.int64))
 
 
 DIGEST = """
 import hashlib, numpy as np
-from v3dg import _core
+from v3dg import _operations
 rng = np.random.default_rng(5)
 means = np.round(rng.normal(size=(200_000, 3)), 2).astype(np.float32)
-order, leaf_offset = _core.median_split(means, 100)
-radii = rng.exponential(0.01, size=len(means)).astype(np.float32)
-ball = _core.bounding_ball_of_points(means[order], radii, leaf_offset)
+order, leaf_offset = _operations.median_split(means, 100)
+radii = rng.exponential(0.01, size=(len(means), 1)).astype(np.float32)
+ball = _operations.bound_spheres(np.concatenate([means[order], radii], axis=1), leaf_offset)
 print(hashlib.sha256(order.tobytes() + leaf_offset.tobytes() + ball.tobytes()).hexdigest())
 """
 

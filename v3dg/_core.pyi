@@ -24,9 +24,15 @@ def ply_write(
 ) -> None: ...
 
 # cluster
-def median_split(means: NDArray[Any], cluster_size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]: ...
-def bounding_ball_of_points(means: NDArray[Any], radii: NDArray[Any], offset: NDArray[Any]) -> Float32: ...
-def bounding_ball_of_balls(balls: NDArray[Any], offset: NDArray[Any]) -> Float32: ...
+def num_halvings(count: int, cluster_size: int) -> int: ...
+def median_split(
+    means: NDArray[Any], offset: NDArray[Any], depth: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]: ...
+def median_split_cuda(
+    means: Any, offset: NDArray[Any], depth: int, order: Any, stream: int
+) -> NDArray[np.int64]: ...
+def bound_spheres(spheres: NDArray[Any], offset: NDArray[Any]) -> Float32: ...
+def bound_spheres_cuda(spheres: Any, offset: NDArray[Any], ball: Any, stream: int) -> None: ...
 
 # select
 def num_cuda_devices() -> int: ...
@@ -139,14 +145,11 @@ def render_selection(
 # simplify_init
 def prune(
     means: NDArray[Any],
-    quats: NDArray[Any],
     scales: NDArray[Any],
     opacities: NDArray[Any],
-    sh: NDArray[Any],
     in_offset: NDArray[np.int64],
     out_offset: NDArray[np.int64],
-    growth: float,
-) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
+) -> NDArray[np.int64]: ...
 def merge(
     means: NDArray[Any],
     quats: NDArray[Any],
@@ -156,6 +159,30 @@ def merge(
     in_offset: NDArray[np.int64],
     out_offset: NDArray[np.int64],
 ) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
+def prune_cuda(
+    means: Any,
+    scales: Any,
+    opacities: Any,
+    in_offset: NDArray[np.int64],
+    out_offset: NDArray[np.int64],
+    kept: Any,
+    stream: int,
+) -> None: ...
+def merge_cuda(
+    means: Any,
+    quats: Any,
+    scales: Any,
+    opacities: Any,
+    sh: Any,
+    in_offset: NDArray[np.int64],
+    out_offset: NDArray[np.int64],
+    out_means: Any,
+    out_quats: Any,
+    out_scales: Any,
+    out_opacities: Any,
+    out_sh: Any,
+    stream: int,
+) -> None: ...
 
 # fit_level
 class LossWeights:

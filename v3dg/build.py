@@ -9,14 +9,13 @@ import operator
 import os
 import threading
 from dataclasses import asdict, dataclass, fields, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core
+from v3dg import _core, _operations
 from v3dg._version import __version__
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.gaussians import Gaussians
@@ -254,10 +253,10 @@ def _check_drawable(rows: tuple[Any, ...]) -> None:
 
 
 def _leaves(asset: Gaussians, config: BuildConfig) -> _Level:
-    order, offset = _core.median_split(asset.means, config.cluster_size)
+    order, offset = _operations.median_split(asset.means, config.cluster_size)
     gaussians = asset.subset(order)
     count = len(offset) - 1
-    ball = _core.bounding_ball_of_points(gaussians.means, gaussians.scales.max(axis=1), offset)
+    ball = _operations.bound_spheres(_spheres(gaussians), offset)
     return _Level(
         gaussians,
         offset,
@@ -298,18 +297,17 @@ def _simplify(
     per_group = (len(below.offset) - 1) // num_groups
     offset = np.ascontiguousarray(below.offset[::per_group])
     out_offset = np.concatenate([[0], np.cumsum((np.diff(offset) + 1) // 2)])
-    rows = _start(below.gaussians, offset, out_offset, config)
+    rows = rows_of(_start(below.gaussians, offset, out_offset, config))
 
     # Groups nest: this level's are runs of whole groups of the level below.
     first_group = below.group_of_cluster[np.arange(num_groups) * per_group]
     last_group = below.group_of_cluster[np.arange(1, num_groups + 1) * per_group - 1]
     child_offset = np.append(first_group, last_group[-1] + 1).astype(np.int64)
-    ball = _core.bounding_ball_of_balls(below.ball, child_offset)
+    ball = _operations.bound_spheres(below.ball, child_offset)
     leaf_range = np.stack([below.leaf_range[first_group, 0], below.leaf_range[last_group, 1]], axis=1)
     # Balls of balls are larger than balls of gaussians, which are what the fit looks at.
-    leaves = levels[0].gaussians
-    tight = _core.bounding_ball_of_points(
-        leaves.means, leaves.scales.max(axis=1), np.append(leaf_range[:, 0], leaf_range[-1, 1])
+    tight = _operations.bound_spheres(
+        _spheres(levels[0].gaussians), np.append(leaf_range[:, 0], leaf_range[-1, 1])
     )
     weight = np.maximum(
         (1 / np.diff(out_offset)).astype(np.float32), np.maximum.reduceat(below.weight, child_offset[:-1])
@@ -337,7 +335,12 @@ def _simplify(
             progress,
         ),
     )
-    gaussians, cluster_offset = _split_groups(Gaussians(*rows), out_offset, clusters_made)
+    gaussians, cluster_offset = Gaussians(*rows), out_offset
+    if clusters_made > 1:
+        order, cluster_offset = _operations.split_segments(
+            gaussians.means, out_offset, clusters_made.bit_length() - 1
+        )
+        gaussians = gaussians.subset(order)
     return _Level(
         gaussians,
         cluster_offset,
@@ -354,33 +357,24 @@ def _start(
     offset: npt.NDArray[np.int64],
     out_offset: npt.NDArray[np.int64],
     config: BuildConfig,
-) -> tuple[Any, Any, Any, Any, Any]:
-    """The rows that groups start from: their gaussians halved, from `offset` to `out_offset`."""
+) -> Gaussians:
+    """What groups start from: their gaussians halved, from `offset` to `out_offset`."""
     parts = []
     for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
         cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
-        rows = rows_of(gaussians.subset(slice(cuts[0], cuts[-1])))
+        part = gaussians.subset(slice(cuts[0], cuts[-1]))
+        cuts, out_cuts = cuts - cuts[0], out_cuts - out_cuts[0]
         if config.init == "merge":
-            parts.append(_core.merge(*rows, cuts - cuts[0], out_cuts - out_cuts[0]))
+            parts.append(_operations.merge(part, cuts, out_cuts))
         else:
-            parts.append(_core.prune(*rows, cuts - cuts[0], out_cuts - out_cuts[0], config.prune_growth))
-    means, quats, scales, opacities, sh = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return means, quats, scales, opacities, sh
+            kept = part.subset(_operations.prune(part, cuts, out_cuts))
+            parts.append(replace(kept, scales=kept.scales * np.float32(config.prune_growth)))
+    return Gaussians.concatenate(parts)
 
 
-def _split_groups(
-    gaussians: Gaussians, offset: npt.NDArray[np.int64], parts: int
-) -> tuple[Gaussians, npt.NDArray[np.int64]]:
-    """Split each group's gaussians into `parts` clusters."""
-    if parts == 1:
-        return gaussians, offset
-    orders, counts = [], []
-    for first, last in pairwise(offset):
-        size = max(1, -(-int(last - first) // parts))
-        order, cuts = _core.median_split(gaussians.means[first:last], size)
-        orders.append(order + first)
-        counts.append(np.diff(cuts))
-    return gaussians.subset(np.concatenate(orders)), np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+def _spheres(gaussians: Gaussians) -> npt.NDArray[np.float32]:
+    """(N, 4) centre and largest scale of each gaussian."""
+    return np.concatenate([gaussians.means, gaussians.scales.max(axis=1, keepdims=True)], axis=1)
 
 
 def _fit_config(config: BuildConfig, seed: int, level: int) -> Any:

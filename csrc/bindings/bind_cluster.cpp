@@ -1,77 +1,82 @@
 #include <cmath>
-#include <vector>
 
 #include "bindings/args.h"
+#include "bindings/device_args.h"
 #include "cluster/cluster.h"
 
 namespace v3dg {
 
 namespace {
 
-py::tuple median_split(const py::array& means, int64_t cluster_size) {
-    const Span<const float> values = span_of<const float>(means, "means", {-1, 3});
-    if (cluster_size < 1)
-        throw py::value_error("cluster_size: expected at least 1, got " + std::to_string(cluster_size));
-    const size_t count = values.size / 3;
+// Segment boundaries: ascending, from 0 to `last`.
+Span<const int64_t> offsets_of(const py::array& offset, size_t last) {
+    const Span<const int64_t> values = span_of<const int64_t>(offset, "offset", {-1});
+    bool good = values.size > 0 && values[0] == 0 && values[values.size - 1] == static_cast<int64_t>(last);
+    for (size_t i = 1; good && i < values.size; ++i) good = values[i - 1] <= values[i];
+    if (!good)
+        throw py::value_error("offset: expected ascending boundaries from 0 to " + std::to_string(last) +
+                              ", got others");
+    return values;
+}
+
+Span<const Point> points_of(Span<const float> means) {
+    const size_t count = means.size / 3;
     if (count > 0xffffffffu)
         throw py::value_error("means: expected fewer than 2^32 rows, got " + std::to_string(count));
-    for (size_t i = 0; i < values.size; ++i)
-        if (!std::isfinite(values[i]))
-            throw py::value_error("means: expected finite values, got " + std::to_string(values[i]) +
+    return {reinterpret_cast<const Point*>(means.data), count};
+}
+
+void check_finite(Span<const float> means) {
+    for (size_t i = 0; i < means.size; ++i)
+        if (!std::isfinite(means[i]))
+            throw py::value_error("means: expected finite values, got " + std::to_string(means[i]) +
                                   " in row " + std::to_string(i / 3));
-    const int depth = num_halvings(count, static_cast<size_t>(cluster_size));
-    py::array_t<int64_t> order(static_cast<py::ssize_t>(count));
-    py::array_t<int64_t> leaf_offset((py::ssize_t(1) << depth) + 1);
-    const Span<const Point> points{reinterpret_cast<const Point*>(values.data), count};
-    const Span<int64_t> order_span{order.mutable_data(), count};
-    const Span<int64_t> offset_span{leaf_offset.mutable_data(), static_cast<size_t>(leaf_offset.size())};
+}
+
+// The leaves' boundaries of a split, not yet filled in.
+py::array_t<int64_t> leaf_offset_of(Span<const int64_t> offset, int depth) {
+    constexpr int kDeepest = 32;  // as deep as 2^32 points go
+    if (depth < 0 || depth > kDeepest)
+        throw py::value_error("depth: expected 0 to 32, got " + std::to_string(depth));
+    return py::array_t<int64_t>(static_cast<py::ssize_t>(((offset.size - 1) << depth) + 1));
+}
+
+Span<int64_t> span_of_new(py::array_t<int64_t>& array) {
+    return {array.mutable_data(), static_cast<size_t>(array.size())};
+}
+
+int halvings(int64_t count, int64_t cluster_size) {
+    if (cluster_size < 1)
+        throw py::value_error("cluster_size: expected at least 1, got " + std::to_string(cluster_size));
+    return num_halvings(static_cast<size_t>(count), static_cast<size_t>(cluster_size));
+}
+
+py::tuple median_split(const py::array& means, const py::array& offset, int depth) {
+    const Span<const float> values = span_of<const float>(means, "means", {-1, 3});
+    const Span<const Point> points = points_of(values);
+    check_finite(values);
+    const Span<const int64_t> offsets = offsets_of(offset, points.size);
+    py::array_t<int64_t> order(static_cast<py::ssize_t>(points.size));
+    py::array_t<int64_t> leaf_offset = leaf_offset_of(offsets, depth);
+    const Span<int64_t> order_span = span_of_new(order), leaf_span = span_of_new(leaf_offset);
     {
         const py::gil_scoped_release unlocked;
-        cpu::median_split(points, depth, order_span, offset_span);
+        cpu::median_split(points, offsets, depth, order_span, leaf_span);
     }
     return py::make_tuple(order, leaf_offset);
 }
 
-// Segment boundaries: ascending, from 0 to `last`.
-Span<const int64_t> offsets_of(const py::array& offset, const char* name, size_t last) {
-    const Span<const int64_t> values = span_of<const int64_t>(offset, name, {-1});
-    bool good = values.size > 0 && values[0] == 0 && values[values.size - 1] == static_cast<int64_t>(last);
-    for (size_t i = 1; good && i < values.size; ++i) good = values[i - 1] <= values[i];
-    if (!good)
-        throw py::value_error(std::string(name) + ": expected ascending boundaries from 0 to " +
-                              std::to_string(last) + ", got others");
-    return values;
+Span<const Sphere> spheres_of(Span<const float> rows) {
+    return {reinterpret_cast<const Sphere*>(rows.data), rows.size / 4};
 }
 
-std::vector<Sphere> spheres_of(const py::array& means, const py::array& radii) {
-    const Span<const float> centers = span_of<const float>(means, "means", {-1, 3});
-    const size_t count = centers.size / 3;
-    const Span<const float> radius = span_of<const float>(radii, "radii", {static_cast<py::ssize_t>(count)});
-    std::vector<Sphere> spheres(count);
-    for (size_t i = 0; i < count; ++i)
-        spheres[i] = {centers[3 * i], centers[3 * i + 1], centers[3 * i + 2], radius[i]};
-    return spheres;
-}
-
-py::array_t<float> bounding_ball_of_points(const py::array& means, const py::array& radii,
-                                           const py::array& offset) {
-    const std::vector<Sphere> spheres = spheres_of(means, radii);
-    const Span<const int64_t> offsets = offsets_of(offset, "offset", spheres.size());
+py::array_t<float> bound_spheres(const py::array& spheres, const py::array& offset) {
+    const Span<const Sphere> in = spheres_of(span_of<const float>(spheres, "spheres", {-1, 4}));
+    const Span<const int64_t> offsets = offsets_of(offset, in.size);
     py::array_t<float> ball({static_cast<py::ssize_t>(offsets.size - 1), py::ssize_t(4)});
     const Span<Sphere> out{reinterpret_cast<Sphere*>(ball.mutable_data()), offsets.size - 1};
     const py::gil_scoped_release unlocked;
-    cpu::bound_spheres({spheres.data(), spheres.size()}, offsets, kNestingMargin, out);
-    return ball;
-}
-
-py::array_t<float> bounding_ball_of_balls(const py::array& balls, const py::array& offset) {
-    const Span<const float> values = span_of<const float>(balls, "balls", {-1, 4});
-    const Span<const Sphere> children{reinterpret_cast<const Sphere*>(values.data), values.size / 4};
-    const Span<const int64_t> offsets = offsets_of(offset, "offset", children.size);
-    py::array_t<float> ball({static_cast<py::ssize_t>(offsets.size - 1), py::ssize_t(4)});
-    const Span<Sphere> out{reinterpret_cast<Sphere*>(ball.mutable_data()), offsets.size - 1};
-    const py::gil_scoped_release unlocked;
-    cpu::bound_spheres(children, offsets, kNestingMargin, out);
+    cpu::bound_spheres(in, offsets, kNestingMargin, out);
     return ball;
 }
 
@@ -79,12 +84,48 @@ py::array_t<float> bounding_ball_of_balls(const py::array& balls, const py::arra
 
 void bind_cluster(py::module_& m) {
     using namespace py::literals;
-    m.def("median_split", &median_split, "means"_a, "cluster_size"_a,
-          "Perfect binary tree of points: (order (N,) int64, leaf_offset (L + 1,) int64).");
-    m.def("bounding_ball_of_points", &bounding_ball_of_points, "means"_a, "radii"_a, "offset"_a,
-          "Ball (S, 4) around each segment of spheres, with the margin that keeps balls nested.");
-    m.def("bounding_ball_of_balls", &bounding_ball_of_balls, "balls"_a, "offset"_a,
-          "Ball (S, 4) around each segment of balls (B, 4), with the margin that keeps balls nested.");
+    m.def("num_halvings", &halvings, "count"_a, "cluster_size"_a,
+          "How often points are halved until no part holds more than cluster_size.");
+    m.def("median_split", &median_split, "means"_a, "offset"_a, "depth"_a,
+          "Perfect binary tree of each segment's points: (order (N,) int64, leaf_offset (L + 1,) int64).");
+    m.def("bound_spheres", &bound_spheres, "spheres"_a, "offset"_a,
+          "Ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps balls nested.");
+    if constexpr (V3DG_WITH_CUDA) {
+        m.def(
+            "median_split_cuda",
+            [](const py::object& means, const py::array& offset, int depth, const py::object& order,
+               uintptr_t stream) {
+                const Span<const Point> points =
+                    points_of(device_span_of<const float>(means, "means", {-1, 3}));
+                const Span<const int64_t> offsets = offsets_of(offset, points.size);
+                const Span<int64_t> out =
+                    device_span_of<int64_t>(order, "order", {static_cast<py::ssize_t>(points.size)});
+                py::array_t<int64_t> leaf_offset = leaf_offset_of(offsets, depth);
+                const Span<int64_t> leaf_span = span_of_new(leaf_offset);
+                {
+                    const py::gil_scoped_release unlocked;
+                    cuda::median_split(points, offsets, depth, out, leaf_span,
+                                       reinterpret_cast<cuda::Stream>(stream));
+                }
+                return leaf_offset;
+            },
+            "means"_a, "offset"_a, "depth"_a, "order"_a, "stream"_a,
+            "The same on a device: fills `order` and returns leaf_offset.");
+        m.def(
+            "bound_spheres_cuda",
+            [](const py::object& spheres, const py::array& offset, const py::object& ball, uintptr_t stream) {
+                const Span<const Sphere> in =
+                    spheres_of(device_span_of<const float>(spheres, "spheres", {-1, 4}));
+                const Span<const int64_t> offsets = offsets_of(offset, in.size);
+                const Span<float> out =
+                    device_span_of<float>(ball, "ball", {static_cast<py::ssize_t>(offsets.size - 1), 4});
+                const py::gil_scoped_release unlocked;
+                cuda::bound_spheres(in, offsets, kNestingMargin,
+                                    {reinterpret_cast<Sphere*>(out.data), offsets.size - 1},
+                                    reinterpret_cast<cuda::Stream>(stream));
+            },
+            "spheres"_a, "offset"_a, "ball"_a, "stream"_a, "The same on a device: fills `ball`.");
+    }
 }
 
 }  // namespace v3dg

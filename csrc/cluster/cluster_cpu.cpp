@@ -1,6 +1,5 @@
-// Median split: one task a node, down to a size where tasks cost more than they win.
-// Bounding balls: one thread a segment; the centre comes from a small core set of the farthest spheres
-// (Badoiu and Clarkson, Smaller core-sets for balls, SODA 2003).
+// Median split: segments in parallel, and a task a node, down to a size where tasks cost more than they win.
+// Bounding balls: one thread a segment.
 
 #include "cluster/cluster.h"
 
@@ -15,6 +14,17 @@ int num_halvings(size_t n, size_t cluster_size) {
     int depth = 0;
     for (size_t largest = n; largest > cluster_size; largest = (largest + 1) / 2) ++depth;
     return depth;
+}
+
+void halve_segments(Span<const int64_t> offset, int depth, Span<int64_t> leaf_offset) {
+    const size_t leaves = size_t(1) << depth;
+    assert(leaf_offset.size == (offset.size - 1) * leaves + 1);
+    for (size_t s = 0; s < offset.size; ++s) leaf_offset[s * leaves] = offset[s];
+    for (size_t width = leaves; width > 1; width /= 2)
+        for (size_t leaf = 0; leaf + 1 < leaf_offset.size; leaf += width) {
+            const int64_t first = leaf_offset[leaf], last = leaf_offset[leaf + width];
+            leaf_offset[leaf + width / 2] = first + (last - first + 1) / 2;
+        }
 }
 
 namespace {
@@ -47,11 +57,9 @@ void move_median(IndexedPoint* first, IndexedPoint* middle, IndexedPoint* last) 
     });
 }
 
-// Splits points first .. last, the node's 2^depth leaves being leaf .. leaf + 2^depth.
-void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, size_t leaf,
-                Span<int64_t> order, Span<int64_t> leaf_offset) {
+// Splits points first .. last into the node's 2^depth leaves.
+void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, Span<int64_t> order) {
     if (depth == 0) {
-        leaf_offset[leaf + 1] = last;
         for (ptrdiff_t i = first; i < last; ++i) order[i] = points[i].index;
         std::sort(order.data + first, order.data + last);
         return;
@@ -62,10 +70,9 @@ void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth
         const auto move = axis == 0 ? move_median<0> : axis == 1 ? move_median<1> : move_median<2>;
         move(points + first, points + middle, points + last);
     }
-    const size_t half = size_t(1) << (depth - 1);
 #pragma omp task if (last - first > kTaskSize)
-    split_node(points, first, middle, depth - 1, leaf, order, leaf_offset);
-    split_node(points, middle, last, depth - 1, leaf + half, order, leaf_offset);
+    split_node(points, first, middle, depth - 1, order);
+    split_node(points, middle, last, depth - 1, order);
 }
 
 size_t farthest(const Center& center, const Sphere* spheres, size_t count, double* distance) {
@@ -82,24 +89,14 @@ size_t farthest(const Center& center, const Sphere* spheres, size_t count, doubl
     return best;
 }
 
-constexpr size_t kCoreSize = 24;
-constexpr int kCoreSteps = 256;
-constexpr double kCoreTolerance = 1e-4;
-
 // Moves `center` towards the centre of the smallest ball around a few spheres; returns its radius.
 double center_core(const Sphere* core, size_t count, Center* center) {
     double best_radius;
     Center at = *center;
     size_t far = farthest(at, core, count, &best_radius);
     double radius = best_radius;
-    for (int step = 2; step < kCoreSteps; ++step) {
-        const Sphere& sphere = core[far];
-        const double distance = radius - sphere.radius;
-        if (distance <= 0.0) break;                    // concentric: nothing to move towards
-        const double move = radius / distance / step;  // the far side of the sphere, not its centre
-        at.x += (sphere.x - at.x) * move;
-        at.y += (sphere.y - at.y) * move;
-        at.z += (sphere.z - at.z) * move;
+    for (int step = kFirstCoreStep; step <= kLastCoreStep; ++step) {
+        if (!move_center(core[far], radius, step, at)) break;
         far = farthest(at, core, count, &radius);
         if (radius < best_radius) {
             best_radius = radius;
@@ -111,47 +108,42 @@ double center_core(const Sphere* core, size_t count, Center* center) {
 
 // Centre of nearly the smallest ball around the spheres.
 Center center_of(const Sphere* spheres, size_t count) {
-    Center center{spheres[0].x, spheres[0].y, spheres[0].z};
+    Center center = center_of(spheres[0]);
     if (count == 1) return center;
     double radius;
     size_t far = farthest(center, spheres, count, &radius);
     double best_radius = radius;
     Center best = center;
     Sphere core[kCoreSize] = {spheres[0], spheres[far]};
-    for (size_t size = 2;; ++size) {
+    for (int size = 2;; ++size) {
         const double core_radius = center_core(core, size, &center);
         far = farthest(center, spheres, count, &radius);
         if (radius < best_radius) {
             best_radius = radius;
             best = center;
         }
-        if (radius <= core_radius * (1.0 + kCoreTolerance) || size == kCoreSize) return best;
+        if (core_suffices(radius, core_radius, size)) return best;
         core[size] = spheres[far];
     }
 }
 
-Sphere ball_at(const Center& center, const Sphere* spheres, size_t count, double margin) {
-    Sphere ball{float(center.x), float(center.y), float(center.z), 0.0f};
-    double radius;
-    farthest({ball.x, ball.y, ball.z}, spheres, count, &radius);
-    ball.radius = std::max(round_up(radius * (1.0 + margin)), kMinRadius);
-    return ball;
-}
-
 }  // namespace
 
-void cpu::median_split(Span<const Point> means, int depth, Span<int64_t> order, Span<int64_t> leaf_offset) {
-    assert(order.size == means.size && leaf_offset.size == (size_t(1) << depth) + 1);
+void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int depth, Span<int64_t> order,
+                       Span<int64_t> leaf_offset) {
+    assert(order.size == means.size);
+    halve_segments(offset, depth, leaf_offset);
     std::vector<IndexedPoint> points(means.size);
     const ptrdiff_t count = static_cast<ptrdiff_t>(means.size);
-    leaf_offset[0] = 0;
+    const ptrdiff_t num_segments = static_cast<ptrdiff_t>(offset.size) - 1;
 #pragma omp parallel if (count > kTaskSize)
     {
 #pragma omp for
         for (ptrdiff_t i = 0; i < count; ++i)
             points[i] = {{means[i].axis[0], means[i].axis[1], means[i].axis[2]}, uint32_t(i)};
-#pragma omp single
-        split_node(points.data(), 0, count, depth, 0, order, leaf_offset);
+#pragma omp for schedule(dynamic, 1)
+        for (ptrdiff_t s = 0; s < num_segments; ++s)
+            split_node(points.data(), offset[s], offset[s + 1], depth, order);
     }
 }
 
@@ -160,8 +152,12 @@ void cpu::bound_spheres(Span<const Sphere> spheres, Span<const int64_t> offset, 
     parallel_for(ball.size, 16, [&](size_t s) {
         const Sphere* first = spheres.data + offset[s];
         const size_t count = offset[s + 1] - offset[s];
-        ball[s] =
-            count == 0 ? Sphere{0, 0, 0, kMinRadius} : ball_at(center_of(first, count), first, count, margin);
+        ball[s] = {0, 0, 0, kMinRadius};
+        if (count == 0) return;
+        ball[s] = ball_at(center_of(first, count));
+        double radius;
+        farthest(center_of(ball[s]), first, count, &radius);
+        ball[s].radius = radius_of_ball(radius, margin);
     });
 }
 

@@ -2,7 +2,6 @@
 
 #include <cmath>
 #include <cstddef>
-#include <limits>
 
 #include "base/host_device.h"
 
@@ -29,15 +28,49 @@ struct Center {
 };
 
 // Distance from `center` to the farthest point of the sphere.
-inline double reach(const Center& center, const Sphere& sphere) {
+V3DG_HD inline double reach(const Center& center, const Sphere& sphere) {
     const double dx = sphere.x - center.x, dy = sphere.y - center.y, dz = sphere.z - center.z;
-    return std::sqrt(dx * dx + dy * dy + dz * dz) + sphere.radius;
+    return sqrt(dx * dx + dy * dy + dz * dz) + sphere.radius;
 }
 
 // The smallest float32 that is not below `value`.
-inline float round_up(double value) {
+V3DG_HD inline float round_up(double value) {
     const float nearest = static_cast<float>(value);
-    return nearest < value ? std::nextafter(nearest, std::numeric_limits<float>::infinity()) : nearest;
+    return nearest < value ? nextafterf(nearest, INFINITY) : nearest;
+}
+
+// The centre of the smallest ball around many spheres comes from a core set of a few: those that were the
+// farthest from the centre of the ones before (Badoiu and Clarkson, Smaller core-sets for balls, SODA 2003).
+constexpr int kCoreSize = 24;
+constexpr int kFirstCoreStep = 2, kLastCoreStep = 255;
+constexpr double kCoreTolerance = 1e-4;
+
+// Moves the centre of a core set towards the sphere that reaches farthest from it, to `radius`. False when
+// the two are concentric, so that there is nothing to move towards.
+V3DG_HD inline bool move_center(const Sphere& farthest, double radius, int step, Center& center) {
+    const double distance = radius - farthest.radius;
+    if (distance <= 0.0) return false;
+    const double move = radius / distance / step;  // the far side of the sphere, not its centre
+    center.x += (farthest.x - center.x) * move;
+    center.y += (farthest.y - center.y) * move;
+    center.z += (farthest.z - center.z) * move;
+    return true;
+}
+
+// Whether all spheres lie within the core set's ball, or nearly.
+V3DG_HD inline bool core_suffices(double radius, double core_radius, int core_size) {
+    return radius <= core_radius * (1.0 + kCoreTolerance) || core_size == kCoreSize;
+}
+
+// The centre as a ball in float32 has it; the radius is still to come.
+V3DG_HD inline Sphere ball_at(const Center& center) {
+    return {static_cast<float>(center.x), static_cast<float>(center.y), static_cast<float>(center.z), 0.0f};
+}
+V3DG_HD inline Center center_of(const Sphere& ball) { return {ball.x, ball.y, ball.z}; }
+
+V3DG_HD inline float radius_of_ball(double farthest_reach, double margin) {
+    const float radius = round_up(farthest_reach * (1.0 + margin));
+    return radius > kMinRadius ? radius : kMinRadius;
 }
 
 }  // namespace v3dg

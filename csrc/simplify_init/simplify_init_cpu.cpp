@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numeric>
 #include <vector>
 
 #include "base/parallel_for.h"
@@ -12,40 +11,25 @@
 
 namespace v3dg {
 
-static void copy_row(const RowsIn& in, int64_t from, const RowsOut& out, int64_t to, float growth) {
-    for (int k = 0; k < 3; ++k) out.means[3 * to + k] = in.means[3 * from + k];
-    for (int k = 0; k < 4; ++k) out.quats[4 * to + k] = in.quats[4 * from + k];
-    for (int k = 0; k < 3; ++k) out.scales[3 * to + k] = growth * in.scales[3 * from + k];
-    out.opacities[to] = in.opacities[from];
-    for (int k = 0; k < in.num_sh; ++k) out.sh[in.num_sh * to + k] = in.sh[in.num_sh * from + k];
-}
-
-void prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset, float growth,
-           const RowsOut& out) {
-    constexpr int kCellHalvings = 3;
-    parallel_for(in_offset.size - 1, 1, [&](size_t g) {
-        const int64_t first = in_offset[g], count = in_offset[g + 1] - first;
-        const int64_t wanted = out_offset[g + 1] - out_offset[g];
-        if (count == 0) return;
-        const int halvings = std::min(kCellHalvings, num_halvings(count, 1));
-        std::vector<int64_t> order(count), cell(size_t((1 << halvings) + 1));
-        cpu::median_split({reinterpret_cast<const Point*>(in.means + 3 * first), size_t(count)}, halvings,
-                          {order.data(), order.size()}, {cell.data(), cell.size()});
-        std::vector<float> score(count);
-        for (int64_t i = 0; i < count; ++i)
-            score[i] = prune_score(in.scales + 3 * (first + i), in.opacities[first + i]);
-        std::vector<int64_t> kept;
-        for (size_t c = 0; c + 1 < cell.size(); ++c) {
-            // Shares are rounded so that they add up to what is wanted.
-            const int64_t share = cell[c + 1] * wanted / count - cell[c] * wanted / count;
+void cpu::prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
+                Span<int64_t> kept) {
+    const size_t num_groups = in_offset.size - 1, count = in_offset[num_groups];
+    std::vector<int64_t> order(count), cell(num_groups * kPruneCells + 1);
+    median_split({reinterpret_cast<const Point*>(in.means), count}, in_offset, kPruneHalvings,
+                 {order.data(), count}, {cell.data(), cell.size()});
+    std::vector<double> score(count);
+    parallel_for(count, 4096, [&](size_t i) { score[i] = prune_score(in.scales + 3 * i, in.opacities[i]); });
+    parallel_for(num_groups, 1, [&](size_t g) {
+        const CellShares shares{in_offset[g], in_offset[g + 1], out_offset[g + 1] - out_offset[g]};
+        int64_t* out = kept.data + out_offset[g];
+        for (size_t c = g * kPruneCells; c < (g + 1) * kPruneCells; ++c) {
+            const int64_t share = shares.of(cell[c], cell[c + 1]);
             std::sort(order.begin() + cell[c], order.begin() + cell[c + 1], [&](int64_t a, int64_t b) {
                 return score[a] != score[b] ? score[a] > score[b] : a < b;
             });
-            kept.insert(kept.end(), order.begin() + cell[c], order.begin() + cell[c] + share);
+            out = std::copy_n(order.begin() + cell[c], share, out);
         }
-        std::sort(kept.begin(), kept.end());
-        for (size_t i = 0; i < kept.size(); ++i)
-            copy_row(in, first + kept[i], out, out_offset[g] + int64_t(i), growth);
+        std::sort(kept.data + out_offset[g], out);
     });
 }
 
@@ -92,6 +76,14 @@ void join(Node& a, const Node& b) {
     a.rows.insert(a.rows.end(), b.rows.begin(), b.rows.end());
 }
 
+void copy_row(const RowsIn& in, int64_t from, const RowsOut& out, int64_t to) {
+    std::copy_n(in.means + 3 * from, 3, out.means + 3 * to);
+    std::copy_n(in.quats + 4 * from, 4, out.quats + 4 * to);
+    std::copy_n(in.scales + 3 * from, 3, out.scales + 3 * to);
+    out.opacities[to] = in.opacities[from];
+    std::copy_n(in.sh + in.num_sh * from, in.num_sh, out.sh + in.num_sh * to);
+}
+
 struct Pair {
     double cost;
     int a, b;
@@ -99,8 +91,8 @@ struct Pair {
 
 }  // namespace
 
-void merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
-           const RowsOut& out) {
+void cpu::merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
+                const RowsOut& out) {
     parallel_for(in_offset.size - 1, 1, [&](size_t g) {
         const int64_t first = in_offset[g], count = in_offset[g + 1] - first;
         const int64_t wanted = out_offset[g + 1] - out_offset[g];
@@ -174,7 +166,7 @@ void merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> 
             const Node& n = nodes[i];
             const int64_t to = out_offset[g] + int64_t(i);
             if (n.rows.size() == 1) {
-                copy_row(in, first + n.rows[0], out, to, 1.0f);
+                copy_row(in, first + n.rows[0], out, to);
                 continue;
             }
             double scale[3], quat[4];

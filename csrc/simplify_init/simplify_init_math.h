@@ -1,16 +1,35 @@
 #pragma once
 
 #include <cmath>
+#include <cstdint>
 
 #include "base/host_device.h"
 #include "math/quat.h"
 
 namespace v3dg {
 
-// Importance by which pruning decides (V3DG, section 3.2: product of scale and opacity).
-V3DG_HD inline float prune_score(const float scale[3], float opacity) {
-    return opacity * cbrtf(scale[0] * scale[1] * scale[2]) * cbrtf(scale[0] * scale[1] * scale[2]);
+// Importance by which pruning decides: the cube of opacity * (s1 s2 s3)^(2/3) (V3DG, section 3.2: product of
+// scale and opacity), which orders gaussians as that does and needs no roots, whose last bits differ from
+// library to library. Squares of volumes of float32 scales do not overflow float64; what vanishes is smaller
+// than anything that is seen.
+V3DG_HD inline double prune_score(const float scale[3], float opacity) {
+    const double volume = static_cast<double>(scale[0]) * scale[1] * scale[2];
+    const double o = opacity;
+    return o * o * o * (volume * volume);
 }
+
+// Pruning keeps the same share of each of these cells of a median split.
+constexpr int kPruneHalvings = 3, kPruneCells = 1 << kPruneHalvings;
+
+// How many of a cell's gaussians are kept when `wanted` of first .. last are: rounded so that they add up.
+struct CellShares {
+    int64_t first, last, wanted;
+    V3DG_HD int64_t of(int64_t cell_first, int64_t cell_last) const {
+        if (cell_first == cell_last) return 0;
+        const int64_t count = last - first;
+        return (cell_last - first) * wanted / count - (cell_first - first) * wanted / count;
+    }
+};
 
 // Surface area of an ellipsoid over 4 pi (Thomsen's formula, within 1.1 %).
 V3DG_HD inline double ellipsoid_area(double a, double b, double c) {

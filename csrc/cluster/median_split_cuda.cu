@@ -1,0 +1,283 @@
+// Median split, one level at a time for all nodes at once.
+//
+// Four lists of the points' indices are kept, sorted within each node: along x, y and z, ties by index, and
+// by index alone. So a node's extent is the difference of two values, its median the middle of a list, and a
+// split a stable partition of the lists by the side that each point goes to. In the end the list by index is
+// the order within leaves.
+
+#include <cub/device/device_radix_sort.cuh>
+
+#include <utility>
+#include <vector>
+
+#include "base/launch.cuh"
+#include "cluster/cluster.h"
+
+namespace v3dg {
+namespace cuda {
+
+namespace {
+
+constexpr unsigned kNumLists = 4, kByIndex = 3;  // list l begins at l * count
+constexpr unsigned kBlockSize = 256;
+constexpr unsigned kWordsPerTile = 64;  // a block partitions one tile of a list, a warp 32 points at a time
+constexpr unsigned kTileSize = 32 * kWordsPerTile;
+
+// Positions first .. last of every list; those before `middle` are the left half's.
+struct Node {
+    uint32_t first, middle, last;
+    uint32_t lefts_before;  // left halves of the nodes before, in points
+};
+
+// The last node that begins at or before `position`, between the nodes low and high; so an empty node never.
+__device__ uint32_t node_at(const Node* nodes, uint32_t low, uint32_t high, size_t position) {
+    while (low < high) {
+        const uint32_t middle = low + (high - low + 1) / 2;
+        if (nodes[middle].first <= position)
+            low = middle;
+        else
+            high = middle - 1;
+    }
+    return low;
+}
+
+// The nodes of a tile's first and last positions. Ends with the block in step.
+struct NodeRange {
+    uint32_t low, high;
+};
+__device__ NodeRange nodes_of_tile(const Node* nodes, uint32_t num_nodes, size_t tile, size_t count) {
+    __shared__ uint32_t found[2];
+    if (threadIdx.x < 2) {
+        const size_t last = (tile + 1) * kTileSize < count ? (tile + 1) * kTileSize - 1 : count - 1;
+        found[threadIdx.x] = node_at(nodes, 0, num_nodes - 1, threadIdx.x == 0 ? tile * kTileSize : last);
+    }
+    __syncthreads();
+    return {found[0], found[1]};
+}
+
+// Sort keys along one axis: the segment, then the value. -0 counts as 0, as it does in comparisons.
+__global__ void keys_kernel(const Point* means, size_t count, const Node* segments, uint32_t num_segments,
+                            int axis, uint64_t* keys, uint32_t* indices) {
+    const size_t i = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
+    if (i >= count) return;
+    const uint32_t bits = __float_as_uint(means[i].axis[axis] + 0.0f);
+    const uint32_t ascending = bits ^ (bits >> 31 ? 0xffffffffu : 0x80000000u);
+    keys[i] = uint64_t(node_at(segments, 0, num_segments - 1, i)) << 32 | ascending;
+    indices[i] = static_cast<uint32_t>(i);
+}
+
+__global__ void iota_kernel(size_t count, uint32_t* indices) {
+    const size_t i = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
+    if (i < count) indices[i] = static_cast<uint32_t>(i);
+}
+
+__global__ void longest_axis_kernel(const Point* means, const Node* nodes, uint32_t num_nodes,
+                                    const uint32_t* lists, size_t count, uint8_t* axis_of_node) {
+    const size_t n = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
+    if (n >= num_nodes) return;
+    const Node node = nodes[n];
+    int longest = 0;
+    float longest_extent = 0;
+    for (int a = 0; a < 3 && node.first < node.last; ++a) {
+        const float low = means[lists[a * count + node.first]].axis[a];
+        const float high = means[lists[a * count + node.last - 1]].axis[a];
+        const float extent = high - low;
+        if (a == 0 || extent > longest_extent) {
+            longest = a;
+            longest_extent = extent;
+        }
+    }
+    axis_of_node[n] = static_cast<uint8_t>(longest);
+}
+
+// Notes for every point whether it goes to the left.
+__global__ void side_kernel(const Node* nodes, uint32_t num_nodes, const uint8_t* axis_of_node,
+                            const uint32_t* lists, size_t count, uint8_t* goes_left) {
+    const NodeRange range = nodes_of_tile(nodes, num_nodes, blockIdx.x, count);
+    for (unsigned k = threadIdx.x; k < kTileSize; k += kBlockSize) {
+        const size_t position = blockIdx.x * size_t(kTileSize) + k;
+        if (position >= count) return;
+        const uint32_t n = node_at(nodes, range.low, range.high, position);
+        goes_left[lists[axis_of_node[n] * count + position]] = position < nodes[n].middle;
+    }
+}
+
+// The sides in the order of each list, a bit a position, and how many of a tile go to the left.
+__global__ void count_kernel(const uint32_t* lists, unsigned first_list, size_t count,
+                             const uint8_t* goes_left, uint32_t* words, uint32_t* tile_lefts) {
+    const size_t list = first_list + blockIdx.y;
+    const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    __shared__ uint32_t lefts_of_warp[kBlockSize / 32];
+    uint32_t lefts = 0;
+    for (unsigned k = warp; k < kWordsPerTile; k += kBlockSize / 32) {
+        const size_t word = blockIdx.x * size_t(kWordsPerTile) + k, position = word * 32 + lane;
+        const bool left = position < count && goes_left[lists[list * count + position]] != 0;
+        const uint32_t bits = __ballot_sync(kAllLanes, left);
+        if (lane == 0) words[list * gridDim.x * kWordsPerTile + word] = bits;
+        lefts += __popc(bits);
+    }
+    if (lane == 0) lefts_of_warp[warp] = lefts;
+    __syncthreads();
+    if (threadIdx.x == 0) {
+        uint32_t sum = 0;
+        for (unsigned w = 0; w < kBlockSize / 32; ++w) sum += lefts_of_warp[w];
+        tile_lefts[list * gridDim.x + blockIdx.x] = sum;
+    }
+}
+
+// Turns the counts of each list's tiles into sums of those before. One block a list.
+__global__ void sum_kernel(uint32_t num_tiles, unsigned first_list, uint32_t* tile_lefts) {
+    uint32_t* values = tile_lefts + size_t(first_list + blockIdx.x) * num_tiles;
+    const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    __shared__ uint32_t sum_of_warp[32];
+    uint32_t before = 0;
+    for (uint32_t first = 0; first < num_tiles; first += blockDim.x) {
+        const uint32_t i = first + threadIdx.x;
+        const uint32_t value = i < num_tiles ? values[i] : 0;
+        uint32_t sum = value;
+        for (unsigned step = 1; step < 32; step *= 2) {
+            const uint32_t other = __shfl_up_sync(kAllLanes, sum, step);
+            if (lane >= step) sum += other;
+        }
+        if (lane == 31) sum_of_warp[warp] = sum;
+        __syncthreads();
+        uint32_t total = 0, mine = 0;
+        for (unsigned w = 0; w < blockDim.x / 32; ++w) {
+            if (w == warp) mine = total;
+            total += sum_of_warp[w];
+        }
+        if (i < num_tiles) values[i] = before + mine + sum - value;
+        before += total;
+        __syncthreads();
+    }
+}
+
+// Moves every point to its half of its node, in the order in which the list has them.
+__global__ void partition_kernel(const Node* nodes, uint32_t num_nodes, const uint32_t* from, uint32_t* to,
+                                 unsigned first_list, size_t count, const uint32_t* words,
+                                 const uint32_t* tile_lefts) {
+    const size_t list = first_list + blockIdx.y;
+    const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    __shared__ uint32_t word_bits[kWordsPerTile], lefts_before_word[kWordsPerTile];
+    if (warp == 0) {
+        uint32_t before = tile_lefts[list * gridDim.x + blockIdx.x];
+        for (unsigned k = lane; k < kWordsPerTile; k += 32) {
+            const uint32_t bits = words[(list * gridDim.x + blockIdx.x) * kWordsPerTile + k];
+            const uint32_t value = __popc(bits);
+            uint32_t sum = value;
+            for (unsigned step = 1; step < 32; step *= 2) {
+                const uint32_t other = __shfl_up_sync(kAllLanes, sum, step);
+                if (lane >= step) sum += other;
+            }
+            word_bits[k] = bits;
+            lefts_before_word[k] = before + sum - value;
+            before += __shfl_sync(kAllLanes, sum, 31);
+        }
+    }
+    const NodeRange range = nodes_of_tile(nodes, num_nodes, blockIdx.x, count);
+    for (unsigned k = warp; k < kWordsPerTile; k += kBlockSize / 32) {
+        const size_t position = blockIdx.x * size_t(kTileSize) + k * 32 + lane;
+        if (position >= count) return;
+        const Node node = nodes[node_at(nodes, range.low, range.high, position)];
+        const uint32_t lefts = lefts_before_word[k] + __popc(word_bits[k] & ((1u << lane) - 1));
+        const uint32_t left_rank = lefts - node.lefts_before;
+        const bool left = (word_bits[k] >> lane & 1) != 0;
+        const uint32_t place = left
+                                   ? node.first + left_rank
+                                   : node.middle + (static_cast<uint32_t>(position) - node.first - left_rank);
+        to[list * count + place] = from[list * count + position];
+    }
+}
+
+__global__ void widen_kernel(const uint32_t* from, size_t count, int64_t* to) {
+    const size_t i = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
+    if (i < count) to[i] = from[i];
+}
+
+// The nodes of every level, the first level's first.
+std::vector<Node> nodes_of_levels(Span<const int64_t> leaf_offset, int depth) {
+    const size_t num_leaves = leaf_offset.size - 1;
+    std::vector<Node> nodes;
+    nodes.reserve(num_leaves);
+    for (size_t width = size_t(1) << depth; width > 1; width /= 2) {
+        uint32_t lefts = 0;
+        for (size_t leaf = 0; leaf < num_leaves; leaf += width) {
+            const Node node{static_cast<uint32_t>(leaf_offset[leaf]),
+                            static_cast<uint32_t>(leaf_offset[leaf + width / 2]),
+                            static_cast<uint32_t>(leaf_offset[leaf + width]), lefts};
+            nodes.push_back(node);
+            lefts += node.middle - node.first;
+        }
+    }
+    return nodes;
+}
+
+// Sorts the points of each segment along the three axes.
+void sort_lists(const Point* means, size_t count, const Node* segments, uint32_t num_segments,
+                uint32_t* lists, cudaStream_t stream) {
+    DeviceBuffer<uint64_t> keys(count, stream), sorted_keys(count, stream);
+    DeviceBuffer<uint32_t> indices(count, stream);
+    int num_bits = 32;
+    while (num_bits < 64 && (uint64_t(num_segments - 1) >> (num_bits - 32)) != 0) ++num_bits;
+    const auto sort = [&](void* scratch, size_t& bytes, uint32_t* list) {
+        check(cub::DeviceRadixSort::SortPairs(scratch, bytes, keys.data(), sorted_keys.data(), indices.data(),
+                                              list, count, 0, num_bits, stream),
+              "median_split: sort");
+    };
+    size_t bytes = 0;
+    sort(nullptr, bytes, nullptr);
+    DeviceBuffer<unsigned char> scratch(bytes, stream);
+    const unsigned blocks = blocks_for(count, kBlockSize);
+    for (int axis = 0; axis < 3; ++axis) {
+        launch("median_split: keys", keys_kernel, blocks, kBlockSize, 0, stream, means, count, segments,
+               num_segments, axis, keys.data(), indices.data());
+        sort(scratch.data(), bytes, lists + axis * count);
+    }
+}
+
+}  // namespace
+
+void median_split(Span<const Point> means, Span<const int64_t> offset, int depth, Span<int64_t> order,
+                  Span<int64_t> leaf_offset, Stream stream) {
+    halve_segments(offset, depth, leaf_offset);
+    const size_t count = means.size;
+    if (count == 0) return;
+    const unsigned blocks = blocks_for(count, kBlockSize);
+    DeviceBuffer<uint32_t> buffer(kNumLists * count, stream), next_buffer(kNumLists * count, stream);
+    uint32_t *lists = buffer.data(), *next = next_buffer.data();
+    const std::vector<Node> host_nodes = nodes_of_levels(leaf_offset, depth);
+    const DeviceBuffer<Node> all_nodes(Span<const Node>{host_nodes.data(), host_nodes.size()}, stream);
+    const Node* nodes = all_nodes.data();
+    uint32_t num_nodes = static_cast<uint32_t>(offset.size - 1);
+    if (depth > 0) sort_lists(means.data, count, nodes, num_nodes, lists, stream);
+    launch("median_split: by index", iota_kernel, blocks, kBlockSize, 0, stream, count,
+           lists + kByIndex * count);
+
+    const unsigned tiles = blocks_for(count, kTileSize);
+    DeviceBuffer<uint8_t> goes_left(count, stream), axis_of_node(leaf_offset.size / 2, stream);
+    DeviceBuffer<uint32_t> words(kNumLists * size_t(tiles) * kWordsPerTile, stream);
+    DeviceBuffer<uint32_t> tile_lefts(kNumLists * size_t(tiles), stream);
+    for (int level = 0; level < depth; ++level) {
+        // Nobody looks at the order along an axis after the last split.
+        const unsigned first_list = level + 1 == depth ? kByIndex : 0;
+        const unsigned num_lists = kNumLists - first_list;
+        launch("median_split: longest axis", longest_axis_kernel, blocks_for(num_nodes, kBlockSize),
+               kBlockSize, 0, stream, means.data, nodes, num_nodes, lists, count, axis_of_node.data());
+        launch("median_split: sides", side_kernel, tiles, kBlockSize, 0, stream, nodes, num_nodes,
+               axis_of_node.data(), lists, count, goes_left.data());
+        launch("median_split: count", count_kernel, dim3(tiles, num_lists), kBlockSize, 0, stream, lists,
+               first_list, count, goes_left.data(), words.data(), tile_lefts.data());
+        launch("median_split: sum", sum_kernel, num_lists, 1024, 0, stream, tiles, first_list,
+               tile_lefts.data());
+        launch("median_split: partition", partition_kernel, dim3(tiles, num_lists), kBlockSize, 0, stream,
+               nodes, num_nodes, lists, next, first_list, count, words.data(), tile_lefts.data());
+        std::swap(lists, next);
+        nodes += num_nodes;
+        num_nodes *= 2;
+    }
+    launch("median_split: widen", widen_kernel, blocks, kBlockSize, 0, stream, lists + kByIndex * count,
+           count, order.data);
+}
+
+}  // namespace cuda
+}  // namespace v3dg
