@@ -23,6 +23,14 @@ def ply_write(
     encoding: str,
 ) -> None: ...
 
+# box
+def bound_by_boxes(
+    means: NDArray[Any], quats: NDArray[Any], scales: NDArray[Any], offset: NDArray[Any]
+) -> Float32: ...
+def bound_by_boxes_cuda(
+    means: Any, quats: Any, scales: Any, offset: NDArray[Any], box: Any, stream: int
+) -> None: ...
+
 # cluster
 def num_halvings(count: int, cluster_size: int) -> int: ...
 def median_split(

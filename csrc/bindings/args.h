@@ -56,6 +56,7 @@ Span<T> span_of(const py::array& array, const char* name, std::initializer_list<
     return {data, static_cast<size_t>(array.size())};
 }
 
+void bind_box(py::module_& m);
 void bind_cluster(py::module_& m);
 void bind_select(py::module_& m);
 void bind_simplify_init(py::module_& m);

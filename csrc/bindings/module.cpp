@@ -9,6 +9,7 @@ PYBIND11_MODULE(_core, m) {
     m.def(
         "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },
         "Instruction set that the CPU half runs on.");
+    v3dg::bind_box(m);
     v3dg::bind_cluster(m);
     v3dg::bind_select(m);
     v3dg::bind_simplify_init(m);

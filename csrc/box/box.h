@@ -1,0 +1,27 @@
+#pragma once
+
+#include <cstdint>
+
+#include "base/span.h"
+#include "base/stream.h"
+#include "select/select_math.h"
+
+namespace v3dg {
+
+struct BoxInput {
+    const float *means, *quats, *scales;  // rows of the gaussians
+    Span<const int64_t> offset;           // [C + 1] gaussians of each cluster
+};
+
+// Boxes of what clusters draw: the reach of an opaque gaussian around every mean, rounded outwards, without
+// that of the filter. A cluster of no gaussians gets a box of none: +inf to -inf. Both halves give the same
+// bits.
+//
+// box: [C].
+namespace cpu { void bound_by_boxes(const BoxInput& in, Span<Box> box); }
+
+// Rows and boxes on the device, offsets on the host. Work is queued on the stream. Throws std::runtime_error
+// when CUDA reports an error.
+namespace cuda { void bound_by_boxes(const BoxInput& in, Span<Box> box, Stream stream); }
+
+}  // namespace v3dg

@@ -1,0 +1,42 @@
+#pragma once
+
+// Compiled without contraction on both halves, so that they give the same bits.
+
+#include <cmath>
+
+#include "math/quat.h"
+#include "project/project_math.h"
+#include "select/select_math.h"
+
+namespace v3dg {
+
+V3DG_HD inline Box no_box() { return {{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}}; }
+
+V3DG_HD inline void grow(Box& box, const Box& other) {
+    for (int a = 0; a < 3; ++a) {
+        box.lo[a] = other.lo[a] < box.lo[a] ? other.lo[a] : box.lo[a];
+        box.hi[a] = other.hi[a] > box.hi[a] ? other.hi[a] : box.hi[a];
+    }
+}
+
+// What one gaussian draws. In double precision: scales of 1e-6 and 1e6 in one gaussian are legal.
+V3DG_HD inline Box box_of_gaussian(const float* mean, const float* quat, const float* scale) {
+    const double q[4] = {quat[0], quat[1], quat[2], quat[3]};
+    double r[9];
+    rotation_of_quat(q, r);
+    Box box;
+    for (int a = 0; a < 3; ++a) {
+        double variance = 0;
+        for (int k = 0; k < 3; ++k) {
+            const double side = r[3 * a + k] * scale[k];
+            variance += side * side;
+        }
+        // A little more than the reach, for the rounding of the corners.
+        const double reach = kReachSigmas * 1.0001 * sqrt(variance) + 1e-6 * fabs(double(mean[a]));
+        box.lo[a] = static_cast<float>(mean[a] - reach);
+        box.hi[a] = static_cast<float>(mean[a] + reach);
+    }
+    return box;
+}
+
+}  // namespace v3dg

@@ -1,0 +1,16 @@
+"""Boxes of what gaussians draw."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import project
+
+REACH_SIGMAS = 3.33  # sqrt(2 ln 255): where an opaque gaussian falls below 1/255
+
+
+def bound_by_boxes(means: np.ndarray, quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """(2, 3) lower and upper corner of all of them, without any margin for rounding."""
+    axes = project.rotation(quats) * scales[:, None, :].astype(np.float64)
+    reach = REACH_SIGMAS * np.sqrt((axes**2).sum(axis=2))
+    return np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
