@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from v3dg import _core
+from v3dg.gaussians import Array, Gaussians
 
 
 def resolve(device: str) -> Literal["cpu", "cuda"]:
@@ -41,3 +48,65 @@ def missing_for_cuda() -> str | None:
             f"expected a torch that can use the CUDA device, got {torch.__version__}; install one with CUDA"
         )
     return None
+
+
+def describe(device: Literal["cpu", "cuda"]) -> str:
+    """What of a device the last bits of results depend on."""
+    if device == "cpu":
+        return _core.isa()
+    import torch
+
+    return str(torch.cuda.get_device_name())
+
+
+def of(array: Array) -> Any:
+    """Where an array is: "cpu" for NumPy's, else its torch device."""
+    return "cpu" if isinstance(array, np.ndarray) else array.device
+
+
+def place(gaussians: Gaussians, device: Any) -> Gaussians:
+    """The gaussians as NumPy arrays ("cpu") or as tensors on a CUDA device, without gradients.
+
+    "cuda" is the device that they are on, if it is one, else the current one.
+    """
+    if device == "cpu":
+        return gaussians.numpy()
+    is_there = device == "cuda" and str(of(gaussians.means)).startswith("cuda")
+    there = gaussians.torch(None if is_there else device)
+    return Gaussians(*(getattr(there, field.name).detach() for field in fields(there)))
+
+
+def library_of(array: Array) -> Any:
+    """numpy or torch; many functions have the same names and arguments in both."""
+    if isinstance(array, np.ndarray):
+        return np
+    import torch
+
+    return torch
+
+
+def to_host(array: Array) -> npt.NDArray[Any]:
+    """The array as one of NumPy's."""
+    host: npt.NDArray[Any] = array if isinstance(array, np.ndarray) else array.cpu().numpy()
+    return host
+
+
+def copy_to_host(array: Array, out: npt.NDArray[Any]) -> None:
+    """Copy an array from any device into one of NumPy's."""
+    if isinstance(array, np.ndarray):
+        np.copyto(out, array)
+    else:
+        import torch
+
+        torch.from_numpy(out).copy_(array)
+
+
+@contextmanager
+def memory_errors() -> Iterator[None]:
+    """Turn torch's error about missing device memory into what the core raises, MemoryError."""
+    try:
+        yield
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":
+            raise
+        raise MemoryError(str(error)) from error

@@ -70,6 +70,50 @@ def merge(gaussians: Gaussians, in_offset: Offsets, out_offset: Offsets) -> Gaus
         return Gaussians(*merged)
 
 
+def bound_by_boxes(gaussians: Gaussians, offset: Offsets) -> Array:
+    """Bound what each cluster draws: (C, 2, 3) lower and upper corner."""
+    rows = gaussians.means, gaussians.quats, gaussians.scales
+    if isinstance(rows[0], np.ndarray):
+        return _core.bound_by_boxes(*rows, offset)
+    with _stream_of(rows[0]) as stream:
+        box = _empty_like(rows[0], (len(offset) - 1, 2, 3))
+        _core.bound_by_boxes_cuda(*rows, offset, box, stream)
+        return box
+
+
+def fit_target(gaussians: Gaussians) -> Any:
+    """What `fit_level` takes as its target: the gaussians as the core lays them out."""
+    return _core.Model(*rows_of(gaussians))
+
+
+def fit_level(
+    config: _core.FitConfig,
+    target: Any,
+    target_filter_px2: float,
+    target_compensate: bool,
+    target_range: npt.NDArray[np.int64],
+    own_range: npt.NDArray[np.int64],
+    ball: Array,
+    gaussians: Gaussians,
+    error: npt.NDArray[np.float32],
+    progress: _core.FitProgress,
+) -> None:
+    """Fit groups of gaussians, in place, to look like groups of the target inside their balls (G, 4)."""
+    _core.fit_level(
+        config,
+        target,
+        target_filter_px2,
+        target_compensate,
+        target_range,
+        own_range,
+        ball,
+        np.arange(len(own_range), dtype=np.int64),
+        *rows_of(gaussians),
+        error,
+        progress,
+    )
+
+
 @contextmanager
 def _stream_of(tensor: Any) -> Iterator[int]:
     """The stream that torch works on, where `tensor` is; its device is the current one meanwhile."""

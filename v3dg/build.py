@@ -7,29 +7,34 @@ import json
 import math
 import operator
 import os
+import struct
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core, _operations
+from v3dg import _core, _device, _operations
+from v3dg._operations import Offsets
 from v3dg._version import __version__
 from v3dg.bundle import Bundle, Clusters, Groups
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Array, Gaussians
 from v3dg.rasterize import rows_of
-from v3dg.scene import rotation_from_quaternion
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
 # Of a side of a picture, in pixels.
 _MAX_IMAGE_SIZE = 65535
 
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
 _GROUPS_AT_ONCE = 256
+
+_DIGEST_BYTES = 16
+_PIECE_BYTES = 16 << 20
 
 
 @dataclass(frozen=True)
@@ -167,13 +172,14 @@ class BuildConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """One level while it is built: clusters in order, and for each the group that made it."""
+    """One finished level, on the host: clusters in order, and for each the group that made it."""
 
     gaussians: Gaussians
-    offset: npt.NDArray[np.int64]  # (clusters + 1,)
+    offset: Offsets  # (clusters + 1,)
     # Of the groups that made the clusters; at level 0 every cluster is its own.
     group_of_cluster: npt.NDArray[np.int32]
     leaf_range: npt.NDArray[np.int64]  # (groups, 2) gaussians of level 0 under each
+    box: npt.NDArray[np.float32]  # (clusters, 2, 3) of what they draw
     ball: npt.NDArray[np.float32]  # (groups, 4), nested, for selection
     weight: npt.NDArray[np.float32]  # (groups,) of its footprint
     error: npt.NDArray[np.float32]  # (groups, 2)
@@ -188,84 +194,139 @@ def build_bundle(
     config: BuildConfig | None = None,
     seed: int = 0,
     progress: bool = True,
-    device: Literal["auto", "cpu"] = "auto",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
     resume_path: str | os.PathLike[str] | None = None,
 ) -> Bundle:
     """Build all levels of one asset (V3DG, algorithm 1; what we do differently is in docs/levels.md).
 
-    The same asset, config and seed give the same bundle, bit for bit, whatever the number of threads (on one
-    instruction set: wider vectors round differently).
+    The same asset, config, seed and device give the same bundle, bit for bit, whatever the number of threads
+    (on one instruction set or one kind of GPU: others round differently).
 
     Args:
         asset: At least one gaussian, all values finite.
         config: Settings; ours by default.
         seed: Of the views that groups are fitted to.
         progress: Show a bar with the level, its groups done, the time left and their mean loss.
-        device: "auto" and "cpu" build on the CPU, the only device of this version.
-        resume_path: Where to keep finished levels; a build of the same asset, config and seed that finds them
-            there goes on from them. The file stays: remove it once the bundle is saved.
+        device: Where to compute; the bundle is on the host in any case. "auto" is the asset's or the current
+            CUDA device where there is one and torch can use it, else the CPU.
+        resume_path: Where to keep finished levels; a build of the same asset, config, seed and device that
+            finds them there goes on from them. The file stays: remove it once the bundle is saved.
 
     Raises:
         ValueError: The asset is empty or has values that are not finite, or a setting is wrong.
+        RuntimeError: The device is "cuda", and something is missing for it.
+        MemoryError: The device has too little memory; the message has the numbers.
         KeyboardInterrupt: Ctrl-C; threads have stopped, finished levels are at `resume_path`.
     """
     config = config or BuildConfig()
-    if device not in ("auto", "cpu"):
-        raise ValueError(f"device: expected 'auto' or 'cpu', got {device!r}; this version builds on the CPU")
+    where = _device.resolve(device)
     if not isinstance(progress, bool):
         raise TypeError(f"progress: expected True or False, got {progress!r}")
     seed = operator.index(seed)
     if not 0 <= seed < 2**58:
         raise ValueError(f"seed: expected 0 to 2^58 - 1, got {seed}")
-    rows = rows_of(asset.numpy())
-    _check_drawable(rows)
-    store = _Checkpoint(resume_path, rows, config, seed)
-    levels = store.load()
-    if not levels:
-        levels = [_leaves(Gaussians(*rows), config)]
-    bar = _Bar(levels, config, progress)
-    try:
-        while (shape := levels[-1].next_shape(config)) is not None:
-            levels.append(_simplify(levels, shape, config, seed, bar))
-            store.save(levels)
-    finally:
-        bar.close()
-    return _assemble(levels, config, seed)
+    if str(asset.means.dtype).endswith("64"):
+        raise ValueError("asset: expected float32 arrays, got float64; convert them first")
+    with _device.memory_errors():
+        asset = _device.place(asset, where)
+        _check_drawable(asset)
+        store = _Checkpoint(resume_path, asset, config, seed, where)
+        build = _Build(asset, config, seed)
+        del asset
+        for level in store.load():
+            build.append(level)
+        bar = _Bar(build.levels, config, progress)
+        try:
+            while (shape := build.levels[-1].next_shape(config)) is not None:
+                _simplify(build, shape, bar)
+                store.save(build.levels[-1])
+        finally:
+            bar.close()
+    return _assemble(build.levels, build.pile.gaussians, config, seed)
 
 
-def _check_drawable(rows: tuple[Any, ...]) -> None:
-    if len(rows[0]) == 0:
+def _check_drawable(asset: Gaussians) -> None:
+    if len(asset) == 0:
         raise ValueError("asset: expected at least one gaussian, got none")
-    for name, values in zip(("means", "quats", "scales", "opacities", "sh"), rows, strict=True):
-        good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    isfinite = _device.library_of(asset.means).isfinite
+    for field in fields(asset):
+        values = getattr(asset, field.name)
+        good: Any = isfinite(values)
         expected = "finite numbers"
-        if name == "scales":
-            good &= (values >= 0).all(axis=1)
+        if field.name == "scales":
+            good &= values >= 0
             expected = "numbers of at least 0"
-        elif name == "opacities":
+        elif field.name == "opacities":
             good &= (values >= 0) & (values <= 1)
             expected = "numbers from 0 to 1"
         if not good.all():
+            rows = np.flatnonzero((~_device.to_host(good)).reshape(len(asset), -1).any(axis=1))
             raise ValueError(
-                f"asset: expected {name} that are {expected}, got others in {int((~good).sum())} of "
-                f"{len(good)} gaussians, the first is number {int(np.argmin(good))}; remove them"
+                f"asset: expected {field.name} that are {expected}, got others in {len(rows)} of "
+                f"{len(asset)} gaussians, the first is number {rows[0]}; remove them"
             )
 
 
-def _leaves(asset: Gaussians, config: BuildConfig) -> _Level:
-    order, offset = _operations.median_split(asset.means, config.cluster_size)
-    gaussians = asset.subset(order)
-    count = len(offset) - 1
-    ball = _operations.bound_spheres(_spheres(gaussians), offset)
-    return _Level(
-        gaussians,
-        offset,
-        np.arange(count, dtype=np.int32),
-        np.stack([offset[:-1], offset[1:]], axis=1),
-        ball,
-        np.zeros(count, np.float32),
-        np.zeros((count, 2), np.float32),
-    )
+class _Pile:
+    """The gaussians of all levels, one level after another, on the host: what the bundle will hold."""
+
+    def __init__(self, count: int, like: Gaussians) -> None:
+        shapes = [getattr(like, field.name).shape[1:] for field in fields(Gaussians)]
+        self.gaussians = Gaussians(*(np.empty((count, *shape), np.float32) for shape in shapes))
+        self._filled = 0
+
+    def add(self, gaussians: Gaussians) -> Gaussians:
+        """Copy a level's gaussians, from any device; returns the copy."""
+        first, self._filled = self._filled, self._filled + len(gaussians)
+        copy = self.gaussians.subset(slice(first, self._filled))
+        for field in fields(Gaussians):
+            _device.copy_to_host(getattr(gaussians, field.name), getattr(copy, field.name))
+        return copy
+
+
+class _Build:
+    """The levels so far, and what the next one is made from, on the device that builds."""
+
+    def __init__(self, asset: Gaussians, config: BuildConfig, seed: int) -> None:
+        self.config, self.seed = config, seed
+        self.where = _device.of(asset.means)
+        self.levels: list[_Level] = []
+        order, offset = _operations.median_split(asset.means, config.cluster_size)
+        sizes = np.diff(offset)
+        self.pile = _Pile(len(asset) + sum(_sizes_ahead(sizes, config)), asset)
+        leaves = asset.subset(order)
+        self._spheres = _spheres(leaves)
+        self.append(
+            _Level(
+                leaves,
+                offset,
+                np.arange(len(sizes), dtype=np.int32),
+                np.stack([offset[:-1], offset[1:]], axis=1),
+                _device.to_host(_operations.bound_by_boxes(leaves, offset)),
+                _device.to_host(_operations.bound_spheres(self._spheres, offset)),
+                np.zeros(len(sizes), np.float32),
+                np.zeros((len(sizes), 2), np.float32),
+            )
+        )
+        self.leaves = self.last
+        self.target_leaves = _operations.fit_target(self.leaves) if config.targets == "leaves" else None
+        self._ball_of_leaves = np.zeros((0, 2), np.int64), np.zeros((0, 4), np.float32)
+
+    def append(self, level: _Level) -> None:
+        """Add a finished level, whose gaussians are on any device."""
+        copy = self.pile.add(level.gaussians)
+        self.levels.append(replace(level, gaussians=copy))
+        self.last = copy if self.where == "cpu" else _device.place(level.gaussians, self.where)
+
+    def balls_of_leaves(self, leaf_range: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
+        """Balls around the gaussians of level 0 under each group, which are what the fit looks at."""
+        known_range, ball = self._ball_of_leaves
+        # Past the root, every level stands for all leaves.
+        if not np.array_equal(known_range, leaf_range):
+            offset = np.append(leaf_range[:, 0], leaf_range[-1, 1])
+            ball = _operations.bound_spheres(self._spheres, offset)
+            self._ball_of_leaves = leaf_range, ball
+        return ball
 
 
 def _next_shape(clusters: int, gaussians: int, config: BuildConfig) -> tuple[int, int] | None:
@@ -289,79 +350,76 @@ def _sizes_ahead(sizes: npt.NDArray[np.int64], config: BuildConfig) -> list[int]
     return ahead
 
 
-def _simplify(
-    levels: list[_Level], shape: tuple[int, int], config: BuildConfig, seed: int, bar: _Bar
-) -> _Level:
-    below = levels[-1]
+def _spheres(gaussians: Gaussians) -> Array:
+    """(N, 4) centre and largest scale of each gaussian."""
+    library = _device.library_of(gaussians.means)
+    radius = library.amax(gaussians.scales, axis=1, keepdims=True)
+    return library.concatenate([gaussians.means, radius], axis=1)
+
+
+def _simplify(build: _Build, shape: tuple[int, int], bar: _Bar) -> None:
+    """Add the next level."""
+    config, below, number = build.config, build.levels[-1], len(build.levels)
     num_groups, clusters_made = shape
     per_group = (len(below.offset) - 1) // num_groups
     offset = np.ascontiguousarray(below.offset[::per_group])
     out_offset = np.concatenate([[0], np.cumsum((np.diff(offset) + 1) // 2)])
-    rows = rows_of(_start(below.gaussians, offset, out_offset, config))
+    gaussians = _start(build.last, offset, out_offset, config)
 
     # Groups nest: this level's are runs of whole groups of the level below.
     first_group = below.group_of_cluster[np.arange(num_groups) * per_group]
     last_group = below.group_of_cluster[np.arange(1, num_groups + 1) * per_group - 1]
     child_offset = np.append(first_group, last_group[-1] + 1).astype(np.int64)
-    ball = _operations.bound_spheres(below.ball, child_offset)
     leaf_range = np.stack([below.leaf_range[first_group, 0], below.leaf_range[last_group, 1]], axis=1)
-    # Balls of balls are larger than balls of gaussians, which are what the fit looks at.
-    tight = _operations.bound_spheres(
-        _spheres(levels[0].gaussians), np.append(leaf_range[:, 0], leaf_range[-1, 1])
-    )
     weight = np.maximum(
         (1 / np.diff(out_offset)).astype(np.float32), np.maximum.reduceat(below.weight, child_offset[:-1])
     )
 
     from_leaves = config.targets == "leaves"
-    target = levels[0] if from_leaves else below
-    own_filter = from_leaves or len(levels) == 1
+    own_filter = from_leaves or number == 1
     error = np.zeros((num_groups, 2), np.float32)
-    fit = _fit_config(config, seed, len(levels))
-    bar.start_level(len(levels), num_groups, int(out_offset[-1]))
+    bar.start_level(number, num_groups, int(out_offset[-1]))
     _run_fit(
         bar,
-        lambda progress: _core.fit_level(
-            fit,
-            _core.Model(*rows_of(target.gaussians)),
+        lambda progress: _operations.fit_level(
+            _fit_config(config, build.seed, number),
+            build.target_leaves if from_leaves else _operations.fit_target(build.last),
             config.asset_filter_px2 if own_filter else config.filter_px2,
             config.asset_antialiased if own_filter else True,
             leaf_range if from_leaves else np.stack([offset[:-1], offset[1:]], axis=1),
             np.stack([out_offset[:-1], out_offset[1:]], axis=1),
-            tight,
-            np.arange(num_groups, dtype=np.int64),
-            *rows,
+            build.balls_of_leaves(leaf_range),
+            gaussians,
             error,
             progress,
         ),
     )
-    gaussians, cluster_offset = Gaussians(*rows), out_offset
+    cluster_offset = out_offset
     if clusters_made > 1:
-        order, cluster_offset = _operations.split_segments(
-            gaussians.means, out_offset, clusters_made.bit_length() - 1
-        )
+        depth = clusters_made.bit_length() - 1
+        order, cluster_offset = _operations.split_segments(gaussians.means, out_offset, depth)
         gaussians = gaussians.subset(order)
-    return _Level(
-        gaussians,
-        cluster_offset,
-        np.repeat(np.arange(num_groups, dtype=np.int32), clusters_made),
-        leaf_range,
-        ball,
-        weight,
-        error,
+    build.append(
+        _Level(
+            gaussians,
+            cluster_offset,
+            np.repeat(np.arange(num_groups, dtype=np.int32), clusters_made),
+            leaf_range,
+            _device.to_host(_operations.bound_by_boxes(gaussians, cluster_offset)),
+            _operations.bound_spheres(below.ball, child_offset),
+            weight,
+            error,
+        )
     )
 
 
-def _start(
-    gaussians: Gaussians,
-    offset: npt.NDArray[np.int64],
-    out_offset: npt.NDArray[np.int64],
-    config: BuildConfig,
-) -> Gaussians:
+def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig) -> Gaussians:
     """What groups start from: their gaussians halved, from `offset` to `out_offset`."""
     parts = []
-    for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
-        cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
+    num_groups = len(offset) - 1
+    at_once = _GROUPS_AT_ONCE if isinstance(gaussians.means, np.ndarray) else num_groups
+    for first in range(0, num_groups, at_once):
+        cuts, out_cuts = (o[first : first + at_once + 1] for o in (offset, out_offset))
         part = gaussians.subset(slice(cuts[0], cuts[-1]))
         cuts, out_cuts = cuts - cuts[0], out_cuts - out_cuts[0]
         if config.init == "merge":
@@ -369,12 +427,7 @@ def _start(
         else:
             kept = part.subset(_operations.prune(part, cuts, out_cuts))
             parts.append(replace(kept, scales=kept.scales * np.float32(config.prune_growth)))
-    return Gaussians.concatenate(parts)
-
-
-def _spheres(gaussians: Gaussians) -> npt.NDArray[np.float32]:
-    """(N, 4) centre and largest scale of each gaussian."""
-    return np.concatenate([gaussians.means, gaussians.scales.max(axis=1, keepdims=True)], axis=1)
+    return parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)
 
 
 def _fit_config(config: BuildConfig, seed: int, level: int) -> Any:
@@ -476,86 +529,117 @@ class _Bar:
 
 
 class _Checkpoint:
-    """Finished levels in a file, written whole after each level."""
+    """Finished levels in a file that grows by one after each; the first, the leaves, is quicker to make anew.
+
+    A level whose writing was cut off does not count; one that is whole but damaged is an error.
+    """
+
+    _COUNTS = struct.Struct("<qqq")  # gaussians, clusters, groups
 
     def __init__(
-        self, path: str | os.PathLike[str] | None, rows: tuple[Any, ...], config: BuildConfig, seed: int
+        self,
+        path: str | os.PathLike[str] | None,
+        asset: Gaussians,
+        config: BuildConfig,
+        seed: int,
+        device: Literal["cpu", "cuda"],
     ) -> None:
         self._path = None if path is None else Path(path)
         if self._path is None:
             return
         if not self._path.parent.is_dir():
             raise ValueError(f"resume_path: expected a file in an existing folder, got {self._path}")
-        # One name, so that what a killed build left is written over and not left for ever.
-        self._temporary = self._path.with_name(f".{self._path.name}.tmp")
-        digest = hashlib.blake2b(digest_size=16)
-        for array in rows:
-            digest.update(str(array.shape).encode())
-            digest.update(np.ascontiguousarray(array).data)
-        digest.update(json.dumps([asdict(config), seed, _core.isa(), __version__], sort_keys=True).encode())
-        self._key = digest.hexdigest()
+        what = [asdict(config), seed, _device.describe(device), __version__, len(asset), asset.sh_degree]
+        text = json.dumps(what, sort_keys=True).encode()
+        self._head = b"v3dg levels 2\n" + _digest(text, rows_of(asset.numpy()))
+        self._num_sh = asset.sh.shape[1]
+        self._num_bytes = 0  # of the file that are good
 
     def load(self) -> list[_Level]:
+        """The finished levels but the leaves."""
         if self._path is None or not self._path.exists():
             return []
+        levels = []
         try:
-            levels = self._read(self._path)
-        except Exception as error:  # what a damaged archive raises has no common type
+            with open(self._path, "rb") as file:
+                head = file.read(len(self._head))
+                is_ours = self._head.startswith(head)
+                while is_ours and (level := self._read(file)) is not None:
+                    levels.append(level)
+                    self._num_bytes = file.tell()
+        except (OSError, ValueError) as error:
             raise ValueError(
                 f"{self._path}: expected levels of an interrupted build, could not read them "
                 f"({error}); remove it to start again"
             ) from error
-        if levels is None:
+        if not is_ours:
             raise ValueError(
-                f"{self._path}: holds levels of another asset, config, seed or version; "
-                "remove it to start again"
+                f"{self._path}: holds something else, or levels of another asset, config, seed, device or "
+                "version; remove it to start again"
             )
         return levels
 
-    def _read(self, path: Path) -> list[_Level] | None:
-        # Opened here, since numpy leaves the file of a damaged archive open.
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
-            if str(data["key"]) != self._key:
-                return None
-            if (damaged := data.zip.testzip()) is not None:
-                raise ValueError(f"{damaged} is damaged")
-            return [self._unpack(data, f"{i}.") for i in range(int(data["levels"]))]
+    def _read(self, file: BinaryIO) -> _Level | None:
+        """The next level; None where the file ends before it does."""
+        counts, digest = file.read(self._COUNTS.size), file.read(_DIGEST_BYTES)
+        if len(digest) < _DIGEST_BYTES:
+            return None
+        layout = self._layout(*self._COUNTS.unpack(counts))
+        left = os.fstat(file.fileno()).st_size - file.tell()
+        if not 0 <= sum(dtype.itemsize * math.prod(shape) for dtype, shape in layout) <= left:
+            return None
+        arrays = [np.fromfile(file, dtype, math.prod(shape)).reshape(shape) for dtype, shape in layout]
+        if _digest(counts, arrays) != digest:
+            raise ValueError("a level is damaged")
+        return _Level(Gaussians(*arrays[:5]), *arrays[5:])
 
-    @staticmethod
-    def _unpack(data: Any, prefix: str) -> _Level:
-        gaussians = Gaussians(*(data[f"{prefix}{f.name}"] for f in fields(Gaussians)))
-        return _Level(gaussians, *(data[f"{prefix}{f.name}"] for f in fields(_Level)[1:]))
-
-    def save(self, levels: list[_Level]) -> None:
+    def save(self, level: _Level) -> None:
+        """Add a level that is on the host."""
         if self._path is None:
             return
-        arrays: dict[str, Any] = {"key": self._key, "levels": len(levels)}
-        for i, level in enumerate(levels):
-            for f in fields(Gaussians):
-                arrays[f"{i}.{f.name}"] = getattr(level.gaussians, f.name)
-            for f in fields(_Level)[1:]:
-                arrays[f"{i}.{f.name}"] = getattr(level, f.name)
-        try:
-            with open(self._temporary, "wb") as file:
-                np.savez(file, **arrays)
-            os.replace(self._temporary, self._path)
-        finally:
-            self._temporary.unlink(missing_ok=True)
+        arrays = [*rows_of(level.gaussians), *(getattr(level, field.name) for field in fields(_Level)[1:])]
+        counts = self._COUNTS.pack(len(level.gaussians), len(level.group_of_cluster), len(level.ball))
+        with open(self._path, "r+b" if self._path.exists() else "wb") as file:
+            file.seek(self._num_bytes)
+            file.truncate()
+            if self._num_bytes == 0:
+                file.write(self._head)
+            file.write(counts + _digest(counts, arrays))
+            for array in arrays:
+                file.write(array.reshape(-1).view(np.uint8).data)
+            self._num_bytes = file.tell()
+
+    def _layout(self, n: int, clusters: int, groups: int) -> list[tuple[np.dtype[Any], tuple[int, ...]]]:
+        """Dtype and shape of the arrays of a level, in order."""
+        real = [(n, 3), (n, 4), (n, 3), (n,), (n, self._num_sh, 3)]
+        tables: list[tuple[Any, tuple[int, ...]]] = [
+            (np.int64, (clusters + 1,)),
+            (np.int32, (clusters,)),
+            (np.int64, (groups, 2)),
+            (np.float32, (clusters, 2, 3)),
+            (np.float32, (groups, 4)),
+            (np.float32, (groups,)),
+            (np.float32, (groups, 2)),
+        ]
+        return [(np.dtype(dtype), shape) for dtype, shape in [*((np.float32, s) for s in real), *tables]]
 
 
-def _boxes(gaussians: Gaussians, offset: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
-    """(clusters, 2, 3) lower and upper corner of what each cluster draws."""
-    quats = gaussians.quats.astype(np.float64)
-    rotation = rotation_from_quaternion(quats / np.linalg.norm(quats, axis=1, keepdims=True).clip(1e-30))
-    sigma = np.sqrt(np.einsum("nik,nk->ni", rotation**2, gaussians.scales.astype(np.float64) ** 2))
-    # A little more than the reach, for the rounding of the corners.
-    reach = _core.reach_sigmas * 1.0001 * sigma + 1e-6 * np.abs(gaussians.means)
-    low = np.minimum.reduceat(gaussians.means - reach, offset[:-1], axis=0)
-    high = np.maximum.reduceat(gaussians.means + reach, offset[:-1], axis=0)
-    return np.stack([low, high], axis=1).astype(np.float32)
+def _digest(head: bytes, arrays: Sequence[npt.NDArray[Any]]) -> bytes:
+    """Of the head, the shapes and the bytes; in pieces, so that all cores share the work."""
+    pieces: list[Any] = [head]
+    for array in arrays:
+        data = memoryview(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+        pieces += [data[i : i + _PIECE_BYTES] for i in range(0, len(data), _PIECE_BYTES)]
+
+    def digest(piece: Any) -> bytes:
+        return hashlib.blake2b(piece, digest_size=_DIGEST_BYTES).digest()
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
+        return digest(b"".join(pool.map(digest, pieces)))
 
 
-def _assemble(levels: list[_Level], config: BuildConfig, seed: int) -> Bundle:
+def _assemble(levels: list[_Level], gaussians: Gaussians, config: BuildConfig, seed: int) -> Bundle:
+    """The bundle of all levels, whose `gaussians` follow one another."""
     cluster_level, own, parent, boxes, offsets = [], [], [], [], [np.zeros(1, np.int64)]
     group_parent = []
     first_group = [0]
@@ -565,7 +649,7 @@ def _assemble(levels: list[_Level], config: BuildConfig, seed: int) -> Bundle:
         count = len(level.offset) - 1
         cluster_level.append(np.full(count, i, np.int32))
         offsets.append(offsets[-1][-1] + level.offset[1:])
-        boxes.append(_boxes(level.gaussians, level.offset))
+        boxes.append(level.box)
         own.append(
             np.full(count, -1, np.int32) if i == 0 else level.group_of_cluster + np.int32(first_group[i - 1])
         )
@@ -609,7 +693,6 @@ def _assemble(levels: list[_Level], config: BuildConfig, seed: int) -> Bundle:
         ),
         error=joined([level.error for level in levels[1:]], np.float32, 2),
     )
-    gaussians = Gaussians.concatenate([level.gaussians for level in levels])
     return Bundle(
         clusters,
         groups,
