@@ -66,7 +66,8 @@ def merge(gaussians: Gaussians, in_offset: Offsets, out_offset: Offsets) -> Gaus
         return Gaussians(*_core.merge(*rows, in_offset, out_offset))
     with _stream_of(rows[0]) as stream:
         merged = [_empty_like(column, (int(out_offset[-1]), *column.shape[1:])) for column in rows]
-        _core.merge_cuda(*rows, in_offset, out_offset, *merged, stream)
+        arguments: list[Any] = [*rows, in_offset, out_offset, *merged, stream]
+        _core.merge_cuda(*arguments)
         return Gaussians(*merged)
 
 

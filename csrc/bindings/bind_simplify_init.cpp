@@ -34,6 +34,12 @@ struct Segments {
     py::ssize_t num_out() const { return out[out.size - 1]; }
 };
 
+// The second length of a device array's shape; what is wrong with it is said later.
+py::ssize_t num_bases_of(const py::handle& sh) {
+    const py::object shape = py::getattr(sh, "shape", py::tuple());
+    return py::len(shape) == 3 ? shape[py::int_(1)].cast<py::ssize_t>() : 0;
+}
+
 py::array_t<int64_t> prune(const py::array& means, const py::array& scales, const py::array& opacities,
                            const py::array& in_offset, const py::array& out_offset) {
     const Span<const float> opacity = span_of<const float>(opacities, "opacities", {-1});
@@ -81,6 +87,55 @@ void bind_simplify_init(py::module_& m) {
           "Rows (M,) int64 of the gaussians that survive.");
     m.def("merge", &merge, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "in_offset"_a,
           "out_offset"_a, "Rows of the merged gaussians: means, quats, scales, opacities, sh.");
+    if constexpr (V3DG_WITH_CUDA) {
+        m.def(
+            "prune_cuda",
+            [](const py::object& means, const py::object& scales, const py::object& opacities,
+               const py::array& in_offset, const py::array& out_offset, const py::object& kept,
+               uintptr_t stream) {
+                const Span<const float> opacity = device_span_of<const float>(opacities, "opacities", {-1});
+                const py::ssize_t n = static_cast<py::ssize_t>(opacity.size);
+                RowsIn in{};
+                in.means = device_span_of<const float>(means, "means", {n, 3}).data;
+                in.scales = device_span_of<const float>(scales, "scales", {n, 3}).data;
+                in.opacities = opacity.data;
+                const Segments segments(in_offset, out_offset, n);
+                const Span<int64_t> out = device_span_of<int64_t>(kept, "kept", {segments.num_out()});
+                const py::gil_scoped_release unlocked;
+                cuda::prune(in, segments.in, segments.out, out, reinterpret_cast<cuda::Stream>(stream));
+            },
+            "means"_a, "scales"_a, "opacities"_a, "in_offset"_a, "out_offset"_a, "kept"_a, "stream"_a,
+            "The same on a device: fills `kept`.");
+        m.def(
+            "merge_cuda",
+            [](const py::object& means, const py::object& quats, const py::object& scales,
+               const py::object& opacities, const py::object& sh, const py::array& in_offset,
+               const py::array& out_offset, const py::object& out_means, const py::object& out_quats,
+               const py::object& out_scales, const py::object& out_opacities, const py::object& out_sh,
+               uintptr_t stream) {
+                const Span<const float> opacity = device_span_of<const float>(opacities, "opacities", {-1});
+                const py::ssize_t n = static_cast<py::ssize_t>(opacity.size);
+                const py::ssize_t bases = num_bases_of(sh);
+                const RowsIn in{device_span_of<const float>(means, "means", {n, 3}).data,
+                                device_span_of<const float>(quats, "quats", {n, 4}).data,
+                                device_span_of<const float>(scales, "scales", {n, 3}).data,
+                                opacity.data,
+                                device_span_of<const float>(sh, "sh", {n, bases, 3}).data,
+                                static_cast<int>(3 * bases)};
+                const Segments segments(in_offset, out_offset, n);
+                const py::ssize_t m = segments.num_out();
+                const RowsOut out{device_span_of<float>(out_means, "out_means", {m, 3}).data,
+                                  device_span_of<float>(out_quats, "out_quats", {m, 4}).data,
+                                  device_span_of<float>(out_scales, "out_scales", {m, 3}).data,
+                                  device_span_of<float>(out_opacities, "out_opacities", {m}).data,
+                                  device_span_of<float>(out_sh, "out_sh", {m, bases, 3}).data};
+                const py::gil_scoped_release unlocked;
+                cuda::merge(in, segments.in, segments.out, out, reinterpret_cast<cuda::Stream>(stream));
+            },
+            "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "in_offset"_a, "out_offset"_a,
+            "out_means"_a, "out_quats"_a, "out_scales"_a, "out_opacities"_a, "out_sh"_a, "stream"_a,
+            "The same on a device: fills out_means, ..., out_sh.");
+    }
 }
 
 }  // namespace v3dg

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -36,9 +37,14 @@ def survivors(gaussians, wanted: int) -> list[int]:
 
 
 def area(scales) -> np.ndarray:
-    """Surface of an ellipsoid over 4 pi, after Thomsen."""
-    a, b, c = np.moveaxis(np.asarray(scales, np.float64) ** 1.6075, -1, 0)
-    return ((a * b + a * c + b * c) / 3) ** (1 / 1.6075)
+    """Surface of an ellipsoid over 4 pi: the mean of its shadow along 13 directions, weighted by kind."""
+    directions = [d for d in itertools.product([-1, 0, 1], repeat=3) if d > (0, 0, 0)]
+    weights = {1: 0.0604247, 2: 0.1013528 / 2, 3: 0.5029995 / 4}
+    a, b, c = np.moveaxis(np.asarray(scales, np.float64), -1, 0)
+    pairs = np.stack([b * c, a * c, a * b], axis=-1) ** 2
+    return sum(
+        weights[int(np.abs(d).sum())] * np.sqrt(pairs @ np.square(d) / np.abs(d).sum()) for d in directions
+    )
 
 
 def covariances(gaussians) -> np.ndarray:

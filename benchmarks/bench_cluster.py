@@ -1,0 +1,124 @@
+"""How fast an asset is cut into clusters, bounded, and halved to the start of a coarser level."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import record
+import tyro
+
+import v3dg
+from v3dg import _operations
+from v3dg.rasterize import rows_of
+
+
+@dataclass
+class Config:
+    num_gaussians: int = 1_000_000
+    cluster_size: int = 256
+    group_size: int = 397
+    """Gaussians of a group that are halved together."""
+    sh_degree: int = 0
+    device: Literal["cpu", "cuda"] = "cpu"
+    repeats: int = 5
+    seed: int = 0
+    output: str | None = None
+
+
+def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
+    """On a bumpy shell, as what has been scanned is."""
+    rng = np.random.default_rng(seed)
+    means = rng.standard_normal((num, 3), np.float32)
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    means *= 1 + 0.05 * np.sin(9 * means[:, ::-1])
+    return v3dg.Gaussians(
+        means=means,
+        quats=rng.standard_normal((num, 4), np.float32),
+        scales=np.exp(rng.standard_normal((num, 3), np.float32) - 6),
+        opacities=rng.random(num, np.float32),
+        sh=rng.standard_normal((num, (degree + 1) ** 2, 3), np.float32),
+    )
+
+
+def operations(
+    gaussians: v3dg.Gaussians, config: Config
+) -> dict[str, tuple[int, Callable[[], tuple[Any, ...]]]]:
+    """What is timed, by name: how many gaussians go in, and a call that returns arrays."""
+    num = len(gaussians)
+    order, leaf_offset = _operations.median_split(gaussians.means, config.cluster_size)
+    gaussians = gaussians.subset(order)
+    offset = np.append(np.arange(0, num, config.group_size), num)
+    halved = np.concatenate([[0], np.cumsum((np.diff(offset) + 1) // 2)])
+    one = gaussians.subset(slice(0, min(num, config.group_size)))
+    if config.device == "cpu":
+        spheres = np.concatenate([gaussians.means, gaussians.scales.max(axis=1, keepdims=True)], axis=1)
+    else:
+        import torch
+
+        spheres = torch.cat([gaussians.means, gaussians.scales.amax(dim=1, keepdim=True)], dim=1)
+    one_offset, one_halved = np.array([0, len(one)]), np.array([0, (len(one) + 1) // 2])
+    return {
+        "median_split": (num, lambda: _operations.median_split(gaussians.means, config.cluster_size)),
+        "split_segments": (num, lambda: _operations.split_segments(gaussians.means, offset, 3)),
+        "bound_clusters": (num, lambda: (_operations.bound_spheres(spheres, leaf_offset),)),
+        "bound_all": (num, lambda: (_operations.bound_spheres(spheres, np.array([0, num])),)),
+        "prune": (num, lambda: (_operations.prune(gaussians, offset, halved),)),
+        "merge": (num, lambda: rows_of(_operations.merge(gaussians, offset, halved))),
+        "merge_one_group": (len(one), lambda: rows_of(_operations.merge(one, one_offset, one_halved))),
+    }
+
+
+def to_host(array: Any) -> Any:
+    return array if isinstance(array, np.ndarray) else array.cpu().numpy()
+
+
+def check_against_cpu(config: Config) -> None:
+    """Both devices have to give the same bits."""
+    small = random_gaussians(min(config.num_gaussians, 100_000), config.sh_degree, config.seed)
+    on_cpu = operations(small, Config(**{**vars(config), "device": "cpu"}))
+    on_device = operations(small.torch(config.device), config)
+    for name, (_, run) in on_device.items():
+        for got, expected in zip(run(), on_cpu[name][1](), strict=True):
+            if not np.array_equal(to_host(got), to_host(expected)):
+                raise SystemExit(f"{name}: the two devices disagree")
+
+
+def milliseconds(config: Config, run: Callable[[], object]) -> list[float]:
+    def wait() -> None:
+        if config.device == "cuda":
+            import torch
+
+            torch.cuda.synchronize()
+
+    times = []
+    for _ in range(config.repeats + 1):
+        wait()
+        start = time.perf_counter()
+        run()
+        wait()
+        times.append(1e3 * (time.perf_counter() - start))
+    return times[1:]  # the first one warms up
+
+
+def main(config: Config) -> None:
+    if config.device == "cuda":
+        check_against_cpu(config)
+    gaussians = random_gaussians(config.num_gaussians, config.sh_degree, config.seed)
+    if config.device == "cuda":
+        gaussians = gaussians.torch("cuda")
+    result: dict[str, Any] = {"config": vars(config), "milliseconds": {}}
+    for name, (num, run) in operations(gaussians, config).items():
+        times = milliseconds(config, run)
+        median = statistics.median(times)
+        result["milliseconds"][name] = {"median": median, "least": min(times), "most": max(times)}
+        print(f"{name:16} {median:10.2f} ms  {num / median / 1e3:10.1f} million gaussians a second")
+    record.write(config.output, result)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
