@@ -58,6 +58,12 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.skipif(v3dg._core.num_cuda_devices() > 0, reason="there is a CUDA device")
+@pytest.mark.parametrize("command", [("build", "tuft.ply", "-o", "other.v3dg")], ids=["build"])
+def test_missing_cuda_is_an_error(folder, command):
+    fails(1, "or use 'cpu'", *command, "--device", "cuda", cwd=folder)
+
+
 def test_version():
     done = run("--version")
     assert done.returncode == 0

@@ -110,6 +110,24 @@ def test_subset_takes_the_rows_in_order(index):
         np.testing.assert_array_equal(getattr(taken, name), getattr(gaussians, name)[rows])
 
 
+@pytest.mark.gpu
+def test_subset_on_a_cuda_device():
+    import torch
+
+    gaussians = random_gaussians(5, degree=1)
+    there = gaussians.torch("cuda")
+    for index in ([4, 0, -1], [], [True, False, True, True, False]):
+        expected = gaussians.subset(index)
+        for kind in (index, np.array(index), torch.tensor(index), torch.tensor(index).cuda()):
+            if len(index) or isinstance(kind, list):
+                taken = there.subset(kind)
+                assert taken.means.is_cuda
+                assert_same(taken.numpy(), expected)
+    for wrong in ([5], [-6], [True] * 4):
+        with pytest.raises(IndexError):
+            there.subset(torch.tensor(wrong).cuda())
+
+
 def test_subset_by_a_plain_slice_shares_memory():
     gaussians = random_gaussians(5)
     assert np.shares_memory(gaussians.subset(slice(1, 4)).sh, gaussians.sh)

@@ -45,7 +45,9 @@ class Build:
     cluster_size: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Most gaussians in a cluster; the config's own if not given."""
     seed: int = 0
-    """The same seed gives the same file, byte for byte."""
+    """The same seed gives the same file, byte for byte, on the same kind of device."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto is a CUDA device where there is one and torch can use it."""
     resume: bool = False
     """Continue an interrupted build from its last finished level."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
@@ -207,7 +209,12 @@ def _build(options: Build) -> None:
     asset = load(options.asset)
     try:
         bundle = build_bundle(
-            asset, config=config, seed=options.seed, progress=not options.quiet, resume_path=partial
+            asset,
+            config=config,
+            seed=options.seed,
+            progress=not options.quiet,
+            device=options.device,
+            resume_path=partial,
         )
     except KeyboardInterrupt:
         hint = f"; `--resume` continues from {partial}" if partial.exists() else ""
@@ -542,7 +549,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 1)
     except MemoryError as error:
-        return _fail(f"not enough memory; use smaller pictures or a smaller asset {error}", 1)
+        numbers = f" ({error})" if str(error) else ""
+        return _fail(f"not enough memory{numbers}; use smaller pictures or a smaller asset", 1)
     except (ValueError, RuntimeError, ImportError) as error:
         return _fail(str(error), 1)
     return 0

@@ -94,13 +94,18 @@ class Gaussians:
             if index.step not in (None, 1):  # torch knows no negative steps
                 index = np.arange(*index.indices(len(self)))
         else:
-            index = _index_array(index)
+            index = _checked_index(index)
         if not _is_tensor(self.means):
-            return self._map(lambda array: np.ascontiguousarray(array[index]))
+            rows: Any = index.cpu().numpy() if _is_tensor(index) else index
+            return self._map(lambda array: np.ascontiguousarray(array[rows]))
         import torch
 
         if isinstance(index, np.ndarray):
-            index = torch.from_numpy(np.ascontiguousarray(index)).to(self.means.device)
+            index = torch.from_numpy(np.ascontiguousarray(index))
+        if not isinstance(index, slice):
+            index = index.to(self.means.device)
+            if index.is_cuda:
+                _check_range(index, len(self))
         return self._map(lambda tensor: tensor[index].contiguous())
 
     @staticmethod
@@ -174,15 +179,28 @@ def _check_kind(name: str, array: Any, like: Any) -> None:
         )
 
 
-def _index_array(index: Any) -> np.ndarray[Any, Any]:
-    array = np.asarray(index.detach().cpu().numpy() if _is_tensor(index) else index)
-    if array.ndim == 1 and array.size == 0 and array.dtype.kind == "f":
-        array = array.astype(np.intp)  # an empty list says nothing about its kind
-    if array.ndim == 0 or array.dtype.kind not in "iub":
+def _checked_index(index: Any) -> Array:
+    """A mask or int64 indices: a tensor where it is one, else a NumPy array."""
+    array: Any = index.detach() if _is_tensor(index) else np.asarray(index)
+    if array.ndim == 1 and len(array) == 0 and "float" in str(array.dtype):
+        array = np.zeros(0, np.int64)  # an empty list says nothing about its kind
+    dtype = str(array.dtype).removeprefix("torch.")
+    if array.ndim == 0 or not dtype.startswith(("int", "uint", "bool")):
         raise TypeError(
             f"index: expected a slice, integers or booleans, got {_kind(index)}"
-            + (f" of dtype {array.dtype}" if array.ndim else "; for one gaussian use a slice of length 1")
+            + (f" of dtype {dtype}" if array.ndim else "; for one gaussian use a slice of length 1")
         )
     if array.ndim != 1:
-        raise ValueError(f"index: expected one dimension, got shape {array.shape}")
-    return array if array.dtype.kind == "b" else array.astype(np.int64)
+        raise ValueError(f"index: expected one dimension, got shape {tuple(array.shape)}")
+    if dtype == "bool":
+        return array
+    return array.long() if _is_tensor(array) else array.astype(np.int64)
+
+
+def _check_range(index: Any, count: int) -> None:
+    """Raise for a tensor of indices out of range; on a CUDA device indexing itself would end the context."""
+    if str(index.dtype) == "torch.bool" or len(index) == 0:
+        return
+    low, high = int(index.min()), int(index.max())
+    if low < -count or high >= count:
+        raise IndexError(f"index: expected {-count} to {count - 1}, got {high if high >= count else low}")

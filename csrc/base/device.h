@@ -4,7 +4,9 @@
 
 #include <cuda_runtime.h>
 
+#include <new>
 #include <stdexcept>
+#include <string>
 #include <utility>
 
 #include "base/span.h"
@@ -12,9 +14,15 @@
 namespace v3dg {
 namespace cuda {
 
-// The device has no room; what() names what was asked for and what was free.
-struct OutOfMemory : std::runtime_error {
-    using std::runtime_error::runtime_error;
+// The device has no room; what() names what was asked for and what was free. Python gets a MemoryError, as of
+// every std::bad_alloc.
+class OutOfMemory : public std::bad_alloc {
+  public:
+    explicit OutOfMemory(std::string text) : text_(std::move(text)) {}
+    const char* what() const noexcept override { return text_.c_str(); }
+
+  private:
+    std::string text_;
 };
 
 // Throws std::runtime_error with CUDA's own words unless the call succeeded; `what` names it.
