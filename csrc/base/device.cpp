@@ -13,6 +13,13 @@ void check(cudaError_t error, const char* what) {
     throw std::runtime_error(std::string("cuda: ") + what + " failed: " + cudaGetErrorString(error));
 }
 
+unsigned num_multiprocessors() {
+    int device = 0, count = 0;
+    check(cudaGetDevice(&device), "cudaGetDevice");
+    check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "cudaDeviceGetAttribute");
+    return static_cast<unsigned>(count);
+}
+
 // A pool of our own, so that how long we keep memory is nobody else's affair.
 static cudaMemPool_t pool_of_current_device() {
     static std::mutex mutex;

@@ -28,6 +28,9 @@ class OutOfMemory : public std::bad_alloc {
 // Throws std::runtime_error with CUDA's own words unless the call succeeded; `what` names it.
 void check(cudaError_t error, const char* what);
 
+// Of the current device.
+unsigned num_multiprocessors();
+
 // Stream-ordered memory of the current device, from a pool that keeps what is given back for the next caller.
 // Throws OutOfMemory.
 void* allocate(size_t bytes, cudaStream_t stream);

@@ -1,97 +1,10 @@
-#include <pybind11/stl.h>
-
-#include <algorithm>
-#include <cmath>
-#include <limits>
 #include <stdexcept>
 
-#include "bindings/args.h"
-#include "project/project_math.h"
-#include "select/select.h"
+#include "bindings/select_args.h"
 
 namespace v3dg {
 
 namespace {
-
-// A bundle's table with the arrays that it borrows from.
-class BoundTable {
-  public:
-    BoundTable(py::array ball, py::array weight, py::array own_group, py::array parent_group, py::array box,
-               py::array filter_px2, py::array offset)
-        : arrays_{ball, weight, own_group, parent_group, box, filter_px2, offset} {
-        const Span<const float> balls = span_of<const float>(ball, "ball", {-1, 4});
-        const size_t num_groups = balls.size / 4;
-        const Span<const float> weights =
-            span_of<const float>(weight, "weight", {static_cast<py::ssize_t>(num_groups)});
-        const Span<const int32_t> own = span_of<const int32_t>(own_group, "own_group", {-1});
-        const py::ssize_t num_clusters = static_cast<py::ssize_t>(own.size);
-        const Span<const int32_t> parent =
-            span_of<const int32_t>(parent_group, "parent_group", {num_clusters});
-        const Span<const float> boxes = span_of<const float>(box, "box", {num_clusters, 2, 3});
-        const Span<const float> filters = span_of<const float>(filter_px2, "filter_px2", {num_clusters});
-        const Span<const int64_t> offsets = span_of<const int64_t>(offset, "offset", {num_clusters + 1});
-        check_groups(own, "own_group", num_groups);
-        check_groups(parent, "parent_group", num_groups);
-
-        table_.ball = {reinterpret_cast<const Ball*>(balls.data), num_groups};
-        table_.weight = weights;
-        table_.own_group = own;
-        table_.parent_group = parent;
-        table_.box = {reinterpret_cast<const Box*>(boxes.data), own.size};
-        table_.offset = offsets;
-        find_top();
-        find_bounds();
-        float filter = 0.0f;
-        for (const float value : filters) filter = std::max(filter, value);
-        table_.pad_px = static_cast<float>(kReachSigmas) * std::sqrt(filter) + 1.0f;
-    }
-
-    BoundTable(const BoundTable&) = delete;
-
-    const ClusterTable& table() const { return table_; }
-
-  private:
-    static void check_groups(Span<const int32_t> groups, const char* name, size_t num_groups) {
-        for (const int32_t g : groups)
-            if (g < -1 || (g >= 0 && static_cast<size_t>(g) >= num_groups))
-                throw py::value_error(std::string(name) + ": expected -1 or a group below " +
-                                      std::to_string(num_groups) + ", got " + std::to_string(g));
-    }
-
-    void find_top() {
-        std::vector<uint8_t> is_top(table_.ball.size, 0);
-        for (size_t c = 0; c < table_.parent_group.size; ++c) {
-            if (table_.parent_group[c] >= 0) continue;
-            top_cluster_.push_back(static_cast<int32_t>(c));
-            if (table_.own_group[c] >= 0) is_top[table_.own_group[c]] = 1;
-        }
-        for (size_t g = 0; g < is_top.size(); ++g)
-            if (is_top[g]) top_group_.push_back(static_cast<int32_t>(g));
-        table_.top_group = {top_group_.data(), top_group_.size()};
-        table_.top_cluster = {top_cluster_.data(), top_cluster_.size()};
-    }
-
-    // A box that is not a number makes the bounds so: nothing of the instance is ever dropped.
-    void find_bounds() {
-        constexpr float kInfinity = std::numeric_limits<float>::infinity();
-        table_.bounds = {{kInfinity, kInfinity, kInfinity}, {-kInfinity, -kInfinity, -kInfinity}};
-        for (const Box& box : table_.box)
-            for (int a = 0; a < 3; ++a) {
-                if (!(table_.bounds.lo[a] <= box.lo[a])) table_.bounds.lo[a] = box.lo[a];
-                if (!(table_.bounds.hi[a] >= box.hi[a])) table_.bounds.hi[a] = box.hi[a];
-            }
-    }
-
-    std::vector<py::array> arrays_;
-    std::vector<int32_t> top_group_, top_cluster_;
-    ClusterTable table_;
-};
-
-Footprint footprint_of(const std::string& name) {
-    if (name == "solid_angle") return Footprint::solid_angle;
-    if (name == "paper") return Footprint::paper;
-    throw py::value_error("footprint: expected solid_angle or paper, got " + name);
-}
 
 // Arguments of one selection; `tables` and `input` borrow from them.
 struct Arguments {
@@ -106,32 +19,9 @@ Arguments arguments_of(const py::list& tables, const py::array& instance_bundle,
     Arguments arguments;
     for (const py::handle table : tables) arguments.tables.push_back(table.cast<const BoundTable&>().table());
     SelectInput& input = arguments.input;
-    const Span<const int32_t> bundle = span_of<const int32_t>(instance_bundle, "instance_bundle", {-1});
-    const py::ssize_t count = static_cast<py::ssize_t>(bundle.size);
-    for (const int32_t b : bundle)
-        if (b < 0 || static_cast<size_t>(b) >= arguments.tables.size())
-            throw py::value_error("instance_bundle: expected a bundle below " +
-                                  std::to_string(arguments.tables.size()) + ", got " + std::to_string(b));
-    input.instances = {bundle, span_of<const double>(positions, "positions", {count, 3}),
-                       span_of<const double>(rotations, "rotations", {count, 3, 3}),
-                       span_of<const double>(scales, "scales", {count})};
-    const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
-    const Span<const double> position = span_of<const double>(eye, "eye", {3});
-    const Span<const double> intrinsics = span_of<const double>(K, "K", {3, 3});
-    SelectCamera& camera = input.camera;
-    for (int row = 0; row < 3; ++row) {
-        camera.eye[row] = position[row];
-        for (int k = 0; k < 3; ++k) camera.rotation[3 * row + k] = view[4 * row + k];
-    }
-    camera.fx = intrinsics[0];
-    camera.fy = intrinsics[4];
-    camera.cx = intrinsics[2];
-    camera.cy = intrinsics[5];
-    camera.width = width;
-    camera.height = height;
-    camera.near = near;
-    input.rule = {static_cast<float>(camera.fx * camera.fy), static_cast<float>(tolerance),
-                  footprint_of(footprint), false};
+    input.instances = instance_table(instance_bundle, positions, rotations, scales, arguments.tables.size());
+    input.camera = select_camera(viewmat, eye, K, width, height, near);
+    input.rule = select_rule(input.camera, tolerance, footprint, false);
     return arguments;
 }
 

@@ -16,7 +16,8 @@ constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
 // Gaussians that one block projects.
 constexpr int kItemSize = 256;
 
-// Gaussians as rows, as users hold them (GaussianRows), on the device.
+// Gaussians as rows, as users hold them (GaussianRows), on the device. Quaternions and SH coefficients start
+// at a multiple of 16 bytes.
 struct DeviceRows {
     const float *means, *quats, *scales, *opacities, *sh;  // (N, 3), (N, 4), (N, 3), (N,), (N, bases, 3)
     int sh_degree;
@@ -38,16 +39,26 @@ struct Placement {
     uint32_t model, image;
 };
 
-// At most kItemSize neighbouring gaussians of a placed model.
+// Counted on the device. What exceeds a capacity is counted but not stored, and nothing is then drawn.
+struct FrameCounters {
+    unsigned long long items, gaussians, in_frustum, records, entries;
+};
+
+// At most kItemSize neighbouring gaussians of a placed model. There is room for their records at
+// [record, record + count); those that become one stand at its beginning, in their own order.
 struct DrawItem {
-    uint32_t placement, first, count;
+    uint32_t placement, first, count, record;
     float filter_px2;
     uint32_t compensate;
 };
 
-// Counted on the device. What exceeds a capacity is counted but not stored, and nothing is then drawn.
-struct FrameCounters {
-    unsigned long long items, gaussians, in_frustum, records, entries;
+// Where the items of a frame are written, in their order. Counts what there is, stores what there is room
+// for: counters->items, and in counters->gaussians the end of the last item's records. Items that would end
+// past record_capacity need not be stored.
+struct ItemList {
+    DrawItem* items;
+    FrameCounters* counters;
+    unsigned long long item_capacity, record_capacity;
 };
 
 // A gaussian in the list of a tile, in a word whose order is the order of blending: 26 bits of depth, the 28
@@ -92,7 +103,7 @@ struct FrameLists {
     const FrameImage* images;
     const uint32_t* image_of_tile;  // [num_tiles]
     uint32_t num_tiles;
-    const Record<float>* records;  // in the order of items and gaussians, gaussians without a record left out
+    const Record<float>* records;          // in the order of items and gaussians, with gaps between items
     const unsigned long long* tile_first;  // [num_tiles + 1] into entries
     TileEntry *entries, *scratch;          // each tile's in any order
     const FrameCounters* counters;

@@ -3,16 +3,9 @@
 #include <cstdint>
 #include <vector>
 
-#include "select/select_math.h"
+#include "select/view_math.h"
 
 namespace v3dg {
-
-// A pinhole camera in the world, in double precision.
-struct SelectCamera {
-    double rotation[9];  // world to camera, rows
-    double eye[3];
-    double fx, fy, cx, cy, width, height, near;  // px; near in world units
-};
 
 // Similarity transforms p -> scale * rotation p + position.
 struct InstanceTable {
@@ -20,12 +13,9 @@ struct InstanceTable {
     Span<const double> position;  // [I * 3]
     Span<const double> rotation;  // [I * 9] rows
     Span<const double> scale;     // [I]
-};
 
-// The camera in the frame of one instance: composed in double precision, then rounded.
-// Frustum planes lie pad_px outside the image.
-InstanceView view_from_instance(const SelectCamera& camera, const InstanceTable& instances, size_t i,
-                                double pad_px);
+    V3DG_HD Pose pose(size_t i) const { return {position.data + 3 * i, rotation.data + 9 * i, scale[i]}; }
+};
 
 // Chooses the clusters of all instances that are just detailed enough for one view: exactly one on every path
 // from a leaf to its root, when balls nest and weights never decrease towards the root.

@@ -5,59 +5,8 @@
 #include <algorithm>
 
 #include "base/parallel_for.h"
-#include "project/project_math.h"
 
 namespace v3dg {
-
-InstanceView view_from_instance(const SelectCamera& camera, const InstanceTable& instances, size_t i,
-                                double pad_px) {
-    const double* position = instances.position.data + 3 * i;
-    const double* rotation = instances.rotation.data + 9 * i;
-    const double inverse_scale = 1.0 / instances.scale[i];
-    double eye_from_origin[3], origin[3] = {0, 0, 0}, axes[9];
-    for (int a = 0; a < 3; ++a) eye_from_origin[a] = camera.eye[a] - position[a];
-
-    InstanceView view;
-    // Camera coordinates of an asset's point p, over the scale: axes p + origin.
-    for (int row = 0; row < 3; ++row) {
-        double eye = 0.0;
-        for (int k = 0; k < 3; ++k) {
-            eye += rotation[3 * k + row] * eye_from_origin[k];
-            origin[row] -= camera.rotation[3 * row + k] * eye_from_origin[k];
-            double axis = 0.0;
-            for (int j = 0; j < 3; ++j) axis += camera.rotation[3 * row + j] * rotation[3 * j + k];
-            axes[3 * row + k] = axis;
-        }
-        origin[row] *= inverse_scale;
-        // Any eye gives an exact cut as long as squares of distances stay finite.
-        view.eye[row] = static_cast<float>(std::min(std::max(eye * inverse_scale, -1e18), 1e18));
-    }
-    for (int k = 0; k < 3; ++k) view.forward[k] = static_cast<float>(axes[6 + k]);
-
-    // Outside the near plane: depth < near. Outside a side plane: sign * x > slope * z, or y for x.
-    Plane& near = view.plane[0];
-    for (int k = 0; k < 3; ++k) near.normal[k] = static_cast<float>(-axes[6 + k]);
-    near.offset = static_cast<float>(camera.near * inverse_scale - origin[2]);
-    near.guard = 0.0f;
-    for (int side = 0; side < 4; ++side) {
-        const bool is_x = side < 2;
-        const double sign = side % 2 == 0 ? 1.0 : -1.0;
-        const double focal = is_x ? camera.fx : camera.fy;
-        const double size = is_x ? camera.width : camera.height;
-        const double middle = is_x ? camera.cx : camera.cy;
-        const double edge_px = sign > 0 ? size - middle : middle;
-        const double slope = (edge_px + pad_px) / focal;
-        // The projection is linearised no farther out than this.
-        const double linearised = (edge_px + kFovMargin * size / 2) / focal;
-        const double* axis = axes + (is_x ? 0 : 3);
-        Plane& plane = view.plane[1 + side];
-        for (int k = 0; k < 3; ++k)
-            plane.normal[k] = static_cast<float>(sign * axis[k] - slope * axes[6 + k]);
-        plane.offset = static_cast<float>(sign * origin[is_x ? 0 : 1] - slope * origin[2]);
-        plane.guard = static_cast<float>(std::abs(linearised - slope));
-    }
-    return view;
-}
 
 namespace {
 
@@ -66,7 +15,7 @@ constexpr size_t kChunk = 16;
 // Appends what instance i draws. fits_group: scratch for as many groups as any bundle has.
 void select_instance(const SelectInput& in, size_t i, std::vector<uint8_t>& fits_group, SelectOutput& out) {
     const ClusterTable& table = in.bundles[in.instances.bundle[i]];
-    const InstanceView view = view_from_instance(in.camera, in.instances, i, table.pad_px);
+    const InstanceView view = view_from_instance(in.camera, in.instances.pose(i), table.pad_px);
     if (in.rule.culls && is_outside(table.bounds, view)) return;
     const bool culls = in.rule.culls && !is_inside(table.bounds, view);
     const auto draw = [&](int32_t c) {
@@ -126,7 +75,7 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
 void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric) {
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
         const ClusterTable& table = in.bundles[in.instances.bundle[i]];
-        const InstanceView view = view_from_instance(in.camera, in.instances, i, table.pad_px);
+        const InstanceView view = view_from_instance(in.camera, in.instances.pose(i), table.pad_px);
         for (size_t g = 0; g < table.ball.size; ++g)
             metric[metric_offset[i] + g] = metric_px2(table, static_cast<int32_t>(g), view, in.rule);
     });

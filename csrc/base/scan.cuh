@@ -1,0 +1,77 @@
+#pragma once
+
+// Prefix sums: of a block's threads, and of parts that any number of blocks take in turn.
+
+#include "base/launch.cuh"
+
+namespace v3dg {
+namespace cuda {
+
+// Sum of x over the threads before this one; `total` is that of all. For every thread of a block of whole
+// warps.
+template <class T>
+__device__ inline T block_prefix(T x, T& total) {
+    __shared__ T warp_total[32];
+    const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    T sum = x;
+#pragma unroll
+    for (unsigned offset = 1; offset < 32; offset *= 2) {
+        const T below = __shfl_up_sync(kAllLanes, sum, offset);
+        if (lane >= offset) sum += below;
+    }
+    if (lane == 31) warp_total[warp] = sum;
+    __syncthreads();
+    T before = 0;
+    total = 0;
+    for (unsigned w = 0; w < blockDim.x / 32; ++w) {
+        if (w < warp) before += warp_total[w];
+        total += warp_total[w];
+    }
+    __syncthreads();  // the next call may write again
+    return before + sum - x;
+}
+
+// The next number of a counter that starts at 0, the same for the whole block.
+__device__ inline unsigned take_ticket(unsigned* counter) {
+    __shared__ unsigned ticket;
+    if (threadIdx.x == 0) ticket = atomicAdd(counter, 1u);
+    __syncthreads();
+    const unsigned taken = ticket;
+    __syncthreads();
+    return taken;
+}
+
+// Sum of the parts before `part`, whose own is `sum` (below 2^62); for a whole warp, once a part. `state` is
+// zero at first, a word a part. Parts must be begun in ascending order: take them by ticket.
+//
+// Source: Merrill and Garland, Single-pass Parallel Prefix Scan with Decoupled Look-back, 2016.
+__device__ inline unsigned long long prefix_of_part(unsigned long long* state, size_t part,
+                                                    unsigned long long sum) {
+    constexpr unsigned long long kOwn = 1ull << 62, kAll = 2ull << 62, kValue = kOwn - 1;
+    volatile unsigned long long* word = state;
+    const unsigned lane = threadIdx.x % 32;
+    if (part == 0) {
+        if (lane == 0) word[0] = kAll | sum;
+        return 0;
+    }
+    if (lane == 0) word[part] = kOwn | sum;
+    unsigned long long before = 0;
+    for (size_t end = part;; end -= 32) {
+        unsigned long long seen = kAll;  // before the first part is nothing
+        if (lane < end) do {
+                seen = word[end - 1 - lane];
+            } while (seen < kOwn);
+        // What ends at the nearest part with a sum of all before it.
+        const unsigned is_all = __ballot_sync(kAllLanes, seen >= kAll);
+        unsigned long long x = is_all == 0 || lane < unsigned(__ffs(is_all)) ? seen & kValue : 0;
+#pragma unroll
+        for (int offset = 16; offset > 0; offset /= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
+        before += x;
+        if (is_all != 0) break;
+    }
+    if (lane == 0) word[part] = kAll | (before + sum);
+    return before;
+}
+
+}  // namespace cuda
+}  // namespace v3dg
