@@ -150,6 +150,53 @@ def render_selection(
     with_depth: bool,
 ) -> tuple[Float32, Float32, Float32, dict[str, Any]]: ...
 
+# frame, with CUDA only; arrays on the device are whatever has __cuda_array_interface__
+class Drawing:
+    """A frame that has been enqueued on a device."""
+
+    def finish(self) -> dict[str, Any]: ...
+
+class SceneFrame:
+    """Draws a scene that stays on a device. A bundle is (rows, filter_px2, antialiased)."""
+
+    def __init__(
+        self,
+        bundles: list[tuple[tuple[Any, ...], Float32, NDArray[np.uint8]]],
+        tables: list[ClusterTable],
+        instance_bundle: NDArray[np.int32],
+        positions: NDArray[np.float64],
+        rotations: NDArray[np.float64],
+        scales: NDArray[np.float64],
+        stream: int,
+    ) -> None: ...
+    def draw(
+        self,
+        viewmat: NDArray[np.float64],
+        eye: NDArray[np.float64],
+        K: NDArray[np.float64],
+        near: float,
+        tolerance: float,
+        background: Sequence[float],
+        picture: tuple[Any, Any, Any],
+        stream: int,
+    ) -> Drawing: ...
+
+class ModelFrame:
+    """Draws all gaussians of arrays on a device."""
+
+    def __init__(self) -> None: ...
+    def draw(
+        self,
+        gaussians: tuple[Any, ...],
+        view: Sequence[float] | NDArray[np.float64],
+        filter_px2: float,
+        compensate: bool,
+        intrinsics: Sequence[float],
+        background: Sequence[float],
+        picture: tuple[Any, Any, Any],
+        stream: int,
+    ) -> Drawing: ...
+
 # simplify_init
 def prune(
     means: NDArray[Any],

@@ -64,5 +64,6 @@ void bind_ply(py::module_& m);
 void bind_render(py::module_& m);
 void bind_fit_level(py::module_& m);
 void bind_loss(py::module_& m);
+void bind_frame(py::module_& m);  // nothing without CUDA
 
 }  // namespace v3dg

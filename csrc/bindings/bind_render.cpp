@@ -1,7 +1,7 @@
 #include <memory>
 #include <mutex>
 
-#include "bindings/args.h"
+#include "bindings/render_args.h"
 #include "pipeline/model.h"
 #include "pipeline/render.h"
 
@@ -15,35 +15,13 @@ static std::shared_ptr<Model<T>> make_model(const py::array& means, const py::ar
                                             const py::array& sh) {
     const py::ssize_t n = opacities.ndim() == 1 ? opacities.shape(0) : -1;
     const py::ssize_t bases = sh.ndim() == 3 ? sh.shape(1) : -1;
-    int degree = 0;
-    while (degree <= 3 && num_sh_bases(degree) != bases) ++degree;
-    if (degree > 3)
-        throw py::value_error("sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got " + shape_text(sh));
+    const int degree = degree_of_bases(bases, shape_text(sh));
     const GaussianRows<T> rows{
         span_of<const T>(means, "means", {n, 3}),   span_of<const T>(quats, "quats", {n, 4}),
         span_of<const T>(scales, "scales", {n, 3}), span_of<const T>(opacities, "opacities", {n}),
         span_of<const T>(sh, "sh", {n, bases, 3}),  degree};
     py::gil_scoped_release unlocked;
     return std::make_shared<Model<T>>(rows);
-}
-
-// (fx, fy, cx, cy, near) and the image's size.
-template <class T>
-static Pinhole<T> pinhole_of(const std::array<double, 5>& k, int width, int height) {
-    if (width < 1 || height < 1 || width > UINT16_MAX || height > UINT16_MAX)
-        throw py::value_error("width, height: expected 1 to 65535 px, got " + std::to_string(width) + " x " +
-                              std::to_string(height));
-    return {T(k[0]), T(k[1]), T(k[2]), T(k[3]), T(width), T(height), T(k[4])};
-}
-
-// 15 numbers: the linear part of model -> view row by row, its translation, the eye in the model's frame.
-template <class T>
-static ModelView<T> view_of(const double* v) {
-    ModelView<T> mv;
-    for (int i = 0; i < 9; ++i) mv.linear[i] = T(v[i]);
-    for (int i = 0; i < 3; ++i) mv.translation[i] = T(v[9 + i]);
-    for (int i = 0; i < 3; ++i) mv.eye[i] = T(v[12 + i]);
-    return mv;
 }
 
 template <class T>

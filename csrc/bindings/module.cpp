@@ -17,4 +17,5 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_render(m);
     v3dg::bind_fit_level(m);
     v3dg::bind_loss(m);
+    v3dg::bind_frame(m);
 }

@@ -145,6 +145,14 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
            (half_x < huge) & (half_y < huge);
 }
 
+// No less than either half of extent_of() on the axis whose focal length and slope are passed, for a gaussian
+// whose largest standard deviation is `sigma` in view space.
+template <class T>
+V3DG_HD V3DG_INLINE T extent_bound(T opacity, T sigma, T focal_over_z, T slope, T filter_px2) {
+    const T reach = log2_of(opacity) - T(kLog2MinAlpha), along = focal_over_z * sigma;
+    return T(1.001 / kFalloffScale) * sqrt_of(reach * (along * along * (1 + slope * slope) + filter_px2));
+}
+
 // Whether what reaches `half` from `center` meets (0, size).
 template <class V>
 V3DG_HD V3DG_INLINE auto meets_image(V center, V half, Lane<V> size) {

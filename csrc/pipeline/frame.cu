@@ -1,0 +1,234 @@
+#include "pipeline/frame.h"
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+namespace v3dg {
+namespace cuda {
+
+// What a frame counts, cleared before it and copied to the host after it.
+struct Frame::State {
+    FrameCounters counters;
+    unsigned long long num_large;
+    unsigned long long ticket;
+};
+
+// What the host keeps of a frame in flight.
+struct Frame::Slot {
+    State* state = nullptr;  // pinned
+    cudaEvent_t begun = nullptr, prepared = nullptr, done = nullptr;
+
+    Slot() {
+        check(cudaMallocHost(reinterpret_cast<void**>(&state), sizeof *state), "cudaMallocHost");
+        *state = State{};
+        for (cudaEvent_t* event : {&begun, &prepared, &done})
+            check(cudaEventCreate(event), "cudaEventCreate");
+    }
+    ~Slot() {
+        // At exit the driver may be gone before us.
+        for (const cudaEvent_t event : {begun, prepared, done})
+            if (event != nullptr) cudaEventDestroy(event);
+        cudaFreeHost(state);
+        cudaGetLastError();
+    }
+};
+
+static bool is_capturing(cudaStream_t stream) {
+    cudaStreamCaptureStatus status;
+    check(cudaStreamIsCapturing(stream, &status), "cudaStreamIsCapturing");
+    return status != cudaStreamCaptureStatusNone;
+}
+
+// So many frames can be in flight, or be captured, without a new slot.
+constexpr size_t kSlots = 8;
+
+Frame::Frame(Keeps keeps) : keeps_(keeps) {
+    for (size_t i = 0; i < kSlots; ++i) slots_.push_back(std::make_unique<Slot>());
+    for (const auto& slot : slots_) free_slots_.push_back(slot.get());
+    check(cudaEventCreateWithFlags(&last_done_, cudaEventDisableTiming), "cudaEventCreate");
+}
+
+Frame::~Frame() {
+    if (cudaEventDestroy(last_done_) != cudaSuccess) cudaGetLastError();
+}
+
+template <class T>
+T* Frame::room(DeviceBuffer<T>& buffer, size_t size, cudaStream_t stream) {
+    if (size <= buffer.capacity()) return buffer.reserve(size, stream);
+    if (is_capturing(stream))
+        throw std::runtime_error(
+            "frame: no memory can be had while a graph is captured; draw as much once before");
+    if (was_captured_ && buffer.data() != nullptr) {
+        retired_.push_back(std::make_shared<DeviceBuffer<T>>(std::move(buffer)));
+    }
+    return buffer.reserve(size, stream);
+}
+
+Frame::Slot* Frame::take_slot(bool capturing) {
+    // The oldest is the first to be over. A capture may not ask; nobody draws beside one.
+    const bool waits =
+        !free_slots_.empty() && !capturing && cudaEventQuery(free_slots_.front()->done) != cudaSuccess;
+    if (free_slots_.empty() || waits) {
+        cudaGetLastError();
+        if (capturing)
+            throw std::runtime_error("frame: expected at most " + std::to_string(kSlots) +
+                                     " frames in flight or captured");
+        slots_.push_back(std::make_unique<Slot>());
+        return slots_.back().get();
+    }
+    Slot* slot = free_slots_.front();
+    free_slots_.pop_front();
+    return slot;
+}
+
+void Frame::enlarge(const State& s) {
+    if (s.counters.gaussians > kMostFrameRecords)
+        throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
+                                " in one frame, got " + std::to_string(s.counters.gaussians));
+    // Some more, so that a camera on its way does not need a little more every frame.
+    const auto grow = [](size_t& capacity, unsigned long long count) {
+        if (count > capacity) capacity = static_cast<size_t>(count + count / 8);
+    };
+    grow(capacity_.items, s.counters.items);
+    grow(capacity_.records, s.counters.gaussians);
+    grow(capacity_.large, s.num_large);
+    grow(capacity_.entries, s.counters.entries);
+    capacity_.records = std::min<size_t>(capacity_.records, kMostFrameRecords);
+}
+
+std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream) {
+    std::unique_ptr<Drawing> drawing(new Drawing(*this, batch, std::move(prepare), stream));
+    drawing->is_captured_ = is_capturing(stream);
+    was_captured_ = was_captured_ || drawing->is_captured_;
+    drawing->slot_ = take_slot(drawing->is_captured_);
+    // If the frame before is over and was too large, this one is likely to be, too.
+    if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
+        const cudaError_t over = cudaEventQuery(last_->slot_->done);
+        if (over == cudaSuccess && !last_->was_drawn()) enlarge(*last_->slot_->state);
+        if (over != cudaSuccess && over != cudaErrorNotReady) check(over, "a frame");
+    }
+    enqueue(*drawing);
+    last_ = drawing.get();
+    return drawing;
+}
+
+void Frame::enqueue(Drawing& drawing) {
+    const cudaStream_t stream = drawing.stream_;
+    const FrameBatch& batch = drawing.batch_;
+    const Slot& slot = *drawing.slot_;
+    const bool capturing = drawing.is_captured_;
+    const Capacity& capacity = drawing.capacity_ = capacity_;
+    if (!capturing && stream != last_stream_)
+        check(cudaStreamWaitEvent(stream, last_done_, 0), "cudaStreamWaitEvent");
+
+    const size_t parts = tile_bin_parts(batch.num_tiles);
+    const size_t cleared_bytes =
+        sizeof(State) + parts * sizeof(unsigned long long) + batch.num_tiles * sizeof(uint32_t);
+    unsigned char* cleared = room(cleared_, cleared_bytes, stream);
+    State* state = reinterpret_cast<State*>(cleared);
+    auto* scan_state = reinterpret_cast<unsigned long long*>(cleared + sizeof(State));
+    const TileCounts tiles{reinterpret_cast<uint32_t*>(scan_state + parts), &state->num_large,
+                           reinterpret_cast<unsigned*>(&state->ticket), scan_state};
+    const ItemList items{room(items_, capacity.items, stream), &state->counters, capacity.items,
+                         capacity.records};
+    Record<float>* records = room(records_, capacity.records, stream);
+    uint32_t* item_records = room(item_records_, capacity.items, stream);
+    LargeRecord* large = room(large_, capacity.large, stream);
+    TileEntry* entries = room(entries_, capacity.entries, stream);
+    TileEntry* scratch = room(scratch_, capacity.entries, stream);
+    const bool keeps_tape = keeps_ == Keeps::tape;
+    uint32_t* source = keeps_tape ? room(source_, capacity.records, stream) : nullptr;
+    const TileBinOutput bins{room(tile_first_, batch.num_tiles + 1, stream),
+                             room(cursor_, batch.num_tiles, stream),
+                             room(image_of_tile_, batch.num_tiles, stream), entries};
+
+    if (!capturing) check(cudaEventRecord(slot.begun, stream), "cudaEventRecord");
+    check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
+    drawing.prepare_(items, stream);
+    if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
+    project({batch.models, batch.placements, batch.images, items},
+            {records, item_records, source, tiles, large, capacity.large}, stream);
+    tile_bin({batch.placements, items.items, item_records, records, batch.images, batch.num_images,
+              batch.num_tiles, capacity.items, capacity.records, capacity.large, capacity.entries, large,
+              tiles, &state->counters},
+             bins, stream);
+    const FrameLists lists{
+        batch.images, bins.image_of_tile, batch.num_tiles,  records,         bins.tile_first, entries,
+        scratch,      &state->counters,   capacity.records, capacity.entries};
+    const RasterTape tape{keeps_tape ? room(order_, capacity.entries, stream) : nullptr,
+                          keeps_tape ? room(blended_, batch.num_tiles, stream) : nullptr};
+    rasterize(lists, keeps_tape ? &tape : nullptr, stream);
+    check(cudaMemcpyAsync(slot.state, state, sizeof *state, cudaMemcpyDeviceToHost, stream),
+          "cudaMemcpyAsync to the host");
+    if (!capturing) {
+        check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
+        check(cudaEventRecord(last_done_, stream), "cudaEventRecord");
+    }
+    last_stream_ = stream;
+    last_batch_ = batch;
+}
+
+FrameTape Frame::tape() const {
+    const FrameLists lists{last_batch_.images,    image_of_tile_.data(),
+                           last_batch_.num_tiles, records_.data(),
+                           tile_first_.data(),    entries_.data(),
+                           scratch_.data(),       &reinterpret_cast<const State*>(cleared_.data())->counters,
+                           capacity_.records,     capacity_.entries};
+    return {lists,
+            {order_.data(), blended_.data()},
+            last_batch_.models,
+            last_batch_.placements,
+            items_.data(),
+            item_records_.data(),
+            source_.data()};
+}
+
+Drawing::Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, cudaStream_t stream)
+    : frame_(frame), batch_(batch), prepare_(std::move(prepare)), stream_(stream) {}
+
+Drawing::~Drawing() {
+    if (frame_.last_ == this) frame_.last_ = nullptr;
+    // A graph goes on writing to its slot.
+    if (slot_ != nullptr && !is_captured_) frame_.free_slots_.push_back(slot_);
+}
+
+bool Drawing::was_drawn() const {
+    const Frame::State& s = *slot_->state;
+    return s.counters.items <= capacity_.items && s.counters.gaussians <= capacity_.records &&
+           s.num_large <= capacity_.large && s.counters.entries <= capacity_.entries;
+}
+
+void Drawing::wait() const {
+    if (!is_captured_) check(cudaEventSynchronize(slot_->done), "a frame");
+}
+
+const FrameCounters& Drawing::finish() {
+    if (is_captured_) {
+        if (!was_drawn())
+            throw std::runtime_error(
+                "frame: a captured graph met more than it has room for; draw once outside of the capture "
+                "what it "
+                "will meet, and capture it again");
+        return slot_->state->counters;
+    }
+    while (!is_finished_) {
+        wait();
+        is_finished_ = was_drawn();
+        if (is_finished_) break;
+        frame_.enlarge(*slot_->state);
+        frame_.enqueue(*this);
+    }
+    return slot_->state->counters;
+}
+
+FrameTimes Drawing::times() const {
+    FrameTimes times{0.0f, 0.0f};
+    if (is_captured_) return times;
+    check(cudaEventElapsedTime(&times.prepare_ms, slot_->begun, slot_->prepared), "cudaEventElapsedTime");
+    check(cudaEventElapsedTime(&times.draw_ms, slot_->prepared, slot_->done), "cudaEventElapsedTime");
+    return times;
+}
+
+}  // namespace cuda
+}  // namespace v3dg

@@ -1,0 +1,134 @@
+#pragma once
+
+#include <deque>
+#include <functional>
+#include <memory>
+#include <vector>
+
+#include "base/device.h"
+#include "pipeline/frame_types.h"
+#include "project/project_cuda.h"
+#include "rasterize/rasterize_cuda.h"
+#include "tile_bin/tile_bin_cuda.h"
+
+namespace v3dg {
+namespace cuda {
+
+// What a frame draws; device memory that stays as it is until the frame is drawn.
+struct FrameBatch {
+    const DeviceRows* models;
+    const Placement* placements;
+    const FrameImage* images;
+    uint32_t num_images, num_tiles;  // of all images together
+};
+
+// What a frame leaves for the way back, valid until the next is drawn.
+struct FrameTape {
+    FrameLists lists;
+    RasterTape raster;
+    const DeviceRows* models;
+    const Placement* placements;
+    const DrawItem* items;         // counters->items
+    const uint32_t* item_records;  // how many of an item's gaussians became records
+    const uint32_t* source;        // of each record, its gaussian's place in the model
+};
+
+struct FrameTimes {
+    float prepare_ms, draw_ms;
+};
+
+class Drawing;
+
+// Draws batches of pictures: project, bin, blend. Keeps its buffers from frame to frame.
+//
+// Counts stay on the device, so drawing waits for nothing. A frame that found a buffer too small draws
+// nothing; finish() of its Drawing sees that, enlarges the buffer and draws it again, so look at pictures
+// after finish(). Frames may be enqueued on any streams, one after the other.
+class Frame {
+  public:
+    enum class Keeps { nothing, tape };
+
+    explicit Frame(Keeps keeps = Keeps::nothing);
+    ~Frame();
+    Frame(const Frame&) = delete;
+    Frame& operator=(const Frame&) = delete;
+
+    // Enqueues what writes the batch's items, and its tables where they are not there yet. Called again when
+    // a frame is drawn again. The counters are zero before.
+    using Prepare = std::function<void(const ItemList& items, cudaStream_t stream)>;
+
+    // Enqueues a frame. While `stream` captures a graph nothing is allocated: draw as much once before. The
+    // frame's buffers then live as long as this object.
+    std::unique_ptr<Drawing> draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream);
+
+    // Of the last frame that was drawn; needs Keeps::tape.
+    FrameTape tape() const;
+
+  private:
+    friend class Drawing;
+    struct Slot;
+    struct State;
+    // Elements that the buffers have room for.
+    struct Capacity {
+        size_t items = 64, records = 4096, large = 4096, entries = 4096;
+    };
+
+    void enqueue(Drawing& drawing);
+    void enlarge(const State& state);
+    Slot* take_slot(bool capturing);
+    template <class T>
+    T* room(DeviceBuffer<T>& buffer, size_t size, cudaStream_t stream);
+
+    const Keeps keeps_;
+    Capacity capacity_;
+    DeviceBuffer<DrawItem> items_;
+    DeviceBuffer<uint32_t> item_records_, source_, image_of_tile_, order_, blended_;
+    DeviceBuffer<Record<float>> records_;
+    DeviceBuffer<LargeRecord> large_;
+    DeviceBuffer<TileEntry> entries_, scratch_;
+    DeviceBuffer<unsigned long long> tile_first_, cursor_;
+    DeviceBuffer<unsigned char> cleared_;  // State, states of the scan, counts of the tiles
+
+    std::vector<std::unique_ptr<Slot>> slots_;
+    std::deque<Slot*> free_slots_;                // their frames may not be over yet
+    std::vector<std::shared_ptr<void>> retired_;  // buffers that captured graphs still use
+    bool was_captured_ = false;
+    Drawing* last_ = nullptr;
+    FrameBatch last_batch_{};
+    cudaStream_t last_stream_ = nullptr;
+    cudaEvent_t last_done_ = nullptr;
+};
+
+// A frame that has been enqueued. The Frame must outlive it.
+class Drawing {
+  public:
+    ~Drawing();
+    Drawing(const Drawing&) = delete;
+    Drawing& operator=(const Drawing&) = delete;
+
+    // Waits until the device is done with it; finish() may draw it again.
+    void wait() const;
+    // Waits until the pictures are drawn, drawing again if a buffer was too small. Throws OutOfMemory, or
+    // std::length_error past kMostFrameRecords.
+    //
+    // Of a captured frame: of its last replay, which must be over; throws std::runtime_error if a buffer was
+    // too small.
+    const FrameCounters& finish();
+    FrameTimes times() const;
+
+  private:
+    friend class Frame;
+    Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, cudaStream_t stream);
+    bool was_drawn() const;
+
+    Frame& frame_;
+    FrameBatch batch_;
+    Frame::Prepare prepare_;
+    cudaStream_t stream_;
+    Frame::Slot* slot_ = nullptr;
+    Frame::Capacity capacity_;  // that it was drawn with
+    bool is_captured_ = false, is_finished_ = false;
+};
+
+}  // namespace cuda
+}  // namespace v3dg

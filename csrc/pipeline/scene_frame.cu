@@ -1,0 +1,84 @@
+#include "pipeline/scene_frame.h"
+
+#include <algorithm>
+
+#include "base/launch.cuh"
+
+namespace v3dg {
+namespace cuda {
+
+FrameImage frame_image(const Pinhole<float>& camera, int width, int height, const float background[3],
+                       float* color, float* alpha, float* depth) {
+    return {camera,
+            width,
+            height,
+            (width + kFrameTileWidth - 1) / kFrameTileWidth,
+            (height + kFrameTileHeight - 1) / kFrameTileHeight,
+            0,
+            {background[0], background[1], background[2]},
+            color,
+            alpha,
+            depth};
+}
+
+static uint32_t num_tiles(const FrameImage& image) {
+    return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
+}
+
+SceneFrame::SceneFrame(Span<const DeviceRows> models, Span<const ClusterTable> tables,
+                       Span<const ClusterFilters> filters, const InstanceTable& instances,
+                       cudaStream_t stream)
+    : models_(models, stream),
+      tables_(tables, filters, instances, stream),
+      placements_(instances.scale.size, stream),
+      images_(1, stream) {}
+
+std::unique_ptr<Drawing> SceneFrame::draw(const SelectCamera& camera, const SelectRule& rule,
+                                          const FrameImage& image, cudaStream_t stream) {
+    const FrameBatch batch{models_.data(), placements_.data(), images_.data(), 1, num_tiles(image)};
+    return frame_.draw(
+        batch,
+        [this, camera, rule, image](const ItemList& items, cudaStream_t on) {
+            tables_.cut_items(camera, rule, image, images_.data(), placements_.data(), items, on);
+        },
+        stream);
+}
+
+constexpr unsigned kModelThreads = 128;
+
+// A thread an item.
+static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, unsigned long long count,
+                                    float filter_px2, bool compensate, ItemList items) {
+    const unsigned long long i = blockIdx.x * static_cast<unsigned long long>(blockDim.x) + threadIdx.x;
+    const unsigned long long first = i * kItemSize;
+    if (i == 0) {
+        *on_device = tables;
+        items.counters->items = (count + kItemSize - 1) / kItemSize;
+        items.counters->gaussians = count;
+    }
+    if (first >= count || i >= items.item_capacity || count > items.record_capacity) return;
+    const uint32_t at = static_cast<uint32_t>(first);
+    const uint32_t size =
+        static_cast<uint32_t>(min(static_cast<unsigned long long>(kItemSize), count - first));
+    items.items[i] = {0, at, size, at, filter_px2, compensate};
+}
+
+std::unique_ptr<Drawing> ModelFrame::draw(const DeviceRows& rows, size_t count, const ModelView<float>& view,
+                                          float filter_px2, bool compensate, const FrameImage& image,
+                                          cudaStream_t stream) {
+    if (tables_.data() == nullptr) tables_.reserve(1, stream);
+    ModelTables* on_device = tables_.data();
+    const ModelTables tables{rows, {view, 0, 0}, image};
+    const FrameBatch batch{&on_device->rows, &on_device->placement, &on_device->image, 1, num_tiles(image)};
+    const unsigned blocks = std::max(1u, blocks_for(blocks_for(count, kItemSize), kModelThreads));
+    return frame_.draw(
+        batch,
+        [=](const ItemList& items, cudaStream_t on) {
+            launch("model_kernel", model_kernel, blocks, kModelThreads, 0, on, tables, on_device, count,
+                   filter_px2, compensate, items);
+        },
+        stream);
+}
+
+}  // namespace cuda
+}  // namespace v3dg

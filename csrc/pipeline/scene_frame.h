@@ -1,0 +1,56 @@
+#pragma once
+
+#include "pipeline/frame.h"
+#include "select/select_cuda.h"
+
+namespace v3dg {
+namespace cuda {
+
+// The only picture of a frame; `first_tile` and the tiles are filled in.
+FrameImage frame_image(const Pinhole<float>& camera, int width, int height, const float background[3],
+                       float* color, float* alpha, float* depth);
+
+// Draws a scene that stays on the device: selects, then draws the cut.
+class SceneFrame {
+  public:
+    // `models` are the gaussians of each bundle, which stay where they are. Other memory may be reused on
+    // return.
+    SceneFrame(Span<const DeviceRows> models, Span<const ClusterTable> tables,
+               Span<const ClusterFilters> filters, const InstanceTable& instances, cudaStream_t stream);
+
+    std::unique_ptr<Drawing> draw(const SelectCamera& camera, const SelectRule& rule, const FrameImage& image,
+                                  cudaStream_t stream);
+
+  private:
+    DeviceBuffer<DeviceRows> models_;
+    SceneTables tables_;
+    DeviceBuffer<Placement> placements_;
+    DeviceBuffer<FrameImage> images_;
+    Frame frame_;
+};
+
+// One model in front of one camera.
+struct ModelTables {
+    DeviceRows rows;
+    Placement placement;
+    FrameImage image;
+};
+
+// Draws all gaussians of one model.
+class ModelFrame {
+  public:
+    explicit ModelFrame(Frame::Keeps keeps = Frame::Keeps::nothing) : frame_(keeps) {}
+
+    // The rows stay where they are until the drawing is finished.
+    std::unique_ptr<Drawing> draw(const DeviceRows& rows, size_t count, const ModelView<float>& view,
+                                  float filter_px2, bool compensate, const FrameImage& image,
+                                  cudaStream_t stream);
+    FrameTape tape() const { return frame_.tape(); }
+
+  private:
+    DeviceBuffer<ModelTables> tables_;
+    Frame frame_;
+};
+
+}  // namespace cuda
+}  // namespace v3dg

@@ -1,0 +1,31 @@
+#pragma once
+
+#include "pipeline/frame_types.h"
+#include "tile_bin/tile_bin_cuda.h"
+
+namespace v3dg {
+namespace cuda {
+
+struct ProjectInput {
+    const DeviceRows* models;
+    const Placement* placements;
+    const FrameImage* images;
+    ItemList items;  // in the counters: sets in_frustum and records, which start at 0
+};
+
+struct ProjectOutput {
+    Record<float>* records;
+    uint32_t* item_records;  // [items] how many of an item's gaussians became records
+    uint32_t* source;        // of each record, its gaussian's place in the model; may be null
+    TileCounts tiles;
+    LargeRecord* large;
+    unsigned long long large_capacity;
+};
+
+// As v3dg::project, for all items of a frame: writes a record, in the order of items and gaussians, for each
+// gaussian that reaches a pixel centre, and counts into the tiles that it touches. Does nothing when the
+// items are over a capacity.
+void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream);
+
+}  // namespace cuda
+}  // namespace v3dg
