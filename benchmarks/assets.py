@@ -1,4 +1,4 @@
-"""Large assets, made of copies of a small one."""
+"""Assets to measure with: many copies of a small one, and random gaussians that look trained."""
 
 from __future__ import annotations
 
@@ -37,3 +37,43 @@ def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3d
             )
         )
     return v3dg.Gaussians.concatenate(copies)
+
+
+def like_trained(
+    count: int, camera: v3dg.Camera, device: str, *, sh_degree: int = 0, seed: int = 0
+) -> v3dg.Gaussians:
+    """Random gaussians before a camera with the sizes, shapes and opacities that training leaves, as tensors.
+
+    The distributions are fitted to a trained asset: logs of sizes are normal with deviation 1, logs of the
+    ratios of neighbouring axes are gamma of shape 3 (median ratios 3 and 4), logits of opacities are normal.
+    Training spends gaussians where they show, so sizes on screen do not depend on depth: the longest axis has
+    a median of 2 px (the middle one 0.7 px), and one in a thousand passes 40 px. Depths are log-uniform over
+    a factor of 20, places uniform on the image and a little beyond it.
+    """
+    import torch
+
+    generator = torch.Generator(device).manual_seed(seed)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator, device=device)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, device=device)
+
+    depth = 2 * 20 ** uniform(count, 1)
+    tangent = torch.tensor([camera.width / camera.fx, camera.height / camera.fy], device=device) / 2
+    view = torch.cat([1.1 * tangent * (2 * uniform(count, 2) - 1) * depth, depth], 1)
+    rotation = torch.as_tensor(camera.viewmat[:3, :3], dtype=torch.float32, device=device)
+    eye = torch.as_tensor(camera.position, dtype=torch.float32, device=device)
+
+    longest = 2 * torch.exp(normal(count, 1)) * depth / camera.fx
+    ratios = torch.exp(-torch.tensor([0.4, 0.5], device=device) * -uniform(count, 3, 2).log().sum(1))
+    middle = longest * ratios[:, :1]
+    sh = torch.cat([uniform(count, 1, 3) * 3.4 - 1.7, 0.2 * normal(count, (sh_degree + 1) ** 2 - 1, 3)], 1)
+    return v3dg.Gaussians(
+        means=view @ rotation + eye,
+        quats=normal(count, 4),
+        scales=torch.cat([longest, middle, middle * ratios[:, 1:]], 1),
+        opacities=torch.sigmoid(0.6 + 2.3 * normal(count)),
+        sh=sh,
+    )

@@ -27,17 +27,17 @@ class Config:
     output: str | None = None
 
 
-def camera_that_fills(gaussians: v3dg.Gaussians, size: int) -> Camera:
-    """Look at the asset from above its front, so that it fills a square picture."""
+def camera_that_fills(gaussians: v3dg.Gaussians, width: int, height: int) -> Camera:
+    """Look at the asset from above its front, so that it fills a picture."""
     low, high = np.quantile(gaussians.means, [0.01, 0.99], axis=0)
     center, extent = (low + high) / 2, np.linalg.norm(high - low)
     eye = center + extent * np.array([0.0, -0.42, 0.7])
-    return Camera.look_at(eye, center, (0.0, 0.0, 1.0), fov_x=0.785, width=size, height=size)
+    return Camera.look_at(eye, center, (0.0, 0.0, 1.0), fov_x=0.785, width=width, height=height)
 
 
 def main(config: Config) -> None:
     gaussians = make_asset() if config.asset is None else v3dg.load(config.asset)
-    camera = camera_that_fills(gaussians, config.size)
+    camera = camera_that_fills(gaussians, config.size, config.size)
     options = (
         view_of_world(camera),
         0.0,

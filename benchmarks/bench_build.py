@@ -1,0 +1,154 @@
+"""Build bundles: seconds and GPU memory on each device, beside the error of the picture that they give.
+
+Parts: "default" and "paper" build the asset with our settings and the paper's; "split" orders the points of
+many copies of it, and "large" builds them as one asset. With a layout of instances and its true picture, the
+first two are also drawn at several numbers of gaussians in the frustum.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import gpu
+import numpy as np
+import record
+import torch
+import tyro
+from assets import many_copies
+from PIL import Image
+
+import v3dg
+from v3dg import _operations, metrics
+from v3dg.build import BuildConfig, build_bundle
+from v3dg.bundle import Bundle
+from v3dg.procedural import make_asset
+from v3dg.scene import read_scene
+
+Part = Literal["default", "paper", "split", "large"]
+
+
+@dataclass
+class Config:
+    parts: tuple[Part, ...] = ("default", "paper", "split", "large")
+    devices: tuple[str, ...] = ("cuda",)
+    """"cpu" too: patience for "large"."""
+    asset: Path | None = None
+    """A .ply file; by default the procedural asset."""
+    copies: int = 285
+    """Of the asset, in "split" and "large"; 285 donuts are 13 million gaussians."""
+    layout: Path | None = None
+    """A layout of instances of that asset."""
+    truth: Path | None = None
+    """The true picture of its camera."""
+    camera: int = 59
+    in_frustum: tuple[float, ...] = (2.9e6, 5.7e6, 11.5e6, 22.9e6)
+    """How many gaussians to draw; the tolerance is searched."""
+    repeats: int = 3
+    output: str | None = None
+
+
+def main(config: Config) -> None:
+    asset = make_asset() if config.asset is None else v3dg.load(config.asset)
+    rows = []
+    for part in config.parts:
+        for device in config.devices:
+            if part == "split":
+                row = split(many_copies(asset, config.copies).means, device, config.repeats)
+            elif part == "large":
+                row, _ = build(many_copies(asset, config.copies), BuildConfig(), device, 1)
+            else:
+                settings = BuildConfig.paper() if part == "paper" else BuildConfig()
+                row, bundle = build(asset, settings, device, config.repeats)
+                row["pictures"] = pictures(bundle, config)
+            row = {"part": part, "device": device, **row}
+            print(row, flush=True)
+            rows.append(row)
+    record.write(config.output, {**gpu.machine(), "asset_gaussians": len(asset), "results": rows})
+
+
+def build(
+    asset: v3dg.Gaussians, settings: BuildConfig, device: str, repeats: int
+) -> tuple[dict[str, Any], Bundle]:
+    """Median over the repeats; the first run of a process also loads the kernels, so there is one more."""
+    seconds = []
+    with gpu.PeakMemory() as peak:
+        for _ in range(repeats + (repeats > 1)):
+            start = time.perf_counter()
+            bundle = build_bundle(asset, config=settings, progress=False, device=device)
+            seconds.append(time.perf_counter() - start)
+    row = {
+        "gaussians": len(asset),
+        "first_seconds": round(seconds[0], 3),
+        "seconds": round(float(np.median(seconds[1:] or seconds)), 3),
+        "peak_gigabytes": round(peak.gigabytes, 2),
+        "levels": bundle.num_levels,
+        "mean_error": [round(float(e), 5) for e in bundle.groups.error.mean(axis=0)],
+    }
+    return row, bundle
+
+
+def split(means: Any, device: str, repeats: int) -> dict[str, Any]:
+    points = torch.from_numpy(means).to(gpu.DEVICE) if device == "cuda" else means
+    seconds = []
+    with gpu.PeakMemory() as peak:
+        for _ in range(repeats + 1):
+            torch.cuda.synchronize()
+            start = time.perf_counter()
+            order, offset = _operations.median_split(points, BuildConfig().cluster_size)
+            torch.cuda.synchronize()
+            seconds.append(time.perf_counter() - start)
+    expected, expected_offset = _operations.median_split(means, BuildConfig().cluster_size)
+    return {
+        "points": len(means),
+        "seconds": round(float(np.median(seconds[1:])), 4),
+        "peak_gigabytes": round(peak.gigabytes, 2),
+        "same_as_cpu": bool(
+            np.array_equal(torch.as_tensor(order).cpu().numpy(), expected)
+            and np.array_equal(offset, expected_offset)
+        ),
+    }
+
+
+def pictures(bundle: Bundle, config: Config) -> list[dict[str, Any]]:
+    """FLIP and PSNR of the layout from this bundle, by the number of gaussians in the frustum."""
+    if config.layout is None or config.truth is None:
+        return []
+    name = json.loads(config.layout.read_text())["asset"]
+    scene, cameras = read_scene(config.layout, bundles={name: bundle})
+    camera = list(cameras.values())[config.camera]
+    truth = np.asarray(Image.open(config.truth).convert("RGB"), np.float32) / 255
+
+    def draw(tolerance: float) -> Any:
+        return v3dg.render(scene, camera, tolerance=tolerance, device=gpu.DEVICE)
+
+    rows = []
+    for wanted in config.in_frustum:
+        low, high = math.log(1e-3), math.log(1e4)
+        for _ in range(24):  # more gaussians at a lower tolerance
+            middle = (low + high) / 2
+            if draw(math.exp(middle)).stats.gaussians_in_frustum > wanted:
+                low = middle
+            else:
+                high = middle
+        frame = draw(math.exp(high))
+        color = torch.as_tensor(frame.color).cpu().numpy()
+        color = np.round(np.clip(color, 0, 1) * 255) / np.float32(255)
+        rows.append(
+            {
+                "tolerance": round(math.exp(high), 4),
+                "gaussians_in_frustum": frame.stats.gaussians_in_frustum,
+                "flip": round(metrics.flip(truth, color), 4),
+                "psnr": round(metrics.psnr(truth, color), 2),
+            }
+        )
+        print(rows[-1], flush=True)
+    return rows
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

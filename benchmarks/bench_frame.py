@@ -1,0 +1,131 @@
+"""Our CUDA frame beside gsplat's, in one run: time, ratio, and how far the two pictures are apart.
+
+Scenes: a layout of instances in full detail (gsplat gets all of them in the world), random gaussians of the
+sizes that training leaves, and one asset that fills the picture.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gpu
+import record
+import torch
+import tyro
+from assets import like_trained
+from bench_rasterize import camera_that_fills
+
+import v3dg
+from v3dg.build import BuildConfig, build_bundle
+from v3dg.cameras import Camera
+from v3dg.procedural import make_asset
+from v3dg.render import Renderer
+from v3dg.scene import read_scene
+
+
+@dataclass
+class Config:
+    asset: Path | None = None
+    """A .ply file; by default the procedural asset."""
+    layout: Path | None = None
+    """A layout of instances of that asset; without one, that part is left out."""
+    cameras: tuple[int, ...] = (45, 50, 55, 59)
+    """Which cameras of the layout."""
+    counts: tuple[int, ...] = (1_000_000, 4_000_000, 20_000_000)
+    """How many random gaussians."""
+    width: int = 1920
+    height: int = 1080
+    repeats: int = 11
+    gsplat: bool = True
+    """Measure gsplat too, packed and not; the faster one counts."""
+    output: str | None = None
+
+
+def main(config: Config) -> None:
+    rows: list[dict[str, Any]] = []
+
+    def measure(
+        name: str, subject: Any, gaussians: v3dg.Gaussians, camera: Camera, options: dict[str, Any]
+    ) -> None:
+        renderer = Renderer(subject)
+
+        def ours() -> Any:
+            frame = renderer.render(camera, **options)
+            frame.stats  # noqa: B018  waits for the picture
+            return frame
+
+        row: dict[str, Any] = {"scene": name, "gaussians": len(gaussians)}
+        row["gaussians_in_frustum"] = ours().stats.gaussians_in_frustum
+        row["frame_ms"] = round(gpu.median_ms(ours, config.repeats), 3)
+        if config.gsplat:
+            row.update(beside_gsplat(row["frame_ms"], ours().color, gaussians, camera, config.repeats))
+        print(row, flush=True)
+        rows.append(row)
+
+    asset = make_asset() if config.asset is None else v3dg.load(config.asset)
+    if config.layout is not None:
+        # One level is all that is drawn.
+        bundle = build_bundle(asset, config=BuildConfig(min_clusters=1 << 30), progress=False, device="cpu")
+        name = json.loads(config.layout.read_text())["asset"]
+        scene, cameras = read_scene(config.layout, bundles={name: bundle})
+        placed = gpu.placed_gaussians(scene)
+        for index in config.cameras:
+            name, camera = list(cameras.items())[index]
+            measure(f"{config.layout.stem} {name}", scene, placed, camera, {"tolerance": 0.0})
+        del placed
+    camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=config.width, height=config.height)
+    for count in config.counts:
+        gaussians = like_trained(count, camera, gpu.DEVICE)
+        measure(f"random {count / 1e6:g} M", gaussians, gaussians, camera, {})
+    gaussians = asset.torch(gpu.DEVICE)
+    close = camera_that_fills(asset, config.width, config.height)
+    measure("close-up", gaussians, gaussians, close, {})
+
+    print_table(rows)
+    record.write(
+        config.output,
+        {**gpu.machine(), "width": config.width, "height": config.height, "frames": rows},
+    )
+
+
+@torch.no_grad()
+def beside_gsplat(
+    ours_ms: float, color: Any, gaussians: v3dg.Gaussians, camera: Camera, repeats: int
+) -> dict[str, Any]:
+    def peer(packed: bool) -> Callable[[], Any]:
+        return lambda: gpu.gsplat_picture(gaussians, camera, packed=packed)
+
+    packed_ms, unpacked_ms = (gpu.median_ms(peer(packed), repeats) for packed in (True, False))
+    error = gpu.picture_error(color, peer(True)()[0])
+    torch.cuda.empty_cache()
+    return {
+        "gsplat_packed_ms": round(packed_ms, 3),
+        "gsplat_unpacked_ms": round(unpacked_ms, 3),
+        "ratio": round(ours_ms / min(packed_ms, unpacked_ms), 4),
+        **error,
+    }
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    columns = {
+        "scene": "scene",
+        "gaussians_in_frustum": "in frustum",
+        "frame_ms": "ours ms",
+        "gsplat_packed_ms": "gsplat packed",
+        "gsplat_unpacked_ms": "unpacked",
+        "ratio": "ratio",
+        "largest_error": "largest error",
+        "psnr": "PSNR",
+        "share_over_1_255": "> 1/255",
+    }
+    print("".join(f"{title:>{32 if key == 'scene' else 14}}" for key, title in columns.items()))
+    for row in rows:
+        print("".join(f"{row.get(key, ''):>{32 if key == 'scene' else 14}}" for key in columns))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

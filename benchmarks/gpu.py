@@ -1,0 +1,139 @@
+"""What benchmarks on a GPU share: time, memory, errors, and gsplat as the peer to compare with."""
+
+from __future__ import annotations
+
+import statistics
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+import torch
+
+import v3dg
+from v3dg.cameras import Camera
+from v3dg.scene import Scene
+
+DEVICE = "cuda"
+
+
+def machine() -> dict[str, str]:
+    """The GPU and the versions that its numbers belong to."""
+    return {"gpu": torch.cuda.get_device_name(), "cuda": str(torch.version.cuda), "torch": torch.__version__}
+
+
+def median_ms(call: Callable[[], Any], repeats: int) -> float:
+    """Median time of a call by the GPU's clock, after a warm-up; waiting for Python counts."""
+    for _ in range(2):
+        call()
+    times = []
+    for _ in range(repeats):
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        torch.cuda.synchronize()
+        start.record()
+        call()
+        end.record()
+        torch.cuda.synchronize()
+        times.append(start.elapsed_time(end))
+    return statistics.median(times)
+
+
+class PeakMemory:
+    """The most memory of the GPU in use within a `with` block, beyond what was in use before: `.gigabytes`.
+
+    Sampled every few milliseconds, from the driver: it sees everybody's allocations.
+    """
+
+    def __enter__(self) -> PeakMemory:
+        torch.cuda.synchronize()
+        torch.cuda.empty_cache()
+        self._least = self._before = torch.cuda.mem_get_info()[0]
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._done.set()
+        self._thread.join()
+        self.gigabytes = (self._before - self._least) / 1e9
+
+    def _watch(self) -> None:
+        while not self._done.wait(0.005):
+            self._least = min(self._least, torch.cuda.mem_get_info()[0])
+
+
+def picture_error(picture: Any, truth: Any) -> dict[str, float]:
+    """How far a picture is from another, both clipped to [0, 1]."""
+    picture, truth = (torch.as_tensor(p, device=DEVICE).clamp(0, 1) for p in (picture, truth))
+    error = (picture - truth).abs()
+    mean_square = float(error.double().square().mean())
+    return {
+        "largest_error": round(float(error.max()), 6),
+        "mean_error": round(float(error.mean()), 8),
+        "psnr": round(-10 * torch.tensor(max(mean_square, 1e-20)).log10().item(), 2),
+        "share_over_1_255": round(float((error.amax(-1) > 1 / 255).double().mean()), 8),
+    }
+
+
+def placed_gaussians(scene: Scene) -> v3dg.Gaussians:
+    """All instances of a scene of one bundle, in full detail, in the world, on the GPU; SH degree 0."""
+    asset = scene.bundles[0].level_gaussians(0).torch(DEVICE)
+    means = torch.empty(len(scene), len(asset), 3, device=DEVICE)
+    quats = torch.empty(len(scene), len(asset), 4, device=DEVICE)
+    product = torch.as_tensor(_left_products(scene.quaternions), device=DEVICE)
+    linear = torch.as_tensor(scene.rotations * scene.scales[:, None, None], device=DEVICE)
+    positions = torch.as_tensor(scene.positions, device=DEVICE)
+    for i in range(len(scene)):
+        means[i] = asset.means.double() @ linear[i].T + positions[i]
+        quats[i] = asset.quats.double() @ product[i].T
+    scales = torch.as_tensor(scene.scales, device=DEVICE).float()[:, None, None] * asset.scales
+    opacities = asset.opacities.expand(len(scene), -1)
+    sh = asset.sh.expand(len(scene), -1, -1, -1)
+    return v3dg.Gaussians(
+        means.flatten(0, 1),
+        quats.flatten(0, 1),
+        scales.flatten(0, 1).contiguous(),
+        opacities.flatten().contiguous(),
+        sh.flatten(0, 1).contiguous(),
+    )
+
+
+def _left_products(quaternions: Any) -> Any:
+    """(I, 4, 4) matrices that multiply by a quaternion from the left."""
+    w, x, y, z = torch.as_tensor(quaternions).unbind(-1)
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def gsplat_picture(
+    gaussians: v3dg.Gaussians, camera: Camera, *, packed: bool, eps2d: float = 0.0
+) -> tuple[Any, Any]:
+    """Colour (H, W, 3) and alpha (H, W) as gsplat draws them; differentiable.
+
+    Colours without a view dependence are handed over as they are, which spares gsplat a pass.
+    """
+    import gsplat
+
+    if gaussians.sh_degree == 0:
+        colors, degree = (gaussians.sh[:, 0] * 0.28209479177387814 + 0.5).clamp_min(0), None
+    else:
+        colors, degree = gaussians.sh, gaussians.sh_degree
+    color, alpha, _ = gsplat.rasterization(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        colors,
+        torch.as_tensor(camera.viewmat, dtype=torch.float32, device=DEVICE)[None],
+        torch.as_tensor(camera.K, dtype=torch.float32, device=DEVICE)[None],
+        camera.width,
+        camera.height,
+        near_plane=camera.near,
+        eps2d=eps2d,
+        sh_degree=degree,
+        packed=packed,
+    )
+    return color[0], alpha[0, ..., 0]
