@@ -14,7 +14,7 @@ from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, covariances, lod_bundle, random_camera, random_scene, rotation_matrices, turned
 from v3dg import Bundle, Camera, Gaussians, Scene, _core, select
-from v3dg.select import _product, group_metrics
+from v3dg.select import group_metrics
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 seeds = st.integers(0, 2**32 - 1)
@@ -258,11 +258,11 @@ def test_frustum_keeps_needles_whose_image_leans_in(side):
         sh=np.ones((1, 1, 3), np.float32),
     )
     bundle = lod_bundle(np.random.default_rng(0), asset, 1, past_root=0)
-    eighth, quarter = np.array([np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0]), side * np.pi / 4
-    about_view = np.array([np.cos(quarter), 0, 0, np.sin(quarter)])
-    turn = rotation_matrices(about_view[None])[0]
+    # An eighth of a turn about y, then a quarter of one about the view for each side.
+    (w, z), (c, y) = ((np.cos(a), np.sin(a)) for a in (side * np.pi / 4, np.pi / 8))
+    turn = rotation_matrices(np.array([[w, 0, 0, z]]))[0]
     scene = Scene()
-    scene.add(bundle, turn @ [1.2, 0, 1], quaternions=_product(about_view[None], eighth[None])[0])
+    scene.add(bundle, turn @ [1.2, 0, 1], quaternions=[w * c, -z * y, w * y, z * c])
     camera = Camera(np.eye(4), [[50, 0, 50], [0, 50, 50], [0, 0, 1]], 100, 100)
     mean, covariance = (values[0] for values in frames(asset, scene, 0, camera))
     assert reference.touches_image(mean, covariance, 0.0, camera)
@@ -306,96 +306,16 @@ def test_order_counts_and_scenes_of_several_bundles(bundle, other, seed):
         np.testing.assert_array_equal(mine, everything.cluster_ids[everything.instance_ids == i])
 
 
-def color_of(gaussians, n, direction):
-    """Colour of gaussian n towards a unit direction, from the definition of the real harmonics."""
-    x, y, z = direction
-    basis = [0.28209479177387814]
-    basis += [0.4886025119029199 * v for v in (-y, z, -x)]
-    basis += [
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * z * z - x * x - y * y),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (x * x - y * y),
-    ]
-    basis += [
-        -0.5900435899266435 * y * (3 * x * x - y * y),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-        1.445305721320277 * z * (x * x - y * y),
-        -0.5900435899266435 * x * (x * x - 3 * y * y),
-    ]
-    coefficients = gaussians.sh[n].astype(np.float64)
-    return np.array(basis[: len(coefficients)]) @ coefficients
-
-
-@given(seed=seeds, sh_degree=st.integers(0, 3), origin=st.sampled_from([0.0, 1e6]))
-def test_gaussians_are_those_of_the_instances_in_the_world(seed, sh_degree, origin):
-    rng = np.random.default_rng(seed)
-    bundle = lod_bundle(rng, blob(rng, 40, sh_degree=sh_degree), 8)
-    scene = random_scene(rng, bundle, 3, origin=origin)
-    camera = random_camera(rng, origin=origin)
-    selection = select(scene, camera, tolerance=float(rng.choice([0.0, 1.0, 1e3])), cull=False)
-    world = selection.gaussians(origin=camera.position)
-    assert len(world) == selection.num_gaussians
-    first = 0
-    for i, c in pairs(selection):
-        asset = bundle.cluster_gaussians(c)
-        rows = slice(first, first + len(asset))
-        first += len(asset)
-        rotation, scale = scene.rotations[i], scene.scales[i]
-        means = scale * asset.means.astype(np.float64) @ rotation.T + scene.positions[i] - camera.position
-        np.testing.assert_allclose(world.means[rows], means, rtol=1e-5, atol=1e-5)
-        placed = world.subset(rows)
-        expected = scale**2 * rotation @ covariances(asset) @ rotation.T
-        atol = 1e-5 * np.abs(expected).max()
-        np.testing.assert_allclose(covariances(placed), expected, rtol=1e-4, atol=atol)
-        np.testing.assert_array_equal(placed.opacities, asset.opacities)
-        direction = rng.normal(size=3)
-        direction /= np.linalg.norm(direction)
-        for n in range(len(asset)):
-            towards = color_of(asset, n, rotation.T @ direction)
-            np.testing.assert_allclose(color_of(placed, n, direction), towards, rtol=1e-4, atol=1e-5)
-        filters = selection.filters_px2[rows]
-        np.testing.assert_array_equal(filters, np.full(len(asset), bundle.clusters.filter_px2[c]))
-        assert (selection.antialiased[rows] == bool(bundle.clusters.antialiased[c])).all()
-
-
-def test_gaussians_of_several_bundles_and_chunks(monkeypatch):
-    monkeypatch.setattr(sys.modules["v3dg.select"], "CHUNK", 7)
-    rng = np.random.default_rng(8)
-    low, high = (lod_bundle(rng, blob(rng, 60, sh_degree=d), 8) for d in (1, 3))
-    scene = Scene()
-    for bundle in (low, high, low):
-        scene.add(bundle, positions=rng.normal(size=(2, 3)))
-    selection = select(scene, random_camera(rng, distance=30), tolerance=0.0, cull=False)
-    world = selection.gaussians()
-    assert world.sh_degree == 3
-    first = 0
-    for i, c in pairs(selection):
-        bundle = scene.bundles[scene.instance_bundle[i]]
-        asset = bundle.cluster_gaussians(c)
-        num_sh = asset.sh.shape[1]
-        rows = slice(first, first + len(asset))
-        np.testing.assert_allclose(world.means[rows], asset.means + scene.positions[i], atol=1e-5)
-        np.testing.assert_allclose(world.sh[rows, :num_sh], asset.sh, atol=1e-5)
-        assert (world.sh[rows, num_sh:] == 0).all()
-        first += len(asset)
-
-
 def test_empty_and_smallest_scenes():
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8)
     nothing = select(Scene(), camera, tolerance=1.0)
-    assert len(nothing) == nothing.num_gaussians == len(nothing.gaussians()) == len(nothing.filters_px2) == 0
+    assert len(nothing) == nothing.num_gaussians == len(nothing.filters_px2) == 0
     empty = random_bundle(num_levels=0)
     assert select(empty, camera, tolerance=1.0).num_gaussians == 0
     rng = np.random.default_rng(0)
     one = lod_bundle(rng, blob(rng, 1, size=0.01), 4, past_root=0)
     selection = select(one, camera, tolerance=1.0)
     assert pairs(selection) == [(0, 0)]
-    np.testing.assert_array_equal(selection.gaussians().means, one.gaussians.means)
 
 
 def test_bad_arguments_are_refused():
@@ -411,8 +331,6 @@ def test_bad_arguments_are_refused():
         select(bundle, camera, tolerance=1, device="tpu")
     with pytest.raises(TypeError, match="bundle: expected a Bundle, got str"):
         select("donut", camera, tolerance=1)
-    with pytest.raises(ValueError, match=r"origin: expected shape \(3,\)"):
-        select(bundle, camera, tolerance=1).gaussians(origin=1.0)
 
 
 def test_table_refuses_groups_that_do_not_exist():

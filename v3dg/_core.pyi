@@ -42,6 +42,36 @@ def median_split_cuda(
 def bound_spheres(spheres: NDArray[Any], offset: NDArray[Any]) -> Float32: ...
 def bound_spheres_cuda(spheres: Any, offset: NDArray[Any], ball: Any, stream: int) -> None: ...
 
+# gather
+def gather(
+    bundles: list[tuple[Any, Any, Any, Any, Any]],
+    bundle: NDArray[np.int32],
+    positions: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    quaternions: NDArray[np.float64],
+    scales: NDArray[np.float64],
+    bands: NDArray[np.float64],
+    instance: NDArray[np.int32],
+    first_row: NDArray[np.int64],
+    offset: NDArray[np.int64],
+    num_bases: int,
+) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
+def gather_cuda(
+    bundles: list[tuple[Any, Any, Any, Any, Any]],
+    bundle: NDArray[np.int32],
+    positions: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    quaternions: NDArray[np.float64],
+    scales: NDArray[np.float64],
+    bands: NDArray[np.float64],
+    instance: NDArray[np.int32],
+    first_row: NDArray[np.int64],
+    offset: NDArray[np.int64],
+    num_bases: int,
+    rows: tuple[Any, Any, Any, Any, Any],
+    stream: int,
+) -> None: ...
+
 # select
 def num_cuda_devices() -> int: ...
 

@@ -10,16 +10,13 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core
+from v3dg import _core, _device, _operations
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats, VectorLike
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene
 
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
-
-# Gaussians brought into the world at a time, to bound the memory of double precision temporaries.
-CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +40,7 @@ class Selection:
     def __len__(self) -> int:
         return len(self.instance_ids)
 
-    def gaussians(self, origin: VectorLike = (0.0, 0.0, 0.0)) -> Gaussians:
+    def gaussians(self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str = "cpu") -> Gaussians:
         """Return the selected gaussians in the world, N in the order of the selection, for any rasterizer.
 
         Spherical harmonics are rotated into the world's frame, which is exact. The degree is the highest of
@@ -52,42 +49,34 @@ class Selection:
         Args:
             origin: (3,) point in the world that means are relative to; take the camera's position where the
                 scene is so far from zero that float32 would not hold it.
+            device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there, ``"auto"`` for the better
+                of the two that works. Both hold the same numbers.
         """
+        device = _device.resolve(device)
         shift = np.asarray(origin, np.float64)
         if shift.shape != (3,):
             raise ValueError(f"origin: expected shape (3,), got {shift.shape}")
-        scene, first = self.scene, self._first()
-        bundle_of_pair = scene.instance_bundle[self.instance_ids]
-        used = np.unique(bundle_of_pair)
-        num_sh = max((scene.bundles[b].sh_degree + 1 for b in used), default=1) ** 2
-        count = self.num_gaussians
-        means, quats = np.empty((count, 3), np.float32), np.empty((count, 4), np.float32)
-        scales, opacities = np.empty((count, 3), np.float32), np.empty(count, np.float32)
-        sh = np.zeros((count, num_sh, 3), np.float32)
-
-        for b in used:
-            source = scene.bundles[b].gaussians
-            offset = scene.bundles[b].clusters.offset
-            instances, bands = np.unique(self.instance_ids[bundle_of_pair == b]), []
-            if source.sh.shape[1] > 1:
-                bands = _rotations_of_bands(scene.rotations[instances], source.sh.shape[1])
-            for chunk in _chunks(np.flatnonzero(bundle_of_pair == b), np.diff(first)):
-                sizes = np.diff(first)[chunk]
-                within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-                read = np.repeat(offset[self.cluster_ids[chunk]], sizes) + within
-                write = np.repeat(first[chunk], sizes) + within
-                i = np.repeat(self.instance_ids[chunk], sizes)
-                rotated = np.einsum("nij,nj->ni", scene.rotations[i], np.asarray(source.means)[read])
-                means[write] = scene.scales[i, None] * rotated + (scene.positions[i] - shift)
-                quats[write] = _product(scene.quaternions[i], np.asarray(source.quats, np.float64)[read])
-                scales[write] = scene.scales[i, None] * np.asarray(source.scales)[read]
-                opacities[write] = np.asarray(source.opacities)[read]
-                sh[write, 0] = np.asarray(source.sh)[read, 0]
-                known = np.searchsorted(instances, i)
-                for degree, band in enumerate(bands, start=1):
-                    rows = slice(degree**2, (degree + 1) ** 2)
-                    sh[write, rows] = band[known] @ np.asarray(source.sh)[read, rows]
-        return Gaussians(means=means, quats=quats, scales=scales, opacities=opacities, sh=sh)
+        scene = self.scene
+        instances, instance = np.unique(self.instance_ids, return_inverse=True)
+        used, bundle = np.unique(scene.instance_bundle[instances], return_inverse=True)
+        num_bases = max((scene.bundles[b].sh_degree + 1 for b in used), default=1) ** 2
+        sources = [scene.bundles[b].gaussians for b in used]
+        world = _operations.gather(
+            [source.torch("cuda") for source in sources] if device == "cuda" else sources,
+            num_bases,
+            bundle=bundle.astype(np.int32),
+            positions=scene.positions[instances] - shift,
+            rotations=scene.rotations[instances],
+            quaternions=scene.quaternions[instances],
+            scales=scene.scales[instances],
+            bands=_rotations_of_bands(scene.rotations[instances], num_bases),
+            instance=instance.astype(np.int32),
+            first_row=self._per_pair([table.clusters.offset[:-1] for table in scene.bundles]).astype(
+                np.int64
+            ),
+            offset=self._first(),
+        )
+        return world.torch("cuda") if device == "cuda" else world
 
     @property
     def filters_px2(self) -> npt.NDArray[np.float32]:
@@ -193,29 +182,6 @@ def _arguments(scene: Scene, camera: Camera) -> dict[str, Any]:
     }
 
 
-def _chunks(pairs: npt.NDArray[np.int64], sizes: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
-    """The pairs in runs of about CHUNK gaussians."""
-    if len(pairs) == 0:
-        return []
-    run = np.cumsum(sizes[pairs]) // CHUNK
-    return np.split(pairs, np.flatnonzero(np.diff(run)) + 1)
-
-
-def _product(a: Floats, b: Floats) -> Floats:
-    """Quaternion products (N, 4) w x y z: first b, then a."""
-    aw, ax, ay, az = a.T
-    bw, bx, by, bz = b.T
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=1,
-    )
-
-
 def _basis_of_band(degree: int, directions: Floats) -> Floats:
     """Real spherical harmonics (..., 2 degree + 1) of a band at directions (..., 3), signs as in 3DGS."""
     x, y, z = np.moveaxis(directions, -1, 0)
@@ -240,19 +206,23 @@ def _basis_of_band(degree: int, directions: Floats) -> Floats:
     return factor * np.stack(terms, axis=-1)
 
 
-def _rotations_of_bands(rotations: Floats, num_sh: int) -> list[Floats]:
-    """For bands 1, 2, ...: matrices (I, 2l + 1, 2l + 1) that take an asset's coefficients into the world.
+def _rotations_of_bands(rotations: Floats, num_bases: int) -> Floats:
+    """(I, 83): matrices of bands 1, 2, ..., one after another, that take coefficients into the world.
 
     A band is closed under rotation, so the matrix follows from the basis at enough directions: the colour
     towards d in the world is the asset's colour towards the direction rotated back.
     """
+    flat = np.zeros((len(rotations), sum((2 * degree + 1) ** 2 for degree in (1, 2, 3))))
     # Points on a spiral: many more than the 7 that the largest band needs, for a well-posed solution.
     count = 32
     z = 1 - (2 * np.arange(count) + 1) / count
     turn = np.arange(count) * math.pi * (3 - math.sqrt(5))
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
     in_asset = directions @ rotations  # rows: rotation transposed times direction
-    return [
-        np.linalg.pinv(_basis_of_band(degree, directions)) @ _basis_of_band(degree, in_asset)
-        for degree in range(1, math.isqrt(num_sh))
-    ]
+    first = 0
+    for degree in range(1, math.isqrt(num_bases)):
+        size = (2 * degree + 1) ** 2
+        band = np.linalg.pinv(_basis_of_band(degree, directions)) @ _basis_of_band(degree, in_asset)
+        flat[:, first : first + size] = band.reshape(-1, size)
+        first += size
+    return flat

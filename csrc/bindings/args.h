@@ -58,6 +58,7 @@ Span<T> span_of(const py::array& array, const char* name, std::initializer_list<
 
 void bind_box(py::module_& m);
 void bind_cluster(py::module_& m);
+void bind_gather(py::module_& m);
 void bind_select(py::module_& m);
 void bind_simplify_init(py::module_& m);
 void bind_ply(py::module_& m);

@@ -11,6 +11,7 @@ PYBIND11_MODULE(_core, m) {
         "Instruction set that the CPU half runs on.");
     v3dg::bind_box(m);
     v3dg::bind_cluster(m);
+    v3dg::bind_gather(m);
     v3dg::bind_select(m);
     v3dg::bind_simplify_init(m);
     v3dg::bind_ply(m);

@@ -4,17 +4,9 @@
 
 #include "base/span.h"
 #include "base/stream.h"
+#include "math/rows.h"
 
 namespace v3dg {
-
-// Gaussians as rows; `num_sh` is 3 times the number of SH bases.
-struct RowsIn {
-    const float *means, *quats, *scales, *opacities, *sh;
-    int num_sh;
-};
-struct RowsOut {
-    float *means, *quats, *scales, *opacities, *sh;
-};
 
 // Starts of coarser clusters. Segment g takes gaussians in_offset[g] .. in_offset[g + 1] to as many as
 // out_offset says, at most as many as come in. Decisions are made in the order of the rows, ties by index,

@@ -1,0 +1,71 @@
+// A thread writes the shape of a gaussian, or one of its SH bases. Blocks take neighbours, so they look up
+// few clusters.
+
+#include "base/launch.cuh"
+#include "gather/gather.h"
+#include "gather/gather_math.h"
+
+namespace v3dg {
+namespace cuda {
+
+namespace {
+
+constexpr unsigned kBlockSize = 256;
+
+// The last cluster that begins at or before `row`, from low to high; so an empty one never.
+__device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size_t high, int64_t row) {
+    while (low < high) {
+        const size_t middle = low + (high - low + 1) / 2;
+        if (offset[middle] <= row)
+            low = middle;
+        else
+            high = middle - 1;
+    }
+    return low;
+}
+
+// One thread a row of the result, or one a row and basis: num_items a row.
+__global__ void __launch_bounds__(kBlockSize) gather_kernel(GatherInput in, RowsOut out, int num_items) {
+    const int64_t num = in.offset[in.instance.size] * num_items;
+    const int64_t first = blockIdx.x * int64_t(kBlockSize);
+    const int64_t last = (first + kBlockSize < num ? first + kBlockSize : num) - 1;
+    __shared__ size_t cluster[2];
+    if (threadIdx.x < 2)
+        cluster[threadIdx.x] =
+            cluster_at(in.offset, 0, in.instance.size - 1, (threadIdx.x == 0 ? first : last) / num_items);
+    __syncthreads();
+    const int64_t item = first + threadIdx.x;
+    if (item > last) return;
+    const int64_t row = item / num_items;
+    const size_t s = cluster_at(in.offset, cluster[0], cluster[1], row);
+    const int basis = static_cast<int>(item % num_items);
+    gather_sh(in, s, row - in.offset[s], basis, out);
+    if (basis == 0) gather_shape(in, s, row - in.offset[s], out);
+}
+
+// A host array on the device, for as long as this lives.
+template <class T>
+class Copy {
+  public:
+    Copy(Span<const T>& span, cudaStream_t stream) : buffer_(span, stream) { span.data = buffer_.data(); }
+
+  private:
+    DeviceBuffer<T> buffer_;
+};
+
+}  // namespace
+
+void gather(const GatherInput& host, const RowsOut& out, Stream stream) {
+    GatherInput in = host;
+    const int64_t num_items = host.offset[host.instance.size] * (host.num_sh / 3);
+    const Copy<RowsIn> bundles(in.bundles, stream);
+    const Copy<int32_t> bundle(in.bundle, stream), instance(in.instance, stream);
+    const Copy<double> position(in.position, stream), rotation(in.rotation, stream),
+        quaternion(in.quaternion, stream), scale(in.scale, stream), bands(in.bands, stream);
+    const Copy<int64_t> first_row(in.first_row, stream), offset(in.offset, stream);
+    launch("gather", gather_kernel, blocks_for(num_items, kBlockSize), kBlockSize, 0, stream, in, out,
+           host.num_sh / 3);
+}
+
+}  // namespace cuda
+}  // namespace v3dg

@@ -1,0 +1,51 @@
+#pragma once
+
+#include "base/host_device.h"
+#include "gather/gather.h"
+
+namespace v3dg {
+
+// Writes all but the SH coefficients of the gaussian `within` cluster s.
+V3DG_HD inline void gather_shape(const GatherInput& in, size_t s, int64_t within, const RowsOut& out) {
+    const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
+    const size_t i = in.instance[s];
+    const RowsIn& rows = in.bundles[in.bundle[i]];
+    const double *r = in.rotation.data + 9 * i, *q = in.quaternion.data + 4 * i, scale = in.scale[i];
+    const double x = rows.means[3 * from], y = rows.means[3 * from + 1], z = rows.means[3 * from + 2];
+    for (int k = 0; k < 3; ++k) {
+        const double rotated = r[3 * k] * x + r[3 * k + 1] * y + r[3 * k + 2] * z;
+        out.means[3 * to + k] = static_cast<float>(scale * rotated + in.position[3 * i + k]);
+        out.scales[3 * to + k] = static_cast<float>(scale * rows.scales[3 * from + k]);
+    }
+    const float* p = rows.quats + 4 * from;
+    float* product = out.quats + 4 * to;
+    product[0] = static_cast<float>(q[0] * p[0] - q[1] * p[1] - q[2] * p[2] - q[3] * p[3]);
+    product[1] = static_cast<float>(q[0] * p[1] + q[1] * p[0] + q[2] * p[3] - q[3] * p[2]);
+    product[2] = static_cast<float>(q[0] * p[2] - q[1] * p[3] + q[2] * p[0] + q[3] * p[1]);
+    product[3] = static_cast<float>(q[0] * p[3] + q[1] * p[2] - q[2] * p[1] + q[3] * p[0]);
+    out.opacities[to] = rows.opacities[from];
+}
+
+// Writes the three coefficients of one SH basis of that gaussian, rotated into the world with its band.
+V3DG_HD inline void gather_sh(const GatherInput& in, size_t s, int64_t within, int basis,
+                              const RowsOut& out) {
+    const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
+    const size_t i = in.instance[s];
+    const RowsIn& rows = in.bundles[in.bundle[i]];
+    const float* coefficients = rows.sh + rows.num_sh * from;
+    float* result = out.sh + in.num_sh * to + 3 * basis;
+    if (basis == 0 || 3 * basis >= rows.num_sh) {
+        for (int c = 0; c < 3; ++c) result[c] = basis == 0 ? coefficients[c] : 0.0f;
+        return;
+    }
+    const int degree = basis < 4 ? 1 : basis < 9 ? 2 : 3, first = degree * degree, size = 2 * degree + 1;
+    const double* band = in.bands.data + kBandsSize * i + (degree == 1 ? 0 : degree == 2 ? 9 : 9 + 25);
+    for (int c = 0; c < 3; ++c) {
+        double sum = 0;
+        for (int k = 0; k < size; ++k)
+            sum += band[(basis - first) * size + k] * coefficients[3 * (first + k) + c];
+        result[c] = static_cast<float>(sum);
+    }
+}
+
+}  // namespace v3dg
