@@ -59,7 +59,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.skipif(v3dg._core.num_cuda_devices() > 0, reason="there is a CUDA device")
-@pytest.mark.parametrize("command", [("build", "tuft.ply", "-o", "other.v3dg")], ids=["build"])
+@pytest.mark.parametrize("command", [("build", "tuft.ply", "-o", "other.v3dg"), ("render", "tuft.v3dg")])
 def test_missing_cuda_is_an_error(folder, command):
     fails(1, "or use 'cpu'", *command, "--device", "cuda", cwd=folder)
 

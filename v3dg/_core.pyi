@@ -321,6 +321,28 @@ def fit_level(
     error: Float32,
     progress: FitProgress,
 ) -> None: ...
+def fit_level_cuda(
+    config: FitConfig,
+    target_means: Any,
+    target_quats: Any,
+    target_scales: Any,
+    target_opacities: Any,
+    target_sh: Any,
+    target_filter_px2: float,
+    target_compensate: bool,
+    target_range: NDArray[Any],
+    range: NDArray[Any],
+    ball: NDArray[Any],
+    stream: NDArray[Any],
+    means: Any,
+    quats: Any,
+    scales: Any,
+    opacities: Any,
+    sh: Any,
+    error: NDArray[Any],
+    progress: FitProgress,
+    cuda_stream: int,
+) -> None: ...
 
 # loss
 def dssim(picture: Float32, target: Float32) -> tuple[float, Float32]: ...

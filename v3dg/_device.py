@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core
 from v3dg.gaussians import Array, Gaussians
+
+_T = TypeVar("_T")
+_MUCH_MEMORY = 1 << 30
 
 
 def resolve(device: str) -> Literal["cpu", "cuda"]:
@@ -110,3 +113,28 @@ def memory_errors() -> Iterator[None]:
         if type(error).__name__ != "OutOfMemoryError":
             raise
         raise MemoryError(str(error)) from error
+
+
+def with_this_stream(work: Callable[[_T], None], device: Any) -> Callable[[_T], None]:
+    """The same work on this thread's stream, whatever thread it will run on."""
+    if device == "cpu":
+        return work
+    import torch
+
+    stream = torch.cuda.current_stream(device)
+
+    def on_stream(argument: _T) -> None:
+        with torch.cuda.stream(stream):
+            work(argument)
+
+    return on_stream
+
+
+def spare_memory(device: Any) -> None:
+    """Have torch give back what it keeps for later, where that is much: the core cannot use it."""
+    if device == "cpu":
+        return
+    import torch
+
+    if torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device) > _MUCH_MEMORY:
+        torch.cuda.empty_cache()

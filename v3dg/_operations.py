@@ -83,8 +83,8 @@ def bound_by_boxes(gaussians: Gaussians, offset: Offsets) -> Array:
 
 
 def fit_target(gaussians: Gaussians) -> Any:
-    """What `fit_level` takes as its target: the gaussians as the core lays them out."""
-    return _core.Model(*rows_of(gaussians))
+    """What `fit_level` takes as its target: on the CPU the gaussians as the core lays them out."""
+    return _core.Model(*rows_of(gaussians)) if isinstance(gaussians.means, np.ndarray) else gaussians
 
 
 def fit_level(
@@ -94,25 +94,20 @@ def fit_level(
     target_compensate: bool,
     target_range: npt.NDArray[np.int64],
     own_range: npt.NDArray[np.int64],
-    ball: Array,
+    ball: npt.NDArray[np.float32],
     gaussians: Gaussians,
     error: npt.NDArray[np.float32],
     progress: _core.FitProgress,
 ) -> None:
     """Fit groups of gaussians, in place, to look like groups of the target inside their balls (G, 4)."""
-    _core.fit_level(
-        config,
-        target,
-        target_filter_px2,
-        target_compensate,
-        target_range,
-        own_range,
-        ball,
-        np.arange(len(own_range), dtype=np.int64),
-        *rows_of(gaussians),
-        error,
-        progress,
-    )
+    groups: Any = (target_range, own_range, ball, np.arange(len(own_range), dtype=np.int64))
+    look = (target_filter_px2, target_compensate)
+    rows = rows_of(gaussians)
+    if isinstance(rows[0], np.ndarray):
+        _core.fit_level(config, target, *look, *groups, *rows, error, progress)
+        return
+    with _stream_of(rows[0]) as stream:
+        _core.fit_level_cuda(config, *rows_of(target), *look, *groups, *rows, error, progress, stream)
 
 
 def gather(bundles: list[Gaussians], num_bases: int, **tables: npt.NDArray[Any]) -> Gaussians:

@@ -324,7 +324,7 @@ class _Build:
         # Past the root, every level stands for all leaves.
         if not np.array_equal(known_range, leaf_range):
             offset = np.append(leaf_range[:, 0], leaf_range[-1, 1])
-            ball = _operations.bound_spheres(self._spheres, offset)
+            ball = _device.to_host(_operations.bound_spheres(self._spheres, offset))
             self._ball_of_leaves = leaf_range, ball
         return ball
 
@@ -379,16 +379,20 @@ def _simplify(build: _Build, shape: tuple[int, int], bar: _Bar) -> None:
     own_filter = from_leaves or number == 1
     error = np.zeros((num_groups, 2), np.float32)
     bar.start_level(number, num_groups, int(out_offset[-1]))
+    ball = build.balls_of_leaves(leaf_range)
+    target = build.target_leaves if from_leaves else _operations.fit_target(build.last)
+    _device.spare_memory(build.where)
     _run_fit(
         bar,
+        build.where,
         lambda progress: _operations.fit_level(
             _fit_config(config, build.seed, number),
-            build.target_leaves if from_leaves else _operations.fit_target(build.last),
+            target,
             config.asset_filter_px2 if own_filter else config.filter_px2,
             config.asset_antialiased if own_filter else True,
             leaf_range if from_leaves else np.stack([offset[:-1], offset[1:]], axis=1),
             np.stack([out_offset[:-1], out_offset[1:]], axis=1),
-            build.balls_of_leaves(leaf_range),
+            ball,
             gaussians,
             error,
             progress,
@@ -453,9 +457,10 @@ def _fit_config(config: BuildConfig, seed: int, level: int) -> Any:
     return fit
 
 
-def _run_fit(bar: _Bar, fit: Callable[[_core.FitProgress], None]) -> None:
+def _run_fit(bar: _Bar, where: Any, fit: Callable[[_core.FitProgress], None]) -> None:
     """Run `fit` on a thread of its own, so that Ctrl-C and the bar stay alive while it computes."""
     state = _core.FitProgress()
+    fit = _device.with_this_stream(fit, where)
     failure: list[BaseException] = []
     done = threading.Event()
 

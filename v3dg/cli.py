@@ -90,6 +90,8 @@ class Render:
     """Screen area in px² that one gaussian of a coarser cluster may stand for; 0 draws everything."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Colour behind, each 0 to 1."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to draw; auto is a CUDA device where there is one and torch can use it."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """CPU threads; all if not given."""
     json: bool = False
@@ -352,21 +354,23 @@ def _level_size(bundle: Bundle, level: int) -> int:
 
 def _render(options: Render) -> None:
     _require(options.subject, ".ply", ".v3dg", ".json")
+    from v3dg import _device
     from v3dg.pictures import check_picture_path, write_picture
     from v3dg.render import DEFAULT_TOLERANCE, render
 
     if min(options.views, *options.size) < 1:
         raise _UsageError("--views, --size: expected at least 1")
     output = check_picture_path(options.output or Path(options.subject.with_suffix(".png").name))
+    device = _device.resolve(options.device)
     subject, cameras = _subject_and_cameras(options)
     tolerance = DEFAULT_TOLERANCE if options.tolerance is None else options.tolerance
     results = []
     for name, camera in cameras.items():
-        image = render(subject, camera, tolerance=tolerance, background=options.background)
+        image = render(subject, camera, tolerance=tolerance, background=options.background, device=device)
         path = output
         if len(cameras) > 1:
             path = output.with_name(f"{output.stem}_{_safe(name)}{output.suffix}")
-        write_picture(path, image.color)
+        write_picture(path, _device.to_host(image.color))
         stats = image.stats
         results.append(
             {

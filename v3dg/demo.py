@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from v3dg import _device
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.metrics import box_downsample, flip, psnr
@@ -69,7 +70,7 @@ class DemoResult:
     levels: int
     bundle_gaussians: int
     tolerance: float
-    threads: int
+    device: str  # of the CPU the number of threads, of the GPU its name
     build_seconds: float
     seconds: float
     columns: tuple[Column, ...]
@@ -115,6 +116,7 @@ def run_demo(
     config: BuildConfig | None = None,
     views: tuple[tuple[float, float], ...] = VIEWS,
     progress: bool = True,
+    device: str = "auto",
 ) -> DemoResult:
     """Build the procedural asset, place it, draw and measure every distance, and write the picture.
 
@@ -122,6 +124,7 @@ def run_demo(
         num_gaussians: Of the asset.
         size: Width and height of one panel in px.
         views: Distance and elevation of every column.
+        device: Where to build and draw: "auto", "cpu" or "cuda".
 
     Raises:
         ValueError: The picture cannot be written to ``output``, or an argument is out of range.
@@ -131,9 +134,10 @@ def run_demo(
     start = time.perf_counter()
     path = check_picture_path(output)
     width, height = size
+    where = _device.resolve(device)
     asset = make_asset(num_gaussians, seed=seed)
     built = time.perf_counter()
-    bundle = build_bundle(asset, config=config or BuildConfig(), seed=seed, progress=progress)
+    bundle = build_bundle(asset, config=config or BuildConfig(), seed=seed, progress=progress, device=where)
     build_seconds = time.perf_counter() - built
     scene = Scene()
     positions, quaternions, scales = place_field(instances, seed=seed)
@@ -143,14 +147,15 @@ def run_demo(
     with tqdm(total=3 * len(views), desc="draw", unit="picture", leave=False, disable=not progress) as bar:
         for distance, elevation in views:
             camera = view_camera(distance, elevation, width, height)
-            sharp = render(scene, camera.scaled(SUPERSAMPLING), tolerance=0.0)
-            truth = _over_sky(*(box_downsample(x, SUPERSAMPLING) for x in (sharp.color, sharp.alpha)))
+            sharp = render(scene, camera.scaled(SUPERSAMPLING), tolerance=0.0, device=where)
+            pixels = (_device.to_host(x) for x in (sharp.color, sharp.alpha))
+            truth = _over_sky(*(box_downsample(x, SUPERSAMPLING) for x in pixels))
             del sharp
             bar.update()
 
             def measure(allowed: float, camera: Camera = camera, truth: Any = truth) -> tuple[Panel, Any]:
-                image = render(scene, camera, tolerance=allowed)
-                picture = _over_sky(image.color, image.alpha)
+                image = render(scene, camera, tolerance=allowed, device=where)
+                picture = _over_sky(_device.to_host(image.color), _device.to_host(image.alpha))
                 stats = image.stats
                 bar.update()
                 panel = Panel(
@@ -175,7 +180,7 @@ def run_demo(
         levels=bundle.num_levels,
         bundle_gaussians=bundle.num_gaussians,
         tolerance=tolerance,
-        threads=_num_threads(),
+        device=f"{_num_threads()} CPU threads" if where == "cpu" else _device.describe(where),
         build_seconds=build_seconds,
         seconds=time.perf_counter() - start,
         columns=tuple(columns),
@@ -256,7 +261,7 @@ def _poster(result: DemoResult, pictures: list[tuple[Any, Any]]) -> NDArray[np.u
     line = (
         f"{result.instances:,} tufts of {result.asset_gaussians:,} gaussians, {count_text(placed)} in all; "
         f"bundle of {result.levels} levels built in {result.build_seconds:.0f} s; "
-        f"{result.threads} CPU threads; tolerance {result.tolerance:g} square px"
+        f"{result.device}; tolerance {result.tolerance:g} square px"
     )
     _text(draw, (_MARGIN + 128, 66), line, 17, _QUIET)
 

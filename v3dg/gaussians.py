@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
@@ -96,7 +96,7 @@ class Gaussians:
         else:
             index = _checked_index(index)
         if not _is_tensor(self.means):
-            rows: Any = index.cpu().numpy() if _is_tensor(index) else index
+            rows = cast(Any, index).cpu().numpy() if _is_tensor(index) else index
             return self._map(lambda array: np.ascontiguousarray(array[rows]))
         import torch
 
