@@ -100,29 +100,16 @@ def fit_level(
     progress: _core.FitProgress,
 ) -> None:
     """Fit groups of gaussians, in place, to look like groups of the target inside their balls (G, 4)."""
-    groups: Any = (target_range, own_range, ball, np.arange(len(own_range), dtype=np.int64))
+    stream_of_group = np.arange(len(own_range), dtype=np.int64)  # of random numbers
     look = (target_filter_px2, target_compensate)
+    groups = (target_range, own_range, ball, stream_of_group)
     rows = rows_of(gaussians)
+    arguments: list[Any] = [*look, *groups, *rows, error, progress]
     if isinstance(rows[0], np.ndarray):
-        _core.fit_level(config, target, *look, *groups, *rows, error, progress)
+        _core.fit_level(config, target, *arguments)
         return
     with _stream_of(rows[0]) as stream:
-        _core.fit_level_cuda(config, *rows_of(target), *look, *groups, *rows, error, progress, stream)
-
-
-def gather(bundles: list[Gaussians], num_bases: int, **tables: npt.NDArray[Any]) -> Gaussians:
-    """Bring clusters of instances into the world (csrc/gather/gather.h), on the device of the bundles."""
-    rows = [rows_of(gaussians) for gaussians in bundles]
-    if not rows or isinstance(rows[0][0], np.ndarray):
-        return Gaussians(*_core.gather(rows, num_bases=num_bases, **tables))
-    with _stream_of(rows[0][0]) as stream:
-        count = int(tables["offset"][-1])
-        means, quats, scales, opacities = (
-            _empty_like(rows[0][0], shape) for shape in ((count, 3), (count, 4), (count, 3), (count,))
-        )
-        gathered = (means, quats, scales, opacities, _empty_like(rows[0][0], (count, num_bases, 3)))
-        _core.gather_cuda(rows, num_bases=num_bases, rows=gathered, stream=stream, **tables)
-        return Gaussians(*gathered)
+        _core.fit_level_cuda(config, *rows_of(target), *arguments, stream)
 
 
 @contextmanager
