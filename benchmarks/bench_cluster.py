@@ -1,4 +1,4 @@
-"""How fast an asset is cut into clusters, bounded, and halved to the start of a coarser level."""
+"""How fast assets are cut into clusters, bounded, halved for a coarser level, and gathered from instances."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ import tyro
 import v3dg
 from v3dg import _operations
 from v3dg.rasterize import rows_of
+from v3dg.scene import rotation_from_quaternion
+from v3dg.select import _rotations_of_bands
 
 
 @dataclass
@@ -24,6 +26,7 @@ class Config:
     group_size: int = 397
     """Gaussians of a group that are halved together."""
     sh_degree: int = 0
+    instances: int = 4
     device: Literal["cpu", "cuda"] = "cpu"
     repeats: int = 5
     seed: int = 0
@@ -45,6 +48,26 @@ def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
     )
 
 
+def placements(leaf_offset: np.ndarray, config: Config) -> dict[str, np.ndarray]:
+    """Every cluster, in each of some instances."""
+    rng = np.random.default_rng(config.seed)
+    count, sizes = config.instances, np.tile(np.diff(leaf_offset), config.instances)
+    quaternions = rng.standard_normal((count, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    rotations = rotation_from_quaternion(quaternions)
+    return {
+        "bundle": np.zeros(count, np.int32),
+        "positions": rng.standard_normal((count, 3)),
+        "rotations": rotations,
+        "quaternions": quaternions,
+        "scales": np.ones(count),
+        "bands": _rotations_of_bands(rotations, (config.sh_degree + 1) ** 2),
+        "instance": np.repeat(np.arange(count, dtype=np.int32), len(leaf_offset) - 1),
+        "first_row": np.tile(leaf_offset[:-1], count),
+        "offset": np.concatenate([[0], np.cumsum(sizes)]),
+    }
+
+
 def operations(
     gaussians: v3dg.Gaussians, config: Config
 ) -> dict[str, tuple[int, Callable[[], tuple[Any, ...]]]]:
@@ -61,6 +84,7 @@ def operations(
         import torch
 
         spheres = torch.cat([gaussians.means, gaussians.scales.amax(dim=1, keepdim=True)], dim=1)
+    tables = placements(leaf_offset, config)
     one_offset, one_halved = np.array([0, len(one)]), np.array([0, (len(one) + 1) // 2])
     return {
         "median_split": (num, lambda: _operations.median_split(gaussians.means, config.cluster_size)),
@@ -70,6 +94,10 @@ def operations(
         "prune": (num, lambda: (_operations.prune(gaussians, offset, halved),)),
         "merge": (num, lambda: rows_of(_operations.merge(gaussians, offset, halved))),
         "merge_one_group": (len(one), lambda: rows_of(_operations.merge(one, one_offset, one_halved))),
+        "gather": (
+            config.instances * num,
+            lambda: rows_of(_operations.gather([gaussians], (config.sh_degree + 1) ** 2, **tables)),
+        ),
     }
 
 

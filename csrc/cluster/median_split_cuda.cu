@@ -10,7 +10,7 @@
 #include <utility>
 #include <vector>
 
-#include "base/launch.cuh"
+#include "base/scan.cuh"
 #include "cluster/cluster.h"
 
 namespace v3dg {
@@ -128,27 +128,13 @@ __global__ void count_kernel(const uint32_t* lists, unsigned first_list, size_t 
 // Turns the counts of each list's tiles into sums of those before. One block a list.
 __global__ void sum_kernel(uint32_t num_tiles, unsigned first_list, uint32_t* tile_lefts) {
     uint32_t* values = tile_lefts + size_t(first_list + blockIdx.x) * num_tiles;
-    const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    __shared__ uint32_t sum_of_warp[32];
     uint32_t before = 0;
     for (uint32_t first = 0; first < num_tiles; first += blockDim.x) {
         const uint32_t i = first + threadIdx.x;
-        const uint32_t value = i < num_tiles ? values[i] : 0;
-        uint32_t sum = value;
-        for (unsigned step = 1; step < 32; step *= 2) {
-            const uint32_t other = __shfl_up_sync(kAllLanes, sum, step);
-            if (lane >= step) sum += other;
-        }
-        if (lane == 31) sum_of_warp[warp] = sum;
-        __syncthreads();
-        uint32_t total = 0, mine = 0;
-        for (unsigned w = 0; w < blockDim.x / 32; ++w) {
-            if (w == warp) mine = total;
-            total += sum_of_warp[w];
-        }
-        if (i < num_tiles) values[i] = before + mine + sum - value;
+        uint32_t total;
+        const uint32_t sum = block_prefix(i < num_tiles ? values[i] : 0, total);
+        if (i < num_tiles) values[i] = before + sum;
         before += total;
-        __syncthreads();
     }
 }
 
@@ -159,20 +145,14 @@ __global__ void partition_kernel(const Node* nodes, uint32_t num_nodes, const ui
     const size_t list = first_list + blockIdx.y;
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     __shared__ uint32_t word_bits[kWordsPerTile], lefts_before_word[kWordsPerTile];
-    if (warp == 0) {
-        uint32_t before = tile_lefts[list * gridDim.x + blockIdx.x];
-        for (unsigned k = lane; k < kWordsPerTile; k += 32) {
-            const uint32_t bits = words[(list * gridDim.x + blockIdx.x) * kWordsPerTile + k];
-            const uint32_t value = __popc(bits);
-            uint32_t sum = value;
-            for (unsigned step = 1; step < 32; step *= 2) {
-                const uint32_t other = __shfl_up_sync(kAllLanes, sum, step);
-                if (lane >= step) sum += other;
-            }
-            word_bits[k] = bits;
-            lefts_before_word[k] = before + sum - value;
-            before += __shfl_sync(kAllLanes, sum, 31);
-        }
+    const bool has_word = threadIdx.x < kWordsPerTile;
+    const uint32_t bits = has_word ? words[(list * gridDim.x + blockIdx.x) * kWordsPerTile + threadIdx.x] : 0;
+    uint32_t total;
+    const uint32_t before =
+        tile_lefts[list * gridDim.x + blockIdx.x] + block_prefix<uint32_t>(__popc(bits), total);
+    if (has_word) {
+        word_bits[threadIdx.x] = bits;
+        lefts_before_word[threadIdx.x] = before;
     }
     const NodeRange range = nodes_of_tile(nodes, num_nodes, blockIdx.x, count);
     for (unsigned k = warp; k < kWordsPerTile; k += kBlockSize / 32) {
