@@ -31,8 +31,8 @@ def asset():
 
 
 @pytest.fixture(scope="module")
-def bundle(asset):
-    return build(asset)
+def bundle(asset, device):
+    return build(asset, device=device)
 
 
 def everything_in(bundle):
@@ -86,12 +86,13 @@ import sys
 import v3dg
 from v3dg.procedural import make_asset
 config = v3dg.BuildConfig(cluster_size=32, steps=10)
-v3dg.build_bundle(make_asset(num_gaussians=1200, seed=0), config=config, progress=False).save(sys.argv[1])
+asset = make_asset(num_gaussians=1200, seed=0)
+v3dg.build_bundle(asset, config=config, progress=False, device="cpu").save(sys.argv[1])
 """
 
 
-def test_same_file_on_any_number_of_threads(bundle, tmp_path):
-    bundle.save(tmp_path / "here.v3dg")
+def test_same_file_on_any_number_of_threads(asset, tmp_path):
+    build(asset, device="cpu").save(tmp_path / "here.v3dg")
     files = [tmp_path / "here.v3dg"]
     for threads in (1, 2, 4):
         files.append(tmp_path / f"{threads}.v3dg")
@@ -104,17 +105,49 @@ def test_same_file_on_any_number_of_threads(bundle, tmp_path):
     assert len({hashlib.sha256(file.read_bytes()).hexdigest() for file in files}) == 1
 
 
-def test_another_seed_builds_another_bundle(asset, bundle):
-    assert same(build(asset, seed=0), bundle)
-    assert not same(build(asset, seed=1), bundle)
+def test_another_seed_builds_another_bundle(asset, bundle, device):
+    assert same(build(asset, seed=0, device=device), bundle)
+    assert not same(build(asset, seed=1, device=device), bundle)
 
 
-def test_largest_seed_is_its_own(asset):
+def test_largest_seed_is_its_own(asset, device):
     largest = 2**58 - 1
-    assert not same(build(asset, seed=largest), build(asset, seed=largest - 1))
+    a, b = (build(asset, seed=seed, device=device) for seed in (largest, largest - 1))
+    assert not same(a, b)
     for seed in (-1, largest + 1):
         with pytest.raises(ValueError, match="seed: expected 0 to 2\\^58 - 1"):
             build(asset, seed=seed)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("init", ["merge", "prune"])
+@pytest.mark.parametrize("group_size", [2, 8])
+def test_devices_start_from_the_same_bits(asset, init, group_size):
+    config = replace(SMALL, steps=0, init=init, group_size=group_size)
+    cpu, cuda = (everything_in(build(asset, config, device=device)) for device in ("cpu", "cuda"))
+    for name, array in cpu.items():
+        if name == "groups.error":
+            np.testing.assert_allclose(cuda[name], array, rtol=1e-3, atol=1e-5)
+        else:
+            np.testing.assert_array_equal(cuda[name], array, err_msg=name)
+
+
+@pytest.mark.gpu
+def test_asset_may_be_on_the_device(asset):
+    there = asset.torch("cuda")
+    there.means.requires_grad_()
+    for device in ("cuda", "cpu"):
+        assert same(build(there, device=device), build(asset, device=device))
+
+
+@pytest.mark.gpu
+def test_build_runs_on_the_callers_stream(asset):
+    import torch
+
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        bundle = build(asset, device="cuda")
+    assert same(bundle, build(asset, device="cuda"))
 
 
 # ---- what it is made of
@@ -122,9 +155,9 @@ def test_largest_seed_is_its_own(asset):
 
 @pytest.mark.parametrize("num_gaussians", [1000, 1023, 1025])
 @pytest.mark.parametrize("group_size", [2, 8])
-def test_each_level_has_half_of_the_one_below(num_gaussians, group_size):
+def test_each_level_has_half_of_the_one_below(num_gaussians, group_size, device):
     asset = make_asset(num_gaussians=1100, seed=3).subset(slice(num_gaussians))
-    bundle = build(asset, replace(SMALL, steps=0, group_size=group_size))
+    bundle = build(asset, replace(SMALL, steps=0, group_size=group_size), device=device)
     sizes = [len(bundle.level_gaussians(level)) for level in range(bundle.num_levels)]
     clusters = [len(bundle.level_range(level)) for level in range(bundle.num_levels)]
     assert sizes[0] == num_gaussians
@@ -161,8 +194,8 @@ def test_weights_and_balls_grow_towards_the_root(bundle):
 
 
 @pytest.mark.parametrize("moved", [0.0, 1e4])
-def test_boxes_hold_all_that_is_drawn(asset, moved):
-    bundle = build(scenes.replaced(asset, means=asset.means + np.float32(moved)))
+def test_boxes_hold_all_that_is_drawn(asset, moved, device):
+    bundle = build(scenes.replaced(asset, means=asset.means + np.float32(moved)), device=device)
     g = bundle.gaussians
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(200, 3))
@@ -177,17 +210,17 @@ def test_boxes_hold_all_that_is_drawn(asset, moved):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colours_of_all_degrees_survive_to_the_coarsest_level(degree):
+def test_colours_of_all_degrees_survive_to_the_coarsest_level(degree, device):
     rng = np.random.default_rng(degree)
     num_bases = (degree + 1) ** 2
     means = rng.uniform(-1, 1, (600, 3))
     sh = np.broadcast_to(rng.normal(0, 0.3, (num_bases, 3)), (600, num_bases, 3))
     asset = scenes.gaussians(means, scales=0.2, opacities=0.5, sh=sh.astype(np.float32))
-    bundle = build(asset, replace(SMALL, steps=0))
+    bundle = build(asset, replace(SMALL, steps=0), device=device)
     last = bundle.level_gaussians(bundle.num_levels - 1)
     np.testing.assert_allclose(last.sh, asset.sh[: len(last)], rtol=1e-5, atol=1e-6)
     # Fitting makes up for lost overlap with brightness, but has no reason to turn what the view changes.
-    fitted = build(asset)
+    fitted = build(asset, device=device)
     assert fitted.sh_degree == degree
     fitted_last = fitted.level_gaussians(fitted.num_levels - 1)
     np.testing.assert_allclose(fitted_last.sh.mean(axis=0)[1:], asset.sh[0, 1:], atol=0.1)
@@ -244,10 +277,10 @@ DEGENERATE = degenerate_assets()
 
 @pytest.mark.parametrize("init", ["merge", "prune"])
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_any_asset_is_built_selected_and_drawn(name, init):
+def test_any_asset_is_built_selected_and_drawn(name, init, device):
     asset = DEGENERATE[name]
     config = BuildConfig(cluster_size=8, steps=3, views_per_step=1, num_views=8, min_gaussians=1, init=init)
-    bundle = build(asset, config)
+    bundle = build(asset, config, device=device)
     for array_name, array in everything_in(bundle).items():
         assert np.isfinite(array).all(), array_name
     assert len(bundle.level_gaussians(bundle.num_levels - 1)) == 1
@@ -260,9 +293,9 @@ def test_any_asset_is_built_selected_and_drawn(name, init):
         assert all(np.isfinite(picture).all() for picture in (image.color, image.alpha, image.depth))
 
 
-def test_asset_without_gaussians_is_refused():
+def test_asset_without_gaussians_is_refused(device):
     with pytest.raises(ValueError, match="asset: expected at least one gaussian, got none"):
-        build(scenes.gaussians(np.zeros((0, 3))))
+        build(scenes.gaussians(np.zeros((0, 3))), device=device)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +310,7 @@ def test_asset_without_gaussians_is_refused():
         ("opacities", np.nan, "numbers from 0 to 1"),
     ],
 )
-def test_asset_with_wrong_values_is_refused(asset, name, value, expected):
+def test_asset_with_wrong_values_is_refused(asset, name, value, expected, device):
     wrong = np.array(getattr(asset, name))
     wrong.reshape(len(wrong), -1)[[17, 40], -1] = value
     message = (
@@ -285,7 +318,7 @@ def test_asset_with_wrong_values_is_refused(asset, name, value, expected):
         "the first is number 17; remove them"
     )
     with pytest.raises(ValueError, match=message):
-        build(scenes.replaced(asset, **{name: wrong}))
+        build(scenes.replaced(asset, **{name: wrong}), device=device)
 
 
 # ---- settings
@@ -334,9 +367,9 @@ def test_wrong_options_are_named(asset):
 
 @pytest.mark.parametrize("group_size", [2, 4, 8, 32])
 @pytest.mark.parametrize("changes", [{}, {"prune_growth": 1.0}, {"init": "merge", "targets": "leaves"}])
-def test_paper_settings_build(asset, group_size, changes):
+def test_paper_settings_build(asset, group_size, changes, device):
     config = BuildConfig.paper(cluster_size=1200 // 16, group_size=group_size, steps=2, **changes)
-    bundle = build(asset, config)
+    bundle = build(asset, config, device=device)
     # Down to two clusters, in place of a root.
     clusters = [len(bundle.level_range(level)) for level in range(bundle.num_levels)]
     assert clusters == [16, 8, 4, 2]
@@ -345,38 +378,42 @@ def test_paper_settings_build(asset, group_size, changes):
     assert np.isfinite(render(bundle, camera).color).all()
 
 
-def test_paper_fit_reduces_the_error(asset):
+def test_paper_fit_reduces_the_error(asset, device):
     config = BuildConfig.paper(cluster_size=300)
-    start, fitted = (build(asset, replace(config, steps=steps)) for steps in (0, 100))
+    start, fitted = (build(asset, replace(config, steps=steps), device=device) for steps in (0, 100))
     assert held_out_psnr(asset, fitted, 1) > held_out_psnr(asset, start, 1)
 
 
 # ---- quality
 
 
-def test_fit_is_never_worse_than_its_start(asset):
+def test_fit_is_never_worse_than_its_start(asset, device):
     config = replace(SMALL, num_views=16)
-    start = build(asset, replace(config, steps=0)).groups
+    start = build(asset, replace(config, steps=0), device=device).groups
     # Steps so long that fits run away; those of the first level have the same start in all.
     for change in ({}, {"step_position": 10.0, "step_logit": 50.0}, {"step_log_scale": 5.0, "step_sh0": 9.0}):
-        fitted = build(asset, replace(config, **change)).groups
+        fitted = build(asset, replace(config, **change), device=device).groups
         weights = [config.loss_l1, config.loss_alpha]
         first = start.level == 1
         assert (fitted.error[first] @ weights <= start.error[first] @ weights).all()
         assert np.isfinite(fitted.error).all()
 
 
-def test_runaway_fit_leaves_the_start(asset):
+def test_runaway_fit_leaves_the_start(asset, device):
     runaway = replace(SMALL, steps=3, step_position=1e6, step_logit=1e6, step_log_scale=1e6, step_sh0=1e6)
-    fitted, start = (build(asset, c).level_gaussians(1) for c in (runaway, replace(SMALL, steps=0)))
+    fitted, start = (
+        build(asset, c, device=device).level_gaussians(1) for c in (runaway, replace(SMALL, steps=0))
+    )
     np.testing.assert_allclose(fitted.means, start.means, atol=1e-6)
     np.testing.assert_allclose(fitted.opacities, start.opacities, atol=1e-3)
     np.testing.assert_allclose(fitted.sh, start.sh, atol=1e-6)
 
 
-def test_fit_gains_over_merging_alone(asset):
+def test_fit_gains_over_merging_alone(asset, device):
     """In dB, at the size of selection, on views that no fit saw. Measured: 1.5, 1.5, 0.7."""
-    merged, fitted = (build(asset, BuildConfig(cluster_size=64, steps=steps)) for steps in (0, 200))
+    merged, fitted = (
+        build(asset, BuildConfig(cluster_size=64, steps=steps), device=device) for steps in (0, 200)
+    )
     for level in (1, 2, 3):
         assert held_out_psnr(asset, fitted, level) > held_out_psnr(asset, merged, level) + 0.6
 
@@ -384,8 +421,8 @@ def test_fit_gains_over_merging_alone(asset):
 # ---- progress
 
 
-def test_bar_counts_all_levels_ahead(asset, capsys):
-    bundle = build_bundle(asset, config=replace(SMALL, group_size=4), progress=True)
+def test_bar_counts_all_levels_ahead(asset, capsys, device):
+    bundle = build_bundle(asset, config=replace(SMALL, group_size=4), progress=True, device=device)
     out, err = capsys.readouterr()
     assert out == ""
     # One bar that ends complete: all coarser gaussians, all levels, the last group, its loss.
@@ -396,6 +433,6 @@ def test_bar_counts_all_levels_ahead(asset, capsys):
     assert "groups 1/1, loss 0.0" in last
 
 
-def test_no_bar_unless_wanted(asset, capfd):
-    build_bundle(asset, config=SMALL, progress=False)
+def test_no_bar_unless_wanted(asset, capfd, device):
+    build_bundle(asset, config=SMALL, progress=False, device=device)
     assert capfd.readouterr() == ("", "")

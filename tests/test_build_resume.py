@@ -26,9 +26,14 @@ import v3dg
 from v3dg.procedural import make_asset
 asset = make_asset(num_gaussians=1000, seed=0)
 config = v3dg.BuildConfig(cluster_size=32, steps=int(sys.argv[1]))
+if sys.argv[4] == "cuda":
+    import torch
+    torch.zeros(1, device="cuda")  # so that the device is up
 print("ready", flush=True)
 try:
-    bundle = v3dg.build_bundle(asset, config=config, seed=7, progress=False, resume_path=sys.argv[2])
+    bundle = v3dg.build_bundle(
+        asset, config=config, seed=7, progress=False, device=sys.argv[4], resume_path=sys.argv[2]
+    )
 except KeyboardInterrupt:
     sys.exit(130)
 bundle.save(sys.argv[3])
@@ -49,17 +54,17 @@ def bytes_of(bundle, folder):
 
 
 @pytest.fixture(scope="module")
-def whole(asset, tmp_path_factory):
+def whole(asset, device, tmp_path_factory):
     """The bundle of a build that nothing interrupts."""
-    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False)
+    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False, device=device)
     return bytes_of(bundle, tmp_path_factory.mktemp("whole"))
 
 
 @contextmanager
-def started_build(config, folder):
+def started_build(config, device, folder):
     """A build in a process of its own; killed at the end if it still runs."""
     environment = os.environ | {"PYTHONPATH": str(Path(v3dg.__file__).parent.parent)}
-    arguments = [str(config.steps), str(folder / "levels"), str(folder / "out.v3dg")]
+    arguments = [str(config.steps), str(folder / "levels"), str(folder / "out.v3dg"), device]
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, *arguments],
         cwd=folder,
@@ -91,35 +96,37 @@ def names_in(folder):
     return sorted(p.name for p in folder.iterdir())
 
 
-def test_ctrl_c_ends_a_build_at_once(tmp_path):
-    with started_build(ENDLESS, tmp_path) as process:
+def test_ctrl_c_ends_a_build_at_once(tmp_path, device):
+    with started_build(ENDLESS, device, tmp_path) as process:
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE) == 130
     assert names_in(tmp_path) == []
 
 
-def test_interrupted_build_resumes_to_the_same_bytes(asset, whole, tmp_path):
-    with started_build(CONFIG, tmp_path) as process:
+def test_interrupted_build_resumes_to_the_same_bytes(asset, whole, tmp_path, device):
+    with started_build(CONFIG, device, tmp_path) as process:
         assert wait_for_growth(tmp_path / "levels", process)
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE) == 130
     assert names_in(tmp_path) == ["levels"]
-    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False, resume_path=tmp_path / "levels")
+    bundle = build_bundle(
+        asset, config=CONFIG, seed=7, progress=False, device=device, resume_path=tmp_path / "levels"
+    )
     assert names_in(tmp_path) == ["levels"]
     assert bytes_of(bundle, tmp_path) == whole
 
 
-def test_killed_builds_resume_to_the_same_bytes(asset, whole, tmp_path):
+def test_killed_builds_resume_to_the_same_bytes(asset, whole, tmp_path, device):
     levels = tmp_path / "levels"
     seen = 0
     for _ in range(3):
-        with started_build(CONFIG, tmp_path) as process:
+        with started_build(CONFIG, device, tmp_path) as process:
             seen = wait_for_growth(levels, process, seen) or seen
             process.kill()
             process.wait()
         assert names_in(tmp_path) == ["levels"]
-    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False, resume_path=levels)
+    bundle = build_bundle(asset, config=CONFIG, seed=7, progress=False, device=device, resume_path=levels)
     assert names_in(tmp_path) == ["levels"]
     assert bytes_of(bundle, tmp_path) == whole
 
@@ -159,7 +166,7 @@ def test_level_that_was_cut_off_is_built_again(asset, checkpoint, tmp_path):
         assert checkpoint.read_bytes() == whole
 
 
-@pytest.mark.parametrize("changed", ["asset", "config", "seed", "version"])
+@pytest.mark.parametrize("changed", ["asset", "config", "seed", "device", "version"])
 def test_checkpoint_of_another_build_is_refused(asset, checkpoint, changed, monkeypatch):
     before = checkpoint.read_bytes()
     config, seed = QUICK, 0
@@ -169,6 +176,8 @@ def test_checkpoint_of_another_build_is_refused(asset, checkpoint, changed, monk
         config = replace(config, distance=4.5)
     elif changed == "seed":
         seed = 1
+    elif changed == "device":
+        monkeypatch.setattr(v3dg.build._device, "describe", lambda _: "another")
     else:
         monkeypatch.setattr(v3dg.build, "__version__", "0.0.0")
     with pytest.raises(ValueError, match="another asset, config, seed, device or version; remove it"):
