@@ -1,37 +1,31 @@
 #include <memory>
 
 #include "bindings/args.h"
+#include "bindings/device_args.h"
+#include "bindings/render_args.h"
 #include "pipeline/fit_level.h"
+#include "pipeline/fit_level_cuda.h"
 #include "pipeline/model.h"
 
 namespace v3dg {
 
 using namespace py::literals;
 
-static void fit_level_arrays(const FitConfig& config, const std::shared_ptr<Model<float>>& target,
-                             float target_filter_px2, bool target_compensate, const py::array& target_range,
-                             const py::array& range, const py::array& ball, const py::array& stream,
-                             py::array& means, py::array& quats, py::array& scales, py::array& opacities,
-                             py::array& sh, py::array& error, FitProgress& progress) {
+namespace {
+
+// The groups that index `num_targets` and `num_rows` gaussians.
+std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& range, const py::array& ball,
+                                const py::array& stream, py::ssize_t num_targets, py::ssize_t num_rows) {
     const py::ssize_t num_groups = range.ndim() == 2 ? range.shape(0) : 0;
-    const py::ssize_t n = opacities.ndim() == 1 ? opacities.shape(0) : 0;
-    const int degree = target->planes().sh_degree;
     const Span<const int64_t> targets = span_of<const int64_t>(target_range, "target_range", {num_groups, 2});
     const Span<const int64_t> own = span_of<const int64_t>(range, "range", {num_groups, 2});
     const Span<const float> balls = span_of<const float>(ball, "ball", {num_groups, 4});
     const Span<const int64_t> streams = span_of<const int64_t>(stream, "stream", {num_groups});
-    const FitRows rows{span_of<float>(means, "means", {n, 3}).data,
-                       span_of<float>(quats, "quats", {n, 4}).data,
-                       span_of<float>(scales, "scales", {n, 3}).data,
-                       span_of<float>(opacities, "opacities", {n}).data,
-                       span_of<float>(sh, "sh", {n, num_sh_bases(degree), 3}).data,
-                       degree};
-    float* errors = span_of<float>(error, "error", {num_groups, 2}).data;
     std::vector<FitGroup> groups;
     for (py::ssize_t g = 0; g < num_groups; ++g) {
         const int64_t bounds[4] = {targets[2 * g], targets[2 * g + 1], own[2 * g], own[2 * g + 1]};
-        if (bounds[0] < 0 || bounds[1] < bounds[0] || bounds[1] > static_cast<int64_t>(target->size()) ||
-            bounds[2] < 0 || bounds[3] < bounds[2] || bounds[3] > n)
+        if (bounds[0] < 0 || bounds[1] < bounds[0] || bounds[1] > num_targets || bounds[2] < 0 ||
+            bounds[3] < bounds[2] || bounds[3] > num_rows)
             throw py::value_error("range: expected [first, last) within the gaussians, group " +
                                   std::to_string(g) + " is not");
         FitGroup group{static_cast<uint64_t>(bounds[0]),
@@ -46,10 +40,35 @@ static void fit_level_arrays(const FitConfig& config, const std::shared_ptr<Mode
                                   " has none");
         groups.push_back(group);
     }
+    return groups;
+}
+
+float* errors_of(py::array& error, size_t num_groups) {
+    return span_of<float>(error, "error", {static_cast<py::ssize_t>(num_groups), 2}).data;
+}
+
+void fit_level_arrays(const FitConfig& config, const std::shared_ptr<Model<float>>& target,
+                      float target_filter_px2, bool target_compensate, const py::array& target_range,
+                      const py::array& range, const py::array& ball, const py::array& stream,
+                      py::array& means, py::array& quats, py::array& scales, py::array& opacities,
+                      py::array& sh, py::array& error, FitProgress& progress) {
+    const py::ssize_t n = opacities.ndim() == 1 ? opacities.shape(0) : 0;
+    const int degree = target->planes().sh_degree;
+    const std::vector<FitGroup> groups =
+        groups_of(target_range, range, ball, stream, static_cast<py::ssize_t>(target->size()), n);
+    const FitRows rows{span_of<float>(means, "means", {n, 3}).data,
+                       span_of<float>(quats, "quats", {n, 4}).data,
+                       span_of<float>(scales, "scales", {n, 3}).data,
+                       span_of<float>(opacities, "opacities", {n}).data,
+                       span_of<float>(sh, "sh", {n, num_sh_bases(degree), 3}).data,
+                       degree};
+    float* errors = errors_of(error, groups.size());
     py::gil_scoped_release unlocked;
     fit_level(config, {groups.data(), groups.size()},
               {&target->planes(), target_filter_px2, target_compensate}, rows, errors, progress);
 }
+
+}  // namespace
 
 void bind_fit_level(py::module_& m) {
     py::class_<LossWeights>(m, "LossWeights")
@@ -84,6 +103,53 @@ void bind_fit_level(py::module_& m) {
     m.def("fit_level", &fit_level_arrays, "config"_a, "target"_a, "target_filter_px2"_a,
           "target_compensate"_a, "target_range"_a, "range"_a, "ball"_a, "stream"_a, "means"_a, "quats"_a,
           "scales"_a, "opacities"_a, "sh"_a, "error"_a, "progress"_a);
+    if constexpr (V3DG_WITH_CUDA) {
+        m.def(
+            "fit_level_cuda",
+            [](const FitConfig& config, const py::object& target_means, const py::object& target_quats,
+               const py::object& target_scales, const py::object& target_opacities,
+               const py::object& target_sh, float target_filter_px2, bool target_compensate,
+               const py::array& target_range, const py::array& range, const py::array& ball,
+               const py::array& stream, const py::object& means, const py::object& quats,
+               const py::object& scales, const py::object& opacities, const py::object& sh, py::array& error,
+               FitProgress& progress, uintptr_t cuda_stream) {
+                const Span<const float> target_opacity =
+                    device_span_of<const float>(target_opacities, "target_opacities", {-1});
+                const Span<float> opacity = device_span_of<float>(opacities, "opacities", {-1});
+                const auto num_targets = static_cast<py::ssize_t>(target_opacity.size);
+                const auto n = static_cast<py::ssize_t>(opacity.size);
+                const Span<const float> target_coefficients =
+                    device_span_of<const float>(target_sh, "target_sh", {num_targets, -1, 3});
+                const py::ssize_t bases =
+                    num_targets > 0 ? static_cast<py::ssize_t>(target_coefficients.size) / num_targets / 3
+                                    : 1;
+                const int degree = degree_of_bases(bases, "(N, " + std::to_string(bases) + ", 3)");
+                const cuda::DeviceFitTarget target{
+                    {device_span_of<const float>(target_means, "target_means", {num_targets, 3}).data,
+                     device_span_of<const float>(target_quats, "target_quats", {num_targets, 4}).data,
+                     device_span_of<const float>(target_scales, "target_scales", {num_targets, 3}).data,
+                     target_opacity.data, target_coefficients.data, degree},
+                    target_filter_px2,
+                    target_compensate};
+                const FitRows rows{device_span_of<float>(means, "means", {n, 3}).data,
+                                   device_span_of<float>(quats, "quats", {n, 4}).data,
+                                   device_span_of<float>(scales, "scales", {n, 3}).data,
+                                   opacity.data,
+                                   device_span_of<float>(sh, "sh", {n, bases, 3}).data,
+                                   degree};
+                const std::vector<FitGroup> groups =
+                    groups_of(target_range, range, ball, stream, num_targets, n);
+                float* errors = errors_of(error, groups.size());
+                py::gil_scoped_release unlocked;
+                cuda::fit_level(config, {groups.data(), groups.size()}, target, rows, errors, progress,
+                                reinterpret_cast<cuda::Stream>(cuda_stream));
+            },
+            "config"_a, "target_means"_a, "target_quats"_a, "target_scales"_a, "target_opacities"_a,
+            "target_sh"_a, "target_filter_px2"_a, "target_compensate"_a, "target_range"_a, "range"_a,
+            "ball"_a, "stream"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "error"_a,
+            "progress"_a, "cuda_stream"_a,
+            "The same on a device, where all gaussians are; the other arrays are on the host.");
+    }
 }
 
 }  // namespace v3dg

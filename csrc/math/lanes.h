@@ -18,7 +18,15 @@ namespace v3dg {
 
 V3DG_HD inline float sqrt_of(float x) { return ::sqrtf(x); }
 V3DG_HD inline double sqrt_of(double x) { return ::sqrt(x); }
-V3DG_HD inline float exp2_in_range(float x) { return ::exp2f(x); }
+V3DG_HD inline float exp2_in_range(float x) {
+#ifdef __CUDA_ARCH__
+    float y;  // exp2f without its care for results below 2^-126
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return ::exp2f(x);
+#endif
+}
 V3DG_HD inline double exp2_in_range(double x) { return ::exp2(x); }
 V3DG_HD inline float log2_of(float x) { return ::log2f(x); }
 V3DG_HD inline double log2_of(double x) { return ::log2(x); }

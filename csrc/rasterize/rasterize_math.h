@@ -93,6 +93,15 @@ V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V b
     return moves ? Lane<V>(kLn2) * alpha * d_alpha : V{};
 }
 
+// The same for a walk from back to front, without the division. `behind` is what the gaussians behind give,
+// seen through nothing else; this one is put in front of them. Pass an alpha of 0 where it was not blended.
+template <class V>
+V3DG_HD V3DG_INLINE V exponent_vjp_from_behind(V alpha, V weight, V by_weight, V& behind) {
+    const V difference = by_weight - behind;
+    behind = behind + alpha * difference;
+    return alpha < all_lanes<V>(Lane<V>(kMaxAlpha)) ? Lane<V>(kLn2) * weight * difference : V{};
+}
+
 // Sums over pixels of the gradients by what the exponent is made of.
 template <class T>
 struct FalloffSums {

@@ -1,0 +1,57 @@
+#pragma once
+
+#include "base/device.h"
+#include "fit_group/fit_group_math.h"
+
+namespace v3dg {
+namespace cuda {
+
+// Between a running fit and the host, in memory that both see.
+struct FitSignals {
+    unsigned long long groups_done;
+    unsigned long long loss_sum;  // in units of 2^-32
+    int cancel;
+};
+
+// A group with the place of its pictures and of its result.
+struct FitJob {
+    FitGroup group;
+    uint64_t first_pixel;  // of its pictures, in `targets`
+    uint64_t first_view;   // in `views`
+    uint32_t error;        // in pairs
+    int size;              // of its pictures, px
+};
+
+// All pointers are the device's; so are the rows of `rows`.
+struct FitGroupsInput {
+    FitConfig config;
+    uint64_t stride;  // visiting_stride()
+    Span<const FitJob> jobs;
+    const float4* targets;  // colour and alpha, picture by picture, row major
+    const FitView* views;   // as many as there are pictures
+    const FitStep* steps;
+    FitRows rows;
+    float* error;
+    FitSignals* signals;
+};
+
+// Pictures that a group is compared with: its fixed views, or those of all steps and then of the residual.
+V3DG_HD inline uint64_t num_pictures(const FitConfig& config) {
+    return config.num_views > 0
+               ? static_cast<uint64_t>(config.num_views)
+               : static_cast<uint64_t>(config.steps) * config.views_per_step + kResidualViews;
+}
+V3DG_HD inline uint64_t view_of_picture(const FitConfig& config, uint64_t picture) {
+    const uint64_t num_visits = static_cast<uint64_t>(config.steps) * config.views_per_step;
+    return config.num_views > 0 || picture < num_visits
+               ? picture
+               : residual_view(config, 0, static_cast<int>(picture - num_visits));
+}
+
+// As v3dg::fit_group, for all groups at once; jobs are best ordered by falling size. The jobs are read by the
+// host, too. Groups done are counted in the signals; when they say cancel, groups under way stay as they
+// were.
+void fit_groups(const FitGroupsInput& in, Span<const FitJob> jobs, cudaStream_t stream);
+
+}  // namespace cuda
+}  // namespace v3dg

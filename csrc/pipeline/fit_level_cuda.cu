@@ -1,0 +1,170 @@
+#include "pipeline/fit_level_cuda.h"
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <thread>
+#include <vector>
+
+#include "fit_group/fit_target_cuda.h"
+
+namespace v3dg {
+namespace cuda {
+
+namespace {
+
+// Bytes of target pictures that may wait at once; a quarter of what is free, if that is less.
+constexpr size_t kTargetBytes = size_t(2) << 30;
+constexpr std::chrono::microseconds kBetweenLooks{50};
+
+// Memory that the host and a running kernel both see.
+class Signals {
+  public:
+    Signals() {
+        check(cudaHostAlloc(reinterpret_cast<void**>(&host_), sizeof(FitSignals), cudaHostAllocMapped),
+              "cudaHostAlloc");
+        *host_ = FitSignals{};
+    }
+    Signals(const Signals&) = delete;
+    Signals& operator=(const Signals&) = delete;
+    ~Signals() { cudaFreeHost(host_); }
+
+    volatile FitSignals& host() { return *host_; }
+    FitSignals* device() const { return host_; }  // the same address
+
+  private:
+    FitSignals* host_ = nullptr;
+};
+
+class Event {
+  public:
+    Event() { check(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming), "cudaEventCreateWithFlags"); }
+    Event(const Event&) = delete;
+    Event& operator=(const Event&) = delete;
+    ~Event() { cudaEventDestroy(event_); }
+
+    void record(cudaStream_t stream) { check(cudaEventRecord(event_, stream), "cudaEventRecord"); }
+    bool has_happened() const {
+        const cudaError_t state = cudaEventQuery(event_);
+        if (state == cudaErrorNotReady) return false;
+        check(state, "fit_groups_kernel");
+        return true;
+    }
+
+  private:
+    cudaEvent_t event_ = nullptr;
+};
+
+// Groups in the order in which they are taken: those that take longest first.
+std::vector<FitJob> jobs_of(const FitConfig& config, Span<const FitGroup> groups) {
+    std::vector<FitJob> jobs(groups.size);
+    for (size_t g = 0; g < groups.size; ++g)
+        jobs[g] = {groups[g], 0, 0, static_cast<uint32_t>(g), fit_view(config, groups[g], 0).size};
+    std::stable_sort(jobs.begin(), jobs.end(),
+                     [](const FitJob& a, const FitJob& b) { return a.group.count > b.group.count; });
+    return jobs;
+}
+
+size_t target_bytes(const FitConfig& config, const FitJob& job) {
+    return num_pictures(config) * job.size * job.size * sizeof(float4);
+}
+
+// Fits jobs whose pictures fit into memory together.
+class Level {
+  public:
+    Level(const FitConfig& config, const DeviceFitTarget& target, const FitRows& rows, size_t num_groups,
+          FitProgress& progress, cudaStream_t stream)
+        : config_(config),
+          target_(target),
+          rows_(rows),
+          progress_(progress),
+          stream_(stream),
+          error_(2 * num_groups, stream) {
+        std::vector<FitStep> steps;
+        for (int i = 0; i < config.steps; ++i) steps.push_back(fit_step(config, i));
+        steps_.copy_from({steps.data(), steps.size()}, stream);
+    }
+
+    const float* error() const { return error_.data(); }
+
+    void fit(Span<FitJob> jobs) {
+        size_t num_pixels = 0, num_views = 0;
+        for (FitJob& job : jobs) {
+            job.first_pixel = num_pixels;
+            job.first_view = num_views;
+            num_pixels += target_bytes(config_, job) / sizeof(float4);
+            num_views += num_pictures(config_);
+        }
+        const DeviceBuffer<FitJob> jobs_on_device(jobs, stream_);
+        float4* targets = targets_.reserve(num_pixels, stream_);
+        FitView* views = views_.reserve(num_views, stream_);
+        const Span<const FitJob> on_device{jobs_on_device.data(), jobs.size};
+        make_views(config_, on_device, views, stream_);
+        draw_targets(config_, jobs, on_device.data, target_, views, targets, frame_, stream_);
+
+        Signals signals;
+        const FitGroupsInput in{
+            config_,       visiting_stride(config_), on_device, targets, views, steps_.data(), rows_,
+            error_.data(), signals.device()};
+        fit_groups(in, jobs, stream_);
+        done_.record(stream_);
+        const uint64_t done_before = progress_.groups_done;
+        const double loss_before = progress_.loss_sum;
+        const auto report = [&] {
+            progress_.groups_done = done_before + signals.host().groups_done;
+            progress_.loss_sum = loss_before + std::ldexp(static_cast<double>(signals.host().loss_sum), -32);
+        };
+        while (!done_.has_happened()) {
+            report();
+            if (progress_.cancel) signals.host().cancel = 1;
+            std::this_thread::sleep_for(kBetweenLooks);
+        }
+        report();
+    }
+
+  private:
+    const FitConfig& config_;
+    const DeviceFitTarget& target_;
+    const FitRows& rows_;
+    FitProgress& progress_;
+    const cudaStream_t stream_;
+    DeviceBuffer<float> error_;
+    DeviceBuffer<FitStep> steps_;
+    DeviceBuffer<float4> targets_;
+    DeviceBuffer<FitView> views_;
+    Frame frame_;
+    Event done_;
+};
+
+}  // namespace
+
+void fit_level(const FitConfig& config, Span<const FitGroup> groups, const DeviceFitTarget& target,
+               const FitRows& rows, float* error, FitProgress& progress, Stream stream) {
+    if (groups.empty() || progress.cancel) return;
+    std::vector<FitJob> jobs = jobs_of(config, groups);
+    size_t free_bytes = 0, total_bytes = 0;
+    check(cudaMemGetInfo(&free_bytes, &total_bytes), "cudaMemGetInfo");
+    size_t budget = std::min(kTargetBytes, free_bytes / 4);
+    Level level(config, target, rows, groups.size, progress, stream);
+    for (size_t first = 0; first < jobs.size() && !progress.cancel;) {
+        size_t last = first, bytes = 0;
+        while (last < jobs.size() && (last == first || bytes + target_bytes(config, jobs[last]) <= budget))
+            bytes += target_bytes(config, jobs[last++]);
+        try {
+            level.fit({jobs.data() + first, last - first});
+        } catch (const OutOfMemory&) {
+            if (last == first + 1) throw;
+            budget /= 2;
+            continue;
+        }
+        first = last;
+    }
+    if (progress.cancel) return;
+    check(cudaMemcpyAsync(error, level.error(), 2 * groups.size * sizeof(float), cudaMemcpyDeviceToHost,
+                          stream),
+          "cudaMemcpyAsync");
+    check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+}
+
+}  // namespace cuda
+}  // namespace v3dg

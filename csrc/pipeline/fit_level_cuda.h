@@ -1,0 +1,26 @@
+#pragma once
+
+#include "base/stream.h"
+#include "fit_group/fit_group.h"
+#include "pipeline/frame_types.h"
+
+namespace v3dg {
+namespace cuda {
+
+// The gaussians that groups should look like, on the device.
+struct DeviceFitTarget {
+    DeviceRows rows;
+    float filter_px2;
+    bool compensate;
+};
+
+// As v3dg::fit_level, with rows on the device and `error` on the host. Returns when all is done.
+//
+// Any device gives the same result at any time; it differs from the CPU's as far as rounding is carried by
+// the steps. Groups' pictures are drawn before they are fitted, as many groups at once as there is memory
+// for.
+void fit_level(const FitConfig& config, Span<const FitGroup> groups, const DeviceFitTarget& target,
+               const FitRows& rows, float* error, FitProgress& progress, Stream stream);
+
+}  // namespace cuda
+}  // namespace v3dg
