@@ -18,6 +18,30 @@ namespace v3dg {
 
 V3DG_HD inline float sqrt_of(float x) { return ::sqrtf(x); }
 V3DG_HD inline double sqrt_of(double x) { return ::sqrt(x); }
+// As many bits as a hair of margin needs, for normal x: relative error below 1e-6.
+V3DG_HD inline float rough_reciprocal(float x) {
+#ifdef __CUDA_ARCH__
+    return __fdividef(1.0f, x);
+#else
+    return 1.0f / x;
+#endif
+}
+V3DG_HD inline float rough_sqrt(float x) {
+#ifdef __CUDA_ARCH__
+    float root;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(root) : "f"(x));
+    return root;
+#else
+    return ::sqrtf(x);
+#endif
+}
+// The integer nearest to x in [0, 2^21]; ties go either way.
+V3DG_HD inline uint32_t nearest_int(float x) {
+    const float shifted = x + 8388608.0f;  // 2^23: adding it rounds to an integer
+    uint32_t bits;
+    std::memcpy(&bits, &shifted, sizeof bits);
+    return bits & 0x1fffff;
+}
 V3DG_HD inline float exp2_in_range(float x) {
 #ifdef __CUDA_ARCH__
     float y;  // exp2f without its care for results below 2^-126

@@ -153,9 +153,17 @@ void Frame::enqueue(Drawing& drawing) {
               batch.num_tiles, capacity.items, capacity.records, capacity.large, capacity.entries, large,
               tiles, &state->counters},
              bins, stream);
-    const FrameLists lists{
-        batch.images, bins.image_of_tile, batch.num_tiles,  records,         bins.tile_first, entries,
-        scratch,      &state->counters,   capacity.records, capacity.entries};
+    const FrameLists lists{batch.images,
+                           bins.image_of_tile,
+                           batch.num_tiles,
+                           records,
+                           bins.tile_first,
+                           entries,
+                           scratch,
+                           &state->counters,
+                           capacity.records,
+                           capacity.entries,
+                           room(tile_order_, batch.num_tiles, stream)};
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, stream) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, stream) : nullptr};
     rasterize(lists, keeps_tape ? &tape : nullptr, stream);

@@ -108,6 +108,7 @@ struct FrameLists {
     TileEntry *entries, *scratch;          // each tile's in any order
     const FrameCounters* counters;
     unsigned long long record_capacity, entry_capacity;  // records: at most kMostFrameRecords
+    uint32_t* tile_order;  // [num_tiles] scratch: the order in which blocks take the tiles; may be null
 };
 
 }  // namespace cuda

@@ -123,4 +123,24 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
+// The pixels of an 8 x 4 window that a gaussian may reach, a bit each, row by row; (u, v) is its centre from
+// that of the first pixel. Some more, so that the blend step alone decides.
+V3DG_HD inline uint32_t reached_pixels(float u, float v, float l11, float l12, float l22,
+                                       float log2_opacity) {
+    const float reach = log2_opacity - static_cast<float>(kLog2MinAlpha);
+    const float inverse = rough_reciprocal(l11), slope = -l12 * inverse;
+    constexpr float kHair = 1e-2f;
+    // Half a pixel more, as the first pixel and the end are rounded to the nearest.
+    const float first_u = u + (0.5f - kHair), end_u = u + (0.5f + kHair), wider = inverse * (1 + 2e-3f);
+    uint32_t pixels = 0;
+    for (int row = 0; row < 4; ++row) {
+        const float y = static_cast<float>(row) - v, t = l22 * y;
+        const float half = rough_sqrt(max_of(reach - t * t, 0.0f)) * wider;
+        const float first = min_of(max_of(slope * y + (first_u - half), 0.0f), 8.0f);
+        const float end = min_of(max_of(slope * y + (end_u + half), first), 8.0f);
+        pixels += ((1u << nearest_int(end)) - (1u << nearest_int(first))) << (8 * row);
+    }
+    return pixels;
+}
+
 }  // namespace v3dg
