@@ -29,6 +29,9 @@ from v3dg.bundle import Bundle
 from v3dg.procedural import make_asset
 from v3dg.scene import read_scene
 
+# px², past which every instance is drawn from its last level.
+_MOST_TOLERANCE = 1e4
+
 Part = Literal["default", "paper", "split", "large"]
 
 
@@ -47,7 +50,7 @@ class Config:
     """The true picture of its camera."""
     camera: int = 59
     in_frustum: tuple[float, ...] = (2.9e6, 5.7e6, 11.5e6, 22.9e6)
-    """How many gaussians to draw; the tolerance is searched."""
+    """How many gaussians to draw, as far as the bundle goes down; the tolerance is searched."""
     repeats: int = 3
     output: str | None = None
 
@@ -127,8 +130,11 @@ def pictures(bundle: Bundle, config: Config) -> list[dict[str, Any]]:
         return v3dg.render(scene, camera, tolerance=tolerance, device=gpu.DEVICE)
 
     rows = []
+    least = draw(_MOST_TOLERANCE).stats.gaussians_in_frustum
     for wanted in config.in_frustum:
-        low, high = math.log(1e-3), math.log(1e4)
+        if wanted < least:
+            continue
+        low, high = math.log(1e-3), math.log(_MOST_TOLERANCE)
         for _ in range(24):  # more gaussians at a lower tolerance
             middle = (low + high) / 2
             if draw(math.exp(middle)).stats.gaussians_in_frustum > wanted:

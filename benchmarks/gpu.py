@@ -39,15 +39,19 @@ def median_ms(call: Callable[[], Any], repeats: int) -> float:
 
 
 class PeakMemory:
-    """The most memory of the GPU in use within a `with` block, beyond what was in use before: `.gigabytes`.
+    """The most memory of the GPU in use within a `with` block, beyond an idle process's: `.gigabytes`.
 
-    Sampled every few milliseconds, from the driver: it sees everybody's allocations.
+    Sampled every few milliseconds, from the driver: it sees everybody's allocations, and what a pool keeps.
     """
+
+    _idle: int | None = None
 
     def __enter__(self) -> PeakMemory:
         torch.cuda.synchronize()
         torch.cuda.empty_cache()
-        self._least = self._before = torch.cuda.mem_get_info()[0]
+        self._least = torch.cuda.mem_get_info()[0]
+        if PeakMemory._idle is None:
+            PeakMemory._idle = self._least
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._watch)
         self._thread.start()
@@ -58,7 +62,7 @@ class PeakMemory:
     ) -> None:
         self._done.set()
         self._thread.join()
-        self.gigabytes = (self._before - self._least) / 1e9
+        self.gigabytes = (PeakMemory._idle - self._least) / 1e9
 
     def _watch(self) -> None:
         while not self._done.wait(0.005):
