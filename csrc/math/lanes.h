@@ -218,6 +218,18 @@ V3DG_INLINE Vec<float> min_of(Vec<float> a, Vec<float> b) {
 }
 #endif
 
+// a / b of numbers that are neither tiny nor huge.
+template <class V>
+V3DG_HD V3DG_INLINE V quotient_of(V a, V b) {
+#ifdef __CUDA_ARCH__
+    float inverse;  // within 1 ulp
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(b));
+    return a * inverse;
+#else
+    return a / b;
+#endif
+}
+
 template <class V>
 V3DG_HD V3DG_INLINE V max_of(V a, V b) {
     return a > b ? a : b;

@@ -37,9 +37,9 @@ struct RasterizeBackwardInput {
     PictureGradient<float> d_picture;
 };
 
-// Writes the slots, and into `d_background_of_tile` [num_tiles, 3] what each tile gives to the background.
+// Writes the slots and the gradient of the background (3). `d_background_of_tile` is scratch, (num_tiles, 3).
 void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
-                        float* d_background_of_tile, cudaStream_t stream);
+                        float* d_background_of_tile, float* d_background, cudaStream_t stream);
 
 }  // namespace cuda
 }  // namespace v3dg

@@ -29,6 +29,7 @@ static_assert(kPairs >= kWarps, "one entry fits");
 struct Share {
     float d_exponent, weight;
 };
+constexpr int kShareStride = 33;  // of the pixels of a gaussian; odd, against bank conflicts
 
 struct Shared {
     Record<float> record[kBatch];
@@ -40,7 +41,7 @@ struct Shared {
     uint32_t alive;  // bit w: warp w has a pixel that has not stopped
     float4 d_color[kWarps][kWarpHeight]
                   [kWarpWidth + 1];  // and by depth; the spare column is against conflicts
-    Share share[kWarps][kHeld][33];
+    Share share[kWarps][kHeld * kShareStride];
     float pair[kPairs][kValues];
     float d_background[kWarps][3];
 };
@@ -96,14 +97,14 @@ __device__ Pixel read_pixel(const RasterizeBackwardInput& in, int column, int ro
 }
 
 // Sums over the warp's pixels for the gaussians it holds; `entry` is the place in the batch of the one this
-// lane works on. Lane = row of pixels * kHeld + gaussian.
+// lane works on, (left, top) the centre of the warp's first pixel. Lane = row of pixels * kHeld + gaussian.
 template <bool kWithDepth>
 __device__ void add_up(Shared& s, int warp, int held, int entry, float left, float top) {
     const int lane = threadIdx.x % 32, gaussian = lane % kHeld, row = lane / kHeld;
     __syncwarp();
     const Record<float>& g = s.record[entry];
-    const float u = g.u, v = g.v, l11 = g.l11, l12 = g.l12, l22 = g.l22;
-    const Share* shares = &s.share[warp][gaussian][kWarpWidth * row];
+    const float u = g.u - left, v = g.v - top, l11 = g.l11, l12 = g.l12, l22 = g.l22;
+    const Share* shares = &s.share[warp][gaussian * kShareStride + kWarpWidth * row];
     const float4* d_colors = s.d_color[warp][row];
     float sum = 0, sum_t1 = 0, sum_t1_dx = 0, color[3] = {0, 0, 0}, depth = 0;
     Falloff<float> f;
@@ -111,7 +112,7 @@ __device__ void add_up(Shared& s, int warp, int held, int entry, float left, flo
     for (int i = 0; i < kWarpWidth; ++i) {
         const Share share = shares[i];
         const float4 d_color = d_colors[i];
-        f = falloff_at(left + i, top + row, u, v, l11, l12, l22, 0.0f);
+        f = falloff_at(float(i), float(row), u, v, l11, l12, l22, 0.0f);
         const float d_t1 = share.d_exponent * f.t1;
         sum += share.d_exponent;
         sum_t1 += d_t1;
@@ -157,6 +158,8 @@ __device__ void add_up(Shared& s, int warp, int held, int entry, float left, flo
 template <bool kWithDepth>
 __device__ void blend_batch_vjp(Shared& s, int warp, int num, Pixel& p, float left, float top) {
     const int lane = threadIdx.x % 32;
+    Share* const shares = &s.share[warp][lane];
+    const int own = lane % kHeld;  // which of the held gaussians this lane will sum: the batch's `entry`
     int held = 0, entry = 0;
     bool alive = true;
     for (int first = 0; first < num && alive; first += 32) {
@@ -172,11 +175,11 @@ __device__ void blend_batch_vjp(Shared& s, int warp, int num, Pixel& p, float le
             for (int c = 0; c < 3; ++c) by_weight += p.d_color[c] * g.color[c];
             if (kWithDepth) by_weight += p.d_depth * g.depth;
             p.running += weight * by_weight;
-            s.share[warp][held][lane] = {exponent_vjp(alpha, before, weight, by_weight, p.total - p.running),
-                                         weight};
-            if (lane % kHeld == held) entry = i;
+            shares[held * kShareStride] = {
+                exponent_vjp(alpha, before, weight, by_weight, p.total - p.running), weight};
+            if (held == own) entry = i;
             if (++held == kHeld) {
-                add_up<kWithDepth>(s, warp, held, entry, left, top);
+                add_up<kWithDepth>(s, warp, kHeld, entry, left, top);
                 held = 0;
             }
         }
@@ -190,7 +193,9 @@ template <bool kWithDepth>
 __global__ void __launch_bounds__(kThreads, 2)
     rasterize_backward_kernel(RasterizeBackwardInput in, GradientSlots slots, float* d_background_of_tile) {
     Shared& s = *reinterpret_cast<Shared*>(shared_memory());
-    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    const int lane = threadIdx.x % 32;
+    const int warp =
+        __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32, 0);  // tells that all lanes agree
     const int tile_column = blockIdx.x % in.image.tile_columns, tile_row = blockIdx.x / in.image.tile_columns;
     const int left = tile_column * kFrameTileWidth, top = tile_row * kFrameTileHeight;
     const int warp_left = left + warp % kWarpColumns * kWarpWidth,
@@ -261,15 +266,26 @@ __global__ void __launch_bounds__(kThreads, 2)
     }
 }
 
+// A warp a channel.
+__global__ void sum_over_tiles_kernel(const float* of_tile, uint32_t num_tiles, float* total) {
+    const int channel = threadIdx.x / 32, lane = threadIdx.x % 32;
+    float sum = 0;
+    for (uint32_t t = lane; t < num_tiles; t += 32) sum += of_tile[3 * t + channel];
+    sum = warp_sum(sum);
+    if (lane == 0) total[channel] = sum;
+}
+
 }  // namespace
 
 void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
-                        float* d_background_of_tile, cudaStream_t stream) {
+                        float* d_background_of_tile, float* d_background, cudaStream_t stream) {
     const unsigned num_tiles = in.image.tile_columns * in.image.tile_rows;
     launch(
-        "rasterize_backward",
+        "rasterize_backward_kernel",
         in.d_picture.depth != nullptr ? &rasterize_backward_kernel<true> : &rasterize_backward_kernel<false>,
         num_tiles, kThreads, sizeof(Shared), stream, in, slots, d_background_of_tile);
+    launch("sum_over_tiles_kernel", &sum_over_tiles_kernel, 1, 3 * 32, 0, stream, d_background_of_tile,
+           num_tiles, d_background);
 }
 
 }  // namespace cuda

@@ -88,7 +88,7 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t) {
 template <class V>
 V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V behind) {
     // alpha takes its weight and dims all that is behind.
-    const V d_alpha = before * by_weight - behind / (1 - alpha);
+    const V d_alpha = before * by_weight - quotient_of(behind, 1 - alpha);
     const auto moves = (weight > V{}) & (alpha < all_lanes<V>(Lane<V>(kMaxAlpha)));
     return moves ? Lane<V>(kLn2) * alpha * d_alpha : V{};
 }
