@@ -93,6 +93,12 @@ GRADIENT_FLOAT = GradientBound(
     reason="Sums over pixels in float32; single pixels flip at the cut-offs.",
 )
 
+BACKGROUND_GRADIENT = Bound(
+    relative=1e-5,
+    absolute=1e-4,
+    reason="A sum over thousands of pixels of numbers of order 1, in float32.",
+)
+
 MERGE_FLOAT = Bound(
     relative=2e-5,
     absolute=3e-6,

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import scenes
 import v3dg
 from compare import (
+    BACKGROUND_GRADIENT,
     FINITE_DIFFERENCE,
     GRADIENT_DOUBLE,
     GRADIENT_FLOAT,
@@ -23,6 +24,7 @@ from compare import (
     assert_gradients_agree,
     assert_pictures_agree,
 )
+from devices import host, on
 from reference import rasterize as reference
 
 CAMERAS = pytest.mark.parametrize("camera", scenes.CAMERAS.values(), ids=scenes.CAMERAS.keys())
@@ -42,6 +44,12 @@ INPUTS = (*scenes.NAMES, "background")
 @pytest.fixture
 def torch():
     return pytest.importorskip("torch")
+
+
+def draw(device, gaussians, camera, **mode):
+    """The picture drawn on `device`, as NumPy arrays."""
+    raster = v3dg.rasterize(on(device, gaussians), camera, **mode)
+    return v3dg.Raster(*host((raster.color, raster.alpha, raster.depth)))
 
 
 def draw_double(torch, gaussians, camera, **mode):
@@ -68,67 +76,67 @@ def test_picture_in_double_is_the_references(torch, camera, mode, sh_degree):
 @CAMERAS
 @MODES
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_picture_is_the_references(camera, mode, sh_degree):
+def test_picture_is_the_references(device, camera, mode, sh_degree):
     gaussians = scenes.random_gaussians(10 + sh_degree, camera, 100, sh_degree=sh_degree)
     picture = reference.rasterize(gaussians, camera, **mode)
     assert (picture.alpha > 0).mean() > 0.5
-    assert_pictures_agree(v3dg.rasterize(gaussians, camera, **mode), picture, PICTURE_FLOAT)
+    assert_pictures_agree(draw(device, gaussians, camera, **mode), picture, PICTURE_FLOAT)
 
 
 @MODES
-def test_many_gaussians_over_many_tiles(torch, mode):
+def test_many_gaussians_over_many_tiles(torch, device, mode):
     camera = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
     gaussians = scenes.trained_like(20, camera, 1500)
     picture = reference.rasterize(gaussians, camera, **mode)
     assert picture.num_blended.max() > 20
     assert picture.is_stopped.any() or mode.get("antialiased")
     assert_pictures_agree(draw_double(torch, gaussians, camera, **mode), picture, PICTURE_DOUBLE)
-    assert_pictures_agree(v3dg.rasterize(gaussians, camera, **mode), picture, NEEDLES_FLOAT)
+    assert_pictures_agree(draw(device, gaussians, camera, **mode), picture, NEEDLES_FLOAT)
 
 
 @MODES
 @pytest.mark.parametrize("name", scenes.degenerate())
-def test_degenerate_scene_is_the_references(torch, mode, name):
+def test_degenerate_scene_is_the_references(torch, device, mode, name):
     gaussians, camera = scenes.degenerate()[name], scenes.CAMERAS["plain"]
     picture = reference.rasterize(gaussians, camera, **mode)
     assert_pictures_agree(draw_double(torch, gaussians, camera, **mode), picture, PICTURE_DOUBLE)
-    assert_pictures_agree(v3dg.rasterize(gaussians, camera, **mode), picture, NEEDLES_FLOAT)
+    assert_pictures_agree(draw(device, gaussians, camera, **mode), picture, NEEDLES_FLOAT)
 
 
 @pytest.mark.parametrize("name", scenes.poison())
 @MODES
-def test_gaussian_without_meaning_is_not_drawn(name, mode):
+def test_gaussian_without_meaning_is_not_drawn(device, name, mode):
     camera = scenes.CAMERAS["plain"]
     good = scenes.random_gaussians(3, camera, 20)
-    alone = v3dg.rasterize(good, camera, **mode)
+    alone = draw(device, good, camera, **mode)
     with_poison = v3dg.Gaussians.concatenate([scenes.poison()[name], good])
-    assert digest(v3dg.rasterize(with_poison, camera, **mode)) == digest(alone)
+    assert digest(draw(device, with_poison, camera, **mode)) == digest(alone)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_color_without_meaning_stays_where_the_gaussian_is(value):
+def test_color_without_meaning_stays_where_the_gaussian_is(device, value):
     camera = scenes.CAMERAS["plain"]
     here = scenes.gaussians([-0.4, 0, 2.0], color=(value, 0.5, 0.5))
     there = scenes.gaussians([0.5, 0, 2.0])
-    both = v3dg.rasterize(v3dg.Gaussians.concatenate([here, there]), camera)
-    right = v3dg.rasterize(there, camera)
+    both = draw(device, v3dg.Gaussians.concatenate([here, there]), camera)
+    right = draw(device, there, camera)
     np.testing.assert_array_equal(both.color[:, 30:], right.color[:, 30:])
 
 
 @pytest.mark.parametrize("num", [1, 2, 7, 8, 9, 15, 16, 17, 31, 33])
-def test_every_count_of_gaussians(num):
+def test_every_count_of_gaussians(device, num):
     camera = scenes.CAMERAS["posed"]
     gaussians = scenes.random_gaussians(num, camera, num, sh_degree=1)
     picture = reference.rasterize(gaussians, camera, filter_px2=0.1)
-    assert_pictures_agree(v3dg.rasterize(gaussians, camera, filter_px2=0.1), picture, PICTURE_FLOAT)
+    assert_pictures_agree(draw(device, gaussians, camera, filter_px2=0.1), picture, PICTURE_FLOAT)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (31, 33), (32, 32), (33, 31), (64, 65), (129, 3)])
-def test_every_image_size(size):
+def test_every_image_size(device, size):
     camera = scenes.camera(*size, fx=40.0)
     gaussians = scenes.random_gaussians(7, camera, 60, size_px=(1, 8))
     picture = reference.rasterize(gaussians, camera)
-    assert_pictures_agree(v3dg.rasterize(gaussians, camera), picture, PICTURE_FLOAT)
+    assert_pictures_agree(draw(device, gaussians, camera), picture, PICTURE_FLOAT)
 
 
 @st.composite
@@ -163,18 +171,18 @@ def test_tiles_lose_no_pixel_of_any_gaussian(gaussian, size, center, filter_px2)
 # Properties
 
 
-def test_gaussian_nearer_than_near_is_not_drawn():
+def test_gaussian_nearer_than_near_is_not_drawn(device):
     at = scenes.gaussians([[0, 0, 0.5]], scales=0.01)
     for near, drawn in ((0.499, True), (0.5, True), (0.501, False)):
-        alpha = v3dg.rasterize(at, scenes.camera(near=near)).alpha
+        alpha = draw(device, at, scenes.camera(near=near)).alpha
         assert (alpha.max() > 0) == drawn
 
 
-def test_background_is_composed_last():
+def test_background_is_composed_last(device):
     camera = scenes.CAMERAS["plain"]
     gaussians = scenes.random_gaussians(4, camera, 30)
-    black = v3dg.rasterize(gaussians, camera)
-    shown = v3dg.rasterize(gaussians, camera, background=(0.25, 1.0, 2.0))
+    black = draw(device, gaussians, camera)
+    shown = draw(device, gaussians, camera, background=(0.25, 1.0, 2.0))
     np.testing.assert_array_equal(shown.alpha, black.alpha)
     np.testing.assert_array_equal(shown.depth, black.depth)
     np.testing.assert_allclose(
@@ -182,35 +190,31 @@ def test_background_is_composed_last():
     )
 
 
-def test_empty_set_shows_the_background():
-    raster = v3dg.rasterize(
-        scenes.gaussians(np.zeros((0, 3))), scenes.camera(5, 3), background=(0.1, 0.2, 0.3)
-    )
+def test_empty_set_shows_the_background(device):
+    raster = draw(device, scenes.gaussians(np.zeros((0, 3))), scenes.camera(5, 3), background=(0.1, 0.2, 0.3))
     np.testing.assert_array_equal(raster.color, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (3, 5, 3)))
     assert not raster.alpha.any()
     assert not raster.depth.any()
 
 
-def test_equal_depths_are_drawn_in_the_order_of_their_index():
+def test_equal_depths_are_drawn_in_the_order_of_their_index(device):
     camera = scenes.camera(33, 33)
     red, blue = [1.0, 0, 0], [0, 0, 1.0]
     for colors in ([red, blue], [blue, red]):
         pair = scenes.gaussians([[0, 0, 2.0]] * 2, opacities=0.7, color=colors)
-        center = v3dg.rasterize(pair, camera).color[16, 16]
+        center = draw(device, pair, camera).color[16, 16]
         expected = 0.7 * np.array(colors[0]) + 0.3 * 0.7 * np.array(colors[1])
         np.testing.assert_allclose(center, expected, atol=2e-6)
 
 
-def test_order_of_the_arrays_does_not_matter():
+def test_order_of_the_arrays_does_not_matter(device):
     camera = scenes.CAMERAS["off_centre"]
     gaussians = scenes.trained_like(6, camera, 300)
     order = np.random.default_rng(0).permutation(300)
-    assert digest(v3dg.rasterize(gaussians, camera)) == digest(
-        v3dg.rasterize(gaussians.subset(order), camera)
-    )
+    assert digest(draw(device, gaussians, camera)) == digest(draw(device, gaussians.subset(order), camera))
 
 
-def test_gaussians_out_of_sight_change_nothing():
+def test_gaussians_out_of_sight_change_nothing(device):
     camera = scenes.CAMERAS["plain"]
     seen = scenes.random_gaussians(9, camera, 50)
     unseen = scenes.gaussians(
@@ -218,12 +222,12 @@ def test_gaussians_out_of_sight_change_nothing():
         scales=[[1.0] * 3, [0.1] * 3, [0.1] * 3, [1.0] * 3, [0.0] * 3],
         opacities=[1, 1, 1, 0, 1],
     )
-    alone = digest(v3dg.rasterize(seen, camera))
-    assert digest(v3dg.rasterize(v3dg.Gaussians.concatenate([unseen, seen]), camera)) == alone
-    assert digest(v3dg.rasterize(v3dg.Gaussians.concatenate([seen, unseen]), camera)) == alone
+    alone = digest(draw(device, seen, camera))
+    assert digest(draw(device, v3dg.Gaussians.concatenate([unseen, seen]), camera)) == alone
+    assert digest(draw(device, v3dg.Gaussians.concatenate([seen, unseen]), camera)) == alone
 
 
-def test_moving_world_and_camera_together_changes_only_rounding():
+def test_moving_world_and_camera_together_changes_only_rounding(device):
     camera = scenes.CAMERAS["posed"]
     gaussians = scenes.random_gaussians(5, camera, 100)
     shift = np.array([4.0, -2.0, 8.0])
@@ -232,14 +236,14 @@ def test_moving_world_and_camera_together_changes_only_rounding():
     moved = scenes.replaced(gaussians, means=gaussians.means + shift.astype(np.float32))
     there = v3dg.Camera(viewmat, camera.K, camera.width, camera.height)
     picture = reference.rasterize(gaussians, camera, filter_px2=0.3)
-    assert_pictures_agree(v3dg.rasterize(moved, there, filter_px2=0.3), picture, PICTURE_FLOAT)
+    assert_pictures_agree(draw(device, moved, there, filter_px2=0.3), picture, PICTURE_FLOAT)
 
 
-def test_antialiased_keeps_what_a_small_gaussian_adds_to_the_picture():
+def test_antialiased_keeps_what_a_small_gaussian_adds_to_the_picture(device):
     camera = scenes.camera(33, 33)
     tiny = scenes.gaussians([0.003, 0.002, 2.0], scales=0.02, opacities=0.5)  # half a pixel
-    sharp, soft = (v3dg.rasterize(tiny, camera, **m).alpha.sum() for m in ({}, {"filter_px2": 0.3}))
-    kept = v3dg.rasterize(tiny, camera, filter_px2=0.3, antialiased=True).alpha.sum()
+    sharp, soft = (draw(device, tiny, camera, **m).alpha.sum() for m in ({}, {"filter_px2": 0.3}))
+    kept = draw(device, tiny, camera, filter_px2=0.3, antialiased=True).alpha.sum()
     assert soft > 1.5 * sharp
     assert abs(kept - sharp) < 0.1 * sharp
 
@@ -255,28 +259,56 @@ def test_numpy_in_numpy_out():
         assert array.shape == shape
 
 
+def test_torch_in_torch_out(torch, device):
+    raster = v3dg.rasterize(scenes.gaussians([0, 0, 1.0]).torch(device), scenes.camera(20, 10))
+    for tensor, shape in ((raster.color, (10, 20, 3)), (raster.alpha, (10, 20)), (raster.depth, (10, 20))):
+        assert isinstance(tensor, torch.Tensor)
+        assert tensor.device.type == device
+        assert tensor.dtype == torch.float32
+        assert tensor.shape == shape
+        assert not tensor.requires_grad
+
+
 @pytest.mark.parametrize("mode", [{}, {"filter_px2": 0.3, "antialiased": True, "background": (1, 0.5, 0)}])
-def test_torch_in_torch_out(torch, mode):
+def test_numpy_and_torch_are_drawn_alike(torch, mode):
     camera = scenes.CAMERAS["off_centre"]
     gaussians = scenes.random_gaussians(2, camera, 40, sh_degree=2)
-    raster = v3dg.rasterize(gaussians.torch(), camera, **mode)
-    for tensor in (raster.color, raster.alpha, raster.depth):
-        assert isinstance(tensor, torch.Tensor)
-        assert tensor.dtype == torch.float32
-        assert not tensor.requires_grad
-    assert digest(raster) == digest(v3dg.rasterize(gaussians, camera, **mode))
+    assert digest(v3dg.rasterize(gaussians.torch(), camera, **mode)) == digest(
+        v3dg.rasterize(gaussians, camera, **mode)
+    )
 
 
-def test_inputs_are_left_as_they_were(torch):
+@pytest.mark.gpu
+def test_double_precision_stays_on_the_cpu(torch):
+    double = v3dg.Gaussians(
+        *(getattr(scenes.gaussians([0, 0, 1.0]).torch("cuda"), n).double() for n in scenes.NAMES)
+    )
+    with pytest.raises(ValueError, match="float64 is computed on the CPU"):
+        v3dg.rasterize(double, scenes.camera())
+
+
+@pytest.mark.gpu
+def test_rows_may_begin_anywhere_in_memory(torch):
+    camera = scenes.CAMERAS["plain"]
+    gaussians = scenes.random_gaussians(8, camera, 41).torch("cuda")
+    rest = gaussians.subset(slice(1, None))
+    copies = v3dg.Gaussians(*(getattr(rest, n).clone() for n in scenes.NAMES))
+    pictures = [host(v3dg.rasterize(g, camera).color) for g in (rest, copies)]
+    assert rest.sh.data_ptr() % 16 != 0
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_inputs_are_left_as_they_were(torch, device):
     camera = scenes.CAMERAS["plain"]
     gaussians = scenes.random_gaussians(2, camera, 40, sh_degree=2)
     before = [getattr(gaussians, n).copy() for n in scenes.NAMES]
-    tensors = gaussians.torch()
+    tensors = gaussians.torch(device)
     tensors.means.requires_grad_()
     v3dg.rasterize(gaussians, camera)
     v3dg.rasterize(tensors, camera).color.sum().backward()
     for name, array in zip(scenes.NAMES, before, strict=True):
         np.testing.assert_array_equal(getattr(gaussians, name), array)
+        np.testing.assert_array_equal(host(getattr(tensors, name)), array)
 
 
 @pytest.mark.parametrize(
@@ -300,13 +332,13 @@ def weighted_sum(torch, raster, seed=0):
     """A number that every pixel of colour, alpha and depth has a part in."""
     rng = np.random.default_rng(seed)
     parts = [raster.color, raster.alpha, raster.depth] if hasattr(raster, "color") else raster
-    return sum((p * torch.from_numpy(rng.normal(size=tuple(p.shape))).to(p.dtype)).sum() for p in parts)
+    return sum((p * torch.from_numpy(rng.normal(size=tuple(p.shape))).to(p)).sum() for p in parts)
 
 
-def leaves(torch, gaussians, background, dtype):
+def leaves(torch, gaussians, background, dtype, device="cpu"):
     """The five inputs and the background as leaf tensors."""
     arrays = [getattr(gaussians, name) for name in scenes.NAMES] + [background]
-    return [torch.tensor(np.asarray(a), dtype=dtype, requires_grad=True) for a in arrays]
+    return [torch.tensor(np.asarray(a), dtype=dtype, device=device, requires_grad=True) for a in arrays]
 
 
 def draw_leaves(inputs, camera, **mode):
@@ -404,20 +436,45 @@ def test_each_coordinate_is_its_finite_difference(torch):
             ), (INPUTS[i], k)
 
 
+def gradients_of(torch, gaussians, camera, dtype, device, *, background=BACKGROUND, **mode):
+    """Gradients of weighted_sum by the five inputs and the background, as NumPy arrays."""
+    inputs = leaves(torch, gaussians, background, dtype, device)
+    return host(torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs))
+
+
+def assert_gradients_are_those_in_double(torch, gaussians, camera, device, **mode):
+    single = gradients_of(torch, gaussians, camera, torch.float32, device, **mode)
+    double = gradients_of(torch, gaussians, camera, torch.float64, "cpu", **mode)
+    for name, s, d in zip(INPUTS, single, double, strict=True):
+        assert s.dtype == np.float32
+        assert np.abs(d).max() > 0, name
+        assert_gradients_agree(s, d, GRADIENT_FLOAT)
+
+
 @CAMERAS
 @GRADIENT_MODES
-def test_gradients_in_float_are_those_in_double(torch, camera, mode):
+def test_gradients_in_float_are_those_in_double(torch, device, camera, mode):
     gaussians = scenes.random_gaussians(40, camera, 200, size_px=(0.5, 8), sh_degree=3)
-    gradients = []
-    for dtype in (torch.float32, torch.float64):
-        inputs = leaves(torch, gaussians, BACKGROUND, dtype)
-        gradients.append(
-            torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
-        )
-    for name, single, double in zip(INPUTS, *gradients, strict=True):
-        assert single.dtype == torch.float32
-        assert double.abs().max() > 0, name
-        assert_gradients_agree(single, double, GRADIENT_FLOAT)
+    assert_gradients_are_those_in_double(torch, gaussians, camera, device, **mode)
+
+
+@pytest.mark.parametrize("sh_degree", range(3))
+def test_gradients_of_every_degree(torch, device, sh_degree):
+    camera = scenes.CAMERAS["posed"]
+    gaussians = scenes.random_gaussians(41, camera, 100, size_px=(0.5, 8), sh_degree=sh_degree)
+    assert_gradients_are_those_in_double(torch, gaussians, camera, device)
+
+
+@GRADIENT_MODES
+def test_gradients_over_many_tiles(torch, device, mode):
+    """Gaussians over hundreds of tiles beside such of a pixel, and pixels that stop early."""
+    camera = scenes.camera(517, 389, fx=300.0, pose=scenes.pose(9))
+    small = scenes.random_gaussians(42, camera, 3000, size_px=(0.5, 6), opacity=(0.1, 1.0), sh_degree=1)
+    large = scenes.random_gaussians(43, camera, 60, size_px=(40, 150), opacity=(0.8, 1.2), sh_degree=1)
+    gaussians = v3dg.Gaussians.concatenate([small, large])
+    alpha = v3dg.rasterize(gaussians, camera, **mode).alpha
+    assert (alpha > 0.999).any()
+    assert_gradients_are_those_in_double(torch, gaussians, camera, device, **mode)
 
 
 @pytest.mark.parametrize("which", ["color", "alpha", "depth"])
@@ -437,7 +494,64 @@ def test_each_output_has_gradients_of_its_own(torch, which):
         assert_close(g.numpy(), 0 * g.numpy() if e is None else e.numpy(), GRADIENT_DOUBLE)
 
 
-def test_gaussians_that_are_not_drawn_have_zero_gradients(torch):
+@pytest.mark.parametrize("which", ["color", "alpha", "depth"])
+def test_one_output_alone_can_be_differentiated(torch, device, which):
+    camera = scenes.CAMERAS["posed"]
+    gaussians = scenes.random_gaussians(31, camera, 50, sh_degree=1)
+    gradients = []
+    for dtype, where in ((torch.float32, device), (torch.float64, "cpu")):
+        inputs = leaves(torch, gaussians, BACKGROUND, dtype, where)
+        output = getattr(draw_leaves(inputs, camera, filter_px2=0.3), which)
+        gradients.append(host(torch.autograd.grad(weighted_sum(torch, [output]), inputs)))
+    for single, double in zip(*gradients, strict=True):
+        assert_gradients_agree(single, double, GRADIENT_FLOAT)
+
+
+def test_pictures_can_be_differentiated_in_any_order_and_again(torch, device):
+    camera = scenes.CAMERAS["plain"]
+    scene = [scenes.random_gaussians(seed, camera, 60) for seed in (50, 51, 52)]
+    alone = [gradients_of(torch, g, camera, torch.float32, device) for g in scene]
+    inputs = [leaves(torch, g, BACKGROUND, torch.float32, device) for g in scene]
+    losses = [weighted_sum(torch, draw_leaves(i, camera)) for i in inputs]
+    for k in (1, 1, 0, 2):
+        again = host(torch.autograd.grad(losses[k], inputs[k], retain_graph=True))
+        for a, b in zip(again, alone[k], strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_gradients_are_the_same_on_every_run(torch, device):
+    camera = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
+    gaussians = scenes.trained_like(20, camera, 1500)
+    first, *others = (gradients_of(torch, gaussians, camera, torch.float32, device) for _ in range(4))
+    for other in others:
+        for a, b in zip(first, other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.gpu
+def test_picture_that_was_written_to_cannot_be_differentiated(torch):
+    inputs = leaves(torch, scenes.gaussians([0, 0, 2.0]), BACKGROUND, torch.float32, "cuda")
+    color = draw_leaves(inputs, scenes.camera()).color
+    loss = color.sum()
+    with torch.no_grad():
+        color.zero_()
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+@pytest.mark.gpu
+def test_background_on_the_device_has_its_gradient_there(torch):
+    inputs = leaves(torch, scenes.gaussians([0, 0, 2.0]), BACKGROUND, torch.float32, "cuda")
+    on_host = [*inputs[:5], torch.tensor(BACKGROUND, requires_grad=True)]
+    gradients = []
+    for tensors in (inputs, on_host):
+        loss = draw_leaves(tensors, scenes.camera()).color.sum()
+        gradients.append(torch.autograd.grad(loss, tensors[5])[0])
+        assert gradients[-1].device == tensors[5].device
+    np.testing.assert_array_equal(*host(gradients))
+
+
+def test_gaussians_that_are_not_drawn_have_zero_gradients(torch, device):
     camera = scenes.CAMERAS["plain"]
     seen = scenes.random_gaussians(9, camera, 10)
     unseen = [
@@ -446,34 +560,42 @@ def test_gaussians_that_are_not_drawn_have_zero_gradients(torch):
         scenes.degenerate()["opacity_below_threshold"],
     ]
     gaussians = v3dg.Gaussians.concatenate([seen, *unseen])
-    inputs = leaves(torch, gaussians, BACKGROUND, torch.float32)
-    gradients = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, filter_px2=0.1)), inputs)
-    alone = leaves(torch, seen, BACKGROUND, torch.float32)
-    expected = torch.autograd.grad(weighted_sum(torch, draw_leaves(alone, camera, filter_px2=0.1)), alone)
+    gradients = gradients_of(torch, gaussians, camera, torch.float32, device, filter_px2=0.1)
+    expected = gradients_of(torch, seen, camera, torch.float32, device, filter_px2=0.1)
     for g, e in zip(gradients[:5], expected[:5], strict=True):
-        np.testing.assert_array_equal(g[:10].numpy(), e.numpy())
+        np.testing.assert_array_equal(g[:10], e)
         assert not g[10:].any()
+
+
+def test_no_gaussians_leave_the_background_its_gradient(torch, device):
+    nothing = scenes.gaussians(np.zeros((0, 3)))
+    *gradients, d_background = gradients_of(torch, nothing, scenes.camera(70, 50), torch.float32, device)
+    assert [g.shape for g in gradients] == [getattr(nothing, n).shape for n in scenes.NAMES]
+    assert_close(
+        d_background,
+        gradients_of(torch, nothing, scenes.camera(70, 50), torch.float64, "cpu")[5],
+        BACKGROUND_GRADIENT,
+    )
 
 
 @pytest.mark.parametrize("name", scenes.degenerate())
 @GRADIENT_MODES
-def test_gradients_of_degenerate_scenes_are_finite(torch, name, mode):
-    camera = scenes.CAMERAS["plain"]
-    inputs = leaves(torch, scenes.degenerate()[name], BACKGROUND, torch.float32)
-    gradients = torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera, **mode)), inputs)
-    for g, i in zip(gradients, inputs, strict=True):
-        assert g.shape == i.shape
-        assert g.isfinite().all()
+def test_gradients_of_degenerate_scenes_are_finite(torch, device, name, mode):
+    camera, gaussians = scenes.CAMERAS["plain"], scenes.degenerate()[name]
+    gradients = gradients_of(torch, gaussians, camera, torch.float32, device, **mode)
+    for g, n in zip(gradients, scenes.NAMES, strict=False):
+        assert g.shape == getattr(gaussians, n).shape
+        assert np.isfinite(g).all()
 
 
-def test_gradient_descent_finds_a_moved_gaussian(torch):
+def test_gradient_descent_finds_a_moved_gaussian(torch, device):
     camera = scenes.camera(32, 32, fx=30.0)
-    target = v3dg.rasterize(scenes.gaussians([0.15, -0.1, 2.0], scales=0.2), camera)
-    start = scenes.gaussians([0.0, 0.0, 2.0], scales=0.25).torch()
+    target = draw(device, scenes.gaussians([0.15, -0.1, 2.0], scales=0.2), camera)
+    start = scenes.gaussians([0.0, 0.0, 2.0], scales=0.25).torch(device)
     start.means.requires_grad_()
     optimizer = torch.optim.Adam([start.means], lr=0.02)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.97)
-    goal = torch.from_numpy(target.color)
+    goal = torch.from_numpy(target.color).to(device)
     for _ in range(150):
         optimizer.zero_grad()
         (v3dg.rasterize(start, camera).color - goal).square().sum().backward()

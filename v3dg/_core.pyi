@@ -167,6 +167,32 @@ def rasterize(
 def rasterize_backward(
     tape: Tape | TapeDouble, d_color: NDArray[Any], d_alpha: NDArray[Any], d_depth: NDArray[Any] | None
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]: ...
+
+class TapeCuda:
+    """What rasterize_cuda leaves for rasterize_backward_cuda."""
+
+# The picture (color, alpha, depth) is filled; the way back reads it and the gaussians again.
+def rasterize_cuda(
+    gaussians: tuple[Any, ...],
+    view: Sequence[float] | NDArray[np.float64],
+    filter_px2: float,
+    compensate: bool,
+    intrinsics: Sequence[float],
+    background: Sequence[float],
+    picture: tuple[Any, Any, Any],
+    stream: int,
+) -> TapeCuda: ...
+
+# Fills d_gaussians, as (means, quats, scales, opacities, sh), and d_background.
+def rasterize_backward_cuda(
+    tape: TapeCuda,
+    d_color: Any,
+    d_alpha: Any,
+    d_depth: Any | None,
+    d_gaussians: tuple[Any, ...],
+    d_background: Any,
+    stream: int,
+) -> None: ...
 def render_selection(
     bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
     instance_bundle: NDArray[np.int32],

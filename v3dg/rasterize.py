@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from v3dg import _core
+from v3dg import _core, _device
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 
@@ -44,7 +45,9 @@ def rasterize(
     fall to 1e-4, and gaussians are blended in the order of their depth, equal depths by index.
 
     On torch tensors the picture is differentiable with respect to the gaussians' means, quats, scales,
-    opacities and sh, and to `background` when that is a tensor; float64 tensors are computed in float64.
+    opacities and sh, and to `background` when that is a tensor; float64 tensors on the CPU are computed in
+    float64. Tensors on a CUDA device are drawn there, on its current stream. Pictures and gradients are the
+    same on every run.
 
     Args:
         gaussians: N gaussians in world space.
@@ -56,8 +59,9 @@ def rasterize(
         background: Three numbers, or a tensor of them.
 
     Raises:
-        ValueError: The filter is negative, or the background is not three numbers.
-        RuntimeError: The gaussians are on a CUDA device, which this version cannot draw on.
+        ValueError: The filter is negative, the background is not three numbers, or the gaussians are float64
+            on a CUDA device.
+        RuntimeError: The gaussians are on a CUDA device, and v3dg was built without CUDA.
     """
     if not filter_px2 >= 0:
         raise ValueError(f"filter_px2: expected a variance of at least 0 px², got {filter_px2}")
@@ -97,21 +101,25 @@ def _rasterize_torch(
     import torch
 
     rows = rows_of(gaussians)
-    if any(r.is_cuda for r in rows):
-        raise RuntimeError(
-            "gaussians: this version rasterizes on the CPU only; call gaussians.torch('cpu') first"
-        )
-    double = rows[0].dtype == torch.float64
-    model_type = _core.ModelDouble if double else _core.Model
     bg = torch.as_tensor(background, dtype=rows[0].dtype)
+    draw = _draw_on_cuda if rows[0].is_cuda else _draw_on_cpu
     needs_tape = torch.is_grad_enabled() and any(t.requires_grad for t in (*rows, bg))
+    return Raster(*draw(rows, bg, view_of_world(camera), options, needs_tape))
+
+
+def _draw_on_cpu(
+    rows: tuple[Any, ...], bg: Any, view: Any, options: tuple[float, bool, list[float], int, int], tape: bool
+) -> Any:
+    import torch
+
+    model_type = _core.ModelDouble if rows[0].dtype == torch.float64 else _core.Model
 
     class Rasterize(torch.autograd.Function):
         @staticmethod
         def forward(ctx: Any, *tensors: Any) -> Any:
             arrays = [np.ascontiguousarray(t.detach().numpy()) for t in tensors[:5]]
             *out, _, ctx.tape = _core.rasterize(
-                model_type(*arrays), view_of_world(camera), *options, tensors[5].tolist(), True, needs_tape
+                model_type(*arrays), view, *options, tensors[5].tolist(), True, tape
             )
             return tuple(torch.from_numpy(o) for o in out)
 
@@ -121,4 +129,66 @@ def _rasterize_torch(
             return tuple(torch.from_numpy(g) for g in _core.rasterize_backward(ctx.tape, *arrays))
 
     apply: Any = Rasterize.apply
-    return Raster(*apply(*rows, bg))
+    return apply(*rows, bg)
+
+
+def _draw_on_cuda(
+    rows: tuple[Any, ...], bg: Any, view: Any, options: tuple[float, bool, list[float], int, int], tape: bool
+) -> Any:
+    import torch
+
+    if not _core.has_cuda:
+        raise RuntimeError(f"gaussians: {_device.missing_for_cuda()}; or call gaussians.torch('cpu')")
+    if rows[0].dtype == torch.float64:
+        raise ValueError(
+            "gaussians: float64 is computed on the CPU only; call gaussians.torch('cpu'), or use float32"
+        )
+    with torch.cuda.device(rows[0].device):
+        return _cuda_function().apply(view, options, tape, *rows, bg)
+
+
+@functools.cache
+def _cuda_function() -> Any:
+    import torch
+
+    class Rasterize(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, view: Any, options: Any, tape: bool, *tensors: Any) -> Any:
+            ctx.set_materialize_grads(False)
+            filter_px2, antialiased, k, width, height = options
+            inputs = tuple(_aligned(t.detach()) for t in tensors[:5])
+            new = inputs[0].new_empty
+            picture = new((height, width, 3)), new((height, width)), new((height, width))
+            stream = torch.cuda.current_stream().cuda_stream
+            bg = tensors[5].tolist()
+            kept = _core.rasterize_cuda(inputs, view, filter_px2, antialiased, k, bg, picture, stream)
+            if tape:
+                ctx.tape, ctx.inputs, ctx.background_device = kept, inputs, tensors[5].device
+                ctx.save_for_backward(*tensors[:5], *picture)
+            return picture
+
+        @staticmethod
+        def backward(ctx: Any, *gradients: Any) -> Any:
+            # Reading them complains of what was written to since.
+            pictures = ctx.saved_tensors[5:]
+            d_color, d_alpha = (
+                torch.zeros_like(p) if g is None else g.contiguous()
+                for p, g in zip(pictures[:2], gradients[:2], strict=True)
+            )
+            d_depth = None if gradients[2] is None else gradients[2].contiguous()
+            out = tuple(torch.empty_like(t) for t in ctx.inputs)
+            d_background = d_color.new_empty(3)
+            with torch.cuda.device(d_color.device):
+                stream = torch.cuda.current_stream().cuda_stream
+                _core.rasterize_backward_cuda(ctx.tape, d_color, d_alpha, d_depth, out, d_background, stream)
+            if ctx.needs_input_grad[8]:
+                return None, None, None, *out, d_background.to(ctx.background_device)
+            return None, None, None, *out, None
+
+    return Rasterize
+
+
+def _aligned(tensor: Any) -> Any:
+    """The tensor where the device can read it in words of 16 bytes."""
+    tensor = tensor.contiguous()
+    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()

@@ -63,6 +63,7 @@ void bind_select(py::module_& m);
 void bind_simplify_init(py::module_& m);
 void bind_ply(py::module_& m);
 void bind_render(py::module_& m);
+void bind_rasterize_cuda(py::module_& m);
 void bind_fit_level(py::module_& m);
 void bind_loss(py::module_& m);
 void bind_frame(py::module_& m);  // nothing without CUDA

@@ -16,6 +16,7 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_simplify_init(m);
     v3dg::bind_ply(m);
     v3dg::bind_render(m);
+    v3dg::bind_rasterize_cuda(m);
     v3dg::bind_fit_level(m);
     v3dg::bind_loss(m);
     v3dg::bind_frame(m);

@@ -1,0 +1,55 @@
+#pragma once
+
+#include <memory>
+
+#include "pipeline/scene_frame.h"
+#include "project/project_backward.h"
+
+namespace v3dg {
+namespace cuda {
+
+// One model in one picture.
+struct ModelPicture {
+    DeviceRows rows;
+    size_t count;  // gaussians
+    ModelView<float> view;
+    float filter_px2;
+    bool compensate;
+    FrameImage image;
+};
+
+// Draws a model and can go back from the picture to the model. Keeps its buffers from picture to picture.
+class DifferentiableFrame {
+  public:
+    DifferentiableFrame();
+    ~DifferentiableFrame();
+    DifferentiableFrame(const DifferentiableFrame&) = delete;
+    DifferentiableFrame& operator=(const DifferentiableFrame&) = delete;
+
+    // Returns when the picture is drawn. Throws what Drawing::finish throws.
+    void draw(const ModelPicture& in, cudaStream_t stream);
+
+    // Enqueues the gradients of the gaussians and the background (3) of the picture last drawn; its arrays
+    // and the gaussians are still as they were. Every element is written, the same on every run.
+    void backward(const PictureGradient<float>& d_picture, const GaussianGradients<float>& out,
+                  float* d_background, cudaStream_t stream);
+
+  private:
+    friend void give_back(std::unique_ptr<DifferentiableFrame> frame);
+
+    int device_ = 0;
+    ModelFrame frame_;
+    ModelPicture in_{};
+    DeviceBuffer<uint32_t> first_slot_;
+    DeviceBuffer<unsigned long long> num_slots_;
+    unsigned long long* num_slots_on_host_ = nullptr;  // pinned
+    cudaEvent_t slots_counted_ = nullptr, gone_back_ = nullptr;
+};
+
+// A frame of the current device, if possible one that was given back with its buffers. Whoever has one that
+// failed drops it.
+std::unique_ptr<DifferentiableFrame> take_frame();
+void give_back(std::unique_ptr<DifferentiableFrame> frame);
+
+}  // namespace cuda
+}  // namespace v3dg
