@@ -55,18 +55,19 @@ void merge_segment(const RowsIn& in, int64_t first, int count, int64_t wanted, c
     const double inverse_spacing2 = inverse_spacing2_of(low, high, wanted);
 
     // Rounds: each node finds its cheapest partner, and the cheapest disjoint pairs join.
+    std::vector<MergeFeature> features(count);
     std::vector<MergePair> pairs;
     std::vector<char> is_used;
     while (static_cast<int64_t>(alive.size()) > wanted) {
         const int n = static_cast<int>(alive.size());
+        for (int i = 0; i < n; ++i) features[i] = nodes[alive[i]].feature;
         pairs.clear();
         for (int i = 0; i < n; ++i) {
             double cheapest = INFINITY;
             int partner = i == 0 ? 1 : 0;
             for (int k = 0; k < n; ++k) {
                 if (k == i) continue;
-                const double cost =
-                    merge_cost(nodes[alive[i]].feature, nodes[alive[k]].feature, inverse_spacing2);
+                const double cost = merge_cost(features[i], features[k], inverse_spacing2);
                 if (cost < cheapest) {
                     cheapest = cost;
                     partner = k;
