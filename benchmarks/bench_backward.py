@@ -1,10 +1,13 @@
-"""Forward and backward on CUDA beside gsplat's, in one run: time, ratio, distance of the gradients."""
+"""Forward and backward on CUDA beside gsplat's, in one run: time, ratio, distance of the gradients.
+
+With fewer gaussians in a smaller picture, both are also measured against float64 on the CPU.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import gpu
 import record
@@ -15,6 +18,7 @@ from assets import like_trained
 import v3dg
 from v3dg.cameras import Camera
 
+Draw: TypeAlias = Callable[[v3dg.Gaussians], tuple[Any, Any]]
 ROWS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -32,103 +36,110 @@ class Config:
 
 
 def main(config: Config) -> None:
+    rows = [compare(config, count) for count in config.counts]
+    small = replace(config, width=320, height=180, repeats=1)
+    result = {
+        **gpu.machine(),
+        "width": config.width,
+        "height": config.height,
+        "filter_px2": config.filter_px2,
+        "scenes": rows,
+        "to_float64": errors_to_float64(small, 20_000),
+    }
+    print(result["to_float64"])
+    record.write(config.output, result)
+
+
+def compare(config: Config, count: int) -> dict[str, Any]:
+    camera, gaussians, weights = inputs(config, count)
+    forward_ms, total_ms, gradients = measure(ours(config, camera), gaussians, weights, config.repeats)
+    _, _, again = measure(ours(config, camera), gaussians, weights, 1)
+    row: dict[str, Any] = {
+        "gaussians": count,
+        "sh_degree": config.sh_degree,
+        "forward_ms": round(forward_ms, 3),
+        "forward_backward_ms": round(total_ms, 3),
+        "same_bits_twice": all(torch.equal(gradients[name], again[name]) for name in ROWS),
+    }
+    if config.gsplat:
+        peers = [
+            measure(gsplats(config, camera, packed), gaussians, weights, config.repeats)
+            for packed in (True, False)
+        ]
+        peer_forward_ms, peer_ms, expected = min(peers, key=lambda peer: peer[1])
+        row["gsplat_forward_ms"] = round(peer_forward_ms, 3)
+        row["gsplat_forward_backward_ms"] = round(peer_ms, 3)
+        row["ratio_forward"] = round(forward_ms / peer_forward_ms, 4)
+        row["ratio"] = round(total_ms / peer_ms, 4)
+        row["relative_l2_to_gsplat"] = relative_l2(gradients, expected)
+    print(row, flush=True)
+    return row
+
+
+def errors_to_float64(config: Config, count: int) -> dict[str, dict[str, float]]:
+    """Relative L2 distance of the gradients of each row, ours and gsplat's."""
+    camera, gaussians, weights = inputs(config, count)
+    exact = gradients_of(
+        ours(config, camera),
+        v3dg.Gaussians(**{name: getattr(gaussians, name).double().cpu() for name in ROWS}),
+        tuple(weight.double().cpu() for weight in weights),
+    )
+    draws = {"ours": ours(config, camera)}
+    if config.gsplat:
+        draws["gsplat"] = gsplats(config, camera, False)
+    return {name: relative_l2(gradients_of(draw, gaussians, weights), exact) for name, draw in draws.items()}
+
+
+def inputs(config: Config, count: int) -> tuple[Camera, v3dg.Gaussians, tuple[Any, ...]]:
+    """A camera, gaussians, and the random weights of colour and alpha whose weighted sum is the loss."""
     camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=config.width, height=config.height)
-    rows = []
-    for count in config.counts:
-        gaussians = like_trained(count, camera, gpu.DEVICE, sh_degree=config.sh_degree)
-        weights = loss_weights(config.height, config.width)
-
-        def ours(g: v3dg.Gaussians) -> tuple[Any, Any]:
-            raster = v3dg.rasterize(g, camera, filter_px2=config.filter_px2)
-            return raster.color, raster.alpha
-
-        forward_ms, total_ms, gradients = measure(ours, gaussians, weights, config.repeats)
-        _, _, again = measure(ours, gaussians, weights, 1)
-        row: dict[str, Any] = {
-            "gaussians": count,
-            "sh_degree": config.sh_degree,
-            "forward_ms": round(forward_ms, 3),
-            "forward_backward_ms": round(total_ms, 3),
-            "same_bits_twice": all(
-                torch.equal(a, b) for a, b in zip(gradients.values(), again.values(), strict=True)
-            ),
-        }
-        if config.gsplat:
-            row.update(beside_gsplat(row, gradients, gaussians, camera, weights, config))
-        print(row, flush=True)
-        rows.append(row)
-    record.write(
-        config.output,
-        {
-            **gpu.machine(),
-            "width": config.width,
-            "height": config.height,
-            "filter_px2": config.filter_px2,
-            "scenes": rows,
-        },
-    )
-
-
-def loss_weights(height: int, width: int) -> tuple[Any, Any]:
-    """Random weights of colour and alpha, whose weighted sum is the loss."""
+    gaussians = like_trained(count, camera, gpu.DEVICE, sh_degree=config.sh_degree)
     generator = torch.Generator(gpu.DEVICE).manual_seed(1)
-    return (
-        torch.randn(height, width, 3, generator=generator, device=gpu.DEVICE),
-        torch.randn(height, width, generator=generator, device=gpu.DEVICE),
-    )
+    shape = (config.height, config.width)
+    color = torch.randn(*shape, 3, generator=generator, device=gpu.DEVICE)
+    return camera, gaussians, (color, torch.randn(*shape, generator=generator, device=gpu.DEVICE))
+
+
+def ours(config: Config, camera: Camera) -> Draw:
+    def draw(gaussians: v3dg.Gaussians) -> tuple[Any, Any]:
+        raster = v3dg.rasterize(gaussians, camera, filter_px2=config.filter_px2)
+        return raster.color, raster.alpha
+
+    return draw
+
+
+def gsplats(config: Config, camera: Camera, packed: bool) -> Draw:
+    return lambda gaussians: gpu.gsplat_picture(gaussians, camera, packed=packed, eps2d=config.filter_px2)
 
 
 def measure(
-    draw: Callable[[v3dg.Gaussians], tuple[Any, Any]],
-    gaussians: v3dg.Gaussians,
-    weights: tuple[Any, Any],
-    repeats: int,
+    draw: Draw, gaussians: v3dg.Gaussians, weights: tuple[Any, ...], repeats: int
 ) -> tuple[float, float, dict[str, Any]]:
     """Milliseconds forward, and forward and backward, and the gradients of the rows."""
-    leaves = {name: getattr(gaussians, name).detach().clone().requires_grad_() for name in ROWS}
-    with_gradient = v3dg.Gaussians(**leaves)
-
-    def forward() -> Any:
-        color, alpha = draw(with_gradient)
-        return color, alpha
-
-    def both() -> None:
-        for leaf in leaves.values():
-            leaf.grad = None
-        # The gradient of the weighted sum, without the sum.
-        torch.autograd.backward(forward(), weights)
-
-    forward_ms, total_ms = gpu.median_ms(forward, repeats), gpu.median_ms(both, repeats)
-    return forward_ms, total_ms, {name: leaf.grad for name, leaf in leaves.items()}
+    leaves = with_gradients(gaussians)
+    forward_ms = gpu.median_ms(lambda: draw(leaves), repeats)
+    total_ms = gpu.median_ms(lambda: gradients_of(draw, leaves, weights), repeats)
+    return forward_ms, total_ms, gradients_of(draw, leaves, weights)
 
 
-def beside_gsplat(
-    ours: dict[str, Any],
-    gradients: dict[str, Any],
-    gaussians: v3dg.Gaussians,
-    camera: Camera,
-    weights: tuple[Any, Any],
-    config: Config,
-) -> dict[str, Any]:
-    results = {}
-    for packed in (True, False):
-        results[packed] = measure(
-            lambda g, packed=packed: gpu.gsplat_picture(g, camera, packed=packed, eps2d=config.filter_px2),
-            gaussians,
-            weights,
-            config.repeats,
-        )
-    forward_ms, total_ms, peer = min(results.values(), key=lambda result: result[1])
-    return {
-        "gsplat_forward_ms": round(forward_ms, 3),
-        "gsplat_forward_backward_ms": round(total_ms, 3),
-        "ratio_forward": round(ours["forward_ms"] / forward_ms, 4),
-        "ratio": round(ours["forward_backward_ms"] / total_ms, 4),
-        **{
-            f"relative_l2_{name}": float(f"{(gradients[name] - peer[name]).norm() / peer[name].norm():.2e}")
-            for name in ROWS
-        },
-    }
+def with_gradients(gaussians: v3dg.Gaussians) -> v3dg.Gaussians:
+    return v3dg.Gaussians(
+        **{name: getattr(gaussians, name).detach().clone().requires_grad_() for name in ROWS}
+    )
+
+
+def gradients_of(draw: Draw, gaussians: v3dg.Gaussians, weights: tuple[Any, ...]) -> dict[str, Any]:
+    leaves = gaussians if gaussians.means.requires_grad else with_gradients(gaussians)
+    rows = [getattr(leaves, name) for name in ROWS]
+    return dict(zip(ROWS, torch.autograd.grad(draw(leaves), rows, weights), strict=True))
+
+
+def relative_l2(values: dict[str, Any], truths: dict[str, Any]) -> dict[str, float]:
+    errors = {}
+    for name in ROWS:
+        value, truth = values[name].double().cpu(), truths[name].double().cpu()
+        errors[name] = float(f"{float((value - truth).norm() / truth.norm()):.2e}")
+    return errors
 
 
 if __name__ == "__main__":
