@@ -15,7 +15,7 @@ from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
 from v3dg.rasterize import Raster, rasterize
-from v3dg.render import DEFAULT_TOLERANCE, Image, Stats, render
+from v3dg.render import DEFAULT_TOLERANCE, Image, Renderer, Stats, render
 from v3dg.scene import Scene, read_scene, write_scene
 from v3dg.select import Selection, select
 
@@ -29,6 +29,7 @@ __all__ = [
     "Groups",
     "Image",
     "Raster",
+    "Renderer",
     "Scene",
     "Selection",
     "Stats",

@@ -238,12 +238,11 @@ class SceneFrame:
     ) -> Drawing: ...
 
 class ModelFrame:
-    """Draws all gaussians of arrays on a device."""
+    """Draws gaussians that stay on a device."""
 
-    def __init__(self) -> None: ...
+    def __init__(self, gaussians: tuple[Any, ...], stream: int) -> None: ...
     def draw(
         self,
-        gaussians: tuple[Any, ...],
         view: Sequence[float] | NDArray[np.float64],
         filter_px2: float,
         compensate: bool,

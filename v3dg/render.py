@@ -156,11 +156,10 @@ class Renderer:
     def __init__(self, subject: Scene | Bundle | Gaussians) -> None:
         _device.resolve("cuda")
         self._device = arrays.current_device()
-        self._rows: tuple[Any, ...] | None = None
         self._shown: tuple[Any, ...] = ()
         if isinstance(subject, Gaussians):
-            self._rows = arrays.rows_on_device(subject)
-            self._frame: Any = _core.ModelFrame()
+            rows = arrays.rows_on_device(subject)
+            self._frame: Any = _core.ModelFrame(rows, arrays.current_stream())
             return
         scene = Scene.of(subject)
         self._shown = _shown(scene)
@@ -190,14 +189,12 @@ class Renderer:
         shape = (camera.height, camera.width)
         picture = (arrays.empty((*shape, 3)), arrays.empty(shape), arrays.empty(shape))
         last = ([float(b) for b in background], picture, arrays.current_stream())
-        if self._rows is None:
+        if isinstance(self._frame, _core.SceneFrame):
             drawing = self._frame.draw(
                 camera.viewmat, camera.position, camera.K, camera.near, float(tolerance), *last
             )
         else:
-            drawing = self._frame.draw(
-                self._rows, view_of_world(camera), 0.0, False, intrinsics(camera), *last
-            )
+            drawing = self._frame.draw(view_of_world(camera), 0.0, False, intrinsics(camera), *last)
 
         def finish() -> Stats:
             counts = drawing.finish()

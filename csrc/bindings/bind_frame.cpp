@@ -43,7 +43,7 @@ class BoundScene {
                const py::array& positions, const py::array& rotations, const py::array& scales,
                uintptr_t stream)
         : arrays_(bundles) {
-        std::vector<cuda::DeviceRows> models;
+        std::vector<cuda::PackedModel> models;
         std::vector<ClusterTable> cluster_tables;
         std::vector<cuda::ClusterFilters> filters;
         for (size_t b = 0; b < bundles.size(); ++b) {
@@ -53,16 +53,16 @@ class BoundScene {
             const py::ssize_t clusters = static_cast<py::ssize_t>(table.own_group.size);
             if (table.offset[clusters] > static_cast<int64_t>(rows.count))
                 throw py::value_error("offset: expected ranges of the bundle's gaussians");
-            models.push_back(rows.rows);
+            models.emplace_back(rows.rows, rows.count, stream_of(stream));
             cluster_tables.push_back(table);
             filters.push_back({span_of<const float>(t[1].cast<py::array>(), "filter_px2", {clusters}),
                                span_of<const uint8_t>(t[2].cast<py::array>(), "antialiased", {clusters})});
         }
+        const InstanceTable instances =
+            instance_table(instance_bundle, positions, rotations, scales, models.size());
         frame_ = std::make_unique<cuda::SceneFrame>(
-            Span<const cuda::DeviceRows>{models.data(), models.size()},
-            Span<const ClusterTable>{cluster_tables.data(), cluster_tables.size()},
-            Span<const cuda::ClusterFilters>{filters.data(), filters.size()},
-            instance_table(instance_bundle, positions, rotations, scales, models.size()), stream_of(stream));
+            std::move(models), Span<const ClusterTable>{cluster_tables.data(), cluster_tables.size()},
+            Span<const cuda::ClusterFilters>{filters.data(), filters.size()}, instances, stream_of(stream));
     }
 
     std::unique_ptr<cuda::Drawing> draw(const SelectCamera& camera, const SelectRule& rule,
@@ -88,17 +88,34 @@ std::unique_ptr<BoundDrawing> draw_scene(const py::object& scene, const py::arra
                                        stream));
 }
 
-std::unique_ptr<BoundDrawing> draw_model(const py::object& frame, const py::tuple& arrays,
-                                         const std::array<double, 15>& view, double filter_px2,
-                                         bool compensate, const std::array<double, 5>& k,
+class BoundModel {
+  public:
+    BoundModel(const py::tuple& gaussians, uintptr_t stream)
+        : BoundModel(gaussians, rows_of(gaussians), stream) {}
+
+    std::unique_ptr<cuda::Drawing> draw(const ModelView<float>& view, double filter_px2, bool compensate,
+                                        const cuda::FrameImage& image, uintptr_t stream) {
+        return frame_.draw(model_.rows(), model_.size(), view, static_cast<float>(filter_px2), compensate,
+                           image, stream_of(stream), &model_.packed());
+    }
+
+  private:
+    BoundModel(const py::tuple& gaussians, const Rows& rows, uintptr_t stream)
+        : arrays_(gaussians), model_(rows.rows, rows.count, stream_of(stream)) {}
+
+    py::object arrays_;
+    cuda::PackedModel model_;
+    cuda::ModelFrame frame_;
+};
+
+std::unique_ptr<BoundDrawing> draw_model(const py::object& frame, const std::array<double, 15>& view,
+                                         double filter_px2, bool compensate, const std::array<double, 5>& k,
                                          const std::array<double, 3>& background, const py::tuple& picture,
                                          uintptr_t stream) {
-    const Rows rows = rows_of(arrays);
     return std::make_unique<BoundDrawing>(
-        frame, py::make_tuple(arrays, picture),
-        frame.cast<cuda::ModelFrame&>().draw(rows.rows, rows.count, view_of<float>(view.data()),
-                                             static_cast<float>(filter_px2), compensate,
-                                             image_of(k, background, picture), stream_of(stream)));
+        frame, picture,
+        frame.cast<BoundModel&>().draw(view_of<float>(view.data()), filter_px2, compensate,
+                                       image_of(k, background, picture), stream));
 }
 
 }  // namespace
@@ -114,10 +131,10 @@ void bind_frame(py::module_& m) {
              "stream"_a)
         .def("draw", &draw_scene, "viewmat"_a, "eye"_a, "K"_a, "near"_a, "tolerance"_a, "background"_a,
              "picture"_a, "stream"_a);
-    py::class_<cuda::ModelFrame>(m, "ModelFrame", "Draws all gaussians of arrays on a device.")
-        .def(py::init<>())
-        .def("draw", &draw_model, "gaussians"_a, "view"_a, "filter_px2"_a, "compensate"_a, "intrinsics"_a,
-             "background"_a, "picture"_a, "stream"_a);
+    py::class_<BoundModel>(m, "ModelFrame", "Draws gaussians that stay on a device.")
+        .def(py::init<const py::tuple&, uintptr_t>(), "gaussians"_a, "stream"_a)
+        .def("draw", &draw_model, "view"_a, "filter_px2"_a, "compensate"_a, "intrinsics"_a, "background"_a,
+             "picture"_a, "stream"_a);
 }
 
 }  // namespace v3dg

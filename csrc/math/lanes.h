@@ -18,6 +18,8 @@ namespace v3dg {
 
 V3DG_HD inline float sqrt_of(float x) { return ::sqrtf(x); }
 V3DG_HD inline double sqrt_of(double x) { return ::sqrt(x); }
+V3DG_HD inline float round_of(float x) { return ::rintf(x); }
+V3DG_HD inline double round_of(double x) { return ::rint(x); }
 // As many bits as a hair of margin needs, for normal x: relative error below 1e-6.
 V3DG_HD inline float rough_reciprocal(float x) {
 #ifdef __CUDA_ARCH__

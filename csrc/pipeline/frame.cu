@@ -54,15 +54,15 @@ Frame::~Frame() {
 }
 
 template <class T>
-T* Frame::room(DeviceBuffer<T>& buffer, size_t size, cudaStream_t stream) {
-    if (size <= buffer.capacity()) return buffer.reserve(size, stream);
-    if (is_capturing(stream))
+T* Frame::room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing) {
+    if (drawing.is_captured_) {
+        if (size <= buffer.capacity()) return buffer.data();
         throw std::runtime_error(
             "frame: no memory can be had while a graph is captured; draw as much once before");
-    if (was_captured_ && buffer.data() != nullptr) {
-        retired_.push_back(std::make_shared<DeviceBuffer<T>>(std::move(buffer)));
     }
-    return buffer.reserve(size, stream);
+    if (size > buffer.capacity() && was_captured_)
+        retired_.push_back(std::make_shared<DeviceBuffer<T>>(std::move(buffer)));
+    return buffer.reserve(size, drawing.stream_);
 }
 
 Frame::Slot* Frame::take_slot(bool capturing) {
@@ -125,29 +125,29 @@ void Frame::enqueue(Drawing& drawing) {
     const size_t parts = tile_bin_parts(batch.num_tiles);
     const size_t cleared_bytes =
         sizeof(State) + parts * sizeof(unsigned long long) + batch.num_tiles * sizeof(uint32_t);
-    unsigned char* cleared = room(cleared_, cleared_bytes, stream);
+    unsigned char* cleared = room(cleared_, cleared_bytes, drawing);
     State* state = reinterpret_cast<State*>(cleared);
     auto* scan_state = reinterpret_cast<unsigned long long*>(cleared + sizeof(State));
     const TileCounts tiles{reinterpret_cast<uint32_t*>(scan_state + parts), &state->num_large,
                            reinterpret_cast<unsigned*>(&state->ticket), scan_state};
-    const ItemList items{room(items_, capacity.items, stream), &state->counters, capacity.items,
+    const ItemList items{room(items_, capacity.items, drawing), &state->counters, capacity.items,
                          capacity.records};
-    Record<float>* records = room(records_, capacity.records, stream);
-    uint32_t* item_records = room(item_records_, capacity.items, stream);
-    LargeRecord* large = room(large_, capacity.large, stream);
-    TileEntry* entries = room(entries_, capacity.entries, stream);
-    TileEntry* scratch = room(scratch_, capacity.entries, stream);
+    Record<float>* records = room(records_, capacity.records, drawing);
+    uint32_t* item_records = room(item_records_, capacity.items, drawing);
+    LargeRecord* large = room(large_, capacity.large, drawing);
+    TileEntry* entries = room(entries_, capacity.entries, drawing);
+    TileEntry* scratch = room(scratch_, capacity.entries, drawing);
     const bool keeps_tape = keeps_ == Keeps::tape;
-    uint32_t* source = keeps_tape ? room(source_, capacity.records, stream) : nullptr;
-    const TileBinOutput bins{room(tile_first_, batch.num_tiles + 1, stream),
-                             room(cursor_, batch.num_tiles, stream),
-                             room(image_of_tile_, batch.num_tiles, stream), entries};
+    uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
+    const TileBinOutput bins{room(tile_first_, batch.num_tiles + 1, drawing),
+                             room(cursor_, batch.num_tiles, drawing),
+                             room(image_of_tile_, batch.num_tiles, drawing), entries};
 
     if (!capturing) check(cudaEventRecord(slot.begun, stream), "cudaEventRecord");
     check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
     drawing.prepare_(items, stream);
     if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
-    project({batch.models, batch.placements, batch.images, items},
+    project({batch.models, batch.packed, batch.placements, batch.images, items},
             {records, item_records, source, tiles, large, capacity.large}, stream);
     tile_bin({batch.placements, items.items, item_records, records, batch.images, batch.num_images,
               batch.num_tiles, capacity.items, capacity.records, capacity.large, capacity.entries, large,
@@ -163,9 +163,9 @@ void Frame::enqueue(Drawing& drawing) {
                            &state->counters,
                            capacity.records,
                            capacity.entries,
-                           room(tile_order_, batch.num_tiles, stream)};
-    const RasterTape tape{keeps_tape ? room(order_, capacity.entries, stream) : nullptr,
-                          keeps_tape ? room(blended_, batch.num_tiles, stream) : nullptr};
+                           room(tile_order_, batch.num_tiles, drawing)};
+    const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
+                          keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
     rasterize(lists, keeps_tape ? &tape : nullptr, stream);
     check(cudaMemcpyAsync(slot.state, state, sizeof *state, cudaMemcpyDeviceToHost, stream),
           "cudaMemcpyAsync to the host");

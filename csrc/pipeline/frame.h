@@ -19,7 +19,8 @@ struct FrameBatch {
     const DeviceRows* models;
     const Placement* placements;
     const FrameImage* images;
-    uint32_t num_images, num_tiles;  // of all images together
+    uint32_t num_images, num_tiles;      // of all images together
+    const PackedRows* packed = nullptr;  // of the same models
 };
 
 // What a frame leaves for the way back, valid until the next is drawn.
@@ -77,7 +78,7 @@ class Frame {
     void enlarge(const State& state);
     Slot* take_slot(bool capturing);
     template <class T>
-    T* room(DeviceBuffer<T>& buffer, size_t size, cudaStream_t stream);
+    T* room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing);
 
     const Keeps keeps_;
     Capacity capacity_;

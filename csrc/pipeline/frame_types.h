@@ -23,6 +23,14 @@ struct DeviceRows {
     int sh_degree;
 };
 
+// The same packed: four planes of (N, 4) that hold a PackedGaussian each, and the SH coefficients.
+struct PackedRows {
+    const float* planes;
+    unsigned long long count;
+    const float* sh;
+    int sh_degree;
+};
+
 // One picture of a batch.
 struct FrameImage {
     Pinhole<float> camera;

@@ -25,17 +25,33 @@ static uint32_t num_tiles(const FrameImage& image) {
     return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
 }
 
-SceneFrame::SceneFrame(Span<const DeviceRows> models, Span<const ClusterTable> tables,
+PackedModel::PackedModel(const DeviceRows& rows, size_t count, cudaStream_t stream)
+    : rows_(rows),
+      size_(count),
+      planes_(16 * count, stream),
+      packed_(pack(rows, count, planes_.data(), stream)) {}
+
+SceneFrame::SceneFrame(std::vector<PackedModel> models, Span<const ClusterTable> tables,
                        Span<const ClusterFilters> filters, const InstanceTable& instances,
                        cudaStream_t stream)
-    : models_(models, stream),
+    : models_(std::move(models)),
       tables_(tables, filters, instances, stream),
       placements_(instances.scale.size, stream),
-      images_(1, stream) {}
+      images_(1, stream) {
+    std::vector<DeviceRows> rows;
+    std::vector<PackedRows> packed;
+    for (const PackedModel& model : models_) {
+        rows.push_back(model.rows());
+        packed.push_back(model.packed());
+    }
+    rows_.copy_from({rows.data(), rows.size()}, stream);
+    packed_.copy_from({packed.data(), packed.size()}, stream);
+}
 
 std::unique_ptr<Drawing> SceneFrame::draw(const SelectCamera& camera, const SelectRule& rule,
                                           const FrameImage& image, cudaStream_t stream) {
-    const FrameBatch batch{models_.data(), placements_.data(), images_.data(), 1, num_tiles(image)};
+    const FrameBatch batch{rows_.data(),     placements_.data(), images_.data(), 1,
+                           num_tiles(image), packed_.data()};
     return frame_.draw(
         batch,
         [this, camera, rule, image](const ItemList& items, cudaStream_t on) {
@@ -65,11 +81,13 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
 
 std::unique_ptr<Drawing> ModelFrame::draw(const DeviceRows& rows, size_t count, const ModelView<float>& view,
                                           float filter_px2, bool compensate, const FrameImage& image,
-                                          cudaStream_t stream) {
+                                          cudaStream_t stream, const PackedRows* packed) {
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
-    const ModelTables tables{rows, {view, 0, 0}, image};
-    const FrameBatch batch{&on_device->rows, &on_device->placement, &on_device->image, 1, num_tiles(image)};
+    const ModelTables tables{rows, packed == nullptr ? PackedRows{} : *packed, {view, 0, 0}, image};
+    const FrameBatch batch{&on_device->rows,  &on_device->placement,
+                           &on_device->image, 1,
+                           num_tiles(image),  packed == nullptr ? nullptr : &on_device->packed};
     const unsigned blocks = std::max(1u, blocks_for(blocks_for(count, kItemSize), kModelThreads));
     return frame_.draw(
         batch,

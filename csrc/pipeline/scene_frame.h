@@ -10,19 +10,36 @@ namespace cuda {
 FrameImage frame_image(const Pinhole<float>& camera, int width, int height, const float background[3],
                        float* color, float* alpha, float* depth);
 
+// Gaussians that stay as they are, and packed.
+class PackedModel {
+  public:
+    PackedModel(const DeviceRows& rows, size_t count, cudaStream_t stream);
+    const DeviceRows& rows() const { return rows_; }
+    const PackedRows& packed() const { return packed_; }
+    size_t size() const { return size_; }
+
+  private:
+    DeviceRows rows_;
+    size_t size_;
+    DeviceBuffer<float> planes_;
+    PackedRows packed_;
+};
+
 // Draws a scene that stays on the device: selects, then draws the cut.
 class SceneFrame {
   public:
     // `models` are the gaussians of each bundle, which stay where they are. Other memory may be reused on
     // return.
-    SceneFrame(Span<const DeviceRows> models, Span<const ClusterTable> tables,
+    SceneFrame(std::vector<PackedModel> models, Span<const ClusterTable> tables,
                Span<const ClusterFilters> filters, const InstanceTable& instances, cudaStream_t stream);
 
     std::unique_ptr<Drawing> draw(const SelectCamera& camera, const SelectRule& rule, const FrameImage& image,
                                   cudaStream_t stream);
 
   private:
-    DeviceBuffer<DeviceRows> models_;
+    std::vector<PackedModel> models_;
+    DeviceBuffer<DeviceRows> rows_;
+    DeviceBuffer<PackedRows> packed_;
     SceneTables tables_;
     DeviceBuffer<Placement> placements_;
     DeviceBuffer<FrameImage> images_;
@@ -32,6 +49,7 @@ class SceneFrame {
 // One model in front of one camera.
 struct ModelTables {
     DeviceRows rows;
+    PackedRows packed;
     Placement placement;
     FrameImage image;
 };
@@ -41,10 +59,10 @@ class ModelFrame {
   public:
     explicit ModelFrame(Frame::Keeps keeps = Frame::Keeps::nothing) : frame_(keeps) {}
 
-    // The rows stay where they are until the drawing is finished.
+    // The rows, and what is packed of them, stay where they are until the drawing is finished.
     std::unique_ptr<Drawing> draw(const DeviceRows& rows, size_t count, const ModelView<float>& view,
                                   float filter_px2, bool compensate, const FrameImage& image,
-                                  cudaStream_t stream);
+                                  cudaStream_t stream, const PackedRows* packed = nullptr);
     FrameTape tape() const { return frame_.tape(); }
 
   private:

@@ -8,6 +8,7 @@ namespace cuda {
 
 struct ProjectInput {
     const DeviceRows* models;
+    const PackedRows* packed;  // read in place of `models` where it is not null
     const Placement* placements;
     const FrameImage* images;
     ItemList items;  // in the counters: sets in_frustum and records, which start at 0
@@ -26,6 +27,9 @@ struct ProjectOutput {
 // gaussian that reaches a pixel centre, and counts into the tiles that it touches. Does nothing when the
 // items are over a capacity.
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream);
+
+// `planes` has room for (4, count, 4).
+PackedRows pack(const DeviceRows& rows, size_t count, float* planes, cudaStream_t stream);
 
 }  // namespace cuda
 }  // namespace v3dg

@@ -75,12 +75,48 @@ V3DG_HD V3DG_INLINE void cross3(const V a[3], const V b[3], V c[3]) {
     c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// Limits of x / z (and with the other arguments of y / z) past which the Jacobian is held.
+// Limits of x / z and y / z past which the Jacobian is held.
 template <class T>
-V3DG_HD V3DG_INLINE void slope_limits(T focal, T center, T size, T& lowest, T& highest) {
-    const T margin = T(kFovMargin) * size / (2 * focal);
-    lowest = -(center / focal + margin);
-    highest = (size - center) / focal + margin;
+struct SlopeLimits {
+    T low_x, high_x, low_y, high_y;
+};
+template <class T>
+V3DG_HD V3DG_INLINE SlopeLimits<T> slope_limits(const Pinhole<T>& cam) {
+    const T margin_x = T(kFovMargin) * cam.width / (2 * cam.fx);
+    const T margin_y = T(kFovMargin) * cam.height / (2 * cam.fy);
+    return {-(cam.cx / cam.fx + margin_x), (cam.width - cam.cx) / cam.fx + margin_x,
+            -(cam.cy / cam.fy + margin_y), (cam.height - cam.cy) / cam.fy + margin_y};
+}
+
+// Sets the slopes of s.p.
+template <class V, class T>
+V3DG_HD V3DG_INLINE void set_slopes(const SlopeLimits<T>& limits, V inv_z, Projection<V>& s) {
+    s.slope_x = min_of(all_lanes<V>(limits.high_x), max_of(all_lanes<V>(limits.low_x), s.p[0] * inv_z));
+    s.slope_y = min_of(all_lanes<V>(limits.high_y), max_of(all_lanes<V>(limits.low_y), s.p[1] * inv_z));
+}
+
+// The ellipse whose covariance is A Aᵀ + filter I, with the rows a1 and a2 of A and p in `s`; all but its
+// opacity.
+template <class V, class T>
+V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const Pinhole<T>& cam, T filter_px2, V inv_z,
+                                               Projection<V>& s) {
+    V normal[3];
+    cross3(s.a1, s.a2, normal);
+    const V n11 = dot3(s.a1, s.a1), n22 = dot3(s.a2, s.a2);
+    s.c11 = n11 + filter_px2;
+    s.c22 = n22 + filter_px2;
+    s.c12 = dot3(s.a1, s.a2);
+    s.det0 = dot3(normal, normal);
+    s.det = s.det0 + filter_px2 * (n11 + n22) + filter_px2 * filter_px2;
+
+    Ellipse<V> e;
+    e.u = cam.fx * s.p[0] * inv_z + cam.cx;
+    e.v = cam.fy * s.p[1] * inv_z + cam.cy;
+    e.l11 = T(kFalloffScale) * sqrt_of(s.c22 / s.det);
+    e.l12 = -(s.c12 / s.c22) * e.l11;
+    e.l22 = T(kFalloffScale) / sqrt_of(s.c22);
+    e.depth = s.p[2];
+    return e;
 }
 
 // Ellipse of a gaussian with p[2] > 0. `filter_px2` is added to both variances; with `compensate` (0 or 1)
@@ -99,35 +135,15 @@ V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const Mo
             s.linear_rs[3 * i + k] = (mv.linear[3 * i] * r[k] + mv.linear[3 * i + 1] * r[3 + k] +
                                       mv.linear[3 * i + 2] * r[6 + k]) *
                                      g.scale[k];
-
     const V inv_z = 1 / s.p[2];
-    T low, high;
-    slope_limits(cam.fx, cam.cx, cam.width, low, high);
-    s.slope_x = min_of(all_lanes<V>(high), max_of(all_lanes<V>(low), s.p[0] * inv_z));
-    slope_limits(cam.fy, cam.cy, cam.height, low, high);
-    s.slope_y = min_of(all_lanes<V>(high), max_of(all_lanes<V>(low), s.p[1] * inv_z));
+    set_slopes(slope_limits(cam), inv_z, s);
     for (int k = 0; k < 3; ++k) {
         s.a1[k] = cam.fx * inv_z * (s.linear_rs[k] - s.slope_x * s.linear_rs[6 + k]);
         s.a2[k] = cam.fy * inv_z * (s.linear_rs[3 + k] - s.slope_y * s.linear_rs[6 + k]);
     }
-    V normal[3];
-    cross3(s.a1, s.a2, normal);
-    const V n11 = dot3(s.a1, s.a1), n22 = dot3(s.a2, s.a2);
-    s.c11 = n11 + filter_px2;
-    s.c22 = n22 + filter_px2;
-    s.c12 = dot3(s.a1, s.a2);
-    s.det0 = dot3(normal, normal);
-    s.det = s.det0 + filter_px2 * (n11 + n22) + filter_px2 * filter_px2;
-
-    Ellipse<V> e;
-    e.u = cam.fx * s.p[0] * inv_z + cam.cx;
-    e.v = cam.fy * s.p[1] * inv_z + cam.cy;
-    e.l11 = T(kFalloffScale) * sqrt_of(s.c22 / s.det);
-    e.l12 = -(s.c12 / s.c22) * e.l11;
-    e.l22 = T(kFalloffScale) / sqrt_of(s.c22);
+    Ellipse<V> e = ellipse_of_axes(cam, filter_px2, inv_z, s);
     const V opacity = compensate ? g.opacity * sqrt_of(s.det0 / s.det) : g.opacity;
     e.log2_opacity = log2_of(opacity);
-    e.depth = s.p[2];
     return e;
 }
 
@@ -145,12 +161,104 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
            (half_x < huge) & (half_y < huge);
 }
 
-// No less than either half of extent_of() on the axis whose focal length and slope are passed, for a gaussian
-// whose largest standard deviation is `sigma` in view space.
+// How far from its mean a gaussian reaches at most, in its model's units: no less than extent_of() leads to.
+// Negative where it is too faint to be drawn, not a number where it may have no area, or is none.
+V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
+    if (g.opacity < float(kMinAlpha)) return -1.0f;
+    const float least = min_of(g.scale[0], min_of(g.scale[1], g.scale[2]));
+    const float most = max_of(g.scale[0], max_of(g.scale[1], g.scale[2]));
+    const float sigmas = sqrt_of(log2_of(g.opacity) - float(kLog2MinAlpha)) * float(1.001 / kFalloffScale);
+    return least > 0 && g.opacity <= 1 ? most * sigmas : NAN;
+}
+
+// A gaussian in the form that is quickest to project, for what is projected more than once. Its covariance is
+// F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5] f[7]], columns from the longest on.
+struct PackedGaussian {
+    float mean[3];
+    float reach;
+    float f[8];
+    float log2_opacity;
+};
+
+V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
+    PackedGaussian out{};
+    for (int k = 0; k < 3; ++k) out.mean[k] = g.mean[k];
+    out.log2_opacity = log2_of(g.opacity);
+    out.reach = reach_of(g);
+    double quat[4], r[9];
+    for (int k = 0; k < 4; ++k) quat[k] = g.quat[k];
+    rotation_of_quat(quat, r);
+    int order[3] = {0, 1, 2};
+    for (int pass = 0; pass < 3; ++pass) {
+        const int k = pass % 2;
+        if (g.scale[order[k]] >= g.scale[order[k + 1]]) continue;
+        const int other = order[k];
+        order[k] = order[k + 1];
+        order[k + 1] = other;
+    }
+    double column[3][3];
+    for (int k = 0; k < 3; ++k)
+        for (int i = 0; i < 3; ++i) column[k][i] = r[3 * i + order[k]] * double(g.scale[order[k]]);
+    // Turning two columns into each other leaves F Fᵀ; a number becomes 0. The shorter two, whose lengths
+    // then differ least from before.
+    const double x = column[1][0], y = column[2][0], length = sqrt_of(x * x + y * y);
+    const double cosine = length > 0 ? x / length : 1, sine = length > 0 ? y / length : 0;
+    for (int i = 0; i < 3; ++i) {
+        const double a = column[1][i], b = column[2][i];
+        column[1][i] = cosine * a + sine * b;
+        column[2][i] = cosine * b - sine * a;
+    }
+    for (int i = 0; i < 3; ++i) {
+        out.f[i] = static_cast<float>(column[0][i]);
+        out.f[3 + i] = static_cast<float>(column[1][i]);
+    }
+    out.f[6] = static_cast<float>(column[2][1]);
+    out.f[7] = static_cast<float>(column[2][2]);
+    return out;
+}
+
+// As project_gaussian(); s.p is set, s.linear_rs is left alone.
+V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g, const ModelView<float>& mv,
+                                                  const Pinhole<float>& cam, const SlopeLimits<float>& limits,
+                                                  float filter_px2, bool compensate, Projection<float>& s) {
+    const float inv_z = 1 / s.p[2];
+    set_slopes(limits, inv_z, s);
+    float row1[3], row2[3];  // of the Jacobian times the view
+    for (int k = 0; k < 3; ++k) {
+        row1[k] = cam.fx * inv_z * (mv.linear[k] - s.slope_x * mv.linear[6 + k]);
+        row2[k] = cam.fy * inv_z * (mv.linear[3 + k] - s.slope_y * mv.linear[6 + k]);
+    }
+    for (int k = 0; k < 2; ++k) {
+        s.a1[k] = dot3(row1, g.f + 3 * k);
+        s.a2[k] = dot3(row2, g.f + 3 * k);
+    }
+    s.a1[2] = row1[1] * g.f[6] + row1[2] * g.f[7];
+    s.a2[2] = row2[1] * g.f[6] + row2[2] * g.f[7];
+    Ellipse<float> e = ellipse_of_axes(cam, filter_px2, inv_z, s);
+    e.log2_opacity = compensate ? g.log2_opacity + 0.5f * log2_of(s.det0 / s.det) : g.log2_opacity;
+    return e;
+}
+
+// Whether sphere_of_image() holds: where the Jacobian is clamped, it is clamped towards the camera's axis.
 template <class T>
-V3DG_HD V3DG_INLINE T extent_bound(T opacity, T sigma, T focal_over_z, T slope, T filter_px2) {
-    const T reach = log2_of(opacity) - T(kLog2MinAlpha), along = focal_over_z * sigma;
-    return T(1.001 / kFalloffScale) * sqrt_of(reach * (along * along * (1 + slope * slope) + filter_px2));
+V3DG_HD V3DG_INLINE bool sees_its_axis(const SlopeLimits<T>& limits) {
+    return limits.low_x < 0 && limits.high_x > 0 && limits.low_y < 0 && limits.high_y > 0;
+}
+
+// No less than either half of extent_of(), of what reaches `reach_px` from its mean at depth 1.
+template <class T>
+V3DG_HD V3DG_INLINE T sphere_of_image(T reach_px, T inv_z, T slope_x, T slope_y, T filter_px2) {
+    const T along = reach_px * inv_z;
+    return sqrt_of(along * along * (1 + slope_x * slope_x + slope_y * slope_y) +
+                   T(kReachSigmas * kReachSigmas) * filter_px2);
+}
+
+// Whether there is no pixel centre within `half` of `center` on one axis, with the hair of pixel_span().
+template <class T>
+V3DG_HD V3DG_INLINE bool misses_centers(T center, T half) {
+    const T from_center = center - T(0.5);
+    const T off = from_center - round_of(from_center);
+    return (off < 0 ? -off : off) > half * T(1 + 1e-5) + T(2e-3);
 }
 
 // Whether what reaches `half` from `center` meets (0, size).

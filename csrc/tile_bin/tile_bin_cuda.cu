@@ -105,6 +105,18 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     }
 }
 
+// Depth and box of a record, which are all that its last 16 bytes hold of it but a colour.
+__device__ Record<float> end_of_record(const Record<float>* record) {
+    const uint4 end = reinterpret_cast<const uint4*>(record)[2];
+    Record<float> r;
+    r.depth = __uint_as_float(end.y);
+    r.x0 = static_cast<uint16_t>(end.z);
+    r.x1 = static_cast<uint16_t>(end.z >> 16);
+    r.y0 = static_cast<uint16_t>(end.w);
+    r.y1 = static_cast<uint16_t>(end.w >> 16);
+    return r;
+}
+
 // Blocks take items, a thread a record, and then the records over many tiles.
 __global__ void scatter_kernel(TileBinInput in, TileBinOutput out) {
     if (!is_complete(in) || in.counters->entries > in.entry_capacity) return;
@@ -118,7 +130,7 @@ __global__ void scatter_kernel(TileBinInput in, TileBinOutput out) {
         TileBox box{0, 1, 0, 0};
         Record<float> r;
         if (threadIdx.x < num_records) {
-            r = in.records[record];
+            r = end_of_record(in.records + record);
             box = tile_box(r, image);
             if (box.count > kFewTiles) box.count = 0;
         }

@@ -14,7 +14,11 @@ constexpr unsigned kFewTiles = 4;
 // The tiles that the record's pixels lie in.
 struct TileBox {
     uint32_t first, columns, count, stride;
-    V3DG_HD uint32_t tile(uint32_t k) const { return first + k / columns * stride + k % columns; }
+    // Tile k of at most kFewTiles: with more than two columns there is one row.
+    V3DG_HD uint32_t tile(uint32_t k) const {
+        if (columns > 2) return first + k;
+        return columns == 1 ? first + k * stride : first + (k >> 1) * stride + (k & 1);
+    }
 };
 
 V3DG_HD inline TileBox tile_box(const Record<float>& r, const FrameImage& image) {

@@ -1,0 +1,178 @@
+"""Frames drawn by CUDA: the CPU's pictures, whatever the stream, the buffers and what was drawn before."""
+
+import numpy as np
+import pytest
+
+import scenes
+import scenes_lod
+from compare import PICTURE_FLOAT
+from devices import host
+from v3dg import Camera, Gaussians, Renderer, Scene, render
+
+pytestmark = pytest.mark.gpu
+
+CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
+BACKGROUND = (0.1, 0.2, 0.3)
+
+
+def arrays(image):
+    return host((image.color, image.alpha, image.depth))
+
+
+def assert_same_bytes(image, other):
+    for got, expected in zip(arrays(image), arrays(other), strict=True):
+        np.testing.assert_array_equal(got, expected)
+
+
+def assert_like_cpu(image, expected):
+    """Both round; a pixel more or less at a cut-off may differ by more."""
+    for got, wanted in zip(arrays(image), arrays(expected), strict=True):
+        assert got.shape == wanted.shape
+        assert np.isfinite(got).all()
+        error = np.abs(got - wanted)
+        assert error.mean() <= PICTURE_FLOAT.mean
+        assert (error > PICTURE_FLOAT.absolute).mean() <= PICTURE_FLOAT.share
+    assert image.stats.gaussians_selected == expected.stats.gaussians_selected
+    assert image.stats.gaussians_in_frustum == expected.stats.gaussians_in_frustum
+
+
+def composed_scene(rng, sh_degree=1):
+    bundles = [
+        scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, n, sh_degree=sh_degree), 64) for n in (900, 300)
+    ]
+    scene = scenes_lod.random_scene(rng, bundles[0], 30, spread=3.0)
+    scene.add(bundles[1], positions=rng.normal(size=(7, 3)), quaternions=rng.normal(size=(7, 4)))
+    return scene
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("tolerance", [0.0, 2.0, np.inf])
+def test_scene_looks_as_on_the_cpu(sh_degree, tolerance):
+    scene = composed_scene(np.random.default_rng(sh_degree), sh_degree)
+    expected = render(scene, CAMERA, tolerance=tolerance, background=BACKGROUND)
+    image = render(scene, CAMERA, tolerance=tolerance, background=BACKGROUND, device="cuda")
+    assert_like_cpu(image, expected)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+def test_asset_looks_as_on_the_cpu(sh_degree):
+    asset = scenes_lod.blob(np.random.default_rng(sh_degree), 5000, sh_degree=sh_degree)
+    assert_like_cpu(render(asset, CAMERA, device="cuda"), render(asset, CAMERA))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 3.0, 100.0])
+def test_gaussians_of_any_size(scale):
+    """From those that miss every pixel centre to those that cover every tile."""
+    rng = np.random.default_rng(1)
+    blob = scenes_lod.blob(rng, 600)
+    scales = (scale * np.exp(0.3 * rng.normal(size=(600, 3)))).astype(np.float32)
+    asset = Gaussians(blob.means, blob.quats, scales, 0.3 * blob.opacities, blob.sh)
+    assert_like_cpu(render(asset, CAMERA, device="cuda"), render(asset, CAMERA))
+
+
+def test_poisoned_gaussians_are_left_out():
+    asset = scenes_lod.blob(np.random.default_rng(2), 400)
+    poisoned = {name: np.array(getattr(asset, name)) for name in scenes.NAMES}
+    for i, name in enumerate(scenes.NAMES):
+        for k, value in enumerate((np.nan, np.inf, -np.inf, 0.0, 1e30)):
+            poisoned[name][40 * i + k] = value
+    poisoned["sh"][:] = asset.sh  # a colour that is no number is one on both devices
+    subject = Gaussians(**poisoned)
+    assert_like_cpu(render(subject, CAMERA, device="cuda"), render(subject, CAMERA))
+
+
+@pytest.mark.parametrize(
+    "subject", [Scene(), scenes_lod.blob(np.random.default_rng(0), 0)], ids=["scene", "asset"]
+)
+def test_nothing_gives_the_background(subject):
+    image = render(subject, CAMERA, background=BACKGROUND, device="cuda")
+    assert (host(image.color) == np.float32(BACKGROUND)).all()
+    assert not host(image.alpha).any()
+    assert image.stats.gaussians_selected == 0
+
+
+def test_buffers_that_were_too_small_leave_no_trace():
+    """The first frame of a renderer finds next to no room; later ones what it needed."""
+    subject = composed_scene(np.random.default_rng(3))
+    renderer = Renderer(subject)
+    first, second = (renderer.render(CAMERA, tolerance=0.0) for _ in range(2))
+    assert first.stats.gaussians_in_frustum > 10_000
+    third = renderer.render(CAMERA, tolerance=0.0)
+    assert_same_bytes(first, third)
+    assert_same_bytes(second, third)
+
+
+def test_every_renderer_draws_the_same_bytes():
+    subject = composed_scene(np.random.default_rng(4))
+    assert_same_bytes(Renderer(subject).render(CAMERA), Renderer(subject).render(CAMERA))
+
+
+def test_pictures_drawn_ahead_stay_apart():
+    subject = composed_scene(np.random.default_rng(5))
+    cameras = [scenes_lod.turned(CAMERA, np.random.default_rng(seed)) for seed in range(12)] + [CAMERA]
+    renderer = Renderer(subject)
+    ahead = [renderer.render(camera, tolerance=0.0) for camera in cameras]
+    for camera, image in zip(cameras, ahead, strict=True):
+        assert_same_bytes(image, Renderer(subject).render(camera, tolerance=0.0))
+
+
+def test_sizes_may_change_from_picture_to_picture():
+    subject = composed_scene(np.random.default_rng(6))
+    renderer = Renderer(subject)
+    for factor in (1, 3, 2):
+        camera = CAMERA.scaled(factor)
+        assert_same_bytes(renderer.render(camera), Renderer(subject).render(camera))
+
+
+def test_what_is_added_to_a_scene_is_drawn():
+    rng = np.random.default_rng(7)
+    scene = composed_scene(rng)
+    render(scene, CAMERA, device="cuda")
+    scene.add(scene.bundles[1], positions=(0.0, -1.0, 0.0))
+    assert_like_cpu(render(scene, CAMERA, device="cuda"), render(scene, CAMERA))
+
+
+def test_other_streams_see_the_picture():
+    import torch
+
+    subject = composed_scene(np.random.default_rng(8))
+    renderer = Renderer(subject)
+    expected = renderer.render(CAMERA)
+    expected.stats  # noqa: B018  waits
+    streams = [torch.cuda.Stream() for _ in range(2)]
+    for turn in range(6):
+        with torch.cuda.stream(streams[turn % 2]):
+            image = renderer.render(CAMERA)
+            color = image.color.clone()
+        streams[turn % 2].synchronize()
+        assert torch.equal(color, expected.color)
+
+
+def test_a_graph_draws_again():
+    import torch
+
+    subject = composed_scene(np.random.default_rng(9))
+    renderer = Renderer(subject)
+    expected = renderer.render(CAMERA, tolerance=0.0)
+    count = expected.stats.gaussians_in_frustum
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        image = renderer.render(CAMERA, tolerance=0.0)
+    # Other pictures, which need other buffers, in between.
+    other = renderer.render(CAMERA.scaled(4), tolerance=0.0)
+    other.stats  # noqa: B018  waits
+    for _ in range(3):
+        image.color.zero_()
+        graph.replay()
+        torch.cuda.synchronize()
+        assert_same_bytes(image, expected)
+        assert image.stats.gaussians_in_frustum == count
+
+
+def test_a_graph_without_room_is_refused():
+    import torch
+
+    renderer = Renderer(composed_scene(np.random.default_rng(10)))
+    graph = torch.cuda.CUDAGraph()
+    with pytest.raises(RuntimeError, match="draw as much once before"), torch.cuda.graph(graph):
+        renderer.render(CAMERA)
