@@ -8,6 +8,7 @@ import pytest
 
 import scenes
 from compare import DSSIM_FLOAT, FIT_FLOAT, assert_close
+from devices import host, on
 from v3dg import BuildConfig, Camera, Gaussians, _core, rasterize
 from v3dg.build import _fit_config
 from v3dg.rasterize import rows_of
@@ -24,24 +25,38 @@ FROZEN = dict.fromkeys(
 CENTER, RADIUS = np.float32([3.0, -2.0, 1.0]), 0.5
 
 
-def fit(start, target, config, *, seed=0, stream=0, progress=None, target_filter_px2=0.0):
-    """Fit one group in the ball (CENTER, RADIUS); the result and its residual, mean |colour| and |alpha|."""
-    rows = [np.array(row) for row in rows_of(start)]
-    error = np.full((1, 2), -1, np.float32)
-    _core.fit_level(
-        _fit_config(config, seed, 0),
-        _core.Model(*rows_of(target)),
-        target_filter_px2,
-        False,
-        np.array([[0, len(target)]]),
-        np.array([[0, len(start)]]),
-        np.array([[*CENTER, RADIUS]], np.float32),
-        np.array([stream]),
+def fit_groups(
+    device, start, target, config, target_range, own_range, *, seed=0, streams=None, progress=None
+):
+    """Fit groups that are all in the ball (CENTER, RADIUS); the result and residuals."""
+    num_groups = len(own_range)
+    start = on(device, start)
+    rows = [row.copy() if device == "cpu" else row.clone() for row in rows_of(start)]
+    error = np.full((num_groups, 2), -1, np.float32)
+    ranges = (np.array(r, np.int64).reshape(-1, 2) for r in (target_range, own_range))
+    arguments = [
+        *(0.0, False, *ranges),
+        np.tile(np.float32([*CENTER, RADIUS]), (num_groups, 1)),
+        np.arange(num_groups) if streams is None else np.array(streams),
         *rows,
         error,
         progress or _core.FitProgress(),
+    ]
+    fit_config = _fit_config(config, seed, 0)
+    if device == "cpu":
+        _core.fit_level(fit_config, _core.Model(*rows_of(target)), *arguments)
+    else:
+        _core.fit_level_cuda(fit_config, *rows_of(on(device, target)), *arguments, 0)
+    return Gaussians(*host(rows)), error
+
+
+def fit(device, start, target, config, *, seed=0, stream=0, progress=None):
+    """Fit one group; the result and its residual, mean |colour| and |alpha|."""
+    ranges = [[0, len(target)]], [[0, len(start)]]
+    fitted, error = fit_groups(
+        device, start, target, config, *ranges, seed=seed, streams=[stream], progress=progress
     )
-    return Gaussians(*rows), error[0]
+    return fitted, error[0]
 
 
 def in_ball(seed, num, **changes):
@@ -84,67 +99,67 @@ def view_of_ball(config, direction=(0, 0, 1)):
 # ---- views and residual
 
 
-def test_residual_of_what_matches_is_nothing():
+def test_residual_of_what_matches_is_nothing(device):
     g = in_ball(0, 30)
-    out, error = fit(g, g, replace(PLAIN, steps=0))
+    out, error = fit(device, g, g, replace(PLAIN, steps=0))
     assert (error < 2e-6).all()
     np.testing.assert_allclose(out.means, g.means, rtol=1e-6)
 
 
-def test_residual_is_the_mean_difference_in_colour_and_alpha():
+def test_residual_is_the_mean_difference_in_colour_and_alpha(device):
     start, target = ball(0.4, (0.2, 0.9, 0.1)), ball(0.9, (0.7, 0.3, 0.6), scale=0.4)
     pictures = [rasterize(g, view_of_ball(PLAIN)) for g in (start, target)]
-    _, error = fit(start, target, replace(PLAIN, steps=0))
+    _, error = fit(device, start, target, replace(PLAIN, steps=0))
     assert_close(error[0], np.abs(pictures[0].color - pictures[1].color).mean(), FIT_FLOAT)
     assert_close(error[1], np.abs(pictures[0].alpha - pictures[1].alpha).mean(), FIT_FLOAT)
 
 
-def test_targets_are_supersampled():
+def test_targets_are_supersampled(device):
     """A gaussian between the pixel centres of a picture is seen at four times the size."""
     speck = ball(0.9, (1, 1, 1), scale=0.004)
     nothing = ball(0.0, (0, 0, 0))
     camera = view_of_ball(PLAIN).scaled(4)
     expected = rasterize(speck, camera).alpha.reshape(32, 4, 32, 4).mean()
-    _, error = fit(nothing, speck, replace(PLAIN, steps=0, supersample=4))
+    _, error = fit(device, nothing, speck, replace(PLAIN, steps=0, supersample=4))
     assert_close(error[1], expected, FIT_FLOAT)
 
 
-def mean_colour_over_views(coefficient, config, **options):
+def mean_colour_over_views(device, coefficient, config, **options):
     """Of one SH coefficient over the views of a residual, in standard deviations over the sphere."""
     sh = np.zeros((1, 16, 3), np.float32)
     sh[0, 0] = 0.5 / scenes.SH_C0  # a colour of 1, which keeps all of them above 0
     sh[0, coefficient] = 0.2
     bright, nothing = ball(0.9, (1, 1, 1), sh=sh), with_bases(ball(0.0, (0, 0, 0)), 3)
-    _, error = fit(nothing, bright, replace(config, steps=0), **options)
+    _, error = fit(device, nothing, bright, replace(config, steps=0), **options)
     return (error[0] / error[1] - 1) / (0.2 * scenes.SH_C0)
 
 
 @pytest.mark.parametrize("num_views", [14, 16])  # all of them are in the residual
-def test_fixed_views_lie_evenly_on_the_sphere(num_views):
+def test_fixed_views_lie_evenly_on_the_sphere(device, num_views):
     """Up to degree 3, functions on the sphere average out as they do not over 16 random views."""
     config = replace(PLAIN, num_views=num_views)
-    means = [mean_colour_over_views(k, config, seed=seed) for k in range(1, 16) for seed in range(3)]
+    means = [mean_colour_over_views(device, k, config, seed=seed) for k in range(1, 16) for seed in range(3)]
     assert np.abs(means).max() < 0.2
     assert np.sqrt(np.mean(np.square(means))) < 0.08  # 0.25 if they were random
 
 
-def test_fresh_views_are_random_and_uniform():
+def test_fresh_views_are_random_and_uniform(device):
     config = replace(PLAIN, num_views=0)
     for k in (*range(1, 9), 12, 15):
-        means = np.array([mean_colour_over_views(k, config, stream=stream) for stream in range(100)])
+        means = np.array([mean_colour_over_views(device, k, config, stream=stream) for stream in range(100)])
         assert abs(means.mean()) < 4 * 0.25 / 10  # 4 sigma of 100 means over 16
         assert 0.7 < means.std() / 0.25 < 1.3
 
 
-def test_seed_and_stream_change_the_views():
-    _, first = fit(ball(0, (0, 0, 0)), in_ball(1, 20), replace(PLAIN, steps=0))
+def test_seed_and_stream_change_the_views(device):
+    _, first = fit(device, ball(0, (0, 0, 0)), in_ball(1, 20), replace(PLAIN, steps=0))
     for options in ({"seed": 1}, {"stream": 1}):
-        _, other = fit(ball(0, (0, 0, 0)), in_ball(1, 20), replace(PLAIN, steps=0), **options)
+        _, other = fit(device, ball(0, (0, 0, 0)), in_ball(1, 20), replace(PLAIN, steps=0), **options)
         assert not np.array_equal(first, other)
 
 
 @pytest.mark.parametrize("num_views", [1, 4, 29, 58, 64])
-def test_every_view_is_looked_at(num_views):
+def test_every_view_is_looked_at(device, num_views):
     """What only some directions show is learnt from views all around."""
     sh = np.zeros((1, 4, 3), np.float32)
     sh[0, 0], sh[0, 1:] = 1.0, np.float32([[0.5], [-0.4], [0.3]])
@@ -153,7 +168,7 @@ def test_every_view_is_looked_at(num_views):
     config = replace(
         PLAIN, **FROZEN | {"step_sh_rest": 0.02}, num_views=num_views, steps=200, final_step=0.01
     )
-    fitted, _ = fit(start, target, config)
+    fitted, _ = fit(device, start, target, config)
     close = np.abs(fitted.sh - sh).max() < 0.03
     assert close == (num_views > 1)
 
@@ -216,7 +231,7 @@ def test_wrong_pictures_are_refused(picture, target):
 
 @pytest.mark.parametrize("weights", [(1.0, 0.0, 0.5), (0.8, 0.2, 0.1), (0.0, 1.0, 0.0)])
 @pytest.mark.parametrize("views_per_step", [1, 3])
-def test_steps_are_those_of_adam(weights, views_per_step):
+def test_steps_are_those_of_adam(device, weights, views_per_step):
     """A ball that looks the same from everywhere, fitted by torch.optim.Adam on differentiable pictures."""
     steps = 25
     config = replace(
@@ -227,7 +242,7 @@ def test_steps_are_those_of_adam(weights, views_per_step):
         views_per_step=views_per_step,
     )
     start, target = ball(0.3, (0.2, 0.9, 0.35)), ball(0.8, (0.6, 0.5, 0.3), scale=0.35)
-    fitted, _ = fit(start, target, config)
+    fitted, _ = fit(device, start, target, config)
 
     camera = view_of_ball(config)
     goal = scenes.doubles(target, torch=torch)
@@ -250,7 +265,7 @@ def test_steps_are_those_of_adam(weights, views_per_step):
     assert_close(fitted.sh, sh.detach().numpy(), FIT_FLOAT)
 
 
-def test_first_step_has_the_sizes_that_were_set():
+def test_first_step_has_the_sizes_that_were_set(device):
     """Adam's first step is as long as set, whatever the gradient."""
     steps = {"step_position": 1e-3, "step_log_scale": 2e-3, "step_logit": 3e-3, "step_sh0": 4e-3}
     start, target = in_ball(2, 12), in_ball(3, 12)
@@ -258,7 +273,7 @@ def test_first_step_has_the_sizes_that_were_set():
         PLAIN, **FROZEN | steps | {"step_sh_rest": 5e-3}, steps=1, views_per_step=16, image_size=64
     )
     start, target = with_bases(start, 1), with_bases(target, 1)
-    fitted, _ = fit(start, target, config)
+    fitted, _ = fit(device, start, target, config)
     assert not np.array_equal(fitted.sh, start.sh)  # it was better than the start
 
     def logit(x):
@@ -275,58 +290,54 @@ def test_first_step_has_the_sizes_that_were_set():
         np.testing.assert_allclose(np.abs(change), getattr(config, name), rtol=0.01, err_msg=name)
 
 
-def test_position_steps_in_world_units():
+def test_position_steps_in_world_units(device):
     config = replace(
         PLAIN, **FROZEN | {"step_position": 1e-3}, position_in_world=True, steps=1, image_size=64
     )
     start = in_ball(2, 12)
-    fitted, _ = fit(start, in_ball(3, 12), config)
+    fitted, _ = fit(device, start, in_ball(3, 12), config)
     np.testing.assert_allclose(np.abs(fitted.means - start.means), 1e-3, rtol=0.01)
 
 
 @pytest.mark.parametrize("changes", [{}, {"num_views": 0}, {"image_size": 0}, {"loss_dssim": 0.2}])
-def test_longer_fits_come_closer(changes):
+def test_longer_fits_come_closer(device, changes):
     start, target = in_ball(4, 20), in_ball(5, 60)
     config = replace(PLAIN, supersample=2, filter_px2=0.1, **changes)
     loss = [
-        fit(start, target, replace(config, steps=steps))[1] @ [config.loss_l1, config.loss_alpha]
+        fit(device, start, target, replace(config, steps=steps))[1] @ [config.loss_l1, config.loss_alpha]
         for steps in (0, 20, 200)
     ]
     assert loss[1] < 0.9 * loss[0]
     assert loss[2] < 0.9 * loss[1]
 
 
-def test_result_no_better_than_its_start_is_thrown_away():
+def test_result_no_better_than_its_start_is_thrown_away(device):
     target = in_ball(6, 20)
     start = scenes.replaced(target, sh=target.sh + np.float32(0.05))  # far better than nothing at all
-    _, before = fit(start, target, replace(PLAIN, steps=0))
+    _, before = fit(device, start, target, replace(PLAIN, steps=0))
     for step in ("step_position", "step_log_scale", "step_logit", "step_sh0"):
-        out, error = fit(start, target, replace(PLAIN, **FROZEN | {step: 1e8}, steps=5))
+        out, error = fit(device, start, target, replace(PLAIN, **FROZEN | {step: 1e8}, steps=5))
         assert all(np.array_equal(getattr(out, n), getattr(start, n)) for n in scenes.NAMES), step
         np.testing.assert_array_equal(error, before)
 
 
-def test_groups_do_not_touch_each_other():
+def test_groups_do_not_touch_each_other(device):
     """Two groups at once give what each gives alone, with its own stream."""
     starts, targets = [in_ball(8, 12), in_ball(9, 7)], [in_ball(10, 30), in_ball(11, 20)]
     config = replace(PLAIN, steps=10)
-    alone = [fit(s, t, config, stream=i) for i, (s, t) in enumerate(zip(starts, targets, strict=True))]
-    both = [np.array(row) for row in rows_of(Gaussians.concatenate(starts))]
-    error = np.zeros((2, 2), np.float32)
+    alone = [
+        fit(device, s, t, config, stream=i) for i, (s, t) in enumerate(zip(starts, targets, strict=True))
+    ]
     progress = _core.FitProgress()
-    _core.fit_level(
-        _fit_config(config, 0, 0),
-        _core.Model(*rows_of(Gaussians.concatenate(targets))),
-        *(0.0, False),
-        *(np.array([[0, 30], [30, 50]]), np.array([[0, 12], [12, 19]])),
-        np.array([[*CENTER, RADIUS]] * 2, np.float32),
-        np.arange(2),
-        *both,
-        error,
-        progress,
+    both, error = fit_groups(
+        device,
+        *(Gaussians.concatenate(starts), Gaussians.concatenate(targets), config),
+        *([[0, 30], [30, 50]], [[0, 12], [12, 19]]),
+        progress=progress,
     )
-    for name, row in zip(scenes.NAMES, both, strict=True):
-        np.testing.assert_array_equal(row, np.concatenate([getattr(g, name) for g, _ in alone]))
+    for name in scenes.NAMES:
+        expected = np.concatenate([getattr(g, name) for g, _ in alone])
+        np.testing.assert_array_equal(getattr(both, name), expected)
     np.testing.assert_array_equal(error, [e for _, e in alone])
     assert progress.groups_done == 2
     np.testing.assert_allclose(
@@ -334,23 +345,18 @@ def test_groups_do_not_touch_each_other():
     )
 
 
-def test_cancelled_fit_does_nothing():
+def test_cancelled_fit_does_nothing(device):
     progress = _core.FitProgress()
     progress.cancel()
     start = in_ball(12, 10)
-    out, _ = fit(start, in_ball(13, 10), PLAIN, progress=progress)
+    out, _ = fit(device, start, in_ball(13, 10), PLAIN, progress=progress)
     assert np.array_equal(out.means, start.means)
     assert progress.groups_done == 0
 
 
-def test_no_groups_are_legal():
-    rows = [np.array(row) for row in rows_of(in_ball(14, 0))]
-    empty = np.zeros((0, 2), np.int64)
-    _core.fit_level(
-        *(_fit_config(PLAIN, 0, 0), _core.Model(*rows_of(in_ball(14, 0))), 0.0, False, empty, empty),
-        *(np.zeros((0, 4), np.float32), np.zeros(0, np.int64), *rows, np.zeros((0, 2), np.float32)),
-        _core.FitProgress(),
-    )
+def test_no_groups_are_legal(device):
+    out, error = fit_groups(device, in_ball(14, 0), in_ball(14, 0), PLAIN, [], [])
+    assert len(out) == len(error) == 0
 
 
 @pytest.mark.parametrize(
@@ -383,3 +389,57 @@ def test_group_without_extent_is_named():
             *(np.array([[0, 10]]), np.array([[0, 10]]), np.zeros((1, 4), np.float32), np.array([0])),
             *(*rows, np.zeros((1, 2), np.float32), _core.FitProgress()),
         )
+
+
+# ---- both halves
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    ("num", "num_target", "degree", "changes"),
+    [
+        (1, 3, 0, {}),
+        (2, 1, 0, {"num_views": 0}),
+        (31, 60, 0, {"views_per_step": 3}),
+        (60, 120, 3, {"loss_dssim": 0.2}),
+        (178, 356, 0, {"image_size": 0, "supersample": 4, "filter_px2": 0.05, "views_per_step": 2}),
+        (178, 356, 1, {"num_views": 0, "loss_dssim": 0.2}),
+        (300, 400, 0, {"image_size": 0, "views_per_step": 2}),
+        (40, 60, 0, {"image_size": 50, "loss_dssim": 0.2}),
+        (3000, 4000, 3, {"image_size": 64, "num_views": 0, "loss_dssim": 0.2}),
+    ],
+)
+@pytest.mark.parametrize("steps", [0, 1, 5])
+def test_devices_agree(num, num_target, degree, changes, steps):
+    """Rounding moves nearly nothing; Adam makes whole steps out of gradients that are all rounding."""
+    start, target = with_bases(in_ball(16, num), degree), with_bases(in_ball(17, num_target), degree)
+    config = replace(PLAIN, steps=steps, **changes)
+    (a, a_error), (b, b_error) = (fit(device, start, target, config) for device in ("cpu", "cuda"))
+    np.testing.assert_allclose(b_error, a_error, rtol=1e-4, atol=1e-7)
+    for name in scenes.NAMES:
+        first, x, y = (getattr(g, name).astype(np.float64) for g in (start, a, b))
+        moved = np.abs(x - first).max()
+        assert (np.abs(x - y) > 1e-3 * moved + 1e-6).mean() < 0.01, name
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("changes", [{}, {"num_views": 0, "loss_dssim": 0.2, "image_size": 64}])
+def test_devices_come_as_close(changes):
+    start, target = in_ball(18, 60), in_ball(19, 180)
+    config = replace(PLAIN, supersample=2, filter_px2=0.1, steps=150, **changes)
+    loss = [
+        fit(device, start, target, config)[1] @ [config.loss_l1, config.loss_alpha]
+        for device in ("cpu", "cuda")
+    ]
+    assert loss[1] == pytest.approx(loss[0], rel=0.03)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("num_groups", "num"), [(1, 178), (200, 20), (3, 700)])
+def test_every_run_gives_the_same_bytes(num_groups, num):
+    start, target = in_ball(20, num_groups * num), in_ball(21, num_groups * num)
+    ranges = np.arange(num_groups)[:, None] * num + [0, num]
+    config = replace(PLAIN, steps=20, views_per_step=2, num_views=4, image_size=0)
+    (a, a_error), (b, b_error) = (fit_groups("cuda", start, target, config, ranges, ranges) for _ in range(2))
+    assert all(np.array_equal(getattr(a, name), getattr(b, name)) for name in scenes.NAMES)
+    np.testing.assert_array_equal(a_error, b_error)

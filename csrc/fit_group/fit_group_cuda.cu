@@ -1,16 +1,18 @@
-// A block fits a group, start to end, then takes the next from a queue.
+// A block, or a team of blocks, fits a group, start to end, then takes the next from a queue.
 //
-// One step: threads project gaussians and order them by depth; warps take 8 x 4 pixels of a view each, list
+// One step: threads project gaussians and order them by depth; half-warps take cells of 4 x 4 pixels, list
 // the gaussians that reach them, blend them front to back, compare, and walk back; what a gaussian gets from
-// each warp has its own slot, and slots are added up in a fixed order; threads carry that on to the
-// parameters, and Adam moves them. So every run has the same result, whatever order warps and blocks come in.
+// each cell has its own slot, and slots are added up in a fixed order; threads carry that on to the
+// parameters, and Adam moves them. So every run has the same result, whatever order blocks and warps come in.
 //
-// Small groups keep what is read again and again in shared memory, large ones in global memory.
+// Small groups are fitted by one block each, which keeps what is read again and again in shared memory. Large
+// groups lie in global memory, and are fitted by teams where there are fewer groups than multiprocessors.
 
 #include "fit_group/fit_group_cuda.h"
 
 #include <algorithm>
 #include <cfloat>
+#include <cstddef>
 #include <type_traits>
 
 #include "base/launch.cuh"
@@ -22,40 +24,47 @@ namespace cuda {
 namespace {
 
 constexpr int kViewsAtOnce = 2;
-// Masks of sub-tiles have a bit for each of those in a region; a larger picture takes several regions.
-constexpr int kSubWidth = 8, kSubHeight = 4, kRegion = 32;
-constexpr int kSubColumns = kRegion / kSubWidth, kSubTiles = kSubColumns * (kRegion / kSubHeight);
-static_assert(kSubTiles == 32, "a mask is a word");
-// Gaussians of a list whose blending is kept for the walk back. What came before is blended again.
-constexpr int kChunk = 32;
-constexpr int kAtOnce = 4;      // gaussians that a warp looks at together
-constexpr int kSumStride = 12;  // of FalloffSums and colour, with room to spare
-constexpr int kSums = 9;
+// A half-warp blends a cell. Masks have a bit for each cell of a region; a larger picture takes several
+// regions.
+constexpr int kCell = 4, kCellPixels = kCell * kCell;
+constexpr int kRegion = 32, kRegionCells = kRegion / kCell;
+static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16, "a mask is a word, a cell half a warp");
+using CellMask = unsigned long long;
+constexpr int kAtOnce = 4;  // gaussians that a half-warp looks at together
+constexpr int kSums = 9;    // FalloffSums and colour
+constexpr int kSumStride = 12;
 constexpr uint32_t kHiddenKey = 0xfffffffeu;  // after all depths
-constexpr uint32_t kSmallCount = 256;         // gaussians of a small group
+constexpr uint32_t kSmallCount = 256;         // gaussians of a small group, whose picture is one region
 constexpr int kStepsPerPoll = 16;
+constexpr unsigned kLargestTeam = 16;
 
-static_assert(sizeof(Record<float>) == 48, "loaded as three float4");
+static_assert(sizeof(Record<float>) == 48 && offsetof(Record<float>, l22) == 16 &&
+                  offsetof(Record<float>, color) == 24,
+              "loaded as whole words");
 
-// Where a kernel's array lies: in the block's shared memory or its part of the scratch.
+// Where an array lies: in the block's shared memory, or in the team's part of the scratch.
 struct Place {
     size_t offset;
     bool is_shared;
 };
 
 struct Layout {
-    // Hot: shared for small groups, in the scratch for large ones.
-    size_t records, keys, mask, slot_first, order, lists, kept_transmittance;
-    size_t list_size, kept_size;  // of a warp, bytes
-    size_t fragments;             // shared
-    // Cold: wherever there is room.
-    Place value, m, v, by_view, sum, sort_keys, sums, near_slots;
+    // Shared for small groups, in the scratch for large ones.
+    size_t records, sorted, keys, mask, slot_first, order, lists, errors;
+    size_t list_size;  // bytes, of a half-warp
+    size_t fragments;  // shared
+    // Wherever there is room.
+    Place kept_transmittance, value, m, v, by_view, sum, sort_keys, sums, near_slots;
+    size_t kept_size;        // bytes, of a warp
     size_t far_slots, maps;  // scratch
-    uint32_t num_near_slots;
-    size_t shared_bytes, scratch_bytes;  // of a block
+    uint32_t num_near_slots, num_far_slots;
+    size_t shared_bytes;   // of a block
+    size_t scratch_bytes;  // of a team
 };
 
-constexpr size_t kFragmentsBytes = kChunk * 33 * sizeof(float2) + 32 * sizeof(float4);
+V3DG_HD constexpr size_t fragments_bytes(int chunk) {
+    return chunk * 33 * sizeof(float2) + 32 * sizeof(float4);
+}
 
 struct Cameras {
     ModelView<float> view[kViewsAtOnce];
@@ -63,17 +72,29 @@ struct Cameras {
     const float4* target[kViewsAtOnce];
 };
 
+// What the blocks of a team share beside arrays.
+struct Team {
+    unsigned arrived;  // at barriers, ever
+    unsigned unit, ticket;
+    int cancel;
+    uint32_t num_slots[kLargestTeam];  // of each block's part
+};
+
 struct Shared {
     Cameras cameras[2];  // of this step and the next
-    float error[kViewsAtOnce * kSubTiles][2];
+    Team team;           // of one block
     uint32_t warp_total[32];
-    uint32_t ticket, unit;
-    int cancel;
+    unsigned arrival;
 };
 
 enum class Pass { measure, draw, train };
 
-template <int kThreads, bool kSmall>
+// 0, 1, 2, ... to the middle of [0, size), then alternately before and behind it.
+__device__ inline int from_middle(int k, int size) { return size / 2 + (k % 2 ? -(k + 1) / 2 : k / 2); }
+
+// A small group's team is one block. The walk back keeps how a chunk of kChunk gaussians was blended; what
+// came before the last chunk is blended again.
+template <int kThreads, bool kSmall, int kChunk>
 struct Fit {
     using Index = std::conditional_t<kSmall, uint16_t, uint32_t>;
     static constexpr int kWarps = kThreads / 32;
@@ -81,6 +102,8 @@ struct Fit {
     const FitGroupsInput& in;
     const Layout& layout;
     Shared& s;
+    Team& team;
+    const unsigned team_rank, team_size;
     unsigned char* const scratch;
     unsigned char* const hot;
     // The group.
@@ -88,46 +111,92 @@ struct Fit {
     uint32_t n = 0, n_padded = 0;
     int num_sh = 0;
     uint32_t num_values = 0;
+    int regions_across = 1;
 
-    __device__ Fit(const FitGroupsInput& input, const Layout& l, Shared& shared, unsigned char* all_scratch)
+    __device__ Fit(const FitGroupsInput& input, const Layout& l, Shared& shared, Team& the_team,
+                   unsigned rank, unsigned size, unsigned char* of_team)
         : in(input),
           layout(l),
           s(shared),
-          scratch(all_scratch + blockIdx.x * l.scratch_bytes),
+          team(the_team),
+          team_rank(kSmall ? 0 : rank),
+          team_size(kSmall ? 1 : size),
+          scratch(of_team),
           hot(kSmall ? shared_memory() : scratch) {}
 
-    __device__ Record<float>* records() const {
-        return reinterpret_cast<Record<float>*>(hot + layout.records);
+    __device__ void take(const FitJob& next) {
+        job = next;
+        n = static_cast<uint32_t>(job.group.count);
+        n_padded = (n + 31) / 32 * 32;
+        num_sh = 3 * num_sh_bases(in.rows.sh_degree);
+        num_values = n * (11 + num_sh);
+        regions_across = kSmall ? 1 : (job.size + kRegion - 1) / kRegion;
     }
-    __device__ uint32_t* keys() const { return reinterpret_cast<uint32_t*>(hot + layout.keys); }
-    __device__ uint32_t* mask() const { return reinterpret_cast<uint32_t*>(hot + layout.mask); }
-    __device__ uint32_t* slot_first() const { return reinterpret_cast<uint32_t*>(hot + layout.slot_first); }
-    __device__ Index* order() const { return reinterpret_cast<Index*>(hot + layout.order); }
-    __device__ Index* list() const {
-        return reinterpret_cast<Index*>(hot + layout.lists + threadIdx.x / 32 * layout.list_size);
+
+    // ---- the team
+
+    __device__ bool leads() const { return threadIdx.x == 0 && team_rank == 0; }
+    // The team's threads, neighbouring warps in different blocks.
+    __device__ uint32_t first() const {
+        return (threadIdx.x / 32 * team_size + team_rank) * 32 + threadIdx.x % 32;
+    }
+    __device__ uint32_t stride() const { return kThreads * team_size; }
+
+    // A barrier of the whole team.
+    __device__ void sync() const {
+        __syncthreads();
+        if (kSmall || team_size == 1) return;
+        if (threadIdx.x == 0) {
+            __threadfence();
+            const unsigned all = (atomicAdd(&team.arrived, 1u) / team_size + 1) * team_size;
+            while (*static_cast<volatile unsigned*>(&team.arrived) < all) {
+            }
+            __threadfence();
+        }
+        __syncthreads();
+    }
+
+    // ---- arrays
+
+    template <class T>
+    __device__ T* hot_at(size_t offset) const {
+        return reinterpret_cast<T*>(hot + offset);
+    }
+    __device__ float* at(const Place& place) const {
+        return reinterpret_cast<float*>((place.is_shared ? shared_memory() : scratch) + place.offset);
+    }
+    // Gaussians have places: those of view b from b * n_padded on. What is blended has ranks: the places of
+    // small groups, whose lists go through `order`; positions by depth of large ones, whose records are
+    // sorted.
+    __device__ Record<float>* records() const { return hot_at<Record<float>>(layout.records); }
+    __device__ Record<float>* ranked() const {
+        return hot_at<Record<float>>(kSmall ? layout.records : layout.sorted);
+    }
+    __device__ uint32_t num_places() const { return kViewsAtOnce * n_padded; }
+    __device__ uint32_t nothing() const { return num_places(); }  // the rank of a record that draws nothing
+    __device__ uint32_t* keys() const { return hot_at<uint32_t>(layout.keys); }
+    __device__ Index* order() const { return hot_at<Index>(layout.order); }
+    __device__ CellMask* mask(int region) const {
+        return hot_at<CellMask>(layout.mask) + (kSmall ? 0 : region * num_places());
+    }
+    __device__ uint32_t* slot_first(int region) const {
+        return hot_at<uint32_t>(layout.slot_first) + (kSmall ? 0 : region * num_places());
+    }
+    __device__ uint32_t warp() const { return team_rank * kWarps + threadIdx.x / 32; }
+    __device__ Index* list(int half) const {
+        return hot_at<Index>(layout.lists + (2 * warp() + half) * layout.list_size);
     }
     __device__ float* kept_transmittance() const {
-        return reinterpret_cast<float*>(hot + layout.kept_transmittance +
-                                        threadIdx.x / 32 * layout.kept_size);
+        return at(layout.kept_transmittance) + warp() * (layout.kept_size / sizeof(float));
     }
     // [gaussian][pixel]: alpha and weight, then gradient by the exponent and weight. The spare column keeps
     // lanes that read one pixel each of their own gaussian out of each other's banks.
     __device__ float2* fragments() const {
         return reinterpret_cast<float2*>(shared_memory() + layout.fragments +
-                                         threadIdx.x / 32 * kFragmentsBytes);
+                                         threadIdx.x / 32 * fragments_bytes(kChunk));
     }
-    __device__ float4* d_pixels() const {
-        return reinterpret_cast<float4*>(shared_memory() + layout.fragments +
-                                         threadIdx.x / 32 * kFragmentsBytes + kChunk * 33 * sizeof(float2));
-    }
-    __device__ float* at(const Place& place) const {
-        return reinterpret_cast<float*>((place.is_shared ? shared_memory() : scratch) + place.offset);
-    }
-    // A slot for each sub-tile that each record reaches.
-    __device__ float* slots(uint32_t num) const {
-        return num <= layout.num_near_slots ? at(layout.near_slots)
-                                            : reinterpret_cast<float*>(scratch + layout.far_slots);
-    }
+    __device__ float4* d_pixels() const { return reinterpret_cast<float4*>(fragments() + kChunk * 33); }
+    __device__ int num_regions() const { return regions_across * regions_across; }
 
     // ---- parameters: means, quaternions, log scales and logits, a plane each; then SH coefficients,
     // gaussian by gaussian
@@ -137,7 +206,7 @@ struct Fit {
         float *m = at(layout.m), *v = at(layout.v);
         const float inverse = 1 / job.group.radius;
         const FitRows& rows = in.rows;
-        for (uint32_t i = threadIdx.x; i < n; i += kThreads) {
+        for (uint32_t i = first(); i < n; i += stride()) {
             const size_t from = job.group.first + i;
             for (int k = 0; k < 3; ++k) {
                 value[k * n + i] = (rows.means[3 * from + k] - job.group.center[k]) * inverse;
@@ -146,9 +215,9 @@ struct Fit {
             for (int k = 0; k < 4; ++k) value[(3 + k) * n + i] = rows.quats[4 * from + k];
             value[10 * n + i] = logit_of_opacity(rows.opacities[from]);
         }
-        for (uint32_t k = threadIdx.x; k < num_sh * n; k += kThreads)
+        for (uint32_t k = first(); k < num_sh * n; k += stride())
             value[11 * n + k] = rows.sh[num_sh * job.group.first + k];
-        for (uint32_t k = threadIdx.x; k < num_values; k += kThreads) m[k] = v[k] = 0;
+        for (uint32_t k = first(); k < num_values; k += stride()) m[k] = v[k] = 0;
     }
 
     // Writes the values back in world units unless one of them is not finite; whether it did.
@@ -160,7 +229,7 @@ struct Fit {
         if (!__syncthreads_and(finite)) return false;
         const FitRows& rows = in.rows;
         const FitGroup& group = job.group;
-        for (uint32_t i = threadIdx.x; i < n; i += kThreads) {
+        for (uint32_t i = first(); i < n; i += stride()) {
             const Gaussian3d<float> g = gaussian(i);
             const size_t to = group.first + i;
             const float length = sqrt_of(g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] +
@@ -174,7 +243,7 @@ struct Fit {
                 rows.quats[4 * to + k] = length > 0 ? g.quat[k] / length : static_cast<float>(k == 0);
             rows.opacities[to] = g.opacity;
         }
-        for (uint32_t k = threadIdx.x; k < num_sh * n; k += kThreads)
+        for (uint32_t k = first(); k < num_sh * n; k += stride())
             rows.sh[num_sh * group.first + k] = value[11 * n + k];
         return true;
     }
@@ -200,27 +269,26 @@ struct Fit {
 
     // ---- the way forth
 
-    // Places of gaussians in a batch of views: view b has those from b * n_padded on.
     __device__ void project(const Cameras& cameras, int num_views) const {
-        for (uint32_t j = threadIdx.x; j < num_views * n_padded; j += kThreads) {
+        for (uint32_t j = first(); j < num_views * n_padded; j += stride()) {
             const uint32_t b = j / n_padded, i = j - b * n_padded;
-            uint32_t key = kHiddenKey, reached = 0;
+            uint32_t key = kHiddenKey;
+            CellMask reached = 0;
             if (i < n) {
                 Record<float> r;
                 if (project_one(i, cameras.view[b], cameras.camera[b], r)) {
                     records()[j] = r;
                     key = __float_as_uint(r.depth);
-                    if (kSmall) reached = sub_tiles_of(r, 0, 0);
+                    if (kSmall) reached = cells_of(r, 0, 0);
                 }
             }
             keys()[j] = key;
-            if (kSmall) mask()[j] = reached;
+            if (kSmall) mask(0)[j] = reached;
         }
-        if (threadIdx.x == 0) {
-            // What fills up the lists draws nothing.
-            Record<float> nothing{};
-            nothing.log2_opacity = -100;
-            records()[num_views * n_padded] = nothing;
+        if (leads()) {
+            Record<float> r{};
+            r.log2_opacity = -100;
+            ranked()[nothing()] = r;
         }
     }
 
@@ -269,55 +337,61 @@ struct Fit {
         }
     }
 
-    // Sub-tiles of the region at (left, top) that the record may reach, a bit each, row by row.
-    __device__ static uint32_t sub_tiles_of(const Record<float>& r, int left, int top) {
+    // Cells of the region at (left, top) that the record may reach, a bit each, row by row.
+    __device__ static CellMask cells_of(const Record<float>& r, int left, int top) {
         const int x0 = max(r.x0 - left, 0), x1 = min(r.x1 - left, kRegion - 1);
         const int y0 = max(r.y0 - top, 0), y1 = min(r.y1 - top, kRegion - 1);
         if (x0 > x1 || y0 > y1) return 0;
         const EllipseRows<float> ellipse = ellipse_rows(r.l11, r.l12, r.l22, r.log2_opacity);
         const float u = r.u - static_cast<float>(left) - 0.5f, v = r.v - static_cast<float>(top) - 0.5f;
-        uint32_t reached = 0;
-        for (int row = y0 / kSubHeight; row <= y1 / kSubHeight; ++row) {
-            const float low = static_cast<float>(kSubHeight * row) - v;
+        CellMask reached = 0;
+        for (int row = y0 / kCell; row <= y1 / kCell; ++row) {
+            const float low = static_cast<float>(kCell * row) - v;
             float from, to;
-            row_extent(ellipse, low, low + static_cast<float>(kSubHeight - 1), from, to);
+            row_extent(ellipse, low, low + static_cast<float>(kCell - 1), from, to);
             const int first = max(x0, static_cast<int>(ceilf(max_of(u + from, -1.0f))));
             const int last = min(x1, static_cast<int>(floorf(min_of(u + to, static_cast<float>(kRegion)))));
             if (first > last) continue;
-            const uint32_t columns = (2u << last / kSubWidth) - (1u << first / kSubWidth);
-            reached |= columns << (kSubColumns * row);
+            const uint32_t columns = (2u << last / kCell) - (1u << first / kCell);
+            reached |= static_cast<CellMask>(columns) << (kRegionCells * row);
         }
         return reached;
     }
 
     // Orders the gaussians of each view by depth, ties by place.
     __device__ void sort(int num_views) const {
-        if (kSmall)
+        if (kSmall || team_size > 1)
             rank_by_counting(num_views);
         else
             for (int b = 0; b < num_views; ++b) sort_bitonic(b);
     }
 
     __device__ void rank_by_counting(int num_views) const {
-        for (uint32_t j = threadIdx.x; j < num_views * n_padded; j += kThreads) {
-            const uint32_t first = j / n_padded * n_padded, i = j - first, warp_first = i - threadIdx.x % 32;
-            const uint4* all = reinterpret_cast<const uint4*>(keys() + first);
+        for (uint32_t j = first(); j < num_views * n_padded; j += stride()) {
+            const uint32_t begin = j / n_padded * n_padded, i = j - begin, warp_first = i - threadIdx.x % 32;
+            const uint4* all = reinterpret_cast<const uint4*>(keys() + begin);
             const uint32_t key = keys()[j];
             uint32_t rank = 0;
-            const auto count = [&](uint32_t begin, uint32_t end, const auto& before) {
-                for (uint32_t k = begin; k < end; k += 4) {
-                    const uint4 other = all[k / 4];
-                    rank += before(other.x, k);
-                    rank += before(other.y, k + 1);
-                    rank += before(other.z, k + 2);
-                    rank += before(other.w, k + 3);
+            // Keys come before at the same depth where their place does: in all runs of 32 before this
+            // warp's, in none behind.
+            const auto count = [&](uint32_t from, uint32_t to, const auto& before) {
+                for (uint32_t run = from; run < to; run += 32) {
+                    uint4 other[8];
+#pragma unroll
+                    for (int q = 0; q < 8; ++q) other[q] = all[run / 4 + q];
+#pragma unroll
+                    for (int q = 0; q < 8; ++q) {
+                        const uint32_t k = run + 4 * q;
+                        rank += before(other[q].x, k) + before(other[q].y, k + 1);
+                        rank += before(other[q].z, k + 2) + before(other[q].w, k + 3);
+                    }
                 }
             };
             count(0, warp_first, [&](uint32_t other, uint32_t) { return other <= key; });
             count(warp_first, warp_first + 32,
                   [&](uint32_t other, uint32_t k) { return other < key + (k < i); });
             count(warp_first + 32, n_padded, [&](uint32_t other, uint32_t) { return other < key; });
-            order()[first + rank] = static_cast<Index>(j);
+            order()[begin + rank] = static_cast<Index>(j);
         }
     }
 
@@ -325,10 +399,10 @@ struct Fit {
         auto* sorted = reinterpret_cast<unsigned long long*>(at(layout.sort_keys));
         uint32_t size = 32;
         while (size < n) size *= 2;
-        const uint32_t first = b * n_padded;
+        const uint32_t begin = b * n_padded;
         for (uint32_t i = threadIdx.x; i < size; i += kThreads)
             sorted[i] =
-                i < n ? static_cast<unsigned long long>(keys()[first + i]) << 32 | (first + i) : ~0ull;
+                i < n ? static_cast<unsigned long long>(keys()[begin + i]) << 32 | (begin + i) : ~0ull;
         __syncthreads();
         for (uint32_t run = 2; run <= size; run *= 2)
             for (uint32_t stride = run / 2; stride > 0; stride /= 2) {
@@ -343,22 +417,33 @@ struct Fit {
                 __syncthreads();
             }
         for (uint32_t i = threadIdx.x; i < n_padded; i += kThreads)
-            order()[first + i] = i < n ? static_cast<Index>(sorted[i]) : static_cast<Index>(first + i);
+            order()[begin + i] = i < n ? static_cast<Index>(sorted[i]) : static_cast<Index>(begin + i);
         __syncthreads();
     }
 
-    // Large groups: which sub-tiles of a region each record reaches.
-    __device__ void mark_region(int num_views, int left, int top) const {
-        for (uint32_t j = threadIdx.x; j < num_views * n_padded; j += kThreads)
-            mask()[j] = keys()[j] == kHiddenKey ? 0 : sub_tiles_of(records()[j], left, top);
+    // Large groups: sorts the records, and finds the cells of each.
+    __device__ void arrange(int num_views) const {
+        for (uint32_t r = first(); r < num_views * n_padded; r += stride()) {
+            const uint32_t j = order()[r];
+            const bool is_hidden = keys()[j] == kHiddenKey;
+            Record<float> record{};
+            if (!is_hidden) ranked()[r] = record = records()[j];
+            for (int region = 0; region < num_regions(); ++region)
+                mask(region)[r] = is_hidden ? 0
+                                            : cells_of(record, region % regions_across * kRegion,
+                                                       region / regions_across * kRegion);
+        }
     }
 
-    // Gives each record its slots, and counts them.
+    // Gives each record a slot for each cell that it reaches, region by region, and counts them.
     __device__ uint32_t assign_slots(int num_views) const {
-        const uint32_t count = num_views * n_padded, each = (count + kThreads - 1) / kThreads;
-        const uint32_t begin = min(count, threadIdx.x * each), end = min(count, begin + each);
+        const uint32_t used = num_views * n_padded, count = num_regions() * used;
+        const auto mask_at = [&](uint32_t t) { return kSmall ? mask(0)[t] : mask(t / used)[t % used]; };
+        const uint32_t each = (count + stride() - 1) / stride();
+        const uint32_t begin = min(count, (team_rank * kThreads + threadIdx.x) * each);
+        const uint32_t end = min(count, begin + each);
         uint32_t own = 0;
-        for (uint32_t j = begin; j < end; ++j) own += __popc(mask()[j]);
+        for (uint32_t t = begin; t < end; ++t) own += __popcll(mask_at(t));
         uint32_t upto = own;
         for (int offset = 1; offset < 32; offset *= 2) {
             const uint32_t left = __shfl_up_sync(kAllLanes, upto, offset);
@@ -371,118 +456,169 @@ struct Fit {
             if (w < threadIdx.x / 32) before += s.warp_total[w];
             total += s.warp_total[w];
         }
-        for (uint32_t j = begin; j < end; ++j) {
-            slot_first()[j] = before;
-            before += __popc(mask()[j]);
+        if (team_size > 1) {
+            if (threadIdx.x == 0) team.num_slots[team_rank] = total;
+            sync();
+            total = 0;
+            for (unsigned block = 0; block < team_size; ++block) {
+                if (block < team_rank) before += team.num_slots[block];
+                total += team.num_slots[block];
+            }
+        }
+        for (uint32_t t = begin; t < end; ++t) {
+            slot_first(kSmall ? 0 : t / used)[kSmall ? t : t % used] = before;
+            before += __popcll(mask_at(t));
         }
         return total;
     }
 
     // ---- blending
 
-    // A warp's 8 x 4 pixels, a lane each.
+    // A lane's pixel in its half-warp's cell.
     struct Pixel {
         int x, y;
         float center_x, center_y;
         bool inside;
     };
 
-    __device__ Pixel pixel_of(int sub_tile, int left, int top) const {
-        const int lane = threadIdx.x % 32;
-        const int x = left + sub_tile % kSubColumns * kSubWidth + lane % kSubWidth;
-        const int y = top + sub_tile / kSubColumns * kSubHeight + lane / kSubWidth;
+    __device__ Pixel pixel_at(int cell_x, int cell_y) const {
+        const int lane = threadIdx.x % kCellPixels;
+        const int x = cell_x * kCell + lane % kCell, y = cell_y * kCell + lane / kCell;
         return {x, y, static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f,
                 x < job.size && y < job.size};
     }
-
-    // Lists what reaches a sub-tile of view b, nearest first, filled up to whole steps of the walk.
-    __device__ uint32_t make_list(int b, int sub_tile, uint32_t nothing) const {
-        const uint32_t lane = threadIdx.x % 32;
-        Index* const out = list();
-        uint32_t length = 0;
-        for (uint32_t i = lane; i < n_padded; i += 32) {
-            const Index j = order()[b * n_padded + i];
-            const bool reaches = (mask()[j] >> sub_tile & 1) != 0;
-            const uint32_t all = __ballot_sync(kAllLanes, reaches);
-            if (reaches) out[length + __popc(all & ((1u << lane) - 1))] = j;
-            length += __popc(all);
-        }
-        if (lane < kAtOnce) out[length + lane] = static_cast<Index>(nothing);
-        __syncwarp();
-        return length;
-    }
-
-    // A record in three loads.
-    struct Loaded {
-        float4 a, b;  // u, v, l11, l12; l22, log2_opacity, red, green
-        float4 c;     // blue, depth, box
-
-        __device__ explicit Loaded(const Record<float>* r) {
-            const float4* words = reinterpret_cast<const float4*>(r);
-            a = words[0];
-            b = words[1];
-            c = words[2];
-        }
-        __device__ float alpha_at(float x, float y) const {
-            return alpha_of(falloff_at(x, y, a.x, a.y, a.z, a.w, b.x, b.y));
-        }
-    };
 
     struct alignas(kAtOnce * sizeof(Index)) Entries {
         Index record[kAtOnce];
     };
 
-    // Blends kAtOnce gaussians of the list from `first` on over the pixel.
-    template <class Blended>
-    __device__ void blend(const Pixel& p, uint32_t first, float& transmittance,
-                          const Blended& blended) const {
-        const Entries entries = *reinterpret_cast<const Entries*>(list() + first);
-        float alpha[kAtOnce], color[kAtOnce][3];
+    // What reaches each half-warp's cell, nearest first, filled up with nothing to the same length for both.
+    struct List {
+        const Index* entry;
+        uint32_t length, filled;
+
+        __device__ Entries at(uint32_t i) const { return *reinterpret_cast<const Entries*>(entry + i); }
+    };
+
+    // Of view b; `cell` is the left one's bit.
+    __device__ List make_lists(int b, int region, int cell) const {
+        constexpr int kLoads = 4;
+        const uint32_t lane = threadIdx.x % 32, before = (1u << lane) - 1;
+        const CellMask* masks = mask(region);
+        uint32_t left = 0, right = 0;
+        for (uint32_t first = 0; first < n_padded; first += 32 * kLoads) {
+            Index j[kLoads];
+            uint32_t reached[kLoads];
 #pragma unroll
-        for (int q = 0; q < kAtOnce; ++q) {
-            const Loaded r(records() + entries.record[q]);
-            alpha[q] = r.alpha_at(p.center_x, p.center_y);
-            color[q][0] = r.b.z;
-            color[q][1] = r.b.w;
-            color[q][2] = r.c.x;
-        }
+            for (int q = 0; q < kLoads; ++q) {
+                const uint32_t i = first + 32 * q + lane;
+                reached[q] = 0;
+                if (i >= n_padded) continue;
+                j[q] = static_cast<Index>(b * n_padded + i);
+                if (kSmall) j[q] = order()[j[q]];
+                reached[q] = static_cast<uint32_t>(masks[j[q]] >> cell) & 3;
+            }
 #pragma unroll
-        for (int q = 0; q < kAtOnce; ++q) {
-            const float weight = blend_weight(alpha[q], transmittance);
-            blended(q, color[q], weight > 0 ? alpha[q] : 0.0f, weight);
+            for (int q = 0; q < kLoads; ++q) {
+                const uint32_t in_left = __ballot_sync(kAllLanes, reached[q] & 1);
+                const uint32_t in_right = __ballot_sync(kAllLanes, reached[q] & 2);
+                if (reached[q] & 1) list(0)[left + __popc(in_left & before)] = j[q];
+                if (reached[q] & 2) list(1)[right + __popc(in_right & before)] = j[q];
+                left += __popc(in_left);
+                right += __popc(in_right);
+            }
         }
+        const int half = lane / kCellPixels;
+        const uint32_t length = half == 0 ? left : right;
+        const uint32_t filled = (max(left, right) + kAtOnce - 1) / kAtOnce * kAtOnce;
+        Index* const own = list(half);
+        for (uint32_t i = length + lane % kCellPixels; i < filled; i += kCellPixels)
+            own[i] = static_cast<Index>(nothing());
+        __syncwarp();
+        return {own, length, filled};
     }
 
+    // Parts of a record, in as few loads as they take.
+    static __device__ float4 ellipse_of(const Record<float>& r) {
+        return *reinterpret_cast<const float4*>(&r.u);
+    }
+    static __device__ float3 color_of(const Record<float>& r) {
+        const float2 red_green = *reinterpret_cast<const float2*>(r.color);
+        return make_float3(red_green.x, red_green.y, r.color[2]);
+    }
+
+    // Blends kAtOnce gaussians of the list over the pixel.
+    template <class Blended>
+    __device__ void blend(const Pixel& p, const Entries& entries, float& transmittance,
+                          const Blended& blended) const {
+        float alpha[kAtOnce], weight[kAtOnce];
+        float3 color[kAtOnce];
+#pragma unroll
+        for (int q = 0; q < kAtOnce; ++q) {
+            const Record<float>& r = ranked()[entries.record[q]];
+            const float4 e = ellipse_of(r), f = *reinterpret_cast<const float4*>(&r.l22);
+            color[q] = make_float3(f.z, f.w, r.color[2]);
+            alpha[q] = alpha_of(falloff_at(p.center_x, p.center_y, e.x, e.y, e.z, e.w, f.x, f.y));
+        }
+        blend_weights(alpha, transmittance, weight);
+#pragma unroll
+        for (int q = 0; q < kAtOnce; ++q) blended(q, color[q], alpha[q], weight[q]);
+    }
+
+    // The first chunk of a list is what is left over.
+    __device__ static uint32_t chunk_end(uint32_t chunk, uint32_t filled) {
+        return (filled - 1) % kChunk + 1 + chunk * kChunk;
+    }
+    __device__ static uint32_t chunk_begin(uint32_t chunk, uint32_t filled) {
+        return chunk == 0 ? 0 : chunk_end(chunk - 1, filled);
+    }
+
+    // Where a pass reads and writes.
+    struct Targets {
+        float* slots;          // train
+        uint32_t slot_base;    // of the first of them
+        const float* d_dssim;  // train; may be null
+        float* picture;        // draw
+        float2* errors;        // measure
+    };
+
+    // A warp takes two cells side by side in view b. `unit` numbers the pair.
     template <Pass kPass>
-    __device__ void blend_sub_tile(const Cameras& cameras, int b, int sub_tile, int left, int top,
-                                   uint32_t nothing, float* slots, const float* d_dssim,
-                                   float* picture) const {
+    __device__ void blend_cells(const Cameras& cameras, int b, int pair_x, int cell_y, uint32_t unit,
+                                const Targets& targets) const {
         const uint32_t lane = threadIdx.x % 32;
-        const Pixel p = pixel_of(sub_tile, left, top);
-        const size_t at = static_cast<size_t>(p.y) * job.size + p.x;
+        const Pixel p = pixel_at(2 * pair_x + lane / kCellPixels, cell_y);
+        const int region = cell_y / kRegionCells * regions_across + 2 * pair_x / kRegionCells;
+        const int left_cell = cell_y % kRegionCells * kRegionCells + 2 * pair_x % kRegionCells;
+        const int cell = left_cell + lane / kCellPixels;
         const size_t num_pixels = static_cast<size_t>(job.size) * job.size;
+        const size_t at = static_cast<size_t>(p.y) * job.size + p.x;
         float4 target = make_float4(0, 0, 0, 0);
         if (kPass != Pass::draw && p.inside) target = cameras.target[b][at];
-        const uint32_t length = make_list(b, sub_tile, nothing);
-        if (kPass == Pass::train && length == 0) return;
+        const List list = make_lists(b, region, left_cell);
+        if (kPass == Pass::train && list.filled == 0) return;
 
         float2* const mine = fragments() + lane;  // this pixel's
         float* const kept = kept_transmittance() + lane;
         float color[3] = {0, 0, 0}, transmittance = p.inside ? 1 : -1;
-        uint32_t done = 0;
-        for (; done < length; done += kAtOnce) {
-            if (done % kChunk == 0) {
-                if (!__any_sync(kAllLanes, transmittance > 0)) break;
-                if (kPass == Pass::train) kept[done] = transmittance;  // kChunk is 32, as are the lanes
-            }
-            blend(p, done, transmittance, [&](int q, const float* rgb, float alpha, float weight) {
-                for (int c = 0; c < 3; ++c) color[c] += weight * rgb[c];
-                if (kPass == Pass::train) mine[(done % kChunk + q) * 33] = make_float2(alpha, weight);
-            });
+        uint32_t done = 0, num_chunks = 0;
+        while (done < list.filled && __any_sync(kAllLanes, transmittance > 0)) {
+            const uint32_t begin = done, end = chunk_end(num_chunks, list.filled);
+            if (kPass == Pass::train) kept[32 * num_chunks] = transmittance;
+            ++num_chunks;
+            for (; done < end; done += kAtOnce)
+                blend(p, list.at(done), transmittance,
+                      [&](int q, const float3& rgb, float alpha, float weight) {
+                          color[0] += weight * rgb.x;
+                          color[1] += weight * rgb.y;
+                          color[2] += weight * rgb.z;
+                          if (kPass == Pass::train)
+                              mine[(done - begin + q) * 33] = make_float2(alpha, weight);
+                      });
         }
         if (kPass == Pass::draw) {
             if (p.inside)
-                for (int c = 0; c < 3; ++c) picture[c * num_pixels + at] = color[c];
+                for (int c = 0; c < 3; ++c) targets.picture[(3 * b + c) * num_pixels + at] = color[c];
             return;
         }
         const float difference[4] = {color[0] - target.x, color[1] - target.y, color[2] - target.z,
@@ -495,10 +631,7 @@ struct Fit {
             }
             in_color = warp_sum(in_color);
             in_alpha = warp_sum(in_alpha);
-            if (lane == 0) {
-                s.error[b * kSubTiles + sub_tile][0] = in_color;
-                s.error[b * kSubTiles + sub_tile][1] = in_alpha;
-            }
+            if (lane == 0) targets.errors[unit] = make_float2(in_color, in_alpha);
             return;
         }
 
@@ -509,81 +642,83 @@ struct Fit {
             const float d_color = loss.l1 / (3 * pixels), d_alpha = loss.alpha / pixels;
             for (int c = 0; c < 3; ++c) d[c] = l1_vjp(difference[c], d_color);
             d[3] = l1_vjp(difference[3], d_alpha);
-            if (d_dssim != nullptr)
-                for (int c = 0; c < 3; ++c) d[c] += d_dssim[c * num_pixels + at];
+            if (targets.d_dssim != nullptr)
+                for (int c = 0; c < 3; ++c) d[c] += targets.d_dssim[(3 * b + c) * num_pixels + at];
         }
         d_pixels()[lane] = make_float4(d[0], d[1], d[2], 0);
 
         // Back to front, a chunk at a time; the last is still there.
+        const auto slot_of = [&](uint32_t j) {
+            const uint32_t slot =
+                slot_first(region)[j] + __popcll(mask(region)[j] & ((CellMask(1) << cell) - 1));
+            return targets.slots + kSums * static_cast<size_t>(slot - targets.slot_base);
+        };
         float behind = 0;
-        const uint32_t filled = min(done, length);
-        for (uint32_t end = done; end > 0;) {
-            const uint32_t begin = (end - 1) / kChunk * kChunk;
-            if (end < done) {
-                transmittance = kept[begin];
+        for (uint32_t chunk = num_chunks; chunk-- > 0;) {
+            const uint32_t begin = chunk_begin(chunk, list.filled), end = chunk_end(chunk, list.filled);
+            if (chunk + 1 < num_chunks) {
+                transmittance = kept[32 * chunk];
                 for (uint32_t i = begin; i < end; i += kAtOnce)
-                    blend(p, i, transmittance, [&](int q, const float*, float alpha, float weight) {
-                        mine[(i % kChunk + q) * 33] = make_float2(alpha, weight);
+                    blend(p, list.at(i), transmittance, [&](int q, const float3&, float alpha, float weight) {
+                        mine[(i - begin + q) * 33] = make_float2(alpha, weight);
                     });
             }
             for (uint32_t i = end; i > begin;) {
                 i -= kAtOnce;
-                const Entries entries = *reinterpret_cast<const Entries*>(list() + i);
+                const Entries entries = list.at(i);
                 float2 blended[kAtOnce];
                 float by_weight[kAtOnce];
 #pragma unroll
                 for (int q = 0; q < kAtOnce; ++q) {
-                    const Loaded r(records() + entries.record[q]);
-                    blended[q] = mine[(i % kChunk + q) * 33];
-                    by_weight[q] = d[0] * r.b.z + d[1] * r.b.w + d[2] * r.c.x + d[3];
+                    const float3 rgb = color_of(ranked()[entries.record[q]]);
+                    blended[q] = mine[(i - begin + q) * 33];
+                    by_weight[q] = d[0] * rgb.x + d[1] * rgb.y + d[2] * rgb.z + d[3];
                 }
 #pragma unroll
                 for (int q = kAtOnce - 1; q >= 0; --q)
-                    mine[(i % kChunk + q) * 33].x =
+                    mine[(i - begin + q) * 33].x =
                         exponent_vjp_from_behind(blended[q].x, blended[q].y, by_weight[q], behind);
             }
             __syncwarp();
-            if (begin + lane < filled) add_up(p, sub_tile, list()[begin + lane], slots);
+            for (uint32_t i = lane % kCellPixels; i < end - begin; i += kCellPixels)
+                if (begin + i < list.length)
+                    add_up(p, i, list.entry[begin + i], slot_of(list.entry[begin + i]));
             __syncwarp();
-            end = begin;
         }
-        for (uint32_t i = filled + lane; i < length; i += 32) {
-            float* slot = slot_of(list()[i], sub_tile, slots);
+        // Nothing was left to blend for the rest.
+        for (uint32_t i = done + lane % kCellPixels; i < list.length; i += kCellPixels) {
+            float* slot = slot_of(list.entry[i]);
             for (int k = 0; k < kSums; ++k) slot[k] = 0;
         }
     }
 
-    __device__ float* slot_of(uint32_t j, int sub_tile, float* slots) const {
-        return slots + kSums * (slot_first()[j] + __popc(mask()[j] & ((1u << sub_tile) - 1)));
-    }
-
-    // Sums for record j, which is this lane's, over the sub-tile's pixels.
-    __device__ void add_up(const Pixel& p, int sub_tile, uint32_t j, float* slots) const {
-        const Loaded r(records() + j);
-        const uint32_t lane = threadIdx.x % 32;
-        const float2* theirs = fragments() + 33 * lane;
-        const float4* d = d_pixels();
-        const float u = r.a.x, v = r.a.y, l11 = r.a.z, l12 = r.a.w, l22 = r.b.x;
-        const float left = p.center_x - static_cast<float>(lane % kSubWidth),
-                    top = p.center_y - static_cast<float>(lane / kSubWidth);
+    // Sums over the half-warp's cell, for record j, which is gaussian `i` of the chunk.
+    __device__ void add_up(const Pixel& p, uint32_t i, uint32_t j, float* slot) const {
+        const float4 e = ellipse_of(ranked()[j]);
+        const float l22 = ranked()[j].l22;
+        const uint32_t half = threadIdx.x % 32 / kCellPixels;
+        const float2* shares = fragments() + 33 * i + half * kCellPixels;
+        const float4* d_colors = d_pixels() + half * kCellPixels;
+        const float left = static_cast<float>(p.x / kCell * kCell) + 0.5f,
+                    top = static_cast<float>(p.y / kCell * kCell) + 0.5f;
         FalloffSums<float> sums{};
         float color[3] = {0, 0, 0};
-#pragma unroll 1
-        for (int y = 0; y < kSubHeight; ++y) {
+#pragma unroll
+        for (int y = 0; y < kCell; ++y) {
             float exponent = 0, t1 = 0, t1_dx = 0;
             Falloff<float> f;
 #pragma unroll
-            for (int x = 0; x < kSubWidth; ++x) {
-                const float2 fragment = theirs[y * kSubWidth + x];
-                const float4 d_color = d[y * kSubWidth + x];
-                f = falloff_at(left + x, top + y, u, v, l11, l12, l22, 0.0f);
-                const float d_t1 = fragment.x * f.t1;
-                exponent += fragment.x;
+            for (int x = 0; x < kCell; ++x) {
+                const float2 share = shares[y * kCell + x];
+                const float4 d_color = d_colors[y * kCell + x];
+                f = falloff_at(left + x, top + y, e.x, e.y, e.z, e.w, l22, 0.0f);
+                const float d_t1 = share.x * f.t1;
+                exponent += share.x;
                 t1 += d_t1;
                 t1_dx += d_t1 * f.dx;
-                color[0] += fragment.y * d_color.x;
-                color[1] += fragment.y * d_color.y;
-                color[2] += fragment.y * d_color.z;
+                color[0] += share.y * d_color.x;
+                color[1] += share.y * d_color.y;
+                color[2] += share.y * d_color.z;
             }
             // The exponent is less by t1² + t2².
             sums.exponent += exponent;
@@ -593,7 +728,6 @@ struct Fit {
             sums.t2 -= 2 * f.t2 * exponent;
             sums.t2_dy -= 2 * f.t2 * exponent * f.dy;
         }
-        float* slot = slot_of(j, sub_tile, slots);
         slot[0] = sums.exponent;
         slot[1] = sums.t1;
         slot[2] = sums.t2;
@@ -603,115 +737,118 @@ struct Fit {
         for (int c = 0; c < 3; ++c) slot[6 + c] = color[c];
     }
 
-    // Warps take sub-tiles of all views.
+    __device__ int cell_rows() const { return (job.size + kCell - 1) / kCell; }
+    __device__ int cell_pairs() const { return (job.size + 2 * kCell - 1) / (2 * kCell); }
+
+    // Warps take pairs of cells from a queue, those in the middle first, which have most to blend.
     template <Pass kPass>
-    __device__ void blend_region(const Cameras& cameras, int num_views, int left, int top, float* slots,
-                                 const float* d_dssim, float* picture) const {
-        const int columns = min(kSubColumns, (job.size - left + kSubWidth - 1) / kSubWidth);
-        const int rows = min(kSubTiles / kSubColumns, (job.size - top + kSubHeight - 1) / kSubHeight);
-        const uint32_t num_units = num_views * columns * rows;
+    __device__ void blend_regions(const Cameras& cameras, int num_views, int first_region, int last_region,
+                                  const Targets& targets) const {
+        const int rows = cell_rows(), pairs = cell_pairs();
         for (;;) {
             uint32_t unit = 0;
-            if (threadIdx.x % 32 == 0) unit = atomicAdd(&s.unit, 1u);
+            if (threadIdx.x % 32 == 0) unit = atomicAdd(&team.unit, 1u);
             unit = __shfl_sync(kAllLanes, unit, 0);
-            if (unit >= num_units) return;
-            const int b = unit / (columns * rows), place = unit % (columns * rows);
-            const size_t num_pixels = static_cast<size_t>(job.size) * job.size;
-            blend_sub_tile<kPass>(cameras, b, place / columns * kSubColumns + place % columns, left, top,
-                                  num_views * n_padded, slots,
-                                  d_dssim == nullptr ? nullptr : d_dssim + 3 * b * num_pixels,
-                                  picture == nullptr ? nullptr : picture + 3 * b * num_pixels);
+            if (unit >= static_cast<uint32_t>(num_views * rows * pairs)) return;
+            const int b = unit % num_views, pair_x = unit / num_views % pairs;
+            const int cell_y = from_middle(unit / num_views / pairs, rows);
+            const int region = cell_y / kRegionCells * regions_across + 2 * pair_x / kRegionCells;
+            if (!kSmall && (region < first_region || region >= last_region)) continue;
+            blend_cells<kPass>(cameras, b, pair_x, cell_y, unit, targets);
             __syncwarp();
         }
     }
 
     // ---- D-SSIM
 
-    // Adds to nothing: writes the gradient of D-SSIM by the pictures, three planes each.
+    // Writes the gradient of D-SSIM by the pictures, three planes each.
     __device__ void dssim_backward(const Cameras& cameras, int num_views, const float* pictures,
-                                   float* d_pictures, float* maps) const {
+                                   float* d_pictures, float* all_maps) const {
         const int size = job.size;
-        const uint32_t n_pixels = size * size;
-        const float scale = -in.config.loss.dssim / (3 * static_cast<float>(n_pixels));
-        for (int plane = 0; plane < 3 * num_views; ++plane) {
-            const float* picture = pictures + static_cast<size_t>(plane) * n_pixels;
-            float* d_picture = d_pictures + static_cast<size_t>(plane) * n_pixels;
-            const float* target = &cameras.target[plane / 3]->x + plane % 3;
-            float *d_x = maps + 5 * n_pixels, *d_xx = d_x + n_pixels, *d_xy = d_xx + n_pixels;
-            // The window's sums along rows, then along columns.
-            for (uint32_t i = threadIdx.x; i < n_pixels; i += kThreads) {
-                const int x = i % size;
-                SsimSums sums{};
+        const uint32_t num_pixels = size * size, count = 3 * num_views * num_pixels;
+        const float scale = -in.config.loss.dssim / (3 * static_cast<float>(num_pixels));
+        // The window's sums of `kMaps` maps along rows (step 1) or columns.
+        const auto blur = [&](const float* maps, uint32_t i, int place, int step, auto& sums) {
 #pragma unroll
-                for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
-                    if (x + k >= 0 && x + k < size)
-                        add(sums, ssim_weight(k), picture[i + k], target[4 * static_cast<size_t>(i + k)]);
-                maps[i] = sums.x;
-                maps[n_pixels + i] = sums.y;
-                maps[2 * n_pixels + i] = sums.xx;
-                maps[3 * n_pixels + i] = sums.yy;
-                maps[4 * n_pixels + i] = sums.xy;
+            for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
+                if (place + k >= 0 && place + k < size)
+                    for (int m = 0; m < static_cast<int>(sizeof(sums) / sizeof(float)); ++m)
+                        sums[m] += ssim_weight(k) * maps[m * num_pixels + i + k * step];
+        };
+        const auto for_each_pixel = [&](const auto& body) {
+            for (uint32_t t = first(); t < count; t += stride()) {
+                const uint32_t plane = t / num_pixels, i = t - plane * num_pixels;
+                body(plane, i, all_maps + static_cast<size_t>(8 * plane) * num_pixels);
             }
-            __syncthreads();
-            for (uint32_t i = threadIdx.x; i < n_pixels; i += kThreads) {
-                const int y = i / size;
-                float sums[5] = {0, 0, 0, 0, 0};
+            sync();
+        };
+        const auto target_of = [&](uint32_t plane, uint32_t i) {
+            return (&cameras.target[plane / 3]->x)[4 * static_cast<size_t>(i) + plane % 3];
+        };
+        for_each_pixel([&](uint32_t plane, uint32_t i, float* maps) {
+            const float* picture = pictures + static_cast<size_t>(plane) * num_pixels;
+            const int column = i % size;
+            SsimSums sums{};
 #pragma unroll
-                for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
-                    if (y + k >= 0 && y + k < size)
-                        for (int map = 0; map < 5; ++map)
-                            sums[map] += ssim_weight(k) * maps[map * n_pixels + i + k * size];
-                const Ssim ssim = ssim_of({sums[0], sums[1], sums[2], sums[3], sums[4]});
-                d_x[i] = scale * ssim.d_x;
-                d_xx[i] = scale * ssim.d_xx;
-                d_xy[i] = scale * ssim.d_xy;
+            for (int k = -kSsimRadius; k <= kSsimRadius; ++k) {
+                if (column + k < 0 || column + k >= size) continue;
+                const float w = ssim_weight(k), x = picture[i + k], y = target_of(plane, i + k);
+                sums.x += w * x;
+                sums.y += w * y;
+                sums.xx += w * x * x;
+                sums.yy += w * y * y;
+                sums.xy += w * x * y;
             }
-            __syncthreads();
-            // Back through the window, which is its own transpose.
-            for (uint32_t i = threadIdx.x; i < n_pixels; i += kThreads) {
-                const int x = i % size;
-                float sums[3] = {0, 0, 0};
-#pragma unroll
-                for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
-                    if (x + k >= 0 && x + k < size)
-                        for (int map = 0; map < 3; ++map)
-                            sums[map] += ssim_weight(k) * d_x[map * n_pixels + i + k];
-                for (int map = 0; map < 3; ++map) maps[map * n_pixels + i] = sums[map];
-            }
-            __syncthreads();
-            for (uint32_t i = threadIdx.x; i < n_pixels; i += kThreads) {
-                const int y = i / size;
-                float sums[3] = {0, 0, 0};
-#pragma unroll
-                for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
-                    if (y + k >= 0 && y + k < size)
-                        for (int map = 0; map < 3; ++map)
-                            sums[map] += ssim_weight(k) * maps[map * n_pixels + i + k * size];
-                d_picture[i] =
-                    sums[0] + 2 * picture[i] * sums[1] + target[4 * static_cast<size_t>(i)] * sums[2];
-            }
-            __syncthreads();
-        }
-    }
-
-    __device__ static void add(SsimSums& sums, float weight, float x, float y) {
-        sums.x += weight * x;
-        sums.y += weight * y;
-        sums.xx += weight * x * x;
-        sums.yy += weight * y * y;
-        sums.xy += weight * x * y;
+            maps[i] = sums.x;
+            maps[num_pixels + i] = sums.y;
+            maps[2 * num_pixels + i] = sums.xx;
+            maps[3 * num_pixels + i] = sums.yy;
+            maps[4 * num_pixels + i] = sums.xy;
+        });
+        for_each_pixel([&](uint32_t, uint32_t i, float* maps) {
+            float sums[5] = {0, 0, 0, 0, 0};
+            blur(maps, i, i / size, size, sums);
+            const Ssim ssim = ssim_of({sums[0], sums[1], sums[2], sums[3], sums[4]});
+            maps[5 * num_pixels + i] = scale * ssim.d_x;
+            maps[6 * num_pixels + i] = scale * ssim.d_xx;
+            maps[7 * num_pixels + i] = scale * ssim.d_xy;
+        });
+        // Back through the window, which is its own transpose.
+        for_each_pixel([&](uint32_t, uint32_t i, float* maps) {
+            float sums[3] = {0, 0, 0};
+            blur(maps + 5 * num_pixels, i, i % size, 1, sums);
+            for (int m = 0; m < 3; ++m) maps[m * num_pixels + i] = sums[m];
+        });
+        for_each_pixel([&](uint32_t plane, uint32_t i, float* maps) {
+            float sums[3] = {0, 0, 0};
+            blur(maps, i, i / size, size, sums);
+            const size_t at = static_cast<size_t>(plane) * num_pixels + i;
+            d_pictures[at] = sums[0] + 2 * pictures[at] * sums[1] + target_of(plane, i) * sums[2];
+        });
     }
 
     // ---- the way back
 
-    // Adds up each record's slots, onto what earlier regions gave.
-    __device__ void sum_slots(int num_views, const float* slots, bool is_first_region) const {
+    // Adds up each record's slots in these regions, onto what earlier ones gave.
+    __device__ void sum_slots(int num_views, const float* slots, uint32_t slot_base, int first_region,
+                              int last_region) const {
+        constexpr int kLoads = 8;
         float* sums = at(layout.sums);
-        for (uint32_t q = threadIdx.x; q < num_views * n_padded * kSums; q += kThreads) {
+        for (uint32_t q = first(); q < num_views * n_padded * kSums; q += stride()) {
             const uint32_t j = q / kSums, k = q - j * kSums;
-            const uint32_t first = slot_first()[j], count = __popc(mask()[j]);
-            float sum = is_first_region ? 0 : sums[kSumStride * j + k];
-            for (uint32_t t = first; t < first + count; ++t) sum += slots[kSums * t + k];
+            float sum = first_region == 0 ? 0 : sums[kSumStride * j + k];
+            for (int region = first_region; region < last_region; ++region) {
+                const uint32_t count = __popcll(mask(region)[j]);
+                const float* slot =
+                    slots + kSums * static_cast<size_t>(slot_first(region)[j] - slot_base) + k;
+                for (uint32_t t = 0; t < count; t += kLoads) {
+                    float x[kLoads];
+#pragma unroll
+                    for (int l = 0; l < kLoads; ++l) x[l] = t + l < count ? slot[kSums * (t + l)] : 0;
+#pragma unroll
+                    for (int l = 0; l < kLoads; ++l) sum += x[l];
+                }
+            }
             sums[kSumStride * j + k] = sum;
         }
     }
@@ -720,12 +857,12 @@ struct Fit {
     __device__ void project_backward(const Cameras& cameras, int num_views) const {
         const float* sums = at(layout.sums);
         const float* value = at(layout.value);
-        for (uint32_t j = threadIdx.x; j < num_views * n_padded; j += kThreads) {
-            const uint32_t b = j / n_padded, i = j - b * n_padded;
+        for (uint32_t j = first(); j < num_views * n_padded; j += stride()) {
+            const uint32_t b = j / n_padded, place = kSmall ? j : order()[j], i = place - b * n_padded;
             if (i >= n) continue;
             float* out = at(layout.by_view) + static_cast<size_t>(b) * num_values;
             float* d_sh = out + 11 * n + num_sh * i;
-            if (keys()[j] == kHiddenKey) {
+            if (keys()[place] == kHiddenKey) {
                 for (int k = 0; k < 11; ++k) out[k * n + i] = 0;
                 for (int k = 0; k < num_sh; ++k) d_sh[k] = 0;
                 continue;
@@ -762,7 +899,8 @@ struct Fit {
         const float* by_view = at(layout.by_view);
         const FitStep step = in.steps[index];
         const float position = position_step(in.config, job.group, step);
-        for (uint32_t k = threadIdx.x; k < num_values; k += kThreads) {
+#pragma unroll 2
+        for (uint32_t k = first(); k < num_values; k += stride()) {
             float gradient = is_first ? 0 : sum[k];
             for (int b = 0; b < num_views; ++b) gradient += by_view[b * num_values + k];
             if (!is_last) {
@@ -786,61 +924,55 @@ struct Fit {
 
     // ---- a batch of views, and all of them
 
-    template <class Body>
-    __device__ void for_each_region(const Body& body) const {
-        const int size = kSmall ? kRegion : job.size;
-        for (int top = 0; top < size; top += kRegion)
-            for (int left = 0; left < size; left += kRegion) body(left, top);
-    }
-
     // Adds the |difference| of colour and alpha, summed over pixels, in every thread.
     __device__ void measure(const Cameras& cameras, int num_views, double error[2]) const {
-        for_each_region([&](int left, int top) {
-            if (!kSmall) mark_region(num_views, left, top);
-            for (uint32_t t = threadIdx.x; t < kViewsAtOnce * kSubTiles; t += kThreads)
-                s.error[t][0] = s.error[t][1] = 0;
-            __syncthreads();
-            blend_region<Pass::measure>(cameras, num_views, left, top, nullptr, nullptr, nullptr);
-            __syncthreads();
-            for (int t = 0; t < num_views * kSubTiles; ++t)
-                for (int k = 0; k < 2; ++k) error[k] += static_cast<double>(s.error[t][k]);
-            if (threadIdx.x == 0) s.unit = 0;
-            __syncthreads();
-        });
+        Targets targets{};
+        targets.errors = hot_at<float2>(layout.errors);
+        blend_regions<Pass::measure>(cameras, num_views, 0, num_regions(), targets);
+        sync();
+        for (int unit = 0; unit < num_views * cell_rows() * cell_pairs(); ++unit) {
+            error[0] += static_cast<double>(targets.errors[unit].x);
+            error[1] += static_cast<double>(targets.errors[unit].y);
+        }
+        if (leads()) team.unit = 0;
     }
 
     // Leaves the gradients of the parameters, for each view.
     __device__ void differentiate(const Cameras& cameras, int num_views) const {
-        const float* d_dssim = nullptr;
+        Targets targets{};
         if (in.config.loss.dssim > 0) {
             const size_t planes = static_cast<size_t>(3 * kViewsAtOnce) * job.size * job.size;
-            float* picture = reinterpret_cast<float*>(scratch + layout.maps);
-            for_each_region([&](int left, int top) {
-                if (!kSmall) mark_region(num_views, left, top);
-                __syncthreads();
-                blend_region<Pass::draw>(cameras, num_views, left, top, nullptr, nullptr, picture);
-                __syncthreads();
-                if (threadIdx.x == 0) s.unit = 0;
-            });
-            dssim_backward(cameras, num_views, picture, picture + planes, picture + 2 * planes);
-            d_dssim = picture + planes;
+            float* maps = reinterpret_cast<float*>(scratch + layout.maps);
+            targets.picture = maps;
+            blend_regions<Pass::draw>(cameras, num_views, 0, num_regions(), targets);
+            sync();
+            if (leads()) team.unit = 0;
+            dssim_backward(cameras, num_views, maps, maps + planes, maps + 2 * planes);
+            targets.d_dssim = maps + planes;
         }
-        for_each_region([&](int left, int top) {
-            if (!kSmall) {
-                mark_region(num_views, left, top);
-                __syncthreads();
-            }
-            float* const slots = this->slots(assign_slots(num_views));
-            __syncthreads();
-            blend_region<Pass::train>(cameras, num_views, left, top, slots, d_dssim, nullptr);
-            __syncthreads();
-            sum_slots(num_views, slots, left == 0 && top == 0);
-            if (threadIdx.x == 0) s.unit = 0;
-            if (!kSmall) __syncthreads();
-        });
-        __syncthreads();
+        const uint32_t num_slots = assign_slots(num_views);
+        sync();
+        const bool is_near = num_slots <= layout.num_near_slots;
+        targets.slots =
+            is_near ? at(layout.near_slots) : reinterpret_cast<float*>(scratch + layout.far_slots);
+        const uint32_t capacity = is_near ? num_slots : layout.num_far_slots;
+        // All regions at once, unless their slots are more than there is room for.
+        const auto slots_before = [&](int region) {
+            return region < num_regions() ? slot_first(region)[0] : num_slots;
+        };
+        for (int region = 0; region < num_regions();) {
+            int last = region + 1;
+            targets.slot_base = slots_before(region);
+            while (last < num_regions() && slots_before(last + 1) - targets.slot_base <= capacity) ++last;
+            blend_regions<Pass::train>(cameras, num_views, region, last, targets);
+            sync();
+            sum_slots(num_views, targets.slots, targets.slot_base, region, last);
+            if (leads()) team.unit = 0;
+            sync();
+            region = last;
+        }
         project_backward(cameras, num_views);
-        __syncthreads();
+        sync();
     }
 
     // The residual's views, those of all steps, and the residual's again, in batches of at most kViewsAtOnce.
@@ -856,8 +988,8 @@ struct Fit {
             return static_cast<int>(min(static_cast<int64_t>(kViewsAtOnce), left));
         };
         const auto look_from = [&](Cameras& cameras, int64_t first) {
-            const int b = threadIdx.x;
-            if (b >= views_at(first)) return;
+            const int b = static_cast<int>(threadIdx.x) - (kThreads - 32);  // the warp with least to do
+            if (b < 0 || b >= views_at(first)) return;
             const int64_t visit = first + b;
             uint64_t picture;
             if (visit >= 0 && visit < num_visits) {
@@ -871,30 +1003,33 @@ struct Fit {
         double error[2][2] = {{0, 0}, {0, 0}};  // before and after
         start();
         look_from(s.cameras[0], -num_residual);
-        if (threadIdx.x == 0) s.unit = 0;
-        __syncthreads();
+        if (leads()) team.unit = 0;
+        sync();
         int turn = 0;
         for (int64_t visit = -num_residual; visit < num_visits + num_residual; turn ^= 1) {
             const int num_views = views_at(visit);
             const Cameras& cameras = s.cameras[turn];
             project(cameras, num_views);
-            __syncthreads();
+            sync();
             sort(num_views);
+            sync();
+            if (!kSmall) {
+                arrange(num_views);
+                sync();
+            }
+            look_from(s.cameras[turn ^ 1], visit + num_views);
             if (visit < 0 || visit >= num_visits) {
-                __syncthreads();
                 measure(cameras, num_views, error[visit >= 0]);
-                look_from(s.cameras[turn ^ 1], visit + num_views);
             } else {
                 const int index = static_cast<int>(visit / views_per_step),
                           within = static_cast<int>(visit % views_per_step);
-                if (threadIdx.x == 0 && within == 0 && index % kStepsPerPoll == 0)
-                    s.cancel = *static_cast<volatile int*>(&in.signals->cancel);
+                if (leads() && within == 0 && index % kStepsPerPoll == 0)
+                    team.cancel = *static_cast<volatile int*>(&in.signals->cancel);
                 differentiate(cameras, num_views);
-                if (s.cancel) return;
-                look_from(s.cameras[turn ^ 1], visit + num_views);
+                if (team.cancel) return;
                 move(num_views, within == 0, within + num_views == views_per_step, index);
             }
-            __syncthreads();
+            sync();
             visit += num_views;
         }
         const double num_pixels = static_cast<double>(job.size) * job.size * num_residual;
@@ -905,39 +1040,41 @@ struct Fit {
         const bool better = num_visits > 0 &&
                             residual_loss(config.loss, error[1]) <= residual_loss(config.loss, error[0]) &&
                             write();
-        if (threadIdx.x != 0) return;
+        if (!leads()) return;
         for (int k = 0; k < 2; ++k) in.error[2 * job.error + k] = static_cast<float>(error[better][k]);
     }
 };
 
 // Counters of the queue, on the device.
 struct Queue {
-    unsigned next;
+    unsigned arrived, next;
     unsigned long long groups_done, loss_sum;
 };
 
-template <int kThreads, int kBlocks, bool kSmall>
+template <int kThreads, int kBlocks, bool kSmall, int kChunk>
 __global__ void __launch_bounds__(kThreads, kBlocks)
-    fit_groups_kernel(const FitGroupsInput in, const Layout layout, unsigned char* scratch, Queue* queue) {
+    fit_groups_kernel(const FitGroupsInput in, const Layout layout, unsigned char* scratch,
+                      unsigned team_size, Team* teams, Queue* queue) {
     __shared__ Shared s;
-    Fit<kThreads, kSmall> fit(in, layout, s, scratch);
+    // Teams form as blocks arrive, so a block only ever waits for blocks that run or will.
+    if (threadIdx.x == 0) s.arrival = atomicAdd(&queue->arrived, 1u);
+    __syncthreads();
+    const unsigned t = s.arrival / team_size;
+    Team& team = kSmall ? s.team : teams[t];
+    Fit<kThreads, kSmall, kChunk> fit(in, layout, s, team, s.arrival % team_size, team_size,
+                                      scratch + t * layout.scratch_bytes);
     for (;;) {
-        if (threadIdx.x == 0) {
-            s.ticket = atomicAdd(&queue->next, 1u);
-            s.cancel = *static_cast<volatile int*>(&in.signals->cancel);
+        if (fit.leads()) {
+            team.ticket = atomicAdd(&queue->next, 1u);
+            team.cancel = *static_cast<volatile int*>(&in.signals->cancel);
         }
-        __syncthreads();
-        const uint32_t ticket = s.ticket;
-        if (ticket >= in.jobs.size || s.cancel) return;
-        fit.job = in.jobs.data[ticket];
-        fit.n = static_cast<uint32_t>(fit.job.group.count);
-        fit.n_padded = (fit.n + 31) / 32 * 32;
-        fit.num_sh = 3 * num_sh_bases(in.rows.sh_degree);
-        fit.num_values = fit.n * (11 + fit.num_sh);
+        fit.sync();
+        if (team.ticket >= in.jobs.size || team.cancel) return;
+        fit.take(in.jobs.data[team.ticket]);
         fit.fit();
-        __syncthreads();
-        if (s.cancel) return;
-        if (threadIdx.x != 0) continue;
+        if (team.cancel) return;
+        fit.sync();
+        if (!fit.leads()) continue;
         const float* error = in.error + 2 * fit.job.error;
         const double loss[2] = {error[0], error[1]};
         const auto share =
@@ -961,58 +1098,68 @@ struct Arena {
         scratch += rounded(bytes);
         return scratch - rounded(bytes);
     }
-    Place anywhere(size_t bytes) {
-        const bool fits = shared + rounded(bytes) <= shared_limit;
-        return {fits ? in_shared(bytes) : in_scratch(bytes), fits};
-    }
 };
 
-Layout layout_of(const FitGroupsInput& in, uint32_t most, int largest, bool is_small, int num_warps,
+// For groups of at most `most` gaussians and pictures of at most `largest` pixels a side.
+template <int kThreads, bool kSmall, int kChunk>
+Layout layout_of(const FitGroupsInput& in, uint32_t most, int largest, unsigned team_size,
                  size_t shared_limit) {
     Layout l{};
     Arena arena{shared_limit};
-    const auto hot = [&](size_t bytes) {
-        return is_small ? arena.in_shared(bytes) : arena.in_scratch(bytes);
+    const auto hot = [&](size_t bytes) { return kSmall ? arena.in_shared(bytes) : arena.in_scratch(bytes); };
+    const auto anywhere = [&](size_t bytes) {
+        const bool fits = kSmall && arena.shared + Arena::rounded(bytes) <= shared_limit;
+        return Place{fits ? arena.in_shared(bytes) : arena.in_scratch(bytes), fits};
     };
-    const size_t padded = (most + 31) / 32 * 32;
-    const size_t views = static_cast<size_t>(std::min(in.config.views_per_step, kViewsAtOnce));
-    const size_t all = kViewsAtOnce * padded;  // a residual takes kViewsAtOnce in any case
-    const size_t index = is_small ? sizeof(uint16_t) : sizeof(uint32_t);
+    const size_t warps = kThreads / 32 * team_size, fragments = kThreads / 32 * fragments_bytes(kChunk);
+    const size_t padded = (most + 31) / 32 * 32, places = kViewsAtOnce * padded;
     const size_t values = most * (11 + 3 * static_cast<size_t>(num_sh_bases(in.rows.sh_degree)));
-    l.records = hot((all + 1) * sizeof(Record<float>));
-    l.keys = hot(all * sizeof(uint32_t));
-    l.mask = hot(all * sizeof(uint32_t));
-    l.slot_first = hot(all * sizeof(uint32_t));
-    l.order = hot(all * index);
+    const size_t regions_across = (largest + kRegion - 1) / kRegion,
+                 regions = regions_across * regions_across;
+    const size_t cells = static_cast<size_t>((largest + kCell - 1) / kCell) * ((largest + kCell - 1) / kCell);
+    const size_t index = sizeof(typename Fit<kThreads, kSmall, kChunk>::Index);
+    l.records = hot((places + 1) * sizeof(Record<float>));
+    if (!kSmall) l.sorted = hot((places + 1) * sizeof(Record<float>));
+    l.keys = hot(places * sizeof(uint32_t));
+    l.mask = hot(regions * places * sizeof(CellMask));
+    l.slot_first = hot(regions * places * sizeof(uint32_t));
+    l.order = hot(places * index);
     l.list_size = Arena::rounded((padded + kAtOnce) * index);
-    l.lists = hot(num_warps * l.list_size);
-    l.kept_size = (padded + kChunk) / kChunk * 32 * sizeof(float);
-    l.kept_transmittance = hot(num_warps * l.kept_size);
-    l.fragments = arena.in_shared(num_warps * kFragmentsBytes);
-    if (!is_small) {
+    l.lists = hot(2 * warps * l.list_size);
+    l.errors = hot(kViewsAtOnce * (cells + largest) * sizeof(float2));
+    l.fragments = arena.in_shared(fragments);
+    // Fragments are done with when gradients come, and not begun when keys are sorted.
+    const auto over_fragments = [&](size_t bytes) {
+        return team_size == 1 && bytes <= fragments ? Place{l.fragments, true} : anywhere(bytes);
+    };
+    l.by_view = over_fragments(kViewsAtOnce * values * sizeof(float));
+    if (!kSmall) {
         size_t size = 32;
         while (size < most) size *= 2;
-        l.sort_keys = arena.anywhere(size * sizeof(unsigned long long));
+        l.sort_keys = over_fragments(size * sizeof(unsigned long long));
     }
-    // Gradients come when the fragments are done with.
-    const size_t by_view = views * values * sizeof(float);
-    l.by_view = by_view <= num_warps * kFragmentsBytes ? Place{l.fragments, true} : arena.anywhere(by_view);
-    // Small groups' sums take the place of their records.
+    // Sums take the place of the records that were projected.
     static_assert(kSumStride * sizeof(float) == sizeof(Record<float>), "");
-    l.sums = is_small ? Place{l.records, true} : arena.anywhere(views * padded * kSumStride * sizeof(float));
-    l.value = arena.anywhere(values * sizeof(float));
-    l.m = {arena.in_scratch(values * sizeof(float)), false};
-    l.v = {arena.in_scratch(values * sizeof(float)), false};
+    l.sums = {l.records, kSmall};
+    l.value = anywhere(values * sizeof(float));
+    l.m = anywhere(values * sizeof(float));
+    l.v = anywhere(values * sizeof(float));
+    l.kept_size = (padded / kChunk + 1) * 32 * sizeof(float);
+    l.kept_transmittance = anywhere(warps * l.kept_size);
     l.sum = {arena.in_scratch(values * sizeof(float)), false};
-    l.far_slots = arena.in_scratch(views * padded * kSubTiles * kSums * sizeof(float));
+    // At least what one region can take.
+    l.num_far_slots = static_cast<uint32_t>(places * kRegionCells * kRegionCells);
+    l.far_slots = arena.in_scratch(l.num_far_slots * kSums * sizeof(float));
     if (in.config.loss.dssim > 0)
         l.maps =
-            arena.in_scratch((6 * kViewsAtOnce + 8) * static_cast<size_t>(largest) * largest * sizeof(float));
-    // The rest of the shared memory takes slots.
-    l.num_near_slots = static_cast<uint32_t>((shared_limit - arena.shared) / (kSums * sizeof(float)));
-    l.near_slots = {arena.in_shared(l.num_near_slots * kSums * sizeof(float)), true};
+            arena.in_scratch(10 * 3 * kViewsAtOnce * static_cast<size_t>(largest) * largest * sizeof(float));
+    if (kSmall) {
+        // The rest of the shared memory takes slots.
+        l.num_near_slots = static_cast<uint32_t>((shared_limit - arena.shared) / (kSums * sizeof(float)));
+        l.near_slots = {arena.in_shared(l.num_near_slots * kSums * sizeof(float)), true};
+    }
     l.shared_bytes = arena.shared;
-    l.scratch_bytes = Arena::rounded(arena.scratch + 127) / 128 * 128;
+    l.scratch_bytes = (arena.scratch + 127) / 128 * 128;
     return l;
 }
 
@@ -1023,20 +1170,29 @@ int attribute(cudaDeviceAttr name) {
     return value;
 }
 
-template <int kThreads, int kBlocks, bool kSmall>
+template <int kThreads, int kBlocks, bool kSmall, int kChunk>
 void run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream) {
-    const size_t reserved = sizeof(Shared) + 1024;  // the driver's own, and ours
+    const size_t reserved = sizeof(Shared) + 1024;  // ours, and the driver's own of each block
     const size_t limit =
-        std::min<size_t>(attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - sizeof(Shared),
-                         attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / kBlocks - reserved) /
+        (std::min<size_t>(attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - sizeof(Shared),
+                          attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / kBlocks - reserved)) /
         16 * 16;
-    const Layout layout = layout_of(in, most, largest, kSmall, kThreads / 32, limit);
-    const size_t blocks = std::min<size_t>(in.jobs.size, kBlocks * attribute(cudaDevAttrMultiProcessorCount));
-    const DeviceBuffer<unsigned char> scratch(blocks * layout.scratch_bytes, stream);
+    const size_t most_blocks = kBlocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
+    size_t team_size = 1;
+    // Teams need blocks that run at the same time.
+    if (!kSmall && attribute(cudaDevAttrCooperativeLaunch) != 0)
+        team_size = std::clamp<size_t>(most_blocks / in.jobs.size, 1, kLargestTeam);
+    const size_t num_teams = std::min<size_t>(in.jobs.size, most_blocks / team_size);
+    const Layout layout =
+        layout_of<kThreads, kSmall, kChunk>(in, most, largest, static_cast<unsigned>(team_size), limit);
+    const DeviceBuffer<unsigned char> scratch(num_teams * layout.scratch_bytes, stream);
+    const DeviceBuffer<Team> teams(num_teams, stream);
     const DeviceBuffer<Queue> queue(1, stream);
+    check(cudaMemsetAsync(teams.data(), 0, num_teams * sizeof(Team), stream), "cudaMemsetAsync");
     check(cudaMemsetAsync(queue.data(), 0, sizeof(Queue), stream), "cudaMemsetAsync");
-    launch("fit_groups_kernel", fit_groups_kernel<kThreads, kBlocks, kSmall>, static_cast<unsigned>(blocks),
-           kThreads, layout.shared_bytes, stream, in, layout, scratch.data(), queue.data());
+    launch("fit_groups_kernel", fit_groups_kernel<kThreads, kBlocks, kSmall, kChunk>,
+           static_cast<unsigned>(num_teams * team_size), kThreads, layout.shared_bytes, stream, in, layout,
+           scratch.data(), static_cast<unsigned>(team_size), teams.data(), queue.data());
 }
 
 }  // namespace
@@ -1049,11 +1205,11 @@ void fit_groups(const FitGroupsInput& in, Span<const FitJob> jobs, cudaStream_t 
         largest = std::max(largest, job.size);
     }
     if (most > kSmallCount || largest > kRegion)
-        run<512, 1, false>(in, most, largest, stream);
+        run<512, 1, false, 32>(in, most, largest, stream);
     else if (jobs.size > static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount)))
-        run<256, 2, true>(in, most, largest, stream);
+        run<256, 3, true, 16>(in, most, largest, stream);
     else
-        run<512, 1, true>(in, most, largest, stream);
+        run<512, 1, true, 16>(in, most, largest, stream);
 }
 
 }  // namespace cuda

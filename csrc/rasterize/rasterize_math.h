@@ -82,6 +82,24 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t) {
     return weight;
 }
 
+// The same for several gaussians, one behind the other, and sets the alphas of those that were not blended to
+// 0. Most pixels do not stop among them, which the product of all tells.
+template <int kCount, class T>
+V3DG_HD V3DG_INLINE void blend_weights(T (&alpha)[kCount], T& t, T (&weight)[kCount]) {
+    T before[kCount + 1];
+    before[0] = t;
+    for (int i = 0; i < kCount; ++i) before[i + 1] = before[i] * (1 - alpha[i]);
+    if (before[kCount] > T(kMinTransmittance)) {
+        for (int i = 0; i < kCount; ++i) weight[i] = alpha[i] * before[i];
+        t = before[kCount];
+        return;
+    }
+    for (int i = 0; i < kCount; ++i) {
+        weight[i] = t > 0 ? blend_weight(alpha[i], t) : T(0);
+        if (!(weight[i] > 0)) alpha[i] = 0;
+    }
+}
+
 // Gradient by the exponent of a gaussian that was blended with `alpha` and `weight` where the transmittance
 // was `before`. `by_weight` is the gradient by its weight, `behind` what all gaussians behind it give: the
 // sum of their weights times the gradients by them.
