@@ -16,6 +16,8 @@ CSRC = ROOT / "csrc"
 NOT_OPERATIONS = {"base", "math", "pipeline", "bindings"}
 HOST_ONLY = {"ply"}  # reads and writes files: no kernel will ever exist
 FORMULAS_ONLY = {"adam"}  # used inside another operation's loop
+# On CUDA a group's picture never leaves the block that draws it, so its loss is a part of the fit's kernel.
+CUDA_HALF_ELSEWHERE = {"loss": "fit_group"}
 TESTED_WITH = {"adam": "fit_group", "loss": "fit_group", "tile_bin": "rasterize"}
 
 OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)
@@ -29,14 +31,22 @@ def test_cmake_lists_every_source_once():
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
-def test_operation_has_a_contract_and_a_cpu_half(operation):
+def test_operation_has_a_contract_and_both_halves(operation):
     names = {p.name for p in (CSRC / operation).iterdir() if p.stat().st_size}
     if operation in FORMULAS_ONLY:
         assert names == {f"{operation}_math.h"}
         return
     assert f"{operation}.h" in names
-    if operation not in HOST_ONLY:
-        assert f"{operation}_cpu.cpp" in names
+    if operation in HOST_ONLY:
+        return
+    assert f"{operation}_cpu.cpp" in names
+    kernels = [name for name in names if name.endswith("_cuda.cu")]
+    if operation in CUDA_HALF_ELSEWHERE:
+        assert kernels == []
+        users = (CSRC / CUDA_HALF_ELSEWHERE[operation]).iterdir()
+        assert any(f'"{operation}/{operation}_math.h"' in p.read_text(encoding="utf-8") for p in users)
+    else:
+        assert kernels
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
@@ -69,6 +79,12 @@ def test_host_sources_know_nothing_of_the_cuda_runtime():
         text = behind_the_flag.sub("", path.read_text(encoding="utf-8"))
         assert path.name == "host_device.h" or not re.search(r"__CUDACC__|cuda_runtime", text), path
         todo |= {CSRC / name for name in re.findall(r'^#include "(.+)"', text, re.MULTILINE)} - seen
+
+
+def test_kernels_are_started_by_launch_alone():
+    """It checks that they start, and gives them the shared memory that they ask for."""
+    sources = [p for p in CSRC.rglob("*") if p.suffix in {".cu", ".cuh"} and p.name != "launch.cuh"]
+    assert [str(p) for p in sources if "<<<" in p.read_text(encoding="utf-8")] == []
 
 
 def imports_when_loaded(path):
