@@ -182,7 +182,8 @@ FrameTape Frame::tape() const {
                            last_batch_.num_tiles, records_.data(),
                            tile_first_.data(),    entries_.data(),
                            scratch_.data(),       &reinterpret_cast<const State*>(cleared_.data())->counters,
-                           capacity_.records,     capacity_.entries};
+                           capacity_.records,     capacity_.entries,
+                           tile_order_.data()};
     return {lists,
             {order_.data(), blended_.data()},
             last_batch_.models,

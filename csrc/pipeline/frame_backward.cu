@@ -53,7 +53,7 @@ void DifferentiableFrame::backward(const PictureGradient<float>& d_picture,
     if (num_slots > 0) check(cudaMemsetAsync(is_touched.data(), 0, num_slots, stream), "cudaMemsetAsync");
     const GradientSlots slots{first_slot_.data(), slot.data(), is_touched.data()};
     rasterize_backward({in_.image, tape.lists.records, tape.lists.tile_first, tape.raster.order,
-                        tape.raster.blended, d_picture},
+                        tape.raster.blended, tape.lists.tile_order, d_picture},
                        slots, d_background_of_tile.data(), d_background, stream);
     project_backward({records_of(tape, in_), tape.source, in_.rows, in_.view, in_.image.camera,
                       in_.filter_px2, in_.compensate},

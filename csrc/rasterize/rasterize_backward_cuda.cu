@@ -5,6 +5,8 @@
 // each of them, then lanes take over a row of 8 pixels of one gaussian each. That costs a fifth of adding up
 // across lanes gaussian by gaussian.
 
+#include <cmath>
+
 #include "base/launch.cuh"
 #include "rasterize/rasterize_backward.h"
 #include "rasterize/rasterize_math.h"
@@ -18,12 +20,14 @@ constexpr int kWarps = kFrameTileWidth * kFrameTileHeight / 32;
 constexpr int kThreads = 32 * kWarps;
 constexpr int kWarpWidth = 8, kWarpHeight = 4;  // px
 constexpr int kWarpColumns = kFrameTileWidth / kWarpWidth;
-constexpr int kBatch = 128;   // entries
-constexpr int kPairs = 1024;  // (entry, warp) pairs of a batch
-constexpr int kHeld = 8;      // gaussians whose sums a warp makes at once
+constexpr int kBatch = 192;  // entries
+constexpr int kPairs = 768;  // (entry, warp) pairs of a batch
+constexpr int kHeld = 8;     // gaussians whose sums a warp makes at once
 constexpr int kValues = sizeof(RecordGradient<float>) / sizeof(float);
 static_assert(kHeld * kWarpHeight == 32, "a lane sums one row of one gaussian");
+constexpr int kTogether = 2;  // gaussians blended without a branch between them
 static_assert(kPairs >= kWarps, "one entry fits");
+static_assert(kBatch <= 255 && kBatch % 32 == 0 && kHeld % kTogether == 0, "");
 
 // What a pixel gives to a gaussian.
 struct Share {
@@ -32,11 +36,12 @@ struct Share {
 constexpr int kShareStride = 33;  // of the pixels of a gaussian; odd, against bank conflicts
 
 struct Shared {
-    Record<float> record[kBatch];
+    Record<float> record[kBatch + 1];  // the last is one that nothing shows of
     uint32_t slot[kBatch];
     uint32_t first_pair[kBatch];
-    uint32_t warps[kBatch];      // bit w: warp w may blend the entry
-    uint32_t took_part[kBatch];  // bit w: it did
+    uint32_t warps[kBatch];                // bit w: warp w may blend the entry
+    uint32_t took_part[kBatch];            // bit k: the k-th of these did
+    uint8_t list[kWarps][kBatch + kHeld];  // the entries that a warp may blend, then some of kBatch
     uint32_t pairs_of_warp[kBatch / 32];
     uint32_t alive;  // bit w: warp w has a pixel that has not stopped
     float4 d_color[kWarps][kWarpHeight]
@@ -145,47 +150,59 @@ __device__ void add_up(Shared& s, int warp, int held, int entry, float left, flo
         }
     }
     if (gaussian < held) {
-        const uint32_t pair = s.first_pair[entry] + __popc(s.warps[entry] & ((1u << warp) - 1));
+        const uint32_t rank = __popc(s.warps[entry] & ((1u << warp) - 1));
+        float* pair = s.pair[s.first_pair[entry] + rank];
 #pragma unroll
         for (int i = 0; i < 3; ++i)
-            if (3 * row + i < kValues) s.pair[pair][3 * row + i] = value[i];
-        if (row == 0) atomicOr(&s.took_part[entry], 1u << warp);
+            if (3 * row + i < kValues) pair[3 * row + i] = value[i];
+        if (row == 0) atomicOr(&s.took_part[entry], 1u << rank);
     }
     __syncwarp();
+}
+
+// Blends one gaussian over the pixel.
+template <bool kWithDepth>
+__device__ Share blend_vjp(const Record<float>& g, Pixel& p) {
+    const Falloff<float> f = falloff_at(p.x, p.y, g.u, g.v, g.l11, g.l12, g.l22, g.log2_opacity);
+    const float alpha = alpha_of(f), before = p.transmittance;
+    const float weight = blend_weight(alpha, p.transmittance);
+    float by_weight = p.d_weight;
+    for (int c = 0; c < 3; ++c) by_weight += p.d_color[c] * g.color[c];
+    if (kWithDepth) by_weight += p.d_depth * g.depth;
+    p.running += weight * by_weight;
+    return {exponent_vjp(alpha, before, weight, by_weight, p.total - p.running), weight};
 }
 
 // Takes this warp's pixels through the batch.
 template <bool kWithDepth>
 __device__ void blend_batch_vjp(Shared& s, int warp, int num, Pixel& p, float left, float top) {
     const int lane = threadIdx.x % 32;
-    Share* const shares = &s.share[warp][lane];
-    const int own = lane % kHeld;  // which of the held gaussians this lane will sum: the batch's `entry`
-    int held = 0, entry = 0;
-    bool alive = true;
-    for (int first = 0; first < num && alive; first += 32) {
+    uint8_t* list = s.list[warp];
+    int count = 0;
+    for (int first = 0; first < num; first += 32) {
         const bool meets = first + lane < num && (s.warps[first + lane] >> warp & 1) != 0;
-        for (unsigned todo = __ballot_sync(kAllLanes, meets); todo != 0; todo &= todo - 1) {
-            const int i = first + __ffs(todo) - 1;
-            const Record<float>& g = s.record[i];
-            const Falloff<float> f = falloff_at(p.x, p.y, g.u, g.v, g.l11, g.l12, g.l22, g.log2_opacity);
-            if (!__any_sync(kAllLanes, contributes(f) && p.transmittance > 0)) continue;
-            const float alpha = alpha_of(f), before = p.transmittance;
-            const float weight = blend_weight(alpha, p.transmittance);
-            float by_weight = p.d_weight;
-            for (int c = 0; c < 3; ++c) by_weight += p.d_color[c] * g.color[c];
-            if (kWithDepth) by_weight += p.d_depth * g.depth;
-            p.running += weight * by_weight;
-            shares[held * kShareStride] = {
-                exponent_vjp(alpha, before, weight, by_weight, p.total - p.running), weight};
-            if (held == own) entry = i;
-            if (++held == kHeld) {
-                add_up<kWithDepth>(s, warp, kHeld, entry, left, top);
-                held = 0;
-            }
+        const unsigned entries = __ballot_sync(kAllLanes, meets);
+        if (meets) list[count + __popc(entries & ((1u << lane) - 1))] = static_cast<uint8_t>(first + lane);
+        count += __popc(entries);
+    }
+    if (lane < kHeld) list[count + lane] = kBatch;
+    __syncwarp();
+
+    Share* shares = &s.share[warp][lane];
+    bool alive = true;
+    for (int first = 0; first < count && alive; first += kHeld) {
+        const int held = min(kHeld, count - first);
+        for (int h = 0; h < held; h += kTogether) {
+            Share share[kTogether];  // stored last, so that all the loads can come first
+#pragma unroll
+            for (int k = 0; k < kTogether; ++k)
+                share[k] = blend_vjp<kWithDepth>(s.record[list[first + h + k]], p);
+#pragma unroll
+            for (int k = 0; k < kTogether; ++k) shares[(h + k) * kShareStride] = share[k];
         }
+        add_up<kWithDepth>(s, warp, held, list[first + lane % kHeld], left, top);
         alive = __any_sync(kAllLanes, p.transmittance > 0) != 0;
     }
-    if (held > 0) add_up<kWithDepth>(s, warp, held, entry, left, top);
     if (!alive && lane == 0) atomicAnd(&s.alive, ~(1u << warp));
 }
 
@@ -196,7 +213,8 @@ __global__ void __launch_bounds__(kThreads, 2)
     const int lane = threadIdx.x % 32;
     const int warp =
         __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32, 0);  // tells that all lanes agree
-    const int tile_column = blockIdx.x % in.image.tile_columns, tile_row = blockIdx.x / in.image.tile_columns;
+    const uint32_t tile = in.tile_order[blockIdx.x];
+    const int tile_column = tile % in.image.tile_columns, tile_row = tile / in.image.tile_columns;
     const int left = tile_column * kFrameTileWidth, top = tile_row * kFrameTileHeight;
     const int warp_left = left + warp % kWarpColumns * kWarpWidth,
               warp_top = top + warp / kWarpColumns * kWarpHeight;
@@ -209,16 +227,20 @@ __global__ void __launch_bounds__(kThreads, 2)
         const float sum = warp_sum(d_background[c]);
         if (lane == 0) s.d_background[warp][c] = sum;
     }
-    if (threadIdx.x == 0) s.alive = (1u << kWarps) - 1;
+    if (threadIdx.x == 0) {
+        s.alive = (1u << kWarps) - 1;
+        s.record[kBatch] = {};
+        s.record[kBatch].log2_opacity = -INFINITY;
+    }
     __syncthreads();
     if (threadIdx.x < 3) {
         float sum = 0;
         for (int w = 0; w < kWarps; ++w) sum += s.d_background[w][threadIdx.x];
-        d_background_of_tile[3 * blockIdx.x + threadIdx.x] = sum;
+        d_background_of_tile[3 * tile + threadIdx.x] = sum;
     }
 
-    const uint32_t* order = in.order + in.tile_first[blockIdx.x];
-    const int count = in.blended[blockIdx.x];
+    const uint32_t* order = in.order + in.tile_first[tile];
+    const int count = in.blended[tile];
     for (int first = 0; first < count && s.alive != 0;) {
         uint32_t end_pair = 0;
         if (threadIdx.x < kBatch) {
@@ -253,10 +275,10 @@ __global__ void __launch_bounds__(kThreads, 2)
             const int entry = i / kValues, value = i % kValues;
             const uint32_t took_part = s.took_part[entry];
             if (took_part == 0) continue;
-            uint32_t pair = s.first_pair[entry];
+            const float* pair = &s.pair[s.first_pair[entry]][value];
             float sum = 0;
-            for (uint32_t warps = s.warps[entry]; warps != 0; warps &= warps - 1, ++pair)
-                if ((took_part & warps & (~warps + 1)) != 0) sum += s.pair[pair][value];
+            for (uint32_t todo = took_part; todo != 0; todo &= todo - 1)
+                sum += pair[(__ffs(todo) - 1) * kValues];
             const uint32_t slot = s.slot[entry];
             reinterpret_cast<float*>(slots.slot + slot)[value] = sum;
             if (value == 0) slots.is_touched[slot] = 1;
@@ -266,13 +288,19 @@ __global__ void __launch_bounds__(kThreads, 2)
     }
 }
 
-// A warp a channel.
+constexpr int kSumThreads = 256;
+
+// A block a channel.
 __global__ void sum_over_tiles_kernel(const float* of_tile, uint32_t num_tiles, float* total) {
-    const int channel = threadIdx.x / 32, lane = threadIdx.x % 32;
+    __shared__ float of_warp[kSumThreads / 32];
     float sum = 0;
-    for (uint32_t t = lane; t < num_tiles; t += 32) sum += of_tile[3 * t + channel];
+    for (uint32_t t = threadIdx.x; t < num_tiles; t += kSumThreads) sum += of_tile[3 * t + blockIdx.x];
     sum = warp_sum(sum);
-    if (lane == 0) total[channel] = sum;
+    if (threadIdx.x % 32 == 0) of_warp[threadIdx.x / 32] = sum;
+    __syncthreads();
+    if (threadIdx.x != 0) return;
+    for (int w = 1; w < kSumThreads / 32; ++w) sum += of_warp[w];
+    total[blockIdx.x] = sum;
 }
 
 }  // namespace
@@ -284,7 +312,7 @@ void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& s
         "rasterize_backward_kernel",
         in.d_picture.depth != nullptr ? &rasterize_backward_kernel<true> : &rasterize_backward_kernel<false>,
         num_tiles, kThreads, sizeof(Shared), stream, in, slots, d_background_of_tile);
-    launch("sum_over_tiles_kernel", &sum_over_tiles_kernel, 1, 3 * 32, 0, stream, d_background_of_tile,
+    launch("sum_over_tiles_kernel", &sum_over_tiles_kernel, 3, kSumThreads, 0, stream, d_background_of_tile,
            num_tiles, d_background);
 }
 
