@@ -93,6 +93,12 @@ GRADIENT_FLOAT = GradientBound(
     reason="Sums over pixels in float32; single pixels flip at the cut-offs.",
 )
 
+GRADIENT_GSPLAT = GradientBound(
+    relative_l2=5e-3,
+    cosine=0.9999,
+    reason="float32 on both sides. gsplat takes the determinant as a difference, approximates the "
+    "exponential, and divides the transmittance back out from behind; single pixels flip at the cut-offs.",
+)
 BACKGROUND_GRADIENT = Bound(
     relative=1e-5,
     absolute=1e-4,

@@ -142,7 +142,9 @@ def test_full_device_is_a_memory_error():
     means = torch.zeros((100_000_000, 3), device="cuda")
     free = torch.cuda.mem_get_info()[0]
     rest = torch.empty(max(0, free - (64 << 20)), dtype=torch.uint8, device="cuda")
-    with pytest.raises(MemoryError, match=r"cuda: out of memory: asked for .* MiB, free are .* MiB of .* MiB"):
+    with pytest.raises(
+        MemoryError, match=r"cuda: out of memory: asked for .* MiB, free are .* MiB of .* MiB"
+    ):
         _operations.median_split(means, 256)
     with pytest.raises(MemoryError), _device.memory_errors():
         torch.empty_like(means)

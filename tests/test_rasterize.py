@@ -17,6 +17,7 @@ from compare import (
     FINITE_DIFFERENCE,
     GRADIENT_DOUBLE,
     GRADIENT_FLOAT,
+    GRADIENT_GSPLAT,
     NEEDLES_FLOAT,
     PICTURE_DOUBLE,
     PICTURE_FLOAT,
@@ -606,6 +607,50 @@ def test_gradient_descent_finds_a_moved_gaussian(torch, device):
     np.testing.assert_allclose(
         depth, 2.5, atol=0.05
     )  # larger than the target: it goes where it looks as small
+
+
+def draw_with_gsplat(gsplat, torch, inputs, camera, filter_px2, antialiased=False):
+    """gsplat's colour, alpha and expected depth of the five inputs before the background."""
+    view, K = (torch.tensor(m, dtype=torch.float32, device="cuda")[None] for m in (camera.viewmat, camera.K))
+    pictures, alpha, _ = gsplat.rasterization(
+        *inputs[:5],
+        view,
+        K,
+        camera.width,
+        camera.height,
+        near_plane=camera.near,
+        eps2d=filter_px2,
+        sh_degree=math.isqrt(inputs[4].shape[1]) - 1,
+        rasterize_mode="antialiased" if antialiased else "classic",
+        render_mode="RGB+ED",
+    )
+    color = pictures[0, ..., :3] + (1 - alpha[0]) * inputs[5]
+    return color, alpha[0, ..., 0], pictures[0, ..., 3]
+
+
+@pytest.mark.gpu
+@pytest.mark.witness
+@pytest.mark.filterwarnings("ignore")  # of what gsplat imports
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_pictures_and_gradients_are_gsplats(torch, antialiased, sh_degree):
+    gsplat = pytest.importorskip("gsplat")
+    camera = scenes.camera(517, 389, fx=300.0, pose=scenes.pose(9))
+    gaussians = scenes.random_gaussians(60, camera, 5000, size_px=(0.5, 20), sh_degree=sh_degree)
+    mode = {"filter_px2": 0.3, "antialiased": antialiased}
+    inputs = leaves(torch, gaussians, BACKGROUND, torch.float32, "cuda")
+    ours = draw_leaves(inputs, camera, **mode)
+    theirs = draw_with_gsplat(gsplat, torch, inputs, camera, **mode)
+    for got, expected in zip((ours.color, ours.alpha), theirs[:2], strict=True):
+        error = (got - expected).abs()
+        # A contribution at the threshold of 1/255, or the one at which a pixel stops, may be taken or left.
+        assert error.max() < PICTURE_FLOAT.flip
+        assert (error > 1e-3).float().mean() < 1e-3
+    got = host(torch.autograd.grad(weighted_sum(torch, ours), inputs))
+    expected = host(torch.autograd.grad(weighted_sum(torch, theirs), inputs))
+    for name, g, e in zip(INPUTS, got, expected, strict=True):
+        assert np.abs(e).max() > 0, name
+        assert_gradients_agree(g, e, GRADIENT_GSPLAT)
 
 
 # The same on every run and machine
