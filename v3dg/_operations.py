@@ -109,7 +109,22 @@ def fit_level(
         _core.fit_level(config, target, *arguments)
         return
     with _stream_of(rows[0]) as stream:
-        _core.fit_level_cuda(config, *rows_of(target), *arguments, stream)
+        _core.fit_level_cuda(config, *[*rows_of(target), *arguments, stream])
+
+
+def gather(bundles: list[Gaussians], num_bases: int, **tables: npt.NDArray[Any]) -> Gaussians:
+    """Bring clusters of instances into the world (csrc/gather/gather.h), on the device of the bundles."""
+    rows = [rows_of(gaussians) for gaussians in bundles]
+    if not rows or isinstance(rows[0][0], np.ndarray):
+        return Gaussians(*_core.gather(rows, num_bases=num_bases, **tables))
+    with _stream_of(rows[0][0]) as stream:
+        count = int(tables["offset"][-1])
+        means, quats, scales, opacities = (
+            _empty_like(rows[0][0], shape) for shape in ((count, 3), (count, 4), (count, 3), (count,))
+        )
+        gathered = (means, quats, scales, opacities, _empty_like(rows[0][0], (count, num_bases, 3)))
+        _core.gather_cuda(rows, num_bases=num_bases, rows=gathered, stream=stream, **tables)
+        return Gaussians(*gathered)
 
 
 @contextmanager

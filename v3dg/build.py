@@ -639,6 +639,8 @@ def _digest(head: bytes, arrays: Sequence[npt.NDArray[Any]]) -> bytes:
     def digest(piece: Any) -> bytes:
         return hashlib.blake2b(piece, digest_size=_DIGEST_BYTES).digest()
 
+    if sum(array.nbytes for array in arrays) < _PIECE_BYTES:  # less work than starting threads
+        return digest(b"".join(map(digest, pieces)))
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
         return digest(b"".join(pool.map(digest, pieces)))
 

@@ -192,7 +192,7 @@ class Bundle:
             for f in fields(table)
         }
         tables |= _page_tables(self.clusters, self.sh_degree)
-        pages = (_attributes(self.read_page(page)) for page in range(self.num_pages))
+        pages = (self._page_attributes(page) for page in range(self.num_pages))
         bundle_file.write(path, tables, pages, sh_degree=self.sh_degree, config_json=self._config_json)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -310,6 +310,12 @@ class Bundle:
             "levels": levels,
             "config": self.config,
         }
+
+    def _page_attributes(self, page: int) -> Sequence[Any]:
+        if self._gaussians is None:
+            return _attributes(self.read_page(page))
+        rows = self._gaussian_slice(self.page_range(page))
+        return [array[rows] for array in _attributes(self._gaussians)]
 
     def _gaussian_slice(self, clusters: range) -> slice:
         offset = self.clusters.offset

@@ -13,12 +13,13 @@ import os
 import secrets
 import stat
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,6 +31,8 @@ ALIGNMENT_BYTES = 4096  # of a page in the file: the memory page, so that a page
 HASH_BYTES = 16
 
 _MAX_HEADER_BYTES = 1 << 20  # the header holds 20 entries and the config; more is damage or an attack
+_THREADS = 8
+_RUN_BYTES = 64 << 20
 _READ_BYTES = 1 << 30  # one read call moves at most 2 GiB - 4 KiB
 _DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
 _SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
@@ -77,6 +80,25 @@ def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
     for piece in pieces:
         digest.update(piece.reshape(-1).view(np.uint8).data)
     return digest.digest()
+
+
+def _page_in_file(pieces: Sequence[NDArray[Any]]) -> tuple[NDArray[np.uint8], bytes]:
+    """A page's bytes with their padding, and their hash."""
+    padding = np.zeros(padding_bytes(sum(piece.nbytes for piece in pieces)), np.uint8)
+    data = np.concatenate([piece.reshape(-1).view(np.uint8) for piece in (*pieces, padding)])
+    return data, page_hash((data,))
+
+
+def _runs(pages: Iterable[Sequence[NDArray[Any]]]) -> Iterator[list[Sequence[NDArray[Any]]]]:
+    """Cut pages into runs that are enough work for all threads and little memory."""
+    run, num_bytes = [], 0
+    for pieces in pages:
+        run.append(pieces)
+        num_bytes += sum(piece.nbytes for piece in pieces)
+        if num_bytes > _RUN_BYTES:
+            yield run
+            run, num_bytes = [], 0
+    yield run
 
 
 def _entries(num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int) -> dict[str, Any]:
@@ -156,12 +178,11 @@ def write(
             file.write(header)
             digest = hashlib.blake2b(header, digest_size=HASH_BYTES)
             hashes = bytearray()
-            for pieces in pages:
-                num_bytes = sum(piece.nbytes for piece in pieces)
-                padding = np.zeros(padding_bytes(num_bytes), np.uint8)
-                for piece in (*pieces, padding):
-                    file.write(piece.reshape(-1).view(np.uint8).data)
-                hashes += page_hash((*pieces, padding))
+            with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+                for run in _runs(pages):
+                    for page, page_digest in pool.map(_page_in_file, run):
+                        file.write(page.data)
+                        hashes += page_digest
             hash_table = np.frombuffer(hashes, np.uint8).reshape(-1, HASH_BYTES)
             for name, dtype, _, _ in _SCHEMA:
                 table = hash_table if name == "pages.hash" else tables[name]
