@@ -227,12 +227,12 @@ def build_bundle(
         raise ValueError(f"seed: expected 0 to 2^58 - 1, got {seed}")
     if str(asset.means.dtype).endswith("64"):
         raise ValueError("asset: expected float32 arrays, got float64; convert them first")
+    store = _Checkpoint(resume_path, asset, config, seed, where)
     with _device.memory_errors():
-        asset = _device.place(asset, where)
-        _check_drawable(asset)
-        store = _Checkpoint(resume_path, asset, config, seed, where)
-        build = _Build(asset, config, seed)
-        del asset
+        placed = _device.place(asset, where)
+        _check_drawable(placed)
+        build = _Build(placed, config, seed)
+        del placed  # twice is enough: the caller's, and in the order of the leaves
         for level in store.load():
             build.append(level)
         bar = _Bar(build.levels, config, progress)
@@ -589,9 +589,11 @@ class _Checkpoint:
         counts, digest = file.read(self._COUNTS.size), file.read(_DIGEST_BYTES)
         if len(digest) < _DIGEST_BYTES:
             return None
+        if min(self._COUNTS.unpack(counts)) < 0:
+            raise ValueError("a level is damaged")
         layout = self._layout(*self._COUNTS.unpack(counts))
         left = os.fstat(file.fileno()).st_size - file.tell()
-        if not 0 <= sum(dtype.itemsize * math.prod(shape) for dtype, shape in layout) <= left:
+        if sum(dtype.itemsize * math.prod(shape) for dtype, shape in layout) > left:
             return None
         arrays = [np.fromfile(file, dtype, math.prod(shape)).reshape(shape) for dtype, shape in layout]
         if _digest(counts, arrays) != digest:
@@ -630,7 +632,7 @@ class _Checkpoint:
 
 
 def _digest(head: bytes, arrays: Sequence[npt.NDArray[Any]]) -> bytes:
-    """Of the head, the shapes and the bytes; in pieces, so that all cores share the work."""
+    """Of the head and the arrays' bytes; in pieces, so that all cores share the work."""
     pieces: list[Any] = [head]
     for array in arrays:
         data = memoryview(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
