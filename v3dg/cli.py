@@ -193,6 +193,7 @@ def _build(options: Build) -> None:
     _require(options.asset, ".ply")
     from dataclasses import replace
 
+    from v3dg import _device
     from v3dg.build import BuildConfig, build_bundle
     from v3dg.io import load
 
@@ -207,6 +208,7 @@ def _build(options: Build) -> None:
     partial = output.with_name(output.name + ".partial")
     if not options.resume:
         partial.unlink(missing_ok=True)
+    device = _device.resolve(options.device)
     start = time.perf_counter()
     asset = load(options.asset)
     try:
@@ -215,7 +217,7 @@ def _build(options: Build) -> None:
             config=config,
             seed=options.seed,
             progress=not options.quiet,
-            device=options.device,
+            device=device,
             resume_path=partial,
         )
     except KeyboardInterrupt:

@@ -131,10 +131,10 @@ def run_demo(
     """
     from tqdm import tqdm
 
-    start = time.perf_counter()
     path = check_picture_path(output)
     width, height = size
     where = _device.resolve(device)
+    start = time.perf_counter()
     asset = make_asset(num_gaussians, seed=seed)
     built = time.perf_counter()
     bundle = build_bundle(asset, config=config or BuildConfig(), seed=seed, progress=progress, device=where)
