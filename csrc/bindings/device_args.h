@@ -11,10 +11,11 @@ namespace v3dg {
 template <class T>
 Span<T> device_span_of(const py::handle& array, const char* name, std::initializer_list<py::ssize_t> shape) {
     using Value = std::remove_const_t<T>;
-    if (!py::hasattr(array, "__cuda_array_interface__"))
+    const py::object found = py::getattr(array, "__cuda_array_interface__", py::none());
+    if (found.is_none())
         throw py::type_error(std::string(name) + ": expected an array on a CUDA device, got " +
                              py::str(py::type::of(array)).cast<std::string>());
-    const py::dict face = array.attr("__cuda_array_interface__").cast<py::dict>();
+    const py::dict face = found.cast<py::dict>();
     const std::string dtype = face["typestr"].cast<std::string>();
     const std::string wanted_dtype = py::dtype::of<Value>().attr("str").template cast<std::string>();
     if (dtype != wanted_dtype)

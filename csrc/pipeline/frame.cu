@@ -4,6 +4,8 @@
 #include <stdexcept>
 #include <string>
 
+#include "project/project_backward.h"
+
 namespace v3dg {
 namespace cuda {
 
@@ -17,17 +19,17 @@ struct Frame::State {
 // What the host keeps of a frame in flight.
 struct Frame::Slot {
     State* state = nullptr;  // pinned
-    cudaEvent_t begun = nullptr, prepared = nullptr, done = nullptr;
+    cudaEvent_t begun = nullptr, prepared = nullptr, counted = nullptr, done = nullptr;
 
     Slot() {
         check(cudaMallocHost(reinterpret_cast<void**>(&state), sizeof *state), "cudaMallocHost");
         *state = State{};
-        for (cudaEvent_t* event : {&begun, &prepared, &done})
+        for (cudaEvent_t* event : {&begun, &prepared, &counted, &done})
             check(cudaEventCreate(event), "cudaEventCreate");
     }
     ~Slot() {
         // At exit the driver may be gone before us.
-        for (const cudaEvent_t event : {begun, prepared, done})
+        for (const cudaEvent_t event : {begun, prepared, counted, done})
             if (event != nullptr) cudaEventDestroy(event);
         cudaFreeHost(state);
         cudaGetLastError();
@@ -166,9 +168,18 @@ void Frame::enqueue(Drawing& drawing) {
                            room(tile_order_, batch.num_tiles, drawing)};
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
+    const auto report = [&] {
+        check(cudaMemcpyAsync(slot.state, state, sizeof *state, cudaMemcpyDeviceToHost, stream),
+              "cudaMemcpyAsync to the host");
+        if (!capturing) check(cudaEventRecord(slot.counted, stream), "cudaEventRecord");
+    };
+    // Whoever differentiates goes on while the pictures are blended; else nothing should delay the blending.
+    if (keeps_tape) {
+        place_slots(items, item_records, records, room(first_slot_, capacity.records, drawing), stream);
+        report();
+    }
     rasterize(lists, keeps_tape ? &tape : nullptr, stream);
-    check(cudaMemcpyAsync(slot.state, state, sizeof *state, cudaMemcpyDeviceToHost, stream),
-          "cudaMemcpyAsync to the host");
+    if (!keeps_tape) report();
     if (!capturing) {
         check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
         check(cudaEventRecord(last_done_, stream), "cudaEventRecord");
@@ -190,7 +201,8 @@ FrameTape Frame::tape() const {
             last_batch_.placements,
             items_.data(),
             item_records_.data(),
-            source_.data()};
+            source_.data(),
+            first_slot_.data()};
 }
 
 Drawing::Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, cudaStream_t stream)
@@ -221,10 +233,16 @@ const FrameCounters& Drawing::finish() {
                 "will meet, and capture it again");
         return slot_->state->counters;
     }
-    while (!is_finished_) {
-        wait();
-        is_finished_ = was_drawn();
-        if (is_finished_) break;
+    settle();
+    wait();
+    return slot_->state->counters;
+}
+
+const FrameCounters& Drawing::settle() {
+    while (!is_settled_) {
+        check(cudaEventSynchronize(slot_->counted), "a frame");
+        is_settled_ = was_drawn();
+        if (is_settled_) break;
         frame_.enlarge(*slot_->state);
         frame_.enqueue(*this);
     }

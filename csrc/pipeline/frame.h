@@ -32,6 +32,7 @@ struct FrameTape {
     const DrawItem* items;         // counters->items
     const uint32_t* item_records;  // how many of an item's gaussians became records
     const uint32_t* source;        // of each record, its gaussian's place in the model
+    const uint32_t* first_slot;    // of each record, as place_slots() gives them
 };
 
 struct FrameTimes {
@@ -83,7 +84,7 @@ class Frame {
     const Keeps keeps_;
     Capacity capacity_;
     DeviceBuffer<DrawItem> items_;
-    DeviceBuffer<uint32_t> item_records_, source_, image_of_tile_, order_, blended_;
+    DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
     DeviceBuffer<Record<float>> records_;
     DeviceBuffer<LargeRecord> large_;
     DeviceBuffer<TileEntry> entries_, scratch_;
@@ -110,6 +111,9 @@ class Drawing {
 
     // Waits until the device is done with it; finish() may draw it again.
     void wait() const;
+    // As finish(), but the pictures may still be on their way: where the frame keeps a tape, it waits no
+    // longer than until everything is counted. Not of a captured frame.
+    const FrameCounters& settle();
     // Waits until the pictures are drawn, drawing again if a buffer was too small. Throws OutOfMemory, or
     // std::length_error past kMostFrameRecords.
     //
@@ -129,7 +133,7 @@ class Drawing {
     cudaStream_t stream_;
     Frame::Slot* slot_ = nullptr;
     Frame::Capacity capacity_;  // that it was drawn with
-    bool is_captured_ = false, is_finished_ = false;
+    bool is_captured_ = false, is_settled_ = false;
 };
 
 }  // namespace cuda

@@ -9,54 +9,40 @@ namespace cuda {
 
 DifferentiableFrame::DifferentiableFrame() : frame_(Frame::Keeps::tape) {
     check(cudaGetDevice(&device_), "cudaGetDevice");
-    check(cudaMallocHost(reinterpret_cast<void**>(&num_slots_on_host_), sizeof *num_slots_on_host_),
-          "cudaMallocHost");
-    for (cudaEvent_t* event : {&slots_counted_, &gone_back_})
+    for (cudaEvent_t* event : {&drawn_, &gone_back_})
         check(cudaEventCreateWithFlags(event, cudaEventDisableTiming), "cudaEventCreate");
 }
 
 DifferentiableFrame::~DifferentiableFrame() {
-    for (const cudaEvent_t event : {slots_counted_, gone_back_})
+    for (const cudaEvent_t event : {drawn_, gone_back_})
         if (event != nullptr) cudaEventDestroy(event);
-    cudaFreeHost(num_slots_on_host_);
-    cudaGetLastError();
-}
-
-static ModelRecords records_of(const FrameTape& tape, const ModelPicture& in) {
-    return {in.count, tape.item_records, tape.lists.records};
+    cudaGetLastError();  // at exit the driver may be gone before us
 }
 
 void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
     in_ = in;
     check(cudaStreamWaitEvent(stream, gone_back_, 0), "cudaStreamWaitEvent");
-    frame_.draw(in.rows, in.count, in.view, in.filter_px2, in.compensate, in.image, stream)->finish();
-
-    // How many slots there are will be known long before the way back asks for it.
-    unsigned long long* num_slots = num_slots_.reserve(1, stream);
-    uint32_t* first_slot = first_slot_.reserve((in.count + kItemSize - 1) / kItemSize * kItemSize, stream);
-    check(cudaMemsetAsync(num_slots, 0, sizeof *num_slots, stream), "cudaMemsetAsync");
-    place_slots(records_of(frame_.tape(), in), first_slot, num_slots, stream);
-    check(cudaMemcpyAsync(num_slots_on_host_, num_slots, sizeof *num_slots, cudaMemcpyDeviceToHost, stream),
-          "cudaMemcpyAsync to the host");
-    check(cudaEventRecord(slots_counted_, stream), "cudaEventRecord");
+    const std::unique_ptr<Drawing> drawing =
+        frame_.draw(in.rows, in.count, in.view, in.filter_px2, in.compensate, in.image, stream);
+    num_slots_ = drawing->settle().slots;
+    check(cudaEventRecord(drawn_, stream), "cudaEventRecord");
 }
 
 void DifferentiableFrame::backward(const PictureGradient<float>& d_picture,
                                    const GaussianGradients<float>& out, float* d_background,
                                    cudaStream_t stream) {
-    check(cudaEventSynchronize(slots_counted_), "place_slots");
-    const size_t num_slots = *num_slots_on_host_;
+    check(cudaStreamWaitEvent(stream, drawn_, 0), "cudaStreamWaitEvent");
     const FrameTape tape = frame_.tape();
-    const DeviceBuffer<RecordGradient<float>> slot(num_slots, stream);
-    const DeviceBuffer<uint8_t> is_touched(num_slots, stream);
+    const DeviceBuffer<RecordGradient<float>> slot(num_slots_, stream);
+    const DeviceBuffer<uint8_t> is_touched(num_slots_, stream);
     const DeviceBuffer<float> d_background_of_tile(3 * size_t(tape.lists.num_tiles), stream);
-    if (num_slots > 0) check(cudaMemsetAsync(is_touched.data(), 0, num_slots, stream), "cudaMemsetAsync");
-    const GradientSlots slots{first_slot_.data(), slot.data(), is_touched.data()};
+    if (num_slots_ > 0) check(cudaMemsetAsync(is_touched.data(), 0, num_slots_, stream), "cudaMemsetAsync");
+    const GradientSlots slots{tape.first_slot, slot.data(), is_touched.data()};
     rasterize_backward({in_.image, tape.lists.records, tape.lists.tile_first, tape.raster.order,
                         tape.raster.blended, tape.lists.tile_order, d_picture},
                        slots, d_background_of_tile.data(), d_background, stream);
-    project_backward({records_of(tape, in_), tape.source, in_.rows, in_.view, in_.image.camera,
-                      in_.filter_px2, in_.compensate},
+    project_backward({in_.count, tape.item_records, tape.lists.records, tape.source, in_.rows, in_.view,
+                      in_.image.camera, in_.filter_px2, in_.compensate},
                      slots, out, stream);
     check(cudaEventRecord(gone_back_, stream), "cudaEventRecord");
 }

@@ -26,7 +26,7 @@ class DifferentiableFrame {
     DifferentiableFrame(const DifferentiableFrame&) = delete;
     DifferentiableFrame& operator=(const DifferentiableFrame&) = delete;
 
-    // Returns when the picture is drawn. Throws what Drawing::finish throws.
+    // Returns when it is sure that the picture will be drawn. Throws what Drawing::finish throws.
     void draw(const ModelPicture& in, cudaStream_t stream);
 
     // Enqueues the gradients of the gaussians and the background (3) of the picture last drawn; its arrays
@@ -40,10 +40,8 @@ class DifferentiableFrame {
     int device_ = 0;
     ModelFrame frame_;
     ModelPicture in_{};
-    DeviceBuffer<uint32_t> first_slot_;
-    DeviceBuffer<unsigned long long> num_slots_;
-    unsigned long long* num_slots_on_host_ = nullptr;  // pinned
-    cudaEvent_t slots_counted_ = nullptr, gone_back_ = nullptr;
+    unsigned long long num_slots_ = 0;
+    cudaEvent_t drawn_ = nullptr, gone_back_ = nullptr;
 };
 
 // A frame of the current device, if possible one that was given back with its buffers. Whoever has one that

@@ -50,6 +50,7 @@ struct Placement {
 // Counted on the device. What exceeds a capacity is counted but not stored, and nothing is then drawn.
 struct FrameCounters {
     unsigned long long items, gaussians, in_frustum, records, entries;
+    unsigned long long slots;  // of gradients, in a frame that keeps a tape
 };
 
 // At most kItemSize neighbouring gaussians of a placed model. There is room for their records at

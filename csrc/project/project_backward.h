@@ -9,16 +9,17 @@
 namespace v3dg {
 namespace cuda {
 
-// The records of a model's gaussians, kItemSize gaussians an item, the last of what is left. Those of item i
-// stand in a row from i * kItemSize on, in the order of their gaussians.
-struct ModelRecords {
+// Gives each record of a frame its slots, `first_slot` of the first, and counts all of them in the counters.
+// Does nothing when the items are over a capacity.
+void place_slots(const ItemList& items, const uint32_t* item_records, const Record<float>* records,
+                 uint32_t* first_slot, cudaStream_t stream);
+
+struct ProjectBackwardInput {
+    // Items of kItemSize gaussians, the last of what is left. The records of item i stand in a row from
+    // i * kItemSize on, in the order of their gaussians.
     uint64_t size;                 // gaussians
     const uint32_t* item_records;  // how many of an item's gaussians became records
     const Record<float>* records;
-};
-
-struct ProjectBackwardInput {
-    ModelRecords made;
     const uint32_t* source;  // each record's gaussian
     DeviceRows rows;
     ModelView<float> view;
@@ -26,10 +27,6 @@ struct ProjectBackwardInput {
     float filter_px2;
     bool compensate;
 };
-
-// Gives each record its slots and adds what that takes to `num_slots`, which starts at 0.
-void place_slots(const ModelRecords& made, uint32_t* first_slot, unsigned long long* num_slots,
-                 cudaStream_t stream);
 
 // Writes the gradients of every gaussian, zeros for those without a record. Those of the SH coefficients
 // begin at a multiple of 16 bytes, as the coefficients do.

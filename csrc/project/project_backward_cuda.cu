@@ -14,6 +14,7 @@ namespace {
 
 constexpr int kThreads = kItemSize;
 constexpr uint32_t kFewSlots = 16;  // a thread adds up so many by itself, a warp more
+constexpr int kWordsAtOnce = 6;     // that a thread asks for before it stores the first
 
 __device__ void add_slot(const GradientSlots& slots, uint32_t i, RecordGradient<float>& sum) {
     static_assert(sizeof sum == 5 * sizeof(float2), "loaded as pairs");
@@ -56,31 +57,38 @@ __device__ bool sum_of_slots(const GradientSlots& slots, uint32_t first, uint32_
     return touched != 0;
 }
 
-__global__ void place_slots_kernel(ModelRecords made, uint32_t* first_slot, unsigned long long* num_slots) {
+__global__ void place_slots_kernel(ItemList items, const uint32_t* item_records, const Record<float>* records,
+                                   uint32_t* first_slot) {
+    const unsigned long long num_items = items.counters->items;
+    if (num_items > items.item_capacity || items.counters->gaussians > items.record_capacity) return;
     __shared__ uint32_t sum_of_warp[kThreads / 32];
     __shared__ uint32_t first_of_item;
     const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    const uint32_t record = blockIdx.x * kItemSize + threadIdx.x;
-    const bool is_record = threadIdx.x < made.item_records[blockIdx.x];
-    const uint32_t num = is_record ? num_slots_of(made.records[record]) : 0;
-    uint32_t end = num;
-    for (int offset = 1; offset < 32; offset *= 2) {
-        const uint32_t before = __shfl_up_sync(kAllLanes, end, offset);
-        if (lane >= offset) end += before;
-    }
-    if (lane == 31) sum_of_warp[warp] = end;
-    __syncthreads();
-    if (threadIdx.x == 0) {
-        uint32_t sum = 0;
-        for (uint32_t& of_warp : sum_of_warp) {
-            const uint32_t here = of_warp;
-            of_warp = sum;
-            sum += here;
+    for (unsigned long long i = blockIdx.x; i < num_items; i += gridDim.x) {
+        const uint32_t record = items.items[i].record + threadIdx.x;
+        const bool is_record = threadIdx.x < item_records[i];
+        const uint32_t num = is_record ? num_slots_of(records[record]) : 0;
+        uint32_t end = num;
+        for (int offset = 1; offset < 32; offset *= 2) {
+            const uint32_t before = __shfl_up_sync(kAllLanes, end, offset);
+            if (lane >= offset) end += before;
         }
-        first_of_item = static_cast<uint32_t>(atomicAdd(num_slots, static_cast<unsigned long long>(sum)));
+        if (lane == 31) sum_of_warp[warp] = end;
+        __syncthreads();
+        if (threadIdx.x == 0) {
+            uint32_t sum = 0;
+            for (uint32_t& of_warp : sum_of_warp) {
+                const uint32_t here = of_warp;
+                of_warp = sum;
+                sum += here;
+            }
+            first_of_item = static_cast<uint32_t>(
+                atomicAdd(&items.counters->slots, static_cast<unsigned long long>(sum)));
+        }
+        __syncthreads();
+        if (is_record) first_slot[record] = first_of_item + sum_of_warp[warp] + end - num;
+        __syncthreads();
     }
-    __syncthreads();
-    if (is_record) first_slot[record] = first_of_item + sum_of_warp[warp] + end - num;
 }
 
 template <int kWidth>
@@ -111,29 +119,46 @@ __global__ void __launch_bounds__(kThreads)
     Word* sh_rows = reinterpret_cast<Word*>(shared_memory());
     __shared__ bool is_used[kThreads];  // whether anything flows into the gaussian
     const uint64_t first = static_cast<uint64_t>(blockIdx.x) * kItemSize;
-    const int num_here = static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.made.size - first));
+    const int num_here = static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.size - first));
     is_used[threadIdx.x] = false;
     __syncthreads();
 
     const uint64_t record = first + threadIdx.x;
-    const bool is_record = threadIdx.x < in.made.item_records[blockIdx.x];
+    const bool is_record = threadIdx.x < in.item_records[blockIdx.x];
     const uint64_t i = is_record ? in.source[record] : 0;  // its gaussian
-    RecordGradient<float> d{};
-    const bool used = sum_of_slots(slots, is_record ? slots.first[record] : 0,
-                                   is_record ? num_slots_of(in.made.records[record]) : 0, d);
-    if (used) is_used[i - first] = true;
-    __syncthreads();
-    const Word* sh_in = reinterpret_cast<const Word*>(in.rows.sh + Row::kValues * first);
-    for (int k = threadIdx.x; k < Row::kWords * num_here; k += kThreads)
-        if (is_used[k / Row::kWords]) sh_rows[k / Row::kWords * Row::kStride + k % Row::kWords] = sh_in[k];
-    __syncthreads();
-
-    if (used) {
-        Gaussian3d<float> g;
+    Gaussian3d<float> g{};
+    float color[3] = {0, 0, 0};
+    if (is_record) {  // early, so that it arrives while the slots are added up
         load_row(in.rows.means, i, g.mean);
         load_row(in.rows.quats, i, g.quat);
         load_row(in.rows.scales, i, g.scale);
         g.opacity = in.rows.opacities[i];
+        for (int c = 0; c < 3; ++c) color[c] = in.records[record].color[c];
+    }
+    RecordGradient<float> d{};
+    const bool used = sum_of_slots(slots, is_record ? slots.first[record] : 0,
+                                   is_record ? num_slots_of(in.records[record]) : 0, d);
+    if (used) is_used[i - first] = true;
+    __syncthreads();
+    const Word* sh_in = reinterpret_cast<const Word*>(in.rows.sh + Row::kValues * first);
+    const auto is_wanted = [&](int k) { return k < Row::kWords * num_here && is_used[k / Row::kWords]; };
+#pragma unroll
+    for (int begin = 0; begin < Row::kWords; begin += kWordsAtOnce) {
+        Word words[kWordsAtOnce];
+#pragma unroll
+        for (int w = 0; w < kWordsAtOnce && begin + w < Row::kWords; ++w) {
+            const int k = (begin + w) * kThreads + threadIdx.x;
+            if (is_wanted(k)) words[w] = sh_in[k];
+        }
+#pragma unroll
+        for (int w = 0; w < kWordsAtOnce && begin + w < Row::kWords; ++w) {
+            const int k = (begin + w) * kThreads + threadIdx.x;
+            if (is_wanted(k)) sh_rows[k / Row::kWords * Row::kStride + k % Row::kWords] = words[w];
+        }
+    }
+    __syncthreads();
+
+    if (used) {
         Projection<float> s;
         const Ellipse<float> e = project_gaussian(g, in.view, in.camera, in.filter_px2, in.compensate, s);
         Gaussian3d<float> d_gaussian =
@@ -142,7 +167,6 @@ __global__ void __launch_bounds__(kThreads)
         Word* row = sh_rows + (i - first) * Row::kStride;
         for (int k = 0; k < Row::kWords; ++k) words[k] = row[k];
         float* sh = reinterpret_cast<float*>(words);
-        const float* color = in.made.records[record].color;
         color_of_sh_vjp(kDegree, g.mean, in.view, sh, color, d.color, d_gaussian.mean, sh);
         for (int k = 0; k < Row::kWords; ++k) row[k] = words[k];
         store_row<3>(out.means, i, d_gaussian.mean);
@@ -167,17 +191,17 @@ __global__ void __launch_bounds__(kThreads)
 template <int kDegree>
 void start(const ProjectBackwardInput& in, const GradientSlots& slots, const GaussianGradients<float>& out,
            cudaStream_t stream) {
-    launch("project_backward_kernel", &project_backward_kernel<kDegree>, blocks_for(in.made.size, kItemSize),
+    launch("project_backward_kernel", &project_backward_kernel<kDegree>, blocks_for(in.size, kItemSize),
            kThreads, kThreads * ShRow<kDegree>::kStride * sizeof(typename ShRow<kDegree>::Word), stream, in,
            slots, out);
 }
 
 }  // namespace
 
-void place_slots(const ModelRecords& made, uint32_t* first_slot, unsigned long long* num_slots,
-                 cudaStream_t stream) {
-    launch("place_slots_kernel", &place_slots_kernel, blocks_for(made.size, kItemSize), kThreads, 0, stream,
-           made, first_slot, num_slots);
+void place_slots(const ItemList& items, const uint32_t* item_records, const Record<float>* records,
+                 uint32_t* first_slot, cudaStream_t stream) {
+    launch("place_slots_kernel", &place_slots_kernel, 8 * num_multiprocessors(), kThreads, 0, stream, items,
+           item_records, records, first_slot);
 }
 
 void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots,

@@ -35,18 +35,23 @@ struct Share {
 };
 constexpr int kShareStride = 33;  // of the pixels of a gaussian; odd, against bank conflicts
 
-struct Shared {
-    Record<float> record[kBatch + 1];  // the last is one that nothing shows of
+// What is needed of a batch's entries until their pairs are added up.
+struct Batch {
     uint32_t slot[kBatch];
     uint32_t first_pair[kBatch];
+    uint32_t took_part[kBatch];  // bit k: the k-th warp of those that might blend the entry did
+};
+
+struct Shared {
+    Record<float> record[kBatch + 1];      // the last is one that nothing shows of
     uint32_t warps[kBatch];                // bit w: warp w may blend the entry
-    uint32_t took_part[kBatch];            // bit k: the k-th of these did
     uint8_t list[kWarps][kBatch + kHeld];  // the entries that a warp may blend, then some of kBatch
     uint32_t pairs_of_warp[kBatch / 32];
     uint32_t alive;  // bit w: warp w has a pixel that has not stopped
     float4 d_color[kWarps][kWarpHeight]
                   [kWarpWidth + 1];  // and by depth; the spare column is against conflicts
     Share share[kWarps][kHeld * kShareStride];
+    Batch batch[2];  // one is blended, the other one added up
     float pair[kPairs][kValues];
     float d_background[kWarps][3];
 };
@@ -104,7 +109,7 @@ __device__ Pixel read_pixel(const RasterizeBackwardInput& in, int column, int ro
 // Sums over the warp's pixels for the gaussians it holds; `entry` is the place in the batch of the one this
 // lane works on, (left, top) the centre of the warp's first pixel. Lane = row of pixels * kHeld + gaussian.
 template <bool kWithDepth>
-__device__ void add_up(Shared& s, int warp, int held, int entry, float left, float top) {
+__device__ void add_up(Shared& s, Batch& batch, int warp, int held, int entry, float left, float top) {
     const int lane = threadIdx.x % 32, gaussian = lane % kHeld, row = lane / kHeld;
     __syncwarp();
     const Record<float>& g = s.record[entry];
@@ -151,11 +156,11 @@ __device__ void add_up(Shared& s, int warp, int held, int entry, float left, flo
     }
     if (gaussian < held) {
         const uint32_t rank = __popc(s.warps[entry] & ((1u << warp) - 1));
-        float* pair = s.pair[s.first_pair[entry] + rank];
+        float* pair = s.pair[batch.first_pair[entry] + rank];
 #pragma unroll
         for (int i = 0; i < 3; ++i)
             if (3 * row + i < kValues) pair[3 * row + i] = value[i];
-        if (row == 0) atomicOr(&s.took_part[entry], 1u << rank);
+        if (row == 0) atomicOr(&batch.took_part[entry], 1u << rank);
     }
     __syncwarp();
 }
@@ -175,7 +180,7 @@ __device__ Share blend_vjp(const Record<float>& g, Pixel& p) {
 
 // Takes this warp's pixels through the batch.
 template <bool kWithDepth>
-__device__ void blend_batch_vjp(Shared& s, int warp, int num, Pixel& p, float left, float top) {
+__device__ void blend_batch_vjp(Shared& s, Batch& batch, int warp, int num, Pixel& p, float left, float top) {
     const int lane = threadIdx.x % 32;
     uint8_t* list = s.list[warp];
     int count = 0;
@@ -200,10 +205,26 @@ __device__ void blend_batch_vjp(Shared& s, int warp, int num, Pixel& p, float le
 #pragma unroll
             for (int k = 0; k < kTogether; ++k) shares[(h + k) * kShareStride] = share[k];
         }
-        add_up<kWithDepth>(s, warp, held, list[first + lane % kHeld], left, top);
+        add_up<kWithDepth>(s, batch, warp, held, list[first + lane % kHeld], left, top);
         alive = __any_sync(kAllLanes, p.transmittance > 0) != 0;
     }
     if (!alive && lane == 0) atomicAnd(&s.alive, ~(1u << warp));
+}
+
+// Adds up the pairs of a batch's entries into their slots; `thread` of `num_threads`.
+__device__ void add_up_pairs(const Shared& s, const Batch& batch, int num, int thread, int num_threads,
+                             const GradientSlots& slots) {
+    for (int i = thread; i < num * kValues; i += num_threads) {
+        const int entry = i / kValues, value = i % kValues;
+        const uint32_t took_part = batch.took_part[entry];
+        if (took_part == 0) continue;
+        const float* pair = &s.pair[batch.first_pair[entry]][value];
+        float sum = 0;
+        for (uint32_t todo = took_part; todo != 0; todo &= todo - 1) sum += pair[(__ffs(todo) - 1) * kValues];
+        const uint32_t slot = batch.slot[entry];
+        reinterpret_cast<float*>(slots.slot + slot)[value] = sum;
+        if (value == 0) slots.is_touched[slot] = 1;
+    }
 }
 
 template <bool kWithDepth>
@@ -241,19 +262,26 @@ __global__ void __launch_bounds__(kThreads, 2)
 
     const uint32_t* order = in.order + in.tile_first[tile];
     const int count = in.blended[tile];
-    for (int first = 0; first < count && s.alive != 0;) {
+    const int i = threadIdx.x;
+    int first = 0, num = 0;
+    for (int turn = 0;; turn ^= 1) {
+        // Some warps load a batch while the others add up the one before.
+        const bool goes_on = first < count && s.alive != 0;
+        Batch& batch = s.batch[turn];
         uint32_t end_pair = 0;
-        if (threadIdx.x < kBatch) {
+        if (i >= kBatch) {
+            add_up_pairs(s, s.batch[turn ^ 1], num, i - kBatch, kThreads - kBatch, slots);
+        } else if (goes_on) {
             uint32_t warps = 0;
-            if (first + static_cast<int>(threadIdx.x) < count) {
-                const uint32_t r = order[first + threadIdx.x];
+            if (first + i < count) {
+                const uint32_t r = order[first + i];
                 const Record<float> g = in.records[r];
-                s.record[threadIdx.x] = g;
-                s.slot[threadIdx.x] = slots.first[r] + slot_of_tile(g, tile_column, tile_row);
+                s.record[i] = g;
+                batch.slot[i] = slots.first[r] + slot_of_tile(g, tile_column, tile_row);
                 warps = warps_of(g, left, top) & s.alive;
             }
-            s.warps[threadIdx.x] = warps;
-            s.took_part[threadIdx.x] = 0;
+            s.warps[i] = warps;
+            batch.took_part[i] = 0;
             end_pair = __popc(warps);
             for (int offset = 1; offset < 32; offset *= 2) {
                 const uint32_t other = __shfl_up_sync(kAllLanes, end_pair, offset);
@@ -261,30 +289,17 @@ __global__ void __launch_bounds__(kThreads, 2)
             }
             if (lane == 31) s.pairs_of_warp[warp] = end_pair;
         }
+        if (!goes_on) break;
         __syncthreads();
-        if (threadIdx.x < kBatch) {
+        if (i < kBatch) {
             for (int w = 0; w < warp; ++w) end_pair += s.pairs_of_warp[w];
-            s.first_pair[threadIdx.x] = end_pair - __popc(s.warps[threadIdx.x]);
+            batch.first_pair[i] = end_pair - __popc(s.warps[i]);
         }
         // The entries of the batch whose pairs there is room for.
-        const int num = __syncthreads_count(static_cast<int>(threadIdx.x) < min(kBatch, count - first) &&
-                                            end_pair <= kPairs);
-        blend_batch_vjp<kWithDepth>(s, warp, num, p, warp_left + 0.5f, warp_top + 0.5f);
-        __syncthreads();
-        for (int i = threadIdx.x; i < num * kValues; i += kThreads) {
-            const int entry = i / kValues, value = i % kValues;
-            const uint32_t took_part = s.took_part[entry];
-            if (took_part == 0) continue;
-            const float* pair = &s.pair[s.first_pair[entry]][value];
-            float sum = 0;
-            for (uint32_t todo = took_part; todo != 0; todo &= todo - 1)
-                sum += pair[(__ffs(todo) - 1) * kValues];
-            const uint32_t slot = s.slot[entry];
-            reinterpret_cast<float*>(slots.slot + slot)[value] = sum;
-            if (value == 0) slots.is_touched[slot] = 1;
-        }
-        __syncthreads();
+        num = __syncthreads_count(i < min(kBatch, count - first) && end_pair <= kPairs);
+        blend_batch_vjp<kWithDepth>(s, batch, warp, num, p, warp_left + 0.5f, warp_top + 0.5f);
         first += num;
+        __syncthreads();
     }
 }
 
