@@ -29,7 +29,7 @@ def assert_like_cpu(image, expected):
     for got, wanted in zip(arrays(image), arrays(expected), strict=True):
         assert got.shape == wanted.shape
         assert np.isfinite(got).all()
-        error = np.abs(got - wanted)
+        error = np.abs(got - wanted) / np.maximum(1, np.abs(wanted))
         assert error.mean() <= PICTURE_FLOAT.mean
         assert (error > PICTURE_FLOAT.absolute).mean() <= PICTURE_FLOAT.share
     assert image.stats.gaussians_selected == expected.stats.gaussians_selected
@@ -96,7 +96,7 @@ def test_buffers_that_were_too_small_leave_no_trace():
     subject = composed_scene(np.random.default_rng(3))
     renderer = Renderer(subject)
     first, second = (renderer.render(CAMERA, tolerance=0.0) for _ in range(2))
-    assert first.stats.gaussians_in_frustum > 10_000
+    assert first.stats.gaussians_selected > 20_000
     third = renderer.render(CAMERA, tolerance=0.0)
     assert_same_bytes(first, third)
     assert_same_bytes(second, third)
@@ -175,4 +175,5 @@ def test_a_graph_without_room_is_refused():
     renderer = Renderer(composed_scene(np.random.default_rng(10)))
     graph = torch.cuda.CUDAGraph()
     with pytest.raises(RuntimeError, match="draw as much once before"), torch.cuda.graph(graph):
+        torch.zeros(1, device="cuda")  # for torch warns of graphs without work
         renderer.render(CAMERA)

@@ -18,6 +18,8 @@ namespace v3dg {
 
 V3DG_HD inline float sqrt_of(float x) { return ::sqrtf(x); }
 V3DG_HD inline double sqrt_of(double x) { return ::sqrt(x); }
+V3DG_HD inline float abs_of(float x) { return ::fabsf(x); }
+V3DG_HD inline double abs_of(double x) { return ::fabs(x); }
 V3DG_HD inline float round_of(float x) { return ::rintf(x); }
 V3DG_HD inline double round_of(double x) { return ::rint(x); }
 // As many bits as a hair of margin needs, for normal x: relative error below 1e-6.
@@ -244,6 +246,7 @@ V3DG_HD V3DG_INLINE V min_of(V a, V b) {
 // The same number in every lane.
 template <class V>
 V3DG_HD V3DG_INLINE V all_lanes(Lane<V> x) {
+    if constexpr (std::is_arithmetic<V>::value) return x;
     return V{} + x;
 }
 

@@ -92,6 +92,8 @@ void Frame::enlarge(const State& s) {
     const auto grow = [](size_t& capacity, unsigned long long count) {
         if (count > capacity) capacity = static_cast<size_t>(count + count / 8);
     };
+    // What was not projected has no entries yet; most scenes have one or two a gaussian.
+    if (s.counters.gaussians > capacity_.records) grow(capacity_.entries, s.counters.gaussians);
     grow(capacity_.items, s.counters.items);
     grow(capacity_.records, s.counters.gaussians);
     grow(capacity_.large, s.num_large);
@@ -135,14 +137,15 @@ void Frame::enqueue(Drawing& drawing) {
     const ItemList items{room(items_, capacity.items, drawing), &state->counters, capacity.items,
                          capacity.records};
     Record<float>* records = room(records_, capacity.records, drawing);
+    FewTiles* few = room(few_, capacity.records, drawing);
     uint32_t* item_records = room(item_records_, capacity.items, drawing);
+    ItemTiles* item_tiles = room(item_tiles_, capacity.items, drawing);
     LargeRecord* large = room(large_, capacity.large, drawing);
     TileEntry* entries = room(entries_, capacity.entries, drawing);
     TileEntry* scratch = room(scratch_, capacity.entries, drawing);
     const bool keeps_tape = keeps_ == Keeps::tape;
     uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
     const TileBinOutput bins{room(tile_first_, batch.num_tiles + 1, drawing),
-                             room(cursor_, batch.num_tiles, drawing),
                              room(image_of_tile_, batch.num_tiles, drawing), entries};
 
     if (!capturing) check(cudaEventRecord(slot.begun, stream), "cudaEventRecord");
@@ -150,10 +153,9 @@ void Frame::enqueue(Drawing& drawing) {
     drawing.prepare_(items, stream);
     if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
     project({batch.models, batch.packed, batch.placements, batch.images, items},
-            {records, item_records, source, tiles, large, capacity.large}, stream);
-    tile_bin({batch.placements, items.items, item_records, records, batch.images, batch.num_images,
-              batch.num_tiles, capacity.items, capacity.records, capacity.large, capacity.entries, large,
-              tiles, &state->counters},
+            {records, few, item_records, item_tiles, source, tiles, large, capacity.large}, stream);
+    tile_bin({item_tiles, few, records, batch.images, batch.num_images, batch.num_tiles, capacity.items,
+              capacity.records, capacity.large, capacity.entries, large, tiles, &state->counters},
              bins, stream);
     const FrameLists lists{batch.images,
                            bins.image_of_tile,

@@ -25,8 +25,7 @@ struct DeviceRows {
 
 // The same packed: four planes of (N, 4) that hold a PackedGaussian each, and the SH coefficients.
 struct PackedRows {
-    const float* planes;
-    unsigned long long count;
+    const float* plane[4];
     const float* sh;
     int sh_degree;
 };
@@ -79,22 +78,33 @@ constexpr int kEntryRecordBits = 28, kEntryBoxBits = 10;
 constexpr unsigned long long kMostFrameRecords = 1ull << kEntryRecordBits;
 constexpr int kEntryBlockSize = 4;  // px; the box counts in blocks
 
-// The record's depth is at least the camera's near depth; its box meets the tile, which is one of the
-// image's. A step of the key is 5e-7 of the depth; the last one is 32 octaves behind near.
-V3DG_HD inline TileEntry tile_entry(const Record<float>& r, uint32_t record, const FrameImage& image,
-                                    uint32_t tile) {
-    const uint32_t in_image = tile - image.first_tile, columns = static_cast<uint32_t>(image.tile_columns);
-    const int left = static_cast<int>(in_image % columns) * kFrameTileWidth;
-    const int top = static_cast<int>(in_image / columns) * kFrameTileHeight;
-    const uint32_t x0 = static_cast<uint32_t>(max_of(r.x0 - left, 0)) / kEntryBlockSize;
-    const uint32_t x1 = static_cast<uint32_t>(min_of(r.x1 - left, kFrameTileWidth - 1)) / kEntryBlockSize;
-    const uint32_t y0 = static_cast<uint32_t>(max_of(r.y0 - top, 0)) / kEntryBlockSize;
-    const uint32_t y1 = static_cast<uint32_t>(min_of(r.y1 - top, kFrameTileHeight - 1)) / kEntryBlockSize;
+// Depth as entries hold it; it is at least the camera's near depth. A step of the key is 5e-7 of the depth;
+// the last one is 32 octaves behind near.
+V3DG_HD inline uint32_t entry_depth(float depth, float near_depth) {
     uint32_t depth_bits, near_bits;  // of positive floats, so they order as they do
-    std::memcpy(&depth_bits, &r.depth, sizeof depth_bits);
-    std::memcpy(&near_bits, &image.camera.near_depth, sizeof near_bits);
-    const unsigned long long depth_key = min_of((depth_bits - near_bits) >> 2, (1u << 26) - 1);
-    return {(depth_key << kEntryRecordBits | record) << kEntryBoxBits | (x0 | x1 << 3 | y0 << 6 | y1 << 8)};
+    std::memcpy(&depth_bits, &depth, sizeof depth_bits);
+    std::memcpy(&near_bits, &near_depth, sizeof near_bits);
+    return min_of((depth_bits - near_bits) >> 2, (1u << 26) - 1);
+}
+
+// First and last block, in the picture, that a record's pixels lie in.
+struct EntryBox {
+    int x0, x1, y0, y1;
+};
+V3DG_HD inline EntryBox entry_box(const Record<float>& r) {
+    return {r.x0 / kEntryBlockSize, r.x1 / kEntryBlockSize, r.y0 / kEntryBlockSize, r.y1 / kEntryBlockSize};
+}
+
+// In the tile of this column and row of the picture, which the box meets.
+V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const EntryBox& box, int column,
+                                    int row) {
+    constexpr int kColumns = kFrameTileWidth / kEntryBlockSize, kRows = kFrameTileHeight / kEntryBlockSize;
+    const uint32_t x0 = max_of(box.x0 - kColumns * column, 0), y0 = max_of(box.y0 - kRows * row, 0);
+    const uint32_t x1 = min_of(box.x1 - kColumns * column, kColumns - 1);
+    const uint32_t y1 = min_of(box.y1 - kRows * row, kRows - 1);
+    const unsigned long long depth_and_record =
+        static_cast<unsigned long long>(depth) << kEntryRecordBits | record;
+    return {depth_and_record << kEntryBoxBits | (x0 | x1 << 3 | y0 << 6 | y1 << 8)};
 }
 V3DG_HD inline uint32_t record_of(TileEntry e) {
     return static_cast<uint32_t>(e.key >> kEntryBoxBits) & static_cast<uint32_t>(kMostFrameRecords - 1);

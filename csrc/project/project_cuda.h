@@ -16,7 +16,9 @@ struct ProjectInput {
 
 struct ProjectOutput {
     Record<float>* records;
+    FewTiles* few;           // of each record, as TileBinInput has it
     uint32_t* item_records;  // [items] how many of an item's gaussians became records
+    ItemTiles* item_tiles;   // [items]
     uint32_t* source;        // of each record, its gaussian's place in the model; may be null
     TileCounts tiles;
     LargeRecord* large;

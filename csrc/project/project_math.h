@@ -257,8 +257,7 @@ V3DG_HD V3DG_INLINE T sphere_of_image(T reach_px, T inv_z, T slope_x, T slope_y,
 template <class T>
 V3DG_HD V3DG_INLINE bool misses_centers(T center, T half) {
     const T from_center = center - T(0.5);
-    const T off = from_center - round_of(from_center);
-    return (off < 0 ? -off : off) > half * T(1 + 1e-5) + T(2e-3);
+    return abs_of(from_center - round_of(from_center)) > half * T(1 + 1e-5) + T(2e-3);
 }
 
 // Whether what reaches `half` from `center` meets (0, size).

@@ -14,7 +14,8 @@ namespace cuda {
 
 namespace {
 
-constexpr unsigned kPart = 256;  // threads of a block; clusters of a part
+constexpr unsigned kPart = 256;         // threads of cut_kernel; clusters of a part
+constexpr unsigned kPlaceThreads = 64;  // few, so that a few thousand instances spread over the device
 
 }  // namespace
 
@@ -42,7 +43,7 @@ struct SceneOnDevice {
 
 __global__ void place_kernel(SceneOnDevice scene, SelectCamera camera, SelectRule rule, FrameImage image,
                              FrameImage* images, Placement* placements, InstanceCut* cuts, Scratch scratch) {
-    const size_t block = take_ticket(scratch.place_ticket), i = block * kPart + threadIdx.x;
+    const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
     if (i == 0 && images != nullptr) images[0] = image;
     InstanceCut cut;
     unsigned parts = 0;
@@ -73,7 +74,7 @@ __global__ void place_kernel(SceneOnDevice scene, SelectCamera camera, SelectRul
         cut.first_part = before + before_in_block;
         cuts[i] = cut;
     }
-    for (unsigned p = before + threadIdx.x; p < before + total; p += kPart)
+    for (unsigned p = before + threadIdx.x; p < before + total; p += kPlaceThreads)
         scratch.unit_state[p] = scratch.count_state[p] = 0;
     if (block + 1 == gridDim.x && threadIdx.x == 0) *scratch.num_parts = before + total;
 }
@@ -227,7 +228,7 @@ __global__ void cut_kernel(SceneOnDevice scene, SelectRule rule, const InstanceC
 }
 
 // One even for an empty scene, which has a picture, too.
-unsigned place_blocks(size_t num_instances) { return std::max(1u, blocks_for(num_instances, kPart)); }
+unsigned place_blocks(size_t num_instances) { return std::max(1u, blocks_for(num_instances, kPlaceThreads)); }
 
 // Words of Scratch that are cleared: three counters and the states of place_kernel's blocks.
 size_t cleared_words(size_t num_instances) { return 2 + place_blocks(num_instances); }
@@ -288,8 +289,8 @@ void SceneTables::cut(const SelectCamera& camera, const SelectRule& rule, const 
                                {rotation_.data(), 9 * num_instances_},
                                {scale_.data(), num_instances_}}};
     check(cudaMemsetAsync(words, 0, cleared * sizeof *words, stream), "cudaMemsetAsync");
-    launch("place_kernel", place_kernel, place_blocks(num_instances_), kPart, 0, stream, scene, camera, rule,
-           image == nullptr ? FrameImage{} : *image, images, placements, cuts_.data(), scratch);
+    launch("place_kernel", place_kernel, place_blocks(num_instances_), kPlaceThreads, 0, stream, scene,
+           camera, rule, image == nullptr ? FrameImage{} : *image, images, placements, cuts_.data(), scratch);
     const unsigned blocks =
         static_cast<unsigned>(std::max<size_t>(1, std::min<size_t>(most_parts_, 8 * num_multiprocessors())));
     launch("cut_kernel", cut_kernel<Output>, blocks, kPart, 0, stream, scene, rule, cuts_.data(), scratch,

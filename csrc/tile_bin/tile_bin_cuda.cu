@@ -14,59 +14,129 @@ namespace cuda {
 
 namespace {
 
-constexpr unsigned kThreads = 256;
-
-// Calls visit(large record, tile) for the tiles of 32 records, one a lane (`at` >= end: none).
-template <class Visit>
-__device__ void for_each_large_tile(const TileBinInput& in, unsigned long long at, unsigned long long end,
-                                    const Visit& visit) {
-    const unsigned lane = threadIdx.x % 32;
-    LargeRecord mine{0, 0};
-    unsigned rows = 0;
-    if (at < end) {
-        mine = in.large[at];
-        const Record<float>& r = in.records[mine.record];
-        rows = r.y1 / kFrameTileHeight - r.y0 / kFrameTileHeight + 1;
-    }
-    unsigned rows_after = rows;  // of this lane and those before it
-#pragma unroll
-    for (unsigned offset = 1; offset < 32; offset *= 2) {
-        const unsigned below = __shfl_up_sync(kAllLanes, rows_after, offset);
-        if (lane >= offset) rows_after += below;
-    }
-    const unsigned total = __shfl_sync(kAllLanes, rows_after, 31);
-    for (unsigned first = 0; first < total; first += 32) {
-        // The record of row first + lane: the first one that ends after it.
-        const unsigned row = first + lane;
-        int owner = 0;
-#pragma unroll
-        for (int step = 16; step > 0; step /= 2)
-            if (__shfl_sync(kAllLanes, rows_after, owner + step - 1) <= row) owner += step;
-        owner = min(owner, 31);
-        const unsigned row_of_owner =
-            row - (__shfl_sync(kAllLanes, rows_after, owner) - __shfl_sync(kAllLanes, rows, owner));
-        const LargeRecord large{__shfl_sync(kAllLanes, mine.record, owner),
-                                __shfl_sync(kAllLanes, mine.image, owner)};
-        if (row >= total) continue;
-        const TileRun run = tile_run(in.records[large.record], in.images[large.image], row_of_owner);
-        for (uint32_t k = 0; k < run.count; ++k) visit(large, run.first + k);
-    }
-}
+constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
+constexpr unsigned kBlocks = 6;        // on a multiprocessor
+constexpr unsigned kLargeAtOnce = 16;  // records that a warp spreads over its lanes
+constexpr uint32_t kNoItem = ~0u;      // in place of a number of records
 
 __device__ bool is_complete(const TileBinInput& in) {
     return in.counters->items <= in.item_capacity && in.counters->gaussians <= in.record_capacity &&
            *in.counts.num_large <= in.large_capacity;
 }
 
-__global__ void count_large_kernel(TileBinInput in) {
-    if (!is_complete(in)) return;
+// Large records that a warp takes together. Neighbours cover the same tiles, so what they do to the counters
+// of those is summed up in shared memory first, where the tiles that they all lie in are few enough: the
+// window.
+struct LargeBatch {
+    LargeRecord mine;                // of this lane
+    int rows, rows_after;            // of tiles, of this lane and of all up to it
+    int left, top, columns, window;  // tiles of the window; no window when there are none
+};
+constexpr int kMostWindow = 256;
+
+__device__ int warp_min(int x) {
+#pragma unroll
+    for (int offset = 16; offset > 0; offset /= 2) x = min(x, __shfl_xor_sync(kAllLanes, x, offset));
+    return x;
+}
+
+__device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first, unsigned long long end) {
+    const unsigned lane = threadIdx.x % 32;
+    LargeBatch batch{{0, 0}, 0, 0, 0, 0, 0, 0};
+    int left = 1 << 20, top = left, right = -left, bottom = -left;
+    const bool is_mine = lane < kLargeAtOnce && first + lane < end;
+    if (is_mine) {
+        batch.mine = in.large[first + lane];
+        const Record<float>& r = in.records[batch.mine.record];
+        left = r.x0 / kFrameTileWidth;
+        right = r.x1 / kFrameTileWidth;
+        top = r.y0 / kFrameTileHeight;
+        bottom = r.y1 / kFrameTileHeight;
+        batch.rows = bottom - top + 1;
+    }
+    batch.rows_after = batch.rows;
+#pragma unroll
+    for (unsigned offset = 1; offset < kLargeAtOnce; offset *= 2) {
+        const int below = __shfl_up_sync(kAllLanes, batch.rows_after, offset);
+        if (lane >= offset) batch.rows_after += below;
+    }
+    batch.left = warp_min(left);
+    batch.top = warp_min(top);
+    batch.columns = -warp_min(-right) - batch.left + 1;
+    batch.window = batch.columns * (-warp_min(-bottom) - batch.top + 1);
+    const bool same_image = batch.mine.image == __shfl_sync(kAllLanes, batch.mine.image, 0);
+    if (!__all_sync(kAllLanes, same_image || !is_mine) || batch.window > kMostWindow) batch.window = 0;
+    return batch;
+}
+
+// Calls visit(large record, run) for the rows of tiles of a batch, a lane a row.
+template <class Visit>
+__device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, const Visit& visit) {
+    const int lane = threadIdx.x % 32, total = __shfl_sync(kAllLanes, batch.rows_after, kLargeAtOnce - 1);
+    for (int first = 0; first < total; first += 32) {
+        // The record that the lane's row is of: the first to end after it.
+        const int row = min(first + lane, total - 1);
+        int owner = 0;
+#pragma unroll
+        for (int step = kLargeAtOnce / 2; step > 0; step /= 2)
+            if (__shfl_sync(kAllLanes, batch.rows_after, owner + step - 1) <= row) owner += step;
+        const int row_of_owner = row - (__shfl_sync(kAllLanes, batch.rows_after, owner) -
+                                        __shfl_sync(kAllLanes, batch.rows, owner));
+        const LargeRecord large{__shfl_sync(kAllLanes, batch.mine.record, owner),
+                                __shfl_sync(kAllLanes, batch.mine.image, owner)};
+        if (first + lane < total) visit(large, tile_run(in.records[large.record], row_of_owner));
+    }
+}
+
+// Calls visit(batch) for all large records, batch by batch; for whole warps of the grid.
+template <class Visit>
+__device__ void for_each_batch(const TileBinInput& in, const Visit& visit) {
     const unsigned long long end = *in.counts.num_large;
-    const unsigned long long stride = static_cast<unsigned long long>(gridDim.x) * kThreads;
-    for (unsigned long long first = blockIdx.x * kThreads + threadIdx.x / 32 * 32; first < end;
-         first += stride)
-        for_each_large_tile(in, first + threadIdx.x % 32, end, [&](const LargeRecord&, uint32_t tile) {
-            atomicAdd(in.counts.count + tile, 1u);
-        });
+    const unsigned long long stride = static_cast<unsigned long long>(gridDim.x) * kWarps * kLargeAtOnce;
+    for (unsigned long long at = (blockIdx.x * kWarps + threadIdx.x / 32) * kLargeAtOnce; at < end;
+         at += stride)
+        visit(load_batch(in, at, end));
+}
+
+// How often a batch touches each tile of its window.
+__device__ void count_window(const TileBinInput& in, const LargeBatch& batch, uint32_t* count) {
+    for (int t = threadIdx.x % 32; t < batch.window; t += 32) count[t] = 0;
+    __syncwarp();
+    for_each_run(in, batch, [&](const LargeRecord&, const TileRun& run) {
+        uint32_t* row = count + (run.row - batch.top) * batch.columns + (run.first - batch.left);
+        for (int k = 0; k < run.count; ++k) atomicAdd(row + k, 1u);
+    });
+    __syncwarp();
+}
+
+// In the batch, of tile t of the window.
+__device__ uint32_t tile_of_window(const TileBinInput& in, const LargeBatch& batch, int t) {
+    const FrameImage& image = in.images[__shfl_sync(kAllLanes, batch.mine.image, 0)];
+    return image.first_tile + (batch.top + t / batch.columns) * image.tile_columns + batch.left +
+           t % batch.columns;
+}
+
+__global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinInput in) {
+    if (!is_complete(in)) return;
+    __shared__ uint32_t counts[kWarps][kMostWindow];
+    uint32_t* count = counts[threadIdx.x / 32];
+    for_each_batch(in, [&](const LargeBatch& batch) {
+        if (batch.window == 0) {
+            for_each_run(in, batch, [&](const LargeRecord& large, const TileRun& run) {
+                const FrameImage& image = in.images[large.image];
+                uint32_t* to = in.counts.count + image.first_tile + run.row * image.tile_columns + run.first;
+                for (int k = 0; k < run.count; ++k) atomicAdd(to + k, 1u);
+            });
+            return;
+        }
+        count_window(in, batch, count);
+        for (int first = 0; first < batch.window; first += 32) {
+            const int t = first + threadIdx.x % 32;
+            const uint32_t tile = tile_of_window(in, batch, t);
+            if (t < batch.window && count[t] > 0) atomicAdd(in.counts.count + tile, count[t]);
+        }
+        __syncwarp();
+    });
 }
 
 __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
@@ -94,7 +164,7 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     }
     __syncthreads();
     if (tile < in.num_tiles) {
-        out.tile_first[tile] = out.cursor[tile] = before_block + before_in_block;
+        out.tile_first[tile] = before_block + before_in_block;
         out.image_of_tile[tile] = image_of(in, static_cast<uint32_t>(tile));
     }
     if (block + 1 == gridDim.x && threadIdx.x == 0) {
@@ -102,6 +172,44 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
         out.tile_first[in.num_tiles] = entries;
         const bool lacks_large = *in.counts.num_large > in.large_capacity;
         in.counters->entries = lacks_large && entries <= in.entry_capacity ? in.entry_capacity + 1 : entries;
+    }
+}
+
+// Puts entries into their tiles: from the end of a tile's list on, whose count goes down to 0.
+struct Scatter {
+    const unsigned long long* tile_first;
+    uint32_t* left;  // [num_tiles] places
+    TileEntry* entries;
+};
+
+// The lanes' records over few tiles, by a whole warp. Places are asked for two at a time, as each takes a
+// while to come.
+__device__ void scatter_few(const Scatter& to, const ItemTiles& item, uint32_t record, FewTiles few) {
+    const unsigned lane = threadIdx.x % 32;
+    const EntryBox box = box_of(few);
+    TileBox tiles = tile_box(box);
+    if (few == kManyTiles) tiles.count = 0;
+    for (unsigned k = 0; __any_sync(kAllLanes, k < tiles.count); k += 2) {
+        uint32_t tile[2], place[2];
+        unsigned peers[2];
+#pragma unroll
+        for (unsigned j = 0; j < 2; ++j) {
+            tile[j] = k + j < tiles.count
+                          ? item.first_tile + tiles.row(k + j) * item.columns + tiles.column(k + j)
+                          : kNoTile;
+            peers[j] = __match_any_sync(kAllLanes, tile[j]);
+            place[j] = 0;
+            if (tile[j] != kNoTile && lane + 1 == unsigned(__ffs(peers[j])))
+                place[j] = atomicSub(to.left + tile[j], unsigned(__popc(peers[j])));
+        }
+#pragma unroll
+        for (unsigned j = 0; j < 2; ++j) {
+            const uint32_t left = __shfl_sync(kAllLanes, place[j], __ffs(peers[j]) - 1);
+            if (tile[j] == kNoTile) continue;
+            const unsigned before = __popc(peers[j] & ((1u << lane) - 1));
+            to.entries[to.tile_first[tile[j]] + (left - 1 - before)] =
+                tile_entry(depth_of(few), record, box, tiles.column(k + j), tiles.row(k + j));
+        }
     }
 }
 
@@ -117,39 +225,63 @@ __device__ Record<float> end_of_record(const Record<float>* record) {
     return r;
 }
 
-// Blocks take items, a thread a record, and then the records over many tiles.
-__global__ void scatter_kernel(TileBinInput in, TileBinOutput out) {
+// Blocks take items, a thread a record, and then the records over many tiles. An item's table is fetched two
+// items before its turn, its records one.
+__global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput in, TileBinOutput out) {
     if (!is_complete(in) || in.counters->entries > in.entry_capacity) return;
-    const unsigned long long num_items = in.counters->items;
-    for (unsigned long long item = blockIdx.x; item < num_items; item += gridDim.x) {
-        const uint32_t num_records = in.item_records[item];
-        const uint32_t warp_first = threadIdx.x / 32 * 32;
-        if (warp_first >= num_records) continue;
-        const FrameImage& image = in.images[in.placements[in.items[item].placement].image];
-        const uint32_t record = in.items[item].record + threadIdx.x;
-        TileBox box{0, 1, 0, 0};
-        Record<float> r;
-        if (threadIdx.x < num_records) {
-            r = end_of_record(in.records + record);
-            box = tile_box(r, image);
-            if (box.count > kFewTiles) box.count = 0;
-        }
-        for (unsigned k = 0; __any_sync(kAllLanes, k < box.count); ++k) {
-            const uint32_t tile = k < box.count ? box.tile(k) : kNoTile;
-            const unsigned long long place = take_place(out.cursor, tile);
-            if (tile != kNoTile) out.entries[place] = tile_entry(r, record, image, tile);
-        }
+    const Scatter to{out.tile_first, in.counts.count, out.entries};
+    const unsigned num_items = static_cast<unsigned>(in.counters->items);
+    ItemTiles now{0, 0, 0, 0}, next = now;
+    FewTiles few = kManyTiles;
+    if (blockIdx.x < num_items) next = in.items[blockIdx.x];
+    // The first turn is of no item.
+    for (unsigned after = blockIdx.x + gridDim.x, turn = 0; turn == 0 || now.num_records != kNoItem; ++turn) {
+        ItemTiles later{kNoItem, 0, 0, 0};
+        if (after < num_items) later = in.items[after];
+        after += gridDim.x;
+        FewTiles next_few = kManyTiles;
+        if (next.num_records != kNoItem && threadIdx.x < next.num_records)
+            next_few = in.few[next.record + threadIdx.x];
+        scatter_few(to, now, now.record + threadIdx.x, few);
+        now = next;
+        next = later;
+        few = next_few;
     }
-    const unsigned long long num_large = *in.counts.num_large;
-    const unsigned long long stride = static_cast<unsigned long long>(gridDim.x) * kThreads;
-    for (unsigned long long first = blockIdx.x * kThreads + threadIdx.x / 32 * 32; first < num_large;
-         first += stride)
-        for_each_large_tile(
-            in, first + threadIdx.x % 32, num_large, [&](const LargeRecord& large, uint32_t tile) {
-                const unsigned long long place = atomicAdd(out.cursor + tile, 1ull);
-                out.entries[place] =
-                    tile_entry(in.records[large.record], large.record, in.images[large.image], tile);
-            });
+    __shared__ uint32_t counts[kWarps][kMostWindow];
+    __shared__ unsigned long long firsts[kWarps][kMostWindow];
+    uint32_t* count = counts[threadIdx.x / 32];
+    unsigned long long* first_place = firsts[threadIdx.x / 32];
+    for_each_batch(in, [&](const LargeBatch& batch) {
+        if (batch.window > 0) {
+            count_window(in, batch, count);
+            for (int first = 0; first < batch.window; first += 32) {
+                const int t = first + threadIdx.x % 32;
+                const uint32_t tile = tile_of_window(in, batch, t);
+                if (t >= batch.window || count[t] == 0) continue;
+                first_place[t] = to.tile_first[tile] + (atomicSub(to.left + tile, count[t]) - count[t]);
+                count[t] = 0;
+            }
+            __syncwarp();
+        }
+        for_each_run(in, batch, [&](const LargeRecord& large, const TileRun& run) {
+            const Record<float> r = end_of_record(in.records + large.record);
+            const FrameImage& image = in.images[large.image];
+            const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
+            const EntryBox box = entry_box(r);
+            for (int k = 0; k < run.count; ++k) {
+                unsigned long long place;
+                if (batch.window > 0) {
+                    const int t = (run.row - batch.top) * batch.columns + (run.first + k - batch.left);
+                    place = first_place[t] + atomicAdd(count + t, 1u);
+                } else {
+                    const uint32_t tile = image.first_tile + run.row * image.tile_columns + run.first + k;
+                    place = to.tile_first[tile] + (atomicSub(to.left + tile, 1u) - 1);
+                }
+                to.entries[place] = tile_entry(depth, large.record, box, run.first + k, run.row);
+            }
+        });
+        __syncwarp();
+    });
 }
 
 }  // namespace
@@ -158,7 +290,7 @@ size_t tile_bin_parts(size_t num_tiles) { return blocks_for(num_tiles, kThreads)
 
 void tile_bin(const TileBinInput& in, const TileBinOutput& out, cudaStream_t stream) {
     static_assert(kThreads == kItemSize, "a thread a record of an item");
-    const unsigned resident = 8 * num_multiprocessors();
+    const unsigned resident = kBlocks * num_multiprocessors();
     launch("count_large_kernel", count_large_kernel, resident, kThreads, 0, stream, in);
     launch("scan_kernel", scan_kernel, blocks_for(in.num_tiles, kThreads), kThreads, 0, stream, in, out);
     launch("scatter_kernel", scatter_kernel, resident, kThreads, 0, stream, in, out);

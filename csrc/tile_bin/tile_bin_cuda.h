@@ -1,7 +1,7 @@
 #pragma once
 
 #include "base/device.h"
-#include "pipeline/frame_types.h"
+#include "tile_bin/tile_bin_math.h"
 
 namespace v3dg {
 namespace cuda {
@@ -11,9 +11,14 @@ struct LargeRecord {
     uint32_t record, image;
 };
 
+// The records of an item, and the tiles of their picture.
+struct ItemTiles {
+    uint32_t num_records, record, first_tile, columns;
+};
+
 // What project() has found out of the tiles, and scratch of tile_bin(). Cleared before project().
 struct TileCounts {
-    uint32_t* count;  // [num_tiles] of the records over at most kFewTiles
+    uint32_t* count;  // [num_tiles] of the records over at most kFewTiles; zero after tile_bin()
     unsigned long long* num_large;
     unsigned* ticket;
     unsigned long long* state;  // [tile_bin_parts(num_tiles)]
@@ -22,9 +27,8 @@ size_t tile_bin_parts(size_t num_tiles);
 
 // Puts a frame's records into the lists of the tiles that they may touch.
 struct TileBinInput {
-    const Placement* placements;
-    const DrawItem* items;
-    const uint32_t* item_records;  // records that each item has
+    const ItemTiles* items;
+    const FewTiles* few;  // of each record, or kManyTiles where it is in `large`
     const Record<float>* records;
     const FrameImage* images;
     uint32_t num_images, num_tiles;
@@ -34,9 +38,8 @@ struct TileBinInput {
     FrameCounters* counters;  // sets `entries`, past the capacity also where `large` had too little room
 };
 
-// `tile_first` is (num_tiles + 1); `cursor`, scratch, (num_tiles).
 struct TileBinOutput {
-    unsigned long long *tile_first, *cursor;
+    unsigned long long* tile_first;  // [num_tiles + 1]
     uint32_t* image_of_tile;
     TileEntry* entries;
 };
