@@ -104,6 +104,33 @@ def test_degenerate_scene_is_the_references(torch, device, mode, name):
     assert_pictures_agree(draw(device, gaussians, camera, **mode), picture, NEEDLES_FLOAT)
 
 
+CROWDS = {
+    "spread": lambda rng, num: rng.uniform(1, 4, num),
+    "on a plane": lambda rng, num: np.full(num, 2.0),
+    "on three planes": lambda rng, num: rng.integers(1, 4, num),
+    "behind one": lambda rng, num: np.where(np.arange(num) == num // 2, 0.02, rng.uniform(3, 3.001, num)),
+    "before one": lambda rng, num: np.where(np.arange(num) == num // 2, 1e6, rng.uniform(3, 3.001, num)),
+}
+
+
+@pytest.mark.parametrize("opacity", [0.01, 0.8])
+@pytest.mark.parametrize("depths", CROWDS)
+def test_crowded_tiles_are_the_references(device, depths, opacity):
+    camera, num = scenes.camera(36, 18, fx=40.0), 9000
+    rng = np.random.default_rng(30)
+    depth = CROWDS[depths](rng, num)
+    place = rng.uniform(-1, [[37], [19]], (2, num)) - [[18], [9]]
+    gaussians = scenes.gaussians(
+        np.stack([*(place * depth / 40), depth], axis=1),
+        quats=rng.normal(size=(num, 4)),
+        scales=rng.uniform(0.2, 1.5, (num, 3)) * depth[:, None] / 40,
+        opacities=opacity * rng.uniform(0.5, 1, num),
+        color=rng.uniform(0, 1, (num, 3)),
+    )
+    picture = reference.rasterize(gaussians, camera)
+    assert_pictures_agree(draw(device, gaussians, camera), picture, PICTURE_FLOAT)
+
+
 @pytest.mark.parametrize("name", scenes.poison())
 @MODES
 def test_gaussian_without_meaning_is_not_drawn(device, name, mode):

@@ -39,12 +39,16 @@ V3DG_HD inline float rough_sqrt(float x) {
     return ::sqrtf(x);
 #endif
 }
-// The integer nearest to x in [0, 2^21]; ties go either way.
-V3DG_HD inline uint32_t nearest_int(float x) {
+// 2^n of the integer n nearest to x in [0, 31]; ties go either way.
+V3DG_HD inline uint32_t bit_nearest(float x) {
     const float shifted = x + 8388608.0f;  // 2^23: adding it rounds to an integer
     uint32_t bits;
     std::memcpy(&bits, &shifted, sizeof bits);
-    return bits & 0x1fffff;
+#ifdef __CUDA_ARCH__
+    return __funnelshift_l(0u, 1u, bits);  // by the last five bits
+#else
+    return 1u << (bits & 31);
+#endif
 }
 V3DG_HD inline float exp2_in_range(float x) {
 #ifdef __CUDA_ARCH__

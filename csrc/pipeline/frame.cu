@@ -167,7 +167,7 @@ void Frame::enqueue(Drawing& drawing) {
                            &state->counters,
                            capacity.records,
                            capacity.entries,
-                           room(tile_order_, batch.num_tiles, drawing)};
+                           room(plans_, batch.num_tiles, drawing)};
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
     const auto report = [&] {
@@ -196,7 +196,7 @@ FrameTape Frame::tape() const {
                            tile_first_.data(),    entries_.data(),
                            scratch_.data(),       &reinterpret_cast<const State*>(cleared_.data())->counters,
                            capacity_.records,     capacity_.entries,
-                           tile_order_.data()};
+                           plans_.data()};
     return {lists,
             {order_.data(), blended_.data()},
             last_batch_.models,

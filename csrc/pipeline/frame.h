@@ -91,7 +91,7 @@ class Frame {
     DeviceBuffer<LargeRecord> large_;
     DeviceBuffer<TileEntry> entries_, scratch_;
     DeviceBuffer<unsigned long long> tile_first_;
-    DeviceBuffer<uint32_t> tile_order_;
+    DeviceBuffer<TilePlan> plans_;
     DeviceBuffer<unsigned char> cleared_;  // State, states of the scan, counts of the tiles
 
     std::vector<std::unique_ptr<Slot>> slots_;

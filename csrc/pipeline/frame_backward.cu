@@ -39,7 +39,7 @@ void DifferentiableFrame::backward(const PictureGradient<float>& d_picture,
     if (num_slots_ > 0) check(cudaMemsetAsync(is_touched.data(), 0, num_slots_, stream), "cudaMemsetAsync");
     const GradientSlots slots{tape.first_slot, slot.data(), is_touched.data()};
     rasterize_backward({in_.image, tape.lists.records, tape.lists.tile_first, tape.raster.order,
-                        tape.raster.blended, tape.lists.tile_order, d_picture},
+                        tape.raster.blended, tape.lists.plans, d_picture},
                        slots, d_background_of_tile.data(), d_background, stream);
     project_backward({in_.count, tape.item_records, tape.lists.records, tape.source, in_.rows, in_.view,
                       in_.image.camera, in_.filter_px2, in_.compensate},

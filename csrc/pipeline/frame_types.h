@@ -69,8 +69,9 @@ struct ItemList {
     unsigned long long item_capacity, record_capacity;
 };
 
-// A gaussian in the list of a tile, in a word whose order is the order of blending: 26 bits of depth, the 28
-// bits of the record, which break ties, and 10 of where in the tile it is.
+// A gaussian in the list of a tile, in one word: 26 bits of depth, the 28 bits of the record, and 10 of where
+// in the tile it is. Lists are blended by ascending depth, ties by record; entries in one step of the key's
+// depth by the depths of their records, unless a tile has more than a thousand of them.
 struct TileEntry {
     unsigned long long key;
 };
@@ -117,6 +118,13 @@ V3DG_HD inline uint32_t blocks_of(TileEntry e) {
     return columns * (0x01010101u >> (8 * (3 - last)) & 0x01010101u << (8 * below));
 }
 
+// A tile in the order in which tiles are blended, and how its list was spread if that is long.
+struct TilePlan {
+    uint32_t tile, image;
+    uint32_t lowest;  // of the depths that the buckets were made for
+    uint16_t last_bucket, shift;
+};
+
 // Input of the blend stage.
 struct FrameLists {
     const FrameImage* images;
@@ -127,7 +135,7 @@ struct FrameLists {
     TileEntry *entries, *scratch;          // each tile's in any order
     const FrameCounters* counters;
     unsigned long long record_capacity, entry_capacity;  // records: at most kMostFrameRecords
-    uint32_t* tile_order;  // [num_tiles] scratch: the order in which blocks take the tiles; may be null
+    TilePlan* plans;                                     // [num_tiles] scratch
 };
 
 }  // namespace cuda

@@ -234,7 +234,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     const int lane = threadIdx.x % 32;
     const int warp =
         __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32, 0);  // tells that all lanes agree
-    const uint32_t tile = in.tile_order[blockIdx.x];
+    const uint32_t tile = in.plans[blockIdx.x].tile;
     const int tile_column = tile % in.image.tile_columns, tile_row = tile / in.image.tile_columns;
     const int left = tile_column * kFrameTileWidth, top = tile_row * kFrameTileHeight;
     const int warp_left = left + warp % kWarpColumns * kWarpWidth,

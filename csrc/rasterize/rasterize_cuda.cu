@@ -9,6 +9,8 @@
 // finds which pixels one of them reaches, and the bits are transposed: a pixel then walks its own records
 // only.
 
+#include <algorithm>
+
 #include "base/launch.cuh"
 #include "rasterize/rasterize_cuda.h"
 #include "rasterize/rasterize_math.h"
@@ -21,17 +23,18 @@ using Key = unsigned long long;  // of a TileEntry
 
 constexpr int kThreads = 256;
 constexpr int kWarps = kThreads / 32;
-constexpr int kLoads = 4;                          // entries a thread has in flight
-constexpr int kWindow = kLoads * kThreads;         // entries looked at in one go
-constexpr int kPiece = kWindow;                    // entries sorted at once, at most
-constexpr int kLog2Spread = 11;                    // buckets of a list
-constexpr int kLog2Sort = 10;                      // buckets of a piece
-constexpr int kFewEntries = 64;                    // sorted without buckets
-constexpr int kBatch = 256;                        // records blended at once
-constexpr int kMostLevels = 64 / kLog2Spread + 1;  // each takes so many bits of the key
+constexpr int kLoads = 4;                   // entries a thread has in flight
+constexpr int kWindow = kLoads * kThreads;  // entries looked at in one go
+constexpr int kPiece = 3 * kWindow / 2;     // entries sorted at once, at most
+constexpr int kLog2Spread = 11;             // buckets of a list, at most
+constexpr int kLog2Sort = 10;               // buckets of a piece
+constexpr int kFewEntries = 64;             // sorted without buckets
+constexpr int kBatch = 256;                 // records blended at once
+// Each takes some bits of depth or record, at least 4, after the first one, whose range is a guess.
+constexpr int kMostLevels = 1 + 26 / 4 + 28 / 4 + 2;
 
 constexpr uint32_t kNoBucket = ~0u;
-constexpr int kOrderThreads = 1024;
+constexpr int kPlanThreads = 1024;
 
 // The pixels that a warp blends at a time, and how many of them a tile has.
 constexpr int kSubWidth = 8, kSubHeight = 4, kSubColumns = kFrameTileWidth / kSubWidth;
@@ -41,16 +44,30 @@ static_assert(sizeof(Record<float>) == 3 * sizeof(float4), "fetched as whole vec
 static_assert(kSubWidth == 8 && kSubHeight == 4, "the window of reached_pixels");
 static_assert(kEntryBlockSize == kSubHeight && 2 * kEntryBlockSize == kSubWidth, "a sub-tile is two blocks");
 
-// Buckets of equal width in the key, which is logarithmic in depth over octaves and linear within.
+constexpr int kDepthShift = kEntryRecordBits + kEntryBoxBits;
+__device__ uint32_t depth_of(Key key) { return static_cast<uint32_t>(key >> kDepthShift); }
+
+// Buckets of equal width in depth, logarithmic over octaves and linear within, or for equal depths in the
+// record.
 struct Buckets {
-    Key lowest;
+    uint32_t lowest, last;  // `last` is the number of the last bucket
     int shift;
-    __device__ uint32_t of(Key key) const { return static_cast<uint32_t>((key - lowest) >> shift); }
+    bool by_record;
+
+    __device__ uint32_t part_of(Key key) const {
+        return by_record ? record_of(TileEntry{key}) : depth_of(key);
+    }
+    // What lies outside of the range that the buckets were made for belongs to the first and to the last.
+    __device__ uint32_t of(Key key) const { return min((max(part_of(key), lowest) - lowest) >> shift, last); }
+    // The part of a key where a bucket begins; nothing lies before the first.
+    __device__ uint32_t begin_of(uint32_t bucket) const {
+        return bucket == 0 ? 0 : lowest + (bucket << shift);
+    }
 };
 
-__device__ Buckets buckets_over(Key lowest, Key highest, int log2_buckets) {
-    const int bits = 64 - __clzll(static_cast<long long>(highest - lowest));
-    return {lowest, max(bits - log2_buckets, 0)};
+__device__ Buckets buckets_over(uint32_t lowest, uint32_t highest, int log2_buckets, bool by_record) {
+    const int bits = 32 - __clz(static_cast<int>(highest - lowest));
+    return {lowest, (1u << log2_buckets) - 1, max(bits - log2_buckets, 0), by_record};
 }
 
 // Copies 16 bytes from device to shared memory; they are there once the thread has waited.
@@ -68,6 +85,110 @@ __device__ void wait_for_copies() {
 #ifdef __CUDA_ARCH__
     asm volatile("cp.async.commit_group;\n cp.async.wait_group 0;" ::: "memory");
 #endif
+}
+
+// What spreading shares in a block.
+struct SpreadShared {
+    uint32_t bucket[1 << kLog2Spread];
+    uint32_t range[4];
+    uint32_t warp_sum[32];
+};
+
+// Turns counts into the place of each bucket's first.
+template <int kCount, int kBlock>
+__device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
+    constexpr int kEach = kCount / kBlock;
+    const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    uint32_t* own = bucket + kEach * threadIdx.x;
+    uint32_t count[kEach], sum = 0;
+#pragma unroll
+    for (int i = 0; i < kEach; ++i) {
+        count[i] = own[i];
+        sum += count[i];
+    }
+    uint32_t inclusive = sum;
+    for (int offset = 1; offset < 32; offset *= 2) {
+        const uint32_t below = __shfl_up_sync(kAllLanes, inclusive, offset);
+        if (lane >= offset) inclusive += below;
+    }
+    if (lane == 31) warp_sum[warp] = inclusive;
+    __syncthreads();
+    uint32_t first = inclusive - sum;
+    for (int w = 0; w < warp; ++w) first += warp_sum[w];
+#pragma unroll
+    for (int i = 0; i < kEach; ++i) {
+        own[i] = first;
+        first += count[i];
+    }
+    __syncthreads();
+}
+
+// Calls visit(entry) for entries [first, last), a thread's share of them.
+template <int kBlock, class Visit>
+__device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_t last, const Visit& visit) {
+    for (; first < last; first += kLoads * kBlock) {
+        TileEntry entry[kLoads];
+#pragma unroll
+        for (int k = 0; k < kLoads; ++k) {
+            const uint32_t i = first + k * kBlock + threadIdx.x;
+            if (i < last) entry[k] = entries[i];
+        }
+#pragma unroll
+        for (int k = 0; k < kLoads; ++k)
+            if (first + k * kBlock + threadIdx.x < last) visit(entry[k]);
+    }
+}
+
+// Buckets for entries [first, last): for the range of all of them, or of a sample when `roughly`.
+template <int kBlock>
+__device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last, bool roughly,
+                                SpreadShared& s) {
+    if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
+    uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // of depths and records
+    const auto widen = [&](TileEntry e) {
+        const uint32_t part[2] = {depth_of(e.key), record_of(e)};
+        for (int i = 0; i < 2; ++i) {
+            low[i] = min(low[i], part[i]);
+            high[i] = max(high[i], part[i]);
+        }
+    };
+    if (roughly) {
+        // A list that is spread has an entry for each thread.
+        widen(entries[first + static_cast<uint32_t>(static_cast<unsigned long long>(last - first) *
+                                                    threadIdx.x / kBlock)]);
+    } else {
+        for_each_entry<kBlock>(entries, first, last, widen);
+    }
+    __syncthreads();
+    for (int i = 0; i < 2; ++i) {
+        low[i] = __reduce_min_sync(kAllLanes, low[i]);
+        high[i] = __reduce_max_sync(kAllLanes, high[i]);
+        if (threadIdx.x % 32 == 0) {
+            atomicMin(&s.range[2 * i], low[i]);
+            atomicMax(&s.range[2 * i + 1], high[i]);
+        }
+    }
+    __syncthreads();
+    // Some 64 entries a bucket; the fewer, the more of what is written together stays together in the cache.
+    const int log2_buckets = min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Spread);
+    const bool by_record = !roughly && s.range[0] == s.range[1];
+    const uint32_t* range = s.range + (by_record ? 2 : 0);
+    return buckets_over(range[0], range[1], log2_buckets, by_record);
+}
+
+// Spreads entries [first, last) into bucket order, from one place to another.
+template <int kBlock>
+__device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
+                       const Buckets& buckets, SpreadShared& s) {
+    for (int i = threadIdx.x; i < 1 << kLog2Spread; i += kBlock) s.bucket[i] = 0;
+    __syncthreads();
+    for_each_entry<kBlock>(from, first, last,
+                           [&](TileEntry e) { atomicAdd(&s.bucket[buckets.of(e.key)], 1u); });
+    __syncthreads();
+    scan_buckets<1 << kLog2Spread, kBlock>(s.bucket, s.warp_sum);
+    for_each_entry<kBlock>(from, first, last,
+                           [&](TileEntry e) { to[first + atomicAdd(&s.bucket[buckets.of(e.key)], 1u)] = e; });
+    __syncthreads();
 }
 
 // A part [.., end) of the list that lies in bucket order, in the entries or in the scratch.
@@ -93,111 +214,25 @@ struct Pixels {
 struct Shared {
     Key key[kPiece];  // of the piece, in any order
     union {
-        uint32_t bucket[1 << kLog2Spread];
+        SpreadShared spreading;
         struct {
-            uint32_t sort_bucket[1 << kLog2Sort];  // the same place as `bucket`
+            uint32_t bucket[1 << kLog2Sort];
+            uint32_t warp_sum[kWarps];
             uint16_t by_bucket[kPiece];
         };
         float4 record[3][kBatch];
     };
-    uint16_t sorted[kPiece];        // places in `key`
-    uint32_t blocks[kBatch];        // live ones that the batch's records may reach
-    uint16_t list[kWarps][kBatch];  // of the batch, those that may reach the sub-tile of a warp
+    uint16_t sorted[kPiece];       // places in `key`
+    uint32_t blocks[kBatch];       // live ones that the batch's records may reach
+    uint8_t list[kWarps][kBatch];  // of the batch, those that may reach the sub-tile of a warp
     Pixels pixels;
     uint32_t alive_blocks;  // as blocks_of(TileEntry)
-    int next_sub;           // that no warp has taken yet
+    uint32_t reached[2];    // by some record of the batch, in turn
+    uint32_t subs_taken;    // of those reached
     Window window[3];
-    Key lowest, highest;
-    uint32_t warp_sum[kWarps];
+    uint32_t lowest, highest;  // depths of the piece
     Level level[kMostLevels];
 };
-
-// Extremes over the block, barriers included.
-__device__ Buckets buckets_of_block(Key lowest, Key highest, int log2_buckets, Shared& s) {
-    if (threadIdx.x == 0) {
-        s.lowest = ~Key(0);
-        s.highest = 0;
-    }
-    for (int offset = 16; offset > 0; offset /= 2) {
-        const Key low = __shfl_xor_sync(kAllLanes, lowest, offset),
-                  high = __shfl_xor_sync(kAllLanes, highest, offset);
-        lowest = low < lowest ? low : lowest;
-        highest = high > highest ? high : highest;
-    }
-    __syncthreads();
-    if (threadIdx.x % 32 == 0) {
-        atomicMin(&s.lowest, lowest);
-        atomicMax(&s.highest, highest);
-    }
-    __syncthreads();
-    return buckets_over(s.lowest, s.highest, log2_buckets);
-}
-
-// Turns counts into the place of each bucket's first.
-template <int kLog2Buckets>
-__device__ void scan_buckets(Shared& s) {
-    constexpr int kEach = (1 << kLog2Buckets) / kThreads;
-    static_assert(kEach % 4 == 0, "");
-    const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    uint4* own = reinterpret_cast<uint4*>(s.bucket + kEach * threadIdx.x);
-    uint4 count[kEach / 4];
-    uint32_t sum = 0;
-#pragma unroll
-    for (int i = 0; i < kEach / 4; ++i) {
-        count[i] = own[i];
-        sum += count[i].x + count[i].y + count[i].z + count[i].w;
-    }
-    uint32_t inclusive = sum;
-    for (int offset = 1; offset < 32; offset *= 2) {
-        const uint32_t below = __shfl_up_sync(kAllLanes, inclusive, offset);
-        if (lane >= offset) inclusive += below;
-    }
-    if (lane == 31) s.warp_sum[warp] = inclusive;
-    __syncthreads();
-    uint32_t first = inclusive - sum;
-    for (int w = 0; w < warp; ++w) first += s.warp_sum[w];
-#pragma unroll
-    for (int i = 0; i < kEach / 4; ++i) {
-        const uint32_t second = first + count[i].x, third = second + count[i].y, fourth = third + count[i].z;
-        own[i] = {first, second, third, fourth};
-        first = fourth + count[i].w;
-    }
-    __syncthreads();
-}
-
-// Calls visit(entry) for entries [first, last), a thread's share of them.
-template <class Visit>
-__device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_t last, const Visit& visit) {
-    for (; first < last; first += kWindow) {
-        TileEntry entry[kLoads];
-#pragma unroll
-        for (int k = 0; k < kLoads; ++k) {
-            const uint32_t i = first + k * kThreads + threadIdx.x;
-            if (i < last) entry[k] = entries[i];
-        }
-#pragma unroll
-        for (int k = 0; k < kLoads; ++k)
-            if (first + k * kThreads + threadIdx.x < last) visit(entry[k]);
-    }
-}
-
-// Spreads entries [first, last) into bucket order, from one place to another.
-__device__ Buckets spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last, Shared& s) {
-    for (int i = threadIdx.x; i < 1 << kLog2Spread; i += kThreads) s.bucket[i] = 0;
-    Key lowest = ~Key(0), highest = 0;
-    for_each_entry(from, first, last, [&](TileEntry e) {
-        lowest = min(lowest, e.key);
-        highest = max(highest, e.key);
-    });
-    const Buckets buckets = buckets_of_block(lowest, highest, kLog2Spread, s);
-    for_each_entry(from, first, last, [&](TileEntry e) { atomicAdd(&s.bucket[buckets.of(e.key)], 1u); });
-    __syncthreads();
-    scan_buckets<kLog2Spread>(s);
-    for_each_entry(from, first, last,
-                   [&](TileEntry e) { to[first + atomicAdd(&s.bucket[buckets.of(e.key)], 1u)] = e; });
-    __syncthreads();
-    return buckets;
-}
 
 // The end of the bucket that entry `first` is in; the entries up to `last` are in bucket order.
 __device__ uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint32_t last,
@@ -211,65 +246,95 @@ __device__ uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint
     return last;
 }
 
-// Adds those entries of a window to the piece that lie over live pixels; `held` is what it holds. `end`
-// becomes the first entry in bucket `beyond` or a later one.
-__device__ void take_window(const TileEntry* entries, uint32_t first, uint32_t& end, const Buckets& buckets,
-                            uint32_t beyond, uint32_t& held, uint32_t& num_windows, Shared& s) {
+// Adds those entries [first, end) to the piece that lie over live pixels. Takes none from the bucket `beyond`
+// on. Returns where it stopped and how many the piece now holds.
+__device__ uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end, const Buckets& buckets,
+                             uint32_t beyond, uint32_t held, uint32_t window_number, Shared& s) {
     const int lane = threadIdx.x % 32;
-    Window& window = s.window[num_windows++ % 3];
+    Window& window = s.window[window_number % 3];
     TileEntry entry[kLoads];
-    uint32_t live[kLoads], total = 0;
 #pragma unroll
     for (int k = 0; k < kLoads; ++k) {
         const uint32_t i = first + k * kThreads + threadIdx.x;
         if (i < end) entry[k] = entries[i];
     }
-    if (threadIdx.x == 0) s.window[num_windows % 3] = {0, ~0u};
+    if (threadIdx.x == 0) s.window[(window_number + 1) % 3] = {0, ~0u};
     const uint32_t alive_blocks = s.alive_blocks;
+    const bool bounded = beyond != kNoBucket;
+    const uint32_t beyond_begin = buckets.begin_of(beyond);
+    const bool by_record = buckets.by_record;
+    uint32_t live[kLoads], total = 0, lowest = ~0u, highest = 0;
 #pragma unroll
     for (int k = 0; k < kLoads; ++k) {
         const uint32_t i = first + k * kThreads + threadIdx.x;
-        const bool inside = i < end && (beyond == kNoBucket || buckets.of(entry[k].key) < beyond);
-        const uint32_t outside = __ballot_sync(kAllLanes, i < end && !inside);
-        if (outside != 0 && lane == __ffs(outside) - 1) atomicMin(&window.end, i);
-        live[k] = __ballot_sync(kAllLanes, inside && (blocks_of(entry[k]) & alive_blocks) != 0);
+        bool inside = i < end;
+        const uint32_t depth = depth_of(entry[k].key);
+        if (bounded) {
+            const bool is_beyond = inside && (by_record ? record_of(entry[k]) : depth) >= beyond_begin;
+            const uint32_t outside = __ballot_sync(kAllLanes, is_beyond);
+            if (outside != 0 && lane == __ffs(outside) - 1) atomicMin(&window.end, i);
+            inside = inside && !is_beyond;
+        }
+        const bool is_live = inside && (blocks_of(entry[k]) & alive_blocks) != 0;
+        lowest = min(lowest, is_live ? depth : ~0u);
+        highest = max(highest, is_live ? depth : 0u);
+        live[k] = __ballot_sync(kAllLanes, is_live);
         total += __popc(live[k]);
     }
-    uint32_t place = 0;
-    if (lane == 0 && total > 0) place = held + atomicAdd(&window.taken, total);
-    place = __shfl_sync(kAllLanes, place, 0);
+    if (total > 0) {
+        lowest = __reduce_min_sync(kAllLanes, lowest);
+        highest = __reduce_max_sync(kAllLanes, highest);
+        uint32_t place = 0;
+        if (lane == 0) {
+            place = held + atomicAdd(&window.taken, total);
+            atomicMin(&s.lowest, lowest);
+            atomicMax(&s.highest, highest);
+        }
+        place = __shfl_sync(kAllLanes, place, 0);
 #pragma unroll
-    for (int k = 0; k < kLoads; ++k) {
-        if (live[k] >> lane & 1) s.key[place + __popc(live[k] & ((1u << lane) - 1))] = entry[k].key;
-        place += __popc(live[k]);
+        for (int k = 0; k < kLoads; ++k) {
+            if (live[k] >> lane & 1) s.key[place + __popc(live[k] & ((1u << lane) - 1))] = entry[k].key;
+            place += __popc(live[k]);
+        }
     }
     __syncthreads();
-    end = min(end, window.end);
-    held += window.taken;
+    return {min(end, window.end), held + window.taken};
+}
+
+// Whether the first entry is blended before the second, by the depths themselves where the keys' are equal.
+__device__ bool precedes_exactly(Key first, Key second, const Record<float>* records) {
+    const uint32_t a = record_of(TileEntry{first}), b = record_of(TileEntry{second});
+    const float depth_a = records[a].depth, depth_b = records[b].depth;
+    return depth_a != depth_b ? depth_a < depth_b : a < b;
+}
+__device__ bool precedes(Key first, Key second, const Record<float>* records) {
+    if ((first ^ second) >> kDepthShift != 0 || first == second) return first < second;
+    return precedes_exactly(first, second, records);
 }
 
 // Sorts the piece.
-__device__ void sort_piece(uint32_t count, Shared& s) {
-    if (count <= kFewEntries) {
-        if (threadIdx.x < count) {
-            const Key key = s.key[threadIdx.x];
-            uint32_t rank = 0;
-            for (uint32_t i = 0; i < count; ++i) rank += s.key[i] < key;
-            s.sorted[rank] = static_cast<uint16_t>(threadIdx.x);
-        }
-        __syncthreads();
-        return;
+__device__ void sort_piece(const Record<float>* records, uint32_t count, Shared& s) {
+    const Buckets buckets = buckets_over(s.lowest, s.highest, kLog2Sort, false);
+    const bool few = count <= kFewEntries;
+    if (few) {
+        const uint32_t i = threadIdx.x / 2;
+        const Key key = s.key[i < count ? i : 0];
+        uint32_t rank = 0;
+        for (uint32_t j = threadIdx.x % 2; j < count; j += 2) rank += precedes(s.key[j], key, records);
+        rank += __shfl_xor_sync(kAllLanes, rank, 1);
+        if (i < count && threadIdx.x % 2 == 0) s.sorted[rank] = static_cast<uint16_t>(i);
+    } else {
+        for (int i = threadIdx.x; i < 1 << kLog2Sort; i += kThreads) s.bucket[i] = 0;
     }
-    for (int i = threadIdx.x; i < 1 << kLog2Sort; i += kThreads) s.bucket[i] = 0;
-    Key lowest = ~Key(0), highest = 0;
-    for (uint32_t i = threadIdx.x; i < count; i += kThreads) {
-        lowest = min(lowest, s.key[i]);
-        highest = max(highest, s.key[i]);
+    __syncthreads();
+    if (threadIdx.x == 0) {  // for the next piece
+        s.lowest = ~0u;
+        s.highest = 0;
     }
-    const Buckets buckets = buckets_of_block(lowest, highest, kLog2Sort, s);
+    if (few) return;
     for (uint32_t i = threadIdx.x; i < count; i += kThreads) atomicAdd(&s.bucket[buckets.of(s.key[i])], 1u);
     __syncthreads();
-    scan_buckets<kLog2Sort>(s);
+    scan_buckets<1 << kLog2Sort, kThreads>(s.bucket, s.warp_sum);
     for (uint32_t i = threadIdx.x; i < count; i += kThreads)
         s.by_bucket[atomicAdd(&s.bucket[buckets.of(s.key[i])], 1u)] = static_cast<uint16_t>(i);
     __syncthreads();
@@ -280,7 +345,7 @@ __device__ void sort_piece(uint32_t count, Shared& s) {
         const uint32_t bucket = buckets.of(key), last = s.bucket[bucket];
         const uint32_t first = bucket > 0 ? s.bucket[bucket - 1] : 0;
         uint32_t rank = first;
-        for (uint32_t j = first; j < last; ++j) rank += s.key[s.by_bucket[j]] < key;
+        for (uint32_t j = first; j < last; ++j) rank += precedes(s.key[s.by_bucket[j]], key, records);
         s.sorted[rank] = static_cast<uint16_t>(i);
     }
     __syncthreads();
@@ -319,33 +384,20 @@ __device__ uint32_t transpose_bits(uint32_t bits) {
     return bits;
 }
 
-template <bool kWithDepth>
-__device__ void blend_record(const float4 (&record)[3][kBatch], int i, Pixel& p) {
-    const float4 a = record[0][i], b = record[1][i];
-    const Falloff<float> f = falloff_at(p.x, p.y, a.x, a.y, a.z, a.w, b.x, b.y);
-    const float4 c = record[2][i];
-    const float weight = blend_weight(alpha_of(f), p.transmittance);
-    p.color[0] += weight * b.z;
-    p.color[1] += weight * b.w;
-    p.color[2] += weight * c.x;
-    if (kWithDepth) p.depth += weight * c.y;
-}
-
 // A warp blends the batch, of `num_groups` times 32 records, over a sub-tile.
 template <bool kWithDepth>
 __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s) {
     const int lane = threadIdx.x % 32;
-    uint16_t* list = s.list[threadIdx.x / 32];
+    uint8_t* list = s.list[threadIdx.x / 32];
     const uint32_t own_blocks = 3u << blocks_place(sub);
     int listed = 0;
     for (int g = 0; g < num_groups; ++g) {
         const bool reaches = (s.blocks[32 * g + lane] & own_blocks) != 0;
         const uint32_t reaching = __ballot_sync(kAllLanes, reaches);
         if (reaches)
-            list[listed + __popc(reaching & ((1u << lane) - 1))] = static_cast<uint16_t>(32 * g + lane);
+            list[listed + __popc(reaching & ((1u << lane) - 1))] = static_cast<uint8_t>(32 * g + lane);
         listed += __popc(reaching);
     }
-    if (listed == 0) return;
     __syncwarp();
 
     const float corner_x = left + sub % kSubColumns * kSubWidth + 0.5f;
@@ -357,28 +409,42 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s)
     p.transmittance = pixels.transmittance[sub][lane];
     for (int c = 0; c < 3; ++c) p.color[c] = pixels.color[c][sub][lane];
     if (kWithDepth) p.depth = pixels.depth[sub][lane];
+    bool alive = p.alive();
     for (int first = 0; first < listed; first += 32) {
-        const uint16_t* group = list + first;
+        const uint8_t* group = list + first;
         uint32_t bits = 0;
         if (first + lane < listed) {
             const float4 a = s.record[0][group[lane]], b = s.record[1][group[lane]];
             bits = reached_pixels(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
         }
         bits = transpose_bits(bits);
-        for (; bits != 0 && p.alive(); bits &= bits - 1)
-            blend_record<kWithDepth>(s.record, group[__ffs(bits) - 1], p);
+        if (!alive) bits = 0;
+        while (bits != 0) {
+            const int i = group[__ffs(bits) - 1];
+            const float4 a = s.record[0][i], b = s.record[1][i], c = s.record[2][i];
+            const Falloff<float> f = falloff_at(p.x, p.y, a.x, a.y, a.z, a.w, b.x, b.y);
+            float weight;
+            alive = blend_live(alpha_of(f), p.transmittance, weight);
+            p.color[0] += weight * b.z;
+            p.color[1] += weight * b.w;
+            p.color[2] += weight * c.x;
+            if (kWithDepth) p.depth += weight * c.y;
+            bits = alive ? bits & (bits - 1) : 0;
+        }
         __syncwarp();
     }
     pixels.transmittance[sub][lane] = p.transmittance;
     for (int c = 0; c < 3; ++c) pixels.color[c][sub][lane] = p.color[c];
     if (kWithDepth) pixels.depth[sub][lane] = p.depth;
-    publish_alive(p.alive(), sub, s);
+    publish_alive(alive, sub, s);
 }
 
 // Blends the sorted piece.
 template <bool kWithDepth>
 __device__ void blend_piece(const Record<float>* records, uint32_t count, int left, int top, Shared& s) {
+    static_assert(kBatch == 256, "a batch's places are bytes; its parity");
     for (uint32_t first = 0; first < count && s.alive_blocks != 0; first += kBatch) {
+        uint32_t* reached = &s.reached[first / kBatch % 2];
         for (uint32_t i = threadIdx.x; i < kBatch; i += kThreads) {
             uint32_t blocks = 0;
             if (first + i < count) {
@@ -389,28 +455,40 @@ __device__ void blend_piece(const Record<float>* records, uint32_t count, int le
                     for (int k = 0; k < 3; ++k) copy_async(&s.record[k][i], from + k);
             }
             s.blocks[i] = blocks;
+            blocks = __reduce_or_sync(kAllLanes, blocks);
+            if (threadIdx.x % 32 == 0 && blocks != 0) atomicOr(reached, blocks);
         }
-        if (threadIdx.x == 0) s.next_sub = 0;
+        if (threadIdx.x == 0) s.subs_taken = 0;
         wait_for_copies();
-        const uint32_t alive_blocks = s.alive_blocks;
         __syncthreads();
+        if (threadIdx.x == 0) s.reached[(first / kBatch + 1) % 2] = 0;
         const int num_groups = (min(count - first, static_cast<uint32_t>(kBatch)) + 31) / 32;
-        while (true) {
-            int sub = 0;
-            if (threadIdx.x % 32 == 0) sub = atomicAdd(&s.next_sub, 1);
-            sub = __shfl_sync(kAllLanes, sub, 0);
-            if (sub >= kSubs) break;
-            if (alive_blocks >> blocks_place(sub) & 3) blend_sub<kWithDepth>(sub, num_groups, left, top, s);
+        // A bit for each sub-tile that is reached, where the first of its blocks is.
+        uint32_t subs = (*reached | *reached >> 1) & 0x55555555u;
+        uint32_t taken = threadIdx.x / 32;  // the first ones are given, the others to whoever is done
+        for (uint32_t passed = 0;;) {
+            for (; passed < taken; ++passed) subs &= subs - 1;
+            if (subs == 0) break;
+            blend_sub<kWithDepth>((__ffs(subs) - 1) / 2, num_groups, left, top, s);
+            if (threadIdx.x % 32 == 0) taken = kWarps + atomicAdd(&s.subs_taken, 1u);
+            taken = __shfl_sync(kAllLanes, taken, 0);
         }
         __syncthreads();
     }
+    if (threadIdx.x < 2) s.reached[threadIdx.x] = 0;
 }
 
 // Blends the list of a tile. Returns how many of its entries were not dropped.
 template <bool kWithDepth>
 __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries, TileEntry* scratch,
-                               uint32_t count, uint32_t* order, int left, int top, Shared& s) {
+                               uint32_t count, const Buckets& spread_buckets, uint32_t* order, int left,
+                               int top, Shared& s) {
     int depth = 0;  // of levels
+    if (count > kPiece) {
+        if (threadIdx.x == 0) s.level[0] = {count, true, spread_buckets};
+        depth = 1;
+        __syncthreads();
+    }
     uint32_t done = 0, blended = 0, num_windows = 0;
     while (s.alive_blocks != 0) {
         uint32_t held = 0;
@@ -419,32 +497,34 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
             const Level level = depth > 0 ? s.level[depth - 1] : Level{count, false, {}};
             const TileEntry* from = level.in_scratch ? scratch : entries;
             const uint32_t left_over = level.end - done, room = kPiece - held;
-            uint32_t end = level.end;
             if (left_over <= room) {
-                end = done + min(left_over, static_cast<uint32_t>(kWindow));
-                take_window(from, done, end, level.buckets, kNoBucket, held, num_windows, s);
+                const uint32_t end = done + min(left_over, static_cast<uint32_t>(kWindow));
+                const uint2 taken =
+                    take_window(from, done, end, level.buckets, kNoBucket, held, num_windows++, s);
                 done = end;
+                held = taken.y;
                 continue;
             }
-            if (depth > 0) {
-                if (room < kWindow) break;
-                // As many whole buckets as a window holds.
-                const uint32_t beyond = level.buckets.of(from[done + kWindow].key);
-                end = done + kWindow;
-                take_window(from, done, end, level.buckets, beyond, held, num_windows, s);
-                if (end > done) {
-                    done = end;
-                    continue;
-                }
-                end = end_of_bucket(from, done, level.end, level.buckets);
+            if (room < kWindow) break;
+            // As many whole buckets as a window holds.
+            const uint32_t beyond = level.buckets.of(from[done + kWindow].key);
+            const uint2 taken =
+                take_window(from, done, done + kWindow, level.buckets, beyond, held, num_windows++, s);
+            if (taken.x > done) {
+                done = taken.x;
+                held = taken.y;
+                continue;
             }
-            const Buckets buckets = spread(from, level.in_scratch ? entries : scratch, done, end, s);
+            // Not even one does.
+            const uint32_t end = end_of_bucket(from, done, level.end, level.buckets);
+            const Buckets buckets = find_buckets<kThreads>(from, done, end, false, s.spreading);
+            spread<kThreads>(from, level.in_scratch ? entries : scratch, done, end, buckets, s.spreading);
             if (threadIdx.x == 0) s.level[depth] = {end, !level.in_scratch, buckets};
             __syncthreads();
             ++depth;
         }
         if (held == 0) break;
-        sort_piece(held, s);
+        sort_piece(records, held, s);
         if (order != nullptr)
             for (uint32_t i = threadIdx.x; i < held; i += kThreads)
                 order[blended + i] = record_of(TileEntry{s.key[s.sorted[i]]});
@@ -456,7 +536,7 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
 
 template <bool kWithDepth>
 __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint32_t tile,
-                           const FrameImage& image, Shared& s) {
+                           const Buckets& spread_buckets, const FrameImage& image, Shared& s) {
     const int in_image = static_cast<int>(tile - image.first_tile);
     const int left = in_image % image.tile_columns * kFrameTileWidth;
     const int top = in_image / image.tile_columns * kFrameTileHeight;
@@ -471,6 +551,9 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
     if (threadIdx.x == 0) {
         s.alive_blocks = ~0u;
         s.window[0] = {0, ~0u};
+        s.lowest = ~0u;
+        s.highest = 0;
+        s.reached[0] = s.reached[1] = 0;
     }
     __syncthreads();
     for_each_pixel([&](int sub, int x, int y) {
@@ -484,9 +567,9 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
 
     const unsigned long long first = lists.tile_first[tile];
     const uint32_t count = static_cast<uint32_t>(lists.tile_first[tile + 1] - first);
-    const uint32_t blended =
-        blend_list<kWithDepth>(lists.records, lists.entries + first, lists.scratch + first, count,
-                               tape.order == nullptr ? nullptr : tape.order + first, left, top, s);
+    const uint32_t blended = blend_list<kWithDepth>(
+        lists.records, lists.entries + first, lists.scratch + first, count, spread_buckets,
+        tape.order == nullptr ? nullptr : tape.order + first, left, top, s);
     if (tape.blended != nullptr && threadIdx.x == 0) tape.blended[tile] = blended;
 
     for_each_pixel([&](int sub, int x, int y) {
@@ -500,33 +583,44 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
     });
 }
 
-__global__ void __launch_bounds__(kThreads, 5) rasterize_kernel(FrameLists lists, RasterTape tape) {
-    if (lists.counters->gaussians > lists.record_capacity || lists.counters->entries > lists.entry_capacity)
-        return;
-    Shared& s = *reinterpret_cast<Shared*>(shared_memory());
-    const uint32_t tile = lists.tile_order != nullptr ? lists.tile_order[blockIdx.x] : blockIdx.x;
-    const FrameImage& image = lists.images[lists.image_of_tile[tile]];
-    if (image.depth != nullptr)
-        blend_tile<true>(lists, tape, tile, image, s);
-    else
-        blend_tile<false>(lists, tape, tile, image, s);
+__device__ bool is_complete(const FrameLists& lists) {
+    return lists.counters->gaussians <= lists.record_capacity &&
+           lists.counters->entries <= lists.entry_capacity;
+}
+__device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
+    return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
 }
 
-// Lists the tiles by falling load, so that no block is left with a long list at the end. Loads of one class,
-// half an octave wide, follow in any order.
-__global__ void __launch_bounds__(kOrderThreads) order_tiles_kernel(FrameLists lists) {
+// Plans the tiles by falling load, so that no block is left with a long list at the end. Loads of one class,
+// half an octave wide, follow in any order; kPiece begins one.
+__global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists) {
     constexpr int kClasses = 64;
     __shared__ uint32_t place[kClasses];
+    if (!is_complete(lists)) return;
     const auto class_of = [&](uint32_t tile) {
-        const uint32_t count = static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
+        const uint32_t count = count_of(lists, tile);
         if (count < 2) return kClasses - 1 - static_cast<int>(count);
         const int octave = 31 - __clz(static_cast<int>(count));
         return kClasses - 1 - 2 * octave - static_cast<int>(count >> (octave - 1) & 1);
     };
+    // Calls visit(tile, its class) for a thread's share of the tiles, some of whose loads are under way
+    // together.
+    const auto for_each_tile = [&](const auto& visit) {
+        constexpr int kTogether = 4;
+        for (uint32_t first = threadIdx.x; first < lists.num_tiles; first += kTogether * kPlanThreads) {
+            int tile_class[kTogether];
+#pragma unroll
+            for (int k = 0; k < kTogether; ++k)
+                tile_class[k] = class_of(min(first + k * kPlanThreads, lists.num_tiles - 1));
+#pragma unroll
+            for (int k = 0; k < kTogether; ++k)
+                if (first + k * kPlanThreads < lists.num_tiles)
+                    visit(first + k * kPlanThreads, tile_class[k]);
+        }
+    };
     if (threadIdx.x < kClasses) place[threadIdx.x] = 0;
     __syncthreads();
-    for (uint32_t t = threadIdx.x; t < lists.num_tiles; t += kOrderThreads)
-        atomicAdd(&place[class_of(t)], 1u);
+    for_each_tile([&](uint32_t, int tile_class) { atomicAdd(&place[tile_class], 1u); });
     __syncthreads();
     if (threadIdx.x == 0) {
         uint32_t first = 0;
@@ -537,15 +631,52 @@ __global__ void __launch_bounds__(kOrderThreads) order_tiles_kernel(FrameLists l
         }
     }
     __syncthreads();
-    for (uint32_t t = threadIdx.x; t < lists.num_tiles; t += kOrderThreads)
-        lists.tile_order[atomicAdd(&place[class_of(t)], 1u)] = t;
+    for_each_tile([&](uint32_t tile, int tile_class) {
+        TilePlan& plan = lists.plans[atomicAdd(&place[tile_class], 1u)];
+        plan.tile = tile;
+        plan.image = lists.image_of_tile[tile];
+    });
+}
+
+// Spreads the long lists, a block one after another.
+__global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists lists) {
+    __shared__ SpreadShared s;
+    if (!is_complete(lists)) return;
+    for (uint32_t i = blockIdx.x; i < lists.num_tiles; i += gridDim.x) {
+        TilePlan& plan = lists.plans[i];
+        const uint32_t count = count_of(lists, plan.tile);
+        if (count < kPiece) return;  // and so are all that follow
+        if (count == kPiece) continue;
+        const unsigned long long first = lists.tile_first[plan.tile];
+        const Buckets buckets = find_buckets<kPlanThreads>(lists.entries + first, 0, count, true, s);
+        spread<kPlanThreads>(lists.entries + first, lists.scratch + first, 0, count, buckets, s);
+        if (threadIdx.x == 0) {
+            plan.lowest = buckets.lowest;
+            plan.last_bucket = static_cast<uint16_t>(buckets.last);
+            plan.shift = static_cast<uint16_t>(buckets.shift);
+        }
+    }
+}
+
+__global__ void __launch_bounds__(kThreads, 5) rasterize_kernel(FrameLists lists, RasterTape tape) {
+    if (!is_complete(lists)) return;
+    Shared& s = *reinterpret_cast<Shared*>(shared_memory());
+    const TilePlan plan = lists.plans[blockIdx.x];
+    const Buckets buckets{plan.lowest, plan.last_bucket, plan.shift, false};
+    const FrameImage& image = lists.images[plan.image];
+    if (image.depth != nullptr)
+        blend_tile<true>(lists, tape, plan.tile, buckets, image, s);
+    else
+        blend_tile<false>(lists, tape, plan.tile, buckets, image, s);
 }
 
 }  // namespace
 
 void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t stream) {
-    if (lists.tile_order != nullptr && lists.num_tiles > 0)
-        launch("order_tiles_kernel", order_tiles_kernel, 1, kOrderThreads, 0, stream, lists);
+    if (lists.num_tiles == 0) return;
+    launch("plan_kernel", plan_kernel, 1, kPlanThreads, 0, stream, lists);
+    launch("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles), kPlanThreads,
+           0, stream, lists);
     launch("rasterize_kernel", rasterize_kernel, lists.num_tiles, kThreads, sizeof(Shared), stream, lists,
            tape == nullptr ? RasterTape{} : *tape);
 }

@@ -8,10 +8,10 @@ namespace cuda {
 
 // What the way back needs of the blend; every pointer is on the device.
 struct RasterTape {
-    // As long as the entries, each tile's at its tile_first: its records in the order they were blended.
+    // As long as the entries, each tile's at its tile_first: its records in the order they were blended,
+    // without those that could change no pixel.
     uint32_t* order;
-    // [num_tiles] How many entries of `order` were written: all, or those up to a place where no pixel of the
-    // tile could change any more.
+    // [num_tiles] How many entries of `order` were written.
     uint32_t* blended;
 };
 

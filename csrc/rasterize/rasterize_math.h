@@ -141,6 +141,15 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
+// The same for a single pixel that has not stopped; returns whether it goes on.
+V3DG_HD inline bool blend_live(float alpha, float& t, float& weight) {
+    const float next = t * (1 - alpha);
+    const bool goes_on = next > static_cast<float>(kMinTransmittance);
+    weight = goes_on ? alpha * t : 0.0f;
+    t = goes_on ? next : -t;
+    return goes_on;
+}
+
 // The pixels of an 8 x 4 window that a gaussian may reach, a bit each, row by row; (u, v) is its centre from
 // that of the first pixel. Some more, so that the blend step alone decides.
 V3DG_HD inline uint32_t reached_pixels(float u, float v, float l11, float l12, float l22,
@@ -156,7 +165,7 @@ V3DG_HD inline uint32_t reached_pixels(float u, float v, float l11, float l12, f
         const float half = rough_sqrt(max_of(reach - t * t, 0.0f)) * wider;
         const float first = min_of(max_of(slope * y + (first_u - half), 0.0f), 8.0f);
         const float end = min_of(max_of(slope * y + (end_u + half), first), 8.0f);
-        pixels += ((1u << nearest_int(end)) - (1u << nearest_int(first))) << (8 * row);
+        pixels += (bit_nearest(end) - bit_nearest(first)) << (8 * row);
     }
     return pixels;
 }
