@@ -34,7 +34,7 @@ constexpr int kBatch = 256;                 // records blended at once
 constexpr int kMostLevels = 1 + 26 / 4 + 28 / 4 + 2;
 
 constexpr uint32_t kNoBucket = ~0u;
-constexpr int kPlanThreads = 1024;
+constexpr int kPlanThreads = 1024;  // of the kernels before the blend
 
 // The pixels that a warp blends at a time, and how many of them a tile has.
 constexpr int kSubWidth = 8, kSubHeight = 4, kSubColumns = kFrameTileWidth / kSubWidth;
@@ -301,15 +301,14 @@ __device__ uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t 
     return {min(end, window.end), held + window.taken};
 }
 
-// Whether the first entry is blended before the second, by the depths themselves where the keys' are equal.
-__device__ bool precedes_exactly(Key first, Key second, const Record<float>* records) {
+// Whether the first entry is blended before the second: where the depths of the keys are equal, the records'
+// own decide.
+__device__ bool precedes(Key first, Key second, const Record<float>* records) {
+    if ((first ^ second) >> kDepthShift != 0) return first < second;
     const uint32_t a = record_of(TileEntry{first}), b = record_of(TileEntry{second});
+    if (a == b) return false;
     const float depth_a = records[a].depth, depth_b = records[b].depth;
     return depth_a != depth_b ? depth_a < depth_b : a < b;
-}
-__device__ bool precedes(Key first, Key second, const Record<float>* records) {
-    if ((first ^ second) >> kDepthShift != 0 || first == second) return first < second;
-    return precedes_exactly(first, second, records);
 }
 
 // Sorts the piece.
@@ -359,7 +358,6 @@ struct Pixel {
     float transmittance;
     float color[3];
     float depth;
-    __device__ bool alive() const { return transmittance > 0; }
 };
 
 // Tells the block which blocks of a sub-tile have died.
@@ -409,7 +407,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s)
     p.transmittance = pixels.transmittance[sub][lane];
     for (int c = 0; c < 3; ++c) p.color[c] = pixels.color[c][sub][lane];
     if (kWithDepth) p.depth = pixels.depth[sub][lane];
-    bool alive = p.alive();
+    bool alive = p.transmittance > 0;
     for (int first = 0; first < listed; first += 32) {
         const uint8_t* group = list + first;
         uint32_t bits = 0;
@@ -442,7 +440,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s)
 // Blends the sorted piece.
 template <bool kWithDepth>
 __device__ void blend_piece(const Record<float>* records, uint32_t count, int left, int top, Shared& s) {
-    static_assert(kBatch == 256, "a batch's places are bytes; its parity");
+    static_assert(kBatch <= 256, "places in a batch are bytes");
     for (uint32_t first = 0; first < count && s.alive_blocks != 0; first += kBatch) {
         uint32_t* reached = &s.reached[first / kBatch % 2];
         for (uint32_t i = threadIdx.x; i < kBatch; i += kThreads) {
