@@ -5,14 +5,16 @@
 // each cell has its own slot, and slots are added up in a fixed order; threads carry that on to the
 // parameters, and Adam moves them. So every run has the same result, whatever order blocks and warps come in.
 //
-// Small groups are fitted by one block each, which keeps what is read again and again in shared memory. Large
-// groups lie in global memory, and are fitted by teams where there are fewer groups than multiprocessors.
+// Small groups keep what is read again and again in shared memory. A block fits one or, where there are few,
+// a pair of blocks, each looking at every other view. Large groups lie in global memory, and are fitted by
+// teams where there are fewer groups than multiprocessors.
 
 #include "fit_group/fit_group_cuda.h"
 
 #include <algorithm>
 #include <cfloat>
 #include <cstddef>
+#include <stdexcept>
 #include <type_traits>
 
 #include "base/launch.cuh"
@@ -51,12 +53,11 @@ struct Place {
 struct Layout {
     // Shared for small groups, in the scratch for large ones.
     size_t records, sorted, keys, mask, slot_first, order, lists, errors;
-    size_t list_size;  // bytes, of a half-warp
-    size_t fragments;  // shared
+    size_t list_size;          // bytes, of a half-warp
+    size_t fragments, staged;  // shared
     // Wherever there is room.
-    Place kept_transmittance, value, m, v, by_view, sum, sort_keys, sums, near_slots;
-    size_t kept_size;        // bytes, of a warp
-    size_t far_slots, maps;  // scratch
+    Place value, m, v, by_view, sum, sort_keys, sums, near_slots;
+    size_t far_slots, maps, exchange;  // scratch
     uint32_t num_near_slots, num_far_slots;
     size_t shared_bytes;   // of a block
     size_t scratch_bytes;  // of a team
@@ -67,24 +68,30 @@ V3DG_HD constexpr size_t fragments_bytes(int chunk) {
 }
 
 struct Cameras {
+    FitStep step;  // that these views are part of
     ModelView<float> view[kViewsAtOnce];
     Pinhole<float> camera[kViewsAtOnce];
     const float4* target[kViewsAtOnce];
 };
 
-// What the blocks of a team share beside arrays.
+constexpr int kBetweenGroups = 2;
+
+// What the blocks that fit a group share beside arrays.
 struct Team {
     unsigned arrived;  // at barriers, ever
     unsigned unit, ticket;
-    int cancel;
+    int cancel[kBetweenGroups + 1];    // noted in turns of steps, and between groups
     uint32_t num_slots[kLargestTeam];  // of each block's part
+    double error[kViewsAtOnce][2][2];  // of each block's views, before and after
 };
 
 struct Shared {
     Cameras cameras[2];  // of this step and the next
-    Team team;           // of one block
+    Team own;            // of a block for itself
     uint32_t warp_total[32];
+    FitJob job;
     unsigned arrival;
+    int cancel;
 };
 
 enum class Pass { measure, draw, train };
@@ -92,8 +99,7 @@ enum class Pass { measure, draw, train };
 // 0, 1, 2, ... to the middle of [0, size), then alternately before and behind it.
 __device__ inline int from_middle(int k, int size) { return size / 2 + (k % 2 ? -(k + 1) / 2 : k / 2); }
 
-// A small group's team is one block. The walk back keeps how a chunk of kChunk gaussians was blended; what
-// came before the last chunk is blended again.
+// On the way back pixels and gaussians meet in chunks of kChunk gaussians of a list.
 template <int kThreads, bool kSmall, int kChunk>
 struct Fit {
     using Index = std::conditional_t<kSmall, uint16_t, uint32_t>;
@@ -102,30 +108,39 @@ struct Fit {
     const FitGroupsInput& in;
     const Layout& layout;
     Shared& s;
-    Team& team;
+    Team& all;   // the blocks that fit the group: of a small one those that share its views
+    Team& team;  // those that look at the same views: a block of a small group has its own
     const unsigned team_rank, team_size;
+    const unsigned view_rank, view_stride;  // the views of a batch that the block looks at
     unsigned char* const scratch;
+    unsigned char* const exchange;  // of small groups: gradients by view, where blocks share the views
     unsigned char* const hot;
     // The group.
-    FitJob job{};
+    const FitJob& job;
     uint32_t n = 0, n_padded = 0;
     int num_sh = 0;
     uint32_t num_values = 0;
     int regions_across = 1;
 
-    __device__ Fit(const FitGroupsInput& input, const Layout& l, Shared& shared, Team& the_team,
-                   unsigned rank, unsigned size, unsigned char* of_team)
+    __device__ Fit(const FitGroupsInput& input, const Layout& l, Shared& shared, Team* teams,
+                   unsigned num_blocks, unsigned char* all_scratch)
         : in(input),
           layout(l),
           s(shared),
-          team(the_team),
-          team_rank(kSmall ? 0 : rank),
-          team_size(kSmall ? 1 : size),
-          scratch(of_team),
-          hot(kSmall ? shared_memory() : scratch) {}
+          all(teams[s.arrival / num_blocks]),
+          team(kSmall ? s.own : all),
+          team_rank(kSmall ? 0 : s.arrival % num_blocks),
+          team_size(kSmall ? 1 : num_blocks),
+          view_rank(kSmall ? s.arrival % num_blocks : 0),
+          view_stride(kSmall ? num_blocks : 1),
+          scratch(all_scratch + (kSmall ? s.arrival : s.arrival / num_blocks) * l.scratch_bytes),
+          exchange(all_scratch + (s.arrival - view_rank) * l.scratch_bytes + l.exchange),
+          hot(kSmall ? shared_memory() : scratch),
+          job(s.job) {}
 
     __device__ void take(const FitJob& next) {
-        job = next;
+        if (threadIdx.x == 0) s.job = next;
+        __syncthreads();
         n = static_cast<uint32_t>(job.group.count);
         n_padded = (n + 31) / 32 * 32;
         num_sh = 3 * num_sh_bases(in.rows.sh_degree);
@@ -136,22 +151,45 @@ struct Fit {
     // ---- the team
 
     __device__ bool leads() const { return threadIdx.x == 0 && team_rank == 0; }
+    __device__ bool leads_all() const { return leads() && view_rank == 0; }
     // The team's threads, neighbouring warps in different blocks.
     __device__ uint32_t first() const {
         return (threadIdx.x / 32 * team_size + team_rank) * 32 + threadIdx.x % 32;
     }
     __device__ uint32_t stride() const { return kThreads * team_size; }
 
-    // A barrier of the whole team.
+    __device__ unsigned num_blocks() const { return team_size * view_stride; }
+
+    // A barrier of those that look at the same views.
     __device__ void sync() const {
+        if (team_size > 1)
+            meet(-1);
+        else
+            __syncthreads();
+    }
+
+    // A barrier of all blocks that fit the group. They learn alike whether the fit was cancelled: `note` is
+    // written before the barrier, and again no sooner than all have come to another.
+    __device__ void sync_all(int note) const {
+        if (num_blocks() > 1)
+            meet(note);
+        else
+            __syncthreads();
+    }
+    __device__ void look_for_cancel(int note) const {
+        int& cancel = num_blocks() > 1 ? all.cancel[note] : s.cancel;
+        cancel = *static_cast<volatile int*>(&in.signals->cancel);
+    }
+
+    __device__ void meet(int note) const {
         __syncthreads();
-        if (kSmall || team_size == 1) return;
         if (threadIdx.x == 0) {
             __threadfence();
-            const unsigned all = (atomicAdd(&team.arrived, 1u) / team_size + 1) * team_size;
-            while (*static_cast<volatile unsigned*>(&team.arrived) < all) {
+            const unsigned goal = (atomicAdd(&all.arrived, 1u) / num_blocks() + 1) * num_blocks();
+            while (*static_cast<volatile unsigned*>(&all.arrived) < goal) {
             }
             __threadfence();
+            if (note >= 0) s.cancel = *static_cast<volatile int*>(&all.cancel[note]);
         }
         __syncthreads();
     }
@@ -186,17 +224,25 @@ struct Fit {
     __device__ Index* list(int half) const {
         return hot_at<Index>(layout.lists + (2 * warp() + half) * layout.list_size);
     }
-    __device__ float* kept_transmittance() const {
-        return at(layout.kept_transmittance) + warp() * (layout.kept_size / sizeof(float));
-    }
-    // [gaussian][pixel]: alpha and weight, then gradient by the exponent and weight. The spare column keeps
-    // lanes that read one pixel each of their own gaussian out of each other's banks.
+    // What a pixel gives to a gaussian, [gaussian][pixel]: gradient by the exponent, and weight. The spare
+    // column keeps lanes that read one pixel each of their own gaussian out of each other's banks.
     __device__ float2* fragments() const {
         return reinterpret_cast<float2*>(shared_memory() + layout.fragments +
                                          threadIdx.x / 32 * fragments_bytes(kChunk));
     }
     __device__ float4* d_pixels() const { return reinterpret_cast<float4*>(fragments() + kChunk * 33); }
+    // Of a large group, the records of a chunk, for each half-warp.
+    __device__ Record<float>* staged() const {
+        return reinterpret_cast<Record<float>*>(shared_memory() + layout.staged) +
+               2 * kChunk * (threadIdx.x / 32);
+    }
     __device__ int num_regions() const { return regions_across * regions_across; }
+    // By the values, from view b of a batch. Blocks that share views write those of one batch while others
+    // may still read those of the one before.
+    __device__ float* gradient(int turn, int b) const {
+        if (view_stride == 1) return at(layout.by_view) + static_cast<size_t>(b) * num_values;
+        return reinterpret_cast<float*>(exchange) + static_cast<size_t>(turn * kViewsAtOnce + b) * num_values;
+    }
 
     // ---- parameters: means, quaternions, log scales and logits, a plane each; then SH coefficients,
     // gaussian by gaussian
@@ -367,32 +413,48 @@ struct Fit {
     }
 
     __device__ void rank_by_counting(int num_views) const {
-        for (uint32_t j = first(); j < num_views * n_padded; j += stride()) {
-            const uint32_t begin = j / n_padded * n_padded, i = j - begin, warp_first = i - threadIdx.x % 32;
-            const uint4* all = reinterpret_cast<const uint4*>(keys() + begin);
-            const uint32_t key = keys()[j];
-            uint32_t rank = 0;
-            // Keys come before at the same depth where their place does: in all runs of 32 before this
-            // warp's, in none behind.
-            const auto count = [&](uint32_t from, uint32_t to, const auto& before) {
-                for (uint32_t run = from; run < to; run += 32) {
-                    uint4 other[8];
-#pragma unroll
-                    for (int q = 0; q < 8; ++q) other[q] = all[run / 4 + q];
-#pragma unroll
-                    for (int q = 0; q < 8; ++q) {
-                        const uint32_t k = run + 4 * q;
-                        rank += before(other[q].x, k) + before(other[q].y, k + 1);
-                        rank += before(other[q].z, k + 2) + before(other[q].w, k + 3);
-                    }
-                }
-            };
-            count(0, warp_first, [&](uint32_t other, uint32_t) { return other <= key; });
-            count(warp_first, warp_first + 32,
-                  [&](uint32_t other, uint32_t k) { return other < key + (k < i); });
-            count(warp_first + 32, n_padded, [&](uint32_t other, uint32_t) { return other < key; });
-            order()[begin + rank] = static_cast<Index>(j);
+        if (kSmall) {
+            for (uint32_t j = first(); j < num_views * n_padded; j += stride())
+                rank(keys() + j / n_padded * n_padded, j / n_padded * n_padded, j % n_padded);
+            return;
         }
+        // Keys are read again and again: from shared memory, if they fit where fragments will be.
+        auto* copy = reinterpret_cast<uint32_t*>(shared_memory() + layout.fragments);
+        const bool fits = n_padded * sizeof(uint32_t) <= kWarps * fragments_bytes(kChunk);
+        for (int b = 0; b < num_views; ++b) {
+            const uint32_t begin = b * n_padded;
+            __syncthreads();
+            for (uint32_t i = threadIdx.x; fits && i < n_padded; i += kThreads) copy[i] = keys()[begin + i];
+            __syncthreads();
+            for (uint32_t i = first(); i < n_padded; i += stride())
+                rank(fits ? copy : keys() + begin, begin, i);
+        }
+    }
+
+    // Puts gaussian `i` of the view whose keys these are into its position.
+    __device__ void rank(const uint32_t* view_keys, uint32_t begin, uint32_t i) const {
+        const uint4* all = reinterpret_cast<const uint4*>(view_keys);
+        const uint32_t key = view_keys[i], warp_first = i - threadIdx.x % 32;
+        uint32_t rank = 0;
+        // Keys come before at the same depth where their place does: in all runs of 32 before this
+        // warp's, in none behind.
+        const auto count = [&](uint32_t from, uint32_t to, const auto& before) {
+            for (uint32_t run = from; run < to; run += 32) {
+                uint4 other[8];
+#pragma unroll
+                for (int q = 0; q < 8; ++q) other[q] = all[run / 4 + q];
+#pragma unroll
+                for (int q = 0; q < 8; ++q) {
+                    const uint32_t k = run + 4 * q;
+                    rank += before(other[q].x, k) + before(other[q].y, k + 1);
+                    rank += before(other[q].z, k + 2) + before(other[q].w, k + 3);
+                }
+            }
+        };
+        count(0, warp_first, [&](uint32_t other, uint32_t) { return other <= key; });
+        count(warp_first, warp_first + 32, [&](uint32_t other, uint32_t k) { return other < key + (k < i); });
+        count(warp_first + 32, n_padded, [&](uint32_t other, uint32_t) { return other < key; });
+        order()[begin + rank] = static_cast<Index>(begin + i);
     }
 
     __device__ void sort_bitonic(int b) const {
@@ -496,8 +558,6 @@ struct Fit {
     struct List {
         const Index* entry;
         uint32_t length, filled;
-
-        __device__ Entries at(uint32_t i) const { return *reinterpret_cast<const Entries*>(entry + i); }
     };
 
     // Of view b; `cell` is the left one's bit.
@@ -538,39 +598,55 @@ struct Fit {
         return {own, length, filled};
     }
 
-    // Parts of a record, in as few loads as they take.
-    static __device__ float4 ellipse_of(const Record<float>& r) {
-        return *reinterpret_cast<const float4*>(&r.u);
-    }
-    static __device__ float3 color_of(const Record<float>& r) {
-        const float2 red_green = *reinterpret_cast<const float2*>(r.color);
-        return make_float3(red_green.x, red_green.y, r.color[2]);
+    // Large groups: brings part of both half-warps' lists into shared memory.
+    __device__ void stage(uint32_t begin, uint32_t end) const {
+        if (kSmall) return;
+        __syncwarp();
+        for (uint32_t i = threadIdx.x % 32; i < 2 * kChunk; i += 32) {
+            const uint32_t entry = begin + i % kChunk;
+            if (entry >= end) continue;
+            const auto* from = reinterpret_cast<const float4*>(ranked() + list(i / kChunk)[entry]);
+            auto* to = reinterpret_cast<float4*>(staged() + i);
+            for (int k = 0; k < 3; ++k) to[k] = from[k];
+        }
+        __syncwarp();
     }
 
-    // Blends kAtOnce gaussians of the list over the pixel.
-    template <class Blended>
-    __device__ void blend(const Pixel& p, const Entries& entries, float& transmittance,
-                          const Blended& blended) const {
-        float alpha[kAtOnce], weight[kAtOnce];
+    // kAtOnce records of a half-warp's list, from entry i on; `begin` is that of the chunk.
+    struct Records {
+        const Record<float>* record[kAtOnce];
+    };
+    __device__ Records records_at(const List& list, uint32_t i, uint32_t begin) const {
+        Records out;
+        if (kSmall) {
+            const Entries entries = *reinterpret_cast<const Entries*>(list.entry + i);
+#pragma unroll
+            for (int q = 0; q < kAtOnce; ++q) out.record[q] = ranked() + entries.record[q];
+        } else {
+            const Record<float>* first = staged() + threadIdx.x % 32 / kCellPixels * kChunk + (i - begin);
+#pragma unroll
+            for (int q = 0; q < kAtOnce; ++q) out.record[q] = first + q;
+        }
+        return out;
+    }
+
+    // What kAtOnce gaussians give to a pixel, one behind the other.
+    struct Blended {
+        float alpha[kAtOnce], before[kAtOnce], weight[kAtOnce];
         float3 color[kAtOnce];
+    };
+    __device__ Blended blend(const Pixel& p, const Records& records, float& transmittance) const {
+        Blended out;
 #pragma unroll
         for (int q = 0; q < kAtOnce; ++q) {
-            const Record<float>& r = ranked()[entries.record[q]];
-            const float4 e = ellipse_of(r), f = *reinterpret_cast<const float4*>(&r.l22);
-            color[q] = make_float3(f.z, f.w, r.color[2]);
-            alpha[q] = alpha_of(falloff_at(p.center_x, p.center_y, e.x, e.y, e.z, e.w, f.x, f.y));
+            const Record<float>& r = *records.record[q];
+            const float4 a = *reinterpret_cast<const float4*>(&r.u);
+            const float4 b = *reinterpret_cast<const float4*>(&r.l22);
+            out.alpha[q] = alpha_of(falloff_at(p.center_x, p.center_y, a.x, a.y, a.z, a.w, b.x, b.y));
+            out.color[q] = make_float3(b.z, b.w, r.color[2]);
         }
-        blend_weights(alpha, transmittance, weight);
-#pragma unroll
-        for (int q = 0; q < kAtOnce; ++q) blended(q, color[q], alpha[q], weight[q]);
-    }
-
-    // The first chunk of a list is what is left over.
-    __device__ static uint32_t chunk_end(uint32_t chunk, uint32_t filled) {
-        return (filled - 1) % kChunk + 1 + chunk * kChunk;
-    }
-    __device__ static uint32_t chunk_begin(uint32_t chunk, uint32_t filled) {
-        return chunk == 0 ? 0 : chunk_end(chunk - 1, filled);
+        blend_weights(out.alpha, transmittance, out.before, out.weight);
+        return out;
     }
 
     // Where a pass reads and writes.
@@ -598,23 +674,20 @@ struct Fit {
         const List list = make_lists(b, region, left_cell);
         if (kPass == Pass::train && list.filled == 0) return;
 
-        float2* const mine = fragments() + lane;  // this pixel's
-        float* const kept = kept_transmittance() + lane;
         float color[3] = {0, 0, 0}, transmittance = p.inside ? 1 : -1;
-        uint32_t done = 0, num_chunks = 0;
-        while (done < list.filled && __any_sync(kAllLanes, transmittance > 0)) {
-            const uint32_t begin = done, end = chunk_end(num_chunks, list.filled);
-            if (kPass == Pass::train) kept[32 * num_chunks] = transmittance;
-            ++num_chunks;
-            for (; done < end; done += kAtOnce)
-                blend(p, list.at(done), transmittance,
-                      [&](int q, const float3& rgb, float alpha, float weight) {
-                          color[0] += weight * rgb.x;
-                          color[1] += weight * rgb.y;
-                          color[2] += weight * rgb.z;
-                          if (kPass == Pass::train)
-                              mine[(done - begin + q) * 33] = make_float2(alpha, weight);
-                      });
+        for (uint32_t begin = 0; begin < list.filled && __any_sync(kAllLanes, transmittance > 0);
+             begin += kChunk) {
+            stage(begin, list.filled);
+            const uint32_t end = min(list.filled, begin + kChunk);
+            for (uint32_t i = begin; i < end; i += kAtOnce) {
+                const Blended blended = blend(p, records_at(list, i, begin), transmittance);
+#pragma unroll
+                for (int q = 0; q < kAtOnce; ++q) {
+                    color[0] += blended.weight[q] * blended.color[q].x;
+                    color[1] += blended.weight[q] * blended.color[q].y;
+                    color[2] += blended.weight[q] * blended.color[q].z;
+                }
+            }
         }
         if (kPass == Pass::draw) {
             if (p.inside)
@@ -647,55 +720,52 @@ struct Fit {
         }
         d_pixels()[lane] = make_float4(d[0], d[1], d[2], 0);
 
-        // Back to front, a chunk at a time; the last is still there.
+        // The same walk again, on the same numbers, now that it is known what all gaussians give together.
         const auto slot_of = [&](uint32_t j) {
             const uint32_t slot =
                 slot_first(region)[j] + __popcll(mask(region)[j] & ((CellMask(1) << cell) - 1));
             return targets.slots + kSums * static_cast<size_t>(slot - targets.slot_base);
         };
-        float behind = 0;
-        for (uint32_t chunk = num_chunks; chunk-- > 0;) {
-            const uint32_t begin = chunk_begin(chunk, list.filled), end = chunk_end(chunk, list.filled);
-            if (chunk + 1 < num_chunks) {
-                transmittance = kept[32 * chunk];
-                for (uint32_t i = begin; i < end; i += kAtOnce)
-                    blend(p, list.at(i), transmittance, [&](int q, const float3&, float alpha, float weight) {
-                        mine[(i - begin + q) * 33] = make_float2(alpha, weight);
-                    });
-            }
-            for (uint32_t i = end; i > begin;) {
-                i -= kAtOnce;
-                const Entries entries = list.at(i);
-                float2 blended[kAtOnce];
-                float by_weight[kAtOnce];
+        float2* const mine = fragments() + lane;  // this pixel's
+        float behind =
+            d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] * (1 - fabsf(transmittance));
+        transmittance = p.inside ? 1 : -1;
+        uint32_t begin = 0;
+        for (; begin < list.filled && __any_sync(kAllLanes, transmittance > 0); begin += kChunk) {
+            stage(begin, list.filled);
+            const uint32_t end = min(list.filled, begin + kChunk);
+            for (uint32_t i = begin; i < end; i += kAtOnce) {
+                const Blended blended = blend(p, records_at(list, i, begin), transmittance);
 #pragma unroll
                 for (int q = 0; q < kAtOnce; ++q) {
-                    const float3 rgb = color_of(ranked()[entries.record[q]]);
-                    blended[q] = mine[(i - begin + q) * 33];
-                    by_weight[q] = d[0] * rgb.x + d[1] * rgb.y + d[2] * rgb.z + d[3];
+                    const float3& rgb = blended.color[q];
+                    const float by_weight = d[0] * rgb.x + d[1] * rgb.y + d[2] * rgb.z + d[3];
+                    behind -= blended.weight[q] * by_weight;
+                    mine[(i - begin + q) * 33] =
+                        make_float2(exponent_vjp(blended.alpha[q], blended.before[q], blended.weight[q],
+                                                 by_weight, behind),
+                                    blended.weight[q]);
                 }
-#pragma unroll
-                for (int q = kAtOnce - 1; q >= 0; --q)
-                    mine[(i - begin + q) * 33].x =
-                        exponent_vjp_from_behind(blended[q].x, blended[q].y, by_weight[q], behind);
             }
             __syncwarp();
-            for (uint32_t i = lane % kCellPixels; i < end - begin; i += kCellPixels)
-                if (begin + i < list.length)
-                    add_up(p, i, list.entry[begin + i], slot_of(list.entry[begin + i]));
+            for (uint32_t i = lane % kCellPixels; i < end - begin; i += kCellPixels) {
+                if (begin + i >= list.length) continue;
+                const uint32_t j = list.entry[begin + i];
+                add_up(p, i, kSmall ? ranked()[j] : staged()[lane / kCellPixels * kChunk + i], slot_of(j));
+            }
             __syncwarp();
         }
         // Nothing was left to blend for the rest.
-        for (uint32_t i = done + lane % kCellPixels; i < list.length; i += kCellPixels) {
+        for (uint32_t i = begin + lane % kCellPixels; i < list.length; i += kCellPixels) {
             float* slot = slot_of(list.entry[i]);
             for (int k = 0; k < kSums; ++k) slot[k] = 0;
         }
     }
 
-    // Sums over the half-warp's cell, for record j, which is gaussian `i` of the chunk.
-    __device__ void add_up(const Pixel& p, uint32_t i, uint32_t j, float* slot) const {
-        const float4 e = ellipse_of(ranked()[j]);
-        const float l22 = ranked()[j].l22;
+    // Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk.
+    __device__ void add_up(const Pixel& p, uint32_t i, const Record<float>& r, float* slot) const {
+        const float4 e = *reinterpret_cast<const float4*>(&r.u);
+        const float l22 = r.l22;
         const uint32_t half = threadIdx.x % 32 / kCellPixels;
         const float2* shares = fragments() + 33 * i + half * kCellPixels;
         const float4* d_colors = d_pixels() + half * kCellPixels;
@@ -854,13 +924,13 @@ struct Fit {
     }
 
     // From the sums of records to gradients of the parameters, for each view.
-    __device__ void project_backward(const Cameras& cameras, int num_views) const {
+    __device__ void project_backward(const Cameras& cameras, int num_views, int turn) const {
         const float* sums = at(layout.sums);
         const float* value = at(layout.value);
         for (uint32_t j = first(); j < num_views * n_padded; j += stride()) {
             const uint32_t b = j / n_padded, place = kSmall ? j : order()[j], i = place - b * n_padded;
             if (i >= n) continue;
-            float* out = at(layout.by_view) + static_cast<size_t>(b) * num_values;
+            float* out = gradient(turn, view_rank + b);
             float* d_sh = out + 11 * n + num_sh * i;
             if (keys()[place] == kHiddenKey) {
                 for (int k = 0; k < 11; ++k) out[k * n + i] = 0;
@@ -894,17 +964,15 @@ struct Fit {
     }
 
     // Adds the views' gradients to those of the step so far; Adam follows the last.
-    __device__ void move(int num_views, bool is_first, bool is_last, int index) const {
+    __device__ void move(const FitStep& step, int num_views, int turn, bool is_first, bool is_last) const {
         float *value = at(layout.value), *m = at(layout.m), *v = at(layout.v), *sum = at(layout.sum);
-        const float* by_view = at(layout.by_view);
-        const FitStep step = in.steps[index];
         const float position = position_step(in.config, job.group, step);
 #pragma unroll 2
         for (uint32_t k = first(); k < num_values; k += stride()) {
-            float gradient = is_first ? 0 : sum[k];
-            for (int b = 0; b < num_views; ++b) gradient += by_view[b * num_values + k];
+            float sum_of_views = is_first ? 0 : sum[k];
+            for (int b = 0; b < num_views; ++b) sum_of_views += gradient(turn, b)[k];
             if (!is_last) {
-                sum[k] = gradient;
+                sum[k] = sum_of_views;
                 continue;
             }
             float size = step.sh0;
@@ -918,7 +986,8 @@ struct Fit {
                 size = step.logit;
             else if (num_sh > 3 && (k - 11 * n) % num_sh >= 3)
                 size = step.sh_rest;
-            value[k] = adam_step(value[k], gradient, m[k], v[k], size, step.correction1, step.correction2);
+            value[k] =
+                adam_step(value[k], sum_of_views, m[k], v[k], size, step.correction1, step.correction2);
         }
     }
 
@@ -938,7 +1007,7 @@ struct Fit {
     }
 
     // Leaves the gradients of the parameters, for each view.
-    __device__ void differentiate(const Cameras& cameras, int num_views) const {
+    __device__ void differentiate(const Cameras& cameras, int num_views, int turn) const {
         Targets targets{};
         if (in.config.loss.dssim > 0) {
             const size_t planes = static_cast<size_t>(3 * kViewsAtOnce) * job.size * job.size;
@@ -971,8 +1040,7 @@ struct Fit {
             sync();
             region = last;
         }
-        project_backward(cameras, num_views);
-        sync();
+        project_backward(cameras, num_views, turn);
     }
 
     // The residual's views, those of all steps, and the residual's again, in batches of at most kViewsAtOnce.
@@ -987,10 +1055,16 @@ struct Fit {
                                                       : num_visits + num_residual - visit;
             return static_cast<int>(min(static_cast<int64_t>(kViewsAtOnce), left));
         };
+        // Of the views of a batch, this block's.
+        const auto own_of = [&](int num_views) {
+            return view_stride == 1 ? num_views : static_cast<int>(view_rank) < num_views ? 1 : 0;
+        };
         const auto look_from = [&](Cameras& cameras, int64_t first) {
             const int b = static_cast<int>(threadIdx.x) - (kThreads - 32);  // the warp with least to do
-            if (b < 0 || b >= views_at(first)) return;
-            const int64_t visit = first + b;
+            if (b == kViewsAtOnce && first >= 0 && first < num_visits)
+                cameras.step = in.steps[first / views_per_step];
+            if (b < 0 || b >= own_of(views_at(first))) return;
+            const int64_t visit = first + view_rank + b;
             uint64_t picture;
             if (visit >= 0 && visit < num_visits) {
                 picture = visited_view(config, in.stride, visit);
@@ -1008,29 +1082,41 @@ struct Fit {
         int turn = 0;
         for (int64_t visit = -num_residual; visit < num_visits + num_residual; turn ^= 1) {
             const int num_views = views_at(visit);
+            const int num_own = own_of(num_views);
             const Cameras& cameras = s.cameras[turn];
-            project(cameras, num_views);
+            project(cameras, num_own);
             sync();
-            sort(num_views);
+            sort(num_own);
             sync();
             if (!kSmall) {
-                arrange(num_views);
+                arrange(num_own);
                 sync();
             }
             look_from(s.cameras[turn ^ 1], visit + num_views);
             if (visit < 0 || visit >= num_visits) {
-                measure(cameras, num_views, error[visit >= 0]);
+                measure(cameras, num_own, error[visit >= 0]);
             } else {
                 const int index = static_cast<int>(visit / views_per_step),
                           within = static_cast<int>(visit % views_per_step);
-                if (leads() && within == 0 && index % kStepsPerPoll == 0)
-                    team.cancel = *static_cast<volatile int*>(&in.signals->cancel);
-                differentiate(cameras, num_views);
-                if (team.cancel) return;
-                move(num_views, within == 0, within + num_views == views_per_step, index);
+                if (leads_all() && within == 0 && index % kStepsPerPoll == 0) look_for_cancel(turn);
+                differentiate(cameras, num_own, turn);
+                sync_all(turn);
+                if (s.cancel) return;
+                move(cameras.step, num_views, turn, within == 0, within + num_views == views_per_step);
             }
             sync();
             visit += num_views;
+        }
+        if (view_stride > 1) {
+            if (threadIdx.x == 0)
+                for (int e = 0; e < 4; ++e) all.error[view_rank][e / 2][e % 2] = error[e / 2][e % 2];
+            meet(-1);
+            for (int e = 0; e < 4; ++e) {
+                error[e / 2][e % 2] = 0;
+                for (unsigned rank = 0; rank < view_stride; ++rank)
+                    error[e / 2][e % 2] += all.error[rank][e / 2][e % 2];
+            }
+            if (view_rank > 0) return;
         }
         const double num_pixels = static_cast<double>(job.size) * job.size * num_residual;
         for (auto& e : error) {
@@ -1054,27 +1140,25 @@ struct Queue {
 template <int kThreads, int kBlocks, bool kSmall, int kChunk>
 __global__ void __launch_bounds__(kThreads, kBlocks)
     fit_groups_kernel(const FitGroupsInput in, const Layout layout, unsigned char* scratch,
-                      unsigned team_size, Team* teams, Queue* queue) {
+                      unsigned num_blocks, Team* teams, Queue* queue) {
     __shared__ Shared s;
-    // Teams form as blocks arrive, so a block only ever waits for blocks that run or will.
+    // Blocks are put together as they arrive, so that they only wait for blocks that run or will.
     if (threadIdx.x == 0) s.arrival = atomicAdd(&queue->arrived, 1u);
     __syncthreads();
-    const unsigned t = s.arrival / team_size;
-    Team& team = kSmall ? s.team : teams[t];
-    Fit<kThreads, kSmall, kChunk> fit(in, layout, s, team, s.arrival % team_size, team_size,
-                                      scratch + t * layout.scratch_bytes);
+    Fit<kThreads, kSmall, kChunk> fit(in, layout, s, teams, num_blocks, scratch);
     for (;;) {
-        if (fit.leads()) {
-            team.ticket = atomicAdd(&queue->next, 1u);
-            team.cancel = *static_cast<volatile int*>(&in.signals->cancel);
+        if (fit.leads_all()) {
+            fit.all.ticket = atomicAdd(&queue->next, 1u);
+            fit.look_for_cancel(kBetweenGroups);
         }
-        fit.sync();
-        if (team.ticket >= in.jobs.size || team.cancel) return;
-        fit.take(in.jobs.data[team.ticket]);
+        fit.sync_all(kBetweenGroups);
+        const unsigned ticket = *static_cast<volatile unsigned*>(&fit.all.ticket);
+        if (ticket >= in.jobs.size || s.cancel) return;
+        fit.take(in.jobs.data[ticket]);
         fit.fit();
-        if (team.cancel) return;
+        if (s.cancel) return;
         fit.sync();
-        if (!fit.leads()) continue;
+        if (!fit.leads_all()) continue;
         const float* error = in.error + 2 * fit.job.error;
         const double loss[2] = {error[0], error[1]};
         const auto share =
@@ -1102,7 +1186,7 @@ struct Arena {
 
 // For groups of at most `most` gaussians and pictures of at most `largest` pixels a side.
 template <int kThreads, bool kSmall, int kChunk>
-Layout layout_of(const FitGroupsInput& in, uint32_t most, int largest, unsigned team_size,
+Layout layout_of(const FitGroupsInput& in, uint32_t most, int largest, size_t num_blocks,
                  size_t shared_limit) {
     Layout l{};
     Arena arena{shared_limit};
@@ -1111,7 +1195,8 @@ Layout layout_of(const FitGroupsInput& in, uint32_t most, int largest, unsigned 
         const bool fits = kSmall && arena.shared + Arena::rounded(bytes) <= shared_limit;
         return Place{fits ? arena.in_shared(bytes) : arena.in_scratch(bytes), fits};
     };
-    const size_t warps = kThreads / 32 * team_size, fragments = kThreads / 32 * fragments_bytes(kChunk);
+    const size_t warps = kThreads / 32 * (kSmall ? 1 : num_blocks),
+                 fragments = kThreads / 32 * fragments_bytes(kChunk);
     const size_t padded = (most + 31) / 32 * 32, places = kViewsAtOnce * padded;
     const size_t values = most * (11 + 3 * static_cast<size_t>(num_sh_bases(in.rows.sh_degree)));
     const size_t regions_across = (largest + kRegion - 1) / kRegion,
@@ -1128,11 +1213,15 @@ Layout layout_of(const FitGroupsInput& in, uint32_t most, int largest, unsigned 
     l.lists = hot(2 * warps * l.list_size);
     l.errors = hot(kViewsAtOnce * (cells + largest) * sizeof(float2));
     l.fragments = arena.in_shared(fragments);
+    if (!kSmall) l.staged = arena.in_shared(kThreads / 32 * 2 * kChunk * sizeof(Record<float>));
     // Fragments are done with when gradients come, and not begun when keys are sorted.
     const auto over_fragments = [&](size_t bytes) {
-        return team_size == 1 && bytes <= fragments ? Place{l.fragments, true} : anywhere(bytes);
+        return num_blocks == 1 && bytes <= fragments ? Place{l.fragments, true} : anywhere(bytes);
     };
-    l.by_view = over_fragments(kViewsAtOnce * values * sizeof(float));
+    if (kSmall && num_blocks > 1)
+        l.exchange = arena.in_scratch(2 * kViewsAtOnce * values * sizeof(float));
+    else
+        l.by_view = over_fragments(kViewsAtOnce * values * sizeof(float));
     if (!kSmall) {
         size_t size = 32;
         while (size < most) size *= 2;
@@ -1144,8 +1233,6 @@ Layout layout_of(const FitGroupsInput& in, uint32_t most, int largest, unsigned 
     l.value = anywhere(values * sizeof(float));
     l.m = anywhere(values * sizeof(float));
     l.v = anywhere(values * sizeof(float));
-    l.kept_size = (padded / kChunk + 1) * 32 * sizeof(float);
-    l.kept_transmittance = anywhere(warps * l.kept_size);
     l.sum = {arena.in_scratch(values * sizeof(float)), false};
     // At least what one region can take.
     l.num_far_slots = static_cast<uint32_t>(places * kRegionCells * kRegionCells);
@@ -1153,7 +1240,7 @@ Layout layout_of(const FitGroupsInput& in, uint32_t most, int largest, unsigned 
     if (in.config.loss.dssim > 0)
         l.maps =
             arena.in_scratch(10 * 3 * kViewsAtOnce * static_cast<size_t>(largest) * largest * sizeof(float));
-    if (kSmall) {
+    if (kSmall && arena.shared < shared_limit) {
         // The rest of the shared memory takes slots.
         l.num_near_slots = static_cast<uint32_t>((shared_limit - arena.shared) / (kSums * sizeof(float)));
         l.near_slots = {arena.in_shared(l.num_near_slots * kSums * sizeof(float)), true};
@@ -1170,29 +1257,34 @@ int attribute(cudaDeviceAttr name) {
     return value;
 }
 
+// Returns whether kBlocks blocks fit on a multiprocessor; nothing happens where they do not.
 template <int kThreads, int kBlocks, bool kSmall, int kChunk>
-void run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream) {
+bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream) {
     const size_t reserved = sizeof(Shared) + 1024;  // ours, and the driver's own of each block
     const size_t limit =
         (std::min<size_t>(attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - sizeof(Shared),
                           attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / kBlocks - reserved)) /
         16 * 16;
     const size_t most_blocks = kBlocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
-    size_t team_size = 1;
-    // Teams need blocks that run at the same time.
-    if (!kSmall && attribute(cudaDevAttrCooperativeLaunch) != 0)
-        team_size = std::clamp<size_t>(most_blocks / in.jobs.size, 1, kLargestTeam);
-    const size_t num_teams = std::min<size_t>(in.jobs.size, most_blocks / team_size);
-    const Layout layout =
-        layout_of<kThreads, kSmall, kChunk>(in, most, largest, static_cast<unsigned>(team_size), limit);
-    const DeviceBuffer<unsigned char> scratch(num_teams * layout.scratch_bytes, stream);
-    const DeviceBuffer<Team> teams(num_teams, stream);
+    // For a group. Together they need to run at the same time.
+    size_t num_blocks = 1;
+    if (attribute(cudaDevAttrCooperativeLaunch) != 0)
+        num_blocks =
+            std::clamp<size_t>(most_blocks / in.jobs.size, 1,
+                               kSmall ? std::min(in.config.views_per_step, kViewsAtOnce) : kLargestTeam);
+    const size_t num_groups = std::min<size_t>(in.jobs.size, most_blocks / num_blocks);
+    const Layout layout = layout_of<kThreads, kSmall, kChunk>(in, most, largest, num_blocks, limit);
+    if (layout.shared_bytes > limit) return false;
+    const DeviceBuffer<unsigned char> scratch(num_groups * (kSmall ? num_blocks : 1) * layout.scratch_bytes,
+                                              stream);
+    const DeviceBuffer<Team> teams(num_groups, stream);
     const DeviceBuffer<Queue> queue(1, stream);
-    check(cudaMemsetAsync(teams.data(), 0, num_teams * sizeof(Team), stream), "cudaMemsetAsync");
+    check(cudaMemsetAsync(teams.data(), 0, num_groups * sizeof(Team), stream), "cudaMemsetAsync");
     check(cudaMemsetAsync(queue.data(), 0, sizeof(Queue), stream), "cudaMemsetAsync");
     launch("fit_groups_kernel", fit_groups_kernel<kThreads, kBlocks, kSmall, kChunk>,
-           static_cast<unsigned>(num_teams * team_size), kThreads, layout.shared_bytes, stream, in, layout,
-           scratch.data(), static_cast<unsigned>(team_size), teams.data(), queue.data());
+           static_cast<unsigned>(num_groups * num_blocks), kThreads, layout.shared_bytes, stream, in, layout,
+           scratch.data(), static_cast<unsigned>(num_blocks), teams.data(), queue.data());
+    return true;
 }
 
 }  // namespace
@@ -1204,12 +1296,15 @@ void fit_groups(const FitGroupsInput& in, Span<const FitJob> jobs, cudaStream_t 
         most = std::max(most, static_cast<uint32_t>(job.group.count));
         largest = std::max(largest, job.size);
     }
-    if (most > kSmallCount || largest > kRegion)
-        run<512, 1, false, 32>(in, most, largest, stream);
-    else if (jobs.size > static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount)))
-        run<256, 3, true, 16>(in, most, largest, stream);
-    else
-        run<512, 1, true, 16>(in, most, largest, stream);
+    const bool is_small = most <= kSmallCount && largest <= kRegion;
+    const bool are_many = jobs.size > static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
+    // Where multiprocessors have less shared memory, with fewer threads.
+    const bool runs = is_small ? (are_many && run<256, 2, true, 16>(in, most, largest, stream)) ||
+                                     run<512, 1, true, 16>(in, most, largest, stream) ||
+                                     run<256, 1, true, 16>(in, most, largest, stream)
+                               : run<512, 1, false, 32>(in, most, largest, stream) ||
+                                     run<256, 1, false, 16>(in, most, largest, stream);
+    if (!runs) throw std::runtime_error("cuda: expected 96 KiB of shared memory in a block, got less");
 }
 
 }  // namespace cuda

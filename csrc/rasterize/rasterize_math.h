@@ -82,21 +82,24 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t) {
     return weight;
 }
 
-// The same for several gaussians, one behind the other, and sets the alphas of those that were not blended to
-// 0. Most pixels do not stop among them, which the product of all tells.
+// The same for several gaussians, one behind the other; `before` is the transmittance at each. Most pixels do
+// not stop among them, which the product of all tells.
 template <int kCount, class T>
-V3DG_HD V3DG_INLINE void blend_weights(T (&alpha)[kCount], T& t, T (&weight)[kCount]) {
-    T before[kCount + 1];
-    before[0] = t;
-    for (int i = 0; i < kCount; ++i) before[i + 1] = before[i] * (1 - alpha[i]);
-    if (before[kCount] > T(kMinTransmittance)) {
-        for (int i = 0; i < kCount; ++i) weight[i] = alpha[i] * before[i];
-        t = before[kCount];
+V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&before)[kCount],
+                                       T (&weight)[kCount]) {
+    T next = t;
+    for (int i = 0; i < kCount; ++i) {
+        before[i] = next;
+        weight[i] = alpha[i] * next;
+        next = next * (1 - alpha[i]);
+    }
+    if (next > T(kMinTransmittance)) {
+        t = next;
         return;
     }
     for (int i = 0; i < kCount; ++i) {
+        before[i] = t;
         weight[i] = t > 0 ? blend_weight(alpha[i], t) : T(0);
-        if (!(weight[i] > 0)) alpha[i] = 0;
     }
 }
 
@@ -109,15 +112,6 @@ V3DG_HD V3DG_INLINE V exponent_vjp(V alpha, V before, V weight, V by_weight, V b
     const V d_alpha = before * by_weight - quotient_of(behind, 1 - alpha);
     const auto moves = (weight > V{}) & (alpha < all_lanes<V>(Lane<V>(kMaxAlpha)));
     return moves ? Lane<V>(kLn2) * alpha * d_alpha : V{};
-}
-
-// The same for a walk from back to front, without the division. `behind` is what the gaussians behind give,
-// seen through nothing else; this one is put in front of them. Pass an alpha of 0 where it was not blended.
-template <class V>
-V3DG_HD V3DG_INLINE V exponent_vjp_from_behind(V alpha, V weight, V by_weight, V& behind) {
-    const V difference = by_weight - behind;
-    behind = behind + alpha * difference;
-    return alpha < all_lanes<V>(Lane<V>(kMaxAlpha)) ? Lane<V>(kLn2) * weight * difference : V{};
 }
 
 // Sums over pixels of the gradients by what the exponent is made of.
