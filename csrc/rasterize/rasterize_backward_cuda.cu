@@ -24,7 +24,7 @@ constexpr int kBatch = 192;  // entries
 constexpr int kPairs = 768;  // (entry, warp) pairs of a batch
 constexpr int kHeld = 8;     // gaussians whose sums a warp makes at once
 constexpr int kValues = sizeof(RecordGradient<float>) / sizeof(float);
-static_assert(kHeld * kWarpHeight == 32, "a lane sums one row of one gaussian");
+static_assert(kHeld * kWarpHeight == 32 && kWarpHeight == 4, "a lane sums one row of one gaussian");
 constexpr int kTogether = 2;  // gaussians blended without a branch between them
 static_assert(kPairs >= kWarps, "one entry fits");
 static_assert(kBatch <= 255 && kBatch % 32 == 0 && kHeld % kTogether == 0, "");
@@ -34,6 +34,8 @@ struct Share {
     float d_exponent, weight;
 };
 constexpr int kShareStride = 33;  // of the pixels of a gaussian; odd, against bank conflicts
+constexpr int kRowsStride = 40;   // of the sums of a value over rows of pixels; the same
+static_assert(kRowsStride * kValues * sizeof(float) <= kHeld * kShareStride * sizeof(Share), "");
 
 // What is needed of a batch's entries until their pairs are added up.
 struct Batch {
@@ -55,6 +57,8 @@ struct Shared {
     float pair[kPairs][kValues];
     float d_background[kWarps][3];
 };
+
+static_assert(sizeof(Shared) <= 99 * 1024, "the most that a block can have on every device");
 
 // Parts of the tile, one bit a warp, that the record may reach.
 __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
@@ -142,24 +146,22 @@ __device__ void add_up(Shared& s, Batch& batch, int warp, int held, int entry, f
     sums.t2_dy = sums.t2 * f.dy;
     const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums);
 
-    // Over the rows: lanes trade halves twice, so that row r is left with the values from 3 r on.
-    float value[12] = {d.u,   d.v,      d.l11,    d.l12,    d.l22, d.log2_opacity,
-                       depth, color[0], color[1], color[2], 0,     0};
+    // Over the rows, in the place of the shares: lane l adds up the values l / kHeld, l / kHeld + 4, ...
+    const float value[kValues] = {d.u,   d.v,      d.l11,    d.l12,   d.l22, d.log2_opacity,
+                                  depth, color[0], color[1], color[2]};
+    float* of_rows = reinterpret_cast<float*>(s.share[warp]);
+    __syncwarp();
 #pragma unroll
-    for (int half = 6, rows = 2; rows > 0; half /= 2, rows /= 2) {
-        const bool upper = (row & rows) != 0;
-#pragma unroll
-        for (int i = 0; i < half; ++i) {
-            const float kept = upper ? value[i + half] : value[i], sent = upper ? value[i] : value[i + half];
-            value[i] = kept + __shfl_xor_sync(kAllLanes, sent, rows * kHeld);
-        }
-    }
+    for (int k = 0; k < kValues; ++k) of_rows[kRowsStride * k + lane] = value[k];
+    __syncwarp();
     if (gaussian < held) {
         const uint32_t rank = __popc(s.warps[entry] & ((1u << warp) - 1));
         float* pair = s.pair[batch.first_pair[entry] + rank];
 #pragma unroll
-        for (int i = 0; i < 3; ++i)
-            if (3 * row + i < kValues) pair[3 * row + i] = value[i];
+        for (int k = row; k < kValues; k += kWarpHeight) {
+            const float* rows = of_rows + kRowsStride * k + gaussian;
+            pair[k] = (rows[0] + rows[kHeld]) + (rows[2 * kHeld] + rows[3 * kHeld]);
+        }
         if (row == 0) atomicOr(&batch.took_part[entry], 1u << rank);
     }
     __syncwarp();
