@@ -140,6 +140,10 @@ def main(config: Config) -> None:
     if config.device == "cuda":
         gaussians = gaussians.torch("cuda")
     result: dict[str, Any] = {"config": vars(config), "milliseconds": {}}
+    if config.device == "cuda":
+        import gpu
+
+        result |= gpu.machine()
     for name, (num, run) in operations(gaussians, config).items():
         times = milliseconds(config, run)
         median = statistics.median(times)
