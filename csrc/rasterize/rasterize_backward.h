@@ -33,8 +33,8 @@ struct RasterizeBackwardInput {
     const Record<float>* records;
     const unsigned long long* tile_first;  // [num_tiles + 1] into order
     const uint32_t* order;                 // each tile's records front to back
-    const uint32_t* blended;     // [num_tiles] of them, those in front of where all pixels had stopped
-    const TilePlan* plans;  // [num_tiles] in the order in which blocks take the tiles
+    const uint32_t* blended;  // [num_tiles] of them, those in front of where all pixels had stopped
+    const TilePlan* plans;    // [num_tiles] in the order in which blocks take the tiles
     PictureGradient<float> d_picture;
 };
 
