@@ -35,31 +35,18 @@ __device__ inline unsigned char* shared_memory() {
     return bytes;
 }
 
-__device__ inline float warp_sum(float x) {
+// Over the lanes of a whole warp, in every lane. The order of the additions is fixed.
+template <class T>
+__device__ inline T warp_sum(T x) {
 #pragma unroll
     for (int offset = 16; offset > 0; offset /= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
     return x;
 }
-
-// Sums over the warp of kCount values a lane, a power of two up to 32: lane l gets the sum of v[l % kCount].
-// Lanes trade halves of what they hold, so this takes about kCount shuffles where kCount warp_sum take five
-// times as many. The order of the additions is fixed.
-template <int kCount>
-__device__ inline float warp_sums(float (&v)[kCount]) {
-    const int lane = threadIdx.x % 32;
+template <class T>
+__device__ inline T warp_min(T x) {
 #pragma unroll
-    for (int width = kCount / 2; width > 0; width /= 2) {
-        const bool upper = (lane & width) != 0;
-#pragma unroll
-        for (int i = 0; i < width; ++i) {
-            const float kept = upper ? v[i + width] : v[i], sent = upper ? v[i] : v[i + width];
-            v[i] = kept + __shfl_xor_sync(kAllLanes, sent, width);
-        }
-    }
-    float sum = v[0];
-#pragma unroll
-    for (int offset = kCount; offset < 32; offset *= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
-    return sum;
+    for (int offset = 16; offset > 0; offset /= 2) x = min(x, __shfl_xor_sync(kAllLanes, x, offset));
+    return x;
 }
 
 }  // namespace cuda

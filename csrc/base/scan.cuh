@@ -63,10 +63,7 @@ __device__ inline unsigned long long prefix_of_part(unsigned long long* state, s
             } while (seen < kOwn);
         // What ends at the nearest part with a sum of all before it.
         const unsigned is_all = __ballot_sync(kAllLanes, seen >= kAll);
-        unsigned long long x = is_all == 0 || lane < unsigned(__ffs(is_all)) ? seen & kValue : 0;
-#pragma unroll
-        for (int offset = 16; offset > 0; offset /= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
-        before += x;
+        before += warp_sum(is_all == 0 || lane < unsigned(__ffs(is_all)) ? seen & kValue : 0);
         if (is_all != 0) break;
     }
     if (lane == 0) word[part] = kAll | (before + sum);

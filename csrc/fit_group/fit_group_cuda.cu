@@ -354,17 +354,7 @@ struct Fit {
         const int x1 = min(job.size - 1, static_cast<int>(floorf(high_x)));
         const int y1 = min(job.size - 1, static_cast<int>(floorf(high_y)));
         if (x0 > x1 || y0 > y1) return false;
-        r.u = e.u;
-        r.v = e.v;
-        r.l11 = e.l11;
-        r.l12 = e.l12;
-        r.l22 = e.l22;
-        r.log2_opacity = e.log2_opacity;
-        r.depth = e.depth;
-        r.x0 = static_cast<uint16_t>(x0);
-        r.x1 = static_cast<uint16_t>(x1);
-        r.y0 = static_cast<uint16_t>(y0);
-        r.y1 = static_cast<uint16_t>(y1);
+        set_ellipse(e, x0, x1, y0, y1, r);
         const float* sh = at(layout.value) + 11 * n + num_sh * i;
         with_degree(in.rows.sh_degree, [&](auto degree) {
             color_of_sh<float>(decltype(degree)::value, g.mean, view, sh, r.color);

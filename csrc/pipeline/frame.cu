@@ -231,8 +231,7 @@ const FrameCounters& Drawing::finish() {
         if (!was_drawn())
             throw std::runtime_error(
                 "frame: a captured graph met more than it has room for; draw once outside of the capture "
-                "what it "
-                "will meet, and capture it again");
+                "what it will meet, and capture it again");
         return slot_->state->counters;
     }
     settle();

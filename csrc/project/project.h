@@ -43,6 +43,22 @@ struct Record {
     uint16_t x0, x1, y0, y1;
 };
 
+// Sets all of a record but its colour.
+template <class T>
+V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, int x0, int x1, int y0, int y1, Record<T>& r) {
+    r.u = e.u;
+    r.v = e.v;
+    r.l11 = e.l11;
+    r.l12 = e.l12;
+    r.l22 = e.l22;
+    r.log2_opacity = e.log2_opacity;
+    r.depth = e.depth;
+    r.x0 = static_cast<uint16_t>(x0);
+    r.x1 = static_cast<uint16_t>(x1);
+    r.y0 = static_cast<uint16_t>(y0);
+    r.y1 = static_cast<uint16_t>(y1);
+}
+
 // Gradients of the ellipse and colour of one record.
 template <class T>
 struct RecordGradient {

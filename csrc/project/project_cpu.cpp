@@ -78,18 +78,11 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
             const int first_py = static_cast<int>(y0[i]), last_py = static_cast<int>(y1[i]);
             if (first_px > last_x || first_py > last_y || last_px < 0 || last_py < 0) continue;
             Record<T>& r = records[num_records];
-            r.u = e.u[i];
-            r.v = e.v[i];
-            r.l11 = e.l11[i];
-            r.l12 = e.l12[i];
-            r.l22 = e.l22[i];
-            r.log2_opacity = e.log2_opacity[i];
+            const Ellipse<T> mine{e.u[i],    e.v[i], e.l11[i], e.l12[i], e.l22[i], e.log2_opacity[i],
+                                  e.depth[i]};
+            set_ellipse(mine, max_of(first_px, 0), min_of(last_px, last_x), max_of(first_py, 0),
+                        min_of(last_py, last_y), r);
             for (int c = 0; c < 3; ++c) r.color[c] = color[c][i];
-            r.depth = e.depth[i];
-            r.x0 = static_cast<uint16_t>(first_px < 0 ? 0 : first_px);
-            r.y0 = static_cast<uint16_t>(first_py < 0 ? 0 : first_py);
-            r.x1 = static_cast<uint16_t>(last_px > last_x ? last_x : last_px);
-            r.y1 = static_cast<uint16_t>(last_py > last_y ? last_y : last_py);
             if (source != nullptr) source[num_records] = source_base + static_cast<uint32_t>(done) + i;
             ++num_records;
         }

@@ -161,17 +161,7 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in, uint32
     const int y0 = max(0, __float2int_ru(low_y)), y1 = min(in.image.height - 1, __float2int_rd(high_y));
     if (x0 > x1 || y0 > y1) return false;
 
-    r.u = e.u;
-    r.v = e.v;
-    r.l11 = e.l11;
-    r.l12 = e.l12;
-    r.l22 = e.l22;
-    r.log2_opacity = e.log2_opacity;
-    r.depth = e.depth;
-    r.x0 = static_cast<uint16_t>(x0);
-    r.x1 = static_cast<uint16_t>(x1);
-    r.y0 = static_cast<uint16_t>(y0);
-    r.y1 = static_cast<uint16_t>(y1);
+    set_ellipse(e, x0, x1, y0, y1, r);
     if (in.model.sh_degree > 0) {
         const float4 sphere = Source::load_sphere(in.model, g);
         const float mean[3] = {sphere.x, sphere.y, sphere.z};
@@ -347,9 +337,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
                                  static_cast<uint32_t>(tables.image.tile_columns)};
         }
     }
-#pragma unroll
-    for (int offset = 16; offset > 0; offset /= 2)
-        num_in_frustum += __shfl_xor_sync(kAllLanes, num_in_frustum, offset);
+    num_in_frustum = warp_sum(num_in_frustum);
     if (lane == 0) {
         atomicAdd(&counters.in_frustum, static_cast<unsigned long long>(num_in_frustum));
         atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));

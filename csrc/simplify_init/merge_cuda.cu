@@ -31,11 +31,6 @@ struct Scratch {
     }
 };
 
-__device__ double warp_min(double x) {
-    for (int step = 16; step > 0; step /= 2) x = fmin(x, __shfl_xor_sync(kAllLanes, x, step));
-    return x;
-}
-
 // Makes each row a node; returns the scale of distances.
 __device__ double start_nodes(const RowsIn& in, int64_t first, int count, int64_t wanted,
                               const Scratch& group) {

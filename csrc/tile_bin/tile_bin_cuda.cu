@@ -34,12 +34,6 @@ struct LargeBatch {
 };
 constexpr int kMostWindow = 256;
 
-__device__ int warp_min(int x) {
-#pragma unroll
-    for (int offset = 16; offset > 0; offset /= 2) x = min(x, __shfl_xor_sync(kAllLanes, x, offset));
-    return x;
-}
-
 __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first, unsigned long long end) {
     const unsigned lane = threadIdx.x % 32;
     LargeBatch batch{{0, 0}, 0, 0, 0, 0, 0, 0};
