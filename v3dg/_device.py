@@ -79,6 +79,26 @@ def place(gaussians: Gaussians, device: Any) -> Gaussians:
     return Gaussians(*(getattr(there, field.name).detach() for field in fields(there)))
 
 
+def current_device() -> int:
+    """Torch's current CUDA device."""
+    import torch
+
+    return int(torch.cuda.current_device())
+
+
+def current_stream() -> int:
+    """The stream of that device that torch's work, and so ours, is enqueued on."""
+    import torch
+
+    return int(torch.cuda.current_stream().cuda_stream)
+
+
+def aligned(tensor: Any) -> Any:
+    """The tensor, contiguous, where the core can read it in words of 16 bytes."""
+    tensor = tensor.contiguous()
+    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
+
+
 def library_of(array: Array) -> Any:
     """numpy or torch; many functions have the same names and arguments in both."""
     if isinstance(array, np.ndarray):

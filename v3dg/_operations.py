@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core
+from v3dg import _core, _device
 from v3dg.gaussians import Array, Gaussians
 from v3dg.rasterize import rows_of
 
@@ -133,7 +133,7 @@ def _stream_of(tensor: Any) -> Iterator[int]:
     import torch
 
     with torch.cuda.device(tensor.device):
-        yield torch.cuda.current_stream().cuda_stream
+        yield _device.current_stream()
 
 
 def _empty_like(tensor: Any, shape: tuple[int, ...], dtype: type[np.generic] = np.float32) -> Any:

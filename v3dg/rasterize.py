@@ -156,10 +156,10 @@ def _cuda_function() -> Any:
         def forward(ctx: Any, view: Any, options: Any, tape: bool, *tensors: Any) -> Any:
             ctx.set_materialize_grads(False)
             filter_px2, antialiased, k, width, height = options
-            inputs = tuple(_aligned(t.detach()) for t in tensors[:5])
+            inputs = tuple(_device.aligned(t.detach()) for t in tensors[:5])
             new = inputs[0].new_empty
             picture = new((height, width, 3)), new((height, width)), new((height, width))
-            stream = torch.cuda.current_stream().cuda_stream
+            stream = _device.current_stream()
             bg = tensors[5].tolist()
             kept = _core.rasterize_cuda(inputs, view, filter_px2, antialiased, k, bg, picture, stream)
             if tape:
@@ -179,16 +179,10 @@ def _cuda_function() -> Any:
             out = tuple(torch.empty_like(t) for t in ctx.inputs)
             d_background = d_color.new_empty(3)
             with torch.cuda.device(d_color.device):
-                stream = torch.cuda.current_stream().cuda_stream
+                stream = _device.current_stream()
                 _core.rasterize_backward_cuda(ctx.tape, d_color, d_alpha, d_depth, out, d_background, stream)
             if ctx.needs_input_grad[8]:
                 return None, None, None, *out, d_background.to(ctx.background_device)
             return None, None, None, *out, None
 
     return Rasterize
-
-
-def _aligned(tensor: Any) -> Any:
-    """The tensor where the device can read it in words of 16 bytes."""
-    tensor = tensor.contiguous()
-    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()

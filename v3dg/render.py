@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _arrays as arrays
 from v3dg import _core, _device
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
@@ -155,11 +154,11 @@ class Renderer:
 
     def __init__(self, subject: Scene | Bundle | Gaussians) -> None:
         _device.resolve("cuda")
-        self._device = arrays.current_device()
+        self._device = _device.current_device()
         self._shown: tuple[Any, ...] = ()
         if isinstance(subject, Gaussians):
-            rows = arrays.rows_on_device(subject)
-            self._frame: Any = _core.ModelFrame(rows, arrays.current_stream())
+            rows = _rows_on_device(subject)
+            self._frame: Any = _core.ModelFrame(rows, _device.current_stream())
             return
         scene = Scene.of(subject)
         self._shown = _shown(scene)
@@ -174,7 +173,7 @@ class Renderer:
             scene.positions,
             scene.rotations,
             scene.scales,
-            arrays.current_stream(),
+            _device.current_stream(),
         )
 
     def render(
@@ -187,8 +186,8 @@ class Renderer:
         """Draw on torch's current stream, as `v3dg.render` does."""
         _check(tolerance, background)
         shape = (camera.height, camera.width)
-        picture = (arrays.empty((*shape, 3)), arrays.empty(shape), arrays.empty(shape))
-        last = ([float(b) for b in background], picture, arrays.current_stream())
+        picture = tuple(_empty(s) for s in ((*shape, 3), shape, shape))
+        last = ([float(b) for b in background], picture, _device.current_stream())
         if isinstance(self._frame, _core.SceneFrame):
             drawing = self._frame.draw(
                 camera.viewmat, camera.position, camera.K, camera.near, float(tolerance), *last
@@ -205,7 +204,7 @@ class Renderer:
     def _draws(self, scene: Scene) -> bool:
         shown = _shown(scene)
         same = len(shown) == len(self._shown) and all(a is b for a, b in zip(shown, self._shown, strict=True))
-        return same and self._device == arrays.current_device()
+        return same and self._device == _device.current_device()
 
 
 def _check(tolerance: float, background: Sequence[float]) -> None:
@@ -235,10 +234,24 @@ def _renderer_of(subject: Scene | Bundle | Gaussians) -> Renderer:
 
 
 def _rows_of_bundle(bundle: Bundle) -> tuple[Any, ...]:
-    device = arrays.current_device()
+    device = _device.current_device()
     if bundle not in _rows or _rows[bundle][0] != device:
-        _rows[bundle] = (device, arrays.rows_on_device(bundle.gaussians))
+        _rows[bundle] = (device, _rows_on_device(bundle.gaussians))
     return _rows[bundle][1]
+
+
+def _rows_on_device(gaussians: Gaussians) -> tuple[Any, ...]:
+    """The five arrays as the core wants them on torch's current CUDA device."""
+    import torch
+
+    return tuple(_device.aligned(row.detach().to(torch.float32)) for row in rows_of(gaussians.torch("cuda")))
+
+
+def _empty(shape: tuple[int, ...]) -> Any:
+    """A float32 tensor on torch's current CUDA device, not initialised."""
+    import torch
+
+    return torch.empty(shape, dtype=torch.float32, device="cuda")
 
 
 # A bundle's gaussians as the core lays them out, made when it is first drawn.
