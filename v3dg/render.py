@@ -186,7 +186,7 @@ class Renderer:
         """Draw on torch's current stream, as `v3dg.render` does."""
         _check(tolerance, background)
         shape = (camera.height, camera.width)
-        picture = tuple(_empty(s) for s in ((*shape, 3), shape, shape))
+        picture = (_empty((*shape, 3)), _empty(shape), _empty(shape))
         last = ([float(b) for b in background], picture, _device.current_stream())
         if isinstance(self._frame, _core.SceneFrame):
             drawing = self._frame.draw(
