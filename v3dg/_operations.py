@@ -129,10 +129,13 @@ def gather(bundles: list[Gaussians], num_bases: int, **tables: npt.NDArray[Any])
 
 @contextmanager
 def _stream_of(tensor: Any) -> Iterator[int]:
-    """The stream that torch works on, where `tensor` is; its device is the current one meanwhile."""
+    """The stream that torch works on, where `tensor` is; its device is the current one meanwhile.
+
+    Too little memory for the results is a MemoryError, as it is for the core's scratch.
+    """
     import torch
 
-    with torch.cuda.device(tensor.device):
+    with torch.cuda.device(tensor.device), _device.memory_errors():
         yield _device.current_stream()
 
 

@@ -1052,7 +1052,7 @@ struct Fit {
         const auto look_from = [&](Cameras& cameras, int64_t first) {
             const int b = static_cast<int>(threadIdx.x) - (kThreads - 32);  // the warp with least to do
             if (b == kViewsAtOnce && first >= 0 && first < num_visits)
-                cameras.step = in.steps[first / views_per_step];
+                cameras.step = fit_step(config, static_cast<int>(first / views_per_step));
             if (b < 0 || b >= own_of(views_at(first))) return;
             const int64_t visit = first + view_rank + b;
             uint64_t picture;

@@ -29,7 +29,6 @@ struct FitGroupsInput {
     Span<const FitJob> jobs;
     const float4* targets;  // colour and alpha, picture by picture, row major
     const FitView* views;   // as many as there are pictures
-    const FitStep* steps;
     FitRows rows;
     float* error;
     FitSignals* signals;

@@ -174,17 +174,17 @@ struct FitStep {
     float correction1, correction2;
 };
 
-inline FitStep fit_step(const FitConfig& config, int index) {
+V3DG_HD inline FitStep fit_step(const FitConfig& config, int index) {
     const double progress = config.steps > 1 ? static_cast<double>(index) / (config.steps - 1) : 0;
-    const float decay = static_cast<float>(std::pow(config.final_step, progress));
+    const float decay = static_cast<float>(::pow(static_cast<double>(config.final_step), progress));
     return {decay * config.step_position,
             decay * config.step_quat,
             decay * config.step_log_scale,
             decay * config.step_logit,
             decay * config.step_sh0,
             decay * config.step_sh_rest,
-            static_cast<float>(1 / (1 - std::pow(kAdamBeta1, index + 1))),
-            static_cast<float>(1 / (1 - std::pow(kAdamBeta2, index + 1)))};
+            static_cast<float>(1 / (1 - ::pow(kAdamBeta1, index + 1.0))),
+            static_cast<float>(1 / (1 - ::pow(kAdamBeta2, index + 1.0)))};
 }
 
 V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& group, const FitStep& step) {

@@ -79,11 +79,7 @@ class Level {
           rows_(rows),
           progress_(progress),
           stream_(stream),
-          error_(2 * num_groups, stream) {
-        std::vector<FitStep> steps;
-        for (int i = 0; i < config.steps; ++i) steps.push_back(fit_step(config, i));
-        steps_.copy_from({steps.data(), steps.size()}, stream);
-    }
+          error_(2 * num_groups, stream) {}
 
     const float* error() const { return error_.data(); }
 
@@ -103,9 +99,8 @@ class Level {
         draw_targets(config_, jobs, on_device.data, target_, views, targets, frame_, stream_);
 
         Signals signals;
-        const FitGroupsInput in{
-            config_,       visiting_stride(config_), on_device, targets, views, steps_.data(), rows_,
-            error_.data(), signals.device()};
+        const FitGroupsInput in{config_,       visiting_stride(config_), on_device, targets, views, rows_,
+                                error_.data(), signals.device()};
         fit_groups(in, jobs, stream_);
         done_.record(stream_);
         const uint64_t done_before = progress_.groups_done;
@@ -129,7 +124,6 @@ class Level {
     FitProgress& progress_;
     const cudaStream_t stream_;
     DeviceBuffer<float> error_;
-    DeviceBuffer<FitStep> steps_;
     DeviceBuffer<float4> targets_;
     DeviceBuffer<FitView> views_;
     Frame frame_;
