@@ -24,7 +24,7 @@ from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.procedural import make_asset
 from v3dg.render import Renderer
-from v3dg.scene import read_scene
+from v3dg.scene_file import read_scene
 
 
 @dataclass

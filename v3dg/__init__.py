@@ -16,7 +16,8 @@ from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
 from v3dg.rasterize import Raster, rasterize
 from v3dg.render import DEFAULT_TOLERANCE, Image, Renderer, Stats, render
-from v3dg.scene import Scene, read_scene, write_scene
+from v3dg.scene import Scene
+from v3dg.scene_file import read_scene, write_scene
 from v3dg.select import Selection, select
 
 __all__ = [

@@ -245,7 +245,7 @@ def _build(options: Build) -> None:
 def _info(options: Info) -> None:
     _require(options.file, ".ply", ".v3dg", ".json")
     if options.file.suffix == ".json":
-        from v3dg.scene import read_scene
+        from v3dg.scene_file import read_scene
 
         result, text = _scene_info(options.file, *read_scene(options.file))
     else:
@@ -407,7 +407,7 @@ def _render(options: Render) -> None:
 
 def _subject_and_cameras(options: Render) -> tuple[Scene | Bundle | Gaussians, dict[str, Camera]]:
     if options.subject.suffix == ".json":
-        from v3dg.scene import read_scene
+        from v3dg.scene_file import read_scene
 
         scene, cameras = read_scene(options.subject)
         if not cameras:
