@@ -412,6 +412,10 @@ HOSTILE = {
         header("element vertex 0", "property list float int x"),
         "header line 4: expected an integer type for the length of a list, found 'float'",
     ),
+    "endless elements": (
+        header(*[f"element e{i} 0" for i in range(65)], *vertex_lines(0)),
+        "header line 67: expected at most 64 elements, found one more",
+    ),
     "no vertex": (header("element face 0"), "expected one element 'vertex', found 0"),
     "two vertices": (header(*vertex_lines(0), *vertex_lines(0)), "expected one element 'vertex', found 2"),
     "duplicate property": (

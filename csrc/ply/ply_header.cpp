@@ -8,6 +8,7 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kMaxHeaderBytes = size_t(1) << 20;  // real ones have a few kilobytes
+constexpr size_t kMaxElements = 64;                  // real ones have one or two; each is walked over
 
 std::vector<std::string> words_of(const std::string& line) {
     const char* kSpace = " \t\r\v\f";
@@ -89,6 +90,9 @@ struct HeaderParser {
             header.encoding = parse_format(words);
             has_format = true;
         } else if (words[0] == "element") {
+            if (header.elements.size() == kMaxElements)
+                throw PlyError("expected at most " + std::to_string(kMaxElements) +
+                               " elements, found one more");
             header.elements.push_back(parse_element(words));
         } else if (words[0] == "property") {
             if (header.elements.empty())

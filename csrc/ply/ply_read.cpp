@@ -200,7 +200,10 @@ class RowDecoder {
 class ByteReader {
   public:
     ByteReader(const PosixFile& file, size_t offset, size_t file_bytes)
-        : file_(file), offset_(offset), file_bytes_(file_bytes), buffer_(kBlockBytes) {}
+        : file_(file),
+          offset_(offset),
+          file_bytes_(file_bytes),
+          buffer_(std::min(kBlockBytes, file_bytes - std::min(offset, file_bytes))) {}
 
     size_t offset() const { return offset_; }
     void skip(size_t size, const PlyElement& element, uint64_t row) {
@@ -263,7 +266,11 @@ bool is_space(char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\v' |
 // The lines of a text that are not blank.
 class LineReader {
   public:
-    LineReader(const PosixFile& file, size_t offset) : file_(file), offset_(offset), buffer_(kChunkBytes) {}
+    // One byte more than is left, so that the end of the file is met by reading.
+    LineReader(const PosixFile& file, size_t offset, size_t file_bytes)
+        : file_(file),
+          offset_(offset),
+          buffer_(std::min(kChunkBytes, file_bytes - std::min(offset, file_bytes) + 1)) {}
 
     size_t offset() const { return offset_ - (end_ - begin_); }
 
@@ -275,6 +282,8 @@ class LineReader {
         while (lines_.empty() && max_lines > 0) {
             cut_lines(max_lines, at_end);
             if (!lines_.empty() || at_end) break;
+            if (begin_ == 0 && end_ == buffer_.size() && end_ < kChunkBytes)
+                throw PlyError("expected no change while it is read, found it longer");
             if (begin_ == 0 && end_ == buffer_.size())
                 throw PlyError("expected lines of at most " + std::to_string(kChunkBytes) +
                                " bytes, found a longer one");
@@ -382,8 +391,8 @@ void parse_row(Line line, uint64_t row, const PlyElement& vertex, double* value_
                    quoted(element.name) + ", found " + std::to_string(found));
 }
 
-size_t skip_text(const PosixFile& file, size_t offset, const PlyElement& element) {
-    LineReader reader(file, offset);
+size_t skip_text(const PlyFile& ply, size_t offset, const PlyElement& element) {
+    LineReader reader(ply.file, offset, ply.file_bytes);
     for (uint64_t row = 0; row < element.count;) {
         const size_t num_lines = reader.next(element.count - row).size();
         if (num_lines == 0) throw_too_few(element, row);
@@ -408,7 +417,7 @@ void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
 size_t skip_element(const PlyFile& ply, const PlyElement& element, size_t offset) {
     check_size(ply, element, offset);
     if (element.properties.empty()) return offset;
-    if (ply.encoding == PlyEncoding::ascii) return skip_text(ply.file, offset, element);
+    if (ply.encoding == PlyEncoding::ascii) return skip_text(ply, offset, element);
     if (!element.has_lists()) return offset + element.count * element.min_row_bytes();
     ByteReader reader(ply.file, offset, ply.file_bytes);
     for (uint64_t row = 0; row < element.count; ++row)
@@ -461,7 +470,7 @@ void read_text(const PlyFile& ply, const PlyGaussians<float>& out) {
     const std::vector<Field> fields = fields_of(ply.vertex, ply.num_sh);
     const size_t num_properties = ply.vertex.properties.size();
     std::vector<double> values(omp_get_max_threads() * num_properties);
-    LineReader reader(ply.file, ply.vertex_offset);
+    LineReader reader(ply.file, ply.vertex_offset, ply.file_bytes);
     for (size_t first = 0; first < ply.num_gaussians();) {
         const std::vector<Line>& lines = reader.next(ply.num_gaussians() - first);
         if (lines.empty()) throw_too_few(ply.vertex, first);
