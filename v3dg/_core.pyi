@@ -204,6 +204,7 @@ def render_selection(
     height: int,
     background: Sequence[float],
     with_depth: bool,
+    window: Sequence[int] | None = None,
 ) -> tuple[Float32, Float32, Float32, dict[str, Any]]: ...
 
 # frame, with CUDA only; arrays on the device are whatever has __cuda_array_interface__

@@ -1,5 +1,6 @@
 #include <memory>
 #include <mutex>
+#include <optional>
 
 #include "bindings/render_args.h"
 #include "pipeline/model.h"
@@ -28,12 +29,11 @@ template <class T>
 struct PictureArrays {
     py::array_t<T> color, alpha, depth;
     Picture<T> picture;
-    PictureArrays(int width, int height, const std::array<double, 3>& background, bool with_depth)
-        : color({height, width, 3}),
-          alpha({height, width}),
-          depth({with_depth ? height : 0, with_depth ? width : 0}) {
-        picture = {width,
-                   height,
+    PictureArrays(const Window& window, const std::array<double, 3>& background, bool with_depth)
+        : color({window.height(), window.width(), 3}),
+          alpha({window.height(), window.width()}),
+          depth({with_depth ? window.height() : 0, with_depth ? window.width() : 0}) {
+        picture = {window,
                    {T(background[0]), T(background[1]), T(background[2])},
                    color.mutable_data(),
                    alpha.mutable_data(),
@@ -41,6 +41,16 @@ struct PictureArrays {
     }
     py::object depth_or_none() const { return picture.depth == nullptr ? py::none() : py::object(depth); }
 };
+
+// x0, y0, x1, y1.
+static Window window_of(const std::array<int, 4>& w, int width, int height) {
+    if (w[0] < 0 || w[1] < 0 || w[2] > width || w[3] > height || w[0] >= w[2] || w[1] >= w[3])
+        throw py::value_error("window: expected x0 < x1 and y0 < y1 within " + std::to_string(width) + " x " +
+                              std::to_string(height) + " px, got " + std::to_string(w[0]) + ", " +
+                              std::to_string(w[1]) + ", " + std::to_string(w[2]) + ", " +
+                              std::to_string(w[3]));
+    return {w[0], w[1], w[2], w[3]};
+}
 
 static py::dict dict_of(const RenderCounts& c) {
     return py::dict("in_frustum"_a = c.in_frustum, "records"_a = c.records, "entries"_a = c.entries,
@@ -71,7 +81,7 @@ static py::tuple rasterize(std::shared_ptr<Model<T>> model, const std::array<dou
     tape->width = width;
     tape->height = height;
     tape->background = background;
-    PictureArrays<T> out(width, height, background, with_depth);
+    PictureArrays<T> out({0, 0, width, height}, background, with_depth);
     RenderCounts counts;
     {
         py::gil_scoped_release unlocked;
@@ -103,9 +113,11 @@ static py::tuple rasterize_backward(const Tape<T>& tape, const py::array& d_colo
     T* d_background = background.mutable_data();
     {
         py::gil_scoped_release unlocked;
-        const Picture<T> picture{
-            tape.width, tape.height, {T(tape.background[0]), T(tape.background[1]), T(tape.background[2])},
-            nullptr,    nullptr,     nullptr};
+        const Picture<T> picture{{0, 0, tape.width, tape.height},
+                                 {T(tape.background[0]), T(tape.background[1]), T(tape.background[2])},
+                                 nullptr,
+                                 nullptr,
+                                 nullptr};
         render_backward<T>(tape.draw, tape.camera, picture, d_picture, tape.workspace, out, d_background);
     }
     return py::make_tuple(means, quats, scales, opacities, sh, background);
@@ -150,7 +162,8 @@ static BundleClusters clusters_of(const py::handle& item) {
 static py::tuple render_selection(const py::list& bundles, const py::array& instance_bundle,
                                   const py::array& views, const py::array& instance_ids,
                                   const py::array& cluster_ids, const std::array<double, 5>& k, int width,
-                                  int height, const std::array<double, 3>& background, bool with_depth) {
+                                  int height, const std::array<double, 3>& background, bool with_depth,
+                                  const std::optional<std::array<int, 4>>& window) {
     static SharedWorkspace shared;
     std::vector<BundleClusters> tables;
     for (const py::handle& item : bundles) tables.push_back(clusters_of(item));
@@ -161,6 +174,7 @@ static py::tuple render_selection(const py::list& bundles, const py::array& inst
     const Span<const int32_t> clusters =
         span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instances.size)});
     const Pinhole<float> camera = pinhole_of<float>(k, width, height);
+    const Window part = window ? window_of(*window, width, height) : Window{0, 0, width, height};
 
     // Neighbouring clusters of one instance are neighbours in memory: one draw.
     std::vector<Draw<float>> draws;
@@ -191,7 +205,7 @@ static py::tuple render_selection(const py::list& bundles, const py::array& inst
                          view_of<float>(view.data + 15 * static_cast<size_t>(i)), filter, compensate});
         last_instance = i;
     }
-    PictureArrays<float> out(width, height, background, with_depth);
+    PictureArrays<float> out(part, background, with_depth);
     RenderCounts counts;
     {
         py::gil_scoped_release unlocked;
@@ -219,7 +233,7 @@ void bind_render(py::module_& m) {
     bind_precision<double>(m, "ModelDouble", "TapeDouble");
     m.def("render_selection", &render_selection, "bundles"_a, "instance_bundle"_a, "views"_a,
           "instance_ids"_a, "cluster_ids"_a, "intrinsics"_a, "width"_a, "height"_a, "background"_a,
-          "with_depth"_a);
+          "with_depth"_a, "window"_a = py::none());
 }
 
 }  // namespace v3dg

@@ -15,14 +15,16 @@ namespace V3DG_ISA {
 
 constexpr int kPlanes = 4;  // red, green, blue, alpha
 
+static V3DG_INLINE Window square(int size) { return {0, 0, size, size}; }
 static int tiles_across(const FitView& view) { return (view.size + kTileSize - 1) / kTileSize; }
 
 // Projects a draw and sorts what is seen by depth; returns how many.
 static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& camera, FitScratch& scratch) {
     Record<float>* records = scratch.records.reserve(draw.count);
     uint32_t* source = scratch.source.reserve(draw.count);
-    uint64_t unused = 0;
-    const size_t count = project<float>(draw, 0, draw.count, camera, records, source, 0, unused);
+    const Window all = square(static_cast<int>(camera.width));
+    Reach unused;
+    const size_t count = project<float>(draw, 0, draw.count, camera, all, records, source, 0, unused);
     uint64_t* order = scratch.order.reserve(count);
     for (size_t i = 0; i < count; ++i) {
         uint32_t bits;
@@ -40,7 +42,7 @@ static bool misses_tile(const Record<float>& g, int left, int top) {
 static void blend_sorted(const FitScratch& scratch, size_t count, int left, int top, int size,
                          TilePlanes<float>& tile) {
     const BlockPixels<float> pixels;
-    uint64_t alive = clear_tile(tile, left, top, size, size, false);
+    uint64_t alive = clear_tile(tile, left, top, square(size), false);
     for (size_t i = 0; i < count && alive != 0; ++i) {
         const Record<float>& g = scratch.records.data()[record_of(scratch.order.data()[i])];
         if (misses_tile(g, left, top)) continue;
@@ -265,7 +267,7 @@ class Comparison {
                 for (int c = 0; c < 3; ++c) total += load(grad.d_color[c] + p) * load(tile.color[c] + p);
                 store(grad.total + p, total);
             }
-            uint64_t alive = clear_tile(tile, left, top, view.size, view.size, false);
+            uint64_t alive = clear_tile(tile, left, top, square(view.size), false);
             for (size_t i = 0; i < count && alive != 0; ++i) {
                 const uint32_t r = record_of(scratch_.order.data()[i]);
                 const Record<float>& g = scratch_.records.data()[r];

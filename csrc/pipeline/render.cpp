@@ -1,6 +1,9 @@
 #include "pipeline/render.h"
 
+#include <omp.h>
+
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <numeric>
 #include <stdexcept>
@@ -14,10 +17,49 @@ static double now() {
     return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
 }
 
-// Gaussians a chunk: enough to spread over threads, few enough that a chunk's counters stay small.
-static uint64_t chunk_size(uint64_t total, size_t num_tiles) {
-    const uint64_t least = std::max<uint64_t>(4096, num_tiles);
-    return std::max<uint64_t>(least, (total + 1023) / 1024);
+// Gaussians that are projected together: a run of one draw, short enough that it reaches few rows of tiles
+// where neighbours in memory are neighbours in space.
+constexpr uint64_t kPieceSize = 4096;
+
+struct Piece {
+    size_t draw;
+    uint64_t skip, count;  // in the draw
+    uint64_t first;        // among the gaussians of all draws
+    Reach reach;           // known after the first band
+};
+
+// Pieces [first, last), whose records one thread makes.
+struct Chunk {
+    size_t first, last;
+};
+
+template <class T>
+static std::vector<Piece> pieces_of(const std::vector<Draw<T>>& draws) {
+    std::vector<Piece> pieces;
+    uint64_t total = 0;
+    for (size_t d = 0; d < draws.size(); ++d)
+        for (uint64_t skip = 0; skip < draws[d].count; skip += kPieceSize) {
+            const uint64_t count = std::min(kPieceSize, draws[d].count - skip);
+            pieces.push_back({d, skip, count, total, {}});
+            total += count;
+        }
+    if (total > UINT32_MAX)
+        throw std::length_error("gaussians: expected at most 4294967295 in one picture, got " +
+                                std::to_string(total));
+    return pieces;
+}
+
+// Enough chunks to spread over threads, few enough that a chunk's counters stay small beside it.
+static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num_tiles) {
+    const uint64_t total = pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
+    const uint64_t size = std::max({kPieceSize, uint64_t(num_tiles), (total + 1023) / 1024});
+    std::vector<Chunk> chunks;
+    for (size_t p = 0; p < pieces.size(); ++p) {
+        if (chunks.empty() || pieces[p].first + pieces[p].count - pieces[chunks.back().first].first > size)
+            chunks.push_back({p, p});
+        chunks.back().last = p + 1;
+    }
+    return chunks;
 }
 
 // Most crowded tiles first, so that no thread is left with one of them at the end.
@@ -30,47 +72,91 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
     return order;
 }
 
-template <class T>
-RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera, const Picture<T>& picture,
-                    bool keep_source, Workspace<T>& ws) {
-    const double start = now();
-    std::vector<uint64_t> begin(draws.size() + 1, 0);
-    for (size_t d = 0; d < draws.size(); ++d) begin[d + 1] = begin[d] + draws[d].count;
-    const uint64_t total = begin.back();
-    if (total > UINT32_MAX)
-        throw std::length_error("gaussians: expected at most 4294967295 in one picture, got " +
-                                std::to_string(total));
-    const TileGrid grid(picture.width, picture.height);
-    const uint64_t chunk = chunk_size(total, grid.size());
-    const size_t num_chunks = (total + chunk - 1) / chunk;
-    ws.num_chunks = num_chunks;
+// A frame holds this many records at once, or about: 48 bytes each, and 8 for every tile that they touch.
+constexpr uint64_t kBandRecords = uint64_t(12) << 20;
 
-    // Room for the worst case; pages that no record reaches are never touched.
-    Record<T>* records = ws.records.reserve(total);
-    uint32_t* source = keep_source ? ws.source.reserve(total) : nullptr;
-    uint64_t* chunk_first = ws.chunk_first.reserve(num_chunks);
-    uint32_t* chunk_count = ws.chunk_count.reserve(num_chunks);
-    uint64_t* chunk_in_frustum = ws.chunk_in_frustum.reserve(num_chunks);
-    parallel_for(num_chunks, 1, [&](size_t c) {
-        const uint64_t first = c * chunk, last = std::min(total, first + chunk);
-        size_t d = std::upper_bound(begin.begin(), begin.end(), first) - begin.begin() - 1;
-        size_t count = 0;
-        uint64_t in_frustum = 0;
-        for (uint64_t at = first; at < last; ++d) {
-            const uint64_t stop = std::min(last, begin[d + 1]);
-            if (stop > at)
-                count += V3DG_DISPATCH_ISA(project<T>, draws[d], at - begin[d], stop - at, camera,
-                                           records + first + count,
-                                           source == nullptr ? nullptr : source + first + count,
-                                           static_cast<uint32_t>(at - begin[d]), in_frustum);
-            at = stop;
-        }
-        chunk_first[c] = first;
-        chunk_count[c] = static_cast<uint32_t>(count);
-        chunk_in_frustum[c] = in_frustum;
+// Rows of tiles that share the picture's gaussians evenly; a single band where memory holds them all. The
+// first few gaussians of a piece tell where it is drawn.
+template <class T>
+static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
+                                    const Pinhole<T>& camera, const Window& window) {
+    const uint64_t total = pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
+    if (total <= kBandRecords) return {window};
+    constexpr uint64_t kFew = 16;
+    const TileGrid grid(window);
+    std::vector<uint32_t> row(pieces.size());  // of tiles; grid.rows where a piece is not seen
+    parallel_for(pieces.size(), 64, [&](size_t p) {
+        const Piece& piece = pieces[p];
+        Reach reach;
+        V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, std::min(kFew, piece.count), camera,
+                          Window{}, nullptr, nullptr, 0, reach);
+        const int middle = (reach.top + reach.bottom) / 2;
+        const bool seen = reach.drawn > 0 && middle >= window.y0 && middle < window.y1;
+        row[p] = seen ? middle / kTileSize - grid.first_row : grid.rows;
     });
+    std::vector<uint64_t> load(grid.rows + 1, 0);
+    for (size_t p = 0; p < pieces.size(); ++p) load[row[p]] += pieces[p].count;
+    const uint64_t seen = std::accumulate(load.begin(), load.end() - 1, uint64_t(0));
+    const uint64_t num_bands = std::max<uint64_t>(1, (seen + kBandRecords - 1) / kBandRecords);
+    std::vector<Window> bands{window};
+    uint64_t above = 0;
+    for (int r = 0; r + 1 < grid.rows; ++r) {
+        above += load[r];
+        if (above * num_bands < seen * bands.size()) continue;
+        const int edge = (grid.first_row + r + 1) * kTileSize;
+        bands.back().y1 = edge;
+        bands.push_back({window.x0, edge, window.x1, window.y1});
+    }
+    return bands;
+}
+
+// Draws one band; `is_first` of a picture's bands finds out what each piece reaches.
+template <class T>
+static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces, bool is_first,
+                        const Pinhole<T>& camera, const Picture<T>& picture, bool keep_source,
+                        Workspace<T>& ws, RenderCounts& counts) {
+    const double start = now();
+    const Window& window = picture.window;
+    const TileGrid grid(window);
+    const std::vector<Chunk> chunks = chunks_of(pieces, grid.size());
+    uint64_t longest = 0, total = 0;
+    for (const Chunk& c : chunks) {
+        const uint64_t end = pieces[c.last - 1].first + pieces[c.last - 1].count;
+        longest = std::max(longest, end - pieces[c.first].first);
+        total = end;
+    }
+    // Room for the worst case; pages that no record reaches are never touched.
+    ws.num_chunks = chunks.size();
+    Record<T>* records = ws.records.reserve(total);
+    uint32_t* source = ws.source.reserve(keep_source ? total : 0);
+    uint64_t* chunk_first = ws.chunk_first.reserve(chunks.size());
+    uint32_t* chunk_count = ws.chunk_count.reserve(chunks.size());
+    const size_t num_threads = omp_get_max_threads();
+    ws.thread_records.reserve(num_threads * longest);
+    ws.thread_source.reserve(keep_source ? num_threads * longest : 0);
+    std::atomic<uint64_t> num_records{0};
+    parallel_for(chunks.size(), 1, [&](size_t c) {
+        const size_t room = omp_get_thread_num() * longest;
+        Record<T>* mine = ws.thread_records.data() + room;
+        uint32_t* my_source = keep_source ? ws.thread_source.data() + room : nullptr;
+        size_t count = 0;
+        for (size_t p = chunks[c].first; p < chunks[c].last; ++p) {
+            Piece& piece = pieces[p];
+            if (!is_first && (piece.reach.bottom < window.y0 || piece.reach.top >= window.y1)) continue;
+            Reach reach;
+            count += V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, piece.count, camera, window,
+                                       mine + count, keep_source ? my_source + count : nullptr,
+                                       static_cast<uint32_t>(piece.first), reach);
+            piece.reach = reach;
+        }
+        chunk_first[c] = num_records.fetch_add(count, std::memory_order_relaxed);
+        chunk_count[c] = static_cast<uint32_t>(count);
+        std::copy_n(mine, count, records + chunk_first[c]);
+        if (keep_source) std::copy_n(my_source, count, source + chunk_first[c]);
+    });
+    ws.num_records = num_records;
     const double projected = now();
-    tile_bin(records, RecordChunks{chunk_first, chunk_count, num_chunks}, grid, ws.lists);
+    tile_bin(records, RecordChunks{chunk_first, chunk_count, chunks.size()}, grid, ws.lists);
     const double binned = now();
 
     const uint64_t* offset = ws.lists.offset.data();
@@ -84,19 +170,42 @@ RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
             uint64_t* entry = ws.lists.entry.data() + offset[t];
             const size_t count = offset[t + 1] - offset[t];
             sort_tile(records, entry, count, scratch.reserve(count));
-            V3DG_DISPATCH_ISA(rasterize_tile<T>, records, entry, count, kTileSize * (t % grid.columns),
-                              kTileSize * (t / grid.columns), picture);
+            V3DG_DISPATCH_ISA(rasterize_tile<T>, records, entry, count, kTileSize * grid.column(t),
+                              kTileSize * grid.row(t), picture);
         }
     }
+    counts.entries += ws.lists.num_entries;
+    counts.project_seconds += projected - start;
+    counts.bin_seconds += binned - projected;
+    counts.rasterize_seconds += now() - binned;
+}
+
+// The part of a picture that lies in a band of it.
+template <class T>
+static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
+    const size_t skip =
+        static_cast<size_t>(band.y0 - picture.window.y0) * static_cast<size_t>(picture.window.width());
+    Picture<T> part = picture;
+    part.window = band;
+    part.color += 3 * skip;
+    part.alpha += skip;
+    if (part.depth != nullptr) part.depth += skip;
+    return part;
+}
+
+template <class T>
+RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera, const Picture<T>& picture,
+                    bool keep_source, Workspace<T>& ws) {
     RenderCounts counts{};
-    for (size_t c = 0; c < num_chunks; ++c) {
-        counts.in_frustum += chunk_in_frustum[c];
-        counts.records += chunk_count[c];
+    std::vector<Piece> pieces = pieces_of(draws);
+    const std::vector<Window> bands =
+        keep_source ? std::vector<Window>{picture.window} : bands_of(draws, pieces, camera, picture.window);
+    for (size_t b = 0; b < bands.size(); ++b)
+        render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws, counts);
+    for (const Piece& piece : pieces) {
+        counts.in_frustum += piece.reach.in_frustum;
+        counts.records += piece.reach.drawn;
     }
-    counts.entries = ws.lists.num_entries;
-    counts.project_seconds = projected - start;
-    counts.bin_seconds = binned - projected;
-    counts.rasterize_seconds = now() - binned;
     return counts;
 }
 
@@ -110,13 +219,13 @@ template <class T>
 void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& ws,
                      const GaussianGradients<T>& out, T d_background[3]) {
-    const TileGrid grid(picture.width, picture.height);
+    const TileGrid grid(picture.window);
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
     const uint64_t* entry = ws.lists.entry.data();
     // Each (record, tile) pair has a place of its own, the pairs of a record side by side in the order of the
     // tiles, so the sum over tiles does not depend on which thread came first.
-    std::vector<uint64_t> pair_first(ws.records.capacity());
+    std::vector<uint64_t> pair_first(ws.num_records);
     uint64_t num_pairs = 0;
     for (size_t c = 0; c < ws.num_chunks; ++c)
         for (uint64_t r = ws.chunk_first.data()[c], end = r + ws.chunk_count.data()[c]; r < end; ++r) {
@@ -133,7 +242,7 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
         for (size_t i = 0; i < order.size(); ++i) {
             const uint32_t t = order[i];
             const size_t count = offset[t + 1] - offset[t];
-            const int column = t % grid.columns, row = t / grid.columns;
+            const int column = grid.column(t), row = grid.row(t);
             d_entry.assign(count, RecordGradient<T>{});
             V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, entry + offset[t], count,
                               kTileSize * column, kTileSize * row, picture, d_picture, d_entry.data(),

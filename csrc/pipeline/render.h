@@ -9,24 +9,30 @@ namespace v3dg {
 // What one picture needs in between; reused from picture to picture.
 template <class T>
 struct Workspace {
+    // Records of a chunk lie side by side in the order of the draws, chunks in any order.
     Buffer<Record<T>> records;
     Buffer<uint32_t> source;
     Buffer<uint64_t> chunk_first;
     Buffer<uint32_t> chunk_count;
-    Buffer<uint64_t> chunk_in_frustum;
     TileLists lists;
     size_t num_chunks = 0;
+    uint64_t num_records = 0;
+    // A chunk of each thread, before it is known where its records go.
+    Buffer<Record<T>> thread_records;
+    Buffer<uint32_t> thread_source;
 };
 
 struct RenderCounts {
     uint64_t in_frustum;  // gaussians whose extent meets the image
     uint64_t records;     // of them, those that reach a pixel centre
-    uint64_t entries;     // (record, tile) pairs
+    uint64_t entries;     // (record, tile) pairs in the window
     double project_seconds, bin_seconds, rasterize_seconds;
 };
 
-// Draws everything in `draws`: project, bin, sort, blend. Equal depths are blended in the order of the draws.
-// With `keep_source` the workspace can go to render_backward. Throws std::length_error past 2^32 gaussians.
+// Draws the picture's window of everything in `draws`: project, bin, sort, blend. Equal depths are blended in
+// the order of the draws. What is too much for memory at once is drawn in bands of tile rows, with the same
+// result. With `keep_source` it is one band, and the workspace can go to render_backward: `source` is then
+// each record's place among the gaussians of all draws. Throws std::length_error past 2^32 gaussians.
 template <class T>
 RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera, const Picture<T>& picture,
                     bool keep_source, Workspace<T>& workspace);

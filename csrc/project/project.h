@@ -1,5 +1,6 @@
 #pragma once
 
+#include <climits>
 #include <cstddef>
 #include <cstdint>
 
@@ -33,13 +34,21 @@ struct Draw {
     bool compensate;  // opacity for what the filter adds
 };
 
+// The pixels [x0, x1) x [y0, y1) of a picture.
+struct Window {
+    int x0, y0, x1, y1;
+    V3DG_INLINE int width() const { return x1 - x0; }
+    V3DG_INLINE int height() const { return y1 - y0; }
+    V3DG_INLINE bool contains(int x, int y) const { return x0 <= x && x < x1 && y0 <= y && y < y1; }
+};
+
 // One gaussian on the image, ready to blend. A reader finds the meaning of L in project_math.h.
 template <class T>
 struct Record {
     T u, v, l11, l12, l22, log2_opacity;
     T color[3];
     T depth;
-    // First and last pixel whose centre the gaussian can reach, cut to the image.
+    // First and last pixel whose centre the gaussian can reach, cut to the image or the window that is drawn.
     uint16_t x0, x1, y0, y1;
 };
 
@@ -84,15 +93,21 @@ struct GaussianGradients {
     T *means, *quats, *scales, *opacities, *sh;
 };
 
+// What of the whole image a run of gaussians reaches, whichever window of it is drawn.
+struct Reach {
+    uint64_t in_frustum = 0;              // gaussians whose extent meets the image
+    uint64_t drawn = 0;                   // of them, those that reach a pixel centre
+    int top = INT_MAX, bottom = INT_MIN;  // rows that hold all those pixels
+};
+
 // Projects gaussians [skip, skip + count) of a draw and writes a record, in order, for each one that reaches
-// a pixel centre: in front of the near plane, alpha of at least 1/255 somewhere, a positive finite
-// determinant. `source` (or null) receives `source_base` plus the gaussian's place in the draw. Returns the
-// number of records and adds to `in_frustum` the gaussians whose extent meets the image, whether or not they
-// reach a pixel centre.
+// a pixel centre in the window: in front of the near plane, alpha of at least 1/255 somewhere, a positive
+// finite determinant. The window may be empty, and is otherwise within the camera's image. `source` (or null)
+// receives `source_base` plus the gaussian's place behind `skip`. Returns the number of records.
 V3DG_DECLARE_PER_ISA(template <class T> size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count,
-                                                       const Pinhole<T>& camera, Record<T>* records,
-                                                       uint32_t* source, uint32_t source_base,
-                                                       uint64_t& in_frustum))
+                                                       const Pinhole<T>& camera, const Window& window,
+                                                       Record<T>* records, uint32_t* source,
+                                                       uint32_t source_base, Reach& reach))
 
 // Writes the gradients of the `count` gaussians `source` (places in one draw) from those of their records.
 V3DG_DECLARE_PER_ISA(template <class T> void project_backward(const Draw<T>& draw, const uint32_t* source,

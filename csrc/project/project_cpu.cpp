@@ -32,10 +32,14 @@ static V3DG_INLINE auto ceil_to_int(V x) {
 
 template <class T>
 size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
-               Record<T>* records, uint32_t* source, uint32_t source_base, uint64_t& in_frustum) {
+               const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base,
+               Reach& reach) {
     using V = Vec<T>;
+    using I = decltype(V{} < V{});
     constexpr int kWidth = kLanes<T>;
     const GaussianPlanes<T>& model = *draw.model;
+    const int last_x = static_cast<int>(camera.width) - 1, last_y = static_cast<int>(camera.height) - 1;
+    I top = I{} + INT_MAX, bottom = I{} - 1;
     size_t num_records = 0;
     for (uint64_t done = 0; done < count; done += kWidth) {
         const uint64_t at = draw.first + skip + done;
@@ -54,15 +58,23 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         const auto meets =
             drawable & meets_image(e.u, half_x, camera.width) & meets_image(e.v, half_y, camera.height);
         const unsigned meets_bits = bits_of(meets) & lanes;
-        in_frustum += __builtin_popcount(meets_bits);
+        reach.in_frustum += __builtin_popcount(meets_bits);
         if (meets_bits == 0) continue;
 
         V low_x, high_x, low_y, high_y;
         pixel_span(e.u, half_x, camera.width, low_x, high_x);
         pixel_span(e.v, half_y, camera.height, low_y, high_y);
-        const auto x0 = ceil_to_int(low_x), x1 = floor_to_int(high_x);
-        const auto y0 = ceil_to_int(low_y), y1 = floor_to_int(high_y);
-        unsigned kept = bits_of(meets & (x0 <= x1) & (y0 <= y1)) & lanes;
+        I x0 = max_of(ceil_to_int(low_x), I{}), x1 = min_of(floor_to_int(high_x), I{} + last_x);
+        I y0 = max_of(ceil_to_int(low_y), I{}), y1 = min_of(floor_to_int(high_y), I{} + last_y);
+        const auto drawn = meets & (x0 <= x1) & (y0 <= y1);
+        const unsigned drawn_bits = bits_of(drawn) & lanes;
+        reach.drawn += __builtin_popcount(drawn_bits);
+        top = min_of(top, drawn ? y0 : top);
+        bottom = max_of(bottom, drawn ? y1 : bottom);
+
+        x0 = max_of(x0, I{} + window.x0), x1 = min_of(x1, I{} + (window.x1 - 1));
+        y0 = max_of(y0, I{} + window.y0), y1 = min_of(y1, I{} + (window.y1 - 1));
+        unsigned kept = drawn_bits & bits_of((x0 <= x1) & (y0 <= y1));
         if (kept == 0) continue;
 
         V sh[3 * kMaxShBases], color[3];
@@ -70,22 +82,22 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         for (int k = 0; k < num_sh; ++k) sh[k] = load(model.sh[k] + at);
         color_of_sh(model.sh_degree, g.mean, mv, sh, color);
 
-        const int last_x = static_cast<int>(camera.width) - 1, last_y = static_cast<int>(camera.height) - 1;
         while (kept != 0) {
             const int i = __builtin_ctz(kept);
             kept &= kept - 1;
-            const int first_px = static_cast<int>(x0[i]), last_px = static_cast<int>(x1[i]);
-            const int first_py = static_cast<int>(y0[i]), last_py = static_cast<int>(y1[i]);
-            if (first_px > last_x || first_py > last_y || last_px < 0 || last_py < 0) continue;
             Record<T>& r = records[num_records];
             const Ellipse<T> mine{e.u[i],    e.v[i], e.l11[i], e.l12[i], e.l22[i], e.log2_opacity[i],
                                   e.depth[i]};
-            set_ellipse(mine, max_of(first_px, 0), min_of(last_px, last_x), max_of(first_py, 0),
-                        min_of(last_py, last_y), r);
+            set_ellipse(mine, static_cast<int>(x0[i]), static_cast<int>(x1[i]), static_cast<int>(y0[i]),
+                        static_cast<int>(y1[i]), r);
             for (int c = 0; c < 3; ++c) r.color[c] = color[c][i];
             if (source != nullptr) source[num_records] = source_base + static_cast<uint32_t>(done) + i;
             ++num_records;
         }
+    }
+    for (int i = 0; i < kWidth; ++i) {
+        reach.top = min_of(reach.top, static_cast<int>(top[i]));
+        reach.bottom = max_of(reach.bottom, static_cast<int>(bottom[i]));
     }
     return num_records;
 }
@@ -142,10 +154,10 @@ void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordG
     }
 }
 
-#define V3DG_INSTANTIATE(T)                                                                                  \
-    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Pinhole<T>&, Record<T>*, uint32_t*, \
-                               uint32_t, uint64_t&);                                                         \
-    template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, size_t,     \
+#define V3DG_INSTANTIATE(T)                                                                              \
+    template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Pinhole<T>&, const Window&,     \
+                               Record<T>*, uint32_t*, uint32_t, Reach&);                                 \
+    template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, size_t, \
                                       const Pinhole<T>&, const GaussianGradients<T>&);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)

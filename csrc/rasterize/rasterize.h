@@ -4,17 +4,17 @@
 
 namespace v3dg {
 
-// Pictures are row major, (height, width) pixels; colour has three channels.
+// The pixels of a window, row major; colour has three channels.
 template <class T>
 struct Picture {
-    int width, height;
+    Window window;
     T background[3];
     T* color;  // premultiplied, the background composed last
     T* alpha;
     T* depth;  // expected depth, sum of weight * depth over alpha, 0 where alpha is 0; may be null
 };
 
-// Gradients of the picture; `depth` may be null.
+// Gradients of the picture, laid out as it is; `depth` may be null.
 template <class T>
 struct PictureGradient {
     const T* color;
@@ -22,7 +22,7 @@ struct PictureGradient {
     const T* depth;
 };
 
-// Blends one tile's sorted entries, front to back, and writes its pixels.
+// Blends one tile's sorted entries, front to back, and writes its pixels that are in the picture's window.
 V3DG_DECLARE_PER_ISA(template <class T> void rasterize_tile(const Record<T>* records, const uint64_t* entry,
                                                             size_t count, int left, int top,
                                                             const Picture<T>& picture))

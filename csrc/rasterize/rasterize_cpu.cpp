@@ -18,9 +18,9 @@ static V3DG_INLINE void prefetch(const Record<T>* records, const uint64_t* entry
 
 template <class T, bool kWithDepth>
 static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
-                       int width, int height, TilePlanes<T>& tile) {
+                       const Window& window, TilePlanes<T>& tile) {
     const BlockPixels<T> pixels;
-    uint64_t alive = clear_tile(tile, left, top, width, height, kWithDepth);
+    uint64_t alive = clear_tile(tile, left, top, window, kWithDepth);
     for (size_t i = 0; i < count && alive != 0; ++i) {
         prefetch(records, entry, i, count);
         const Record<T>& g = records[record_of(entry[i])];
@@ -29,15 +29,15 @@ static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t c
     }
 }
 
-// Calls visit(place in the tile, place in the picture) for the pixels of a tile that are in the picture.
+// Calls visit(place in the tile, place in the picture) for the pixels of a tile that are in the window.
 template <class Visit>
-static V3DG_INLINE void for_each_pixel(int left, int top, int width, int height, const Visit& visit) {
+static V3DG_INLINE void for_each_pixel(int left, int top, const Window& window, const Visit& visit) {
     for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
         const int x0 = left + block % kTileBlocks * kBlockSize, y0 = top + block / kTileBlocks * kBlockSize;
-        for (int y = y0; y < y0 + kBlockSize && y < height; ++y)
-            for (int x = x0; x < x0 + kBlockSize && x < width; ++x)
+        for (int y = max_of(y0, window.y0); y < min_of(y0 + kBlockSize, window.y1); ++y)
+            for (int x = max_of(x0, window.x0); x < min_of(x0 + kBlockSize, window.x1); ++x)
                 visit(block * kBlockPixels + (y - y0) * kBlockSize + (x - x0),
-                      static_cast<size_t>(y) * width + x);
+                      static_cast<size_t>(y - window.y0) * window.width() + (x - window.x0));
     }
 }
 
@@ -46,10 +46,10 @@ void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t coun
                     const Picture<T>& picture) {
     TilePlanes<T> tile;
     if (picture.depth != nullptr)
-        blend_tile<T, true>(records, entry, count, left, top, picture.width, picture.height, tile);
+        blend_tile<T, true>(records, entry, count, left, top, picture.window, tile);
     else
-        blend_tile<T, false>(records, entry, count, left, top, picture.width, picture.height, tile);
-    for_each_pixel(left, top, picture.width, picture.height, [&](int p, size_t out) {
+        blend_tile<T, false>(records, entry, count, left, top, picture.window, tile);
+    for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
         for (int c = 0; c < 3; ++c) picture.color[3 * out + c] = tile.color[c][p] + t * picture.background[c];
         picture.alpha[out] = 1 - t;
@@ -62,9 +62,9 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
                      const Picture<T>& picture, const PictureGradient<T>& d_picture,
                      RecordGradient<T>* d_entry, T* d_background) {
     TilePlanes<T> tile;
-    blend_tile<T, kWithDepth>(records, entry, count, left, top, picture.width, picture.height, tile);
+    blend_tile<T, kWithDepth>(records, entry, count, left, top, picture.window, tile);
     TileGradient<T> grad = {};
-    for_each_pixel(left, top, picture.width, picture.height, [&](int p, size_t out) {
+    for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
         T d_weight = d_picture.alpha[out], total = 0;
         for (int c = 0; c < 3; ++c) {
@@ -84,7 +84,7 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
         grad.total[p] = total + d_weight * (1 - t);
     });
     const BlockPixels<T> pixels;
-    uint64_t alive = clear_tile(tile, left, top, picture.width, picture.height, false);
+    uint64_t alive = clear_tile(tile, left, top, picture.window, false);
     for (size_t i = 0; i < count && alive != 0; ++i) {
         prefetch(records, entry, i, count);
         const Record<T>& g = records[record_of(entry[i])];

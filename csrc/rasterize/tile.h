@@ -83,19 +83,20 @@ V3DG_INLINE uint64_t live_blocks(const Record<T>& g, int left, int top, uint64_t
     return blocks_of_ellipse(g, left, top, blocks_of(g, left, top) & alive);
 }
 
-// Sets the planes to an empty picture and returns the blocks with a pixel inside width x height. Pixels
-// outside count as stopped.
+// Sets the planes to an empty picture and returns the blocks with a pixel in the window. Pixels outside count
+// as stopped.
 template <class T>
-inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, int width, int height, bool with_depth) {
+inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window& window, bool with_depth) {
     uint64_t alive = 0;
     for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
         const int x = left + kBlockSize * (block % kTileBlocks), y = top + kBlockSize * (block / kTileBlocks);
-        if (x >= width || y >= height) continue;
+        if (x >= window.x1 || y >= window.y1 || x + kBlockSize <= window.x0 || y + kBlockSize <= window.y0)
+            continue;
         alive |= uint64_t(1) << block;
         for (int i = 0; i < kBlockPixels; ++i) {
             const int p = kBlockPixels * block + i;
-            const bool inside = x + i % kBlockSize < width && y + i / kBlockSize < height;
-            tile.transmittance[p] = inside ? T(1) : T(-1);
+            const int px = x + i % kBlockSize, py = y + i / kBlockSize;
+            tile.transmittance[p] = window.contains(px, py) ? T(1) : T(-1);
             tile.color[0][p] = tile.color[1][p] = tile.color[2][p] = T(0);
             if (with_depth) tile.depth[p] = T(0);
         }

@@ -8,12 +8,18 @@
 
 namespace v3dg {
 
-// Tiles of kTileSize pixels that cover an image, row by row.
+// The tiles of kTileSize pixels of an image that cover a window of it, row by row.
 struct TileGrid {
-    int columns, rows;
-    TileGrid(int width, int height)
-        : columns((width + kTileSize - 1) / kTileSize), rows((height + kTileSize - 1) / kTileSize) {}
+    int first_column, first_row, columns, rows;
+    explicit TileGrid(const Window& w)
+        : first_column(w.x0 / kTileSize),
+          first_row(w.y0 / kTileSize),
+          columns((w.x1 + kTileSize - 1) / kTileSize - first_column),
+          rows((w.y1 + kTileSize - 1) / kTileSize - first_row) {}
     size_t size() const { return static_cast<size_t>(columns) * rows; }
+    // Column and row of a tile in the image.
+    int column(size_t tile) const { return first_column + static_cast<int>(tile % columns); }
+    int row(size_t tile) const { return first_row + static_cast<int>(tile / columns); }
 };
 
 // Records in runs, one run a chunk of the draw list: chunk c holds records[first[c] .. first[c] + count[c]).
@@ -36,7 +42,7 @@ struct TileLists {
 template <class T>
 void tile_bin(const Record<T>* records, const RecordChunks& chunks, const TileGrid& grid, TileLists& out);
 
-// Sorts one tile's entries by depth, ties by record. `scratch` has room for as many.
+// Sorts one tile's entries by depth; equal depths stay in their order. `scratch` has room for as many.
 // Double-precision records are ordered by their own depth, which float32 bits do not hold.
 template <class T>
 void sort_tile(const Record<T>* records, uint64_t* entry, size_t count, uint64_t* scratch);

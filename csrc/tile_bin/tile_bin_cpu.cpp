@@ -14,7 +14,8 @@ template <class T, class Visit>
 static void for_each_tile(const Record<T>& r, const TileGrid& grid, const Visit& visit) {
     const int x0 = r.x0 / kTileSize, x1 = r.x1 / kTileSize, y0 = r.y0 / kTileSize, y1 = r.y1 / kTileSize;
     for (int y = y0; y <= y1; ++y)
-        for (int x = x0; x <= x1; ++x) visit(static_cast<size_t>(y) * grid.columns + x);
+        for (int x = x0; x <= x1; ++x)
+            visit(static_cast<size_t>(y - grid.first_row) * grid.columns + (x - grid.first_column));
 }
 
 template <class T>
@@ -57,10 +58,16 @@ template <>
 void sort_tile<float>(const Record<float>*, uint64_t* entry, size_t count, uint64_t* scratch) {
     constexpr size_t kSmall = 256;
     if (count <= kSmall) {
-        std::sort(entry, entry + count);  // the place breaks ties
+        constexpr uint64_t kLow = UINT32_MAX;
+        for (size_t i = 0; i < count; ++i) {
+            scratch[i] = entry[i] & kLow;
+            entry[i] = (entry[i] & ~kLow) | i;
+        }
+        std::sort(entry, entry + count);
+        for (size_t i = 0; i < count; ++i) entry[i] = (entry[i] & ~kLow) | scratch[entry[i] & kLow];
         return;
     }
-    // Least significant digit first over the depth bits that differ; stable, and entries come in by place.
+    // Least significant digit first over the depth bits that differ; stable.
     constexpr int kDigit = 11;
     uint64_t any = 0, all = ~uint64_t(0);
     for (size_t i = 0; i < count; ++i) {
@@ -89,9 +96,8 @@ void sort_tile<float>(const Record<float>*, uint64_t* entry, size_t count, uint6
 
 template <>
 void sort_tile<double>(const Record<double>* records, uint64_t* entry, size_t count, uint64_t*) {
-    std::sort(entry, entry + count, [&](uint64_t a, uint64_t b) {
-        const double depth_a = records[record_of(a)].depth, depth_b = records[record_of(b)].depth;
-        return depth_a != depth_b ? depth_a < depth_b : record_of(a) < record_of(b);
+    std::stable_sort(entry, entry + count, [&](uint64_t a, uint64_t b) {
+        return records[record_of(a)].depth < records[record_of(b)].depth;
     });
 }
 
