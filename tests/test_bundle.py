@@ -654,9 +654,11 @@ def test_a_half_written_file_is_refused_and_replaced(saved):
 def test_save_refuses_what_is_not_a_file(saved, tmp_path):
     bundle, _ = saved
     os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path, tmp_path / "pipe", os.devnull):
+    for path in (tmp_path / "pipe", os.devnull):
         with pytest.raises(ValueError, match="expected the path of a file"):
             bundle.save(path)
+    with pytest.raises(IsADirectoryError, match=tmp_path.name):
+        bundle.save(tmp_path)
     with pytest.raises(FileNotFoundError, match="nowhere"):
         bundle.save(tmp_path / "nowhere" / "a.v3dg")
 

@@ -88,9 +88,9 @@ def test_missing_bundle_is_named(tmp_path):
         read_scene(path)
 
 
-def changed(place, value):
-    """GOOD with the value at a place, as keys and indices; None removes it."""
-    document = json.loads(json.dumps(GOOD))
+def changed(place, value, document=GOOD):
+    """A document with the value at a place, as keys and indices; None removes it."""
+    document = json.loads(json.dumps(document))
     target = document
     for key in place[:-1]:
         target = target[key]
@@ -131,7 +131,7 @@ def changed(place, value):
         ),
         (["instances", 2], 7, "instances[2]: expected an object, got 7"),
         (["instances"], {}, "instances: expected an array, got {}"),
-        (["bundles"], ["a"], "bundles: expected an object of paths by name"),
+        (["bundles"], ["a"], "bundles: expected an object, got"),
         (["bundles", "donut"], 3, "bundles.donut: expected a string, got 3"),
         (["format"], "gltf", 'format: expected "v3dg-scene", got "gltf"'),
         (["version"], 2, "version: expected 1, which is what this build reads, got 2"),
@@ -174,7 +174,81 @@ def test_json_that_is_no_scene_is_refused(tmp_path, text):
         read_scene(put(tmp_path / "scene.json", text))
 
 
+MATRIX = [[1, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 1], [0, 0, 0, 1]]
+
+
 def published_layout():
+    """As the paper's code has them: two assets, one with the notes of the program that placed it."""
+    camera = {
+        "camera_name": "camera_0",
+        "camera_width": 64,
+        "camera_height": 48,
+        "camera_angle_x": 0.8,
+        "camera_angle_y": 0.6,
+        "transform_matrix": MATRIX,
+    }
+    pose = {"scale": 0.5, "quaternions": [1, 0, 0, 0], "positions": [0, 0, 0]}
+    other = {"scale": 2.0, "quaternions": [0, 1, 0, 0], "positions": [1, 2, 3]}
+    asset = {"ply_suffix": "point_cloud/fused.ply", "bundle_kind": "trees", "bundle_name": "oak_250414_n4096"}
+    return {
+        "layouts": [
+            {
+                "layout_name": "layout_0",
+                "assets": [
+                    {"asset_kind": "trees", "asset_name": "oak", **asset, "instances": [pose, other]},
+                    {
+                        "asset_kind": "donut",
+                        "asset_name": "donut",
+                        **asset,
+                        "scene_max_3d_box": [1, 1, 1],
+                        "instances": [{"i_asset": 1, "instance_name": "instance_2", "center_x": 0.1, **pose}],
+                    },
+                ],
+                "cameras": [camera, {**camera, "camera_name": "camera_1"}],
+            }
+        ]
+    }
+
+
+def test_published_layouts_are_read(tmp_path):
+    path = put(tmp_path / "layout.json", published_layout())
+    scene, cameras = read_scene(path, bundles={"oak": BUNDLE, "donut": OTHER})
+    assert scene.bundles == [BUNDLE, OTHER]
+    np.testing.assert_array_equal(scene.instance_bundle, [0, 0, 1])
+    np.testing.assert_array_equal(scene.scales, [0.5, 2, 0.5])
+    np.testing.assert_array_equal(scene.positions[1], [1, 2, 3])
+    np.testing.assert_array_equal(scene.rotations[1], np.diag([1, -1, -1]))
+    assert list(cameras) == ["camera_0", "camera_1"]
+    camera = cameras["camera_0"]
+    np.testing.assert_allclose(camera.position, [0, -5, 1])
+    np.testing.assert_allclose(camera.viewmat[2, :3], [0, 1, 0], atol=1e-12)  # looks along y
+    assert camera.fx == pytest.approx(32 / np.tan(0.4))
+    assert camera.fy == pytest.approx(24 / np.tan(0.3))
+
+
+def test_published_layouts_find_bundles_where_a_build_puts_them(tmp_path):
+    """Beside the layout, or beside the assets of the published code."""
+    (tmp_path / "layouts").mkdir()
+    path = put(tmp_path / "layouts" / "layout.json", published_layout())
+    with pytest.raises(FileNotFoundError, match=r"layouts\[0\]\.assets\[0\]\.asset_name: .*oak\.v3dg or "):
+        read_scene(path)
+    BUNDLE.save(tmp_path / "layouts" / "donut.v3dg")
+    place = tmp_path / "_3dgs-assets" / "trees" / "oak" / "point_cloud"
+    place.mkdir(parents=True)
+    OTHER.save(place / "fused.v3dg")
+    scene, _ = read_scene(path)
+    assert [bundle.num_gaussians for bundle in scene.bundles] == [OTHER.num_gaussians, BUNDLE.num_gaussians]
+
+
+def test_repeated_camera_names_of_a_layout_get_their_place(tmp_path):
+    layout = published_layout()
+    layout["layouts"][0]["cameras"][1]["camera_name"] = "camera_0"
+    path = put(tmp_path / "layout.json", layout)
+    _, cameras = read_scene(path, bundles={"oak": BUNDLE, "donut": OTHER})
+    assert list(cameras) == ["000_camera_0", "001_camera_0"]
+
+
+def flat_layout():
     return {
         "name": "Sea",
         "asset": "donut.ply",
@@ -184,38 +258,50 @@ def published_layout():
             {"scale": 2, "quaternion": [0, 1, 0, 0], "position": [1, 2, 3]},
         ],
         "cameras": [
-            {
-                "name": "0",
-                "width": 64,
-                "height": 48,
-                "fov_x": 0.8,
-                "fov_y": 0.6,
-                "transform_matrix": [[1, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 1], [0, 0, 0, 1]],
-            }
+            {"name": "0", "width": 64, "height": 48, "fov_x": 0.8, "fov_y": 0.6, "transform_matrix": MATRIX}
         ],
     }
 
 
-def test_published_layouts_are_read(tmp_path):
-    path = put(tmp_path / "layout.json", published_layout())
+def test_flat_layouts_are_read(tmp_path):
+    path = put(tmp_path / "layout.json", flat_layout())
     scene, cameras = read_scene(path, bundles={"donut.ply": BUNDLE})
     np.testing.assert_array_equal(scene.scales, [0.5, 2])
-    np.testing.assert_array_equal(scene.positions[1], [1, 2, 3])
     np.testing.assert_allclose(cameras["0"].position, [0, -5, 1])
-    np.testing.assert_allclose(cameras["0"].viewmat[2, :3], [0, 1, 0], atol=1e-12)  # looks along y
-    assert cameras["0"].fx == pytest.approx(32 / np.tan(0.4))
-    assert cameras["0"].fy == pytest.approx(24 / np.tan(0.3))
     with pytest.raises(FileNotFoundError, match=r"layout\.json: asset: expected a bundle at .*donut\.v3dg"):
         read_scene(path)
     BUNDLE.save(tmp_path / "donut.v3dg")
     assert len(read_scene(path)[0]) == 2
 
 
-def test_bad_published_layout_is_named_by_its_place(tmp_path):
-    layout = published_layout()
-    layout["cameras"][0]["transform_matrix"][0][0] = 2
-    with pytest.raises(ValueError, match=r"layout\.json: cameras\[0\]\.transform_matrix: expected"):
-        read_scene(put(tmp_path / "layout.json", layout), bundles={"donut.ply": BUNDLE})
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (["layouts"], [], "layouts: expected one layout, got 0"),
+        (["layouts"], [{}, {}], "layouts: expected one layout, got 2; each is a scene"),
+        (["layouts", 0, "assets"], None, "layouts[0]: expected the field assets"),
+        (["layouts", 0, "assets", 1, "asset_name"], 3, "layouts[0].assets[1].asset_name: expected a string"),
+        (
+            ["layouts", 0, "assets", 0, "instances", 1, "scale"],
+            0,
+            "layouts[0].assets[0].instances[1].scale: expected a positive number, got 0",
+        ),
+        (
+            ["layouts", 0, "cameras", 1, "transform_matrix", 0, 0],
+            2,
+            "layouts[0].cameras[1].transform_matrix: expected a rotation",
+        ),
+        (
+            ["layouts", 0, "cameras", 1, "camera_angle_x"],
+            4,
+            "layouts[0].cameras[1].camera_angle_x: expected radians between 0 and pi, got 4",
+        ),
+    ],
+)
+def test_bad_layouts_are_named_by_their_place(tmp_path, place, value, message):
+    path = put(tmp_path / "layout.json", changed(place, value, published_layout()))
+    with pytest.raises(ValueError, match="^" + re.escape(f"layout.json: {message}")):
+        read_scene(path, bundles={"oak": BUNDLE, "donut": OTHER})
 
 
 def test_write_refuses_missing_paths(tmp_path):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v3dg import bundle_file
+from v3dg._json import parse_json
 from v3dg.bundle_file import BundleFile
 from v3dg.gaussians import Gaussians
 
@@ -140,7 +141,7 @@ class Bundle:
         file: BundleFile | None,
     ) -> None:
         self._config_json = _to_json(config)
-        self.config: dict[str, Any] = bundle_file.parse_json(self._config_json)
+        self.config: dict[str, Any] = parse_json(self._config_json)
         self.clusters = clusters
         self.groups = groups
         self.sh_degree = sh_degree

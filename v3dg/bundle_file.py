@@ -10,13 +10,14 @@ import errno
 import hashlib
 import json
 import os
-import secrets
-import stat
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
+
+from v3dg import _files
+from v3dg._json import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -163,67 +164,30 @@ def write(
         tables: Every name of TABLE_NAMES but ``pages.hash``, which is computed.
         pages: The arrays of each page, in order; their bytes follow one another in the file.
     """
-    target = os.path.realpath(path)  # a link stays a link, to the new file
-    if os.path.exists(target) and not os.path.isfile(target):
-        raise ValueError(f"{os.fspath(path)}: expected the path of a file, got a directory or a device")
-    # The start of the name only: with the rest the temporary name could be longer than a name may be.
-    temporary = os.path.join(
-        os.path.dirname(target), f".{os.path.basename(target)[:40]}.{secrets.token_hex(8)}.tmp"
-    )
-    try:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-        with open(os.open(temporary, flags, 0o666), "wb", buffering=1 << 20) as file:
-            entries = _table_entries(tables)
-            header = _header(entries, sh_degree, config_json)
-            file.write(header)
-            digest = hashlib.blake2b(header, digest_size=HASH_BYTES)
-            hashes = bytearray()
-            with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
-                for run in _runs(pages):
-                    for page, page_digest in pool.map(_page_in_file, run):
-                        file.write(page.data)
-                        hashes += page_digest
-            hash_table = np.frombuffer(hashes, np.uint8).reshape(-1, HASH_BYTES)
-            for name, dtype, _, _ in _SCHEMA:
-                table = hash_table if name == "pages.hash" else tables[name]
-                data = table.astype(_DTYPES[dtype], copy=False).tobytes()
-                file.write(data)
-                digest.update(data)
-            file.write(digest.digest())
-            assert file.tell() == len(header) + entries["hash"]["data_offsets"][1]
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-    except BaseException as error:
-        if os.path.lexists(temporary):
-            os.unlink(temporary)
-        if isinstance(error, OSError) and error.errno is not None:
-            raise OSError(error.errno, os.strerror(error.errno), os.fspath(path)) from error
-        raise
+    with _files.replacing(path) as temporary, open(temporary, "xb", buffering=1 << 20) as file:
+        entries = _table_entries(tables)
+        header = _header(entries, sh_degree, config_json)
+        file.write(header)
+        digest = hashlib.blake2b(header, digest_size=HASH_BYTES)
+        hashes = bytearray()
+        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+            for run in _runs(pages):
+                for page, page_digest in pool.map(_page_in_file, run):
+                    file.write(page.data)
+                    hashes += page_digest
+        hash_table = np.frombuffer(hashes, np.uint8).reshape(-1, HASH_BYTES)
+        for name, dtype, _, _ in _SCHEMA:
+            table = hash_table if name == "pages.hash" else tables[name]
+            data = table.astype(_DTYPES[dtype], copy=False).tobytes()
+            file.write(data)
+            digest.update(data)
+        file.write(digest.digest())
+        assert file.tell() == len(header) + entries["hash"]["data_offsets"][1]
 
 
 def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    keys = dict(pairs)
-    if len(keys) != len(pairs):
-        raise ValueError("a key appears twice")
-    return keys
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not a JSON number")
-
-
-def parse_json(text: str | bytes) -> Any:
-    """Parse strict JSON: no NaN, no key twice, no unbounded nesting; ValueError otherwise."""
-    try:
-        return json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
-    except RecursionError:
-        raise ValueError("nested too deep") from None
 
 
 class BundleFile:
@@ -245,9 +209,7 @@ class BundleFile:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = os.fspath(path)
-        if not stat.S_ISREG(os.stat(path).st_mode):
-            self._fail("expected a file, got a directory or a device")
-        self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._fd = _files.open_regular(path)
         self.close = weakref.finalize(self, os.close, self._fd)
         try:
             self._read_header_and_tables()

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import os
-import secrets
-from collections.abc import Iterator
 from typing import Literal
 
-from v3dg import _core
+from v3dg import _core, _files
 from v3dg.gaussians import Gaussians
 
 PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
@@ -52,29 +48,10 @@ def save(
     if not isinstance(gaussians, Gaussians):
         raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}")
     host = gaussians.numpy()
-    with replacing(path) as temporary:
+    with _files.replacing(path) as temporary:
         _core.ply_write(
             temporary, host.means, host.quats, host.scales, host.opacities, host.sh, encoding=encoding
         )
-
-
-@contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
-    """Give a new name beside `path` to write to; at the end it replaces `path`, on failure it is removed."""
-    target = os.path.realpath(path)  # a link stays a link
-    if os.path.isdir(target):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
-    folder, name = os.path.split(target)
-    temporary = os.path.join(folder, f".{name[:100]}.{secrets.token_hex(4)}.tmp")
-    try:
-        yield temporary
-        os.replace(temporary, target)
-    except BaseException as error:
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            os.unlink(temporary)
-        if isinstance(error, OSError) and error.filename == temporary:
-            error.filename = os.fspath(path)  # the caller knows no other name
-        raise
 
 
 def _check_suffix(path: str | os.PathLike[str]) -> None:

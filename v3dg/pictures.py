@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from v3dg import _files
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -43,9 +45,5 @@ def write_picture(path: str | os.PathLike[str], image: Any) -> None:
     pixels = image if getattr(image, "dtype", None) == np.uint8 else to_8bit(image)
     kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
     options: dict[str, Any] = {"quality": 90} if kind == "JPEG" else {}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with _files.replacing(path) as temporary:
         Image.fromarray(pixels).save(temporary, kind, **options)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -1,0 +1,65 @@
+"""Files that are complete or not there, and the first step of reading files of strangers."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
+    """Give a new name beside `path` to write to; at the end it replaces `path`, on failure it is removed.
+
+    What is written is on the disk before it gets its name. A link stays a link, to the new file.
+
+    Raises:
+        IsADirectoryError: `path` is a folder.
+        ValueError: `path` is a device or a pipe.
+        OSError: As writing raised it, with `path` for the file's name.
+    """
+    target = os.path.realpath(path)
+    if os.path.isdir(target):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+    if os.path.exists(target) and not os.path.isfile(target):
+        raise ValueError(f"{os.fspath(path)}: expected the path of a file, got a device or a pipe")
+    folder, name = os.path.split(target)
+    # The start of the name only: a name may have 255 bytes, and a character up to four.
+    temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
+    try:
+        yield temporary
+        _flush(temporary)
+        os.replace(temporary, target)
+    except BaseException as error:
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            os.unlink(temporary)
+        # Those of writing to an open file come without a name.
+        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, temporary):
+            raise OSError(error.errno, os.strerror(error.errno), os.fspath(path)) from error
+        raise
+
+
+def _flush(path: str) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def open_regular(path: str | os.PathLike[str]) -> int:
+    """Open a file for reading and return its descriptor.
+
+    Raises:
+        ValueError: It is a directory, a device or a pipe; nothing was waited for.
+        OSError: It cannot be opened (FileNotFoundError, PermissionError, ...).
+    """
+    # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise ValueError(f"{os.fspath(path)}: expected a file, got a directory or a device")
+    return descriptor

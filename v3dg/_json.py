@@ -1,0 +1,169 @@
+"""Strict JSON, and values that know where in their file they stand, so that errors can say it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+from v3dg import _files
+
+T = TypeVar("T")
+
+_LARGEST_SIDE = 1 << 20  # px of a picture
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse strict JSON: no NaN, no key twice, no unbounded nesting; ValueError otherwise."""
+    try:
+        return json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
+    except RecursionError:
+        raise ValueError("nested too deep") from None
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    keys: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in keys:
+            raise ValueError(f"the key {shown(key)} appears twice")
+        keys[key] = value
+    return keys
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a JSON number")
+
+
+def shown(value: Any) -> str:
+    """A JSON value as a message shows it: on one line, and not long."""
+    if isinstance(value, dict | list) and len(value) > 8:
+        return f"{'an object' if isinstance(value, dict) else 'an array'} of {len(value)} values"
+    try:
+        text = json.dumps(value)
+    except RecursionError:
+        return "a value that is nested deep"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def read_json(path: str | os.PathLike[str]) -> Node:
+    """Read a JSON file.
+
+    Raises:
+        ValueError: It is no regular file, or not strict JSON in UTF-8.
+        OSError: It cannot be read.
+    """
+    path = Path(path)
+    with open(_files.open_regular(path), "rb") as file:
+        content = file.read()
+    try:
+        return Node(parse_json(content.decode("utf-8")), path.name, "")
+    except ValueError as error:
+        raise ValueError(f"{path.name}: expected JSON, got a file that does not parse: {error}") from error
+
+
+class Node:
+    """A JSON value that knows where in the file it stands."""
+
+    def __init__(self, value: Any, file: str, path: str) -> None:
+        self.value, self.file, self.path = value, file, path
+
+    def problem(self, text: str) -> ValueError:
+        """An error that begins with the place."""
+        return ValueError(f"{self.file}: {self.path or 'top level'}: {text}")
+
+    def error(self, expected: str) -> ValueError:
+        return self.problem(f"expected {expected}, got {shown(self.value)}")
+
+    def attempt(self, make: Callable[[], T]) -> T:
+        """What ``make`` makes of the fields; its ValueErrors, which begin with a field, get their place."""
+        try:
+            return make()
+        except ValueError as error:
+            raise ValueError(f"{self.file}: {self._at(str(error))}") from error
+
+    def child(self, key: str) -> Node:
+        return Node(self.value[key], self.file, self._at(key))
+
+    def _at(self, key: str) -> str:
+        return f"{self.path}.{key}" if self.path else key
+
+    def has(self, key: str) -> bool:
+        return isinstance(self.value, dict) and key in self.value
+
+    def items(self) -> list[Node]:
+        """An array's values."""
+        if not isinstance(self.value, list):
+            raise self.error("an array")
+        return [Node(value, self.file, f"{self.path}[{i}]") for i, value in enumerate(self.value)]
+
+    def some_fields(self, required: tuple[str, ...]) -> dict[str, Node]:
+        """An object's fields, among them the required ones."""
+        if not isinstance(self.value, dict):
+            raise self.error("an object")
+        for key in required:
+            if key not in self.value:
+                raise self.problem(f"expected the field {key}, got an object without it")
+        return {key: self.child(key) for key in self.value}
+
+    def fields(self, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Node]:
+        """An object's fields, none of them unknown."""
+        fields = self.some_fields(required)
+        for key, node in fields.items():
+            if key not in required and key not in optional:
+                allowed = ", ".join((*required, *optional))
+                raise node.problem(f"expected one of {allowed}, got an unknown field")
+        return fields
+
+    def text(self) -> str:
+        if not isinstance(self.value, str) or not self.value:
+            raise self.error("a string")
+        try:
+            self.value.encode()
+        except UnicodeEncodeError:
+            raise self.error("a string of Unicode characters") from None
+        return self.value
+
+    def number(self) -> float:
+        if isinstance(self.value, bool) or not isinstance(self.value, int | float):
+            raise self.error("a number")
+        try:
+            number = float(self.value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            raise self.error("a finite number")
+        return number
+
+    def positive(self) -> float:
+        number = self.number()
+        if number <= 0:
+            raise self.error("a positive number")
+        return number
+
+    def field_of_view(self) -> float:
+        angle = self.number()
+        if not 0 < angle < math.pi:
+            raise self.error("radians between 0 and pi")
+        return angle
+
+    def size(self) -> int:
+        """A side of a picture in px; some programs write it as 1920.0."""
+        side = self.number()
+        if side != int(side) or side <= 0:
+            raise self.error("a positive whole number")
+        if side > _LARGEST_SIDE:
+            raise self.error(f"at most {_LARGEST_SIDE} px")
+        return int(side)
+
+    def vector(self, length: int) -> list[float]:
+        if not isinstance(self.value, list) or len(self.value) != length:
+            raise self.error(f"{length} numbers")
+        return [item.number() for item in self.items()]
+
+    def matrix(self, num_rows: int, num_columns: int) -> list[list[float]]:
+        if not isinstance(self.value, list) or len(self.value) != num_rows:
+            raise self.error(f"{num_rows} rows of {num_columns} numbers")
+        return [row.vector(num_columns) for row in self.items()]
