@@ -161,6 +161,28 @@ def test_render_scene(folder, tmp_path):
         assert picture.size == (48, 32)
 
 
+def test_render_from_a_camera_file(folder, tmp_path):
+    matrix = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]
+    frames = [{"file_path": f"train/r_{i}", "transform_matrix": matrix} for i in range(2)]
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"camera_angle_x": 0.7, "k1": 0.1, "frames": frames}))
+    for subject in ("tuft.ply", "tuft.v3dg", "scene.json"):
+        command = ["render", folder / subject, "--cameras", path, "--size", 40, 30]
+        done = run(*command, "--distortion", "ignore", "-o", tmp_path / "out.png", "--json")
+        assert done.returncode == 0, done.stderr
+        for i, picture in enumerate(json.loads(done.stdout)["pictures"]):
+            assert picture["picture"] == str(tmp_path / f"out_train_r_{i}.png")
+            assert picture["gaussians_in_frustum"] > 0
+            with Image.open(picture["picture"]) as image:
+                assert image.size == (40, 30)
+        os.unlink(tmp_path / "out_train_r_0.png")
+        os.unlink(tmp_path / "out_train_r_1.png")
+    fails(1, "transforms.json: k1: expected no lens distortion", *command, cwd=tmp_path)
+    done = run(*command, "--distortion", "ignore", "--camera", "train/r_1", "-o", tmp_path / "one.png")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "one.png").exists()
+
+
 def test_wrong_usage(folder):
     fails(2, "bild", "bild", cwd=folder)
     fails(2, "v3dg build --help", "build", cwd=folder)

@@ -11,6 +11,7 @@ if _find_spec("v3dg._core") is None:
 from v3dg._version import __version__
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle, Clusters, Groups
+from v3dg.camera_file import read_cameras, write_cameras
 from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
@@ -38,10 +39,12 @@ __all__ = [
     "build_bundle",
     "load",
     "rasterize",
+    "read_cameras",
     "read_scene",
     "render",
     "save",
     "select",
     "turntable",
+    "write_cameras",
     "write_scene",
 ]

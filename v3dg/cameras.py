@@ -45,10 +45,7 @@ class Camera:
     def __post_init__(self) -> None:
         viewmat = _floats(self.viewmat, "viewmat", (4, 4))
         rotation = viewmat[:3, :3]
-        if (
-            np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE
-            or np.linalg.det(rotation) < 0
-        ):
+        if not is_rotation(rotation):
             raise ValueError(
                 "viewmat: expected a rotation in the upper left 3x3, got a matrix that scales, "
                 "shears or mirrors; put scale into the scene instead"
@@ -106,7 +103,7 @@ class Camera:
             raise ValueError(f"up: expected a direction that is not along the view, got {_text(up_vector)}")
         right /= length
         rotation = np.stack([right, np.cross(forward, right), forward])
-        return cls(_rigid(rotation, position), _intrinsics(fov_x, None, width, height), width, height, near)
+        return cls(_rigid(rotation, position), intrinsics(fov_x, None, width, height), width, height, near)
 
     @classmethod
     def from_blender(
@@ -126,21 +123,8 @@ class Camera:
             fov_x: Horizontal field of view in radians.
             fov_y: Vertical field of view in radians; square pixels if None.
         """
-        matrix = _floats(transform_matrix, "transform_matrix", (4, 4))
-        axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
-        if np.abs(axes.T @ axes - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(axes) < 0:
-            raise ValueError(
-                "transform_matrix: expected a rotation in the upper left 3x3, got a matrix that scales, "
-                "shears or mirrors"
-            )
-        left, _, right = np.linalg.svd(axes)
-        return cls(
-            _rigid((left @ right).T, matrix[:3, 3]),
-            _intrinsics(fov_x, fov_y, width, height),
-            width,
-            height,
-            near,
-        )
+        K = intrinsics(fov_x, fov_y, width, height)
+        return cls(viewmat_from_blender(transform_matrix), K, width, height, near)
 
     @property
     def position(self) -> Floats:
@@ -226,7 +210,29 @@ def _rigid(rotation: Floats, eye: Floats) -> Floats:
     return viewmat
 
 
-def _intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Floats:
+def is_rotation(matrix: Floats) -> bool:
+    """Whether a (3, 3) matrix is a rotation, up to what float32 text loses."""
+    if np.abs(matrix).max() > 2:  # squares of huge numbers would overflow
+        return False
+    off = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(off <= ROTATION_TOLERANCE and np.linalg.det(matrix) > 0)
+
+
+def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
+    """(4, 4) world to camera from camera to world in Blender's convention; the nearest rotation is taken."""
+    matrix = _floats(transform_matrix, "transform_matrix", (4, 4))
+    axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
+    if not is_rotation(axes):
+        raise ValueError(
+            "transform_matrix: expected a rotation in the upper left 3x3, got a matrix that scales, "
+            "shears or mirrors"
+        )
+    left, _, right = np.linalg.svd(axes)
+    return _rigid((left @ right).T, matrix[:3, 3])
+
+
+def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Floats:
+    """(3, 3) K of fields of view in radians, its principal point in the middle; None: square pixels."""
     width, height = _positive_int(width, "width"), _positive_int(height, "height")
     for name, fov in (("fov_x", fov_x), ("fov_y", fov_y)):
         if fov is not None and not 0 < fov < math.pi:

@@ -70,18 +70,22 @@ class Info:
 
 @dataclass
 class Render:
-    """Draw a scene from its cameras, or a bundle or an asset from a turntable, to pictures."""
+    """Draw a scene from its cameras, a bundle or an asset from a turntable, or any from a camera file."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply)."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
     """Picture to write, .png or .jpg; several get a number or the camera's name. Default: as the subject."""
+    cameras: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Draw from the cameras of this nerfstudio transforms.json."""
+    distortion: Literal["refuse", "ignore"] = "refuse"
+    """Whether lens distortion in that file is an error, or left out of the pictures."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Draw only this camera of a scene file: its name, or its place in the file, from 0."""
+    """Draw only this camera of a file with cameras: its name, or its place in the file, from 0."""
     views: int = 1
     """Views around the turntable."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
-    """Width and height of a turntable's pictures in px."""
+    """Width and height in px of a turntable's pictures, and of cameras whose file gives them no size."""
     elevation: float = 20.0
     """Height of the turntable's cameras above the horizon in degrees."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
@@ -406,31 +410,41 @@ def _render(options: Render) -> None:
 
 
 def _subject_and_cameras(options: Render) -> tuple[Scene | Bundle | Gaussians, dict[str, Camera]]:
-    if options.subject.suffix == ".json":
+    """What to draw, and from where: the file of --cameras, else a scene's own cameras, else a turntable."""
+    is_scene = options.subject.suffix == ".json"
+    if options.cameras is None and not is_scene:
+        if options.camera is not None:
+            raise _UsageError("--camera: expected --cameras or a scene (.json) to take it from; leave it out")
+        loaded = _load(options.subject)
+        return loaded, _turntable(loaded, options)
+    subject: Scene | Bundle | Gaussians
+    cameras: dict[str, Camera] = {}
+    if is_scene:
         from v3dg.scene_file import read_scene
 
-        scene, cameras = read_scene(options.subject)
-        if not cameras:
-            raise ValueError(
-                f"{options.subject}: expected cameras, got a scene without; add some to the file"
-            )
-        if options.camera is None:
-            return scene, cameras
-        names = list(cameras)
-        name = options.camera
-        if name not in cameras and name.isdecimal() and int(name) < len(names):
-            name = names[int(name)]
-        if name not in cameras:
-            known = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
-            raise ValueError(
-                f"--camera: expected one of {known}, or 0 to {len(names) - 1}, got {options.camera}; "
-                f"see `v3dg info {options.subject}`"
-            )
-        return scene, {name: cameras[name]}
-    if options.camera is not None:
-        raise _UsageError("--camera: expected a scene file (.json) to take it from; leave it out")
-    subject = _load(options.subject)
-    return subject, _turntable(subject, options)
+        subject, cameras = read_scene(options.subject)
+    else:
+        subject = _load(options.subject)
+    if options.cameras is not None:
+        from v3dg.camera_file import read_cameras
+
+        cameras = read_cameras(options.cameras, size=options.size, distortion=options.distortion)
+    if not cameras:
+        raise ValueError(
+            f"{options.cameras or options.subject}: expected cameras, got a file without; add some to it"
+        )
+    return subject, cameras if options.camera is None else _one_camera(cameras, options.camera)
+
+
+def _one_camera(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
+    """The camera of that name or at that place."""
+    names = list(cameras)
+    if name not in cameras and name.isdecimal() and int(name) < len(names):
+        name = names[int(name)]
+    if name not in cameras:
+        known = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+        raise ValueError(f"--camera: expected one of {known}, or 0 to {len(names) - 1}, got {name}")
+    return {name: cameras[name]}
 
 
 def _turntable(subject: Bundle | Gaussians, options: Render) -> dict[str, Camera]:

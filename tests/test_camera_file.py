@@ -1,0 +1,202 @@
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v3dg import Camera, read_cameras, write_cameras
+
+MATRIX = [[1, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 1], [0, 0, 0, 1]]
+# Seen from (0, -5, 1) along y, z upwards.
+VIEWMAT = [[1, 0, 0, 0], [0, 0, -1, 1], [0, 1, 0, 5], [0, 0, 0, 1]]
+# What a capture's processing writes, without its lens.
+CAPTURE = {
+    "camera_model": "OPENCV",
+    "w": 640,
+    "h": 480,
+    "fl_x": 500.0,
+    "fl_y": 510.0,
+    "cx": 321.5,
+    "cy": 238.5,
+    "k1": 0.0,
+    "k2": 0,
+    "p1": 0.0,
+    "p2": 0.0,
+    "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]],
+    "ply_file_path": "sparse_pc.ply",
+    "frames": [
+        {"file_path": "images/frame_1.png", "transform_matrix": MATRIX, "colmap_im_id": 1},
+        {"file_path": "images/frame_2.png", "transform_matrix": MATRIX, "fl_x": 600, "w": 320.0},
+    ],
+}
+# NeRF's synthetic scenes: the size is that of the pictures, which are not looked at.
+SYNTHETIC = {
+    "camera_angle_x": 0.69,
+    "frames": [
+        {"file_path": "./train/r_0", "rotation": 0.01, "transform_matrix": MATRIX},
+        {"file_path": "./train/r_1", "rotation": 0.01, "transform_matrix": MATRIX[:3]},
+    ],
+}
+
+
+def put(folder, document):
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(document), encoding="utf-8")
+    return path
+
+
+def test_a_capture_is_read(tmp_path):
+    cameras = read_cameras(put(tmp_path, CAPTURE))
+    assert list(cameras) == ["images/frame_1.png", "images/frame_2.png"]
+    first, second = cameras.values()
+    np.testing.assert_allclose(first.viewmat, VIEWMAT, atol=1e-15)
+    np.testing.assert_array_equal(first.K, [[500, 0, 321.5], [0, 510, 238.5], [0, 0, 1]])
+    assert (first.width, first.height, first.near) == (640, 480, 0.01)
+    # A frame's own focal length stands for both axes: the file's fl_y belongs to the other lens.
+    assert (second.fx, second.fy, second.width, second.height) == (600, 600, 320, 480)
+
+
+def test_a_synthetic_scene_is_read(tmp_path):
+    path = put(tmp_path, SYNTHETIC)
+    cameras = read_cameras(path, size=(800, 600))
+    assert list(cameras) == ["./train/r_0", "./train/r_1"]
+    for camera in cameras.values():
+        np.testing.assert_allclose(camera.viewmat, VIEWMAT, atol=1e-15)
+        assert camera.fx == camera.fy == pytest.approx(400 / math.tan(0.345))
+        assert (camera.cx, camera.cy, camera.width, camera.height) == (400, 300, 800, 600)
+    with pytest.raises(ValueError, match=r"frames\[0\]: expected w and h, .* got neither; give the size"):
+        read_cameras(path)
+
+
+def test_vertical_field_of_view_is_used(tmp_path):
+    camera, _ = read_cameras(put(tmp_path, {**SYNTHETIC, "camera_angle_y": 0.5}), size=(80, 60)).values()
+    assert camera.fy == pytest.approx(30 / math.tan(0.25))
+
+
+def test_applied_transform_is_undone_on_request(tmp_path):
+    path = put(tmp_path, {**CAPTURE, "applied_scale": 2})
+    point = np.array([0.3, -0.2, 0.7])  # where the data was before
+    in_file = 2 * np.array(CAPTURE["applied_transform"]) @ [*point, 1]
+    kept = next(iter(read_cameras(path).values()))
+    undone = next(iter(read_cameras(path, applied_transform="undo").values()))
+    seen = kept.viewmat @ [*in_file, 1]
+    np.testing.assert_allclose(2 * (undone.viewmat @ [*point, 1])[:3], seen[:3], atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["k1", "k3", "p2"])
+def test_distortion_is_refused_or_ignored(tmp_path, name):
+    path = put(tmp_path, {**CAPTURE, name: 0.01})
+    with pytest.raises(
+        ValueError, match=f"^transforms.json: {name}: expected no lens distortion; .*got 0.01"
+    ):
+        read_cameras(path)
+    ignored = next(iter(read_cameras(path, distortion="ignore").values()))
+    np.testing.assert_array_equal(ignored.K, read_cameras(put(tmp_path, CAPTURE))["images/frame_1.png"].K)
+
+
+@pytest.mark.parametrize("frame", [{"file_path": "images/frame_2.png"}, {}])
+def test_cameras_without_names_of_their_own_get_their_place(tmp_path, frame):
+    frames = [*CAPTURE["frames"], {"transform_matrix": MATRIX, **frame}]
+    assert list(read_cameras(put(tmp_path, {**CAPTURE, "frames": frames}))) == ["0", "1", "2"]
+
+
+@given(seed=st.integers(0, 2**32 - 1), names=st.sets(st.text("ab/. ä", min_size=1), max_size=4))
+def test_what_is_written_reads_back(tmp_path_factory, seed, names):
+    rng = np.random.default_rng(seed)
+    cameras = {}
+    for name in sorted(names):
+        eye = 100 * rng.normal(size=3)
+        camera = Camera.look_at(eye, eye + rng.normal(size=3), width=64, height=48, near=0.5)
+        K = np.array([[50, 0, rng.normal()], [0, 60, rng.normal()], [0, 0, 1]])
+        cameras[name] = Camera(camera.viewmat, K, 70, 80, camera.near)
+    path = tmp_path_factory.mktemp("cameras") / "transforms.json"
+    write_cameras(path, cameras)
+    again = read_cameras(path)
+    assert list(again) == list(cameras)
+    for name, camera in cameras.items():
+        np.testing.assert_allclose(again[name].viewmat, camera.viewmat, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(again[name].K, camera.K)
+        got = (again[name].width, again[name].height, again[name].near)
+        assert got == (camera.width, camera.height, camera.near)
+    assert [entry.name for entry in path.parent.iterdir()] == ["transforms.json"]
+
+
+def with_frame(**change):
+    return {**CAPTURE, "frames": [CAPTURE["frames"][0], {**CAPTURE["frames"][1], **change}]}
+
+
+def without(*keys):
+    return {key: value for key, value in CAPTURE.items() if key not in keys}
+
+
+BAD = {
+    "no frames": (without("frames"), "top level: expected the field frames"),
+    "frames of another kind": ({**CAPTURE, "frames": {}}, "frames: expected an array, got {}"),
+    "a frame of another kind": ({**CAPTURE, "frames": [3]}, "frames[0]: expected an object, got 3"),
+    "no matrix": ({**CAPTURE, "frames": [{}]}, "frames[0]: expected the field transform_matrix"),
+    "matrix of two rows": (
+        with_frame(transform_matrix=MATRIX[:2]),
+        "frames[1].transform_matrix: expected 4 rows of 4 numbers",
+    ),
+    "matrix with a word": (
+        with_frame(transform_matrix=[[1, 0, 0, "x"], *MATRIX[1:]]),
+        'frames[1].transform_matrix[0][3]: expected a number, got "x"',
+    ),
+    "matrix that scales": (
+        with_frame(transform_matrix=(2 * np.array(MATRIX)).tolist()),
+        "frames[1].transform_matrix: expected a rotation in the upper left 3x3",
+    ),
+    "matrix that overflows": (
+        with_frame(transform_matrix=(1e300 * np.array(MATRIX)).tolist()),
+        "frames[1].transform_matrix: expected a rotation in the upper left 3x3",
+    ),
+    "matrix that mirrors": (
+        with_frame(transform_matrix=(np.diag([-1, 1, 1, 1]) @ np.array(MATRIX)).tolist()),
+        "frames[1].transform_matrix: expected a rotation in the upper left 3x3",
+    ),
+    "no focal length": (
+        without("fl_x", "fl_y"),
+        "frames[0]: expected fl_x or camera_angle_x, in the frame or at the top, got neither",
+    ),
+    "no size": (without("h"), "frames[0]: expected w and h, in the frame or at the top, got focal lengths"),
+    "size of half a pixel": (with_frame(w=320.5), "frames[1].w: expected a positive whole number, got 320.5"),
+    "endless size": ({**CAPTURE, "w": 1 << 40}, "w: expected at most 1048576 px, got 1099511627776"),
+    "negative focal length": (with_frame(fl_x=-1), "frames[1].fl_x: expected a positive number, got -1"),
+    "angle beyond a half turn": (
+        {**without("fl_x"), "camera_angle_x": 3.5},
+        "camera_angle_x: expected radians between 0 and pi, got 3.5",
+    ),
+    "principal point of another kind": ({**CAPTURE, "cx": True}, "cx: expected a number, got true"),
+    "fisheye": (
+        {**CAPTURE, "camera_model": "OPENCV_FISHEYE"},
+        "camera_model: expected a pinhole camera (PINHOLE, SIMPLE_PINHOLE, OPENCV, SIMPLE_RADIAL, RADIAL), "
+        'undistort the pictures first, got "OPENCV_FISHEYE"',
+    ),
+    "fisheye of instant-ngp": ({**CAPTURE, "is_fisheye": True}, "is_fisheye: expected a pinhole camera"),
+    "distortion of one frame": (with_frame(k2=-0.1), "frames[1].k2: expected no lens distortion"),
+    "name of another kind": (with_frame(file_path=7), "frames[1].file_path: expected a string, got 7"),
+    "not an object": ([], "top level: expected an object, got []"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_values_are_named_by_their_place(tmp_path, case):
+    document, message = BAD[case]
+    with pytest.raises(ValueError, match="^" + re.escape(f"transforms.json: {message}")):
+        read_cameras(put(tmp_path, document))
+
+
+def test_an_applied_transform_that_scales_is_not_undone(tmp_path):
+    path = put(tmp_path, {**CAPTURE, "applied_transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]})
+    read_cameras(path)
+    with pytest.raises(ValueError, match=r"^transforms.json: applied_transform: expected a rotation and"):
+        read_cameras(path, applied_transform="undo")
+
+
+@pytest.mark.parametrize("argument", ["distortion", "applied_transform"])
+def test_unknown_choices_are_refused(tmp_path, argument):
+    with pytest.raises(ValueError, match=f"{argument}: expected '.*' or '.*', got 'maybe'"):
+        read_cameras(put(tmp_path, CAPTURE), **{argument: "maybe"})
