@@ -3,6 +3,7 @@
 import hashlib
 import math
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -252,7 +253,7 @@ def degenerate_assets():
         "flat": scenes.replaced(many, scales=many.scales * np.float32([1, 1, 0])),
         "lines": scenes.replaced(many, scales=many.scales * np.float32([1, 0, 0])),
         "on_a_line": scenes.gaussians(np.linspace(0, 1, 90)[:, None] * [1, 2, 3], scales=0.01),
-        "unseen": scenes.replaced(many, opacities=np.zeros_like(many.opacities)),
+        "faint": scenes.replaced(many, opacities=np.full_like(many.opacities, 0.005)),
         "solid": scenes.replaced(many, opacities=np.ones_like(many.opacities)),
         "zero_quats": scenes.replaced(many, quats=np.zeros_like(many.quats)),
         "long_quats": scenes.replaced(many, quats=many.quats * np.float32(1e6)),
@@ -298,27 +299,54 @@ def test_asset_without_gaussians_is_refused(device):
         build(scenes.gaussians(np.zeros((0, 3))), device=device)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        ("means", np.nan, "finite numbers"),
-        ("quats", np.inf, "finite numbers"),
-        ("sh", -np.inf, "finite numbers"),
-        ("scales", np.nan, "numbers of at least 0"),
-        ("scales", -0.1, "numbers of at least 0"),
-        ("opacities", 1.1, "numbers from 0 to 1"),
-        ("opacities", np.nan, "numbers from 0 to 1"),
-    ],
-)
-def test_asset_with_wrong_values_is_refused(asset, name, value, expected, device):
+WRONG = [
+    ("means", np.nan, "means_not_finite", "2 with a position that is not finite"),
+    ("means", -1e19, "too_large", "2 with a position or a scale beyond 1e+18"),
+    ("quats", np.inf, "quats_not_finite", "2 with a rotation that is not finite"),
+    ("sh", -np.inf, "sh_not_finite", "2 with a colour that is not finite"),
+    ("scales", np.nan, "scales_not_finite", "2 with a scale that is not finite"),
+    ("scales", 1e19, "too_large", "2 with a position or a scale beyond 1e+18"),
+    ("scales", -0.1, "negative_scale", "2 with a negative scale"),
+    ("opacities", 1.1, "opacity_out_of_range", "2 with an opacity outside 0 to 1"),
+    ("opacities", -0.1, "opacity_out_of_range", "2 with an opacity outside 0 to 1"),
+    ("opacities", np.nan, "opacities_not_finite", "2 with an opacity that is not finite"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "kind", "reason"), WRONG)
+def test_gaussians_with_wrong_values_are_left_out(asset, name, value, kind, reason, device):
     wrong = np.array(getattr(asset, name))
     wrong.reshape(len(wrong), -1)[[17, 40], -1] = value
-    message = (
-        f"asset: expected {name} that are {expected}, got others in 2 of 1200 gaussians, "
-        "the first is number 17; remove them"
-    )
-    with pytest.raises(ValueError, match=message):
-        build(scenes.replaced(asset, **{name: wrong}), device=device)
+    dirty = scenes.replaced(asset, **{name: wrong})
+    message = f"asset: 2 of 1,200 gaussians cannot be drawn: {re.escape(reason)}; they are left out"
+    with pytest.warns(v3dg.cleaning.AssetWarning, match=message):
+        bundle = build(dirty, device=device)
+    assert bundle.config["dropped"] == {kind: 2}
+    clean = build(asset.subset(np.delete(np.arange(1200), [17, 40])), device=device)
+    assert same(bundle, clean)
+    with pytest.raises(
+        ValueError, match=f"asset: expected gaussians that can be drawn, .* {re.escape(reason)}$"
+    ):
+        build(dirty, device=device, unusable="refuse")
+
+
+def test_gaussians_that_no_pixel_can_show_are_left_out_silently(asset, device):
+    opacities = np.maximum(asset.opacities, np.float32(0.01))
+    opacities[[3, 700, 900]] = 0, 1 / 256, 0.0038
+    bundle = build(scenes.replaced(asset, opacities=opacities), device=device, unusable="refuse")
+    assert bundle.config["dropped"] == {"transparent": 3}
+    assert len(bundle.level_gaussians(0)) == 1197
+
+
+def test_asset_with_nothing_left_is_refused(asset, device):
+    hidden = scenes.replaced(asset, opacities=np.full(1200, 0.001, np.float32))
+    with pytest.raises(ValueError, match=r"asset: expected a gaussian that can be drawn, got none: 1,200 of"):
+        build(hidden, device=device)
+
+
+def test_unknown_choice_for_unusable_gaussians_is_refused(asset):
+    with pytest.raises(ValueError, match="unusable: expected 'drop' or 'refuse', got 'keep'"):
+        build(asset, unusable="keep")
 
 
 # ---- settings

@@ -126,6 +126,46 @@ def test_info_of_an_asset(folder):
     assert (result["kind"], result["gaussians"], result["sh_degree"]) == ("asset", 1000, 1)
 
 
+@pytest.fixture(scope="module")
+def dirty(folder):
+    """The asset with a broken, a transparent and a far gaussian."""
+    asset = make_asset(1000)
+    asset.sh[3, 0, 1] = np.nan
+    asset.opacities[5] = 0.001
+    asset.means[7] = 0, 0, 1e4
+    v3dg.save(folder / "dirty.ply", asset)
+    return folder / "dirty.ply"
+
+
+def test_info_says_what_is_wrong_with_an_asset(dirty):
+    text = run("info", dirty).stdout
+    assert "2 cannot be drawn: 1 with a colour that is not finite, 1 with an opacity below 1/255" in text
+    assert "1 outliers" in text
+    result = json.loads(run("info", dirty, "--json").stdout)
+    assert result["not_drawable"] == {"sh_not_finite": 1, "transparent": 1}
+    assert (result["gaussians"], result["drawable"], result["outliers"]) == (1000, 998, 1)
+    assert result["box"][1][2] == 1e4
+    assert result["box_without_outliers"][1][2] < 2
+
+
+def test_build_leaves_out_what_cannot_be_drawn_and_says_so(dirty, tmp_path):
+    done = run("build", dirty, "-o", "out.v3dg", "--quiet", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert "left out: 1 with a colour that is not finite, 1 with an opacity below 1/255" in done.stdout
+    assert v3dg.Bundle.open(tmp_path / "out.v3dg").config["asset_gaussians"] == 1000
+    message = f"{dirty}: asset: expected gaussians that can be drawn, got others: 2 of 1,000"
+    (tmp_path / "out.v3dg").unlink()
+    fails(1, message, "build", dirty, "-o", "out.v3dg", "--strict", cwd=tmp_path)
+
+
+def test_build_refuses_an_asset_with_nothing_left(folder, tmp_path):
+    asset = make_asset(1000)
+    asset.opacities[:] = 0
+    v3dg.save(tmp_path / "hidden.ply", asset)
+    fails(1, "got none: 1,000 of 1,000 gaussians", "build", "hidden.ply", cwd=tmp_path)
+
+
 def test_info_of_a_scene(folder):
     assert "far away" in run("info", folder / "scene.json").stdout
     result = json.loads(run("info", folder / "scene.json", "--json").stdout)

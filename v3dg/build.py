@@ -9,6 +9,7 @@ import operator
 import os
 import struct
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core, _device, _operations
+from v3dg import _core, _device, _operations, cleaning
 from v3dg._operations import Offsets
 from v3dg._version import __version__
 from v3dg.bundle import Bundle, Clusters, Groups
@@ -196,6 +197,7 @@ def build_bundle(
     progress: bool = True,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     resume_path: str | os.PathLike[str] | None = None,
+    unusable: Literal["drop", "refuse"] = "drop",
 ) -> Bundle:
     """Build all levels of one asset (V3DG, algorithm 1; what we do differently is in docs/levels.md).
 
@@ -203,7 +205,7 @@ def build_bundle(
     (on one instruction set or one kind of GPU: others round differently).
 
     Args:
-        asset: At least one gaussian, all values finite.
+        asset: At least one gaussian that can be drawn.
         config: Settings; ours by default.
         seed: Of the views that groups are fitted to.
         progress: Show a bar with the level, its groups done, the time left and their mean loss.
@@ -211,9 +213,13 @@ def build_bundle(
             CUDA device where there is one and torch can use it, else the CPU.
         resume_path: Where to keep finished levels; a build of the same asset, config, seed and device that
             finds them there goes on from them. The file stays: remove it once the bundle is saved.
+        unusable: Whether gaussians with wrong values (not finite, negative scales, opacities outside 0 to 1)
+            are left out, with a `v3dg.cleaning.AssetWarning`, or are an error. Those that no pixel can show,
+            because their opacity is below 1/255, are left out in any case. How many of each kind is kept in
+            the bundle's config as "dropped".
 
     Raises:
-        ValueError: The asset is empty or has values that are not finite, or a setting is wrong.
+        ValueError: The asset has nothing that can be drawn, or a setting is wrong.
         RuntimeError: The device is "cuda", and something is missing for it.
         MemoryError: The device has too little memory; the message has the numbers.
         KeyboardInterrupt: Ctrl-C; threads have stopped, finished levels are at `resume_path`.
@@ -227,10 +233,11 @@ def build_bundle(
         raise ValueError(f"seed: expected 0 to 2^58 - 1, got {seed}")
     if str(asset.means.dtype).endswith("64"):
         raise ValueError("asset: expected float32 arrays, got float64; convert them first")
-    store = _Checkpoint(resume_path, asset, config, seed, where)
+    if unusable not in ("drop", "refuse"):
+        raise ValueError(f"unusable: expected 'drop' or 'refuse', got {unusable!r}")
     with _device.memory_errors():
-        placed = _device.place(asset, where)
-        _check_drawable(placed)
+        placed, dropped = _drawable_part(_device.place(asset, where), unusable)
+        store = _Checkpoint(resume_path, placed, config, seed, where)
         build = _Build(placed, config, seed)
         del placed  # twice is enough: the caller's, and in the order of the leaves
         for level in store.load():
@@ -242,29 +249,24 @@ def build_bundle(
                 store.save(build.levels[-1])
         finally:
             bar.close()
-    return _assemble(build.levels, build.pile.gaussians, config, seed)
+    made_with = {"build": asdict(config), "seed": seed, "asset_gaussians": len(asset), "dropped": dropped}
+    return _assemble(build.levels, build.pile.gaussians, config, made_with)
 
 
-def _check_drawable(asset: Gaussians) -> None:
+def _drawable_part(asset: Gaussians, unusable: str) -> tuple[Gaussians, dict[str, int]]:
+    """The gaussians that can be drawn, and how many of each kind could not."""
     if len(asset) == 0:
         raise ValueError("asset: expected at least one gaussian, got none")
-    isfinite = _device.library_of(asset.means).isfinite
-    for field in fields(asset):
-        values = getattr(asset, field.name)
-        good: Any = isfinite(values)
-        expected = "finite numbers"
-        if field.name == "scales":
-            good &= values >= 0
-            expected = "numbers of at least 0"
-        elif field.name == "opacities":
-            good &= (values >= 0) & (values <= 1)
-            expected = "numbers from 0 to 1"
-        if not good.all():
-            rows = np.flatnonzero((~_device.to_host(good)).reshape(len(asset), -1).any(axis=1))
-            raise ValueError(
-                f"asset: expected {field.name} that are {expected}, got others in {len(rows)} of "
-                f"{len(asset)} gaussians, the first is number {rows[0]}; remove them"
-            )
+    findings = cleaning.examine(asset)
+    if findings.num_wrong and unusable == "refuse":
+        raise ValueError(f"asset: expected gaussians that can be drawn, got others: {findings.text}")
+    if not findings.drawable.any():
+        raise ValueError(f"asset: expected a gaussian that can be drawn, got none: {findings.text}")
+    if findings.num_wrong:
+        warnings.warn(f"asset: {findings.text}; they are left out", cleaning.AssetWarning, stacklevel=3)
+    if findings.num_dropped:
+        asset = asset.subset(findings.drawable)
+    return asset, findings.counts
 
 
 class _Pile:
@@ -647,7 +649,9 @@ def _digest(head: bytes, arrays: Sequence[npt.NDArray[Any]]) -> bytes:
         return digest(b"".join(pool.map(digest, pieces)))
 
 
-def _assemble(levels: list[_Level], gaussians: Gaussians, config: BuildConfig, seed: int) -> Bundle:
+def _assemble(
+    levels: list[_Level], gaussians: Gaussians, config: BuildConfig, made_with: dict[str, Any]
+) -> Bundle:
     """The bundle of all levels, whose `gaussians` follow one another."""
     cluster_level, own, parent, boxes, offsets = [], [], [], [], [np.zeros(1, np.int64)]
     group_parent = []
@@ -706,5 +710,5 @@ def _assemble(levels: list[_Level], gaussians: Gaussians, config: BuildConfig, s
         clusters,
         groups,
         gaussians,
-        {"build": asdict(config), "seed": seed, "asset_gaussians": len(levels[0].gaussians)},
+        made_with,
     )

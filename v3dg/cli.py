@@ -13,6 +13,7 @@ import os
 import sys
 import textwrap
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +49,8 @@ class Build:
     """The same seed gives the same file, byte for byte, on the same kind of device."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto is a CUDA device where there is one and torch can use it."""
+    strict: bool = False
+    """Refuse an asset with wrong values, instead of leaving out the gaussians that have them."""
     resume: bool = False
     """Continue an interrupted build from its last finished level."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
@@ -199,6 +202,7 @@ def _build(options: Build) -> None:
 
     from v3dg import _device
     from v3dg.build import BuildConfig, build_bundle
+    from v3dg.cleaning import AssetWarning, describe
     from v3dg.io import load
 
     output = options.output or options.asset.with_suffix(".v3dg")
@@ -216,22 +220,29 @@ def _build(options: Build) -> None:
     start = time.perf_counter()
     asset = load(options.asset)
     try:
-        bundle = build_bundle(
-            asset,
-            config=config,
-            seed=options.seed,
-            progress=not options.quiet,
-            device=device,
-            resume_path=partial,
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AssetWarning)  # the result says it
+            bundle = build_bundle(
+                asset,
+                config=config,
+                seed=options.seed,
+                progress=not options.quiet,
+                device=device,
+                resume_path=partial,
+                unusable="refuse" if options.strict else "drop",
+            )
+    except ValueError as error:
+        raise ValueError(f"{options.asset}: {error}") from None
     except KeyboardInterrupt:
         hint = f"; `--resume` continues from {partial}" if partial.exists() else ""
         raise KeyboardInterrupt(f"interrupted{hint}") from None
     bundle.save(output)
     partial.unlink(missing_ok=True)
+    dropped = bundle.config["dropped"]
     result = {
         "output": str(output),
         "asset_gaussians": len(asset),
+        "dropped": dropped,
         "gaussians": bundle.num_gaussians,
         "clusters": len(bundle.clusters),
         "levels": bundle.num_levels,
@@ -243,6 +254,8 @@ def _build(options: Build) -> None:
         f"{bundle.num_gaussians:,} gaussians ({len(asset):,} in the asset), "
         f"{_bytes_text(output.stat().st_size)}, {result['seconds']:.1f} s"
     )
+    if dropped:
+        text += "\nleft out: " + describe(dropped)
     _print(options.json, result, lambda: text)
 
 
@@ -262,35 +275,59 @@ def _info(options: Info) -> None:
 def _asset_info(path: Path, asset: Gaussians) -> tuple[dict[str, Any], str]:
     import numpy as np
 
-    if len(asset):
-        low, high = asset.means.min(axis=0).tolist(), asset.means.max(axis=0).tolist()
+    from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
+
+    findings = examine(asset)
+    drawable = asset.subset(findings.drawable)
+    far = outliers(drawable.means)
+    boxes = {"box": _box(drawable.means), "box_without_outliers": _box(drawable.means[~far])}
+    spread = {}
+    if len(drawable):
         spread = {
             name: [float(q) for q in np.percentile(values, (5, 50, 95))]
-            for name, values in (("longest_scale", asset.scales.max(axis=1)), ("opacity", asset.opacities))
+            for name, values in (
+                ("longest_scale", drawable.scales.max(axis=1)),
+                ("opacity", drawable.opacities),
+            )
         }
-    else:
-        low, high, spread = [], [], {}
     result = {
         "path": str(path),
         "kind": "asset",
         "gaussians": len(asset),
+        "drawable": len(drawable),
+        "not_drawable": findings.counts,
+        "outliers": int(far.sum()),
         "sh_degree": asset.sh_degree,
         "bytes": path.stat().st_size,
-        "low": low,
-        "high": high,
+        **boxes,
         "percentiles_5_50_95": spread,
     }
     lines = [
         f"{path}: asset, {_bytes_text(path.stat().st_size)}",
         f"{len(asset):,} gaussians, SH degree {asset.sh_degree}",
     ]
-    if len(asset):
-        box = " to ".join("(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in (low, high))
-        lines.append(f"means from {box}")
-        for name, (p5, p50, p95) in spread.items():
-            name = name.replace("_", " ")
-            lines.append(f"{name}: 5 % below {p5:.3g}, half below {p50:.3g}, 95 % below {p95:.3g}")
+    if findings.counts:
+        lines.append(f"{findings.num_dropped:,} cannot be drawn: {describe(findings.counts)}")
+    if len(drawable):
+        lines.append("means from {} to {}".format(*map(_point, boxes["box"])))
+    if far.any():
+        lines.append("without outliers from {} to {}".format(*map(_point, boxes["box_without_outliers"])))
+        lines.append(
+            f"{far.sum():,} outliers, {OUTLIER_DISTANCE:g} median distances from the median or farther"
+        )
+    for name, (p5, p50, p95) in spread.items():
+        name = name.replace("_", " ")
+        lines.append(f"{name}: 5 % below {p5:.3g}, half below {p50:.3g}, 95 % below {p95:.3g}")
     return result, "\n".join(lines)
+
+
+def _box(means: Any) -> list[list[float]]:
+    """Lower and upper corner of positions; nothing for none."""
+    return [means.min(axis=0).tolist(), means.max(axis=0).tolist()] if len(means) else []
+
+
+def _point(values: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
 
 
 def _bundle_info(path: Path, bundle: Bundle) -> tuple[dict[str, Any], str]:

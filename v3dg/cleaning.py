@@ -1,0 +1,111 @@
+"""What is wrong with an asset: gaussians that cannot be drawn, and such as lie far from all others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _device
+from v3dg.gaussians import Array, Gaussians
+
+LARGEST = 1e18
+"""Of a coordinate or a scale, in world units: squares of more are no float32 numbers."""
+SMALLEST_OPACITY = 0.0039
+"""A gaussian is drawn where its alpha is 1/255 or more; this is below it, by more than rounding."""
+OUTLIER_DISTANCE = 20.0
+"""From the median of the positions, in median distances; sky and floaters lie there, and slips."""
+
+# Kinds of gaussians that cannot be drawn: those with wrong values, then those that no pixel can show.
+_TEXT = {
+    "means_not_finite": "with a position that is not finite",
+    "quats_not_finite": "with a rotation that is not finite",
+    "scales_not_finite": "with a scale that is not finite",
+    "opacities_not_finite": "with an opacity that is not finite",
+    "sh_not_finite": "with a colour that is not finite",
+    "too_large": f"with a position or a scale beyond {LARGEST:g}",
+    "negative_scale": "with a negative scale",
+    "opacity_out_of_range": "with an opacity outside 0 to 1",
+    "transparent": "with an opacity below 1/255, which no pixel shows",
+}
+_VALID = ("transparent",)
+
+
+class AssetWarning(UserWarning):
+    """Gaussians of an asset have wrong values and were left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """Which of an asset's N gaussians can be drawn, and why the others cannot.
+
+    Attributes:
+        drawable: (N,) bool, on the host.
+        counts: How many there are of each kind that cannot be drawn; kinds without any are left out, and a
+            gaussian can be of several.
+        num_wrong: Gaussians with wrong values; the others that cannot be drawn are valid, but transparent.
+    """
+
+    drawable: npt.NDArray[np.bool_]
+    counts: dict[str, int]
+    num_wrong: int
+
+    @property
+    def num_dropped(self) -> int:
+        """Gaussians that cannot be drawn."""
+        return len(self.drawable) - int(self.drawable.sum())
+
+    @property
+    def text(self) -> str:
+        """One line that says how many cannot be drawn and why."""
+        total = f"{self.num_dropped:,} of {len(self.drawable):,} gaussians cannot be drawn"
+        return f"{total}: {describe(self.counts)}"
+
+
+def describe(counts: Mapping[str, int]) -> str:
+    """Counts of kinds in words."""
+    return ", ".join(f"{count:,} {_TEXT[kind]}" for kind, count in counts.items())
+
+
+def examine(asset: Gaussians) -> Findings:
+    """Find the gaussians that cannot be drawn."""
+    isfinite = _device.library_of(asset.means).isfinite
+    finite = {
+        name: isfinite(getattr(asset, name)) for name in ("means", "quats", "scales", "opacities", "sh")
+    }
+    masks: dict[str, Any] = {f"{name}_not_finite": ~_all(good) for name, good in finite.items()}
+    too_far, too_wide = (finite[name] & (abs(getattr(asset, name)) > LARGEST) for name in ("means", "scales"))
+    masks["too_large"] = _any(too_far) | _any(too_wide)
+    masks["negative_scale"] = _any(asset.scales < 0)
+    masks["opacity_out_of_range"] = (asset.opacities < 0) | (asset.opacities > 1) & finite["opacities"]
+    masks["transparent"] = (asset.opacities >= 0) & (asset.opacities < SMALLEST_OPACITY)
+    host = {kind: _device.to_host(mask) for kind, mask in masks.items()}
+    wrong = np.logical_or.reduce([mask for kind, mask in host.items() if kind not in _VALID])
+    return Findings(
+        drawable=~np.logical_or.reduce(list(host.values())),
+        counts={kind: int(mask.sum()) for kind, mask in host.items() if mask.any()},
+        num_wrong=int(wrong.sum()),
+    )
+
+
+def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Which of (N, 3) finite positions lie far from all others: more than 20 times the median distance."""
+    if len(means) == 0:
+        return np.zeros(0, bool)
+    exact = means.astype(np.float64)
+    distance = np.linalg.norm(exact - np.median(exact, axis=0), axis=1)
+    far: npt.NDArray[np.bool_] = distance > OUTLIER_DISTANCE * np.median(distance)
+    return far
+
+
+def _all(values: Array) -> Any:
+    """Whether all of a row is true, for each row of an array of any dimensions."""
+    return values.reshape(len(values), math.prod(values.shape[1:])).all(axis=1)
+
+
+def _any(values: Array) -> Any:
+    return ~_all(~values)
