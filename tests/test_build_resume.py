@@ -1,6 +1,7 @@
 """Builds that are interrupted, killed, gone on with; and the checkpoints that they leave."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -212,5 +213,51 @@ def test_resume_path_needs_a_folder(asset, tmp_path):
     with pytest.raises(ValueError, match="resume_path: expected a file in an existing folder"):
         build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "no" / "levels")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(ValueError, match="could not read them"):
+    with pytest.raises(IsADirectoryError, match="folder"):
         build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "folder")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe: expected a file of levels, got a device or a pipe"):
+        build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "pipe")
+
+
+def test_a_second_build_to_the_same_place_is_refused(asset, tmp_path):
+    """And the first goes on undisturbed."""
+    with started_build(ENDLESS, "cpu", tmp_path) as process:
+        wait_for_growth(tmp_path / "levels", process, before=-1)
+        for use in (
+            lambda: build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "levels"),
+            lambda: v3dg.build.discard_levels(tmp_path / "levels"),
+        ):
+            with pytest.raises(RuntimeError, match="levels: another build is using it; wait for it"):
+                use()
+        assert process.poll() is None
+        assert names_in(tmp_path) == ["levels"]
+    v3dg.build.discard_levels(tmp_path / "levels")
+    v3dg.build.discard_levels(tmp_path / "levels")
+    assert names_in(tmp_path) == []
+
+
+@contextmanager
+def files_of_at_most(num_bytes):
+    """Writing beyond fails, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_leaves_whole_levels(asset, checkpoint, tmp_path):
+    whole = checkpoint.read_bytes()
+    expected = bytes_of(build_bundle(asset, config=QUICK, progress=False), tmp_path)
+    for num_bytes in (0, 10, 1000, len(whole) // 2, len(whole) - 1):
+        checkpoint.unlink(missing_ok=True)
+        with files_of_at_most(num_bytes), pytest.raises(OSError, match=r"File too large: '.*levels'"):
+            build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
+        left = checkpoint.read_bytes() if checkpoint.exists() else b""
+        assert whole.startswith(left)
+        assert len(left) <= num_bytes
+        bundle = build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
+        assert bytes_of(bundle, tmp_path) == expected
+        assert checkpoint.read_bytes() == whole

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import hashlib
 import json
 import math
 import operator
 import os
+import stat
 import struct
 import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
+from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -220,7 +224,9 @@ def build_bundle(
 
     Raises:
         ValueError: The asset has nothing that can be drawn, or a setting is wrong.
-        RuntimeError: The device is "cuda", and something is missing for it.
+        RuntimeError: The device is "cuda", and something is missing for it; or another build is using
+            `resume_path`.
+        OSError: `resume_path` cannot be written; the levels before are whole.
         MemoryError: The device has too little memory; the message has the numbers.
         KeyboardInterrupt: Ctrl-C; threads have stopped, finished levels are at `resume_path`.
     """
@@ -240,15 +246,16 @@ def build_bundle(
         store = _Checkpoint(resume_path, placed, config, seed, where)
         build = _Build(placed, config, seed)
         del placed  # twice is enough: the caller's, and in the order of the leaves
-        for level in store.load():
-            build.append(level)
-        bar = _Bar(build.levels, config, progress)
-        try:
-            while (shape := build.levels[-1].next_shape(config)) is not None:
-                _simplify(build, shape, bar)
-                store.save(build.levels[-1])
-        finally:
-            bar.close()
+        with store:
+            for level in store.load():
+                build.append(level)
+            bar = _Bar(build.levels, config, progress)
+            try:
+                while (shape := build.levels[-1].next_shape(config)) is not None:
+                    _simplify(build, shape, bar)
+                    store.save(build.levels[-1])
+            finally:
+                bar.close()
     made_with = {"build": asdict(config), "seed": seed, "asset_gaussians": len(asset), "dropped": dropped}
     return _assemble(build.levels, build.pile.gaussians, config, made_with)
 
@@ -538,7 +545,8 @@ class _Bar:
 class _Checkpoint:
     """Finished levels in a file that grows by one after each; the first, the leaves, is quicker to make anew.
 
-    A level whose writing was cut off does not count; one that is whole but damaged is an error.
+    A level whose writing was cut off does not count; one that is whole but damaged is an error. The file is
+    locked while a build uses it, and is gone after one that finished no level.
     """
 
     _COUNTS = struct.Struct("<qqq")  # gaussians, clusters, groups
@@ -554,26 +562,36 @@ class _Checkpoint:
         self._path = None if path is None else Path(path)
         if self._path is None:
             return
-        if not self._path.parent.is_dir():
-            raise ValueError(f"resume_path: expected a file in an existing folder, got {self._path}")
         what = [asdict(config), seed, _device.describe(device), __version__, len(asset), asset.sh_degree]
         text = json.dumps(what, sort_keys=True).encode()
         self._head = b"v3dg levels 2\n" + _digest(text, rows_of(asset.numpy()))
         self._num_sh = asset.sh.shape[1]
         self._num_bytes = 0  # of the file that are good
 
+    def __enter__(self) -> _Checkpoint:
+        if self._path is not None:
+            if not self._path.parent.is_dir():
+                raise ValueError(f"resume_path: expected a file in an existing folder, got {self._path}")
+            self._file = _open_locked(self._path)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._path is not None:
+            if os.fstat(self._file.fileno()).st_size == 0:
+                self._path.unlink(missing_ok=True)
+            self._file.close()
+
     def load(self) -> list[_Level]:
         """The finished levels but the leaves."""
-        if self._path is None or not self._path.exists():
+        if self._path is None:
             return []
         levels = []
         try:
-            with open(self._path, "rb") as file:
-                head = file.read(len(self._head))
-                is_ours = self._head.startswith(head)
-                while is_ours and (level := self._read(file)) is not None:
-                    levels.append(level)
-                    self._num_bytes = file.tell()
+            head = self._file.read(len(self._head))
+            is_ours = self._head.startswith(head)
+            while is_ours and (level := self._read()) is not None:
+                levels.append(level)
+                self._num_bytes = self._file.tell()
         except (OSError, ValueError) as error:
             raise ValueError(
                 f"{self._path}: expected levels of an interrupted build, could not read them "
@@ -586,37 +604,41 @@ class _Checkpoint:
             )
         return levels
 
-    def _read(self, file: BinaryIO) -> _Level | None:
+    def _read(self) -> _Level | None:
         """The next level; None where the file ends before it does."""
-        counts, digest = file.read(self._COUNTS.size), file.read(_DIGEST_BYTES)
+        counts, digest = self._file.read(self._COUNTS.size), self._file.read(_DIGEST_BYTES)
         if len(digest) < _DIGEST_BYTES:
             return None
         if min(self._COUNTS.unpack(counts)) < 0:
             raise ValueError("a level is damaged")
         layout = self._layout(*self._COUNTS.unpack(counts))
-        left = os.fstat(file.fileno()).st_size - file.tell()
+        left = os.fstat(self._file.fileno()).st_size - self._file.tell()
         if sum(dtype.itemsize * math.prod(shape) for dtype, shape in layout) > left:
             return None
-        arrays = [np.fromfile(file, dtype, math.prod(shape)).reshape(shape) for dtype, shape in layout]
+        arrays = [np.fromfile(self._file, dtype, math.prod(shape)).reshape(shape) for dtype, shape in layout]
         if _digest(counts, arrays) != digest:
             raise ValueError("a level is damaged")
         return _Level(Gaussians(*arrays[:5]), *arrays[5:])
 
     def save(self, level: _Level) -> None:
-        """Add a level that is on the host."""
+        """Add a level that is on the host; what a full disk cuts off is removed again."""
         if self._path is None:
             return
         arrays = [*rows_of(level.gaussians), *(getattr(level, field.name) for field in fields(_Level)[1:])]
         counts = self._COUNTS.pack(len(level.gaussians), len(level.group_of_cluster), len(level.ball))
-        with open(self._path, "r+b" if self._path.exists() else "wb") as file:
-            file.seek(self._num_bytes)
-            file.truncate()
+        descriptor = self._file.fileno()
+        os.ftruncate(descriptor, self._num_bytes)
+        self._file.seek(self._num_bytes)
+        try:
             if self._num_bytes == 0:
-                file.write(self._head)
-            file.write(counts + _digest(counts, arrays))
+                _write_all(descriptor, self._head)
+            _write_all(descriptor, counts + _digest(counts, arrays))
             for array in arrays:
-                file.write(array.reshape(-1).view(np.uint8).data)
-            self._num_bytes = file.tell()
+                _write_all(descriptor, array.reshape(-1).view(np.uint8).data)
+        except OSError as error:
+            os.ftruncate(descriptor, self._num_bytes)
+            raise OSError(error.errno, os.strerror(error.errno or errno.EIO), str(self._path)) from error
+        self._num_bytes = self._file.tell()
 
     def _layout(self, n: int, clusters: int, groups: int) -> list[tuple[np.dtype[Any], tuple[int, ...]]]:
         """Dtype and shape of the arrays of a level, in order."""
@@ -631,6 +653,51 @@ class _Checkpoint:
             (np.float32, (groups, 2)),
         ]
         return [(np.dtype(dtype), shape) for dtype, shape in [*((np.float32, s) for s in real), *tables]]
+
+
+def discard_levels(resume_path: str | os.PathLike[str]) -> None:
+    """Remove what an interrupted build left there, if anything.
+
+    Raises:
+        RuntimeError: A build is using it.
+    """
+    if os.path.lexists(resume_path):
+        with _open_locked(resume_path):
+            os.unlink(resume_path)
+
+
+def _open_locked(path: str | os.PathLike[str]) -> FileIO:
+    """Open or make a file to read and write; other builds are kept out until it is closed."""
+    # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
+    file = FileIO(path, "r+", opener=lambda name, _: os.open(name, flags, 0o666))
+    try:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a device or a pipe")
+        _lock(file)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _lock(file: FileIO) -> None:
+    try:
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RuntimeError(
+            f"{os.fspath(file.name)}: another build is using it; wait for it, or write to another place"
+        ) from None
+    except OSError as error:
+        # Some network file systems have no locks; there, two builds of one output are the user's to avoid.
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+            raise
+
+
+def _write_all(descriptor: int, data: bytes | memoryview) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(descriptor, view[:_PIECE_BYTES]) :]
 
 
 def _digest(head: bytes, arrays: Sequence[npt.NDArray[Any]]) -> bytes:

@@ -201,7 +201,7 @@ def _build(options: Build) -> None:
     from dataclasses import replace
 
     from v3dg import _device
-    from v3dg.build import BuildConfig, build_bundle
+    from v3dg.build import BuildConfig, build_bundle, discard_levels
     from v3dg.cleaning import AssetWarning, describe
     from v3dg.io import load
 
@@ -215,7 +215,7 @@ def _build(options: Build) -> None:
         config = replace(config, cluster_size=options.cluster_size)
     partial = output.with_name(output.name + ".partial")
     if not options.resume:
-        partial.unlink(missing_ok=True)
+        discard_levels(partial)
     device = _device.resolve(options.device)
     start = time.perf_counter()
     asset = load(options.asset)
