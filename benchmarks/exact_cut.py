@@ -63,7 +63,8 @@ def random_batch(bundle, rng, count):
     distance = radius * scales * log_uniform(rng, 0.3, farthest, count)
     scene = Scene()
     scene.add(bundle, np.zeros((count, 3)), quaternions, scales)
-    scene.positions = origin + distance[:, None] * direction - scales[:, None] * (scene.rotations @ center)
+    from_center = distance[:, None] * direction - scales[:, None] * (scene.rotations @ center)
+    scene.move(positions=origin + from_center)
     camera = Camera.look_at(
         origin,
         origin + rng.normal(size=3),

@@ -327,7 +327,7 @@ def test_bad_arguments_are_refused():
         select(bundle, camera, tolerance=float("nan"))
     with pytest.raises(ValueError, match="footprint: expected solid_angle or paper, got ball"):
         select(bundle, camera, tolerance=1, footprint="ball")
-    with pytest.raises(ValueError, match="device: expected cpu or cuda, got tpu"):
+    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu' or 'cuda', got 'tpu'"):
         select(bundle, camera, tolerance=1, device="tpu")
     with pytest.raises(TypeError, match="bundle: expected a Bundle, got str"):
         select("donut", camera, tolerance=1)
@@ -341,6 +341,7 @@ def test_table_refuses_groups_that_do_not_exist():
         _core.ClusterTable(
             groups.ball,
             groups.weight,
+            groups.level,
             wrong,
             clusters.parent_group,
             clusters.box,

@@ -5,8 +5,9 @@ import pytest
 
 import scenes_lod
 from v3dg import Camera, Scene, _core, render, select
-from v3dg.rasterize import intrinsics
-from v3dg.render import _table, _views
+from v3dg._resident import instances_of
+from v3dg.render import _table
+from v3dg.select import camera_of
 
 CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
 
@@ -24,14 +25,11 @@ def draw_window(scene, camera, window):
     """Colour, alpha, depth and counts of the pixels [x0, x1) x [y0, y1)."""
     selection = select(scene, camera, tolerance=0.0)
     return _core.render_selection(
-        [_table(bundle) for bundle in scene.bundles],
-        scene.instance_bundle,
-        _views(scene, camera),
+        [_table(bundle, "appearance") for bundle in scene.bundles],
+        instances_of(scene, on_host=True),
+        camera_of(camera),
         selection.instance_ids,
         selection.cluster_ids,
-        intrinsics(camera),
-        camera.width,
-        camera.height,
         [0.1, 0.2, 0.3],
         True,
         window,

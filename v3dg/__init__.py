@@ -16,10 +16,10 @@ from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
 from v3dg.rasterize import Raster, rasterize
-from v3dg.render import DEFAULT_TOLERANCE, Image, Renderer, Stats, render
+from v3dg.render import Image, Renderer, Stats, render
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene, write_scene
-from v3dg.select import Selection, select
+from v3dg.select import DEFAULT_TOLERANCE, Selection, select
 
 __all__ = [
     "DEFAULT_TOLERANCE",

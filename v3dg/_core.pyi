@@ -80,6 +80,7 @@ class ClusterTable:
         self,
         ball: NDArray[Any],
         weight: NDArray[Any],
+        level: NDArray[Any],
         own_group: NDArray[Any],
         parent_group: NDArray[Any],
         box: NDArray[Any],
@@ -87,36 +88,15 @@ class ClusterTable:
         offset: NDArray[Any],
     ) -> None: ...
 
+# Instances are (bundle, positions, quaternions, scales, importance), a camera (viewmat, eye, K, width,
+# height, near), a rule (tolerance, budget or None, min_level, footprint, cull).
+SelectedPairs: TypeAlias = tuple[NDArray[np.int32], NDArray[np.int32], int, float, bool]
+
 def select(
-    tables: list[ClusterTable],
-    instance_bundle: NDArray[Any],
-    positions: NDArray[Any],
-    rotations: NDArray[Any],
-    scales: NDArray[Any],
-    viewmat: NDArray[Any],
-    eye: NDArray[Any],
-    K: NDArray[Any],
-    width: float,
-    height: float,
-    near: float,
-    tolerance: float,
-    footprint: str,
-    cull: bool,
-    device: str,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], int]: ...
+    tables: list[ClusterTable], instances: tuple[Any, ...], camera: tuple[Any, ...], rule: tuple[Any, ...]
+) -> SelectedPairs: ...
 def group_metrics(
-    tables: list[ClusterTable],
-    instance_bundle: NDArray[Any],
-    positions: NDArray[Any],
-    rotations: NDArray[Any],
-    scales: NDArray[Any],
-    viewmat: NDArray[Any],
-    eye: NDArray[Any],
-    K: NDArray[Any],
-    width: float,
-    height: float,
-    near: float,
-    footprint: str,
+    tables: list[ClusterTable], instances: tuple[Any, ...], camera: tuple[Any, ...], rule: tuple[Any, ...]
 ) -> tuple[Float32, NDArray[np.int64]]: ...
 
 # render
@@ -195,13 +175,10 @@ def rasterize_backward_cuda(
 ) -> None: ...
 def render_selection(
     bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
-    instance_bundle: NDArray[np.int32],
-    views: NDArray[np.float64],
+    instances: tuple[Any, ...],
+    camera: tuple[Any, ...],
     instance_ids: NDArray[np.int32],
     cluster_ids: NDArray[np.int32],
-    intrinsics: Sequence[float],
-    width: int,
-    height: int,
     background: Sequence[float],
     with_depth: bool,
     window: Sequence[int] | None = None,
@@ -213,26 +190,35 @@ class Drawing:
 
     def finish(self) -> dict[str, Any]: ...
 
-class SceneFrame:
-    """Draws a scene that stays on a device. A bundle is (rows, filter_px2, antialiased)."""
+class DeviceScene:
+    """What selection reads of a scene, on a device. A bundle is (table, filter_px2, antialiased)."""
 
     def __init__(
-        self,
-        bundles: list[tuple[tuple[Any, ...], Float32, NDArray[np.uint8]]],
-        tables: list[ClusterTable],
-        instance_bundle: NDArray[np.int32],
-        positions: NDArray[np.float64],
-        rotations: NDArray[np.float64],
-        scales: NDArray[np.float64],
-        stream: int,
+        self, bundles: list[tuple[ClusterTable, Float32, NDArray[np.uint8]]], stream: int
     ) -> None: ...
+    def set_instances(self, instances: tuple[Any, ...], stream: int) -> None: ...
+    def set_poses(self, positions: Any, quaternions: Any, scales: Any, stream: int) -> None: ...
+    def select(self, camera: tuple[Any, ...], rule: tuple[Any, ...], stream: int) -> SelectedPairs: ...
+
+class SceneFrame:
+    """Draws scenes of the same bundles; of each, its gaussians on the device."""
+
+    def __init__(self, bundles: list[tuple[Any, ...]], stream: int) -> None: ...
     def draw(
         self,
-        viewmat: NDArray[np.float64],
-        eye: NDArray[np.float64],
-        K: NDArray[np.float64],
-        near: float,
-        tolerance: float,
+        scene: DeviceScene,
+        camera: tuple[Any, ...],
+        rule: tuple[Any, ...],
+        background: Sequence[float],
+        picture: tuple[Any, Any, Any],
+        stream: int,
+    ) -> Drawing: ...
+    def draw_cut(
+        self,
+        scene: DeviceScene,
+        camera: tuple[Any, ...],
+        instance_ids: Any,
+        cluster_ids: Any,
         background: Sequence[float],
         picture: tuple[Any, Any, Any],
         stream: int,

@@ -399,7 +399,8 @@ def _render(options: Render) -> None:
     _require(options.subject, ".ply", ".v3dg", ".json")
     from v3dg import _device
     from v3dg.pictures import check_picture_path, write_picture
-    from v3dg.render import DEFAULT_TOLERANCE, render
+    from v3dg.render import render
+    from v3dg.select import DEFAULT_TOLERANCE
 
     if min(options.views, *options.size) < 1:
         raise _UsageError("--views, --size: expected at least 1")
@@ -522,7 +523,7 @@ def _turntable(subject: Bundle | Gaussians, options: Render) -> dict[str, Camera
 
 def _demo(options: Demo) -> None:
     from v3dg.demo import run_demo, table_text
-    from v3dg.render import DEFAULT_TOLERANCE
+    from v3dg.select import DEFAULT_TOLERANCE
 
     result = run_demo(
         options.output,

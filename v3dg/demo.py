@@ -20,8 +20,9 @@ from v3dg.cameras import Camera
 from v3dg.metrics import box_downsample, flip, psnr
 from v3dg.pictures import check_picture_path, write_picture
 from v3dg.procedural import make_asset, place_field
-from v3dg.render import DEFAULT_TOLERANCE, render
+from v3dg.render import render
 from v3dg.scene import Scene
+from v3dg.select import DEFAULT_TOLERANCE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -5,24 +5,19 @@ from __future__ import annotations
 import time
 import weakref
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
-import numpy as np
-import numpy.typing as npt
-
-from v3dg import _core, _device
+from v3dg import _core, _device, _resident
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
+from v3dg.false_color import ColorBy, false_color
 from v3dg.gaussians import Gaussians
 from v3dg.rasterize import intrinsics, rows_of, view_of_world
 from v3dg.scene import Scene
-from v3dg.select import select
+from v3dg.select import Selection, camera_of, over_budget, rule_of, select
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-# px² of screen that one gaussian of a coarser cluster may stand for; docs/levels.md has the error it gives.
-DEFAULT_TOLERANCE = 3.0
 
 
 @dataclass(frozen=True)
@@ -33,12 +28,15 @@ class Stats:
         gaussians_selected: Gaussians of the selected clusters.
         gaussians_in_frustum: Of them, those in front of the near plane whose extent meets the image, before
             any finer cull.
+        tolerance: px² that one gaussian of a coarser cluster stands for at most; with a budget, those that it
+            came to; 0 for an asset.
         select_ms: Time to choose the clusters.
         draw_ms: Time to draw them.
     """
 
     gaussians_selected: int
     gaussians_in_frustum: int
+    tolerance: float
     select_ms: float
     draw_ms: float
 
@@ -46,7 +44,8 @@ class Stats:
 class Image:
     """A picture of H x W pixels: NumPy arrays, or torch tensors on the CUDA device that drew it.
 
-    A picture drawn by CUDA may still be under way; to look at one of its attributes waits until it is there.
+    A picture drawn by CUDA may still be under way; to look at one of its attributes waits until it is there,
+    and raises what went wrong.
 
     Attributes:
         color: (H, W, 3) premultiplied colour, the background composed last.
@@ -78,15 +77,45 @@ class Image:
         return self._finish()
 
 
+@overload
 def render(
     subject: Scene | Bundle | Gaussians,
     camera: Camera,
     *,
-    tolerance: float = DEFAULT_TOLERANCE,
+    tolerance: float | None = ...,
+    budget: int | None = ...,
+    min_level: int = ...,
+    cut: Selection | None = ...,
+    color_by: ColorBy = ...,
+    background: Sequence[float] = ...,
+    device: str = ...,
+) -> Image: ...
+@overload
+def render(
+    subject: Scene | Bundle | Gaussians,
+    camera: Sequence[Camera],
+    *,
+    tolerance: float | None = ...,
+    budget: int | None = ...,
+    min_level: int = ...,
+    cut: Selection | None = ...,
+    color_by: ColorBy = ...,
+    background: Sequence[float] = ...,
+    device: str = ...,
+) -> list[Image]: ...
+def render(
+    subject: Scene | Bundle | Gaussians,
+    camera: Camera | Sequence[Camera],
+    *,
+    tolerance: float | None = None,
+    budget: int | None = None,
+    min_level: int = 0,
+    cut: Selection | None = None,
+    color_by: ColorBy = "appearance",
     background: Sequence[float] = (0.0, 0.0, 0.0),
     device: str = "cpu",
-) -> Image:
-    """Draw a scene, one bundle or one asset.
+) -> Image | list[Image]:
+    """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each stand for at most `tolerance` px² are drawn in place of finer ones; level 0
     with the asset's own filter, coarser levels with the filter they were made for (V3DG, section 3.4; our
@@ -94,47 +123,74 @@ def render(
 
     Args:
         subject: What to draw, in world space.
-        camera: Pinhole camera.
-        tolerance: px² of screen per gaussian; 0 draws level 0 everywhere.
+        camera: Pinhole camera. With several, each has its own cut and its own picture, as if drawn alone.
+        tolerance: px² of screen per gaussian; 0 draws level 0 everywhere. `DEFAULT_TOLERANCE` if None; with a
+            budget, 0.
+        budget: Most gaussians to draw in one picture, as in `v3dg.select`.
+        min_level: No finer level is drawn, except where an asset has no coarser one.
+        cut: Draw what was selected before from this scene, whatever the camera: a cut to walk around. Takes
+            the place of `tolerance`, `budget` and `min_level`.
+        color_by: "level" or "cluster" colours gaussians by the one that they belong to.
         background: Three numbers.
         device: "cpu", "cuda" or "auto"; CUDA draws on torch's current stream and keeps on the device what the
             next picture of the same scene or bundle needs. Use a `Renderer` to say how long.
 
     Raises:
-        ValueError: The tolerance is negative, or the background is not three numbers.
+        ValueError: An argument is not as above, or the coarsest cut has more gaussians than the budget; on
+            CUDA that is raised where the picture is looked at.
         RuntimeError: `device` is "cuda" and something is missing for it.
     """
-    if _device.resolve(device) == "cuda":
-        return _renderer_of(subject).render(camera, tolerance=tolerance, background=background)
-    _check(tolerance, background)
-    lens = (intrinsics(camera), camera.width, camera.height, [float(b) for b in background], True)
+    drawer = _drawer_of(subject, color_by) if _device.resolve(device) == "cuda" else None
+
+    def one(view: Camera) -> Image:
+        options = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
+        if drawer is not None:
+            return drawer.draw(subject, view, background, **options)
+        return _render_on_cpu(subject, view, background, color_by, **options)
+
+    return one(camera) if isinstance(camera, Camera) else [one(view) for view in camera]
+
+
+def _render_on_cpu(
+    subject: Scene | Bundle | Gaussians,
+    camera: Camera,
+    background: Sequence[float],
+    color_by: ColorBy,
+    **options: Any,
+) -> Image:
+    shade = _three(background)
     if isinstance(subject, Gaussians):
+        _check_asset(color_by, **options)
         start = time.perf_counter()
+        lens = (intrinsics(camera), camera.width, camera.height, shade, True)
         model = _core.Model(*rows_of(subject.numpy()))
         color, alpha, depth, counts, _ = _core.rasterize(
             model, view_of_world(camera), 0.0, False, *lens, False
         )
         milliseconds = 1e3 * (time.perf_counter() - start)
-        asset_stats = Stats(len(subject), counts["in_frustum"], 0.0, milliseconds)
+        asset_stats = Stats(len(subject), counts["in_frustum"], 0.0, 0.0, milliseconds)
         return Image(color, alpha, depth, lambda: asset_stats)
 
     scene = Scene.of(subject)
-    tables = [_table(bundle) for bundle in scene.bundles]
+    tables = [_table(bundle, color_by) for bundle in scene.bundles]
     start = time.perf_counter()
-    selection = select(scene, camera, tolerance=tolerance)
+    cut = options.pop("cut")
+    selection = select(scene, camera, **options) if cut is None else _checked(cut, subject, **options)
     selected = time.perf_counter()
     color, alpha, depth, counts = _core.render_selection(
         tables,
-        scene.instance_bundle,
-        _views(scene, camera),
+        _resident.instances_of(scene, on_host=True),
+        camera_of(camera),
         selection.instance_ids,
         selection.cluster_ids,
-        *lens,
+        shade,
+        True,
     )
     drawn = time.perf_counter()
     stats = Stats(
         gaussians_selected=selection.num_gaussians,
         gaussians_in_frustum=counts["in_frustum"],
+        tolerance=selection.tolerance,
         select_ms=1e3 * (selected - start),
         draw_ms=1e3 * (drawn - selected),
     )
@@ -146,98 +202,147 @@ class Renderer:
 
     Enqueuing a picture waits for nothing, so pictures can be drawn ahead, and captured in a CUDA graph: draw
     once what the graph will meet, so that there is memory enough, then capture `render`. Keep the renderer as
-    long as the graph. What is added to a scene later is not drawn.
+    long as the graph. A picture that is under way when its scene is changed is finished first.
+
+    Args:
+        color_by: As in `v3dg.render`.
 
     Raises:
         RuntimeError: Something is missing for CUDA.
     """
 
-    def __init__(self, subject: Scene | Bundle | Gaussians) -> None:
+    def __init__(self, subject: Scene | Bundle | Gaussians, *, color_by: ColorBy = "appearance") -> None:
         _device.resolve("cuda")
-        self._device = _device.current_device()
-        self._shown: tuple[Any, ...] = ()
-        if isinstance(subject, Gaussians):
-            rows = _rows_on_device(subject)
-            self._frame: Any = _core.ModelFrame(rows, _device.current_stream())
-            return
-        scene = Scene.of(subject)
-        self._shown = _shown(scene)
-        bundles = [
-            (_rows_of_bundle(bundle), bundle.clusters.filter_px2, bundle.clusters.antialiased)
-            for bundle in scene.bundles
-        ]
-        self._frame = _core.SceneFrame(
-            bundles,
-            scene.tables,
-            scene.instance_bundle,
-            scene.positions,
-            scene.rotations,
-            scene.scales,
-            _device.current_stream(),
-        )
+        self._subject = subject
+        self._drawer = _Drawer(subject, color_by)
 
     def render(
         self,
         camera: Camera,
         *,
-        tolerance: float = DEFAULT_TOLERANCE,
+        tolerance: float | None = None,
+        budget: int | None = None,
+        min_level: int = 0,
+        cut: Selection | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> Image:
         """Draw on torch's current stream, as `v3dg.render` does."""
-        _check(tolerance, background)
-        shape = (camera.height, camera.width)
-        picture = (_empty((*shape, 3)), _empty(shape), _empty(shape))
-        last = ([float(b) for b in background], picture, _device.current_stream())
-        if isinstance(self._frame, _core.SceneFrame):
-            drawing = self._frame.draw(
-                camera.viewmat, camera.position, camera.K, camera.near, float(tolerance), *last
-            )
+        options = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
+        return self._drawer.draw(self._subject, camera, background, **options)
+
+
+class _Drawer:
+    """What of a renderer does not keep its subject alive."""
+
+    def __init__(self, subject: Scene | Bundle | Gaussians, color_by: ColorBy) -> None:
+        self.device = _device.current_device()
+        self._color_by = color_by
+        self._num_bundles = 0
+        if isinstance(subject, Gaussians):
+            _check_asset(color_by)
+            self._frame: Any = _core.ModelFrame(_rows_on_device(subject), _device.current_stream())
         else:
-            drawing = self._frame.draw(view_of_world(camera), 0.0, False, intrinsics(camera), *last)
+            self._take_bundles(Scene.of(subject).bundles)
+
+    def _take_bundles(self, bundles: Sequence[Bundle]) -> None:
+        rows = [_rows_of_bundle(bundle, self._color_by) for bundle in bundles]
+        self._frame = _core.SceneFrame(rows, _device.current_stream())
+        self._num_bundles = len(bundles)
+
+    def draw(
+        self, subject: Scene | Bundle | Gaussians, camera: Camera, background: Sequence[float], **options: Any
+    ) -> Image:
+        shape = (camera.height, camera.width)
+        shade, stream = _three(background), _device.current_stream()
+        if isinstance(subject, Gaussians):
+            _check_asset(self._color_by, **options)
+            picture = (_empty((*shape, 3)), _empty(shape), _empty(shape))
+            drawing = self._frame.draw(
+                view_of_world(camera), 0.0, False, intrinsics(camera), shade, picture, stream
+            )
+            return Image(*picture, lambda: _stats(drawing.finish(), 0.0))
+
+        cut, budget = options.pop("cut"), options["budget"]
+        rule = rule_of(**options, footprint="solid_angle", cull=True)
+        if isinstance(subject, Scene) and self._num_bundles != len(subject.bundles):
+            self._take_bundles(subject.bundles)
+        resident = _resident.resident_of(subject)
+        scene = resident.core
+        picture = (_empty((*shape, 3)), _empty(shape), _empty(shape))
+        if cut is None:
+            drawing = self._frame.draw(scene, camera_of(camera), rule, shade, picture, stream)
+        else:
+            selection = _checked(cut, subject, **options)
+            pairs = (_uploaded(selection.instance_ids), _uploaded(selection.cluster_ids))
+            drawing = self._frame.draw_cut(scene, camera_of(camera), *pairs, shade, picture, stream)
+        resident.drawings.add(drawing)
 
         def finish() -> Stats:
             counts = drawing.finish()
-            return Stats(counts["gaussians"], counts["in_frustum"], counts["select_ms"], counts["draw_ms"])
+            if budget is not None and counts["exceeds_budget"]:
+                raise over_budget(budget, counts["least"])
+            used = (
+                cut.tolerance if cut is not None else counts["tolerance"] if budget is not None else rule[0]
+            )
+            return _stats(counts, used)
 
         return Image(*picture, finish)
 
-    def _draws(self, scene: Scene) -> bool:
-        shown = _shown(scene)
-        same = len(shown) == len(self._shown) and all(a is b for a, b in zip(shown, self._shown, strict=True))
-        return same and self._device == _device.current_device()
+
+def _stats(counts: dict[str, Any], tolerance: float) -> Stats:
+    return Stats(counts["gaussians"], counts["in_frustum"], tolerance, counts["select_ms"], counts["draw_ms"])
 
 
-def _check(tolerance: float, background: Sequence[float]) -> None:
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance: expected 0 px² or more, got {tolerance}")
+def _three(background: Sequence[float]) -> list[float]:
     if len(background) != 3:
         raise ValueError(f"background: expected three numbers, got {len(background)}")
+    return [float(b) for b in background]
 
 
-def _shown(scene: Scene) -> tuple[Any, ...]:
-    """What is another object when something was added to the scene."""
-    return (scene.instance_bundle, scene.positions, scene.rotations, scene.scales, *scene.tables)
+def _check_asset(color_by: ColorBy, **options: Any) -> None:
+    """An asset has no levels: refuse what asks for them."""
+    for name, value in options.items():
+        if name != "tolerance" and value:
+            raise ValueError(f"{name}: expected a scene or a bundle to choose from, got an asset")
+    if color_by != "appearance":
+        raise ValueError(
+            f"color_by: expected 'appearance' for an asset, which has no levels, got {color_by!r}"
+        )
+    rule_of(options.get("tolerance"), None, 0, "solid_angle", True)
 
 
-# Renderers of scenes and bundles, and bundles' gaussians, as long as those live.
-_renderers: weakref.WeakKeyDictionary[Scene | Bundle, Renderer] = weakref.WeakKeyDictionary()
-_rows: weakref.WeakKeyDictionary[Bundle, tuple[int, tuple[Any, ...]]] = weakref.WeakKeyDictionary()
+def _checked(cut: Selection, subject: Scene | Bundle, **options: Any) -> Selection:
+    """The cut, if it is one of this scene and nothing else is asked for."""
+    for name, value in options.items():
+        if value:
+            raise ValueError(f"{name}: expected nothing beside a cut, which has been chosen, got {value}")
+    mine = cut.scene is subject or (isinstance(subject, Bundle) and cut.scene.bundles == [subject])
+    if not mine:
+        raise ValueError("cut: expected a selection from this scene, got one from another")
+    if (cut.instance_ids >= len(cut.scene)).any():
+        raise ValueError("cut: expected instances of the scene, got some that were removed since")
+    return cut
 
 
-def _renderer_of(subject: Scene | Bundle | Gaussians) -> Renderer:
+# Drawers of scenes and bundles, and bundles' gaussians, as long as those live.
+_drawers: weakref.WeakKeyDictionary[Scene | Bundle, dict[str, _Drawer]] = weakref.WeakKeyDictionary()
+_rows: weakref.WeakKeyDictionary[Bundle, dict[str, tuple[int, tuple[Any, ...]]]] = weakref.WeakKeyDictionary()
+
+
+def _drawer_of(subject: Scene | Bundle | Gaussians, color_by: ColorBy) -> _Drawer:
     if isinstance(subject, Gaussians):
-        return Renderer(subject)
-    known = _renderers.get(subject)
-    if known is None or (isinstance(subject, Scene) and not known._draws(subject)):
-        known = _renderers[subject] = Renderer(subject)
-    return known
+        return _Drawer(subject, color_by)
+    known = _drawers.setdefault(subject, {})
+    if color_by not in known or known[color_by].device != _device.current_device():
+        known[color_by] = _Drawer(subject, color_by)
+    return known[color_by]
 
 
-def _rows_of_bundle(bundle: Bundle) -> tuple[Any, ...]:
-    device = _device.current_device()
-    if bundle not in _rows or _rows[bundle][0] != device:
-        _rows[bundle] = (device, _rows_on_device(bundle.gaussians))
-    return _rows[bundle][1]
+def _rows_of_bundle(bundle: Bundle, color_by: ColorBy) -> tuple[Any, ...]:
+    device, known = _device.current_device(), _rows.setdefault(bundle, {})
+    if color_by not in known or known[color_by][0] != device:
+        known[color_by] = (device, _rows_on_device(false_color(bundle, color_by)))
+    return known[color_by][1]
 
 
 def _rows_on_device(gaussians: Gaussians) -> tuple[Any, ...]:
@@ -254,22 +359,19 @@ def _empty(shape: tuple[int, ...]) -> Any:
     return torch.empty(shape, dtype=torch.float32, device="cuda")
 
 
+def _uploaded(array: Any) -> Any:
+    import torch
+
+    return torch.from_numpy(array).to("cuda")
+
+
 # A bundle's gaussians as the core lays them out, made when it is first drawn.
-_models: weakref.WeakKeyDictionary[Bundle, Any] = weakref.WeakKeyDictionary()
+_models: weakref.WeakKeyDictionary[Bundle, dict[str, Any]] = weakref.WeakKeyDictionary()
 
 
-def _table(bundle: Bundle) -> tuple[Any, ...]:
-    if bundle not in _models:
-        _models[bundle] = _core.Model(*rows_of(bundle.gaussians))
+def _table(bundle: Bundle, color_by: ColorBy) -> tuple[Any, ...]:
+    known = _models.setdefault(bundle, {})
+    if color_by not in known:
+        known[color_by] = _core.Model(*rows_of(false_color(bundle, color_by)))
     clusters = bundle.clusters
-    return _models[bundle], clusters.offset, clusters.filter_px2, clusters.antialiased
-
-
-def _views(scene: Scene, camera: Camera) -> npt.NDArray[np.float64]:
-    """(I, 15) instance to view for the core, composed in double precision."""
-    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    linear = rotation @ scene.rotations * scene.scales[:, None, None]
-    offset = scene.positions @ rotation.T + translation
-    from_eye = (camera.position - scene.positions)[:, None, :] @ scene.rotations
-    eye = from_eye[:, 0, :] / scene.scales[:, None]
-    return np.ascontiguousarray(np.concatenate([linear.reshape(-1, 9), offset, eye], axis=1))
+    return known[color_by], clusters.offset, clusters.filter_px2, clusters.antialiased

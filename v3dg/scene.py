@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -9,27 +11,36 @@ from v3dg import _core
 from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
 
+_NO_ROTATION = (1.0, 0.0, 0.0, 0.0)
+
 
 class Scene:
     """Instances of bundles: each bundle is stored once, an instance takes p to scale * rotation p + position.
 
+    Instances are numbered from 0 in the order in which they were added; `remove` closes the gaps. What is
+    added, removed or moved counts from the next picture on.
+
+    Poses may be given as NumPy arrays, or as torch tensors on the host or on a CUDA device. Those of a device
+    stay there, without a look at their values: an instance whose pose is not finite, or of no size, is not
+    drawn.
+
     Attributes:
         bundles: The bundles, in the order in which they were first added.
-        instance_bundle: (I,) int32, which bundle an instance shows.
-        positions: (I, 3) float64, world units.
-        quaternions: (I, 4) float64, w x y z, unit length.
-        rotations: (I, 3, 3) float64.
-        scales: (I,) float64.
     """
 
     def __init__(self) -> None:
         self.bundles: list[Bundle] = []
         self.tables: list[_core.ClusterTable] = []
-        self.instance_bundle: npt.NDArray[np.int32] = np.zeros(0, np.int32)
-        self.positions: Floats = np.zeros((0, 3))
-        self.quaternions: Floats = np.zeros((0, 4))
-        self.rotations: Floats = np.zeros((0, 3, 3))
-        self.scales: Floats = np.zeros(0)
+        self._bundle: npt.NDArray[np.int32] = np.zeros(0, np.int32)
+        self._importance: npt.NDArray[np.float32] = np.zeros(0, np.float32)
+        # NumPy arrays or tensors on a CUDA device.
+        self._poses: dict[str, Any] = {
+            "positions": np.zeros((0, 3)),
+            "quaternions": np.zeros((0, 4)),
+            "scales": np.zeros(0),
+        }
+        # Counted up at each change, so that whoever keeps a copy knows when to look again.
+        self.num_changes = self.num_moves = 0
 
     @classmethod
     def of(cls, scene_or_bundle: Scene | Bundle) -> Scene:
@@ -43,9 +54,10 @@ class Scene:
     def add(
         self,
         bundle: Bundle,
-        positions: npt.ArrayLike = (0.0, 0.0, 0.0),
-        quaternions: npt.ArrayLike | None = None,
-        scales: npt.ArrayLike | None = None,
+        positions: Any = (0.0, 0.0, 0.0),
+        quaternions: Any = None,
+        scales: Any = None,
+        importance: npt.ArrayLike = 1.0,
     ) -> range:
         """Place a bundle I times and return the ids of the new instances.
 
@@ -53,6 +65,8 @@ class Scene:
             positions: (I, 3), or (3,) for one instance; world units.
             quaternions: (I, 4) or (4,) w x y z of any length but zero; no rotation if None.
             scales: (I,) or one number for all, > 0; 1 if None.
+            importance: (I,) or one number for all, > 0. An instance of importance 4 is drawn as if the
+                tolerance were a quarter.
 
         Raises:
             TypeError: ``bundle`` is not a bundle.
@@ -60,43 +74,136 @@ class Scene:
         """
         if not isinstance(bundle, Bundle):
             raise TypeError(f"bundle: expected a Bundle, got {type(bundle).__name__}")
-        position = np.atleast_2d(_finite(positions, "positions"))
-        count = len(position)
-        if position.shape != (count, 3):
-            raise ValueError(f"positions: expected shape (I, 3), got {position.shape}")
-        if quaternions is None:
-            quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
-        else:
-            quaternion = np.atleast_2d(_finite(quaternions, "quaternions"))
-        if quaternion.shape != (count, 4):
-            raise ValueError(f"quaternions: expected shape ({count}, 4), got {quaternion.shape}")
-        scale = _finite(1.0 if scales is None else scales, "scales")
-        if scale.ndim == 0:
-            scale = np.full(count, float(scale))
-        if scale.shape != (count,):
-            raise ValueError(f"scales: expected shape ({count},), got {scale.shape}")
-        if (scale <= 0).any():
-            raise ValueError(f"scales: expected positive numbers, got {scale[scale <= 0][0]:g}")
-        largest = np.abs(quaternion).max(axis=1, initial=0.0, keepdims=True)
-        if (largest == 0).any():
-            raise ValueError("quaternions: expected a rotation, got a quaternion of zeros")
-        quaternion = quaternion / largest  # so that squares neither overflow nor vanish
-        quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        if not hasattr(positions, "shape"):
+            positions = _finite(positions, "positions")
+        if len(positions.shape) == 1:
+            positions = positions[None]
+        if len(positions.shape) != 2 or positions.shape[1] != 3:
+            raise ValueError(f"positions: expected shape (I, 3), got {tuple(positions.shape)}")
+        count = len(positions)
+        new = {
+            "positions": _rows(positions, "positions", count),
+            "quaternions": _rows(_NO_ROTATION if quaternions is None else quaternions, "quaternions", count),
+            "scales": _rows(1.0 if scales is None else scales, "scales", count),
+        }
+        weights = _importances(importance, count)
 
         index = next((b for b, known in enumerate(self.bundles) if known is bundle), len(self.bundles))
         if index == len(self.bundles):
             self.tables.append(_table_of(bundle))
             self.bundles.append(bundle)
         first = len(self)
-        self.instance_bundle = np.concatenate([self.instance_bundle, np.full(count, index, np.int32)])
-        self.positions = np.concatenate([self.positions, position])
-        self.quaternions = np.concatenate([self.quaternions, quaternion])
-        self.rotations = np.concatenate([self.rotations, rotation_from_quaternion(quaternion)])
-        self.scales = np.concatenate([self.scales, scale])
+        self._bundle = np.concatenate([self._bundle, np.full(count, index, np.int32)])
+        self._importance = np.concatenate([self._importance, weights])
+        for name, rows in new.items():
+            self._poses[name] = _joined(self._poses[name], rows)
+        self.num_changes += 1
         return range(first, first + count)
 
+    def remove(self, ids: Any) -> None:
+        """Take instances away; those that follow move down, as `numpy.delete` does it."""
+        keep = np.ones(len(self), bool)
+        keep[self._ids(ids)] = False
+        self._bundle, self._importance = self._bundle[keep], self._importance[keep]
+        for name, rows in self._poses.items():
+            self._poses[name] = rows[keep if isinstance(rows, np.ndarray) else _like(rows, keep)]
+        self.num_changes += 1
+
+    def move(
+        self, ids: Any = None, *, positions: Any = None, quaternions: Any = None, scales: Any = None
+    ) -> None:
+        """Give instances new poses; what is None stays.
+
+        Args:
+            ids: (M,) which instances; all if None.
+            positions: (M, 3).
+            quaternions: (M, 4) or (4,) for all of them.
+            scales: (M,) or one number for all of them.
+
+        Raises:
+            IndexError: There is no such instance.
+            ValueError: A shape or a value is not as in `add`.
+        """
+        rows = None if ids is None else self._ids(ids)
+        count = len(self) if rows is None else len(rows)
+        given = {"positions": positions, "quaternions": quaternions, "scales": scales}
+        checked = {name: _rows(values, name, count) for name, values in given.items() if values is not None}
+        for name, values in checked.items():
+            if rows is None:
+                self._poses[name] = values
+                continue
+            here = self._poses[name]
+            if isinstance(here, np.ndarray) and isinstance(values, np.ndarray):
+                here = here.copy()
+                here[rows] = values
+            else:  # on a device, where one of them is
+                there = values if isinstance(here, np.ndarray) else here
+                here = _like(there, here).clone()
+                here[_like(there, rows)] = _like(there, values)
+            self._poses[name] = here
+        self.num_moves += 1
+
+    def set_importance(self, importance: npt.ArrayLike, ids: Any = None) -> None:
+        """Give instances another importance, as in `add`; all of them if ``ids`` is None."""
+        rows = np.arange(len(self)) if ids is None else self._ids(ids)
+        changed = self._importance.copy()
+        changed[rows] = _importances(importance, len(rows))
+        self._importance = changed
+        self.num_changes += 1
+
+    @property
+    def instance_bundle(self) -> npt.NDArray[np.int32]:
+        """(I,) int32, which bundle an instance shows; not to be written to."""
+        return _read_only(self._bundle)
+
+    @property
+    def importance(self) -> npt.NDArray[np.float32]:
+        """(I,) float32; not to be written to."""
+        return _read_only(self._importance)
+
+    @property
+    def positions(self) -> Floats:
+        """(I, 3) float64, world units; a copy if they are on a device. Use `move` to change them."""
+        return self._on_host("positions")
+
+    @property
+    def quaternions(self) -> Floats:
+        """(I, 4) float64, w x y z, unit length."""
+        return self._on_host("quaternions")
+
+    @property
+    def scales(self) -> Floats:
+        """(I,) float64."""
+        return self._on_host("scales")
+
+    @property
+    def rotations(self) -> Floats:
+        """(I, 3, 3) float64, of the quaternions."""
+        return rotation_from_quaternion(self.quaternions)
+
+    def poses_anywhere(self) -> tuple[Any, Any, Any]:
+        """Positions, quaternions and scales where they are: NumPy arrays, or tensors on a CUDA device."""
+        return self._poses["positions"], self._poses["quaternions"], self._poses["scales"]
+
+    def _on_host(self, name: str) -> Floats:
+        rows = self._poses[name]
+        return _read_only(rows if isinstance(rows, np.ndarray) else rows.cpu().numpy())
+
+    def _ids(self, ids: Any) -> npt.NDArray[np.int64]:
+        if hasattr(ids, "detach"):
+            ids = ids.detach().cpu().numpy()
+        rows = np.atleast_1d(np.asarray(ids if len(np.shape(ids)) == 0 else np.array(ids)))
+        if rows.size == 0:
+            return np.zeros(0, np.int64)
+        if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
+            raise ValueError(f"ids: expected whole numbers (M,), got {rows.dtype} of shape {rows.shape}")
+        wrong = (rows < 0) | (rows >= len(self))
+        if wrong.any():
+            raise IndexError(f"ids: expected 0 to {len(self) - 1}, got {rows[wrong][0]}")
+        return rows.astype(np.int64)
+
     def __len__(self) -> int:
-        return len(self.scales)
+        return len(self._bundle)
 
     def __repr__(self) -> str:
         return f"Scene({len(self)} instances of {len(self.bundles)} bundles)"
@@ -118,12 +225,44 @@ def _table_of(bundle: Bundle) -> _core.ClusterTable:
     return _core.ClusterTable(
         groups.ball,
         groups.weight,
+        groups.level,
         clusters.own_group,
         clusters.parent_group,
         clusters.box,
         clusters.filter_px2,
         clusters.offset,
     )
+
+
+_ROW = {"positions": (3,), "quaternions": (4,), "scales": ()}
+
+
+def _rows(values: Any, name: str, count: int) -> Any:
+    """(count, ...) in double precision, contiguous, ours alone; one row stands for all but of positions."""
+    row = _ROW[name]
+    is_on_device = getattr(values, "is_cuda", False)
+    if is_on_device:
+        array = values.detach().double()
+    else:
+        array = _finite(values.detach().numpy() if hasattr(values, "detach") else values, name)
+    if name != "positions" and tuple(array.shape) == row:
+        array = array.expand(count, *row) if is_on_device else np.broadcast_to(array, (count, *row))
+    if tuple(array.shape) != (count, *row):
+        shown = ", ".join(str(length) for length in (count, *row)) + ("," if not row else "")
+        raise ValueError(f"{name}: expected shape ({shown}), got {tuple(array.shape)}")
+    if is_on_device:
+        if name == "quaternions":
+            array = array / array.norm(dim=1, keepdim=True)
+        return array.clone() if array.data_ptr() == values.data_ptr() else array.contiguous()
+    if name == "scales" and (array <= 0).any():
+        raise ValueError(f"scales: expected positive numbers, got {array[array <= 0][0]:g}")
+    if name == "quaternions":
+        largest = np.abs(array).max(axis=1, initial=0.0, keepdims=True)
+        if (largest == 0).any():
+            raise ValueError("quaternions: expected a rotation, got a quaternion of zeros")
+        array = array / largest  # so that squares neither overflow nor vanish
+        array = array / np.linalg.norm(array, axis=1, keepdims=True)
+    return np.ascontiguousarray(array)
 
 
 def _finite(values: npt.ArrayLike, name: str) -> Floats:
@@ -134,3 +273,37 @@ def _finite(values: npt.ArrayLike, name: str) -> Floats:
     if not np.isfinite(array).all():
         raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
     return array
+
+
+def _importances(importance: npt.ArrayLike, count: int) -> npt.NDArray[np.float32]:
+    weights = _finite(importance, "importance").astype(np.float32)
+    if weights.ndim == 0:
+        weights = np.full(count, weights)
+    if weights.shape != (count,):
+        raise ValueError(f"importance: expected shape ({count},), got {weights.shape}")
+    if not ((weights > 0) & np.isfinite(weights)).all():
+        raise ValueError(f"importance: expected positive numbers, got {weights[~(weights > 0)][:1]}")
+    return weights
+
+
+def _like(tensor: Any, values: Any) -> Any:
+    """The values as a tensor on the device of another."""
+    import torch
+
+    return torch.as_tensor(values, device=tensor.device)
+
+
+def _joined(first: Any, second: Any) -> Any:
+    """One after the other; on a device where one of them is."""
+    if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
+        return np.concatenate([first, second])
+    import torch
+
+    there = second if isinstance(first, np.ndarray) else first
+    return torch.cat([_like(there, first), _like(there, second)])
+
+
+def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    view: npt.NDArray[Any] = array.view()
+    view.flags.writeable = False
+    return view

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import math
+import operator
 import time
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, overload
 
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core, _device, _operations
+from v3dg import _core, _device, _operations, _resident
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats, VectorLike
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
+
+# px² of screen that one gaussian of a coarser cluster may stand for; docs/levels.md has the error it gives.
+DEFAULT_TOLERANCE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +35,7 @@ class Selection:
         instance_ids: (S,) int32.
         cluster_ids: (S,) int32, within the instance's bundle.
         num_gaussians: Gaussians in all selected clusters.
+        tolerance: px² that were used; with a budget, those that it came to.
         seconds: Wall time of the selection.
     """
 
@@ -35,6 +43,7 @@ class Selection:
     instance_ids: npt.NDArray[np.int32]
     cluster_ids: npt.NDArray[np.int32]
     num_gaussians: int
+    tolerance: float
     seconds: float
 
     def __len__(self) -> int:
@@ -110,16 +119,42 @@ class Selection:
         return np.repeat(self._per_pair(tables), np.diff(self._first()))
 
 
+@overload
 def select(
     scene_or_bundle: Scene | Bundle,
     camera: Camera,
     *,
-    tolerance: float,
+    tolerance: float | None = ...,
+    budget: int | None = ...,
+    min_level: int = ...,
+    footprint: Footprint = ...,
+    cull: bool = ...,
+    device: str = ...,
+) -> Selection: ...
+@overload
+def select(
+    scene_or_bundle: Scene | Bundle,
+    camera: Sequence[Camera],
+    *,
+    tolerance: float | None = ...,
+    budget: int | None = ...,
+    min_level: int = ...,
+    footprint: Footprint = ...,
+    cull: bool = ...,
+    device: str = ...,
+) -> list[Selection]: ...
+def select(
+    scene_or_bundle: Scene | Bundle,
+    camera: Camera | Sequence[Camera],
+    *,
+    tolerance: float | None = None,
+    budget: int | None = None,
+    min_level: int = 0,
     footprint: Footprint = "solid_angle",
     cull: bool = True,
     device: str = "cpu",
-) -> Selection:
-    """Choose the clusters that are just detailed enough for one view.
+) -> Selection | list[Selection]:
+    """Choose the clusters that are just detailed enough for one view, or for each of several.
 
     Exactly one cluster is chosen on every path from a leaf of an instance to its root, and those that lie
     outside the frustum are then left out. Turning the camera or moving it together with the scene changes
@@ -127,31 +162,44 @@ def select(
 
     Args:
         tolerance: Screen area in px² that one gaussian of a coarser cluster may stand for; 0 chooses the
-            full detail wherever it covers anything, infinity the coarsest clusters.
+            full detail wherever it covers anything, infinity the coarsest clusters. `DEFAULT_TOLERANCE` if
+            None; with a budget, 0.
+        budget: Most gaussians that one view may have. The tolerance is raised, alike for all instances, until
+            they fit: to the least of 2,048 values an octave, so that no finer cut would.
+        min_level: No cluster of a finer level is chosen, except where an asset has no coarser one.
         footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with which a path can
             have more than one cluster.
         cull: False keeps what lies outside the frustum.
         device: ``"cpu"`` or ``"cuda"``; both choose the same.
 
     Raises:
-        ValueError: ``tolerance`` is negative or not a number, or another argument is not one of the above.
-        RuntimeError: ``device`` is ``"cuda"`` and there is none.
+        ValueError: The coarsest cut has more gaussians than the budget, ``tolerance`` is negative or not a
+            number, or another argument is not one of the above.
+        RuntimeError: ``device`` is ``"cuda"`` and something is missing for it.
 
-    Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection.
+    Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the budget is ours.
     """
-    tolerance = float(tolerance)
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance: expected 0 px² or more, got {tolerance}")
-    scene = Scene.of(scene_or_bundle)
+    rule = rule_of(tolerance, budget, min_level, footprint, cull)
+    on_cuda = _device.resolve(device) == "cuda"
+    if not isinstance(camera, Camera):
+        return [_select(scene_or_bundle, view, rule, on_cuda) for view in camera]
+    return _select(scene_or_bundle, camera, rule, on_cuda)
+
+
+def _select(subject: Scene | Bundle, camera: Camera, rule: tuple[Any, ...], on_cuda: bool) -> Selection:
+    scene = Scene.of(subject)
     start = time.perf_counter()
-    instance_ids, cluster_ids, num_gaussians = _core.select(
-        **_arguments(scene, camera),
-        tolerance=min(tolerance, _LARGEST) if math.isfinite(tolerance) else tolerance,
-        footprint=footprint,
-        cull=cull,
-        device=device,
-    )
-    return Selection(scene, instance_ids, cluster_ids, num_gaussians, time.perf_counter() - start)
+    if on_cuda:
+        resident = _resident.resident_of(subject)
+        found = resident.core.select(camera_of(camera), rule, _device.current_stream())
+    else:
+        found = _core.select(
+            scene.tables, _resident.instances_of(scene, on_host=True), camera_of(camera), rule
+        )
+    instance_ids, cluster_ids, count, tolerance, fits_budget = found
+    if not fits_budget:
+        raise over_budget(rule[1], count)
+    return Selection(scene, instance_ids, cluster_ids, count, tolerance, time.perf_counter() - start)
 
 
 def group_metrics(
@@ -159,27 +207,49 @@ def group_metrics(
 ) -> list[npt.NDArray[np.float32]]:
     """Return for each instance what tolerance is compared with: its groups' metrics, (G,) in px²."""
     scene = Scene.of(scene_or_bundle)
-    metric, offset = _core.group_metrics(**_arguments(scene, camera), footprint=footprint)
+    metric, offset = _core.group_metrics(
+        scene.tables,
+        _resident.instances_of(scene, on_host=True),
+        camera_of(camera),
+        rule_of(0.0, None, 0, footprint, False),
+    )
     return np.split(metric, offset[1:-1]) if len(scene) else []
 
 
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-def _arguments(scene: Scene, camera: Camera) -> dict[str, Any]:
-    return {
-        "tables": scene.tables,
-        "instance_bundle": scene.instance_bundle,
-        "positions": scene.positions,
-        "rotations": scene.rotations,
-        "scales": scene.scales,
-        "viewmat": camera.viewmat,
-        "eye": camera.position,
-        "K": camera.K,
-        "width": camera.width,
-        "height": camera.height,
-        "near": camera.near,
-    }
+def rule_of(
+    tolerance: float | None, budget: int | None, min_level: int, footprint: Footprint, cull: bool
+) -> tuple[Any, ...]:
+    """What to choose, as the core takes it.
+
+    Raises:
+        ValueError: A number is not as `select` has it.
+    """
+    if tolerance is None:
+        tolerance = DEFAULT_TOLERANCE if budget is None else 0.0
+    tolerance = float(tolerance)
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance: expected 0 px² or more, got {tolerance}")
+    if budget is not None and operator.index(budget) < 0:
+        raise ValueError(f"budget: expected 0 gaussians or more, got {budget}")
+    if not 0 <= operator.index(min_level) < 1 << 31:
+        raise ValueError(f"min_level: expected a level, 0 or more, got {min_level}")
+    tolerance = min(tolerance, _LARGEST) if math.isfinite(tolerance) else tolerance
+    return (tolerance, budget, min_level, footprint, cull)
+
+
+def over_budget(budget: int, least: int) -> ValueError:
+    """The error that says so."""
+    return ValueError(
+        f"budget: expected at least {least} gaussians, which the coarsest cut of this view has, got {budget}"
+    )
+
+
+def camera_of(camera: Camera) -> tuple[Any, ...]:
+    """The camera as the core takes it."""
+    return (camera.viewmat, camera.position, camera.K, camera.width, camera.height, camera.near)
 
 
 def _basis_of_band(degree: int, directions: Floats) -> Floats:

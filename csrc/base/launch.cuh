@@ -25,7 +25,7 @@ void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_
 }
 
 // Blocks of `size` threads that cover `count` elements.
-inline unsigned blocks_for(size_t count, unsigned size) {
+V3DG_HD inline unsigned blocks_for(size_t count, unsigned size) {
     return static_cast<unsigned>((count + size - 1) / size);
 }
 

@@ -2,7 +2,7 @@
 #include <mutex>
 #include <optional>
 
-#include "bindings/render_args.h"
+#include "bindings/select_args.h"
 #include "pipeline/model.h"
 #include "pipeline/render.h"
 
@@ -159,33 +159,32 @@ static BundleClusters clusters_of(const py::handle& item) {
             span_of<const uint8_t>(t[3].cast<py::array>(), "antialiased", {c})};
 }
 
-static py::tuple render_selection(const py::list& bundles, const py::array& instance_bundle,
-                                  const py::array& views, const py::array& instance_ids,
-                                  const py::array& cluster_ids, const std::array<double, 5>& k, int width,
-                                  int height, const std::array<double, 3>& background, bool with_depth,
-                                  const std::optional<std::array<int, 4>>& window) {
+static py::tuple render_selection(const py::list& bundles, const py::tuple& instances,
+                                  const py::tuple& camera, const py::array& instance_ids,
+                                  const py::array& cluster_ids, const std::array<double, 3>& background,
+                                  bool with_depth, const std::optional<std::array<int, 4>>& window) {
     static SharedWorkspace shared;
     std::vector<BundleClusters> tables;
     for (const py::handle& item : bundles) tables.push_back(clusters_of(item));
-    const Span<const int32_t> bundle_of = span_of<const int32_t>(instance_bundle, "instance_bundle", {-1});
-    const Span<const double> view =
-        span_of<const double>(views, "views", {static_cast<py::ssize_t>(bundle_of.size), 15});
-    const Span<const int32_t> instances = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
+    const InstanceTable placed = host_instances(instances, tables.size());
+    const Span<const int32_t> instance = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
     const Span<const int32_t> clusters =
-        span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instances.size)});
-    const Pinhole<float> camera = pinhole_of<float>(k, width, height);
+        span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instance.size)});
+    const SelectCamera eye = select_camera(camera);
+    const Pinhole<float> pinhole = pinhole_of(eye);
+    const int width = static_cast<int>(eye.width), height = static_cast<int>(eye.height);
     const Window part = window ? window_of(*window, width, height) : Window{0, 0, width, height};
 
     // Neighbouring clusters of one instance are neighbours in memory: one draw.
     std::vector<Draw<float>> draws;
     int32_t last_instance = -1;
-    for (size_t s = 0; s < instances.size; ++s) {
-        const int32_t i = instances[s], c = clusters[s];
-        if (i < 0 || static_cast<size_t>(i) >= bundle_of.size || bundle_of[i] < 0 ||
-            static_cast<size_t>(bundle_of[i]) >= tables.size())
+    ModelView<float> view{};
+    for (size_t s = 0; s < instance.size; ++s) {
+        const int32_t i = instance[s], c = clusters[s];
+        if (i < 0 || static_cast<size_t>(i) >= placed.bundle.size)
             throw py::value_error("instance_ids: expected ids of the scene's instances, got " +
                                   std::to_string(i));
-        const BundleClusters& b = tables[bundle_of[i]];
+        const BundleClusters& b = tables[placed.bundle[i]];
         if (c < 0 || static_cast<size_t>(c) >= b.filter_px2.size)
             throw py::value_error("cluster_ids: expected ids of the bundle's clusters, got " +
                                   std::to_string(c));
@@ -200,9 +199,12 @@ static py::tuple render_selection(const py::list& bundles, const py::array& inst
                 d.count += last - first;
                 continue;
             }
+        } else {
+            const Pose pose = placed.pose(i);
+            if (!is_placed(pose)) continue;
+            view = model_view_from_instance(axes_of_instance(eye, pose), pose);
         }
-        draws.push_back({&b.model->planes(), first, last - first,
-                         view_of<float>(view.data + 15 * static_cast<size_t>(i)), filter, compensate});
+        draws.push_back({&b.model->planes(), first, last - first, view, filter, compensate});
         last_instance = i;
     }
     PictureArrays<float> out(part, background, with_depth);
@@ -210,7 +212,7 @@ static py::tuple render_selection(const py::list& bundles, const py::array& inst
     {
         py::gil_scoped_release unlocked;
         std::unique_ptr<Workspace<float>> workspace = shared.take();
-        counts = render<float>(draws, camera, out.picture, false, *workspace);
+        counts = render<float>(draws, pinhole, out.picture, false, *workspace);
         shared.give_back(std::move(workspace));
     }
     return py::make_tuple(out.color, out.alpha, out.depth_or_none(), dict_of(counts));
@@ -231,9 +233,8 @@ static void bind_precision(py::module_& m, const char* model_name, const char* t
 void bind_render(py::module_& m) {
     bind_precision<float>(m, "Model", "Tape");
     bind_precision<double>(m, "ModelDouble", "TapeDouble");
-    m.def("render_selection", &render_selection, "bundles"_a, "instance_bundle"_a, "views"_a,
-          "instance_ids"_a, "cluster_ids"_a, "intrinsics"_a, "width"_a, "height"_a, "background"_a,
-          "with_depth"_a, "window"_a = py::none());
+    m.def("render_selection", &render_selection, "bundles"_a, "instances"_a, "camera"_a, "instance_ids"_a,
+          "cluster_ids"_a, "background"_a, "with_depth"_a, "window"_a = py::none());
 }
 
 }  // namespace v3dg

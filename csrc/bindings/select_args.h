@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "bindings/args.h"
+#include "bindings/render_args.h"
 #include "project/project_math.h"
 #include "select/select.h"
 
@@ -15,13 +16,15 @@ namespace v3dg {
 // A bundle's table with the arrays that it borrows from.
 class BoundTable {
   public:
-    BoundTable(py::array ball, py::array weight, py::array own_group, py::array parent_group, py::array box,
-               py::array filter_px2, py::array offset)
-        : arrays_{ball, weight, own_group, parent_group, box, filter_px2, offset} {
+    BoundTable(py::array ball, py::array weight, py::array level, py::array own_group, py::array parent_group,
+               py::array box, py::array filter_px2, py::array offset)
+        : arrays_{ball, weight, level, own_group, parent_group, box, filter_px2, offset} {
         const Span<const float> balls = span_of<const float>(ball, "ball", {-1, 4});
         const size_t num_groups = balls.size / 4;
         const Span<const float> weights =
             span_of<const float>(weight, "weight", {static_cast<py::ssize_t>(num_groups)});
+        const Span<const int32_t> levels =
+            span_of<const int32_t>(level, "level", {static_cast<py::ssize_t>(num_groups)});
         const Span<const int32_t> own = span_of<const int32_t>(own_group, "own_group", {-1});
         const py::ssize_t num_clusters = static_cast<py::ssize_t>(own.size);
         const Span<const int32_t> parent =
@@ -34,6 +37,7 @@ class BoundTable {
 
         table_.ball = {reinterpret_cast<const Ball*>(balls.data), num_groups};
         table_.weight = weights;
+        table_.level = levels;
         table_.own_group = own;
         table_.parent_group = parent;
         table_.box = {reinterpret_cast<const Box*>(boxes.data), own.size};
@@ -92,8 +96,10 @@ inline Footprint footprint_of(const std::string& name) {
     throw py::value_error("footprint: expected solid_angle or paper, got " + name);
 }
 
-inline SelectCamera select_camera(const py::array& viewmat, const py::array& eye, const py::array& K,
-                                  double width, double height, double near) {
+// Of (viewmat (4, 4), eye (3,), K (3, 3), width, height, near).
+inline SelectCamera select_camera(const py::tuple& t) {
+    const py::array viewmat = t[0].cast<py::array>(), eye = t[1].cast<py::array>(),
+                    K = t[2].cast<py::array>();
     const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
     const Span<const double> position = span_of<const double>(eye, "eye", {3});
     const Span<const double> intrinsics = span_of<const double>(K, "K", {3, 3});
@@ -106,30 +112,58 @@ inline SelectCamera select_camera(const py::array& viewmat, const py::array& eye
     camera.fy = intrinsics[4];
     camera.cx = intrinsics[2];
     camera.cy = intrinsics[5];
-    camera.width = width;
-    camera.height = height;
-    camera.near = near;
+    camera.width = t[3].cast<int>();
+    camera.height = t[4].cast<int>();
+    camera.near = t[5].cast<double>();
     return camera;
 }
 
-inline SelectRule select_rule(const SelectCamera& camera, double tolerance, const std::string& footprint,
-                              bool culls) {
-    return {static_cast<float>(camera.fx * camera.fy), static_cast<float>(tolerance), footprint_of(footprint),
-            culls};
+inline std::array<double, 5> intrinsics_of(const SelectCamera& c) { return {c.fx, c.fy, c.cx, c.cy, c.near}; }
+inline Pinhole<float> pinhole_of(const SelectCamera& c) {
+    return pinhole_of<float>(intrinsics_of(c), static_cast<int>(c.width), static_cast<int>(c.height));
 }
 
-// Borrows the arrays of a scene's instances.
-inline InstanceTable instance_table(const py::array& instance_bundle, const py::array& positions,
-                                    const py::array& rotations, const py::array& scales, size_t num_bundles) {
-    const Span<const int32_t> bundle = span_of<const int32_t>(instance_bundle, "instance_bundle", {-1});
+// Of (tolerance, budget or None, min_level, footprint, cull).
+inline SelectRule select_rule(const py::tuple& t) {
+    SelectRule rule;
+    rule.tolerance_px2 = static_cast<float>(t[0].cast<double>());
+    if (!t[1].is_none()) rule.budget = t[1].cast<uint64_t>();
+    rule.min_level = t[2].cast<int32_t>();
+    rule.footprint = footprint_of(t[3].cast<std::string>());
+    rule.culls = t[4].cast<bool>();
+    return rule;
+}
+
+// Borrows the arrays of a scene's instances: (bundle (I,), positions (I, 3), quaternions (I, 4), scales (I,),
+// importance (I,)). `doubles(array, name, shape)` borrows those that make the poses.
+template <class Doubles>
+InstanceTable instance_table(const py::tuple& t, size_t num_bundles, const Doubles& doubles) {
+    const py::array bundles = t[0].cast<py::array>(), importance = t[4].cast<py::array>();
+    const Span<const int32_t> bundle = span_of<const int32_t>(bundles, "instance_bundle", {-1});
     const py::ssize_t count = static_cast<py::ssize_t>(bundle.size);
     for (const int32_t b : bundle)
         if (b < 0 || static_cast<size_t>(b) >= num_bundles)
             throw py::value_error("instance_bundle: expected a bundle below " + std::to_string(num_bundles) +
                                   ", got " + std::to_string(b));
-    return {bundle, span_of<const double>(positions, "positions", {count, 3}),
-            span_of<const double>(rotations, "rotations", {count, 3, 3}),
-            span_of<const double>(scales, "scales", {count})};
+    return {bundle, doubles(t[1], "positions", {count, 3}), doubles(t[2], "quaternions", {count, 4}),
+            doubles(t[3], "scales", {count}), span_of<const float>(importance, "importance", {count})};
+}
+
+template <class T>
+py::array_t<T> array_of(const std::vector<T>& values) {
+    return py::array_t<T>(static_cast<py::ssize_t>(values.size()), values.data());
+}
+inline py::tuple tuple_of(const SelectOutput& out) {
+    return py::make_tuple(array_of(out.instance), array_of(out.cluster), out.num_gaussians, out.tolerance_px2,
+                          out.fits_budget);
+}
+
+using Shape = std::initializer_list<py::ssize_t>;
+
+inline InstanceTable host_instances(const py::tuple& t, size_t num_bundles) {
+    return instance_table(t, num_bundles, [](const py::handle& array, const char* name, Shape shape) {
+        return span_of<const double>(array.cast<py::array>(), name, shape);
+    });
 }
 
 }  // namespace v3dg

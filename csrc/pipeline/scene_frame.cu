@@ -31,13 +31,8 @@ PackedModel::PackedModel(const DeviceRows& rows, size_t count, cudaStream_t stre
       planes_(16 * count, stream),
       packed_(pack(rows, count, planes_.data(), stream)) {}
 
-SceneFrame::SceneFrame(std::vector<PackedModel> models, Span<const ClusterTable> tables,
-                       Span<const ClusterFilters> filters, const InstanceTable& instances,
-                       cudaStream_t stream)
-    : models_(std::move(models)),
-      tables_(tables, filters, instances, stream),
-      placements_(instances.scale.size, stream),
-      images_(1, stream) {
+SceneFrame::SceneFrame(std::vector<PackedModel> models, cudaStream_t stream)
+    : models_(std::move(models)), images_(1, stream) {
     std::vector<DeviceRows> rows;
     std::vector<PackedRows> packed;
     for (const PackedModel& model : models_) {
@@ -48,14 +43,33 @@ SceneFrame::SceneFrame(std::vector<PackedModel> models, Span<const ClusterTable>
     packed_.copy_from({packed.data(), packed.size()}, stream);
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw(const SelectCamera& camera, const SelectRule& rule,
-                                          const FrameImage& image, cudaStream_t stream) {
-    const FrameBatch batch{rows_.data(),     placements_.data(), images_.data(), 1,
+std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& tables, const FrameImage& image,
+                                          Frame::Prepare prepare, cudaStream_t stream) {
+    const FrameBatch batch{rows_.data(),     placements_.reserve(tables.num_instances(), stream),
+                           images_.data(),   1,
                            num_tiles(image), packed_.data()};
-    return frame_.draw(
-        batch,
-        [this, camera, rule, image](const ItemList& items, cudaStream_t on) {
-            tables_.cut_items(camera, rule, image, images_.data(), placements_.data(), items, on);
+    return frame_.draw(batch, std::move(prepare), stream);
+}
+
+std::unique_ptr<Drawing> SceneFrame::draw(SceneTables& tables, const SelectCamera& camera,
+                                          const SelectRule& rule, const FrameImage& image,
+                                          cudaStream_t stream) {
+    return draw(
+        tables, image,
+        [=, &tables](const ItemList& items, cudaStream_t on) {
+            tables.cut_items(camera, rule, image, images_.data(), placements_.data(), items, on);
+        },
+        stream);
+}
+
+std::unique_ptr<Drawing> SceneFrame::draw_cut(SceneTables& tables, const SelectCamera& camera,
+                                              Span<const int32_t> instance, Span<const int32_t> cluster,
+                                              const FrameImage& image, cudaStream_t stream) {
+    return draw(
+        tables, image,
+        [=, &tables](const ItemList& items, cudaStream_t on) {
+            tables.given_items(camera, instance, cluster, image, images_.data(), placements_.data(), items,
+                               on);
         },
         stream);
 }

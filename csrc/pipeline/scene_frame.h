@@ -28,19 +28,24 @@ class PackedModel {
 // Draws a scene that stays on the device: selects, then draws the cut.
 class SceneFrame {
   public:
-    // `models` are the gaussians of each bundle, which stay where they are. Other memory may be reused on
-    // return.
-    SceneFrame(std::vector<PackedModel> models, Span<const ClusterTable> tables,
-               Span<const ClusterFilters> filters, const InstanceTable& instances, cudaStream_t stream);
+    // `models` are the gaussians of each bundle of the tables, which stay where they are.
+    SceneFrame(std::vector<PackedModel> models, cudaStream_t stream);
 
-    std::unique_ptr<Drawing> draw(const SelectCamera& camera, const SelectRule& rule, const FrameImage& image,
-                                  cudaStream_t stream);
+    // The tables stay as they are until the drawing is finished.
+    std::unique_ptr<Drawing> draw(SceneTables& tables, const SelectCamera& camera, const SelectRule& rule,
+                                  const FrameImage& image, cudaStream_t stream);
+    // Draws pairs that were selected before; they are on the device and stay, too.
+    std::unique_ptr<Drawing> draw_cut(SceneTables& tables, const SelectCamera& camera,
+                                      Span<const int32_t> instance, Span<const int32_t> cluster,
+                                      const FrameImage& image, cudaStream_t stream);
 
   private:
+    std::unique_ptr<Drawing> draw(const SceneTables& tables, const FrameImage& image, Frame::Prepare prepare,
+                                  cudaStream_t stream);
+
     std::vector<PackedModel> models_;
     DeviceBuffer<DeviceRows> rows_;
     DeviceBuffer<PackedRows> packed_;
-    SceneTables tables_;
     DeviceBuffer<Placement> placements_;
     DeviceBuffer<FrameImage> images_;
     Frame frame_;

@@ -7,14 +7,16 @@
 
 namespace v3dg {
 
-// Similarity transforms p -> scale * rotation p + position.
+// Similarity transforms p -> scale * rotation p + position. An instance whose pose is not finite, or has no
+// size, is not drawn.
 struct InstanceTable {
-    Span<const int32_t> bundle;   // [I] which ClusterTable
-    Span<const double> position;  // [I * 3]
-    Span<const double> rotation;  // [I * 9] rows
-    Span<const double> scale;     // [I]
+    Span<const int32_t> bundle;     // [I] which ClusterTable
+    Span<const double> position;    // [I * 3]
+    Span<const double> quaternion;  // [I * 4] w x y z
+    Span<const double> scale;       // [I]
+    Span<const float> importance;   // [I] metrics are multiplied by it
 
-    V3DG_HD Pose pose(size_t i) const { return {position.data + 3 * i, rotation.data + 9 * i, scale[i]}; }
+    V3DG_HD Pose pose(size_t i) const { return {position.data + 3 * i, quaternion.data + 4 * i, scale[i]}; }
 };
 
 // Chooses the clusters of all instances that are just detailed enough for one view: exactly one on every path
@@ -22,6 +24,10 @@ struct InstanceTable {
 //
 // Selected pairs are in ascending order of instance, then cluster. Pairs outside the frustum are left out,
 // unless they could touch a pixel. Both halves give the same bits for any number of threads.
+//
+// With a budget, the tolerance is the least of those that a budget chooses from (select_math.h) whose cut has
+// no more gaussians. There may be none: then `fits_budget` is false, nothing is selected and `num_gaussians`
+// is what the coarsest cut has.
 //
 // Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the footprint and the
 // nesting balls are ours.
@@ -35,6 +41,8 @@ struct SelectInput {
 struct SelectOutput {
     std::vector<int32_t> instance, cluster;  // [S]
     int64_t num_gaussians = 0;
+    float tolerance_px2 = 0;  // that was used
+    bool fits_budget = true;
 };
 
 namespace cpu {
@@ -48,8 +56,6 @@ namespace cuda {
 // How many devices there are; 0 without a driver.
 int num_devices();
 
-// Host memory in and out. Throws std::runtime_error when CUDA reports an error.
-void select(const SelectInput& in, SelectOutput& out);
 }  // namespace cuda
 
 }  // namespace v3dg

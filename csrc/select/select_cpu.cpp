@@ -1,8 +1,9 @@
-// A chunk of instances to a thread. Metrics are evaluated once a group; a cluster then reads two bytes.
+// A chunk of instances to a thread. Metrics are evaluated once a group; a cluster then reads what was found.
 
 #include "select/select.h"
 
 #include <algorithm>
+#include <utility>
 
 #include "base/parallel_for.h"
 
@@ -12,26 +13,45 @@ namespace {
 
 constexpr size_t kChunk = 16;
 
+struct SeenInstance {
+    const ClusterTable& table;
+    InstanceView view;
+    bool is_hidden, culls;
+
+    SeenInstance(const SelectInput& in, size_t i)
+        : table(in.bundles[in.instances.bundle[i]]), view(), is_hidden(true), culls(false) {
+        const Pose pose = in.instances.pose(i);
+        if (!is_placed(pose)) return;
+        view = view_from_instance(in.camera, axes_of_instance(in.camera, pose), pose,
+                                  in.instances.importance[i], table.pad_px);
+        is_hidden = in.rule.culls && is_outside(table.bounds, view);
+        culls = in.rule.culls && !is_inside(table.bounds, view);
+    }
+
+    bool draws(size_t c) const { return !culls || !is_outside(table.box[c], view); }
+    int64_t size(size_t c) const { return table.offset[c + 1] - table.offset[c]; }
+};
+
 // Appends what instance i draws. fits_group: scratch for as many groups as any bundle has.
-void select_instance(const SelectInput& in, size_t i, std::vector<uint8_t>& fits_group, SelectOutput& out) {
-    const ClusterTable& table = in.bundles[in.instances.bundle[i]];
-    const InstanceView view = view_from_instance(in.camera, in.instances.pose(i), table.pad_px);
-    if (in.rule.culls && is_outside(table.bounds, view)) return;
-    const bool culls = in.rule.culls && !is_inside(table.bounds, view);
+void select_instance(const SelectInput& in, const SelectRule& rule, size_t i,
+                     std::vector<uint8_t>& fits_group, SelectOutput& out) {
+    const SeenInstance seen(in, i);
+    if (seen.is_hidden) return;
+    const ClusterTable& table = seen.table;
     const auto draw = [&](int32_t c) {
-        if (culls && is_outside(table.box[c], view)) return;
+        if (!seen.draws(c)) return;
         out.instance.push_back(static_cast<int32_t>(i));
         out.cluster.push_back(c);
-        out.num_gaussians += table.offset[c + 1] - table.offset[c];
+        out.num_gaussians += seen.size(c);
     };
-    if (top_fits(table, view, in.rule)) {
+    if (top_fits(table, seen.view, rule)) {
         for (const int32_t c : table.top_cluster) draw(c);
         return;
     }
     // Group -1 stands at both ends: below the leaves everything fits, above the roots nothing does.
     const size_t num_groups = table.ball.size;
     for (size_t g = 0; g < num_groups; ++g)
-        fits_group[g] = fits(table, static_cast<int32_t>(g), view, in.rule);
+        fits_group[g] = fits(table, static_cast<int32_t>(g), seen.view, rule);
     const size_t num_clusters = table.own_group.size;
     for (size_t c = 0; c < num_clusters; ++c) {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
@@ -47,9 +67,64 @@ size_t most_groups(const SelectInput& in) {
     return most;
 }
 
+// Adds to `change`, for each tolerance that a budget chooses from, by how many gaussians the cut of instance
+// i differs from that of the tolerance before.
+void count_instance(const SelectInput& in, size_t i, std::vector<uint32_t>& bins,
+                    std::vector<int64_t>& change) {
+    const SeenInstance seen(in, i);
+    if (seen.is_hidden) return;
+    const ClusterTable& table = seen.table;
+    if (top_fits(table, seen.view, in.rule)) {
+        for (const int32_t c : table.top_cluster)
+            if (seen.draws(c)) change[0] += seen.size(c);
+        return;
+    }
+    for (size_t g = 0; g < table.ball.size; ++g)
+        bins[g] = bin_of_group(table, static_cast<int32_t>(g), seen.view, in.rule);
+    for (size_t c = 0; c < table.own_group.size; ++c) {
+        const int32_t own = table.own_group[c], parent = table.parent_group[c];
+        const uint32_t first = own < 0 ? 0 : bins[own], last = parent < 0 ? kNumBudgetBins : bins[parent];
+        if (first >= last || !seen.draws(c)) continue;
+        change[first] += seen.size(c);
+        change[last] -= seen.size(c);
+    }
+}
+
+// Sets the tolerance of `rule`. Returns how many gaussians its cut has; more than the budget where no cut
+// fits.
+int64_t meet_budget(const SelectInput& in, SelectRule& rule) {
+    const size_t num_instances = in.instances.bundle.size, num_groups = most_groups(in);
+    std::vector<int64_t> change(kNumBudgetBins + 1, 0);
+#pragma omp parallel
+    {
+        std::vector<int64_t> own(kNumBudgetBins + 1, 0);
+        std::vector<uint32_t> bins(num_groups);
+#pragma omp for schedule(dynamic, kChunk)
+        for (size_t i = 0; i < num_instances; ++i) count_instance(in, i, bins, own);
+#pragma omp critical
+        for (size_t bin = 0; bin < change.size(); ++bin) change[bin] += own[bin];
+    }
+    int64_t count = 0;
+    for (uint32_t bin = 0; bin < kNumBudgetBins; ++bin) {
+        count += change[bin];
+        if (static_cast<uint64_t>(count) > rule.budget) continue;
+        rule.tolerance_px2 = tolerance_of_bin(bin, in.rule.tolerance_px2);
+        return count;
+    }
+    return count;
+}
+
 }  // namespace
 
 void cpu::select(const SelectInput& in, SelectOutput& out) {
+    SelectRule rule = in.rule;
+    if (rule.budget != kNoBudget) {
+        out.num_gaussians = meet_budget(in, rule);
+        out.fits_budget = static_cast<uint64_t>(out.num_gaussians) <= rule.budget;
+        if (!out.fits_budget) return;
+    }
+    out.tolerance_px2 = rule.tolerance_px2;
+    out.num_gaussians = 0;
     const size_t num_instances = in.instances.bundle.size;
     const size_t num_chunks = (num_instances + kChunk - 1) / kChunk;
     const size_t num_groups = most_groups(in);
@@ -57,7 +132,7 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
     parallel_for(num_chunks, 1, [&](size_t k) {
         std::vector<uint8_t> fits_group(num_groups);
         for (size_t i = k * kChunk; i < std::min(num_instances, (k + 1) * kChunk); ++i)
-            select_instance(in, i, fits_group, chunks[k]);
+            select_instance(in, rule, i, fits_group, chunks[k]);
     });
     std::vector<size_t> first(num_chunks + 1, 0);
     for (size_t k = 0; k < num_chunks; ++k) {
@@ -74,10 +149,10 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
 
 void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric) {
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
-        const ClusterTable& table = in.bundles[in.instances.bundle[i]];
-        const InstanceView view = view_from_instance(in.camera, in.instances.pose(i), table.pad_px);
-        for (size_t g = 0; g < table.ball.size; ++g)
-            metric[metric_offset[i] + g] = metric_px2(table, static_cast<int32_t>(g), view, in.rule);
+        const SeenInstance seen(in, i);
+        for (size_t g = 0; g < seen.table.ball.size; ++g)
+            metric[metric_offset[i] + g] =
+                metric_px2(seen.table, static_cast<int32_t>(g), seen.view, in.rule);
     });
 }
 

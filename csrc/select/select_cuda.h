@@ -18,47 +18,68 @@ struct ClusterFilters {
 // A bundle's tables on the device.
 struct DeviceBundle {
     ClusterTable table;
-    ClusterFilters filters;  // empty when only the cut is wanted
+    ClusterFilters filters;
 };
 
-struct InstanceCut;
-struct CutScratch;
+struct CutPart;
 
 // A scene's instances and the tables of its bundles, resident on the device, and the cut of one view.
 // Everything is enqueued on the stream that is passed; whoever uses several orders them.
 class SceneTables {
   public:
-    // `filters` may be empty when only the cut is wanted. Host memory may be reused on return.
-    SceneTables(Span<const ClusterTable> tables, Span<const ClusterFilters> filters,
-                const InstanceTable& instances, cudaStream_t stream);
+    // Host memory may be reused on return.
+    SceneTables(Span<const ClusterTable> tables, Span<const ClusterFilters> filters, cudaStream_t stream);
 
-    size_t num_instances() const { return num_instances_; }
+    // Takes the place of all instances. Poses may be the host's or the device's; what is the host's may be
+    // reused on return.
+    void set_instances(const InstanceTable& instances, cudaStream_t stream);
+    // Moves the instances that there are.
+    void set_poses(Span<const double> position, Span<const double> quaternion, Span<const double> scale,
+                   cudaStream_t stream);
 
-    // Selected clusters as the items of a frame, clusters that are neighbours in an asset together.
-    // Instance i becomes placement i of model bundle[i] in image 0, and `image` is written to images[0].
+    size_t num_instances() const { return bundle_of_instance_.size(); }
+    size_t num_clusters(size_t bundle) const { return num_clusters_[bundle]; }
+    Span<const int32_t> bundle_of_instance() const {
+        return {bundle_of_instance_.data(), bundle_of_instance_.size()};
+    }
+
+    // Selected clusters as the items of a frame. Instance i becomes placement i of model bundle[i] in image
+    // 0, and `image` is written to images[0].
     void cut_items(const SelectCamera& camera, const SelectRule& rule, const FrameImage& image,
                    FrameImage* images, Placement* placements, const ItemList& items, cudaStream_t stream);
 
-    // Selected clusters as pairs. Returns how many there are and how many gaussians they have, after waiting;
-    // pairs past `capacity` are not written.
-    struct Counts {
-        unsigned long long pairs, gaussians;
-    };
-    Counts cut_pairs(const SelectCamera& camera, const SelectRule& rule, int32_t* instance, int32_t* cluster,
-                     unsigned long long capacity, cudaStream_t stream);
+    // The same for pairs that were selected before, on the device.
+    void given_items(const SelectCamera& camera, Span<const int32_t> instance, Span<const int32_t> cluster,
+                     const FrameImage& image, FrameImage* images, Placement* placements,
+                     const ItemList& items, cudaStream_t stream);
+
+    // Selected clusters as pairs, on the host, after waiting.
+    void select(const SelectCamera& camera, const SelectRule& rule, SelectOutput& out, cudaStream_t stream);
 
   private:
+    struct Pairs {
+        unsigned long long pairs, gaussians;
+        CutChoice choice;
+    };
     template <class Output>
     void cut(const SelectCamera& camera, const SelectRule& rule, const FrameImage* image, FrameImage* images,
-             Placement* placements, const Output& output, cudaStream_t stream);
+             Placement* placements, CutChoice* choice, const Output& output, cudaStream_t stream);
+    InstanceTable instances() const;
 
-    size_t num_instances_, most_parts_ = 0;
+    size_t most_parts_ = 0;
+    std::vector<size_t> num_clusters_;                  // of each bundle
+    std::vector<int32_t> bundle_of_instance_;           // the host's copy
     std::vector<DeviceBuffer<unsigned char>> storage_;  // what the spans of the tables point into
     DeviceBuffer<DeviceBundle> bundles_;
     DeviceBuffer<int32_t> bundle_;
-    DeviceBuffer<double> position_, rotation_, scale_;
-    DeviceBuffer<InstanceCut> cuts_;
-    DeviceBuffer<unsigned long long> scratch_;
+    DeviceBuffer<float> importance_;
+    DeviceBuffer<double> position_, quaternion_, scale_;
+    DeviceBuffer<InstanceView> views_;
+    DeviceBuffer<uint8_t> tops_;
+    DeviceBuffer<CutPart> parts_;
+    DeviceBuffer<unsigned long long> scratch_, change_;
+    DeviceBuffer<int32_t> pair_instance_, pair_cluster_;
+    DeviceBuffer<Pairs> pairs_;
 };
 
 }  // namespace cuda

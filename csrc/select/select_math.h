@@ -8,6 +8,7 @@
 #include <cfloat>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 
 #include "base/host_device.h"
 #include "base/span.h"
@@ -41,7 +42,8 @@ struct Plane {
 // One camera as one instance sees it: in the instance's own frame and units.
 struct InstanceView {
     float eye[3];
-    float forward[3];  // unit length
+    float forward[3];         // unit length
+    float px2_per_steradian;  // times the instance's importance
     Plane plane[kNumPlanes];
 };
 
@@ -49,6 +51,7 @@ struct InstanceView {
 struct ClusterTable {
     Span<const Ball> ball;             // [G] contains the balls of the groups below it
     Span<const float> weight;          // [G] per px2, never decreasing towards the root
+    Span<const int32_t> level;         // [G] of the clusters that the group makes, ascending towards the root
     Span<const int32_t> own_group;     // [C] group that made the cluster; -1: always fits
     Span<const int32_t> parent_group;  // [C] group that replaces the cluster; -1: nothing does
     Span<const Box> box;               // [C] what the cluster draws, without the filter
@@ -59,31 +62,36 @@ struct ClusterTable {
     float pad_px;                      // how far the filter reaches, and a pixel
 };
 
+constexpr uint64_t kNoBudget = ~uint64_t(0);
+
 struct SelectRule {
-    float focal_px2;  // fx fy
     float tolerance_px2;
-    Footprint footprint;
-    bool culls;  // drop what lies outside the frustum
+    Footprint footprint = Footprint::solid_angle;
+    bool culls = true;            // drop what lies outside the frustum
+    int32_t min_level = 0;        // nothing finer is drawn
+    uint64_t budget = kNoBudget;  // most gaussians; the tolerance is raised until they fit
 };
 
 // Screen area that the ball covers, px2. +inf when the eye is inside, or where there is no number.
-V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view, const SelectRule& rule) {
+V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view, Footprint footprint) {
     const float dx = ball.x - view.eye[0], dy = ball.y - view.eye[1], dz = ball.z - view.eye[2];
     const float radius2 = ball.radius * ball.radius;
-    if (rule.footprint == Footprint::paper) {
+    if (footprint == Footprint::paper) {
         const float depth = dx * view.forward[0] + dy * view.forward[1] + dz * view.forward[2];
-        const float area = float(kPi) * (radius2 / (depth * depth)) * rule.focal_px2;
+        const float area = float(kPi) * (radius2 / (depth * depth)) * view.px2_per_steradian;
         return area >= 0.0f ? area : INFINITY;
     }
     const float x2 = radius2 / (dx * dx + dy * dy + dz * dz);
     if (!(x2 < 1.0f)) return INFINITY;
-    return solid_angle_of_ball(x2) * rule.focal_px2;
+    return solid_angle_of_ball(x2) * view.px2_per_steradian;
 }
 
-// Screen area, px2, that one gaussian of the clusters made by group g stands for.
+// Screen area, px2, that one gaussian of the clusters made by group g stands for; none where nothing finer
+// may be drawn.
 V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
                                 const SelectRule& rule) {
-    return footprint_px2(table.ball[g], view, rule) * table.weight[g];
+    if (table.level[g] <= rule.min_level) return 0.0f;
+    return footprint_px2(table.ball[g], view, rule.footprint) * table.weight[g];
 }
 
 V3DG_HD inline bool fits(const ClusterTable& table, int32_t g, const InstanceView& view,
@@ -127,6 +135,36 @@ V3DG_HD inline bool is_inside(const Box& box, const InstanceView& view) {
         if (!(side.farthest + side.reach < 0.0f)) return false;
     }
     return true;
+}
+
+// The tolerances that a budget chooses from: the rule's own, then 2048 to an octave, and infinity. A metric
+// belongs to the first of them that it fits; what is no number, to the bin after the last.
+constexpr int kLog2StepsPerOctave = 11, kOctaves = 32;
+constexpr uint32_t kNumBudgetBins = 2 + (kOctaves << kLog2StepsPerOctave);
+constexpr uint32_t kFirstStepBits = 0x3a800000u;  // of the float 2^-10
+constexpr int kStepShift = 23 - kLog2StepsPerOctave;
+
+V3DG_HD inline uint32_t bin_of_metric(float metric, float tolerance) {
+    if (metric <= tolerance) return 0;
+    uint32_t bits;  // of a positive float, so they order as it does
+    std::memcpy(&bits, &metric, sizeof bits);
+    if (bits <= kFirstStepBits) return 1;
+    if (!(metric <= INFINITY)) return kNumBudgetBins;
+    const uint32_t step = (bits - kFirstStepBits + (1u << kStepShift) - 1) >> kStepShift;
+    return step + 1 < kNumBudgetBins ? step + 1 : kNumBudgetBins - 1;
+}
+V3DG_HD inline float tolerance_of_bin(uint32_t bin, float tolerance) {
+    if (bin == 0) return tolerance;
+    if (bin == kNumBudgetBins - 1) return INFINITY;
+    const uint32_t bits = kFirstStepBits + ((bin - 1) << kStepShift);
+    float value;
+    std::memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+V3DG_HD inline uint32_t bin_of_group(const ClusterTable& table, int32_t g, const InstanceView& view,
+                                     const SelectRule& rule) {
+    return bin_of_metric(metric_px2(table, g, view, rule), rule.tolerance_px2);
 }
 
 // Whether the clusters that nothing replaces are the cut. The paper's footprint does not grow towards the

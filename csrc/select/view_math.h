@@ -2,6 +2,9 @@
 
 // A camera in the world as one instance sees it: composed in double precision, then rounded.
 
+#include <cfloat>
+
+#include "math/quat.h"
 #include "project/project_math.h"
 #include "select/select_math.h"
 
@@ -16,10 +19,19 @@ struct SelectCamera {
 
 // A similarity transform p -> scale * rotation p + position.
 struct Pose {
-    const double* position;  // [3]
-    const double* rotation;  // [9] rows
+    const double* position;    // [3]
+    const double* quaternion;  // [4] w x y z, of any length but zero
     double scale;
 };
+
+// Whether a pose is one: what is not finite, or of no size, is not drawn.
+V3DG_HD inline bool is_placed(const Pose& pose) {
+    double sum = pose.scale;
+    for (int k = 0; k < 3; ++k) sum += fabs(pose.position[k]);
+    double length2 = 0.0;
+    for (int k = 0; k < 4; ++k) length2 += pose.quaternion[k] * pose.quaternion[k];
+    return pose.scale > 0.0 && sum <= DBL_MAX && length2 > 0.0 && length2 <= DBL_MAX;
+}
 
 // The camera in the frame of an instance.
 struct InstanceAxes {
@@ -29,16 +41,18 @@ struct InstanceAxes {
 
 V3DG_HD inline InstanceAxes axes_of_instance(const SelectCamera& camera, const Pose& pose) {
     const double inverse_scale = 1.0 / pose.scale;
+    double rotation[9];
+    rotation_of_quat(pose.quaternion, rotation);
     double eye_from_origin[3];
     for (int a = 0; a < 3; ++a) eye_from_origin[a] = camera.eye[a] - pose.position[a];
     InstanceAxes out;
     for (int row = 0; row < 3; ++row) {
         double eye = 0.0, origin = 0.0;
         for (int k = 0; k < 3; ++k) {
-            eye += pose.rotation[3 * k + row] * eye_from_origin[k];
+            eye += rotation[3 * k + row] * eye_from_origin[k];
             origin -= camera.rotation[3 * row + k] * eye_from_origin[k];
             double axis = 0.0;
-            for (int j = 0; j < 3; ++j) axis += camera.rotation[3 * row + j] * pose.rotation[3 * j + k];
+            for (int j = 0; j < 3; ++j) axis += camera.rotation[3 * row + j] * rotation[3 * j + k];
             out.axes[3 * row + k] = axis;
         }
         out.origin[row] = origin * inverse_scale;
@@ -49,9 +63,10 @@ V3DG_HD inline InstanceAxes axes_of_instance(const SelectCamera& camera, const P
 }
 
 // What selection needs. Frustum planes lie pad_px outside the image.
-V3DG_HD inline InstanceView view_from_instance(const SelectCamera& camera, const Pose& pose, double pad_px) {
-    const InstanceAxes in = axes_of_instance(camera, pose);
+V3DG_HD inline InstanceView view_from_instance(const SelectCamera& camera, const InstanceAxes& in,
+                                               const Pose& pose, float importance, double pad_px) {
     InstanceView view;
+    view.px2_per_steradian = static_cast<float>(camera.fx * camera.fy) * importance;
     for (int k = 0; k < 3; ++k) view.eye[k] = static_cast<float>(in.eye[k]);
     for (int k = 0; k < 3; ++k) view.forward[k] = static_cast<float>(in.axes[6 + k]);
 
@@ -81,8 +96,7 @@ V3DG_HD inline InstanceView view_from_instance(const SelectCamera& camera, const
 }
 
 // What projection needs.
-V3DG_HD inline ModelView<float> model_view_from_instance(const SelectCamera& camera, const Pose& pose) {
-    const InstanceAxes in = axes_of_instance(camera, pose);
+V3DG_HD inline ModelView<float> model_view_from_instance(const InstanceAxes& in, const Pose& pose) {
     ModelView<float> view;
     for (int k = 0; k < 9; ++k) view.linear[k] = static_cast<float>(pose.scale * in.axes[k]);
     for (int k = 0; k < 3; ++k) view.translation[k] = static_cast<float>(pose.scale * in.origin[k]);
