@@ -2,6 +2,8 @@
 
 #include <map>
 #include <mutex>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
 namespace v3dg {
@@ -25,6 +27,10 @@ void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
     const std::unique_ptr<Drawing> drawing =
         frame_.draw(in.rows, in.count, in.view, in.filter_px2, in.compensate, in.image, stream);
     num_slots_ = drawing->settle().slots;
+    if (num_slots_ > UINT32_MAX)
+        throw std::length_error(
+            "gaussians: expected at most 4294967295 pairs with tiles to differentiate, got " +
+            std::to_string(num_slots_));
     check(cudaEventRecord(drawn_, stream), "cudaEventRecord");
 }
 

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <cmath>
 #include <numeric>
 #include <stdexcept>
 #include <string>
@@ -72,37 +73,47 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
     return order;
 }
 
-// A frame holds this many records at once, or about: 48 bytes each, and 8 for every tile that they touch.
-constexpr uint64_t kBandRecords = uint64_t(12) << 20;
+// Bytes of records and entries that a frame holds at once, or about.
+constexpr double kBandBytes = 768 << 20;
+// So few gaussians need no look at how much they cover.
+constexpr uint64_t kFewGaussians = 65536;
 
-// Rows of tiles that share the picture's gaussians evenly; a single band where memory holds them all. The
-// first few gaussians of a piece tell where it is drawn.
+// Bands of tile rows with about as many bytes each; a single one where memory holds all. The first few
+// gaussians of a piece tell where it is drawn and how much it covers.
 template <class T>
 static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
                                     const Pinhole<T>& camera, const Window& window) {
-    const uint64_t total = pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
-    if (total <= kBandRecords) return {window};
+    if (pieces.empty() || pieces.back().first + pieces.back().count <= kFewGaussians) return {window};
     constexpr uint64_t kFew = 16;
-    const TileGrid grid(window);
-    std::vector<uint32_t> row(pieces.size());  // of tiles; grid.rows where a piece is not seen
+    std::vector<Reach> reach(pieces.size());
     parallel_for(pieces.size(), 64, [&](size_t p) {
-        const Piece& piece = pieces[p];
-        Reach reach;
-        V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, std::min(kFew, piece.count), camera,
-                          Window{}, nullptr, nullptr, 0, reach);
-        const int middle = (reach.top + reach.bottom) / 2;
-        const bool seen = reach.drawn > 0 && middle >= window.y0 && middle < window.y1;
-        row[p] = seen ? middle / kTileSize - grid.first_row : grid.rows;
+        V3DG_DISPATCH_ISA(project<T>, draws[pieces[p].draw], pieces[p].skip, std::min(kFew, pieces[p].count),
+                          camera, Window{}, nullptr, nullptr, 0, reach[p]);
     });
-    std::vector<uint64_t> load(grid.rows + 1, 0);
-    for (size_t p = 0; p < pieces.size(); ++p) load[row[p]] += pieces[p].count;
-    const uint64_t seen = std::accumulate(load.begin(), load.end() - 1, uint64_t(0));
-    const uint64_t num_bands = std::max<uint64_t>(1, (seen + kBandRecords - 1) / kBandRecords);
+    const TileGrid grid(window);
+    std::vector<double> row_bytes(grid.rows, 0.0);
+    double bytes = 0;
+    for (size_t p = 0; p < pieces.size(); ++p) {
+        const Reach& few = reach[p];
+        if (few.drawn == 0) continue;
+        const int first = few.top / kTileSize, last = few.bottom / kTileSize;
+        const double share =
+            static_cast<double>(pieces[p].count) /
+            static_cast<double>(std::min(kFew, pieces[p].count) * (last - first + 1)) *
+            static_cast<double>(few.drawn * sizeof(Record<T>) + few.pairs * sizeof(uint64_t));
+        for (int r = std::max(first - grid.first_row, 0); r <= std::min(last - grid.first_row, grid.rows - 1);
+             ++r) {
+            row_bytes[r] += share;
+            bytes += share;
+        }
+    }
+    const double num_bands = std::ceil(bytes / kBandBytes);
     std::vector<Window> bands{window};
-    uint64_t above = 0;
+    double above = 0;
     for (int r = 0; r + 1 < grid.rows; ++r) {
-        above += load[r];
-        if (above * num_bands < seen * bands.size()) continue;
+        above += row_bytes[r];
+        const double num_above = static_cast<double>(bands.size());
+        if (num_above >= num_bands || above * num_bands < bytes * num_above) continue;
         const int edge = (grid.first_row + r + 1) * kTileSize;
         bands.back().y1 = edge;
         bands.push_back({window.x0, edge, window.x1, window.y1});

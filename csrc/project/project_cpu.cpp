@@ -30,6 +30,12 @@ static V3DG_INLINE auto ceil_to_int(V x) {
     return i - (x > __builtin_convertvector(i, V));
 }
 
+// Tiles that the pixels from `first` to `last` lie in, along one axis.
+template <class I>
+static V3DG_INLINE I tiles_of(I first, I last) {
+    return last / kTileSize - first / kTileSize + 1;
+}
+
 template <class T>
 size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
                const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base,
@@ -39,7 +45,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
     constexpr int kWidth = kLanes<T>;
     const GaussianPlanes<T>& model = *draw.model;
     const int last_x = static_cast<int>(camera.width) - 1, last_y = static_cast<int>(camera.height) - 1;
-    I top = I{} + INT_MAX, bottom = I{} - 1;
+    I top = I{} + INT_MAX, bottom = I{} - 1, pairs = I{};
     size_t num_records = 0;
     for (uint64_t done = 0; done < count; done += kWidth) {
         const uint64_t at = draw.first + skip + done;
@@ -71,6 +77,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         reach.drawn += __builtin_popcount(drawn_bits);
         top = min_of(top, drawn ? y0 : top);
         bottom = max_of(bottom, drawn ? y1 : bottom);
+        pairs += drawn ? tiles_of(x0, x1) * tiles_of(y0, y1) : I{};
 
         x0 = max_of(x0, I{} + window.x0), x1 = min_of(x1, I{} + (window.x1 - 1));
         y0 = max_of(y0, I{} + window.y0), y1 = min_of(y1, I{} + (window.y1 - 1));
@@ -98,6 +105,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
     for (int i = 0; i < kWidth; ++i) {
         reach.top = min_of(reach.top, static_cast<int>(top[i]));
         reach.bottom = max_of(reach.bottom, static_cast<int>(bottom[i]));
+        reach.pairs += static_cast<uint64_t>(pairs[i]);
     }
     return num_records;
 }

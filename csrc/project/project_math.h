@@ -6,6 +6,8 @@
 // covariance is A Aᵀ + filter I with A = J W R S (2x3), so its determinant is |a1 x a2|² plus terms that are
 // positive: nothing cancels, however thin the gaussian is.
 
+#include <limits>
+
 #include "math/lanes.h"
 #include "math/quat.h"
 #include "math/sh.h"
@@ -153,7 +155,8 @@ template <class V>
 V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Projection<V>& s, V& half_x,
                                    V& half_y) {
     using T = Lane<V>;
-    const V huge = all_lanes<V>(T(1e30));
+    constexpr T kMost = std::numeric_limits<T>::max();
+    const V huge = all_lanes<V>(kMost);
     const V reach = e.log2_opacity - all_lanes<V>(T(kLog2MinAlpha));
     half_x = sqrt_of(reach * s.c11) * T(1 / kFalloffScale);
     half_y = sqrt_of(reach * s.c22) * T(1 / kFalloffScale);
@@ -344,11 +347,14 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g, c
     return out;
 }
 
-// Colour in the direction from the camera's position in model space. `sh` holds the coefficients of one
-// gaussian (or of one a lane), base by base, three channels each.
+// Colour in the direction from the camera's position in model space; what is not finite is 0, so that it
+// stays off pixels on which the gaussian has no weight. `sh` holds the coefficients of one gaussian (or of
+// one a lane), base by base, three channels each.
 template <class V, class T>
 V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelView<T>& mv, const V* sh,
                                      V color[3]) {
+    using L = Lane<V>;
+    constexpr L kInfinity = std::numeric_limits<L>::infinity();
     V basis[kMaxShBases];
     V dir[3] = {mean[0] - mv.eye[0], mean[1] - mv.eye[1], mean[2] - mv.eye[2]};
     if (degree > 0) {
@@ -360,7 +366,8 @@ V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelVie
     for (int c = 0; c < 3; ++c) {
         V sum = all_lanes<V>(T(0.5));
         for (int b = 0; b < num_sh_bases(degree); ++b) sum += basis[b] * sh[3 * b + c];
-        color[c] = max_of(sum, V{});
+        sum = max_of(sum, V{});
+        color[c] = sum < all_lanes<V>(kInfinity) ? sum : V{};
     }
 }
 
@@ -379,9 +386,10 @@ V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V mean[3], const Mode
     sh_bases(degree, dir[0], dir[1], dir[2], basis);
     for (int b = 0; b < num_sh_bases(degree); ++b) d_basis[b] = V{};
     for (int c = 0; c < 3; ++c) {
-        const V d = color[c] > V{} ? d_color[c] : V{};
+        const auto moves = color[c] > V{};
+        const V d = moves ? d_color[c] : V{};
         for (int b = 0; b < num_sh_bases(degree); ++b) {
-            d_basis[b] += sh[3 * b + c] * d;
+            d_basis[b] += moves ? sh[3 * b + c] * d : V{};
             d_sh[3 * b + c] = basis[b] * d;
         }
     }
