@@ -77,6 +77,23 @@ NEEDLES_FLOAT = PictureBound(
     reason="As PICTURE_FLOAT, with gaussians of aspect 1e3 that are 0.005 px wide without a filter. "
     "Measured: 3e-4, 7e-7, 4e-4.",
 )
+FAR_ASIDE_FLOAT = PictureBound(
+    absolute=2e-3,
+    mean=1e-5,
+    relative_depth=2e-3,
+    band=1e-3,
+    share=0.01,
+    reason="A mean at 4e3 px from the principal point is off by an ulp or two of that, 5e-4 px, which moves "
+    "the falloff of gaussians of 0.5 px (the filter's) by as much. Measured: 1e-3, 4e-6, 9e-4.",
+)
+CUTOFF_FLOAT = PictureBound(
+    absolute=1e-4,
+    mean=1e-6,
+    relative_depth=1e-4,
+    band=1e-4,
+    share=1.0,
+    reason="As PICTURE_FLOAT, with a cut-off under every pixel: each may fall on either side.",
+)
 GRADIENT_DOUBLE = Bound(
     relative=1e-7,
     absolute=1e-9,
@@ -91,6 +108,11 @@ GRADIENT_FLOAT = GradientBound(
     relative_l2=2e-3,
     cosine=0.99999,
     reason="Sums over pixels in float32; single pixels flip at the cut-offs.",
+)
+GRADIENT_NEEDLES = GradientBound(
+    relative_l2=1e-2,
+    cosine=0.9999,
+    reason="As GRADIENT_FLOAT; needles thinner than the rounding of their place cross other pixels.",
 )
 
 GRADIENT_GSPLAT = GradientBound(

@@ -189,6 +189,12 @@ def doubles(g, *, torch, requires_grad=False) -> SimpleNamespace:
     )
 
 
+def leaves(torch, gaussians, background, dtype, device="cpu"):
+    """The five inputs and the background as leaf tensors."""
+    arrays = [getattr(gaussians, name) for name in NAMES] + [background]
+    return [torch.tensor(np.asarray(a), dtype=dtype, device=device, requires_grad=True) for a in arrays]
+
+
 def is_smooth(g, camera, *, filter_px2=0.0, antialiased=False, band=1e-3) -> bool:
     """Whether nothing in the picture is near a step or a kink, so that finite differences mean something."""
     options = {"filter_px2": filter_px2, "antialiased": antialiased}

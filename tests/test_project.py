@@ -99,7 +99,7 @@ def test_torch_reference_has_the_gradients_of_gsplat(name):
         mean_px, covariance, depth, compensation, _ = rasterize_torch.project(
             g.means, g.quats, g.scales, g.sh, camera, filter_px2
         )
-        a, b, c = covariance.unbind(1)
+        a, b, c, _ = covariance.unbind(1)
         conic = torch.stack([c, -b, a], dim=1) / (a * c - b * b)[:, None]
         values += [conic, compensation]
     values += [mean_px, depth]

@@ -27,6 +27,7 @@ from compare import (
 )
 from devices import host, on
 from reference import rasterize as reference
+from scenes import leaves
 
 CAMERAS = pytest.mark.parametrize("camera", scenes.CAMERAS.values(), ids=scenes.CAMERAS.keys())
 MODES = pytest.mark.parametrize(
@@ -361,12 +362,6 @@ def weighted_sum(torch, raster, seed=0):
     rng = np.random.default_rng(seed)
     parts = [raster.color, raster.alpha, raster.depth] if hasattr(raster, "color") else raster
     return sum((p * torch.from_numpy(rng.normal(size=tuple(p.shape))).to(p)).sum() for p in parts)
-
-
-def leaves(torch, gaussians, background, dtype, device="cpu"):
-    """The five inputs and the background as leaf tensors."""
-    arrays = [getattr(gaussians, name) for name in scenes.NAMES] + [background]
-    return [torch.tensor(np.asarray(a), dtype=dtype, device=device, requires_grad=True) for a in arrays]
 
 
 def draw_leaves(inputs, camera, **mode):

@@ -51,6 +51,8 @@ def rasterize(
     for i in np.argsort(projection.depth, kind="stable"):
         if not projection.is_drawable[i] or not opacities[i] > 0:
             continue
+        if not is_open.any():
+            break
         a, b = projection.covariance_px2[i][0]
         dx, dy = x - projection.mean_px[i, 0], y - projection.mean_px[i, 1]
         # A sum of squares (Cholesky), so that no needle's exponent turns positive by rounding.

@@ -8,7 +8,7 @@ import torch
 
 
 def _rotation(quats):
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1, eps=1e-100).unbind(1)
     zero = torch.zeros_like(w)
     # exp of the generator: R = I + 2 w [v] + 2 [v]^2
     v = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
@@ -43,7 +43,8 @@ def _sh_basis(directions, degree):
 
 
 def project(means, quats, scales, sh, camera, filter_px2=0.0):
-    """(N,2) means in px; (N,3) covariance in px² as xx, xy, yy; depth, compensation (N,); colour (N,3)."""
+    """(N,2) means in px; (N,4) covariance in px² as xx, xy, yy and its determinant; depth, compensation (N,);
+    colour (N,3)."""
     viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float64)
     rotate, eye = viewmat[:3, :3], torch.as_tensor(camera.position, dtype=torch.float64)
     view = means @ rotate.T + viewmat[:3, 3]
@@ -60,13 +61,15 @@ def project(means, quats, scales, sh, camera, filter_px2=0.0):
         bounded = slope.clamp(-center / focal - beyond, (size - center) / focal + beyond)
         rows.append(focal / depth[:, None] * (toward_view[:, axis] - bounded[:, None] * toward_view[:, 2]))
     a, b, c = ((rows[i] * rows[j]).sum(1) for i, j in ((0, 0), (0, 1), (1, 1)))
-    sharp = a * c - b * b
+    # As sums of positive terms: needles keep their digits.
+    normal = torch.linalg.cross(*rows)
+    sharp = (normal * normal).sum(1)
+    blurred = sharp + filter_px2 * (a + c) + filter_px2**2
     a, c = a + filter_px2, c + filter_px2
-    blurred = a * c - b * b
-    compensation = (sharp / blurred).clamp(min=0).sqrt()
+    compensation = (sharp / blurred).sqrt()
     basis = _sh_basis(means - eye, math.isqrt(sh.shape[1]) - 1)
     colors = ((basis[:, :, None] * sh).sum(1) + 0.5).clamp(min=0)
-    return torch.stack(image, dim=1), torch.stack([a, b, c], dim=1), depth, compensation, colors
+    return torch.stack(image, dim=1), torch.stack([a, b, c, blurred], dim=1), depth, compensation, colors
 
 
 def rasterize(means, quats, scales, opacities, sh, background, camera, *, filter_px2=0.0, antialiased=False):
@@ -74,8 +77,7 @@ def rasterize(means, quats, scales, opacities, sh, background, camera, *, filter
     image, covariance, depth, compensation, colors = project(means, quats, scales, sh, camera, filter_px2)
     if antialiased:
         opacities = opacities * compensation
-    a, b, c = covariance.unbind(1)
-    determinant = a * c - b * b
+    a, b, _, determinant = covariance.unbind(1)
 
     f64 = torch.float64
     height, width = camera.height, camera.width
@@ -89,7 +91,8 @@ def rasterize(means, quats, scales, opacities, sh, background, camera, *, filter
         if depth[i] < camera.near:
             continue
         du, dv = u - image[i, 0], v - image[i, 1]
-        power = -0.5 * (c[i] * du * du - 2 * b[i] * du * dv + a[i] * dv * dv) / determinant[i]
+        across = a[i] * dv - b[i] * du
+        power = -0.5 * (du * du / a[i] + across * across / (a[i] * determinant[i]))
         alpha = (opacities[i] * power.exp()).clamp(max=0.999)
         left = transmittance * (1 - alpha)
         counts = is_open & (alpha.detach() >= 1 / 255)

@@ -31,9 +31,14 @@ def basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def color(sh: np.ndarray, directions: np.ndarray, degree: int | None = None) -> np.ndarray:
-    """(N,3) colour: the series of sh (N,K,3) up to the degree, plus one half, clamped at 0 from below."""
+    """(N,3) colour: the series of sh (N,K,3) up to the degree, plus one half, clamped at 0 from below.
+
+    What is not finite is 0.
+    """
     sh = np.asarray(sh, np.float64)
     if degree is None:
         degree = math.isqrt(sh.shape[1]) - 1
     values = basis(directions, degree)
-    return np.maximum(0.0, np.einsum("nk,nkc->nc", values, sh[:, : values.shape[1]]) + 0.5)
+    with np.errstate(invalid="ignore"):
+        series = np.einsum("nk,nkc->nc", values, sh[:, : values.shape[1]]) + 0.5
+    return np.where(np.isfinite(series), np.maximum(0.0, series), 0.0)

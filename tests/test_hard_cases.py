@@ -1,0 +1,150 @@
+"""Every hard case, forward and backward, on both devices, against float64."""
+
+import functools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import scenes
+import scenes_lod
+import v3dg
+from compare import GRADIENT_DOUBLE, PICTURE_DOUBLE, PICTURE_FLOAT, assert_pictures_agree
+from devices import host
+from hard_cases import (
+    draw_core,
+    drawn_rows,
+    expected_picture,
+    gradient_errors,
+    gradients,
+    hard_cases,
+    picture,
+    relative_changes,
+)
+from reference import rasterize as reference_rasterize
+
+CASES = pytest.mark.parametrize("name", hard_cases())
+# What a chain of torch operations differentiates in a moment, and without 0 / 0.
+SMOOTH = [
+    name
+    for name, case in hard_cases().items()
+    if len(case.gaussians) <= 200 and case.is_drawn and np.isfinite(case.gaussians.sh).all()
+]
+
+
+@pytest.fixture(scope="module")
+def torch():
+    return pytest.importorskip("torch")
+
+
+@functools.cache
+def expected_of(name):
+    return expected_picture(hard_cases()[name])
+
+
+@functools.cache
+def expected_gradients_of(name):
+    import torch
+
+    return gradients(hard_cases()[name], draw_core, torch.float64)
+
+
+@CASES
+def test_picture_is_the_references(device, name):
+    case = hard_cases()[name]
+    assert (expected_of(name).alpha > 0).any() == case.is_drawn
+    assert_pictures_agree(picture(case, device), expected_of(name), case.picture)
+
+
+@CASES
+def test_picture_in_double_is_the_references(torch, name):
+    case = hard_cases()[name]
+    raster = v3dg.rasterize(scenes.doubles(case.gaussians, torch=torch), case.camera, **case.mode)
+    assert_pictures_agree(raster, expected_of(name), PICTURE_DOUBLE)
+
+
+@CASES
+def test_gradients_are_those_in_double(torch, device, name):
+    case = hard_cases()[name]
+    got, expected = gradients(case, draw_core, torch.float32, device), expected_gradients_of(name)
+    assert all(np.isfinite(g).all() for g in got)
+    drawn = drawn_rows(case)
+    for g in got[:4]:
+        assert not g[~drawn & np.isfinite(case.gaussians.sh).all((1, 2))].any()
+    if case.gradient is None:
+        return
+    errors = gradient_errors(relative_changes(case, got), relative_changes(case, expected))
+    assert max(errors) <= case.gradient.relative_l2, dict(zip(scenes.NAMES, errors, strict=True))
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_gradients_in_double_are_autograds(torch, name):
+    """Of the gaussians that are drawn, by a chain of torch operations that knows none of our formulas."""
+    from reference import rasterize_torch
+
+    case = hard_cases()[name]
+    drawn = drawn_rows(case)
+
+    def draw(inputs, camera, mode):
+        background = torch.zeros(3, dtype=torch.float64)
+        return rasterize_torch.rasterize(*(t[drawn] for t in inputs), background, camera, **mode)
+
+    theirs = relative_changes(case, gradients(case, draw, torch.float64))
+    ours = relative_changes(case, expected_gradients_of(name))
+    whole = np.sqrt(sum((t[drawn] ** 2).sum() for t in theirs))
+    for o, t in zip(ours, theirs, strict=True):
+        assert np.abs(o[drawn] - t[drawn]).max(initial=0) <= GRADIENT_DOUBLE.relative * whole
+
+
+def test_maps_keep_their_detail(device):
+    """Details of 10⁻³ at coordinates of 10⁷: an asset of its own frame, placed by an instance."""
+    rng = np.random.default_rng(0)
+    asset = scenes_lod.blob(rng, 400, size=0.02, sh_degree=1)
+    bundle = scenes_lod.lod_bundle(rng, asset, 64)
+    place = np.array([4.5e6 + 0.123456, 5.2e6 - 0.654321, 1e7 + 0.111111])
+    eye = np.array([0.01, -0.12, 0.03])
+    lens = {"width": 70, "height": 50, "near": 0.001}
+    near, far = (v3dg.Camera.look_at(at + eye, at, **lens) for at in (np.zeros(3), place))
+    scene = v3dg.Scene()
+    scene.add(bundle, positions=place[None])
+    got = v3dg.render(scene, far, tolerance=0.0, device=device)
+    raster = v3dg.Raster(*host((got.color, got.alpha, got.depth)))
+    expected = reference_rasterize.rasterize(asset, near)
+    assert (expected.alpha > 0.5).mean() > 0.3
+    assert_pictures_agree(raster, expected, PICTURE_FLOAT)
+
+
+UNSEEN = {
+    "no gaussians": scenes.gaussians(np.zeros((0, 3))),
+    "all behind": scenes.gaussians([[0, 0, -2.0]] * 300),
+    "all beside": scenes.gaussians([[50.0, 0, 2.0]] * 300, scales=0.01),
+    "all too faint": scenes.gaussians([[0, 0, 2.0]] * 300, opacities=0.003),
+    "all between pixel centres": scenes.gaussians([[0.0, 0, 2.0]] * 300, scales=1e-4),
+    "none a number": scenes.gaussians([[np.nan, 0, 2.0]] * 300),
+}
+
+
+@pytest.mark.parametrize("name", UNSEEN)
+def test_nothing_to_see_is_the_background(torch, device, name):
+    camera, background = scenes.CAMERAS["plain"], (0.1, 0.2, 0.3)
+    inputs = scenes.leaves(torch, UNSEEN[name], background, torch.float32, device)
+    g = SimpleNamespace(**dict(zip(scenes.NAMES, inputs, strict=False)))
+    raster = v3dg.rasterize(g, camera, background=inputs[5])
+    assert (host(raster.color) == np.float32(background)).all()
+    assert not host(raster.alpha).any()
+    assert not host(raster.depth).any()
+    *by_inputs, d_background = torch.autograd.grad(raster.color.sum(), inputs)
+    assert not any(host(g).any() for g in by_inputs)
+    np.testing.assert_allclose(host(d_background), camera.width * camera.height)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_scene_out_of_sight_is_the_background(device, count):
+    rng = np.random.default_rng(0)
+    scene = v3dg.Scene()
+    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 200), 64)
+    scene.add(bundle, positions=np.full((count, 3), [0.0, 0.0, -100.0]))
+    image = v3dg.render(scene, scenes.CAMERAS["plain"], background=(0.1, 0.2, 0.3), device=device)
+    assert (host(image.color) == np.float32((0.1, 0.2, 0.3))).all()
+    assert not host(image.alpha).any()
+    assert image.stats.gaussians_in_frustum == 0
