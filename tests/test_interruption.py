@@ -44,7 +44,11 @@ def whole(tmp_path_factory):
     v3dg.save(folder / "asset.ply", make_asset(num_gaussians=2000, seed=0))
     start = time.perf_counter()
     finished(folder)
-    return (folder / "asset.ply").read_bytes(), (folder / "out.v3dg").read_bytes(), time.perf_counter() - start
+    return (
+        (folder / "asset.ply").read_bytes(),
+        (folder / "out.v3dg").read_bytes(),
+        time.perf_counter() - start,
+    )
 
 
 def test_killed_builds_leave_nothing_or_all_and_resume_to_the_same_bytes(whole, tmp_path):

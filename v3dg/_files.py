@@ -29,17 +29,26 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
     folder, name = os.path.split(target)
     # The start of the name only: a name may have 255 bytes, and a character up to four.
     temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
+    with naming_errors(path, temporary):
+        try:
+            yield temporary
+            _flush(temporary)
+            os.replace(temporary, target)
+        except BaseException:
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                os.unlink(temporary)
+            raise
+
+
+@contextlib.contextmanager
+def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -> Iterator[None]:
+    """Give the system's errors the name of the file: those of an open file have none, or its other name."""
     try:
-        yield temporary
-        _flush(temporary)
-        os.replace(temporary, target)
-    except BaseException as error:
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            os.unlink(temporary)
-        # Those of writing to an open file come without a name.
-        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, temporary):
-            raise OSError(error.errno, os.strerror(error.errno), os.fspath(path)) from error
-        raise
+        yield
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, other_name):
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), os.fspath(path)) from error
 
 
 def _flush(path: str) -> None:

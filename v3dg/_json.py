@@ -56,7 +56,7 @@ def read_json(path: str | os.PathLike[str]) -> Node:
         OSError: It cannot be read.
     """
     path = Path(path)
-    with open(_files.open_regular(path), "rb") as file:
+    with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
         content = file.read()
     try:
         return Node(parse_json(content.decode("utf-8")), path.name, "")

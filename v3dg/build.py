@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core, _device, _operations, cleaning
+from v3dg import _core, _device, _files, _operations, cleaning
 from v3dg._operations import Offsets
 from v3dg._version import __version__
 from v3dg.bundle import Bundle, Clusters, Groups
@@ -629,15 +629,16 @@ class _Checkpoint:
         descriptor = self._file.fileno()
         os.ftruncate(descriptor, self._num_bytes)
         self._file.seek(self._num_bytes)
-        try:
-            if self._num_bytes == 0:
-                _write_all(descriptor, self._head)
-            _write_all(descriptor, counts + _digest(counts, arrays))
-            for array in arrays:
-                _write_all(descriptor, array.reshape(-1).view(np.uint8).data)
-        except OSError as error:
-            os.ftruncate(descriptor, self._num_bytes)
-            raise OSError(error.errno, os.strerror(error.errno or errno.EIO), str(self._path)) from error
+        with _files.naming_errors(self._path):
+            try:
+                if self._num_bytes == 0:
+                    _write_all(descriptor, self._head)
+                _write_all(descriptor, counts + _digest(counts, arrays))
+                for array in arrays:
+                    _write_all(descriptor, array.reshape(-1).view(np.uint8).data)
+            except OSError:
+                os.ftruncate(descriptor, self._num_bytes)
+                raise
         self._num_bytes = self._file.tell()
 
     def _layout(self, n: int, clusters: int, groups: int) -> list[tuple[np.dtype[Any], tuple[int, ...]]]:

@@ -212,7 +212,8 @@ class BundleFile:
         self._fd = _files.open_regular(path)
         self.close = weakref.finalize(self, os.close, self._fd)
         try:
-            self._read_header_and_tables()
+            with _files.naming_errors(path):
+                self._read_header_and_tables()
         except BaseException:
             self.close()
             raise
