@@ -22,7 +22,13 @@ TESTED_WITH = {"adam": "fit_group", "loss": "fit_group", "tile_bin": "rasterize"
 
 OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)
 SOURCES = sorted(str(p.relative_to(ROOT)) for p in CSRC.rglob("*") if p.suffix in {".cpp", ".cu"})
-MODULES = sorted((ROOT / "v3dg").glob("*.py"))
+MODULES = sorted((ROOT / "v3dg").rglob("*.py"))
+
+
+def module_name(path):
+    """As it is imported; a package by its folder's name."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 def test_cmake_lists_every_source_once():
@@ -105,17 +111,17 @@ def imports_when_loaded(path):
 
 
 def test_modules_do_not_import_in_a_circle():
-    own = {f"v3dg.{path.stem}" for path in MODULES if path.stem != "__init__"}
-    below = {
-        f"v3dg.{path.stem}": imports_when_loaded(path) & own for path in MODULES if path.stem != "__init__"
+    modules = {
+        module_name(path): path for path in MODULES if path.parent.name != "v3dg" or path.stem != "__init__"
     }
+    below = {name: imports_when_loaded(path) & modules.keys() for name, path in modules.items()}
     while below:
         ready = {name for name, imported in below.items() if not imported & below.keys()}
         assert ready, f"import each other: {sorted(below)}"
         below = {name: imported for name, imported in below.items() if name not in ready}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
 def test_no_module_needs_torch_to_load(path):
     assert not [name for name in imports_when_loaded(path) if name.split(".")[0] == "torch"]
 

@@ -10,132 +10,27 @@ Axes: z is up, the ground is near z = 0, the tuft's radius is about 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from v3dg.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Array = NDArray[np.float64]
-
-_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
-_UP = np.array([0.0, 0.0, 1.0])
-_TO_SUN = np.array([0.42, -0.50, 0.76]) / np.linalg.norm([0.42, -0.50, 0.76])
-_SUN = np.array([1.55, 1.42, 1.18])
-_SKY = np.array([0.42, 0.52, 0.62])
-_SH_C0 = 0.28209479177387814  # the constant basis function of spherical harmonics
-_SH_C1 = 0.4886025119029199  # the factor of the linear ones
-
-
-@dataclass
-class _Part:
-    """n gaussians before lighting. Colours are linear light."""
-
-    means: Array  # (n,3)
-    tangents: Array  # (n,3) unit, direction of the first scale
-    normals: Array  # (n,3) unit, direction of the third scale
-    scales: Array  # (n,3)
-    opacities: Array  # (n,)
-    albedo: Array  # (n,3)
-    gloss: Array  # (n,) strength of the highlight, 0: matt
-    translucency: Array  # (n,) share of the light that passes through, 0: solid
-    occlusion: Array  # (n,) share of the sky that is seen
-
-    @staticmethod
-    def concatenate(parts: Sequence[_Part]) -> _Part:
-        return _Part(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(_Part)))
-
-    def moved(self, rotation: Array, translation: Array) -> _Part:
-        turned = (x @ rotation.T for x in (self.means, self.tangents, self.normals))
-        means, tangents, normals = turned
-        rest = (getattr(self, f.name) for f in fields(_Part)[3:])
-        return _Part(means + translation, tangents, normals, *rest)
-
-
-def _unit(v: Array) -> Array:
-    lengths: Array = np.linalg.norm(v, axis=-1, keepdims=True)
-    return v / np.maximum(lengths, 1e-12)
-
-
-def _mix(a: Array | Sequence[float], b: Array | Sequence[float], weight: Array) -> Array:
-    """Colours from ``a`` (weight 0) to ``b`` (weight 1), one row per weight."""
-    w = weight[:, None]
-    return np.asarray(a) * (1 - w) + np.asarray(b) * w
-
-
-def _smoothstep(low: float, high: float, x: Array) -> Array:
-    t = np.clip((x - low) / (high - low), 0, 1)
-    return t * t * (3 - 2 * t)
-
-
-def _rotation(axis: Array, angle: float) -> Array:
-    x, y, z = _unit(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    turn: Array = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    return turn
-
-
-class _Noise:
-    """Smooth noise in [0,1] over space, from a periodic lattice of random values."""
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        self._lattice = rng.random((32, 32, 32))
-
-    def __call__(self, points: Array, frequency: float, octaves: int = 3) -> Array:
-        total, weight = np.zeros(len(points)), 0.0
-        for octave in range(octaves):
-            total += 0.5**octave * self._once(points * (frequency * 2**octave) + 17.3 * octave)
-            weight += 0.5**octave
-        return total / weight
-
-    def _once(self, points: Array) -> Array:
-        floor = np.floor(points)
-        f = points - floor
-        f = f * f * (3 - 2 * f)
-        i = floor.astype(np.int64)
-        value = np.zeros(len(points))
-        for corner in np.ndindex(2, 2, 2):
-            at = (i + corner) & 31
-            weight = np.prod(np.where(np.array(corner) == 1, f, 1 - f), axis=1)
-            value += weight * self._lattice[at[:, 0], at[:, 1], at[:, 2]]
-        return value
-
-
-@dataclass
-class _Surface:
-    """n points spread evenly over a surface of revolution around z."""
-
-    points: Array  # (n,3)
-    normals: Array  # (n,3) outwards
-    around: Array  # (n,3) unit tangent around the axis
-    along: Array  # (n,) 0 at the start of the profile, 1 at its end
-    angle: Array  # (n,)
-    spacing: float  # side of the square that one point has to cover
-
-
-def _revolve(profile: Callable[[Array], tuple[Array, Array]], n: int) -> _Surface:
-    """Spread points in a golden-angle spiral, equal area each; ``profile`` maps [0,1] to radius, height."""
-    t = np.linspace(0, 1, 513)
-    radius, height = profile(t)
-    step = np.hypot(np.diff(radius), np.diff(height))
-    area = np.concatenate([[0], np.cumsum(np.pi * (radius[1:] + radius[:-1]) * step)])
-    along = np.interp((np.arange(n) + 0.5) / max(n, 1) * area[-1], area, t)
-    r, z = profile(along)
-    r1, z1 = profile(np.minimum(along + 1e-4, 1))
-    r0, z0 = profile(np.maximum(along - 1e-4, 0))
-    slope = _unit(np.stack([r1 - r0, z1 - z0], -1))
-    angle = np.arange(n) * _GOLDEN_ANGLE
-    cos, sin = np.cos(angle), np.sin(angle)
-    points = np.stack([r * cos, r * sin, z], -1)
-    # The profile runs from the top outwards and down, so its left-hand side is outside.
-    normals = np.stack([-slope[:, 1] * cos, -slope[:, 1] * sin, slope[:, 0]], -1)
-    around = np.stack([-sin, cos, np.zeros(n)], -1)
-    return _Surface(points, normals, around, along, angle, float(np.sqrt(area[-1] / max(n, 1))))
+from v3dg.procedural._light import SH_C0, SH_C1, SKY, SUN, TO_SUN, display
+from v3dg.procedural._parts import (
+    GOLDEN_ANGLE,
+    UP,
+    Array,
+    Noise,
+    Part,
+    mix,
+    quaternions,
+    revolve,
+    rotation,
+    smoothstep,
+    strips,
+    unit,
+)
 
 
 def _discs(
@@ -151,7 +46,7 @@ def _discs(
     translucency: float = 0.0,
     opacity: float = 2.2,
     overlap: float = 0.75,
-) -> _Part:
+) -> Part:
     """Thin discs that together cover a surface whose points lie ``spacing`` apart.
 
     ``stretch`` lengthens them along their tangents at equal area; ``opacity`` is the middle of a spread of
@@ -162,10 +57,10 @@ def _discs(
     long = np.sqrt(stretch) * np.exp(np.abs(0.25 * rng.standard_normal(n)))
     scales = np.stack([size * long, size / long, 0.12 * size * np.exp(0.5 * rng.standard_normal(n))], -1)
     logits = opacity + 1.1 * rng.standard_normal(n) - 3.4 * (rng.random(n) < 1 / 6)
-    return _Part(
+    return Part(
         points + 0.06 * spacing * rng.standard_normal((n, 3)),
-        _unit(tangents + 0.12 * rng.standard_normal((n, 3))),
-        _unit(normals + 0.08 * rng.standard_normal((n, 3))),
+        unit(tangents + 0.12 * rng.standard_normal((n, 3))),
+        unit(normals + 0.08 * rng.standard_normal((n, 3))),
         scales,
         1 / (1 + np.exp(-logits)),
         albedo,
@@ -175,86 +70,30 @@ def _discs(
     )
 
 
-def _strips(
-    base: Array,
-    along: Array,
-    up: Array,
-    length: Array,
-    width: Array,
-    bend: Array,
-    rows: int,
-    columns: int,
-    outline: Callable[[Array], Array],
-    rng: np.random.Generator,
-) -> tuple[_Part, Array, Array]:
-    """K leaves of ``rows`` × ``columns`` gaussians: blades of grass, petals, leaflets.
-
-    A leaf starts at ``base``, runs ``along`` and bends away from ``up`` by ``bend``; ``outline`` maps [0,1]
-    to its half width relative to ``width``. Also returns where each gaussian is: along its leaf in [0,1],
-    across it in [-1,1].
-    """
-    k = len(base)
-    t = (np.arange(rows) + 0.5) / rows
-    s = (np.arange(columns) + 0.5) / columns * 2 - 1
-    t, s = (x.ravel() for x in np.meshgrid(t, s, indexing="ij"))
-    t = np.clip(t + rng.uniform(-0.25, 0.25, (k, rows * columns)) / rows, 0.01, 0.99)
-    s = s + rng.uniform(-0.25, 0.25, (k, rows * columns)) / columns
-    half = outline(t) * width[:, None]
-    along, up = _unit(along), _unit(up - along * np.sum(_unit(along) * up, 1, keepdims=True))
-    side = np.cross(up, along)
-    drop = -bend[:, None] * length[:, None] * t * t
-    curl = 0.25 * half * (s * s)  # edges rise, as a gutter
-    means = (
-        base[:, None]
-        + along[:, None] * (length[:, None] * t)[..., None]
-        + up[:, None] * (drop + curl)[..., None]
-        + side[:, None] * (half * s)[..., None]
-    )
-    tangent = _unit(along[:, None] - 2 * (bend[:, None] * t)[..., None] * up[:, None])
-    normal = _unit(np.cross(tangent, side[:, None]) + 0.5 * s[..., None] * side[:, None])
-    lengthwise = np.broadcast_to(0.62 * length[:, None] / rows, t.shape)
-    across = np.maximum(0.68 * half / columns, 0.05 * lengthwise)
-    scales = np.stack([lengthwise, across, 0.15 * across], -1)
-    n = k * rows * columns
-    logits = 2.6 - 1.3 * t**4 - 0.5 * np.abs(s) ** 3 + 0.8 * rng.standard_normal(t.shape)
-    part = _Part(
-        means.reshape(n, 3),
-        tangent.reshape(n, 3),
-        normal.reshape(n, 3),
-        (scales * np.exp(0.15 * rng.standard_normal(scales.shape))).reshape(n, 3),
-        1 / (1 + np.exp(-logits.ravel())),
-        np.zeros((n, 3)),
-        np.zeros(n),
-        np.zeros(n),
-        np.ones(n),
-    )
-    return part, t.ravel(), s.ravel()
-
-
-def _ground_height(points: Array, noise: _Noise) -> Array:
+def _ground_height(points: Array, noise: Noise) -> Array:
     """Height of the tuft's soil above a point, a low mound that falls away at its rim."""
     r = np.hypot(points[:, 0], points[:, 1])
     flat = np.stack([points[:, 0], points[:, 1], np.zeros(len(points))], -1)
-    return 0.13 * (1 - r**2) + 0.07 * (noise(flat, 2.5, 2) - 0.5) - 0.03 * _smoothstep(0.85, 1.05, r)
+    return 0.13 * (1 - r**2) + 0.07 * (noise(flat, 2.5, 2) - 0.5) - 0.03 * smoothstep(0.85, 1.05, r)
 
 
-def _ground(n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
+def _ground(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     """Moss: a closed layer of discs and a fur of needles on it."""
     n_base = n // 3
-    disc = _revolve(lambda t: (1.18 * t, np.zeros_like(t)), n_base)  # under the neighbours' rims too
+    disc = revolve(lambda t: (1.18 * t, np.zeros_like(t)), n_base)  # under the neighbours' rims too
     points = disc.points.copy()
     points[:, 2] = _ground_height(points, noise)
     e = 1e-3
     dx = (_ground_height(points + np.array([e, 0, 0]), noise) - points[:, 2]) / e
     dy = (_ground_height(points + np.array([0, e, 0]), noise) - points[:, 2]) / e
-    normals = _unit(np.stack([-dx, -dy, np.ones(n_base)], -1))
+    normals = unit(np.stack([-dx, -dy, np.ones(n_base)], -1))
     patch = noise(points, 5.0)
     base = _discs(
         points,
         normals,
         disc.around,
         disc.spacing,
-        _mix([0.060, 0.130, 0.018], [0.160, 0.220, 0.034], patch),
+        mix([0.060, 0.130, 0.018], [0.160, 0.220, 0.034], patch),
         rng,
         overlap=0.95,
         opacity=3.0,
@@ -265,7 +104,7 @@ def _ground(n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
     r, a = np.sqrt(rng.random(n_fur)) * 1.02, rng.uniform(0, 2 * np.pi, n_fur)
     root = np.stack([r * np.cos(a), r * np.sin(a), np.zeros(n_fur)], -1)
     root[:, 2] = _ground_height(root, noise)
-    grow = _unit(_UP + 0.75 * rng.standard_normal((n_fur, 3)))
+    grow = unit(UP + 0.75 * rng.standard_normal((n_fur, 3)))
     # Moss grows in cushions: long in the middle of one, short where two meet.
     cushion = noise(root, 7.0, 2)
     size = 0.022 * np.sqrt(30000 / max(n_fur, 1)) ** 0.5 * (0.55 + 0.9 * cushion)
@@ -273,18 +112,18 @@ def _ground(n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
     fresh = np.clip(
         0.55 * noise(root + 9, 4.0) + 0.6 * height / 0.05 - 0.1 + 0.22 * rng.standard_normal(n_fur), 0, 1
     )
-    fur = _Part(
+    fur = Part(
         root + grow * (height + 0.3 * size)[:, None],
         grow,
-        _unit(np.cross(grow, rng.standard_normal((n_fur, 3)))),
+        unit(np.cross(grow, rng.standard_normal((n_fur, 3)))),
         size[:, None] * [0.75, 0.22, 0.14] * np.exp(0.3 * rng.standard_normal((n_fur, 3))),
         1 / (1 + np.exp(-(1.4 + 1.3 * rng.standard_normal(n_fur) - 3.0 * (rng.random(n_fur) < 0.3)))),
-        _mix([0.055, 0.120, 0.018], [0.42, 0.50, 0.060], fresh),
+        mix([0.055, 0.120, 0.018], [0.42, 0.50, 0.060], fresh),
         np.zeros(n_fur),
         np.full(n_fur, 0.35),
-        0.25 + 0.75 * _smoothstep(0.0, 0.045, height),
+        0.25 + 0.75 * smoothstep(0.0, 0.045, height),
     )
-    return _Part.concatenate([base, fur])
+    return Part.concatenate([base, fur])
 
 
 @dataclass
@@ -305,7 +144,7 @@ class _Toadstool:
         return centre
 
 
-def _toadstool(shape: _Toadstool, n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
+def _toadstool(shape: _Toadstool, n: int, noise: Noise, rng: np.random.Generator) -> Part:
     radius, dome, height = shape.radius, shape.dome * shape.radius, shape.height
     offset = rng.uniform(0, 30, 3)
 
@@ -324,51 +163,51 @@ def _toadstool(shape: _Toadstool, n: int, noise: _Noise, rng: np.random.Generato
         return out
 
     n_warts, n_gills, n_stem, n_skirt = int(0.22 * n), int(0.17 * n), int(0.17 * n), int(0.07 * n)
-    cap = _revolve(cap_profile, n - n_warts - n_gills - n_stem - n_skirt)
+    cap = revolve(cap_profile, n - n_warts - n_gills - n_stem - n_skirt)
     streak = noise(np.stack([6 * cap.angle % (2 * np.pi), 2.0 * cap.along, cap.angle * 0], -1) + offset, 1.2)
     blotch = noise(cap.points + offset, 3.0 / radius)
-    red = _mix([0.36, 0.004, 0.008], [0.66, 0.016, 0.010], np.clip(blotch + 0.5 * (streak - 0.5), 0, 1))
-    rim = _smoothstep(0.62, 0.98, cap.along + 0.25 * (streak - 0.5))
+    red = mix([0.36, 0.004, 0.008], [0.66, 0.016, 0.010], np.clip(blotch + 0.5 * (streak - 0.5), 0, 1))
+    rim = smoothstep(0.62, 0.98, cap.along + 0.25 * (streak - 0.5))
     red = red * (1 - 0.8 * rim[:, None]) + 0.8 * rim[:, None] * np.array([0.78, 0.105, 0.012])
     meridian = np.cross(cap.normals, cap.around)
     skin = _discs(wobble(cap.points), cap.normals, meridian, cap.spacing, red, rng, stretch=1.5, gloss=1.0)
-    skin.scales[:, 0] *= 1 - 0.45 * _smoothstep(0.85, 1.0, cap.along)  # a clean edge, not a fringe
+    skin.scales[:, 0] *= 1 - 0.45 * smoothstep(0.85, 1.0, cap.along)  # a clean edge, not a fringe
     parts = [skin]
 
     # Warts: rests of the veil, large near the top, torn into crumbs near the rim.
     count = max(8, int(40 * min(1.0, n / 4000) ** 0.5))
-    on_cap = _revolve(lambda t: cap_profile(0.03 + 0.80 * t), count)
+    on_cap = revolve(lambda t: cap_profile(0.03 + 0.80 * t), count)
     spots = wobble(on_cap.points)
     sizes = radius * 0.085 * (1.25 - 0.6 * on_cap.along) * np.exp(0.35 * rng.standard_normal(count))
     share = sizes**2 / np.sum(sizes**2)
     for spot, normal, size, m in zip(
         spots, on_cap.normals, sizes, (share * n_warts).astype(int), strict=True
     ):
-        lump = _revolve(lambda t: (np.sin(t * 1.7), 0.55 * np.cos(t * 1.7)), m)
+        lump = revolve(lambda t: (np.sin(t * 1.7), 0.55 * np.cos(t * 1.7)), m)
         a = lump.angle
         ragged = 1 + 0.22 * np.sin(3 * a + spot[0] * 99) + 0.16 * np.sin(7 * a + spot[1] * 99)
         points = lump.points * size
         points[:, :2] *= ragged[:, None]
         points[:, :2] += radius * rng.uniform(-0.10, 0.10, 2)
         points[:, 2] += 0.06 * size * rng.standard_normal(m)
-        side = _unit(np.cross(normal, [0.3, 0.2, 0.93]))
+        side = unit(np.cross(normal, [0.3, 0.2, 0.93]))
         frame = np.stack([side, np.cross(normal, side), normal], -1)
-        cream = _mix([0.62, 0.50, 0.33], [0.95, 0.90, 0.78], lump.points[:, 2] * 0.8 + 0.5 * rng.random(m))
+        cream = mix([0.62, 0.50, 0.33], [0.95, 0.90, 0.78], lump.points[:, 2] * 0.8 + 0.5 * rng.random(m))
         discs = _discs(points, lump.normals, lump.around, lump.spacing * size, np.clip(cream, 0, 1), rng)
         discs.occlusion[:] = 0.6 + 0.4 * np.clip(lump.points[:, 2] / 0.4, 0, 1)
         wart = discs.moved(frame, spot - 0.1 * size * normal)
         parts.append(wart)
 
     # Gills: the underside, in narrow bright and dark rays.
-    gill = _revolve(lambda t: (radius * (0.12 + 0.82 * t), 0.10 * dome * (1 - t) ** 2 - 0.05 * dome), n_gills)
+    gill = revolve(lambda t: (radius * (0.12 + 0.82 * t), 0.10 * dome * (1 - t) ** 2 - 0.05 * dome), n_gills)
     rays = 0.5 + 0.5 * np.sin(gill.angle * 46 + 3 * noise(gill.points + offset, 4.0))
     parts.append(
         _discs(
             wobble(gill.points),
             -gill.normals,
-            _unit(gill.points * [1, 1, 0]),
+            unit(gill.points * [1, 1, 0]),
             gill.spacing,
-            _mix([0.33, 0.25, 0.16], [0.86, 0.78, 0.60], rays),
+            mix([0.33, 0.25, 0.16], [0.86, 0.78, 0.60], rays),
             rng,
             stretch=5.0,
         )
@@ -384,15 +223,15 @@ def _toadstool(shape: _Toadstool, n: int, noise: _Noise, rng: np.random.Generato
         )
         return radius * 0.20 * (1 + 0.25 * (1 - z) + bulb), height * z * 1.0
 
-    stem = _revolve(stem_profile, n_stem)
+    stem = revolve(stem_profile, n_stem)
     fibre = noise(np.stack([9 * np.cos(stem.angle), 9 * np.sin(stem.angle), stem.points[:, 2] * 5], -1), 1.0)
-    cream = _mix([0.55, 0.45, 0.30], [0.93, 0.88, 0.76], np.clip(fibre * 1.5 - 0.15, 0, 1))
-    part = _discs(stem.points, stem.normals, np.tile(_UP, (n_stem, 1)), stem.spacing, cream, rng, stretch=3.0)
-    part.occlusion[:] = 0.55 + 0.45 * _smoothstep(0, 0.3, stem.points[:, 2] / height)
+    cream = mix([0.55, 0.45, 0.30], [0.93, 0.88, 0.76], np.clip(fibre * 1.5 - 0.15, 0, 1))
+    part = _discs(stem.points, stem.normals, np.tile(UP, (n_stem, 1)), stem.spacing, cream, rng, stretch=3.0)
+    part.occlusion[:] = 0.55 + 0.45 * smoothstep(0, 0.3, stem.points[:, 2] / height)
     parts.append(part)
 
     # Skirt: a thin torn veil around the stem.
-    skirt = _revolve(lambda t: (radius * (0.20 + 0.19 * t**0.8), height * (0.80 - 0.13 * t**1.3)), n_skirt)
+    skirt = revolve(lambda t: (radius * (0.20 + 0.19 * t**0.8), height * (0.80 - 0.13 * t**1.3)), n_skirt)
     points = skirt.points.copy()
     points[:, 2] += 0.05 * radius * np.sin(9 * skirt.angle + offset[0]) * skirt.along**2
     veil = _discs(
@@ -400,46 +239,44 @@ def _toadstool(shape: _Toadstool, n: int, noise: _Noise, rng: np.random.Generato
         skirt.normals,
         np.cross(skirt.normals, skirt.around),
         skirt.spacing,
-        _mix([0.66, 0.54, 0.34], [0.98, 0.93, 0.78], noise(points * [1, 1, 0.3] + offset, 14.0)),
+        mix([0.66, 0.54, 0.34], [0.98, 0.93, 0.78], noise(points * [1, 1, 0.3] + offset, 14.0)),
         rng,
         stretch=2.0,
         translucency=0.5,
     )
     veil.scales[:, 0] *= 1 - 0.5 * skirt.along**3
-    veil.opacities *= 1 - 0.5 * _smoothstep(0.8, 1.0, skirt.along + 0.3 * (noise(points, 20.0) - 0.5))
+    veil.opacities *= 1 - 0.5 * smoothstep(0.8, 1.0, skirt.along + 0.3 * (noise(points, 20.0) - 0.5))
     parts.append(veil)
 
     # The cap sits on the stem; everything leans together.
     for i in range(len(parts) - 2):
         parts[i].means[:, 2] += height
-    whole = _Part.concatenate(parts)
+    whole = Part.concatenate(parts)
     return whole.moved(shape.lean, shape.foot)
 
 
-def _on_ground(n: int, noise: _Noise, rng: np.random.Generator, low: float, high: float) -> Array:
+def _on_ground(n: int, noise: Noise, rng: np.random.Generator, low: float, high: float) -> Array:
     """Random places on the ground between two radii."""
     r = np.sqrt(rng.uniform(low**2, high**2, n))
-    a = np.arange(n) * _GOLDEN_ANGLE + rng.uniform(0, 2 * np.pi) + 0.5 * rng.standard_normal(n)
+    a = np.arange(n) * GOLDEN_ANGLE + rng.uniform(0, 2 * np.pi) + 0.5 * rng.standard_normal(n)
     points = np.stack([r * np.cos(a), r * np.sin(a), np.zeros(n)], -1)
     points[:, 2] = _ground_height(points, noise)
     return points
 
 
-def _grass(n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
+def _grass(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     rows = 12
     k = n // rows
     base = _on_ground(k, noise, rng, 0.1, 1.03)
     r = np.hypot(base[:, 0], base[:, 1])
-    lean = _unit(
-        np.stack([base[:, 0], base[:, 1], 0 * r], -1) + 0.8 * rng.standard_normal((k, 3)) * [1, 1, 0]
-    )
+    lean = unit(np.stack([base[:, 0], base[:, 1], 0 * r], -1) + 0.8 * rng.standard_normal((k, 3)) * [1, 1, 0])
     tall = noise(base + 3, 3.0, 2)
     length = (0.16 + 0.40 * tall**1.5) * np.exp(0.25 * rng.standard_normal(k)) * (0.75 + 0.35 * r)
-    along = _unit(_UP + lean * rng.uniform(0.1, 0.7, k)[:, None])
-    part, t, _ = _strips(
-        base - 0.02 * _UP,
+    along = unit(UP + lean * rng.uniform(0.1, 0.7, k)[:, None])
+    part, t, _ = strips(
+        base - 0.02 * UP,
         along,
-        _unit(_UP * 0.6 - lean),
+        unit(UP * 0.6 - lean),
         length,
         rng.uniform(0.009, 0.019, k),
         rng.uniform(0.05, 0.5, k),
@@ -450,12 +287,12 @@ def _grass(n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
     )
     hue = np.repeat(np.clip(tall + 0.25 * rng.standard_normal(k), 0, 1), rows)
     dry = np.repeat(rng.random(k) < 0.06, rows)
-    tip = _mix([0.17, 0.42, 0.045], [0.42, 0.52, 0.08], hue)
+    tip = mix([0.17, 0.42, 0.045], [0.42, 0.52, 0.08], hue)
     tip[dry] = [0.55, 0.42, 0.16]
-    part.albedo = _mix([0.030, 0.080, 0.012], tip, _smoothstep(0.0, 0.75, t))
+    part.albedo = mix([0.030, 0.080, 0.012], tip, smoothstep(0.0, 0.75, t))
     part.gloss[:] = 0.22
     part.translucency[:] = 0.55
-    part.occlusion = 0.30 + 0.70 * _smoothstep(0.05, 0.6, t)
+    part.occlusion = 0.30 + 0.70 * smoothstep(0.05, 0.6, t)
     return part
 
 
@@ -483,25 +320,25 @@ _DAISY = _Flower(15, 5, 2, 60, 14, 0.105, 0.16, 0.22, 0.46, (0.90, 0.90, 0.92), 
 _FORGET_ME_NOT = _Flower(5, 3, 2, 6, 6, 0.036, 0.42, 0.10, 0.26, (0.12, 0.24, 0.80), (0.30, 0.48, 0.95))
 
 
-def _flowers(kind: _Flower, n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
+def _flowers(kind: _Flower, n: int, noise: Noise, rng: np.random.Generator) -> Part:
     k = max(1, n // len(kind))
     per_petal = kind.rows * kind.columns
     base = _on_ground(k, noise, rng, 0.40, 0.95)
     height = rng.uniform(kind.low, kind.high, k)
-    out = _unit(base * [1, 1, 0])
-    face = _unit(_UP + 0.55 * out + 0.25 * rng.standard_normal((k, 3)))
-    head = base + _UP * height[:, None] + 0.10 * out
+    out = unit(base * [1, 1, 0])
+    face = unit(UP + 0.55 * out + 0.25 * rng.standard_normal((k, 3)))
+    head = base + UP * height[:, None] + 0.10 * out
     size = kind.size * rng.uniform(0.8, 1.2, k)
 
     parts = []
-    side = _unit(np.cross(face, [0.6, 0.8, 0.1]))
+    side = unit(np.cross(face, [0.6, 0.8, 0.1]))
     other = np.cross(face, side)
     a = np.arange(kind.petals) * 2 * np.pi / kind.petals + rng.uniform(0, 6, (k, 1))
     a = a + rng.uniform(-0.6, 0.6, a.shape) / kind.petals
     ray = (side[:, None] * np.cos(a)[..., None] + other[:, None] * np.sin(a)[..., None]).reshape(-1, 3)
     faces, heads, sizes = (np.repeat(x, kind.petals, 0) for x in (face, head, size))
     lift = rng.uniform(-0.1, 0.25, (len(ray), 1))
-    part, t, s = _strips(
+    part, t, s = strips(
         heads + 0.2 * ray * sizes[:, None],
         ray + lift * faces,
         faces,
@@ -514,47 +351,47 @@ def _flowers(kind: _Flower, n: int, noise: _Noise, rng: np.random.Generator) -> 
         rng,
     )
     tinge = np.clip((t - 0.45) * np.repeat(rng.uniform(-0.3, 1.3, k), kind.petals * per_petal), 0, 0.6)
-    part.albedo = _mix(kind.petal, kind.tip, tinge) * (1 - 0.12 * np.abs(s))[:, None]
+    part.albedo = mix(kind.petal, kind.tip, tinge) * (1 - 0.12 * np.abs(s))[:, None]
     part.translucency[:] = 0.45
     part.occlusion = 0.75 + 0.25 * t
     parts.append(part)
 
     for i in range(k):
-        dome = _revolve(lambda t: (np.sin(t * 1.6), 0.55 * np.cos(t * 1.6)), kind.heart)
+        dome = revolve(lambda t: (np.sin(t * 1.6), 0.55 * np.cos(t * 1.6)), kind.heart)
         radius = 0.30 * size[i]
-        yellow = _mix([0.78, 0.36, 0.01], [0.95, 0.66, 0.03], rng.random(kind.heart))
+        yellow = mix([0.78, 0.36, 0.01], [0.95, 0.66, 0.03], rng.random(kind.heart))
         bump = _discs(
             dome.points * radius, dome.normals, dome.around, dome.spacing * radius, yellow, rng, overlap=0.65
         )
         bump.occlusion[:] = 0.55 + 0.45 * (1 - dome.along)
         parts.append(bump.moved(np.stack([side[i], other[i], face[i]], -1), head[i]))
     parts.append(_stalks(base, head, 0.008, kind.stalk, rng))
-    return _Part.concatenate(parts)
+    return Part.concatenate(parts)
 
 
-def _stalks(base: Array, head: Array, width: float, rows: int, rng: np.random.Generator) -> _Part:
+def _stalks(base: Array, head: Array, width: float, rows: int, rng: np.random.Generator) -> Part:
     k, toward = len(base), head - base
-    up = _unit(np.cross(toward, rng.standard_normal((k, 3))))
+    up = unit(np.cross(toward, rng.standard_normal((k, 3))))
     length, widths = np.linalg.norm(toward, axis=1), np.full(k, width)
-    part, t, _ = _strips(base, toward, up, length, widths, np.zeros(k), rows, 1, np.ones_like, rng)
-    part.albedo = _mix([0.05, 0.11, 0.02], [0.20, 0.36, 0.07], t)
+    part, t, _ = strips(base, toward, up, length, widths, np.zeros(k), rows, 1, np.ones_like, rng)
+    part.albedo = mix([0.05, 0.11, 0.02], [0.20, 0.36, 0.07], t)
     part.scales[:, 2] = part.scales[:, 1]  # round, not flat
     part.occlusion = 0.4 + 0.6 * t
     return part
 
 
-def _clover(n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
+def _clover(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     rows, columns, stalk = 6, 4, 6
     k = max(1, n // (3 * rows * columns + stalk))
     base = _on_ground(k, noise, rng, 0.25, 0.98)
     height = rng.uniform(0.07, 0.17, k)
-    face = _unit(_UP + 0.35 * rng.standard_normal((k, 3)))
-    head = base + _UP * height[:, None] + 0.02 * rng.standard_normal((k, 3))
-    side = _unit(np.cross(face, [0.6, 0.8, 0.1]))
+    face = unit(UP + 0.35 * rng.standard_normal((k, 3)))
+    head = base + UP * height[:, None] + 0.02 * rng.standard_normal((k, 3))
+    side = unit(np.cross(face, [0.6, 0.8, 0.1]))
     a = np.arange(3) * 2 * np.pi / 3 + rng.uniform(0, 6, (k, 1))
     ray = side[:, None] * np.cos(a)[..., None] + np.cross(face, side)[:, None] * np.sin(a)[..., None]
     size = rng.uniform(0.055, 0.10, k)
-    part, t, s = _strips(
+    part, t, s = strips(
         np.repeat(head, 3, 0),
         ray.reshape(-1, 3) + 0.15 * np.repeat(face, 3, 0),
         np.repeat(face, 3, 0),
@@ -568,36 +405,36 @@ def _clover(n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
     )
     chevron = np.exp(-(((t - 0.55 + 0.25 * np.abs(s)) / 0.10) ** 2))
     shade = np.repeat(rng.random(k), 3 * rows * columns)
-    green = _mix([0.040, 0.17, 0.030], [0.11, 0.29, 0.045], shade)
-    part.albedo = _mix(green, [0.42, 0.60, 0.34], 0.75 * chevron)
+    green = mix([0.040, 0.17, 0.030], [0.11, 0.29, 0.045], shade)
+    part.albedo = mix(green, [0.42, 0.60, 0.34], 0.75 * chevron)
     part.gloss[:] = 0.15
     part.translucency[:] = 0.4
     part.occlusion = 0.7 + 0.3 * t
-    return _Part.concatenate([part, _stalks(base, head, 0.006, stalk, rng)])
+    return Part.concatenate([part, _stalks(base, head, 0.006, stalk, rng)])
 
 
-def _pebbles(n: int, noise: _Noise, rng: np.random.Generator) -> _Part:
+def _pebbles(n: int, noise: Noise, rng: np.random.Generator) -> Part:
     k = 6
     parts = []
     for place in _on_ground(k, noise, rng, 0.5, 0.92):
         m = n // k
-        ball = _revolve(lambda t: (np.sin(np.pi * t), np.cos(np.pi * t)), m)
+        ball = revolve(lambda t: (np.sin(np.pi * t), np.cos(np.pi * t)), m)
         axes = rng.uniform(0.05, 0.12) * np.array([rng.uniform(0.8, 1.4), 1.0, rng.uniform(0.5, 0.75)])
         bulge = 0.85 + 0.3 * noise(ball.points + place * 7, 1.6, 2)
         grain = noise(ball.points + place * 5, 6.0)
-        grey = _mix([0.16, 0.15, 0.15], [0.52, 0.50, 0.47], grain) * rng.uniform(0.7, 1.2)
+        grey = mix([0.16, 0.15, 0.15], [0.52, 0.50, 0.47], grain) * rng.uniform(0.7, 1.2)
         stone = _discs(
             ball.points * bulge[:, None] * axes,
-            _unit(ball.normals / axes),
+            unit(ball.normals / axes),
             ball.around,
             ball.spacing * float(np.mean(axes)),
             grey,
             rng,
             gloss=0.45,
         )
-        stone.occlusion = 0.5 + 0.5 * _smoothstep(-0.6, 0.5, ball.points[:, 2])
-        parts.append(stone.moved(_rotation(_UP, rng.uniform(0, 6)), place))
-    return _Part.concatenate(parts)
+        stone.occlusion = 0.5 + 0.5 * smoothstep(-0.6, 0.5, ball.points[:, 2])
+        parts.append(stone.moved(rotation(UP, rng.uniform(0, 6)), place))
+    return Part.concatenate(parts)
 
 
 def _shadow(points: Array, caps: Sequence[_Toadstool]) -> Array:
@@ -605,10 +442,10 @@ def _shadow(points: Array, caps: Sequence[_Toadstool]) -> Array:
     light = np.ones(len(points))
     for shape in caps:
         axes = np.array([1, 1, shape.dome]) * shape.radius
-        start, ray = (points - shape.cap) / axes, _TO_SUN / axes
+        start, ray = (points - shape.cap) / axes, TO_SUN / axes
         nearest = -(start @ ray) / (ray @ ray)
         miss = np.linalg.norm(start + nearest[:, None] * ray, axis=1)
-        light *= np.where(nearest > 0.05, 0.25 + 0.75 * _smoothstep(0.80, 1.12, miss), 1.0)
+        light *= np.where(nearest > 0.05, 0.25 + 0.75 * smoothstep(0.80, 1.12, miss), 1.0)
     return light
 
 
@@ -617,24 +454,18 @@ def _under_caps(points: Array, caps: Sequence[_Toadstool]) -> Array:
     free = np.ones(len(points))
     for shape in caps:
         aside = np.hypot(*(points - shape.cap)[:, :2].T) / shape.radius
-        below = _smoothstep(0.0, 0.25, shape.cap[2] - points[:, 2])
+        below = smoothstep(0.0, 0.25, shape.cap[2] - points[:, 2])
         near_foot = np.hypot(*(points - shape.foot)[:, :2].T) / shape.radius
         free *= 1 - 0.50 * below * np.exp(-((aside / 0.85) ** 2))
-        free *= 1 - 0.35 * np.exp(-((near_foot / 0.35) ** 2)) * _smoothstep(
+        free *= 1 - 0.35 * np.exp(-((near_foot / 0.35) ** 2)) * smoothstep(
             0.25, 0.0, points[:, 2] - shape.foot[2]
         )
     return free
 
 
-def _display(linear: Array) -> Array:
-    """Linear light to display values, highlights rolled off."""
-    rolled = linear * (1 + linear / 6.0) / (1 + 0.55 * linear)
-    return np.clip(rolled, 0, None) ** (1 / 2.2)
-
-
-def _lit(part: _Part, caps: Sequence[_Toadstool]) -> Array:
+def _lit(part: Part, caps: Sequence[_Toadstool]) -> Array:
     """Light the gaussians and express their colour as spherical harmonics of degree 1, (n,4,3)."""
-    facing = part.normals @ _TO_SUN
+    facing = part.normals @ TO_SUN
     thin = part.translucency
     sunlit = _shadow(part.means, caps)
     sky = part.occlusion * _under_caps(part.means, caps) * (0.62 + 0.38 * part.normals[:, 2])
@@ -642,64 +473,30 @@ def _lit(part: _Part, caps: Sequence[_Toadstool]) -> Array:
     leaf = 0.45 + 0.55 * np.abs(facing)
     direct = sunlit * ((1 - thin) * front + thin * leaf) * (0.35 + 0.65 * part.occlusion)
     bounce = np.array([0.10, 0.13, 0.05]) * (1 - part.normals[:, 2])[:, None] * part.occlusion[:, None]
-    linear = part.albedo * (direct[:, None] * _SUN + sky[:, None] * _SKY + bounce)
-    colour = _display(linear)
+    linear = part.albedo * (direct[:, None] * SUN + sky[:, None] * SKY + bounce)
+    colour = display(linear)
 
     # What depends on the view, linear in the direction v to the eye: the sky's mirror image is brighter the
     # higher the mirrored direction 2 (n.v) n - v points; the sun's highlight leans towards the sun's mirrored
     # direction; thin things glow when the sun is behind them.
     n = part.normals
     shine = part.gloss[:, None]
-    mirrored_sky = 2 * n[:, 2:] * n - _UP
-    mirrored_sun = 2 * np.maximum(facing, 0)[:, None] * n - _TO_SUN
-    highlight = (sunlit * _smoothstep(0.35, 0.95, facing))[:, None]
+    mirrored_sky = 2 * n[:, 2:] * n - UP
+    mirrored_sun = 2 * np.maximum(facing, 0)[:, None] * n - TO_SUN
+    highlight = (sunlit * smoothstep(0.35, 0.95, facing))[:, None]
     white = shine * (0.05 * mirrored_sky + 0.42 * highlight * mirrored_sun)  # (n,3): weight of v
-    glow = (thin * sunlit * part.occlusion)[:, None] * -0.22 * _TO_SUN
+    glow = (thin * sunlit * part.occlusion)[:, None] * -0.22 * TO_SUN
     tint = colour / np.maximum(colour.max(1, keepdims=True), 1e-3)
     gradient = white[:, :, None] * np.array([1.0, 0.98, 0.94]) + glow[:, :, None] * tint[:, None] * 0.5
     colour = colour + shine * (0.02 - 0.12 * highlight)
 
     sh = np.empty((len(n), 4, 3))
-    sh[:, 0] = (colour - 0.5) / _SH_C0
+    sh[:, 0] = (colour - 0.5) / SH_C0
     # The basis functions of degree 1 are -y, z, -x of the direction from the eye, which is -v.
-    sh[:, 1] = gradient[:, 1] / _SH_C1
-    sh[:, 2] = -gradient[:, 2] / _SH_C1
-    sh[:, 3] = gradient[:, 0] / _SH_C1
+    sh[:, 1] = gradient[:, 1] / SH_C1
+    sh[:, 2] = -gradient[:, 2] / SH_C1
+    sh[:, 3] = gradient[:, 0] / SH_C1
     return sh
-
-
-def _quaternions(tangents: Array, normals: Array) -> Array:
-    """Rotations (w,x,y,z) that take x to the tangent and z to the normal, as near as both can be had."""
-    z = _unit(normals)
-    x = tangents - z * np.sum(tangents * z, 1, keepdims=True)
-    stray = np.linalg.norm(x, axis=1) < 1e-6
-    x[stray] = np.cross(z[stray], [0.6, 0.0, 0.8]) + np.cross(z[stray], [0.0, 0.6, 0.8])
-    x = _unit(x)
-    y = np.cross(z, x)
-    m = np.stack([x, y, z], -1)
-    # Four formulas, each well conditioned where its component is the largest.
-    diagonal = np.stack([m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], -1)
-    squares = np.stack(
-        [
-            1 + diagonal.sum(1),
-            1 + 2 * diagonal[:, 0] - diagonal.sum(1),
-            1 + 2 * diagonal[:, 1] - diagonal.sum(1),
-            1 + 2 * diagonal[:, 2] - diagonal.sum(1),
-        ],
-        -1,
-    )
-    wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
-    xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
-    candidates = np.stack(
-        [
-            np.stack([squares[:, 0], wx, wy, wz], -1),
-            np.stack([wx, squares[:, 1], xy, xz], -1),
-            np.stack([wy, xy, squares[:, 2], yz], -1),
-            np.stack([wz, xz, yz, squares[:, 3]], -1),
-        ],
-        1,
-    )
-    return _unit(candidates[np.arange(len(m)), np.argmax(squares, 1)])
 
 
 def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
@@ -718,13 +515,13 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
     if num_gaussians < 1000:
         raise ValueError(f"num_gaussians: expected at least 1000, got {num_gaussians}")
     rng = np.random.default_rng(seed)
-    noise = _Noise(rng)
+    noise = Noise(rng)
 
     def standing(x: float, y: float, tilt: float, toward: float, *rest: float) -> _Toadstool:
         foot = np.array([[x, y, 0.0]])
         foot[0, 2] = _ground_height(foot, noise)[0] - 0.03
         axis = np.array([-np.sin(toward), np.cos(toward), 0.0])
-        return _Toadstool(foot[0], _rotation(axis, tilt), *rest)
+        return _Toadstool(foot[0], rotation(axis, tilt), *rest)
 
     caps = [
         standing(-0.10, 0.08, 0.08, 2.5, 0.76, 0.37, 0.68, 0.55),
@@ -742,11 +539,11 @@ def make_asset(num_gaussians: int = 60_000, *, seed: int = 0) -> Gaussians:
     ]
     rest = n - sum(len(p.means) for p in parts)
     parts.append(_ground(rest, noise, rng))
-    whole = _Part.concatenate(parts)
+    whole = Part.concatenate(parts)
     order = rng.permutation(n)  # files of trained assets have no order either
     return Gaussians(
         means=whole.means[order].astype(np.float32),
-        quats=_quaternions(whole.tangents, whole.normals)[order].astype(np.float32),
+        quats=quaternions(whole.tangents, whole.normals)[order].astype(np.float32),
         scales=whole.scales[order].astype(np.float32),
         opacities=whole.opacities[order].astype(np.float32),
         sh=_lit(whole, caps)[order].astype(np.float32),
@@ -783,9 +580,9 @@ def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Array, Array, Arra
     swell = 0.30
     height = swell * (np.sin(phase).sum(1) - origin) - 0.14 * rim * (np.hypot(*plane.T) / rim) ** 2
     slope = swell * np.cos(phase) @ pitch - 0.28 * plane / rim
-    normal = _unit(np.stack([-slope[:, 0], -slope[:, 1], np.ones(count)], -1))
+    normal = unit(np.stack([-slope[:, 0], -slope[:, 1], np.ones(count)], -1))
     yaw = rng.uniform(0, 2 * np.pi, count)
     scales = rng.uniform(0.82, 1.12, count)
-    normal[0], yaw[0], scales[0] = _UP, 0.0, 1.0
+    normal[0], yaw[0], scales[0] = UP, 0.0, 1.0
     toward = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(count)], -1)
-    return np.column_stack([plane, height]), _quaternions(toward, normal), scales
+    return np.column_stack([plane, height]), quaternions(toward, normal), scales

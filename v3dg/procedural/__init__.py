@@ -1,0 +1,21 @@
+"""Assets that need no download: 3DGS assets made from a seed.
+
+Gaussians are spread as training spreads them: flat ones that cover surfaces, needles along what is thin, a
+wide range of sizes and opacities, colour that depends on the view where something shines or light passes.
+"""
+
+from v3dg.procedural.donut import make_donut
+from v3dg.procedural.person import make_person
+from v3dg.procedural.temple import make_temple
+from v3dg.procedural.toadstools import make_asset, place_field
+from v3dg.procedural.tree import TREE_KINDS, make_tree
+
+__all__ = [
+    "TREE_KINDS",
+    "make_asset",
+    "make_donut",
+    "make_person",
+    "make_temple",
+    "make_tree",
+    "place_field",
+]
