@@ -1,0 +1,61 @@
+"""The camera trajectories with which the V3DG paper measures its scenes."""
+
+from __future__ import annotations
+
+import math
+
+from v3dg.cameras import DEFAULT_FOV_X, Camera, VectorLike, turntable
+
+ELEVATIONS = (15.0, 30.0, 45.0, 60.0, 75.0)
+"""Degrees above the ground."""
+NUM_DIRECTIONS, NUM_DISTANCES = 4, 20
+
+
+def trajectories(
+    center: VectorLike,
+    radius: float,
+    *,
+    fov_x: float = DEFAULT_FOV_X,
+    width: int = 1920,
+    height: int = 1080,
+    near: float = 0.01,
+) -> dict[str, Camera]:
+    """Make the paper's 400 cameras: from 4 directions and 5 elevations, at 20 distances, all to the centre.
+
+    The directions are those of +y, -x, -y and +x in this order; for each, elevations of 15 to 75 degrees; for
+    each, distances of 1/20 to 20/20 of the radius. With the origin and radius 9 they are those of the
+    published DonutSea. Up is z.
+
+    Args:
+        center: (3,) point in the world.
+        radius: Distance of the farthest cameras; > 0.
+        fov_x: Horizontal field of view in radians.
+
+    Returns:
+        Cameras by name in that order, "000_camera_0" to "399_camera_19": the place among all, and the
+        distance's.
+
+    Raises:
+        ValueError: The radius is not a positive number.
+    """
+    if not (radius > 0 and math.isfinite(radius)):
+        raise ValueError(f"radius: expected a positive number, got {radius:g}")
+    cameras: dict[str, Camera] = {}
+    for direction in range(NUM_DIRECTIONS):
+        for elevation in ELEVATIONS:
+            for step in range(NUM_DISTANCES):
+                distance = radius * (step + 1) / NUM_DISTANCES
+                # The turntable begins at +x and turns towards +y.
+                around = turntable(
+                    center,
+                    distance,
+                    NUM_DIRECTIONS,
+                    math.radians(elevation),
+                    fov_x=fov_x,
+                    width=width,
+                    height=height,
+                    near=near,
+                )
+                name = f"{len(cameras):03}_camera_{step}"
+                cameras[name] = around[(direction + 1) % NUM_DIRECTIONS]
+    return cameras
