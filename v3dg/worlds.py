@@ -1,0 +1,260 @@
+"""Worlds of about 100 million gaussians, like the four of the V3DG paper, from assets made here.
+
+A world says which assets stand where. Making the assets, building their bundles and putting them into a scene
+are steps of their own:
+
+    world = v3dg.worlds.forest(instances=60, num_gaussians=20_000)
+    bundles = {name: v3dg.build_bundle(asset.make()) for name, asset in world.assets.items()}
+    scene = v3dg.worlds.scene_of(world, bundles)
+    image = v3dg.render(scene, world.cameras()["000_camera_0"])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera, Floats
+from v3dg.gaussians import Gaussians
+from v3dg.pile import Pile
+from v3dg.procedural import TREE_KINDS, make_donut, make_person, make_temple, make_tree
+from v3dg.procedural.donut import RING, TUBE
+from v3dg.scene import Scene
+from v3dg.trajectories import trajectories
+
+
+@dataclass(frozen=True)
+class Asset:
+    """An asset that can be made: how, and of how many gaussians."""
+
+    make: Callable[[], Gaussians]
+    num_gaussians: int
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where I instances of one asset stand.
+
+    Attributes:
+        positions: (I, 3) world units.
+        quaternions: (I, 4) w x y z.
+        scales: (I,)
+    """
+
+    positions: Floats
+    quaternions: Floats
+    scales: Floats
+
+    def __len__(self) -> int:
+        return len(self.scales)
+
+
+@dataclass(frozen=True)
+class World:
+    """Assets and where they stand, by the assets' names.
+
+    Attributes:
+        extent: Distance of the farthest cameras from the origin.
+    """
+
+    name: str
+    assets: Mapping[str, Asset]
+    placements: Mapping[str, Placement]
+    extent: float
+
+    @property
+    def num_instances(self) -> int:
+        return sum(len(placement) for placement in self.placements.values())
+
+    @property
+    def num_gaussians(self) -> int:
+        """Gaussians of all instances at full detail."""
+        return sum(len(self.placements[name]) * asset.num_gaussians for name, asset in self.assets.items())
+
+    def cameras(self, *, width: int = 1920, height: int = 1080) -> dict[str, Camera]:
+        """The paper's 400 cameras around the origin, up to the world's extent."""
+        return trajectories((0.0, 0.0, 0.0), self.extent, width=width, height=height)
+
+
+def scene_of(world: World, bundles: Mapping[str, Bundle]) -> Scene:
+    """Place bundles as a world says.
+
+    Args:
+        bundles: One for each of the world's assets, by its name.
+
+    Raises:
+        ValueError: A bundle is missing.
+    """
+    missing = [name for name in world.placements if name not in bundles]
+    if missing:
+        raise ValueError(f"bundles: expected one for each asset of {world.name}, got none for {missing[0]}")
+    scene = Scene()
+    for name, placement in world.placements.items():
+        scene.add(bundles[name], placement.positions, placement.quaternions, placement.scales)
+    return scene
+
+
+def donut_sea(instances: int = 2048, num_gaussians: int = 45_624, *, seed: int = 0) -> World:
+    """Make a pile of donuts that fell onto the ground, at 3/4 to full size.
+
+    Args:
+        instances: How many donuts.
+        num_gaussians: Of the one asset.
+
+    Raises:
+        ValueError: ``instances`` is below 1.
+    """
+    pile = donut_shower(instances, seed=seed)
+    for _ in range(_FALL_STEPS):
+        pile.step()
+    pile.relax()
+    placement = Placement(pile.positions, pile.quaternions, pile.scales)
+    reach = float(np.percentile(np.hypot(*pile.positions[:, :2].T), 90)) + RING + TUBE
+    asset = Asset(partial(make_donut, num_gaussians, seed=seed), num_gaussians)
+    return World("donut_sea", {"donut": asset}, {"donut": placement}, 2.6 * reach)
+
+
+_FALL_STEPS = 50  # sixtieths of a second: the highest have fallen and the pile is calm
+
+
+def donut_shower(instances: int, *, seed: int = 0, layers: float = 4.0, gap: float = 0.03) -> Pile:
+    """Hang donuts in the air, about that many above each other, ready to fall; none touches another.
+
+    Args:
+        gap: Free space between donuts of full size, however they are turned.
+    """
+    if instances < 1:
+        raise ValueError(f"instances: expected at least 1, got {instances}")
+    rng = np.random.default_rng(seed)
+    pitch = 2 * (RING + TUBE) + gap
+    a_layer = max(1, round(instances / layers))
+    reach = int(np.ceil(np.sqrt(a_layer))) + 2
+    i, j = (x.ravel() for x in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)))
+    plane = pitch * np.stack([i + 0.5 * j, np.sqrt(0.75) * j], -1)
+    plane = plane[np.argsort(np.hypot(*plane.T), kind="stable")[:a_layer]]
+    layer, cell = np.divmod(np.arange(instances), a_layer)
+    # Layers lie over the gaps of those below, as in a close packing, and are turned a little.
+    shift = pitch * np.array([0.5, np.sqrt(1 / 12)]) * (layer % 2)[:, None]
+    jitter = rng.uniform(-0.4, 0.4, (instances, 3)) * gap / np.sqrt(3)
+    height = RING + TUBE + gap + layer * pitch
+    positions = np.column_stack([plane[cell] + shift, height]) + jitter
+    quaternions = rng.standard_normal((instances, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return Pile(positions, quaternions, rng.uniform(0.75, 1.0, instances), ring=RING, tube=TUBE)
+
+
+def forest(instances: int = 400, num_gaussians: int = 315_630, *, seed: int = 0) -> World:
+    """Make a forest of eight kinds of trees, turned and sized at random, whose crowns hardly meet.
+
+    Args:
+        num_gaussians: Of each of the eight assets, on average: kinds have from 0.6 to 1.4 times as many.
+    """
+    shares = np.linspace(0.6, 1.4, len(TREE_KINDS))[
+        np.random.default_rng([seed, 1]).permutation(len(TREE_KINDS))
+    ]
+    counts = [round(num_gaussians * share) for share in shares]
+    assets = {
+        kind: Asset(partial(make_tree, count, kind=kind, seed=seed), count)
+        for kind, count in zip(TREE_KINDS, counts, strict=True)
+    }
+    radii = dict(zip(TREE_KINDS, (4.2, 3.6, 2.8, 3.4, 3.9, 1.5, 2.4, 2.8), strict=True))
+    return _scattered("forest", assets, radii, instances, (0.75, 1.25), seed)
+
+
+def temples(instances: int = 100, num_gaussians: int = 1_350_487, *, seed: int = 0) -> World:
+    """Make a plain of temples, turned and sized at random, that stand clear of each other.
+
+    Args:
+        num_gaussians: Of the one asset.
+    """
+    asset = Asset(partial(make_temple, num_gaussians, seed=seed), num_gaussians)
+    return _scattered("temples", {"temple": asset}, {"temple": 15.8}, instances, (0.7, 1.2), seed)
+
+
+def crowd(instances: int = 400, num_gaussians: int = 343_274, *, persons: int = 16, seed: int = 0) -> World:
+    """Make a crowd that stands in a square grid and looks one way.
+
+    Args:
+        num_gaussians: Of each asset.
+        persons: How many different ones there are.
+
+    Raises:
+        ValueError: ``instances`` or ``persons`` is below 1.
+    """
+    for name, value in (("instances", instances), ("persons", persons)):
+        if value < 1:
+            raise ValueError(f"{name}: expected at least 1, got {value}")
+    persons = min(persons, instances)
+    pitch, side = 1.2, int(np.ceil(np.sqrt(instances)))
+    row, column = np.divmod(np.arange(instances), side)
+    half = 0.5 * (side - 1)
+    positions = pitch * np.stack([column - half, row - half, np.zeros(instances)], -1)
+    # Each person as often as any other, and neighbours differ.
+    who = np.concatenate(
+        [np.random.default_rng([seed, i]).permutation(persons) for i in range(-(-instances // persons))]
+    )
+    assets, placements = {}, {}
+    for person in range(persons):
+        name = f"person_{person:02}"
+        at = positions[who[:instances] == person]
+        assets[name] = Asset(partial(make_person, num_gaussians, seed=1000 * seed + person), num_gaussians)
+        placements[name] = Placement(at, np.tile([1.0, 0.0, 0.0, 0.0], (len(at), 1)), np.ones(len(at)))
+    return World("crowd", assets, placements, 2.0 * pitch * max(half, 1.0))
+
+
+def _scattered(
+    name: str,
+    assets: dict[str, Asset],
+    radii: Mapping[str, float],
+    instances: int,
+    scales: tuple[float, float],
+    seed: int,
+) -> World:
+    """Place one asset after the other on the plane, at random, where it is clear of all others."""
+    if instances < 1:
+        raise ValueError(f"instances: expected at least 1, got {instances}")
+    rng = np.random.default_rng(seed)
+    names = list(assets)
+    which = np.concatenate([rng.permutation(len(names)) for _ in range(-(-instances // len(names)))])[
+        :instances
+    ]
+    size = rng.uniform(*scales, instances)
+    room = size * np.array([radii[names[k]] for k in which])
+    # Discs dropped one after the other cover about this share of the plane.
+    extent = np.sqrt((room**2).sum() / 0.50)
+    places = np.zeros((instances, 2))
+    for i in range(1, instances):
+        places[i] = _clear_place(places[:i], room[:i], room[i], extent, rng)
+    yaw = rng.uniform(0, 2 * np.pi, instances)
+    quaternions = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], -1)
+    positions = np.column_stack([places, np.zeros(instances)])
+    placements = {
+        asset: Placement(positions[which == k], quaternions[which == k], size[which == k])
+        for k, asset in enumerate(names)
+        if (which == k).any()
+    }
+    assets = {asset: assets[asset] for asset in placements}
+    return World(name, assets, placements, 1.3 * float((np.hypot(*places.T) + room).max()))
+
+
+def _clear_place(
+    places: npt.NDArray[np.float64],
+    room: npt.NDArray[np.float64],
+    radius: float,
+    extent: float,
+    rng: np.random.Generator,
+) -> npt.NDArray[np.float64]:
+    """A place at random where a disc touches no other; the disc of places grows where there is none."""
+    while True:
+        r, a = extent * np.sqrt(rng.random(400)), rng.uniform(0, 2 * np.pi, 400)
+        tried = np.stack([r * np.cos(a), r * np.sin(a)], -1)
+        apart = np.linalg.norm(tried[:, None] - places, axis=-1) - room
+        clear = np.flatnonzero(apart.min(axis=1) > radius)
+        if len(clear):
+            return np.asarray(tried[clear[0]])
+        extent *= 1.1
