@@ -121,7 +121,6 @@ def shapes() -> dict[str, HardCase]:
             "Flat over the picture. Past a deviation of 4 x 10⁹ px the determinant overflows: not drawn.",
             crowd(4, scales=(1e6, 2e6, 5e7), opacities=0.1),
         ),
-        "infinite scales": HardCase("Not drawn.", crowd(4, scales=np.inf), is_drawn=False),
         "quaternions of length 10¹⁵": HardCase(
             "Normalised. Past 10¹⁸ the square overflows, and the quaternion counts as no rotation.",
             crowd(5, quats=1e15 * crowd(5).quats),

@@ -1,0 +1,112 @@
+"""How far float32 is from float64 in each of tests/hard_cases.py: histograms of errors, and docs/numerics.md.
+
+    python benchmarks/hard_cases.py --device cpu --output benchmarks/results/hard_cases_cpu.json
+    python benchmarks/hard_cases.py --device cuda --output benchmarks/results/hard_cases_h200.json
+    python benchmarks/hard_cases.py --docs    # write the table again, from those two
+
+The last one measures nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import record
+import tyro
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "tests"))
+
+import hard_cases as cases  # noqa: E402  (of the tests)
+
+DECADES = (1e-7, 1e-6, 1e-5, 1e-4)
+DOCS = ROOT / "docs" / "numerics.md"
+RESULTS = {"CPU": "hard_cases_cpu.json", "H200": "hard_cases_h200.json"}
+BEGIN, END = "<!-- hard cases: benchmarks/hard_cases.py -->\n", "<!-- end of hard cases -->\n"
+
+
+@dataclass
+class Config:
+    device: Literal["cpu", "cuda"] = "cpu"
+    output: str | None = None
+    docs: bool = False
+    """Write docs/numerics.md's table from the recorded results instead."""
+
+
+def histogram(errors: np.ndarray) -> dict[str, Any]:
+    """Shares of the errors up to each decade and beyond the last, in per cent, and the largest."""
+    counts = np.bincount(np.searchsorted(DECADES, errors.ravel()), minlength=len(DECADES) + 1)
+    shares = 100 * counts / max(errors.size, 1)
+    return {"percent": shares.round(2).tolist(), "largest": float(f"{errors.max(initial=0.0):.1e}")}
+
+
+def gradient_histogram(case: cases.HardCase, device: str) -> dict[str, Any]:
+    """Of the drawn gaussians' gradients by relative changes, in units of each input's root mean square."""
+    import torch
+
+    single = cases.gradients(case, cases.draw_core, torch.float32, device)
+    double = cases.gradients(case, cases.draw_core, torch.float64)
+    drawn = cases.drawn_rows(case)
+    single, double = ([r[drawn] for r in cases.relative_changes(case, g)] for g in (single, double))
+    whole = np.sqrt(sum((d * d).sum() for d in double) / max(sum(d.size for d in double), 1))
+    errors = []
+    for s, d in zip(single, double, strict=True):
+        typical = max(np.sqrt((d * d).mean()) if d.size else 0.0, 1e-6 * whole, 1e-300)
+        errors.append((np.abs(s - d) / typical).ravel())
+    return histogram(np.concatenate(errors))
+
+
+def measure(case: cases.HardCase, device: str) -> dict[str, Any]:
+    expected = cases.expected_picture(case)
+    error = cases.picture_error(cases.picture(case, device), expected)
+    return {"picture": histogram(error), "gradients": gradient_histogram(case, device)}
+
+
+def text_of(shares: list[float]) -> str:
+    """Whole per cents; what is there but rounds to none is a dot."""
+    return " ".join(f"{s:.0f}" if s >= 0.5 else "." if s > 0 else "0" for s in shares)
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    columns = [f"{part}, {device}" for device in results for part in ("picture", "gradients")]
+    lines = [
+        "| case | what happens, and why | bound | " + " | ".join(columns) + " |",
+        "| --- | --- | --- |" + " --- |" * len(columns),
+    ]
+    for name, case in cases.hard_cases().items():
+        cells = [
+            f"{text_of(measured[part]['percent'])} ({measured[part]['largest']:.0e})"
+            for measured in (result["cases"][name] for result in results.values())
+            for part in ("picture", "gradients")
+        ]
+        bound = f"{case.picture.absolute:.0e}" if case.gradient else "finite"
+        lines.append(f"| {name} | {case.what} | {bound} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def write_docs() -> None:
+    paths = {device: ROOT / "benchmarks" / "results" / name for device, name in RESULTS.items()}
+    results = {device: json.loads(path.read_text()) for device, path in paths.items() if path.exists()}
+    before, rest = DOCS.read_text().split(BEGIN)
+    _, after = rest.split(END)
+    DOCS.write_text(before + BEGIN + "\n" + table(results) + "\n" + END + after)
+
+
+def main(config: Config) -> None:
+    if config.docs:
+        write_docs()
+        return
+    measured = {}
+    for name, case in cases.hard_cases().items():
+        measured[name] = measure(case, config.device)
+        print(f"{name:36}", *(f"{m['percent']} {m['largest']:.0e}" for m in measured[name].values()))
+    record.write(config.output, {"device": config.device, "decades": DECADES, "cases": measured})
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
