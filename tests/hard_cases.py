@@ -190,7 +190,7 @@ def places() -> dict[str, HardCase]:
             crowd(10, num=crowded, means=np.column_stack([0.2 * disc[:, :2], stairs]), opacities=0.05),
         ),
         "5,000 at one place": HardCase(
-            "The same. At the threshold all of them are drawn, or none.",
+            "Blended in the order of their index. At the threshold all of them are drawn, or none.",
             crowd(10, num=crowded, means=(0.1, 0.1, 2.0), opacities=0.05),
             picture=CUTOFF_FLOAT,
         ),
