@@ -9,13 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
-import gpu
-import record
 import torch
 import tyro
-from assets import like_trained
 
 import v3dg
+from v3dg.bench import gpu, record
+from v3dg.bench.assets import like_trained
+from v3dg.bench.measure import time_ms
 from v3dg.cameras import Camera
 
 Draw: TypeAlias = Callable[[v3dg.Gaussians], tuple[Any, Any]]
@@ -39,7 +39,6 @@ def main(config: Config) -> None:
     rows = [compare(config, count) for count in config.counts]
     small = replace(config, width=320, height=180, repeats=1)
     result = {
-        **gpu.machine(),
         "width": config.width,
         "height": config.height,
         "filter_px2": config.filter_px2,
@@ -47,7 +46,7 @@ def main(config: Config) -> None:
         "to_float64": errors_to_float64(small, 20_000),
     }
     print(result["to_float64"])
-    record.write(config.output, result)
+    record.write(config.output, result, gpu.DEVICE)
 
 
 def compare(config: Config, count: int) -> dict[str, Any]:
@@ -117,8 +116,8 @@ def measure(
 ) -> tuple[float, float, dict[str, Any]]:
     """Milliseconds forward, and forward and backward, and the gradients of the rows."""
     leaves = with_gradients(gaussians)
-    forward_ms = gpu.median_ms(lambda: draw(leaves), repeats)
-    total_ms = gpu.median_ms(lambda: gradients_of(draw, leaves, weights), repeats)
+    forward_ms = time_ms(lambda: draw(leaves), gpu.DEVICE, repeats).median
+    total_ms = time_ms(lambda: gradients_of(draw, leaves, weights), gpu.DEVICE, repeats).median
     return forward_ms, total_ms, gradients_of(draw, leaves, weights)
 
 

@@ -14,16 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import gpu
 import numpy as np
-import record
 import torch
 import tyro
-from assets import many_copies
 from PIL import Image
 
 import v3dg
 from v3dg import _operations, metrics
+from v3dg.bench import gpu, record
+from v3dg.bench.assets import many_copies
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.procedural import make_asset
@@ -71,7 +70,7 @@ def main(config: Config) -> None:
             row = {"part": part, "device": device, **row}
             print(row, flush=True)
             rows.append(row)
-    record.write(config.output, {**gpu.machine(), "asset_gaussians": len(asset), "results": rows})
+    record.write(config.output, {"asset_gaussians": len(asset), "results": rows}, gpu.DEVICE)
 
 
 def build(

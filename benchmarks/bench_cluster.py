@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import record
 import tyro
 
 import v3dg
 from v3dg import _operations
+from v3dg.bench import record
 from v3dg.rasterize import rows_of
 from v3dg.scene import rotation_from_quaternion
 from v3dg.select import _rotations_of_bands
@@ -140,16 +140,12 @@ def main(config: Config) -> None:
     if config.device == "cuda":
         gaussians = gaussians.torch("cuda")
     result: dict[str, Any] = {"config": vars(config), "milliseconds": {}}
-    if config.device == "cuda":
-        import gpu
-
-        result |= gpu.machine()
     for name, (num, run) in operations(gaussians, config).items():
         times = milliseconds(config, run)
         median = statistics.median(times)
         result["milliseconds"][name] = {"median": median, "least": min(times), "most": max(times)}
         print(f"{name:16} {median:10.2f} ms  {num / median / 1e3:10.1f} million gaussians a second")
-    record.write(config.output, result)
+    record.write(config.output, result, config.device)
 
 
 if __name__ == "__main__":

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gpu
-import record
 import torch
 import tyro
-from assets import like_trained
 from bench_rasterize import camera_that_fills
 
 import v3dg
+from v3dg.bench import gpu, record
+from v3dg.bench.assets import like_trained
+from v3dg.bench.measure import time_ms
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.procedural import make_asset
@@ -60,7 +60,7 @@ def main(config: Config) -> None:
 
         row: dict[str, Any] = {"scene": name, "gaussians": len(gaussians)}
         row["gaussians_in_frustum"] = ours().stats.gaussians_in_frustum
-        row["frame_ms"] = round(gpu.median_ms(ours, config.repeats), 3)
+        row["frame_ms"] = round(time_ms(ours, gpu.DEVICE, config.repeats).median, 3)
         if config.gsplat:
             row.update(beside_gsplat(row["frame_ms"], ours().color, gaussians, camera, config.repeats))
         print(row, flush=True)
@@ -88,7 +88,8 @@ def main(config: Config) -> None:
     print_table(rows)
     record.write(
         config.output,
-        {**gpu.machine(), "width": config.width, "height": config.height, "frames": rows},
+        {"width": config.width, "height": config.height, "frames": rows},
+        gpu.DEVICE,
     )
 
 
@@ -99,7 +100,7 @@ def beside_gsplat(
     def peer(packed: bool) -> Callable[[], Any]:
         return lambda: gpu.gsplat_picture(gaussians, camera, packed=packed)
 
-    packed_ms, unpacked_ms = (gpu.median_ms(peer(packed), repeats) for packed in (True, False))
+    packed_ms, unpacked_ms = (time_ms(peer(packed), gpu.DEVICE, repeats).median for packed in (True, False))
     error = gpu.picture_error(color, peer(True)()[0])
     torch.cuda.empty_cache()
     return {

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import record
 import tyro
 
 import v3dg
 from v3dg import _core
+from v3dg.bench import record
 from v3dg.cameras import Camera
 from v3dg.procedural import make_asset
 from v3dg.rasterize import intrinsics, rows_of, view_of_world

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import record
 import tyro
 from PIL import Image
 
 from v3dg import metrics
+from v3dg.bench import record
 from v3dg.bundle import Bundle
 from v3dg.render import render
 from v3dg.scene_file import read_scene

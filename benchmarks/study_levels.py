@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import record
 import tyro
 from PIL import Image
 
 import v3dg
 from v3dg import metrics
+from v3dg.bench import record
 
 CHANGES: dict[str, dict[str, Any]] = {
     "defaults": {},

@@ -108,6 +108,15 @@ def library_of(array: Array) -> Any:
     return torch
 
 
+def like(values: Any, array: Array) -> Array:
+    """Values as an array of the same kind, type and device as another."""
+    if isinstance(array, np.ndarray):
+        return np.asarray(values, array.dtype)
+    import torch
+
+    return torch.as_tensor(values, dtype=array.dtype, device=array.device)
+
+
 def to_host(array: Array) -> npt.NDArray[Any]:
     """The array as one of NumPy's."""
     host: npt.NDArray[Any] = array if isinstance(array, np.ndarray) else array.cpu().numpy()

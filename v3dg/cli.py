@@ -129,12 +129,41 @@ class Demo:
     """Show no progress."""
 
 
-Command: TypeAlias = Build | Info | Render | Demo
+@dataclass
+class Bench:
+    """Measure speed against error, beside peers, and write JSON, tables and pictures (docs/results.md)."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("v3dg_bench")
+    """Folder for the results; made if it is not there."""
+    preset: Literal["small", "full"] = "small"
+    """small takes minutes on two cores, full wants a GPU."""
+    parts: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
+    """Which parts of the evaluation; all if not given."""
+    asset: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Trained asset, a .ply file, in place of the one that v3dg makes itself."""
+    layout: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Published layout (.json) of the instances of that asset and of cameras."""
+    peers: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """What other tools made of that asset (v3dg/bench/parts/merging.py says how)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to build and draw; auto is a CUDA device where there is one and torch can use it."""
+    seed: int = 0
+    """Seed of assets, layouts and builds."""
+    threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """CPU threads; all if not given."""
+    json: bool = False
+    """Print the results as JSON."""
+    quiet: bool = False
+    """Show no progress."""
+
+
+Command: TypeAlias = Build | Info | Render | Demo | Bench
 _COMMANDS: Any = (
     Annotated[Build, tyro.conf.subcommand("build")]
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
 
@@ -541,6 +570,34 @@ def _demo(options: Demo) -> None:
     )
 
 
+def _bench(options: Bench) -> None:
+    for path, suffix in ((options.asset, ".ply"), (options.layout, ".json")):
+        if path is not None:
+            _require(path, suffix)
+    if options.layout is not None and options.asset is None:
+        raise _UsageError("--layout: expected --asset with it, the asset that it places")
+    from v3dg import _device, bench
+
+    stage = bench.Stage(
+        bench.PRESETS[options.preset],
+        _device.resolve(options.device),
+        options.output,
+        seed=options.seed,
+        asset_path=options.asset,
+        layout_path=options.layout,
+        peers=options.peers,
+    )
+    results = bench.run(stage, options.preset, options.parts or bench.NAMES, quiet=options.quiet)
+
+    def text() -> str:
+        sections = [
+            f"## {bench.part(name).TITLE}\n\n{bench.part(name).tables(r)}" for name, r in results.items()
+        ]
+        return "\n\n".join([*sections, f"Plots and a page: python -m v3dg.bench.report {options.output}"])
+
+    _print(options.json, results, text)
+
+
 def _print(as_json: bool, result: dict[str, Any], text: Callable[[], str]) -> None:
     print(json.dumps(result, indent=1) if as_json else text())
 
@@ -581,7 +638,13 @@ def _safe(name: str) -> str:
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
 
 
-_RUN: dict[type[Any], Callable[[Any], None]] = {Build: _build, Info: _info, Render: _render, Demo: _demo}
+_RUN: dict[type[Any], Callable[[Any], None]] = {
+    Build: _build,
+    Info: _info,
+    Render: _render,
+    Demo: _demo,
+    Bench: _bench,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,41 +1,19 @@
-"""What benchmarks on a GPU share: time, memory, errors, and gsplat as the peer to compare with."""
+"""What benchmarks on a GPU share: memory, errors, and gsplat as the peer to compare with."""
 
 from __future__ import annotations
 
-import statistics
 import threading
-from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
 import torch
 
 import v3dg
+from v3dg.bench.measure import Time, time_ms
 from v3dg.cameras import Camera
 from v3dg.scene import Scene
 
 DEVICE = "cuda"
-
-
-def machine() -> dict[str, str]:
-    """The GPU and the versions that its numbers belong to."""
-    return {"gpu": torch.cuda.get_device_name(), "cuda": str(torch.version.cuda), "torch": torch.__version__}
-
-
-def median_ms(call: Callable[[], Any], repeats: int) -> float:
-    """Median time of a call by the GPU's clock, after a warm-up; waiting for Python counts."""
-    for _ in range(2):
-        call()
-    times = []
-    for _ in range(repeats):
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        torch.cuda.synchronize()
-        start.record()
-        call()
-        end.record()
-        torch.cuda.synchronize()
-        times.append(start.elapsed_time(end))
-    return statistics.median(times)
 
 
 class PeakMemory:
@@ -44,13 +22,13 @@ class PeakMemory:
     Sampled every few milliseconds, from the driver: it sees everybody's allocations, and what a pool keeps.
     """
 
-    _idle: int | None = None
+    _idle = 0
 
     def __enter__(self) -> PeakMemory:
         torch.cuda.synchronize()
         torch.cuda.empty_cache()
         self._least = torch.cuda.mem_get_info()[0]
-        if PeakMemory._idle is None:
+        if not PeakMemory._idle:
             PeakMemory._idle = self._least
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._watch)
@@ -110,6 +88,16 @@ def _left_products(quaternions: Any) -> Any:
     w, x, y, z = torch.as_tensor(quaternions).unbind(-1)
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def time_gsplat(gaussians: v3dg.Gaussians, camera: Camera, repeats: int) -> Time:
+    """A frame of gsplat's, packed or not: the quicker one counts."""
+
+    @torch.no_grad()
+    def measure(packed: bool) -> Time:
+        return time_ms(lambda: gsplat_picture(gaussians, camera, packed=packed), DEVICE, repeats)
+
+    return min((measure(packed) for packed in (True, False)), key=lambda t: t.median)
 
 
 def gsplat_picture(

@@ -1,0 +1,249 @@
+"""The evaluation: its baselines, its measures, a small run of it, and the page that is made of that."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import v3dg
+from reference.project import project
+from v3dg import bench, cli
+from v3dg.bench import measure, report
+from v3dg.bench.assets import hair_lines, like_trained, many_copies, sky_dome
+from v3dg.bench.hierarchy import HierarchyScene, build_hierarchy
+from v3dg.bench.parts import motion
+from v3dg.build import BuildConfig, build_bundle
+from v3dg.cameras import Camera
+from v3dg.procedural import make_asset
+
+TINY = replace(
+    bench.PRESETS["small"],
+    asset_gaussians=1500,
+    instances=7,
+    size=(64, 36),
+    distances=2,
+    repeats=1,
+    composed_repeats=1,
+    steps=(0, 2),
+    tree_steps=2,
+    large_copies=2,
+    large_steps=2,
+    motion_frames=3,
+    hierarchy_instances=3,
+    hard_gaussians=400,
+    counts=(2000,),
+    close_views=1,
+    close_px=48,
+    panel=32,
+)
+
+
+def eye_camera(distance: float) -> Camera:
+    return Camera.look_at((0, -distance, 0.6 * distance), (0, 0, 0), width=96, height=64)
+
+
+@pytest.fixture(scope="module")
+def asset():
+    return make_asset(1500)
+
+
+@pytest.fixture(scope="module")
+def scene(asset):
+    scene = v3dg.Scene()
+    rng = np.random.default_rng(3)
+    quaternions = rng.normal(size=(5, 4))
+    bundle = build_bundle(asset, config=BuildConfig(steps=0), progress=False, device="cpu")
+    scene.add(bundle, rng.uniform(-4, 4, (5, 3)), quaternions, rng.uniform(0.5, 2, 5))
+    return scene
+
+
+@pytest.mark.parametrize("target_px", [0.0, 3.0, 20.0, 1e9])
+def test_cut_of_the_hierarchy_has_one_node_above_every_leaf(asset, scene, target_px):
+    hierarchy = build_hierarchy(asset)
+    instance, node, way = HierarchyScene(hierarchy, scene, "cpu").cut(eye_camera(12), target_px)
+    chosen = np.zeros((len(scene), len(hierarchy.parent)), int)
+    np.add.at(chosen, (instance, node), 1)
+    leaves = np.arange(len(hierarchy.parent) - hierarchy.num_leaves, len(hierarchy.parent))
+    above, at = np.zeros((len(scene), len(leaves)), int), leaves
+    while True:
+        above += chosen[:, at]
+        if (at == 0).all():
+            break
+        # The root counts once, however long the path to it.
+        above[:, at == 0] -= chosen[:, [0]]
+        at = hierarchy.parent[at]
+    assert (above == 1).all()
+    assert ((way >= 0) & (way <= 1)).all()
+
+
+def test_hierarchy_at_size_zero_draws_the_asset(asset, scene):
+    theirs = HierarchyScene(build_hierarchy(asset), scene, "cpu")
+    found = theirs.gaussians(theirs.cut(eye_camera(12), 0.0))
+    expected = v3dg.select(scene, eye_camera(12), tolerance=0, cull=False).gaussians()
+    order = [np.lexsort(g.means.T) for g in (found, expected)]
+    np.testing.assert_allclose(found.means[order[0]], expected.means[order[1]], atol=1e-5)
+    np.testing.assert_allclose(found.opacities[order[0]], expected.opacities[order[1]], atol=1e-6)
+
+
+def test_hierarchy_keeps_moments_and_shares_axes(asset):
+    hierarchy = build_hierarchy(asset)
+    nodes, parent = hierarchy.gaussians, hierarchy.parent
+    first = len(parent) // 3  # somewhere inside
+    siblings = np.flatnonzero(parent == parent[first])
+    assert len(siblings) == hierarchy.num_siblings[first] == 2
+    low, high = nodes.means[siblings].min(axis=0), nodes.means[siblings].max(axis=0)
+    mean = nodes.means[parent[first]]
+    assert ((mean >= low - 1e-6) & (mean <= high + 1e-6)).all()
+    np.testing.assert_array_less(hierarchy.box[parent, 0], hierarchy.box[:, 0] + 1e-6)
+    np.testing.assert_array_less(hierarchy.box[:, 1], hierarchy.box[parent, 1] + 1e-6)
+    # Axes are named alike: no turn of more than 63 degrees, the farthest from all 24 that map axes to axes.
+    turn = np.abs((nodes.quats * nodes.quats[parent]).sum(axis=1)) / np.linalg.norm(
+        nodes.quats[parent], axis=1
+    )
+    assert turn.min() > np.cos(np.radians(63 / 2))
+
+
+def test_siblings_on_the_verge_of_their_parent_cover_as_it_does(asset, scene):
+    hierarchy = build_hierarchy(asset)
+    theirs = HierarchyScene(hierarchy, scene, "cpu")
+    pair = np.flatnonzero(hierarchy.parent == 5)
+    zero, one = np.zeros(2, np.int32), np.ones(2, np.float32)
+    found = theirs.gaussians((zero, pair, one))
+    above = theirs.gaussians((zero[:1], np.array([5]), np.zeros(1, np.float32)))
+    np.testing.assert_allclose(found.means, np.repeat(above.means, 2, 0), atol=1e-6)
+    covered = 1 - np.prod(1 - found.opacities)
+    assert covered == pytest.approx(min(above.opacities[0], 0.999), abs=1e-4)
+
+
+def test_screen_radii_follow_the_projection(asset):
+    camera = eye_camera(3)
+    expected = project(asset, camera, filter_px2=0.0)
+    sigmas = np.clip(np.sqrt(2 * np.log(np.maximum(asset.opacities * 255, 1))), 0, 3.33)
+    variance = np.maximum(expected.covariance_px2[:, 0, 0], expected.covariance_px2[:, 1, 1])
+    radii = measure.screen_radii(asset, camera)
+    inside = radii > 0
+    assert inside.mean() > 0.5
+    np.testing.assert_allclose(radii[inside], (sigmas * np.sqrt(variance))[inside], rtol=1e-3)
+
+
+def test_clip_leaves_at_most_as_many_as_wanted(asset):
+    radii = measure.screen_radii(asset, eye_camera(3))
+    clip = measure.clip_radius_for(radii, 400)
+    assert 390 <= (radii > clip).sum() <= 400
+
+
+def test_tolerance_for_a_count_is_the_smallest_that_fits(scene):
+    camera = eye_camera(12)
+    tolerance = measure.tolerance_for(scene, camera, 3000)
+    assert v3dg.select(scene, camera, tolerance=tolerance).num_gaussians <= 3000
+    assert v3dg.select(scene, camera, tolerance=0.999 * tolerance).num_gaussians > 3000
+
+
+def test_judge_keeps_the_order_and_knows_equal_pictures():
+    judge = measure.Judge()
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    try:
+        same, other = judge.errors([(truth, truth), (truth, 255 - truth)])
+    finally:
+        judge.close()
+    assert same == {"flip": 0.0, "psnr": None}
+    assert other["flip"] > 0.1
+    assert other["psnr"] < 20
+
+
+def test_popping_is_what_a_frame_changes_beyond_the_truth():
+    row = motion.summary("ours", [0.3, 0.5], [0.1, 0.2], [0.2, 0.2])
+    assert row["above_truth"] == pytest.approx(0.25)
+    assert row["worst_above_truth"] == pytest.approx(0.3)
+    assert row["above_full"] == pytest.approx(0.2)
+
+
+def test_made_assets_are_as_many_as_asked_for_and_repeat():
+    camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=64, height=36)
+    for made in (
+        lambda: hair_lines(333),
+        lambda: sky_dome(333),
+        lambda: like_trained(333, camera, "cpu", sh_degree=1),
+        lambda: many_copies(make_asset(1000), 3).subset(slice(333)),
+    ):
+        first, again = made(), made()
+        assert len(first) == 333
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+            assert np.isfinite(getattr(first, name)).all()
+
+
+def test_a_picture_that_changes_between_runs_is_refused(tmp_path, scene, monkeypatch):
+    stage = bench.Stage(TINY, "cpu", tmp_path)
+    view = bench.stage.orbit_view(0, 45, 12, (64, 36))
+    real, drawn = bench.stage.render, []
+
+    def flickering(*arguments, **options):
+        drawn.append(1)
+        return real(*arguments, **options, background=(len(drawn) / 10, 0.0, 0.0))
+
+    monkeypatch.setattr(bench.stage, "render", flickering)
+    with pytest.raises(RuntimeError, match="same on every run"):
+        stage.shoot(scene, view)
+
+
+def test_unknown_part_is_refused(capsys, tmp_path):
+    assert cli.main(["bench", "-o", str(tmp_path), "--parts", "tolerances"]) == 1
+    assert "expected some of tolerance, composed" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """All parts, as small as can be."""
+    folder = tmp_path_factory.mktemp("bench")
+    stage = bench.Stage(TINY, "cpu", folder)
+    return folder, bench.run(stage, "tiny", bench.NAMES, quiet=True)
+
+
+@pytest.mark.slow
+def test_every_part_writes_what_it_measured(results):
+    folder, measured = results
+    assert set(measured) == set(bench.NAMES)
+    for name, result in measured.items():
+        written = json.loads((folder / f"{name}.json").read_text())
+        assert {"commit", "command", "processor", "seed", "seconds"} <= set(written)
+        assert written["part"] == name
+        for picture in result["pictures"]:
+            assert (folder / picture).stat().st_size > 0
+        assert "|" in bench.part(name).tables(result)
+
+
+@pytest.mark.slow
+def test_clipping_is_compared_at_equal_counts(results):
+    for row in results[1]["clipping"]["rows"]:
+        assert row["clipped_in_frustum"] <= row["ours_in_frustum"]
+        assert row["clipped_in_frustum"] > 0.9 * row["ours_in_frustum"]
+
+
+@pytest.mark.slow
+def test_page_begins_with_wins_and_losses(results):
+    folder, _ = results
+    text = report.page([folder], folder / "results.md")
+    beginning = text.splitlines()[:10]
+    assert any(line.startswith("**Where we win**: ") for line in beginning)
+    assert any(line.startswith("**Where we do not**: ") for line in beginning)
+    for name in bench.NAMES:
+        assert f"### {bench.part(name).TITLE}" in text
+    assert "](clipping.jpg)" in text
+
+
+@pytest.mark.slow
+def test_plots_are_drawn(results):
+    pytest.importorskip("matplotlib")
+    folder, _ = results
+    report.draw_plots(folder)
+    assert (folder / "tolerance.png").stat().st_size > 1000
+
+
+def test_report_of_an_empty_folder_says_what_to_run(tmp_path):
+    with pytest.raises(ValueError, match="run `v3dg bench` first"):
+        report.read_results(tmp_path)

@@ -1,0 +1,156 @@
+"""Assets to measure with: many copies of a small one, and random gaussians that look trained."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+import v3dg
+from v3dg.scene import rotation_from_quaternion
+
+
+def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3dg.Gaussians:
+    """Copies of an asset as one: turned at random, half to twice as large, side by side on a square.
+
+    What of the colour depends on the view is not turned with them.
+    """
+    rng = np.random.default_rng(seed)
+    side = math.isqrt(num_copies - 1) + 1
+    pitch = float(np.linalg.norm(np.ptp(asset.means, axis=0)))
+    copies = []
+    for i in range(num_copies):
+        place = pitch * np.array([i % side + rng.uniform(-0.3, 0.3), i // side + rng.uniform(-0.3, 0.3), 0])
+        turn = rng.normal(size=4)
+        turn /= np.linalg.norm(turn)
+        scale = np.float32(2 ** rng.uniform(-1, 1))
+        rotation = np.float32(scale * rotation_from_quaternion(turn))
+        w, x, y, z = turn
+        product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], np.float32)
+        copies.append(
+            v3dg.Gaussians(
+                means=asset.means @ rotation.T + np.float32(place),
+                quats=asset.quats @ product.T,
+                scales=asset.scales * scale,
+                opacities=asset.opacities,
+                sh=asset.sh,
+            )
+        )
+    return v3dg.Gaussians.concatenate(copies)
+
+
+class _Random:
+    """Seeded float32 numbers where they are needed: NumPy's on the CPU, torch's on another device."""
+
+    def __init__(self, device: str, seed: int) -> None:
+        self._device = device
+        if device == "cpu":
+            self.library: Any = np
+            self._rng: Any = np.random.default_rng(seed)
+        else:
+            import torch
+
+            self.library = torch
+            self._rng = torch.Generator(device).manual_seed(seed)
+
+    def uniform(self, *shape: int) -> Any:
+        if self.library is np:
+            return self._rng.random(shape, np.float32)
+        return self.library.rand(*shape, generator=self._rng, device=self._device)
+
+    def normal(self, *shape: int) -> Any:
+        if self.library is np:
+            return self._rng.standard_normal(shape, np.float32)
+        return self.library.randn(*shape, generator=self._rng, device=self._device)
+
+    def array(self, values: Any) -> Any:
+        if self.library is np:
+            return np.asarray(values, np.float32)
+        return self.library.as_tensor(values, dtype=self.library.float32, device=self._device)
+
+
+def like_trained(
+    count: int, camera: v3dg.Camera, device: str, *, sh_degree: int = 0, seed: int = 0
+) -> v3dg.Gaussians:
+    """Random gaussians before a camera with the sizes, shapes and opacities that training leaves.
+
+    The distributions are fitted to a trained asset: logs of sizes are normal with deviation 1, logs of the
+    ratios of neighbouring axes are gamma of shape 3 (median ratios 3 and 4), logits of opacities are normal.
+    Training spends gaussians where they show, so sizes on screen do not depend on depth: the longest axis has
+    a median of 2 px (the middle one 0.7 px), and one in a thousand passes 40 px. Depths are log-uniform over
+    a factor of 20, places uniform on the image and a little beyond it. NumPy arrays on the CPU, else tensors.
+    """
+    random = _Random(device, seed)
+    uniform, normal, array = random.uniform, random.normal, random.array
+    join, exp = random.library.concatenate, random.library.exp
+
+    depth = 2 * 20 ** uniform(count, 1)
+    tangent = array([camera.width / camera.fx, camera.height / camera.fy]) / 2
+    view = join([1.1 * tangent * (2 * uniform(count, 2) - 1) * depth, depth], 1)
+    means = view @ array(camera.viewmat[:3, :3]) + array(camera.position)
+
+    longest = 2 * exp(normal(count, 1)) * depth / camera.fx
+    # A uniform number may be 0, one less never is.
+    ratios = exp(array([0.4, 0.5]) * random.library.log(1 - uniform(count, 3, 2)).sum(1))
+    middle = longest * ratios[:, :1]
+    sh = join([uniform(count, 1, 3) * 3.4 - 1.7, 0.2 * normal(count, (sh_degree + 1) ** 2 - 1, 3)], 1)
+    return v3dg.Gaussians(
+        means=means,
+        quats=normal(count, 4),
+        scales=join([longest, middle, middle * ratios[:, 1:]], 1),
+        opacities=1 / (1 + exp(-(0.6 + 2.3 * normal(count)))),
+        sh=sh,
+    )
+
+
+def hair_lines(count: int, *, seed: int = 0) -> v3dg.Gaussians:
+    """Bent wires within a ball of radius 1, a 3,000th of it thick: what falls between pixels."""
+    rng = np.random.default_rng(seed)
+    wires = max(4, count // 100)
+    wire = np.arange(count) % wires
+    along = (np.arange(count) // wires + 0.5) * wires / count * 2 - 1
+
+    def unit(v: Any) -> Any:
+        return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+    direction, side = unit(rng.normal(size=(wires, 3))), rng.normal(size=(wires, 3))
+    side = unit(side - direction * (side * direction).sum(1, keepdims=True))
+    bend, offset = rng.uniform(-0.5, 0.5, wires), rng.normal(scale=0.3, size=(wires, 3))
+    s, b = along[:, None], bend[wire, None]
+    means = 0.7 * (direction[wire] * s + side[wire] * b * s * s) + offset[wire]
+    tangent = unit(direction[wire] + 2 * b * s * side[wire])
+    scales = np.array([0.7 * wires / count, 1 / 3000, 1 / 3000]) * np.ones((count, 1))
+    color = np.where(rng.random((wires, 1)) < 0.5, [0.9, 0.85, 0.7], [0.85, 0.25, 0.15])[wire]
+    return _gaussians(means, _quats_from_x(tangent), scales, np.full(count, 0.95), color)
+
+
+def sky_dome(count: int, *, seed: int = 0) -> v3dg.Gaussians:
+    """Huge soft gaussians on half a sphere of radius 1: blue above, haze at the horizon, clouds."""
+    rng = np.random.default_rng(seed)
+    z = (np.arange(count) + 0.5) / count
+    turn = np.arange(count) * math.pi * (3 - math.sqrt(5))
+    flat = np.sqrt(1 - z * z)
+    outwards = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], 1)
+    spacing = math.sqrt(2 * math.pi / count)
+    waves = np.sin(outwards @ rng.normal(scale=9, size=(3, 6)) + rng.uniform(0, 6.28, 6)).mean(
+        1, keepdims=True
+    )
+    cloud = np.clip(3 * waves, 0, 1)
+    blue = np.array([0.75, 0.82, 0.9]) * (1 - z[:, None]) + np.array([0.15, 0.35, 0.75]) * z[:, None]
+    scales = spacing * np.array([0.05, 1.2, 1.2]) * np.exp(rng.normal(scale=0.2, size=(count, 3)))
+    opacities = rng.uniform(0.3, 0.8, count)
+    return _gaussians(outwards, _quats_from_x(outwards), scales, opacities, blue * (1 - cloud) + cloud)
+
+
+def _quats_from_x(x: Any) -> Any:
+    """Rotations that take the x axis to unit vectors: half a turn about the middle between the two."""
+    middle = x + np.array([1.0, 0.0, 0.0])
+    middle[np.linalg.norm(middle, axis=1) < 1e-6] = [0.0, 1.0, 0.0]
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    return np.concatenate([np.zeros((len(x), 1)), middle], 1)
+
+
+def _gaussians(means: Any, quats: Any, scales: Any, opacities: Any, color: Any) -> v3dg.Gaussians:
+    sh = (color[:, None] - 0.5) / 0.28209479177387814
+    return v3dg.Gaussians(*(np.asarray(a, np.float32) for a in (means, quats, scales, opacities, sh)))

@@ -1,0 +1,196 @@
+"""What is measured: times of calls, errors of pictures, tolerances at equal counts, who a clip leaves out."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _device, metrics
+from v3dg.cameras import Camera
+from v3dg.gaussians import Gaussians
+from v3dg.pictures import to_8bit
+from v3dg.render import render
+from v3dg.scene import Scene
+from v3dg.select import select
+
+Row = dict[str, Any]
+Picture = npt.NDArray[np.uint8]
+
+SUPERSAMPLING = 2
+"""Truth has so many times the pixels a side, box-averaged: 4K for 1080p, as in the paper."""
+
+_WARM_UPS = 1
+_HALVINGS = 30
+# gsplat 1.5: a gaussian ends where it falls below 1/255, and at 3.33 standard deviations.
+_MIN_ALPHA, _REACH_SIGMAS = 1 / 255, 3.33
+_FRUSTUM_MARGIN = 0.15  # of half the picture, to either side, on which the projection is linearised
+
+
+@dataclass(frozen=True)
+class Time:
+    """Milliseconds of one call: the median of several, and the quickest and slowest."""
+
+    median: float
+    least: float
+    most: float
+
+    def row(self, name: str) -> Row:
+        return {
+            f"{name}_ms": round(self.median, 3),
+            f"{name}_ms_range": [round(self.least, 3), round(self.most, 3)],
+        }
+
+
+def time_ms(call: Callable[[], Any], device: str, repeats: int) -> Time:
+    """Time single calls from an idle device to an idle device, after a warm-up; Python's share counts."""
+    for _ in range(_WARM_UPS):
+        call()
+    clock = _cuda_ms if device == "cuda" else _wall_ms
+    times = [clock(call) for _ in range(repeats)]
+    return Time(statistics.median(times), min(times), max(times))
+
+
+def _wall_ms(call: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    call()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def _cuda_ms(call: Callable[[], Any]) -> float:
+    import torch
+
+    event: Any = torch.cuda.Event
+    start, end = (event(enable_timing=True) for _ in range(2))
+    torch.cuda.synchronize()
+    start.record()
+    call()
+    end.record()
+    torch.cuda.synchronize()
+    return float(start.elapsed_time(end))
+
+
+def draw_truth(subject: Any, camera: Camera, device: str) -> Picture:
+    """All gaussians at `SUPERSAMPLING` times the resolution, clipped as a screen does, box-averaged."""
+    color = render(subject, camera.scaled(SUPERSAMPLING), tolerance=0.0, device=device).color
+    return as_picture(metrics.box_downsample(color.clip(0, 1), SUPERSAMPLING))
+
+
+def as_picture(color: Any) -> Picture:
+    """What a screen shows of a colour array from any device: 8 bits a channel, rounded where the array is."""
+    if isinstance(color, np.ndarray):
+        return to_8bit(color)
+    import torch
+
+    picture: Picture = (color.detach().clip(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+    return picture
+
+
+def _flip_and_psnr(pair: tuple[Picture, Picture]) -> tuple[float, float]:
+    truth, picture = (p.astype(np.float32) / np.float32(255) for p in pair)
+    return metrics.flip(truth, picture), metrics.psnr(truth, picture)
+
+
+class Judge:
+    """FLIP and PSNR of many pairs of pictures, on all cores; never while something is timed.
+
+    Processes are started when they are first needed and stay until `close`.
+    """
+
+    def __init__(self) -> None:
+        self._pool: ProcessPoolExecutor | None = None
+
+    def errors(self, pairs: Iterable[tuple[Picture, Picture]]) -> list[Row]:
+        """{"flip", "psnr"} of each (truth, picture); PSNR is None for equal pictures."""
+        if self._pool is None:
+            # A forked process would inherit CUDA and OpenMP in a state that neither survives.
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=context)
+        found = self._pool.map(_flip_and_psnr, pairs)
+        return [
+            {"flip": round(flip, 5), "psnr": round(psnr, 2) if math.isfinite(psnr) else None}
+            for flip, psnr in found
+        ]
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+
+
+def mean_of(rows: Sequence[Row], *names: str) -> Row:
+    """Means of columns; None where every value is missing."""
+    means: Row = {}
+    for name in names:
+        values = [row[name] for row in rows if row.get(name) is not None]
+        means[name] = float(f"{statistics.fmean(values):.6g}") if values else None
+    return means
+
+
+def tolerance_for(scene: Scene, camera: Camera, count: int) -> float:
+    """The smallest tolerance, as far as bisection sees, at which at most `count` gaussians are selected."""
+
+    def fits(tolerance: float) -> bool:
+        return select(scene, camera, tolerance=tolerance).num_gaussians <= count
+
+    return _bisect(fits, 1e-4, 1e6)
+
+
+def _bisect(fits: Callable[[float], bool], low: float, high: float) -> float:
+    """Where `fits` begins to hold, on a logarithmic scale; `high` must."""
+    for _ in range(_HALVINGS):
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if fits(middle) else (middle, high)
+    return high
+
+
+def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
+    """(N,) px: half the larger side of the box in which gsplat 1.5 draws each gaussian; 0 outside of it.
+
+    Its `radius_clip` leaves out what is not larger. It rounds radii up first; unrounded ones leave room for
+    any count, and to choose among what is of one size.
+    """
+    library = _device.library_of(gaussians.means)
+    viewmat = _device.like(camera.viewmat, gaussians.means)
+    world_to_view = viewmat[:3, :3]
+    view = gaussians.means @ world_to_view.T + viewmat[:3, 3]
+    depth = view[:, 2].clip(camera.near)
+    w, x, y, z = (gaussians.quats / library.linalg.norm(gaussians.quats, axis=1)[:, None]).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    axes = library.stack([library.stack(row, -1) for row in rows], -2)
+    halves = world_to_view @ (axes * gaussians.scales[:, None, :])  # covariance in the view: halves halvesᵀ
+    centers, variances = [], []
+    for axis, size, focal, principal in (
+        (0, camera.width, camera.fx, camera.cx),
+        (1, camera.height, camera.fy, camera.cy),
+    ):
+        margin = _FRUSTUM_MARGIN * size / focal
+        slope = (view[:, axis] / depth).clip(-principal / focal - margin, (size - principal) / focal + margin)
+        variance = (((halves[:, axis] - slope[:, None] * halves[:, 2]) * (focal / depth)[:, None]) ** 2).sum(
+            -1
+        )
+        variances.append(variance)
+        centers.append(focal * view[:, axis] / depth + principal)
+    sigmas = (2 * library.log((gaussians.opacities / _MIN_ALPHA).clip(1))) ** 0.5
+    radii = [sigmas.clip(0, _REACH_SIGMAS) * variance**0.5 for variance in variances]
+    inside = view[:, 2] > camera.near
+    for center, radius, size in zip(centers, radii, (camera.width, camera.height), strict=True):
+        inside = inside & (center + radius > 0) & (center - radius < size)
+    return library.maximum(*radii) * inside
+
+
+def clip_radius_for(radii: Any, count: int) -> float:
+    """The smallest clip, in px, that leaves at most `count` gaussians."""
+    return _bisect(lambda clip: int((radii > clip).sum()) <= count, 1e-3, 1e5)

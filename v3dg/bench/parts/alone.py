@@ -1,0 +1,309 @@
+"""Rasterizer, split, selection and build alone: time, share of the machine's limit, growth with size."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+from v3dg import _core, _device, _operations
+from v3dg.bench.assets import like_trained, many_copies
+from v3dg.bench.measure import Row, as_picture, time_ms
+from v3dg.bench.stage import Stage
+from v3dg.bench.table import Column, count_text, markdown
+from v3dg.bench.verdict import Verdict
+from v3dg.build import BuildConfig
+from v3dg.cameras import Camera
+from v3dg.gaussians import Gaussians
+from v3dg.metrics import psnr
+from v3dg.rasterize import intrinsics, rows_of, view_of_world
+from v3dg.render import DEFAULT_TOLERANCE, render
+from v3dg.scene import Scene
+from v3dg.select import select
+
+TITLE = "Rasterizer, split, selection, build alone"
+ABOUT = (
+    "Random gaussians of the sizes that training leaves. Share is that of the machine's speed of copying "
+    "memory, if every input were read and every output written once; the rasterizer's picture is checked "
+    "against double precision (a small one on the CPU) or against gsplat, in the same run, before its time "
+    "counts."
+)
+
+_COPIED_BYTES = 256 << 20
+_MOST_BUILT = {"cpu": 20_000, "cuda": 10_000_000}
+_MOST_DRAWN = {"cpu": 1_000_000, "cuda": 20_000_000}
+_LEAST_PSNR = 40.0
+
+
+def run(stage: Stage) -> dict[str, Any]:
+    bandwidth = copy_bandwidth(stage.device)
+    counts = stage.settings.counts
+    most_drawn, most_built = _MOST_DRAWN[stage.device], _MOST_BUILT[stage.device]
+    return {
+        "copy_gigabytes_a_second": round(bandwidth / 1e9, 2),
+        "rasterize": [rasterize_row(stage, n, bandwidth) for n in counts if n <= most_drawn],
+        "split": [split_row(stage, n, bandwidth) for n in counts],
+        "select": [select_row(stage, n) for n in counts],
+        "build": [build_row(stage, n) for n in counts if n <= most_built],
+        "threads": threads_rows(stage) if stage.device == "cpu" else [],
+    }
+
+
+def copy_bandwidth(device: str) -> float:
+    """Bytes a second, read and written, of one large copy."""
+    source = np.ones(_COPIED_BYTES, np.uint8)
+    if device == "cpu":
+        target = np.empty_like(source)
+        copied = time_ms(lambda: np.copyto(target, source), device, 5)
+    else:
+        import torch
+
+        on_device = torch.from_numpy(source).to(device)
+        result = torch.empty_like(on_device)
+        copied = time_ms(lambda: result.copy_(on_device), device, 5)
+    return 2 * _COPIED_BYTES / (copied.median / 1e3)
+
+
+def rasterize_row(stage: Stage, count: int, bandwidth: float) -> Row:
+    width, height = stage.settings.size
+    camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=width, height=height)
+    gaussians = like_trained(count, camera, stage.device, seed=stage.seed)
+
+    def draw() -> Any:
+        return render(gaussians, camera, device=stage.device)
+
+    picture = draw()
+    row: Row = {"gaussians": count, "gaussians_in_frustum": picture.stats.gaussians_in_frustum}
+    if stage.device == "cuda":
+        row |= gsplat_peer(stage, gaussians, camera, picture.color)
+    else:
+        row["psnr_to_float64"] = psnr_to_float64(gaussians, camera, picture.color)
+    renderer = _renderer(gaussians, stage.device)
+    timed = time_ms(lambda: renderer(camera), stage.device, stage.settings.repeats)
+    row |= timed.row("frame")
+    num_bytes = 4 * (
+        sum(array[:1].size if stage.device == "cpu" else array[:1].numel() for array in rows_of(gaussians))
+        * count
+        + 5 * width * height
+    )
+    row |= {"bytes": num_bytes, "share": round(num_bytes / (timed.median / 1e3) / bandwidth, 4)}
+    return row
+
+
+def _renderer(gaussians: Gaussians, device: str) -> Any:
+    """What draws an asset that is where it is drawn, without handing it over each time."""
+    if device == "cuda":
+        from v3dg.render import Renderer
+
+        renderer = Renderer(gaussians)
+        return lambda camera: renderer.render(camera).stats
+    return lambda camera: render(gaussians, camera).stats
+
+
+def psnr_to_float64(gaussians: Gaussians, camera: Camera, color: Any) -> float:
+    model = _core.ModelDouble(*(array.astype(np.float64) for array in rows_of(gaussians)))
+    lens = (intrinsics(camera), camera.width, camera.height, [0.0] * 3, False, False)
+    exact = _core.rasterize(model, view_of_world(camera), 0.0, False, *lens)[0]
+    return _checked_psnr(exact.astype(np.float32), color)
+
+
+def _checked_psnr(expected: Any, color: Any) -> float:
+    found = psnr(*(as_picture(c).astype(np.float32) / 255 for c in (expected, color)))
+    if not found >= _LEAST_PSNR:
+        raise RuntimeError(f"picture: expected at least {_LEAST_PSNR:g} dB to the reference, got {found:.1f}")
+    return round(min(found, 99.0), 2)
+
+
+def gsplat_peer(stage: Stage, gaussians: Gaussians, camera: Camera, color: Any) -> Row:
+    import torch
+
+    from v3dg.bench import gpu
+
+    with torch.no_grad():
+        expected = gpu.gsplat_picture(gaussians, camera, packed=True)[0]
+    row: Row = {"psnr_to_gsplat": _checked_psnr(expected, color)}
+    row |= gpu.time_gsplat(gaussians, camera, stage.settings.repeats).row("gsplat")
+    torch.cuda.empty_cache()
+    return row
+
+
+def split_row(stage: Stage, count: int, bandwidth: float) -> Row:
+    means: Any = np.random.default_rng(stage.seed).standard_normal((count, 3), np.float32)
+    on_device = means
+    size = BuildConfig().cluster_size
+    if stage.device == "cuda":
+        import torch
+
+        on_device = torch.from_numpy(means).to(stage.device)
+        if count <= 1_000_000:
+            order, _ = _operations.median_split(on_device, size)
+            if not np.array_equal(_device.to_host(order), _operations.median_split(means, size)[0]):
+                raise RuntimeError("median_split: expected the same order on both devices, got another")
+    timed = time_ms(lambda: _operations.median_split(on_device, size), stage.device, stage.settings.repeats)
+    num_bytes = (12 + 8) * count
+    share = num_bytes / (timed.median / 1e3) / bandwidth
+    return {"points": count, **timed.row("split"), "bytes": num_bytes, "share": round(share, 4)}
+
+
+def select_row(stage: Stage, count: int) -> Row:
+    """A scene of so many gaussians, of instances of the asset, from where about half is coarse."""
+    bundle = stage.build().bundle
+    instances = max(1, count // len(stage.asset))
+    rng = np.random.default_rng(stage.seed)
+    side = 2.0 * instances**0.5
+    positions = np.column_stack([rng.uniform(-side, side, (instances, 2)), np.zeros(instances)])
+    scene = Scene()
+    scene.add(bundle, positions=positions)
+    camera = Camera.look_at((0, -2.0 * side, side), (0, 0, 0), width=1920, height=1080)
+
+    def choose() -> Any:
+        return select(scene, camera, tolerance=DEFAULT_TOLERANCE, device=stage.device)
+
+    chosen = choose()
+    timed = time_ms(choose, stage.device, stage.settings.repeats)
+    clusters = instances * len(bundle.clusters)
+    return {
+        "gaussians": instances * len(stage.asset),
+        "instances": instances,
+        "clusters": clusters,
+        "clusters_selected": len(chosen),
+        **timed.row("select"),
+        "clusters_a_second": round(clusters / (timed.median / 1e3)),
+    }
+
+
+def build_row(stage: Stage, count: int) -> Row:
+    copies = -(-count // len(stage.asset))
+    asset = many_copies(stage.asset, copies, seed=stage.seed).subset(slice(count))
+    start = time.perf_counter()
+    bundle = stage.build(BuildConfig(steps=stage.settings.large_steps), asset).bundle
+    seconds = time.perf_counter() - start
+    return {
+        "gaussians": count,
+        "steps": stage.settings.large_steps,
+        "levels": bundle.num_levels,
+        "seconds": round(seconds, 3),
+        "gaussians_a_second": round(count / seconds),
+        "mean_color_error": round(float(bundle.groups.error[:, 0].mean()), 5) if len(bundle.groups) else None,
+    }
+
+
+# A process a number of threads: OpenMP reads it once. Prints milliseconds of a split and of a frame.
+_SCRIPT = """
+import json, sys
+import numpy as np
+from v3dg import _operations
+from v3dg.bench.assets import like_trained
+from v3dg.bench.measure import time_ms
+from v3dg.cameras import Camera
+from v3dg.render import render
+count, width, height = map(int, sys.argv[1:])
+camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=width, height=height)
+gaussians = like_trained(count, camera, "cpu")
+times = {
+    "frame_ms": time_ms(lambda: render(gaussians, camera), "cpu", 5).median,
+    "split_ms": time_ms(lambda: _operations.median_split(gaussians.means, 256), "cpu", 5).median,
+}
+print(json.dumps(times))
+"""
+
+
+def threads_rows(stage: Stage) -> list[Row]:
+    cores = len(os.sched_getaffinity(0))
+    numbers = sorted({1, *(2**k for k in range(1, 9) if 2**k <= cores), cores})
+    count = min(max(stage.settings.counts), 100_000)
+    rows = []
+    for number in numbers:
+        done = subprocess.run(
+            [sys.executable, "-c", _SCRIPT, str(count), *map(str, stage.settings.size)],
+            env={**os.environ, "OMP_NUM_THREADS": str(number)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        rows.append({"threads": number, **json.loads(done.stdout)})
+    for row in rows:
+        row["frame_speedup"] = round(rows[0]["frame_ms"] / row["frame_ms"], 2)
+        row["split_speedup"] = round(rows[0]["split_ms"] / row["split_ms"], 2)
+    return rows
+
+
+_TABLES = {
+    "rasterize": (
+        Column("gaussians", "gaussians", "count"),
+        Column("in frustum", "gaussians_in_frustum", "count"),
+        Column("rasterize ms", "frame_ms", ".3f"),
+        Column("gsplat ms", "gsplat_ms", ".3f"),
+        Column("PSNR to gsplat", "psnr_to_gsplat", ".1f"),
+        Column("to float64", "psnr_to_float64", ".1f"),
+        Column("share of copying", "share", ".1%"),
+    ),
+    "split": (
+        Column("points", "points", "count"),
+        Column("split ms", "split_ms", ".3f"),
+        Column("share of copying", "share", ".1%"),
+    ),
+    "select": (
+        Column("gaussians", "gaussians", "count"),
+        Column("clusters", "clusters", "count"),
+        Column("selected", "clusters_selected", "count"),
+        Column("select ms", "select_ms", ".3f"),
+        Column("clusters a second", "clusters_a_second", "count"),
+    ),
+    "build": (
+        Column("gaussians", "gaussians", "count"),
+        Column("steps", "steps"),
+        Column("build s", "seconds", ".2f"),
+        Column("gaussians a second", "gaussians_a_second", "count"),
+        Column("colour error", "mean_color_error", ".4f"),
+    ),
+    "threads": (
+        Column("threads", "threads"),
+        Column("frame ms", "frame_ms", ".1f"),
+        Column("x", "frame_speedup", ".2f"),
+        Column("split ms", "split_ms", ".1f"),
+        Column("x", "split_speedup", ".2f"),
+    ),
+}
+
+
+def tables(result: dict[str, Any]) -> str:
+    text = [f"Copying memory: {result['copy_gigabytes_a_second']:g} GB/s, read and written."]
+    for name, columns in _TABLES.items():
+        if rows := result[name]:
+            shown = [c for c in columns if any(row.get(c.key) is not None for row in rows)]
+            text.append(markdown(shown, rows))
+    return "\n\n".join(text)
+
+
+def verdict(result: dict[str, Any]) -> Verdict:
+    out = Verdict()
+    for row in result["rasterize"]:
+        if "gsplat_ms" in row:
+            out.judge(
+                row["frame_ms"] < row["gsplat_ms"],
+                f"{count_text(row['gaussians'])} random gaussians: {row['frame_ms']:.2f} ms, gsplat "
+                f"{row['gsplat_ms']:.2f} ms, {row['psnr_to_gsplat']:.0f} dB apart",
+            )
+    return out
+
+
+def plot(result: dict[str, Any], figure: Any) -> None:
+    axes = figure.subplots()
+    for name, key, count in (
+        ("rasterize", "frame_ms", "gaussians"),
+        ("rasterize", "gsplat_ms", "gaussians"),
+        ("split", "split_ms", "points"),
+        ("select", "select_ms", "gaussians"),
+    ):
+        rows = [row for row in result[name] if key in row]
+        if rows:
+            axes.plot([r[count] for r in rows], [r[key] for r in rows], "o-", label=key.removesuffix("_ms"))
+    axes.set(xlabel="gaussians", ylabel="ms", xscale="log", yscale="log")
+    axes.legend()
+    axes.grid(alpha=0.3)

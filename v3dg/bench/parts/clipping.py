@@ -1,0 +1,106 @@
+"""Against clipping: leaving out what is small on screen, as gsplat's `radius_clip` does, at equal counts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from v3dg.bench.measure import Picture, Row, as_picture, clip_radius_for, screen_radii
+from v3dg.bench.sheet import crop, sheet
+from v3dg.bench.stage import Stage, View
+from v3dg.bench.table import Column, markdown
+from v3dg.bench.verdict import Verdict
+from v3dg.rasterize import rasterize
+from v3dg.select import select
+
+TITLE = "Against clipping what is small"
+ABOUT = (
+    "gsplat's `radius_clip` leaves out gaussians whose radius on screen is small. The clip that leaves as "
+    "many in the frustum as our cut has, by gsplat's rule, both drawn by our rasterizer."
+)
+
+_TOLERANCES = (3.0, 8.0, 16.0)
+
+
+def run(stage: Stage) -> dict[str, Any]:
+    scene = stage.place(stage.build().bundle)
+    views = [len(stage.line) // 2, len(stage.line) - 1]
+    rows: list[Row] = []
+    pictures: list[tuple[Picture, Picture]] = []
+    for index in views:
+        view = stage.line[index]
+        for tolerance in _TOLERANCES:
+            ours = stage.shoot(scene, view, tolerance)
+            clip, count, picture = clipped(stage, view, ours.stats.gaussians_in_frustum)
+            rows.append(
+                {
+                    **view.row(),
+                    "view": index,
+                    "tolerance": tolerance,
+                    "clip_px": round(clip, 4),
+                    "clipped_in_frustum": count,
+                }
+                | ours.row("ours")
+            )
+            pictures.append((ours.picture, picture))
+    pairs = [(stage.truth(row["view"]), p) for row, both in zip(rows, pictures, strict=True) for p in both]
+    errors = iter(stage.judge.errors(pairs))
+    for row in rows:
+        for name in ("ours", "clipped"):
+            row |= {f"{name}_{key}": value for key, value in next(errors).items()}
+    side = stage.settings.panel
+    stage.save(
+        "clipping",
+        sheet(
+            [
+                [
+                    ("truth", crop(stage.truth(row["view"]), side)),
+                    (f"ours, FLIP {row['ours_flip']:.4f}", crop(ours_picture, side)),
+                    (
+                        f"clipped below {row['clip_px']:.2g} px, FLIP {row['clipped_flip']:.4f}",
+                        crop(clipped_picture, side),
+                    ),
+                ]
+                for row, (ours_picture, clipped_picture) in zip(rows, pictures, strict=True)
+                if row["tolerance"] != _TOLERANCES[0]
+            ]
+        ),
+    )
+    return {"rows": rows}
+
+
+def clipped(stage: Stage, view: View, count: int) -> tuple[float, int, Picture]:
+    """The clip that leaves at most so many of the full scene's gaussians in the picture, and the picture."""
+    everything = select(stage.full_scene, view.camera, tolerance=0.0).gaussians(device=stage.device)
+    radii = screen_radii(everything, view.camera)
+    clip = clip_radius_for(radii, count)
+    kept = radii > clip
+    left = everything.subset(kept.nonzero()[0] if stage.device == "cpu" else kept.nonzero()[:, 0])
+    return clip, int(kept.sum()), as_picture(rasterize(left, view.camera).color)
+
+
+_TABLE = (
+    Column("distance", "distance", ".3g"),
+    Column("tolerance", "tolerance", "g"),
+    Column("clip, px", "clip_px", ".2f"),
+    Column("in frustum, ours", "ours_in_frustum", "count"),
+    Column("clipped", "clipped_in_frustum", "count"),
+    Column("FLIP, ours", "ours_flip", ".4f"),
+    Column("clipped", "clipped_flip", ".4f"),
+    Column("PSNR, ours", "ours_psnr", ".1f"),
+    Column("clipped", "clipped_psnr", ".1f"),
+)
+
+
+def tables(result: dict[str, Any]) -> str:
+    return markdown(_TABLE, result["rows"])
+
+
+def verdict(result: dict[str, Any]) -> Verdict:
+    out = Verdict()
+    row = max(result["rows"], key=lambda row: (row["distance"], row["tolerance"]))
+    out.judge(
+        row["ours_flip"] < row["clipped_flip"],
+        f"at equal counts ({row['ours_in_frustum']:,}) clipping small gaussians is at FLIP "
+        f"{row['clipped_flip']:.4f}, ours at {row['ours_flip']:.4f}",
+    )
+    return out

@@ -1,0 +1,150 @@
+"""Composed scenes (figures 6 and 7): the full assets against our cut, from near to far."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from v3dg.bench.measure import Picture, Row, draw_truth, mean_of
+from v3dg.bench.sheet import crop, sheet
+from v3dg.bench.stage import Stage, View
+from v3dg.bench.table import Column, count_text, markdown
+from v3dg.bench.verdict import Verdict
+from v3dg.render import DEFAULT_TOLERANCE
+from v3dg.scene import Scene
+
+TITLE = "Composed scenes"
+ABOUT = (
+    "Every gaussian at one sample a pixel against our cut at the default tolerance, same rasterizer. A row "
+    "is a distance: the mean over directions and elevations; FLIP and PSNR over those of the first "
+    "direction, against the full scene at twice the resolution, box-averaged."
+)
+
+
+def run(stage: Stage) -> dict[str, Any]:
+    scenes = []
+    for name, scene, views in stage.worlds():
+        rows, pictures = measure(stage, scene, views)
+        stage.save(f"composed_{name}", pictures)
+        gaussians = sum(
+            len(bundle.level_gaussians(0)) * int((scene.instance_bundle == b).sum())
+            for b, bundle in enumerate(scene.bundles)
+        )
+        scenes.append({"scene": name, "instances": len(scene), "gaussians": gaussians, "views": rows})
+    return {"tolerance": DEFAULT_TOLERANCE, "scenes": scenes}
+
+
+def measure(stage: Stage, scene: Scene, views: list[View]) -> tuple[list[Row], Picture]:
+    azimuths = sorted({round(view.azimuth, 1) for view in views})[: stage.settings.judged_directions]
+    rows: list[Row] = []
+    judged: list[tuple[int, Picture, Picture, Picture]] = []
+    for view in views:
+        full, ours = (
+            stage.shoot(scene, view, tolerance, stage.settings.composed_repeats)
+            for tolerance in (0.0, DEFAULT_TOLERANCE)
+        )
+        if round(view.azimuth, 1) in azimuths:
+            truth = draw_truth(scene, view.camera, stage.device)
+            judged.append((len(rows), truth, full.picture, ours.picture))
+        rows.append({**view.row(), **full.row("full"), **ours.row("ours")})
+    pairs = [(truth, picture) for _, truth, *both in judged for picture in both]
+    errors = iter(stage.judge.errors(pairs))
+    for index, *_ in judged:
+        for name in ("full", "ours"):
+            rows[index] |= {f"{name}_{key}": value for key, value in next(errors).items()}
+    return rows, strips(rows, judged, stage.settings.panel)
+
+
+def strips(rows: list[Row], judged: list[tuple[int, Picture, Picture, Picture]], side: int) -> Picture:
+    """Near, middle and far: truth, full, ours."""
+    middle = sorted({rows[index]["elevation"] for index, *_ in judged})
+    wanted = middle[len(middle) // 2]
+    line = sorted(
+        (entry for entry in judged if rows[entry[0]]["elevation"] == wanted),
+        key=lambda entry: rows[entry[0]]["distance"],
+    )
+    chosen = [line[len(line) // 4], line[len(line) // 2], line[-1]]
+    return sheet(
+        [
+            [
+                (f"truth, distance {row['distance']:.3g}", crop(truth, side)),
+                *(
+                    (
+                        f"{name}: {count_text(row[f'{name}_in_frustum'])}, FLIP {row[f'{name}_flip']:.4f}",
+                        crop(p, side),
+                    )
+                    for name, p in (("full", full), ("ours", ours))
+                ),
+            ]
+            for index, truth, full, ours in chosen
+            for row in [rows[index]]
+        ]
+    )
+
+
+_NAMES = ("in_frustum", "ms", "flip", "psnr")
+
+
+def by_distance(scene: Row) -> list[Row]:
+    """Means over directions and elevations."""
+    groups: dict[float, list[Row]] = {}
+    for row in scene["views"]:
+        groups.setdefault(round(row["distance"], 3), []).append(row)
+    columns = [f"{who}_{name}" for who in ("full", "ours") for name in _NAMES]
+    return [{"distance": d, **mean_of(rows, *columns)} for d, rows in sorted(groups.items())]
+
+
+COLUMNS = (
+    Column("distance", "distance", ".3g"),
+    Column("in frustum, full", "full_in_frustum", "count"),
+    Column("ours", "ours_in_frustum", "count"),
+    Column("ms, full", "full_ms", ".2f"),
+    Column("ours", "ours_ms", ".2f"),
+    Column("FLIP, full", "full_flip", ".4f"),
+    Column("ours", "ours_flip", ".4f"),
+    Column("PSNR, full", "full_psnr", ".1f"),
+    Column("ours", "ours_psnr", ".1f"),
+)
+
+
+def tables(result: dict[str, Any]) -> str:
+    return "\n\n".join(
+        f"**{scene['scene']}**: {scene['instances']:,} instances, {count_text(scene['gaussians'])} "
+        "gaussians\n\n" + markdown(COLUMNS, by_distance(scene))
+        for scene in result["scenes"]
+    )
+
+
+def verdict(result: dict[str, Any]) -> Verdict:
+    out = Verdict()
+    for scene in result["scenes"]:
+        far = by_distance(scene)[-1]
+        text = (
+            f"{scene['scene']} from its farthest: {far['ours_ms']:.2f} ms a frame instead of "
+            f"{far['full_ms']:.2f} ({far['full_ms'] / far['ours_ms']:.1f} x) with FLIP "
+            f"{far['ours_flip']:.4f} instead of {far['full_flip']:.4f}"
+        )
+        out.judge(far["ours_ms"] < far["full_ms"] and far["ours_flip"] <= far["full_flip"], text)
+        slower = [row for row in by_distance(scene) if row["ours_ms"] > 1.02 * row["full_ms"]]
+        if slower:
+            worst = max(slower, key=lambda row: row["ours_ms"] / row["full_ms"])
+            out.losses.append(
+                f"{scene['scene']} at distance {worst['distance']:.3g}: {worst['ours_ms']:.2f} ms against "
+                f"{worst['full_ms']:.2f} without levels"
+            )
+    return out
+
+
+def plot(result: dict[str, Any], figure: Any) -> None:
+    scenes = result["scenes"]
+    figure.set_size_inches(12, 3 * len(scenes))
+    for axes, scene in zip(figure.subplots(len(scenes), 3, squeeze=False), scenes, strict=True):
+        rows = by_distance(scene)
+        x = [row["distance"] for row in rows]
+        for who, style in (("full", "s--"), ("ours", "o-")):
+            axes[0].plot(x, [row[f"{who}_in_frustum"] for row in rows], style, label=who)
+            axes[1].plot(x, [1e3 / row[f"{who}_ms"] for row in rows], style, label=who)
+            axes[2].plot(x, [row[f"{who}_flip"] for row in rows], style, label=who)
+        for panel, label in zip(axes, ("gaussians in frustum", "frames a second", "FLIP"), strict=True):
+            panel.set(xlabel="distance", ylabel=label, ylim=(0, None), title=scene["scene"])
+            panel.grid(alpha=0.3)
+        axes[0].legend()

@@ -1,0 +1,141 @@
+"""What is hard for level of detail: hair-thin lines, a sky of huge soft gaussians, a dense tree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from v3dg.bench.assets import hair_lines, sky_dome
+from v3dg.bench.measure import Picture, Row, as_picture, draw_truth, tolerance_for
+from v3dg.bench.sheet import sheet
+from v3dg.bench.stage import FOV_X, Stage, close_distance
+from v3dg.bench.table import Column, markdown
+from v3dg.bench.verdict import Verdict
+from v3dg.build import BuildConfig
+from v3dg.cameras import Camera
+from v3dg.gaussians import Gaussians
+from v3dg.render import DEFAULT_TOLERANCE, render
+from v3dg.scene import Scene
+
+TITLE = "Thin structures, sky, foliage"
+ABOUT = (
+    "One asset alone, from near and from far (the sky from within). The first row of a view is the default "
+    "tolerance; the others compare our fitted levels with merging alone at equal counts. Full is every "
+    "gaussian, one sample a pixel."
+)
+
+_SHARES = (0.5, 0.25, 0.1)
+_FAR = 4.0
+_LEAST_PX = 32
+_NOTICED_FLIP = 1e-3
+
+
+def assets(stage: Stage) -> Iterator[tuple[str, Gaussians, dict[str, Camera]]]:
+    count = stage.settings.hard_gaussians
+    lines = hair_lines(count, seed=stage.seed)
+    yield "hair-thin lines", lines, cameras_around(stage, lines)
+    side = stage.settings.panel
+    within = Camera.look_at((0, 0, 0.1), (1, 0, 0.5), fov_x=1.2, width=side, height=side, near=1e-3)
+    yield "sky dome", sky_dome(count, seed=stage.seed), {"within": within}
+    yield stage.asset_name, stage.asset, cameras_around(stage, stage.asset)
+
+
+def cameras_around(stage: Stage, asset: Gaussians) -> dict[str, Camera]:
+    center, distance = close_distance(asset)
+    direction = np.array([0.2, -0.8, 0.55])
+
+    def camera(factor: float) -> Camera:
+        # As many px² a gaussian as from so far away, without the empty rest of the picture.
+        side = max(_LEAST_PX, round(stage.settings.panel / factor))
+        eye = center + factor * distance * direction
+        return Camera.look_at(
+            eye,
+            center,
+            fov_x=2 * math.atan(math.tan(FOV_X / 2) / factor),
+            width=side,
+            height=side,
+            near=1e-3 * distance,
+        )
+
+    return {"near": camera(1.0), "far": camera(_FAR)}
+
+
+def run(stage: Stage) -> dict[str, Any]:
+    rows: list[Row] = []
+    strips: list[list[tuple[str, Picture]]] = []
+    jobs: list[tuple[Picture, Picture]] = []
+    for name, asset, cameras in assets(stage):
+        own = None if asset is stage.asset else asset
+        fitted = Scene.of(stage.build(asset=own).bundle)
+        merged = Scene.of(stage.build(BuildConfig(steps=0), own).bundle)
+        for where, camera in cameras.items():
+            truth = draw_truth(fitted, camera, stage.device)
+
+            def draw(scene: Scene, tolerance: float, camera: Camera = camera) -> tuple[Picture, int]:
+                image = render(scene, camera, tolerance=tolerance, device=stage.device)
+                return as_picture(image.color), image.stats.gaussians_in_frustum
+
+            full, count = draw(fitted, 0.0)
+            strip = [("truth", truth), ("full", full)]
+            for share in (None, *_SHARES):
+                wanted = int(count * (share or 1))
+                tolerance = DEFAULT_TOLERANCE if share is None else tolerance_for(fitted, camera, wanted)
+                (ours, ours_count), (theirs, _) = draw(fitted, tolerance), draw(merged, tolerance)
+                jobs += [(truth, full), (truth, ours), (truth, theirs)]
+                row = {"asset": name, "view": where, "share": share, "tolerance": round(tolerance, 3)}
+                rows.append(row | {"full_in_frustum": count, "ours_in_frustum": ours_count})
+                if share in (None, _SHARES[-1]) or ours_count > wanted:
+                    text = f"{ours_count / count:.0%}"
+                    strip += [(f"ours, {text}", ours), (f"merged, {text}", theirs)]
+                if ours_count > wanted:  # as coarse as it gets: the eye is inside the balls of what is left
+                    break
+            strip[0] = f"{name}, {where}: truth", truth
+            strips.append([(text, enlarged(picture, stage.settings.panel)) for text, picture in strip])
+    errors = iter(stage.judge.errors(jobs))
+    for row in rows:
+        for who in ("full", "ours", "merged"):
+            row |= {f"{who}_{key}": value for key, value in next(errors).items()}
+    stage.save("hard", sheet(strips))
+    return {"rows": rows}
+
+
+def enlarged(picture: Picture, side: int) -> Picture:
+    """Each pixel as a square, so that the picture is about so large."""
+    factor = max(1, side // picture.shape[0])
+    return picture.repeat(factor, 0).repeat(factor, 1)
+
+
+_COLUMNS = (
+    Column("asset", "asset"),
+    Column("view", "view"),
+    Column("tolerance", "tolerance", "g"),
+    Column("in frustum, full", "full_in_frustum", "count"),
+    Column("ours", "ours_in_frustum", "count"),
+    Column("FLIP, full", "full_flip", ".4f"),
+    Column("ours", "ours_flip", ".4f"),
+    Column("merged", "merged_flip", ".4f"),
+    Column("PSNR, full", "full_psnr", ".1f"),
+    Column("ours", "ours_psnr", ".1f"),
+    Column("merged", "merged_psnr", ".1f"),
+)
+
+
+def tables(result: dict[str, Any]) -> str:
+    return markdown(_COLUMNS, result["rows"])
+
+
+def verdict(result: dict[str, Any]) -> Verdict:
+    out = Verdict()
+    for row in result["rows"]:
+        count = f"{row['ours_in_frustum']:,} of {row['full_in_frustum']:,}"
+        what = f"{row['asset']} ({row['view']}), {count} gaussians"
+        if row["share"] is None and row["ours_flip"] > row["full_flip"] + _NOTICED_FLIP:
+            out.losses.append(f"{what}: FLIP {row['ours_flip']:.4f}, of all {row['full_flip']:.4f}")
+        if row["ours_flip"] > row["merged_flip"] + _NOTICED_FLIP:
+            out.losses.append(
+                f"{what}: FLIP {row['ours_flip']:.4f} fitted, {row['merged_flip']:.4f} merely merged"
+            )
+    return out

@@ -1,0 +1,105 @@
+"""Original views (table 5): the close views for which an asset was trained; nothing may be lost there."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from v3dg.bench.measure import Row, draw_truth, mean_of
+from v3dg.bench.stage import Stage, View, close_distance
+from v3dg.bench.table import Column, markdown
+from v3dg.bench.verdict import Verdict
+from v3dg.cameras import turntable
+from v3dg.render import DEFAULT_TOLERANCE
+
+TITLE = "Original views"
+ABOUT = (
+    "Assets that fill the picture, as in the views that assets are trained for, from all sides: our "
+    "cut against the full asset, of which it should be no different, and both against the asset at twice "
+    "the resolution."
+)
+
+_ELEVATION = 30.0
+
+
+def run(stage: Stage) -> dict[str, Any]:
+    return {
+        "tolerance": DEFAULT_TOLERANCE,
+        "rows": [row_of(stage, name, asset) for name, asset in stage.close_assets()],
+    }
+
+
+def row_of(stage: Stage, name: str, asset: Any) -> Row:
+    built = stage.build(asset=None if asset is stage.asset else asset)
+    center, distance = close_distance(asset)
+    side = stage.settings.close_px
+    cameras = turntable(
+        center,
+        distance,
+        stage.settings.close_views,
+        math.radians(_ELEVATION),
+        width=side,
+        height=side,
+        near=1e-3 * distance,
+    )
+    rows = []
+    for camera in cameras:
+        view = View(0.0, _ELEVATION, distance, camera)
+        full, ours = (stage.shoot(built.bundle, view, tolerance) for tolerance in (0.0, DEFAULT_TOLERANCE))
+        truth = draw_truth(built.bundle, camera, stage.device)
+        same, of_full, of_ours = stage.judge.errors(
+            ((full.picture, ours.picture), (truth, full.picture), (truth, ours.picture))
+        )
+        row = {**full.row("full"), **ours.row("ours"), "psnr_to_full": same["psnr"]}
+        row |= {"full_psnr": of_full["psnr"], "ours_psnr": of_ours["psnr"]}
+        rows.append(row)
+    means = mean_of(
+        rows,
+        "full_in_frustum",
+        "ours_in_frustum",
+        "full_ms",
+        "ours_ms",
+        "psnr_to_full",
+        "full_psnr",
+        "ours_psnr",
+    )
+    return {
+        "asset": name,
+        "gaussians": len(asset),
+        "views": len(rows),
+        "same_pictures": sum(row["psnr_to_full"] is None for row in rows),
+        "share": round(means["ours_in_frustum"] / means["full_in_frustum"], 4),
+        "acceleration": round(means["full_ms"] / means["ours_ms"], 3),
+        **means,
+    }
+
+
+_COLUMNS = (
+    Column("asset", "asset"),
+    Column("gaussians", "gaussians", "count"),
+    Column("share drawn", "share", ".1%"),
+    Column("ms, full", "full_ms", ".2f"),
+    Column("ours", "ours_ms", ".2f"),
+    Column("acceleration", "acceleration", ".2f"),
+    Column("PSNR, full", "full_psnr", ".2f"),
+    Column("ours", "ours_psnr", ".2f"),
+    Column("ours to full", "psnr_to_full", ".1f"),
+    Column("views", "views"),
+    Column("equal to the bit", "same_pictures"),
+)
+
+
+def tables(result: dict[str, Any]) -> str:
+    return markdown(_COLUMNS, result["rows"])
+
+
+def verdict(result: dict[str, Any]) -> Verdict:
+    out = Verdict()
+    for row in result["rows"]:
+        drop = row["full_psnr"] - row["ours_psnr"]
+        out.judge(
+            drop <= 0.01,
+            f"{row['asset']} in close views: {row['share']:.0%} of the gaussians, PSNR {-drop:+.2f} dB to "
+            f"the full asset's, {row['acceleration']:.2f} x its speed",
+        )
+    return out

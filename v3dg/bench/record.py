@@ -1,0 +1,67 @@
+"""What every recorded result says of itself: commit, machine, versions, command."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from v3dg import _core
+
+_LIBRARIES = ("numpy", "torch", "gsplat", "flip-evaluator")
+
+
+def provenance(device: str = "cpu") -> dict[str, Any]:
+    """Commit, command, processor, threads, instruction set, versions, and the GPU if that is the device."""
+    names = []
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        lines = cpuinfo.read_text().splitlines()
+        names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    result: dict[str, Any] = {
+        "commit": _commit(),
+        "command": " ".join(Path(a).name if os.sep in a else a for a in sys.argv),
+        "processor": names[0] if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "threads": int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1)),
+        "isa": _core.isa(),
+        "python": platform.python_version(),
+    }
+    if device == "cuda":
+        import torch
+
+        result |= {"gpu": torch.cuda.get_device_name(), "cuda": str(torch.version.cuda)}
+    return result | {name: version for name in _LIBRARIES if (version := _version(name))}
+
+
+def _commit() -> str:
+    """Of the checkout that this file is in, "-dirty" if that was changed; elsewhere what V3DG_COMMIT says."""
+    done = subprocess.run(
+        ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.stdout.strip() or os.environ.get("V3DG_COMMIT", "unknown")
+
+
+def _version(library: str) -> str | None:
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def write(path: str | Path | None, result: dict[str, Any], device: str = "cpu") -> None:
+    """Write a result with its provenance as JSON, whole or not at all; to nowhere if `path` is None."""
+    if path is None:
+        return
+    path = Path(path)
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(json.dumps({**provenance(device), **result}, indent=1) + "\n", encoding="utf-8")
+    temporary.replace(path)

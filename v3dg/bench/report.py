@@ -1,0 +1,129 @@
+"""From recorded results to a page with plots: python -m v3dg.bench.report FOLDER ... -o PAGE."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from v3dg.bench.parts import NAMES, part
+from v3dg.bench.verdict import Verdict
+
+
+@dataclass
+class Options:
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders with results of `v3dg bench`; the first one is what the page begins with."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("results.md")
+    """Page to write."""
+    plots: bool = True
+    """Draw the plots, into the folders; needs matplotlib."""
+
+
+def read_results(folder: Path) -> dict[str, dict[str, Any]]:
+    """Results by part, in the order of parts.
+
+    Raises:
+        ValueError: There are none.
+    """
+    paths = {name: folder / f"{name}.json" for name in NAMES}
+    results = {
+        name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.exists()
+    }
+    if not results:
+        raise ValueError(f"{folder}: expected results such as {NAMES[0]}.json; run `v3dg bench` first")
+    return results
+
+
+def page(folders: Sequence[Path], output: Path) -> str:
+    """The page; pictures are linked relative to where it will be."""
+    sections = [(folder, read_results(folder)) for folder in folders]
+    first = next(iter(sections[0][1].values()))
+    verdict = verdict_of(sections[0][1])
+    lines = [
+        "# Results",
+        "",
+        "Written by `python -m v3dg.bench.report` from recorded JSON, never by hand; here on "
+        f"{machine(first)}.",
+        "",
+        f"**Where we win**: {_joined(verdict.wins)}.",
+        "",
+        f"**Where we do not**: {_joined(verdict.losses)}.",
+        "",
+        "Error is FLIP (67 pixels per degree) and PSNR to the full scene at twice the resolution, "
+        "box-averaged. Times are medians of single frames after a warm-up, selection included, from an "
+        "idle device to an idle device; a picture is checked before its time counts. The JSON beside the "
+        "pictures has the spread and every view.",
+    ]
+    for folder, results in sections:
+        lines += ["", f"## {heading(next(iter(results.values())))}"]
+        for name, result in results.items():
+            lines += _part_lines(name, result, Path(os.path.relpath(folder, output.parent)), folder)
+    return "\n".join(lines) + "\n"
+
+
+def verdict_of(results: dict[str, dict[str, Any]]) -> Verdict:
+    """What all parts say together."""
+    both = Verdict()
+    for name, result in results.items():
+        found = part(name).verdict(result)
+        both.wins += found.wins
+        both.losses += found.losses
+    return both
+
+
+def _joined(sentences: Sequence[str]) -> str:
+    return "; ".join(sentences) or "nothing that was measured"
+
+
+def machine(result: dict[str, Any]) -> str:
+    """Device, commit and versions of a result."""
+    where = result.get("gpu") or f"{result['threads']} threads of {result['processor']}"
+    versions = ", ".join(f"{name} {result[name]}" for name in ("torch", "gsplat") if name in result)
+    return (
+        f"{where}, commit {result['commit']}, Python {result['python']}{', ' + versions if versions else ''}"
+    )
+
+
+def heading(result: dict[str, Any]) -> str:
+    where = result.get("gpu") or f"{result['threads']} CPU threads"
+    return f"{result['preset'].capitalize()} preset, {where}, {result['asset']} asset"
+
+
+def _part_lines(name: str, result: dict[str, Any], link: Path, folder: Path) -> list[str]:
+    module = part(name)
+    lines = ["", f"### {module.TITLE}", "", module.ABOUT, "", module.tables(result)]
+    if (folder / f"{name}.png").exists():
+        lines += ["", f"![{module.TITLE}]({(link / name).as_posix()}.png)"]
+    for picture in result["pictures"]:
+        lines += ["", f"![{Path(picture).stem.replace('_', ' ')}]({(link / picture).as_posix()})"]
+    command = f"`{result['command']}`, seed {result['seed']}, commit {result['commit']}"
+    return [*lines, "", f"Measured in {result['seconds']:.0f} s by {command}."]
+
+
+def draw_plots(folder: Path) -> None:
+    """Write <part>.png for each result that has something to plot."""
+    from matplotlib.figure import Figure
+
+    for name, result in read_results(folder).items():
+        module = part(name)
+        if hasattr(module, "plot"):
+            figure = Figure(figsize=(7, 4.5), layout="constrained")
+            module.plot(result, figure)
+            figure.savefig(folder / f"{name}.png", dpi=90, metadata={"Software": None})
+
+
+def main(options: Options) -> None:
+    for folder in options.folders:
+        if options.plots:
+            draw_plots(folder)
+    options.output.write_text(page(options.folders, options.output), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

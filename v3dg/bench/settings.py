@@ -1,0 +1,106 @@
+"""How much each preset measures: all sizes in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Sizes of an evaluation.
+
+    Attributes:
+        asset_gaussians: Of the asset that the main scene is made of, where none is given.
+        instances: Of it in the main scene.
+        worlds: "small" or "full": which size of the composed worlds.
+        size: Width and height of pictures in px.
+        elevations: Degrees above the horizon of the cameras of "composed"; other parts take the middle.
+        directions: How many of the paper's four directions "composed" looks from.
+        distances: Cameras a direction.
+        judged_directions: Of how many directions FLIP is taken, which needs a second a picture.
+        repeats: Timed calls, of which the median counts ...
+        composed_repeats: ... and in "composed", which has by far the most views.
+        steps: Of the fit, in "fit" and "levels"; the paper's \\*0 (nothing grown, nothing fitted) is added.
+        tree_steps: Of the fit in "tree".
+        large_copies: Of the asset that make the one large asset.
+        large_steps: Of its fit.
+        motion_frames: Of the zoom.
+        hierarchy_instances: In the scene that is compared with single gaussians in a hierarchy.
+        hard_gaussians: Of each hard asset.
+        counts: Gaussians of which the operations are measured alone.
+        close_views: From how many sides an asset is seen from near ...
+        close_px: ... in pictures of this side.
+        panel: Side in px of the pictures that are kept.
+    """
+
+    asset_gaussians: int
+    instances: int
+    worlds: str
+    size: tuple[int, int]
+    elevations: tuple[float, ...]
+    directions: int
+    distances: int
+    judged_directions: int
+    repeats: int
+    composed_repeats: int
+    steps: tuple[int, ...]
+    tree_steps: int
+    large_copies: int
+    large_steps: int
+    motion_frames: int
+    hierarchy_instances: int
+    hard_gaussians: int
+    counts: tuple[int, ...]
+    close_views: int
+    close_px: int
+    panel: int
+
+
+PRESETS = {
+    "small": Settings(
+        asset_gaussians=20_000,
+        instances=100,
+        worlds="small",
+        size=(320, 180),
+        elevations=(45.0,),
+        directions=1,
+        distances=4,
+        judged_directions=1,
+        repeats=3,
+        composed_repeats=3,
+        steps=(0, 40, 160),
+        tree_steps=40,
+        large_copies=3,
+        large_steps=40,
+        motion_frames=6,
+        hierarchy_instances=30,
+        hard_gaussians=8_000,
+        counts=(10_000, 100_000),
+        close_views=2,
+        close_px=400,
+        panel=180,
+    ),
+    "full": Settings(
+        asset_gaussians=45_000,
+        instances=2048,
+        worlds="full",
+        size=(1920, 1080),
+        elevations=(15.0, 30.0, 45.0, 60.0, 75.0),
+        directions=4,
+        distances=20,
+        judged_directions=1,
+        repeats=5,
+        composed_repeats=3,
+        steps=(0, 40, 160, 640),
+        tree_steps=640,
+        large_copies=285,
+        large_steps=800,
+        motion_frames=48,
+        hierarchy_instances=128,
+        hard_gaussians=200_000,
+        counts=(10_000, 100_000, 1_000_000, 10_000_000, 100_000_000),
+        close_views=8,
+        close_px=800,
+        panel=480,
+    ),
+}

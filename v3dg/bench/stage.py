@@ -1,0 +1,295 @@
+"""What parts of the evaluation share: assets, bundles, the main scene with its views and true pictures."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v3dg import _device
+from v3dg.bench.measure import Judge, Picture, Row, Time, as_picture, draw_truth, time_ms
+from v3dg.bench.settings import Settings
+from v3dg.build import BuildConfig, build_bundle
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
+from v3dg.gaussians import Gaussians
+from v3dg.io import load
+from v3dg.pictures import write_picture
+from v3dg.procedural import make_asset, place_field
+from v3dg.render import DEFAULT_TOLERANCE, Stats, render
+from v3dg.scene import Scene, read_scene
+
+FOV_X = math.pi / 4  # the paper's
+PAPER_CLUSTER_SIZE = BuildConfig.paper().cluster_size
+
+
+def paper_tolerance(tau_px2: float) -> float:
+    """Our tolerance, px² a gaussian, for the paper's: px² of a group that is drawn as one cluster."""
+    return tau_px2 / PAPER_CLUSTER_SIZE
+
+
+PAPER_TOLERANCE = paper_tolerance(2048)
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera that looks at the origin, and from where: degrees, degrees, world units."""
+
+    azimuth: float
+    elevation: float
+    distance: float
+    camera: Camera
+
+    def row(self) -> Row:
+        return {
+            "azimuth": round(self.azimuth, 1),
+            "elevation": round(self.elevation, 1),
+            "distance": round(self.distance, 4),
+        }
+
+
+def views_of(cameras: Sequence[Camera]) -> list[View]:
+    views = []
+    for camera in cameras:
+        x, y, z = camera.position
+        distance = math.sqrt(x * x + y * y + z * z)
+        azimuth, elevation = math.degrees(math.atan2(y, x)), math.degrees(math.asin(z / distance))
+        views.append(View(azimuth % 360, elevation, distance, camera))
+    return views
+
+
+def orbit_view(azimuth: float, elevation: float, distance: float, size: tuple[int, int]) -> View:
+    """Look at the origin from there; degrees and world units."""
+    a, e = math.radians(azimuth), math.radians(elevation)
+    eye = distance * np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
+    camera = Camera.look_at(eye, (0, 0, 0), fov_x=FOV_X, width=size[0], height=size[1], near=1e-3 * distance)
+    return View(azimuth, elevation, distance, camera)
+
+
+def resized(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The same view with so many pixels."""
+    factors = np.array([[size[0] / camera.width], [size[1] / camera.height], [1.0]])
+    return replace(camera, K=camera.K * factors, width=size[0], height=size[1])
+
+
+def close_distance(asset: Gaussians) -> tuple[Any, float]:
+    """The middle of an asset and how far from it a square picture is filled; without its few outliers."""
+    low, high = np.percentile(_device.to_host(asset.means), (1, 99), axis=0)
+    return (low + high) / 2, 0.5 * float(np.linalg.norm(high - low)) / math.tan(FOV_X / 2)
+
+
+def close_view(asset: Gaussians, size: tuple[int, int]) -> Camera:
+    """The asset fills the picture, from above its front."""
+    center, distance = close_distance(asset)
+    eye = center + distance * np.array([0.0, -0.8, 0.6])
+    return Camera.look_at(eye, center, fov_x=FOV_X, width=size[0], height=size[1], near=1e-3 * distance)
+
+
+@dataclass(frozen=True)
+class Built:
+    bundle: Bundle
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture that was drawn twice to the same bytes, what it shows, and how long it took in between."""
+
+    view: View
+    picture: Picture
+    stats: Stats
+    time: Time
+
+    def row(self, name: str) -> Row:
+        return {
+            f"{name}_selected": self.stats.gaussians_selected,
+            f"{name}_in_frustum": self.stats.gaussians_in_frustum,
+            f"{name}_select_ms": round(self.stats.select_ms, 3),
+            **self.time.row(name),
+        }
+
+
+@dataclass
+class Stage:
+    """What one evaluation is run with."""
+
+    settings: Settings
+    device: str
+    folder: Path
+    seed: int = 0
+    asset_path: Path | None = None
+    layout_path: Path | None = None
+    peers: Path | None = None
+    """Folder with what other tools made of the asset: <asset>_<percent>.ply and so on, see part "merging"."""
+    judge: Judge = field(default_factory=Judge)
+    _built: dict[str, Built] = field(default_factory=dict)
+    _truths: dict[int, Picture] = field(default_factory=dict)
+    _saved: list[str] = field(default_factory=list)
+
+    @cached_property
+    def asset(self) -> Gaussians:
+        if self.asset_path is None:
+            return make_asset(self.settings.asset_gaussians, seed=self.seed)
+        return load(self.asset_path)
+
+    @property
+    def asset_name(self) -> str:
+        return "procedural" if self.asset_path is None else self.asset_path.stem
+
+    def warm_up(self) -> None:
+        """Load what the first build and the first picture load, so that no part pays for it."""
+        tiny = make_asset(1000)
+        bundle = build_bundle(tiny, config=BuildConfig(steps=2), progress=False, device=self._device)
+        render(bundle, orbit_view(0, 45, 5, (64, 64)).camera, device=self.device).stats  # noqa: B018
+
+    @property
+    def _device(self) -> Any:
+        return self.device
+
+    def build(self, config: BuildConfig | None = None, asset: Gaussians | None = None) -> Built:
+        """Build the main asset, or another; what was built of the main one is kept."""
+        config = config or BuildConfig()
+        key = json.dumps(asdict(config))
+        if asset is None and key in self._built:
+            return self._built[key]
+        start = time.perf_counter()
+        bundle = build_bundle(
+            self.asset if asset is None else asset,
+            config=config,
+            seed=self.seed,
+            progress=False,
+            device=self._device,
+        )
+        built = Built(bundle, time.perf_counter() - start)
+        if asset is None:
+            self._built[key] = built
+        return built
+
+    def place(self, bundle: Bundle, instances: int | None = None) -> Scene:
+        """The main scene, made of this bundle; the first few instances if so many are wanted."""
+        scene = Scene()
+        positions, quaternions, scales = self._layout[0]
+        few = slice(instances)
+        scene.add(bundle, positions=positions[few], quaternions=quaternions[few], scales=scales[few])
+        return scene
+
+    @cached_property
+    def _layout(self) -> tuple[tuple[Any, Any, Any], list[View]]:
+        size = self.settings.size
+        if self.layout_path is None:
+            poses = place_field(self.settings.instances, seed=self.seed)
+            reach = 2.5 * float(np.abs(poses[0]).max())
+            views = [
+                orbit_view(
+                    360 * a / self.settings.directions, e, reach * (d + 1) / self.settings.distances, size
+                )
+                for a in range(self.settings.directions)
+                for e in self.settings.elevations
+                for d in range(self.settings.distances)
+            ]
+            return poses, views
+        name = json.loads(self.layout_path.read_text(encoding="utf-8"))["asset"]
+        scene, cameras = read_scene(self.layout_path, bundles={name: self.build(BuildConfig(steps=0)).bundle})
+        views = views_of([resized(camera, size) for camera in cameras.values()])
+        return (scene.positions, scene.quaternions, scene.scales), views
+
+    @cached_property
+    def full_scene(self) -> Scene:
+        """The main scene of which only level 0 is ever drawn."""
+        return self.place(self.build().bundle)
+
+    @cached_property
+    def all_views(self) -> list[View]:
+        """All of the main scene's that the settings ask for."""
+        elevations = self.settings.elevations
+        azimuths = sorted({round(v.azimuth, 3) for v in self._layout[1]})[: self.settings.directions]
+        lines: dict[tuple[float, float], list[View]] = {}
+        for view in self._layout[1]:
+            if round(view.azimuth, 3) in azimuths and min(abs(view.elevation - e) for e in elevations) < 0.5:
+                lines.setdefault((round(view.azimuth, 3), round(view.elevation)), []).append(view)
+        return [view for line in lines.values() for view in every(line, self.settings.distances)]
+
+    @cached_property
+    def line(self) -> list[View]:
+        """The views of one direction and the middle elevation, from near to far."""
+        middle = sorted(self.settings.elevations)[len(self.settings.elevations) // 2]
+        first = self.all_views[0].azimuth
+        return [v for v in self.all_views if abs(v.azimuth - first) < 0.5 and abs(v.elevation - middle) < 0.5]
+
+    def truth(self, index: int) -> Picture:
+        """The true picture of the line's view."""
+        if index not in self._truths:
+            self._truths[index] = draw_truth(self.full_scene, self.line[index].camera, self.device)
+        return self._truths[index]
+
+    def shoot(
+        self, subject: Any, view: View, tolerance: float = DEFAULT_TOLERANCE, repeats: int | None = None
+    ) -> Shot:
+        """Draw, time, and draw again: a time counts only if the pictures are the same."""
+
+        def draw() -> Any:
+            return render(subject, view.camera, tolerance=tolerance, device=self.device)
+
+        picture = as_picture(draw().color)
+        if not picture.any():
+            raise RuntimeError(f"picture at distance {view.distance:g}: expected something in it, got black")
+        timed = time_ms(lambda: draw().stats, self.device, repeats or self.settings.repeats)
+        last = draw()
+        if not np.array_equal(picture, as_picture(last.color)):
+            raise RuntimeError(
+                f"picture at distance {view.distance:g}: expected the same on every run, got another"
+            )
+        return Shot(view, picture, last.stats, timed)
+
+    def shoot_line(self, scene: Scene, tolerance: float = DEFAULT_TOLERANCE) -> list[Shot]:
+        return [self.shoot(scene, view, tolerance) for view in self.line]
+
+    @cached_property
+    def full_line(self) -> list[Shot]:
+        """The line with all gaussians, one sample a pixel: what level of detail has to beat."""
+        return self.shoot_line(self.full_scene, 0.0)
+
+    def judge_line(self, shots: Sequence[Shot]) -> list[Row]:
+        """FLIP and PSNR of pictures of the line, in its order."""
+        return self.judge.errors((self.truth(i), shot.picture) for i, shot in enumerate(shots))
+
+    def line_rows(self, shots: Sequence[Shot], name: str) -> list[Row]:
+        """A row a view: where from, what was drawn, how long it took, how far off it is."""
+        errors = self.judge_line(shots)
+        return [
+            {**shot.view.row(), **shot.row(name), **{f"{name}_{key}": value for key, value in error.items()}}
+            for shot, error in zip(shots, errors, strict=True)
+        ]
+
+    def worlds(self) -> Iterator[tuple[str, Scene, list[View]]]:
+        """The composed scenes and their views, one after another."""
+        yield "meadow" if self.layout_path is None else self.layout_path.stem, self.full_scene, self.all_views
+
+    def close_assets(self) -> Iterator[tuple[str, Gaussians]]:
+        """Assets to be seen from near."""
+        yield self.asset_name, self.asset
+
+    def save(self, name: str, picture: Picture) -> None:
+        """Keep a picture as a JPEG."""
+        path = self.folder / f"{name}.jpg"
+        write_picture(path, picture)
+        self._saved.append(path.name)
+
+    def take_pictures(self) -> list[str]:
+        """File names of the pictures that were kept since this was last asked."""
+        names, self._saved = self._saved, []
+        return names
+
+
+def every(items: Sequence[Any], count: int) -> list[Any]:
+    """So many of them, evenly spread, the last one always; all if there are no more."""
+    if count >= len(items):
+        return list(items)
+    return [items[round((i + 1) * len(items) / count) - 1] for i in range(count)]

@@ -1,0 +1,16 @@
+"""What a result says in a sentence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Verdict:
+    """Sentences: where we win, by how much and at which error; and where we do not."""
+
+    wins: list[str] = field(default_factory=list)
+    losses: list[str] = field(default_factory=list)
+
+    def judge(self, is_win: bool, sentence: str) -> None:
+        (self.wins if is_win else self.losses).append(sentence)
