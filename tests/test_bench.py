@@ -139,7 +139,11 @@ def test_tolerance_for_a_count_is_the_smallest_that_fits(scene):
     camera = eye_camera(12)
     tolerance = measure.tolerance_for(scene, camera, 3000)
     assert v3dg.select(scene, camera, tolerance=tolerance).num_gaussians <= 3000
-    assert v3dg.select(scene, camera, tolerance=0.999 * tolerance).num_gaussians > 3000
+    assert v3dg.select(scene, camera, tolerance=0.99 * tolerance).num_gaussians > 3000
+
+
+def test_tolerance_for_a_count_that_cannot_be_is_the_coarsest(scene):
+    assert measure.tolerance_for(scene, eye_camera(12), 1) == measure.COARSEST
 
 
 def test_judge_keeps_the_order_and_knows_equal_pictures():

@@ -29,6 +29,9 @@ Picture = npt.NDArray[np.uint8]
 SUPERSAMPLING = 2
 """Truth has so many times the pixels a side, box-averaged: 4K for 1080p, as in the paper."""
 
+COARSEST = 1e9
+"""Tolerance in px² of the coarsest cut that there is, as a number that JSON can hold."""
+
 _WARM_UPS = 1
 _HALVINGS = 30
 # gsplat 1.5: a gaussian ends where it falls below 1/255, and at 3.33 standard deviations.
@@ -136,12 +139,10 @@ def mean_of(rows: Sequence[Row], *names: str) -> Row:
 
 
 def tolerance_for(scene: Scene, camera: Camera, count: int) -> float:
-    """The smallest tolerance, as far as bisection sees, at which at most `count` gaussians are selected."""
-
-    def fits(tolerance: float) -> bool:
-        return select(scene, camera, tolerance=tolerance).num_gaussians <= count
-
-    return _bisect(fits, 1e-4, 1e6)
+    """The tolerance at which at most `count` gaussians are selected; `COARSEST` where that is not enough."""
+    if select(scene, camera, tolerance=COARSEST).num_gaussians > count:
+        return COARSEST
+    return select(scene, camera, budget=count).tolerance
 
 
 def _bisect(fits: Callable[[float], bool], low: float, high: float) -> float:

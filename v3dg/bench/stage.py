@@ -23,8 +23,10 @@ from v3dg.gaussians import Gaussians
 from v3dg.io import load
 from v3dg.pictures import write_picture
 from v3dg.procedural import make_asset, place_field
-from v3dg.render import DEFAULT_TOLERANCE, Stats, render
-from v3dg.scene import Scene, read_scene
+from v3dg.render import Stats, render
+from v3dg.scene import Scene
+from v3dg.scene_file import read_scene
+from v3dg.select import DEFAULT_TOLERANCE
 
 FOV_X = math.pi / 4  # the paper's
 PAPER_CLUSTER_SIZE = BuildConfig.paper().cluster_size

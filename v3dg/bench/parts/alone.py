@@ -22,9 +22,9 @@ from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.metrics import psnr
 from v3dg.rasterize import intrinsics, rows_of, view_of_world
-from v3dg.render import DEFAULT_TOLERANCE, render
+from v3dg.render import render
 from v3dg.scene import Scene
-from v3dg.select import select
+from v3dg.select import DEFAULT_TOLERANCE, select
 
 TITLE = "Rasterizer, split, selection, build alone"
 ABOUT = (

@@ -9,8 +9,8 @@ from v3dg.bench.sheet import crop, sheet
 from v3dg.bench.stage import Stage, View
 from v3dg.bench.table import Column, count_text, markdown
 from v3dg.bench.verdict import Verdict
-from v3dg.render import DEFAULT_TOLERANCE
 from v3dg.scene import Scene
+from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "Composed scenes"
 ABOUT = (

@@ -10,7 +10,7 @@ from v3dg.bench.stage import PAPER_TOLERANCE, Stage
 from v3dg.bench.table import Column, markdown
 from v3dg.bench.verdict import Verdict
 from v3dg.build import BuildConfig
-from v3dg.render import DEFAULT_TOLERANCE
+from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "What the fit gives"
 ABOUT = (

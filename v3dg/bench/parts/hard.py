@@ -17,8 +17,9 @@ from v3dg.bench.verdict import Verdict
 from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
-from v3dg.render import DEFAULT_TOLERANCE, render
+from v3dg.render import render
 from v3dg.scene import Scene
+from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "Thin structures, sky, foliage"
 ABOUT = (

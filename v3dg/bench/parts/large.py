@@ -14,7 +14,7 @@ from v3dg.bench.table import count_text, markdown
 from v3dg.bench.verdict import Verdict
 from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
-from v3dg.render import DEFAULT_TOLERANCE
+from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "One large asset"
 ABOUT = (

@@ -30,9 +30,9 @@ from v3dg.cameras import Camera
 from v3dg.io import load
 from v3dg.metrics import psnr
 from v3dg.rasterize import rasterize
-from v3dg.render import DEFAULT_TOLERANCE, render
+from v3dg.render import render
 from v3dg.scene import Scene
-from v3dg.select import select
+from v3dg.select import DEFAULT_TOLERANCE, select
 
 TITLE = "Against merging alone"
 ABOUT = (

@@ -13,7 +13,8 @@ from v3dg.bench.sheet import crop, sheet
 from v3dg.bench.stage import Stage, orbit_view
 from v3dg.bench.table import Column, markdown
 from v3dg.bench.verdict import Verdict
-from v3dg.render import DEFAULT_TOLERANCE, render
+from v3dg.render import render
+from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "A zoom through the scene, and popping"
 ABOUT = (

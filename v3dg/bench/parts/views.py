@@ -10,7 +10,7 @@ from v3dg.bench.stage import Stage, View, close_distance
 from v3dg.bench.table import Column, markdown
 from v3dg.bench.verdict import Verdict
 from v3dg.cameras import turntable
-from v3dg.render import DEFAULT_TOLERANCE
+from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "Original views"
 ABOUT = (
