@@ -241,8 +241,11 @@ SURROGATE = "\ud800"
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        (["bundles", "donut"], SURROGATE, "bundles.donut: expected a string of Unicode characters"),
-        (["cameras", 0, "name"], SURROGATE, "cameras[0].name: expected a string of Unicode characters"),
+        (["bundles", "donut"], SURROGATE, "bundles.donut: expected a string without control characters"),
+        (["cameras", 0, "name"], SURROGATE, "cameras[0].name: expected a string without control characters"),
+        (["cameras", 0, "name"], "a\nb", "cameras[0].name: expected a string without control characters"),
+        (["a\nb"], 3, '"a\\nb": expected one of format, version, bundles, instances, cameras'),
+        (["a" * 99], 3, f'"{"a" * 56}...: expected one of format, version'),
         (["version"], True, "version: expected 1"),
         (["instances", 0, "position", 0], float("1e400"), None),
         (["cameras", 0, "width"], 1e30, "cameras[0].width: expected at most 1048576 px"),
@@ -262,6 +265,7 @@ def test_extreme_values_of_a_scene_are_refused(tmp_path, place, value, message):
     with pytest.raises(ValueError, match=r"^a\.json: ") as error:
         read_scene(tmp_path / "a.json")
     assert (message or "instances[0].position[0]: expected a finite number") in str(error.value)
+    assert str(error.value).isprintable()
 
 
 CLAIMS = {

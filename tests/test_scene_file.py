@@ -24,7 +24,8 @@ def test_written_scene_reads_back_the_same(tmp_path_factory, positions, seed):
     scene = Scene()
     for position in positions:
         bundle = BUNDLE if rng.random() < 0.5 else OTHER
-        scene.add(bundle, position, rng.normal(size=4), np.exp(rng.normal()))
+        importance = 1.0 if rng.random() < 0.5 else np.exp(rng.normal())
+        scene.add(bundle, position, rng.normal(size=4), np.exp(rng.normal()), importance)
     eye = 100 * rng.normal(size=3)
     cameras = {
         "a": Camera.look_at(eye, eye + rng.normal(size=3), width=64, height=48, near=0.5),
@@ -40,6 +41,9 @@ def test_written_scene_reads_back_the_same(tmp_path_factory, positions, seed):
     np.testing.assert_array_equal(again.positions, scene.positions)
     np.testing.assert_allclose(again.quaternions, scene.quaternions, atol=1e-15)
     np.testing.assert_array_equal(again.scales, scene.scales)
+    np.testing.assert_array_equal(again.importance, scene.importance)
+    written = json.loads(path.read_text(encoding="utf-8"))["instances"]
+    assert ["importance" in instance for instance in written] == (scene.importance != 1).tolist()
     assert list(cameras_again) == list(cameras)
     for name, camera in cameras.items():
         np.testing.assert_array_equal(cameras_again[name].viewmat, camera.viewmat)
@@ -106,6 +110,10 @@ def changed(place, value, document=GOOD):
     [
         (["instances", 3, "scale"], -1, "instances[3].scale: expected a positive number, got -1"),
         (["instances", 3, "scale"], True, "instances[3].scale: expected a number, got true"),
+        (["instances", 3, "importance"], 0, "instances[3].importance: expected a positive number, got 0"),
+        (["instances", 3, "importance"], "x", 'instances[3].importance: expected a number, got "x"'),
+        (["instances", 3, "importance"], 1e39, "instances[3].importance: expected a positive number that a"),
+        (["instances", 3, "importance"], 1e-50, "instances[3].importance: expected a positive number that a"),
         (["instances", 0, "position"], [1, 2], "instances[0].position: expected 3 numbers, got [1, 2]"),
         (["instances", 0, "position", 1], "x", 'instances[0].position[1]: expected a number, got "x"'),
         (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -48,6 +49,11 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+def is_one_line(text: str) -> bool:
+    """Whether text can be part of a message: no control characters, no halves of surrogate pairs."""
+    return not any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in text)
+
+
 def read_json(path: str | os.PathLike[str]) -> Node:
     """Read a JSON file.
 
@@ -82,12 +88,14 @@ class Node:
         try:
             return make()
         except ValueError as error:
-            raise ValueError(f"{self.file}: {self._at(str(error))}") from error
+            place = f"{self.path}." if self.path else ""
+            raise ValueError(f"{self.file}: {place}{error}") from error
 
     def child(self, key: str) -> Node:
         return Node(self.value[key], self.file, self._at(key))
 
     def _at(self, key: str) -> str:
+        key = key if is_one_line(key) and len(key) <= 60 else shown(key)
         return f"{self.path}.{key}" if self.path else key
 
     def has(self, key: str) -> bool:
@@ -120,10 +128,8 @@ class Node:
     def text(self) -> str:
         if not isinstance(self.value, str) or not self.value:
             raise self.error("a string")
-        try:
-            self.value.encode()
-        except UnicodeEncodeError:
-            raise self.error("a string of Unicode characters") from None
+        if not is_one_line(self.value):
+            raise self.error("a string without control characters")
         return self.value
 
     def number(self) -> float:

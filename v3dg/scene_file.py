@@ -26,6 +26,7 @@ class _Instance(NamedTuple):
     position: list[float]
     quaternion: list[float]
     scale: float
+    importance: float = 1.0
 
 
 def read_scene(
@@ -70,18 +71,21 @@ def write_scene(
     if len(bundle_paths) != len(scene.bundles):
         raise ValueError(f"bundle_paths: expected {len(scene.bundles)} paths, got {len(bundle_paths)}")
     names = [f"bundle_{b}" for b in range(len(bundle_paths))]
+    poses = (scene.positions, scene.quaternions, scene.scales)
+    columns = [column.tolist() for column in (scene.instance_bundle, *poses, scene.importance)]
     document = {
         "format": FORMAT,
         "version": VERSION,
         "bundles": dict(zip(names, bundle_paths, strict=True)),
         "instances": [
             {
-                "bundle": names[scene.instance_bundle[i]],
-                "position": scene.positions[i].tolist(),
-                "quaternion": scene.quaternions[i].tolist(),
-                "scale": float(scene.scales[i]),
+                "bundle": names[bundle],
+                "position": position,
+                "quaternion": quaternion,
+                "scale": scale,
+                **({} if importance == 1 else {"importance": importance}),
             }
-            for i in range(len(scene))
+            for bundle, position, quaternion, scale, importance in zip(*columns, strict=True)
         ],
         "cameras": [
             {
@@ -111,7 +115,7 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
     }
     instances = []
     for node in top["instances"].items():
-        fields = node.fields(("bundle", "position"), ("quaternion", "scale"))
+        fields = node.fields(("bundle", "position"), ("quaternion", "scale", "importance"))
         if fields["bundle"].text() not in bundles:
             raise fields["bundle"].error("a name from bundles")
         instances.append(
@@ -120,6 +124,7 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
                 fields["position"].vector(3),
                 _quaternion(fields["quaternion"]) if "quaternion" in fields else [1.0, 0.0, 0.0, 0.0],
                 fields["scale"].positive() if "scale" in fields else 1.0,
+                _importance(fields["importance"]) if "importance" in fields else 1.0,
             )
         )
     cameras: dict[str, Camera] = {}
@@ -140,6 +145,15 @@ def _quaternion(node: Node) -> list[float]:
     return quaternion
 
 
+def _importance(node: Node) -> float:
+    importance = node.positive()
+    with np.errstate(over="ignore"):
+        is_kept = 0 < np.float32(importance) < np.inf  # in which scenes keep it
+    if not is_kept:
+        raise node.error("a positive number that a float32 can hold")
+    return importance
+
+
 def _scene_of(instances: list[_Instance], bundles: Mapping[str, Bundle]) -> Scene:
     """Adds neighbours of the same bundle together, so that instance ids are the places in the file."""
     scene = Scene()
@@ -147,8 +161,8 @@ def _scene_of(instances: list[_Instance], bundles: Mapping[str, Bundle]) -> Scen
     for last in range(1, len(instances) + 1):
         if last < len(instances) and instances[last].bundle == instances[first].bundle:
             continue
-        names, positions, quaternions, scales = zip(*instances[first:last], strict=True)
-        scene.add(bundles[names[0]], positions=positions, quaternions=quaternions, scales=scales)
+        names, positions, quaternions, scales, importances = zip(*instances[first:last], strict=True)
+        scene.add(bundles[names[0]], positions, quaternions, scales, importances)
         first = last
     return scene
 
