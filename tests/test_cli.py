@@ -70,7 +70,9 @@ def test_version():
     assert done.stdout.split() == ["v3dg", v3dg.__version__]
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["build", "--help"], ["demo", "--help"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["build", "--help"], ["demo", "--help"], ["world", "--help"]]
+)
 def test_help(arguments):
     done = run(*arguments)
     assert done.returncode == 0

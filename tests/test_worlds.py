@@ -141,6 +141,28 @@ def test_scene_of_a_world_draws():
     assert v3dg.render(scene, camera).alpha.max() > 0.5
 
 
+def test_a_written_world_is_read_and_drawn(tmp_path):
+    world = worlds.crowd(5, 2000, persons=2, seed=1)
+    path = worlds.write_world(world, tmp_path / "new", config=v3dg.BuildConfig(steps=0), progress=False)
+    assert path == tmp_path / "new" / "crowd.json"
+    assert sorted(p.name for p in path.parent.iterdir()) == [
+        *("crowd.json", "person_00.ply", "person_00.v3dg", "person_01.ply", "person_01.v3dg"),
+    ]
+    scene, cameras = v3dg.read_scene(path)
+    assert len(scene) == 5
+    assert len(cameras) == 400
+    assert np.array_equal(scene.positions, all_of(world, "positions"))
+    assert len(v3dg.load(path.parent / "person_00.ply")) == 2000
+    assert v3dg.render(scene, world.cameras(width=64, height=36)["059_camera_19"]).alpha.max() > 0.5
+
+
+@pytest.mark.parametrize("name", worlds.WORLDS)
+def test_small_worlds_are_small(name):
+    world = worlds.WORLDS[name](**worlds.SMALL[name])
+    assert sum(asset.num_gaussians for asset in world.assets.values()) <= 200_000
+    assert world.num_gaussians > 500_000
+
+
 def test_a_missing_bundle_is_named():
     world = small("temples")
     with pytest.raises(

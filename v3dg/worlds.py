@@ -3,28 +3,34 @@
 A world says which assets stand where. Making the assets, building their bundles and putting them into a scene
 are steps of their own:
 
-    world = v3dg.worlds.forest(instances=60, num_gaussians=20_000)
+    world = worlds.forest(instances=60, num_gaussians=20_000)
     bundles = {name: v3dg.build_bundle(asset.make()) for name, asset in world.assets.items()}
-    scene = v3dg.worlds.scene_of(world, bundles)
+    scene = worlds.scene_of(world, bundles)
     image = v3dg.render(scene, world.cameras()["000_camera_0"])
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.gaussians import Gaussians
+from v3dg.io import save
 from v3dg.pile import Pile
 from v3dg.procedural import TREE_KINDS, make_donut, make_person, make_temple, make_tree
 from v3dg.procedural.donut import RING, TUBE
 from v3dg.scene import Scene
+from v3dg.scene_file import write_scene
 from v3dg.trajectories import trajectories
 
 
@@ -258,3 +264,54 @@ def _clear_place(
         if len(clear):
             return np.asarray(tried[clear[0]])
         extent *= 1.1
+
+
+WORLDS: dict[str, Callable[..., World]] = {
+    "donut_sea": donut_sea,
+    "forest": forest,
+    "temples": temples,
+    "crowd": crowd,
+}
+SMALL: dict[str, dict[str, int]] = {
+    "donut_sea": {"instances": 256, "num_gaussians": 15_000},
+    "forest": {"instances": 40, "num_gaussians": 20_000},
+    "temples": {"instances": 12, "num_gaussians": 100_000},
+    "crowd": {"instances": 64, "num_gaussians": 20_000, "persons": 4},
+}
+"""Arguments of worlds that a CPU builds in a minute or two."""
+
+
+def write_world(
+    world: World,
+    folder: str | os.PathLike[str],
+    *,
+    config: BuildConfig | None = None,
+    seed: int = 0,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    progress: bool = True,
+) -> Path:
+    """Make a world's assets, build their bundles, and write all of it with a scene file and its cameras.
+
+    Args:
+        folder: Made if it is not there. It gets ASSET.ply and ASSET.v3dg for each asset, and WORLD.json.
+        config: How bundles are built; by default as `build_bundle` does.
+        seed: Of the builds.
+
+    Returns:
+        The scene file's path.
+    """
+    from tqdm import tqdm
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    bundles = {}
+    for name, asset in tqdm(world.assets.items(), desc=world.name, unit="asset", disable=not progress):
+        gaussians = asset.make()
+        save(folder / f"{name}.ply", gaussians)
+        bundle = build_bundle(gaussians, config=config, seed=seed, device=device, progress=progress)
+        bundle.save(folder / f"{name}.v3dg")
+        bundles[name] = bundle
+    path = folder / f"{world.name}.json"
+    paths = [f"{name}.v3dg" for name in world.placements]
+    write_scene(path, scene_of(world, bundles), paths, world.cameras())
+    return path

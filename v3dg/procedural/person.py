@@ -137,7 +137,8 @@ class _Figure:
     scalp: _Shape
     head: Array  # centre
     hips: float  # height
-    hem: float  # of the shirt
+    shirt_hem: float  # heights
+    trouser_hem: float
 
 
 def _figure(rng: np.random.Generator) -> _Figure:
@@ -255,6 +256,7 @@ def _figure(rng: np.random.Generator) -> _Figure:
         size * head,
         size * z_hip,
         size * (z_hip - 0.06),
+        size * (0.49 if skirt else 0.055),
     )
 
 
@@ -312,7 +314,7 @@ def _seen(figure: _Figure, points: Array, *, behind: Sequence[_Shape]) -> Array:
     """Which points no other layer hides."""
     free = np.ones(len(points), bool)
     for shape in behind:
-        near = np.flatnonzero(free & ((points[:, 2] > figure.hem) | (shape is not figure.shirt)))
+        near = np.flatnonzero(free & ((points[:, 2] > figure.shirt_hem) | (shape is not figure.shirt)))
         d, _ = shape.distance(points[near])
         free[near[d < 0]] = False
     return free
@@ -396,14 +398,12 @@ def _cloth(
     rng: np.random.Generator,
 ) -> Part:
     """Woven cloth with folds, in one colour, in stripes across or along, or in checks."""
-    others = (figure.trousers,) if shape is figure.shirt else ()
-    hidden = () if shape is figure.shirt else (figure.shirt,)
-    points, normals, spacing = _enough(shape, n, figure, hidden, rng)
-    if others:  # the shirt hangs over the trousers
-        low = points[:, 2] > figure.hem
-        points, normals = points[low], normals[low]
-        spare = rng.choice(len(points), n - len(points))
-        points, normals = np.concatenate([points, points[spare]]), np.concatenate([normals, normals[spare]])
+    on_top = shape is figure.shirt
+    points, normals, spacing = _enough(shape, n, figure, () if on_top else (figure.shirt,), rng)
+    # Cut at the hem, where the round cones end in balls.
+    kept = np.flatnonzero(points[:, 2] > (figure.shirt_hem if on_top else figure.trouser_hem))
+    kept = np.concatenate([kept, rng.choice(kept, n - len(kept))])
+    points, normals = points[kept], normals[kept]
     folded = points * [1.0, 1.0, 0.38]
     crease = noise(folded, 11.0, 2) - 0.5
     e = 2e-3
@@ -417,7 +417,7 @@ def _cloth(
     along = 0.5 + 0.5 * np.tanh(6 * np.sin(points[:, 0] * 2 * np.pi / 0.060))
     amount = (np.zeros(n), across, along, 0.5 * (across + along))[pattern]
     colour = mix(first, second, amount) * (weave * (1 + 0.8 * crease))[:, None]
-    if shape is figure.shirt:
+    if on_top:
         collar = smoothstep(0.006, 0.002, np.abs(points[:, 2] - (figure.head[2] - 0.20)))
         placket = smoothstep(0.004, 0.002, np.abs(points[:, 0] - 0.012)) * (points[:, 1] < 0)
         colour *= (1 - 0.5 * np.maximum(collar, placket))[:, None]
