@@ -1,0 +1,54 @@
+"""Films: pictures in a row as a video file, written whole or not at all. Wants the extra `video`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import Any
+
+from v3dg import _files
+from v3dg.pictures import to_8bit
+
+
+def write_film(
+    path: str | os.PathLike[str], pictures: Iterable[Any], *, fps: int = 30, quality: int = 18
+) -> int:
+    """Encode pictures as H.264 in an .mp4 file, each as it comes; the file appears when all are in it.
+
+    Args:
+        pictures: (H, W, 3) floats in [0, 1], NumPy arrays or torch tensors, all of one size; height and width
+            are even.
+        fps: Pictures a second.
+        quality: Constant rate factor, 0 to 51; smaller is better and larger, 18 shows no difference.
+
+    Returns:
+        How many pictures the film has.
+
+    Raises:
+        ImportError: The extra is not installed.
+        ValueError: Another suffix, no pictures, or pictures of an odd or a changing size.
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise ImportError("films want PyAV, which is not installed; pip install 'v3dg[video]'") from error
+    if not os.fspath(path).endswith(".mp4"):
+        raise ValueError(f"{os.fspath(path)}: expected a file name ending in .mp4")
+    count, size = 0, None
+    with _files.replacing(path) as temporary, av.open(temporary, "w", format="mp4") as film:
+        stream = film.add_stream("h264", rate=fps, options={"crf": str(quality)})
+        stream.pix_fmt = "yuv420p"
+        for picture in pictures:
+            pixels = to_8bit(picture.detach().cpu() if hasattr(picture, "detach") else picture)
+            if size is None:
+                size = pixels.shape
+                stream.height, stream.width = size[:2]
+            if pixels.shape != size or len(size) != 3 or size[0] % 2 or size[1] % 2:
+                expected = "an even height and width" if pixels.shape == size else f"{size} as before"
+                raise ValueError(f"pictures: expected {expected}, got {pixels.shape}")
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+            count += 1
+        if not count:
+            raise ValueError("pictures: expected at least one, got none")
+        film.mux(stream.encode())
+    return count
