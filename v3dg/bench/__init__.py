@@ -7,8 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from v3dg.bench import record
 from v3dg.bench.parts import NAMES, part
+from v3dg.bench.record import write
 from v3dg.bench.settings import PRESETS
 from v3dg.bench.stage import Stage
 
@@ -28,15 +28,17 @@ def run(stage: Stage, preset: str, names: Sequence[str], *, quiet: bool = False)
     try:
         for name, module in modules.items():
             start = time.perf_counter()
-            result = module.run(stage)
-            seconds = time.perf_counter() - start
-            results[name] = {
-                **{"part": name, "preset": preset, "device": stage.device, "seed": stage.seed},
-                **{"asset": stage.asset_name, "asset_gaussians": len(stage.asset)},
-                **{"seconds": round(seconds, 1), "pictures": stage.take_pictures()},
-                **result,
-            }
-            record.write(stage.folder / f"{name}.json", results[name], stage.device)
+            stage.pictures = []
+            found = module.run(stage)
+            for result in [found] if isinstance(found, dict) else found:
+                seconds = time.perf_counter() - start
+                results[name] = {
+                    **{"part": name, "preset": preset, "device": stage.device, "seed": stage.seed},
+                    **{"asset": stage.asset_name, "asset_gaussians": len(stage.asset)},
+                    **{"seconds": round(seconds, 1), "pictures": stage.pictures},
+                    **result,
+                }
+                write(stage.folder / f"{name}.json", results[name], stage.device)
             if not quiet:
                 print(f"{name}: {seconds:.1f} s", file=sys.stderr, flush=True)
     finally:

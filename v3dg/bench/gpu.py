@@ -6,8 +6,6 @@ import threading
 from types import TracebackType
 from typing import Any
 
-import torch
-
 import v3dg
 from v3dg.bench.measure import Time, time_ms
 from v3dg.cameras import Camera
@@ -25,9 +23,12 @@ class PeakMemory:
     _idle = 0
 
     def __enter__(self) -> PeakMemory:
+        import torch
+
         torch.cuda.synchronize()
         torch.cuda.empty_cache()
-        self._least = torch.cuda.mem_get_info()[0]
+        self._free = torch.cuda.mem_get_info
+        self._least = self._free()[0]
         if not PeakMemory._idle:
             PeakMemory._idle = self._least
         self._done = threading.Event()
@@ -44,11 +45,13 @@ class PeakMemory:
 
     def _watch(self) -> None:
         while not self._done.wait(0.005):
-            self._least = min(self._least, torch.cuda.mem_get_info()[0])
+            self._least = min(self._least, self._free()[0])
 
 
 def picture_error(picture: Any, truth: Any) -> dict[str, float]:
     """How far a picture is from another, both clipped to [0, 1]."""
+    import torch
+
     picture, truth = (torch.as_tensor(p, device=DEVICE).clamp(0, 1) for p in (picture, truth))
     error = (picture - truth).abs()
     mean_square = float(error.double().square().mean())
@@ -62,6 +65,8 @@ def picture_error(picture: Any, truth: Any) -> dict[str, float]:
 
 def placed_gaussians(scene: Scene) -> v3dg.Gaussians:
     """All instances of a scene of one bundle, in full detail, in the world, on the GPU; SH degree 0."""
+    import torch
+
     asset = scene.bundles[0].level_gaussians(0).torch(DEVICE)
     means = torch.empty(len(scene), len(asset), 3, device=DEVICE)
     quats = torch.empty(len(scene), len(asset), 4, device=DEVICE)
@@ -85,6 +90,8 @@ def placed_gaussians(scene: Scene) -> v3dg.Gaussians:
 
 def _left_products(quaternions: Any) -> Any:
     """(I, 4, 4) matrices that multiply by a quaternion from the left."""
+    import torch
+
     w, x, y, z = torch.as_tensor(quaternions).unbind(-1)
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
@@ -93,11 +100,13 @@ def _left_products(quaternions: Any) -> Any:
 def time_gsplat(gaussians: v3dg.Gaussians, camera: Camera, repeats: int) -> Time:
     """A frame of gsplat's, packed or not: the quicker one counts."""
 
-    @torch.no_grad()
+    import torch
+
     def measure(packed: bool) -> Time:
         return time_ms(lambda: gsplat_picture(gaussians, camera, packed=packed), DEVICE, repeats)
 
-    return min((measure(packed) for packed in (True, False)), key=lambda t: t.median)
+    with torch.no_grad():
+        return min((measure(packed) for packed in (True, False)), key=lambda t: t.median)
 
 
 def gsplat_picture(
@@ -108,6 +117,7 @@ def gsplat_picture(
     Colours without a view dependence are handed over as they are, which spares gsplat a pass.
     """
     import gsplat
+    import torch
 
     if gaussians.sh_degree == 0:
         colors, degree = (gaussians.sh[:, 0] * 0.28209479177387814 + 0.5).clamp_min(0), None

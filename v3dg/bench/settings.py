@@ -12,7 +12,8 @@ class Settings:
     Attributes:
         asset_gaussians: Of the asset that the main scene is made of, where none is given.
         instances: Of it in the main scene.
-        worlds: "small" or "full": which size of the composed worlds.
+        worlds: Instances and gaussians of an asset of the composed worlds beside the main scene.
+        world_steps: Of the fit of their assets.
         size: Width and height of pictures in px.
         elevations: Degrees above the horizon of the cameras of "composed"; other parts take the middle.
         directions: How many of the paper's four directions "composed" looks from.
@@ -35,7 +36,8 @@ class Settings:
 
     asset_gaussians: int
     instances: int
-    worlds: str
+    worlds: dict[str, tuple[int, int]]
+    world_steps: int
     size: tuple[int, int]
     elevations: tuple[float, ...]
     directions: int
@@ -60,7 +62,8 @@ PRESETS = {
     "small": Settings(
         asset_gaussians=20_000,
         instances=100,
-        worlds="small",
+        worlds={"forest": (24, 4_000), "temples": (12, 8_000), "crowd": (36, 2_000)},
+        world_steps=80,
         size=(320, 180),
         elevations=(45.0,),
         directions=1,
@@ -83,7 +86,8 @@ PRESETS = {
     "full": Settings(
         asset_gaussians=45_000,
         instances=2048,
-        worlds="full",
+        worlds={"forest": (400, 315_630), "temples": (100, 1_350_487), "crowd": (400, 343_274)},
+        world_steps=800,
         size=(1920, 1080),
         elevations=(15.0, 30.0, 45.0, 60.0, 75.0),
         directions=4,

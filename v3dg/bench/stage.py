@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from v3dg import _device
+from v3dg import _device, worlds
 from v3dg.bench.measure import Judge, Picture, Row, Time, as_picture, draw_truth, time_ms
 from v3dg.bench.settings import Settings
 from v3dg.build import BuildConfig, build_bundle
@@ -22,7 +22,7 @@ from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.io import load
 from v3dg.pictures import write_picture
-from v3dg.procedural import make_asset, place_field
+from v3dg.procedural import make_asset
 from v3dg.render import Stats, render
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene
@@ -57,7 +57,7 @@ class View:
         }
 
 
-def views_of(cameras: Sequence[Camera]) -> list[View]:
+def views_of(cameras: Iterable[Camera]) -> list[View]:
     views = []
     for camera in cameras:
         x, y, z = camera.position
@@ -130,20 +130,21 @@ class Stage:
     layout_path: Path | None = None
     peers: Path | None = None
     """Folder with what other tools made of the asset: <asset>_<percent>.ply and so on, see part "merging"."""
+    pictures: list[str] = field(default_factory=list)
+    """File names of what the part at hand has saved."""
     judge: Judge = field(default_factory=Judge)
     _built: dict[str, Built] = field(default_factory=dict)
     _truths: dict[int, Picture] = field(default_factory=dict)
-    _saved: list[str] = field(default_factory=list)
 
     @cached_property
     def asset(self) -> Gaussians:
         if self.asset_path is None:
-            return make_asset(self.settings.asset_gaussians, seed=self.seed)
+            return self._main_world.assets["donut"].make()
         return load(self.asset_path)
 
     @property
     def asset_name(self) -> str:
-        return "procedural" if self.asset_path is None else self.asset_path.stem
+        return "made_donut" if self.asset_path is None else self.asset_path.stem
 
     def warm_up(self) -> None:
         """Load what the first build and the first picture load, so that no part pays for it."""
@@ -183,23 +184,21 @@ class Stage:
         return scene
 
     @cached_property
+    def _main_world(self) -> worlds.World:
+        settings = self.settings
+        return worlds.donut_sea(settings.instances, settings.asset_gaussians, seed=self.seed)
+
+    @cached_property
     def _layout(self) -> tuple[tuple[Any, Any, Any], list[View]]:
         size = self.settings.size
         if self.layout_path is None:
-            poses = place_field(self.settings.instances, seed=self.seed)
-            reach = 2.5 * float(np.abs(poses[0]).max())
-            views = [
-                orbit_view(
-                    360 * a / self.settings.directions, e, reach * (d + 1) / self.settings.distances, size
-                )
-                for a in range(self.settings.directions)
-                for e in self.settings.elevations
-                for d in range(self.settings.distances)
-            ]
-            return poses, views
+            world = self._main_world
+            placement = world.placements["donut"]
+            views = views_of(world.cameras(width=size[0], height=size[1]).values())
+            return (placement.positions, placement.quaternions, placement.scales), views
         name = json.loads(self.layout_path.read_text(encoding="utf-8"))["asset"]
         scene, cameras = read_scene(self.layout_path, bundles={name: self.build(BuildConfig(steps=0)).bundle})
-        views = views_of([resized(camera, size) for camera in cameras.values()])
+        views = views_of(resized(camera, size) for camera in cameras.values())
         return (scene.positions, scene.quaternions, scene.scales), views
 
     @cached_property
@@ -210,12 +209,18 @@ class Stage:
     @cached_property
     def all_views(self) -> list[View]:
         """All of the main scene's that the settings ask for."""
-        elevations = self.settings.elevations
-        azimuths = sorted({round(v.azimuth, 3) for v in self._layout[1]})[: self.settings.directions]
-        lines: dict[tuple[float, float], list[View]] = {}
-        for view in self._layout[1]:
-            if round(view.azimuth, 3) in azimuths and min(abs(view.elevation - e) for e in elevations) < 0.5:
-                lines.setdefault((round(view.azimuth, 3), round(view.elevation)), []).append(view)
+        return self._some_of(self._layout[1])
+
+    def _some_of(self, views: Sequence[View]) -> list[View]:
+        """Of the paper's 400 views those of the settings' directions, elevations and distances."""
+        azimuths = sorted({round(v.azimuth) for v in views})[: self.settings.directions]
+        lines: dict[tuple[int, int], list[View]] = {}
+        for view in views:
+            if (
+                round(view.azimuth) in azimuths
+                and min(abs(view.elevation - e) for e in self.settings.elevations) < 0.5
+            ):
+                lines.setdefault((round(view.azimuth), round(view.elevation)), []).append(view)
         return [view for line in lines.values() for view in every(line, self.settings.distances)]
 
     @cached_property
@@ -270,24 +275,41 @@ class Stage:
             for shot, error in zip(shots, errors, strict=True)
         ]
 
-    def worlds(self) -> Iterator[tuple[str, Scene, list[View]]]:
+    def composed_scenes(self) -> Iterator[tuple[str, Scene, list[View]]]:
         """The composed scenes and their views, one after another."""
-        yield "meadow" if self.layout_path is None else self.layout_path.stem, self.full_scene, self.all_views
+        name = self._main_world.name if self.layout_path is None else self.layout_path.stem
+        yield name, self.full_scene, self.all_views
+        width, height = self.settings.size
+        for world in self._other_worlds:
+            bundles = {name: self._world_bundle(world, name) for name in world.assets}
+            views = views_of(world.cameras(width=width, height=height).values())
+            yield world.name, worlds.scene_of(world, bundles), self._some_of(views)
 
-    def close_assets(self) -> Iterator[tuple[str, Gaussians]]:
-        """Assets to be seen from near."""
-        yield self.asset_name, self.asset
+    @cached_property
+    def _other_worlds(self) -> list[worlds.World]:
+        return [
+            getattr(worlds, name)(instances, gaussians, seed=self.seed)
+            for name, (instances, gaussians) in self.settings.worlds.items()
+        ]
+
+    def _world_bundle(self, world: worlds.World, name: str) -> Bundle:
+        if name not in self._built:
+            config = BuildConfig(steps=self.settings.world_steps)
+            self._built[name] = self.build(config, world.assets[name].make())
+        return self._built[name].bundle
+
+    def close_bundles(self) -> Iterator[tuple[str, Bundle]]:
+        """Assets to be seen from near: the main one, and the first of each world."""
+        yield self.asset_name, self.build().bundle
+        for world in self._other_worlds:
+            name = next(iter(world.assets))
+            yield name, self._world_bundle(world, name)
 
     def save(self, name: str, picture: Picture) -> None:
         """Keep a picture as a JPEG."""
         path = self.folder / f"{name}.jpg"
         write_picture(path, picture)
-        self._saved.append(path.name)
-
-    def take_pictures(self) -> list[str]:
-        """File names of the pictures that were kept since this was last asked."""
-        names, self._saved = self._saved, []
-        return names
+        self.pictures.append(path.name)
 
 
 def every(items: Sequence[Any], count: int) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from v3dg.bench.measure import Picture, Row, draw_truth, mean_of
@@ -20,9 +21,10 @@ ABOUT = (
 )
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    scenes = []
-    for name, scene, views in stage.worlds():
+def run(stage: Stage) -> Iterator[dict[str, Any]]:
+    """What is known after each scene."""
+    scenes: list[Row] = []
+    for name, scene, views in stage.composed_scenes():
         rows, pictures = measure(stage, scene, views)
         stage.save(f"composed_{name}", pictures)
         gaussians = sum(
@@ -30,7 +32,7 @@ def run(stage: Stage) -> dict[str, Any]:
             for b, bundle in enumerate(scene.bundles)
         )
         scenes.append({"scene": name, "instances": len(scene), "gaussians": gaussians, "views": rows})
-    return {"tolerance": DEFAULT_TOLERANCE, "scenes": scenes}
+        yield {"tolerance": DEFAULT_TOLERANCE, "scenes": scenes}
 
 
 def measure(stage: Stage, scene: Scene, views: list[View]) -> tuple[list[Row], Picture]:

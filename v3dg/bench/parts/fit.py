@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from v3dg.bench import line
-from v3dg.bench.line import build_row, full_row
+from v3dg.bench.line import COLUMNS, build_row, full_row
 from v3dg.bench.stage import PAPER_TOLERANCE, Stage
 from v3dg.bench.table import Column, markdown
 from v3dg.bench.verdict import Verdict
@@ -37,7 +36,7 @@ def tables(result: dict[str, Any]) -> str:
         Column("steps", "steps"),
         Column("build s", "build_seconds", ".2f"),
     )
-    return markdown((*columns, *line.COLUMNS[2:]), result["rows"])
+    return markdown((*columns, *COLUMNS[2:]), result["rows"])
 
 
 def verdict(result: dict[str, Any]) -> Verdict:

@@ -17,6 +17,7 @@ from v3dg.bench.verdict import Verdict
 from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
+from v3dg.procedural import make_tree
 from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
@@ -41,6 +42,8 @@ def assets(stage: Stage) -> Iterator[tuple[str, Gaussians, dict[str, Camera]]]:
     side = stage.settings.panel
     within = Camera.look_at((0, 0, 0.1), (1, 0, 0.5), fov_x=1.2, width=side, height=side, near=1e-3)
     yield "sky dome", sky_dome(count, seed=stage.seed), {"within": within}
+    tree = make_tree(count, seed=stage.seed)
+    yield "dense tree", tree, cameras_around(stage, tree)
     yield stage.asset_name, stage.asset, cameras_around(stage, stage.asset)
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from v3dg.bench import line
-from v3dg.bench.line import build_row, full_row, summary
+from v3dg.bench.line import COLUMNS, build_row, full_row, summary
 from v3dg.bench.measure import Row
 from v3dg.bench.stage import Stage, paper_tolerance
 from v3dg.bench.table import markdown
@@ -61,7 +60,7 @@ def gsplat_row(stage: Stage) -> Row:
 
 
 def tables(result: dict[str, Any]) -> str:
-    return markdown(line.COLUMNS, result["rows"])
+    return markdown(COLUMNS, result["rows"])
 
 
 def verdict(result: dict[str, Any]) -> Verdict:

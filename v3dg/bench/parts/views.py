@@ -9,6 +9,7 @@ from v3dg.bench.measure import Row, draw_truth, mean_of
 from v3dg.bench.stage import Stage, View, close_distance
 from v3dg.bench.table import Column, markdown
 from v3dg.bench.verdict import Verdict
+from v3dg.bundle import Bundle
 from v3dg.cameras import turntable
 from v3dg.select import DEFAULT_TOLERANCE
 
@@ -25,12 +26,12 @@ _ELEVATION = 30.0
 def run(stage: Stage) -> dict[str, Any]:
     return {
         "tolerance": DEFAULT_TOLERANCE,
-        "rows": [row_of(stage, name, asset) for name, asset in stage.close_assets()],
+        "rows": [row_of(stage, name, bundle) for name, bundle in stage.close_bundles()],
     }
 
 
-def row_of(stage: Stage, name: str, asset: Any) -> Row:
-    built = stage.build(asset=None if asset is stage.asset else asset)
+def row_of(stage: Stage, name: str, bundle: Bundle) -> Row:
+    asset = bundle.level_gaussians(0)
     center, distance = close_distance(asset)
     side = stage.settings.close_px
     cameras = turntable(
@@ -45,8 +46,8 @@ def row_of(stage: Stage, name: str, asset: Any) -> Row:
     rows = []
     for camera in cameras:
         view = View(0.0, _ELEVATION, distance, camera)
-        full, ours = (stage.shoot(built.bundle, view, tolerance) for tolerance in (0.0, DEFAULT_TOLERANCE))
-        truth = draw_truth(built.bundle, camera, stage.device)
+        full, ours = (stage.shoot(bundle, view, tolerance) for tolerance in (0.0, DEFAULT_TOLERANCE))
+        truth = draw_truth(bundle, camera, stage.device)
         same, of_full, of_ours = stage.judge.errors(
             ((full.picture, ours.picture), (truth, full.picture), (truth, ours.picture))
         )
