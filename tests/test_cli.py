@@ -1,5 +1,6 @@
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -166,6 +167,27 @@ def test_build_refuses_an_asset_with_nothing_left(folder, tmp_path):
     asset.opacities[:] = 0
     v3dg.save(tmp_path / "hidden.ply", asset)
     fails(1, "got none: 1,000 of 1,000 gaussians", "build", "hidden.ply", cwd=tmp_path)
+
+
+def test_a_full_disk_is_named_with_what_resumes(folder, tmp_path):
+    """The levels fit, the bundle does not."""
+    limit = (folder / "tuft.v3dg").stat().st_size - 1
+    done = subprocess.run(
+        [*COMMAND, "build", folder / "tuft.ply", "-o", "out.v3dg", "--quiet"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY)),
+    )
+    assert done.returncode == 1
+    message = "out.v3dg: File too large; `--resume` continues from out.v3dg.partial"
+    assert done.stderr == f"v3dg: error: {message}\n"
+    assert os.listdir(tmp_path) == ["out.v3dg.partial"]
+    done = run("build", folder / "tuft.ply", "-o", "out.v3dg", "--resume", "--quiet", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out.v3dg").read_bytes() == (folder / "tuft.v3dg").read_bytes()
+    assert os.listdir(tmp_path) == ["out.v3dg"]
 
 
 def test_info_of_a_scene(folder):

@@ -283,12 +283,14 @@ def _build(options: Build) -> None:
                 resume_path=partial,
                 unusable="refuse" if options.strict else "drop",
             )
+        bundle.save(output)
     except ValueError as error:
-        raise ValueError(f"{options.asset}: {error}") from None
+        place = f"{options.asset}: " if str(error).startswith("asset: ") else ""
+        raise ValueError(f"{place}{error}") from None
     except KeyboardInterrupt:
-        hint = f"; `--resume` continues from {partial}" if partial.exists() else ""
-        raise KeyboardInterrupt(f"interrupted{hint}") from None
-    bundle.save(output)
+        raise KeyboardInterrupt(f"interrupted{_to_resume(partial)}") from None
+    except OSError as error:  # a full disk, say
+        raise OSError(error.errno, f"{error.strerror}{_to_resume(partial)}", error.filename) from None
     partial.unlink(missing_ok=True)
     dropped = bundle.config["dropped"]
     result = {
@@ -309,6 +311,10 @@ def _build(options: Build) -> None:
     if dropped:
         text += "\nleft out: " + describe(dropped)
     _print(options.json, result, lambda: text)
+
+
+def _to_resume(partial: Path) -> str:
+    return f"; `--resume` continues from {partial}" if partial.exists() else ""
 
 
 def _info(options: Info) -> None:
