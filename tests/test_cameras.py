@@ -127,6 +127,7 @@ def test_camera_refuses_bad_values(change, message):
     ("change", "message"),
     [
         ({"target": (1, 1, 1)}, "target: expected a point away from the eye"),
+        ({"target": (1e200, 0, 0)}, "target: expected a distance that a double can hold"),
         ({"up": (2, 2, 2)}, "up: expected a direction that is not along the view"),
         ({"up": (0, 0, 0)}, "up: expected a direction that is not along the view"),
         ({"fov_x": 0.0}, "fov_x: expected radians between 0 and pi, got 0.0"),
@@ -138,6 +139,14 @@ def test_look_at_refuses_bad_values(change, message):
     good = {"eye": (1, 1, 1), "target": (0, 0, 0), "up": (0, 0, 1), "width": 8, "height": 8}
     with pytest.raises(ValueError, match=message):
         Camera.look_at(**{**good, **change})
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e300])
+def test_up_may_have_any_length(length):
+    camera = Camera.look_at((1, 2, 3), (0, 0, 0), (0, 0, length), width=8, height=8)
+    np.testing.assert_array_equal(
+        camera.viewmat, Camera.look_at((1, 2, 3), (0, 0, 0), width=8, height=8).viewmat
+    )
 
 
 def test_blender_camera_refuses_a_scale():

@@ -93,13 +93,17 @@ class Camera:
         """
         position, goal = _floats(eye, "eye", (3,)), _floats(target, "target", (3,))
         up_vector = _floats(up, "up", (3,))
-        distance = np.linalg.norm(goal - position)
+        with np.errstate(over="ignore"):
+            distance = np.linalg.norm(goal - position)
         if not distance > 0:
             raise ValueError(f"target: expected a point away from the eye, got {_text(goal)} for both")
+        if not np.isfinite(distance):
+            raise ValueError(f"target: expected a distance that a double can hold, got {_text(goal)}")
         forward = (goal - position) / distance
-        right = np.cross(forward, up_vector)
+        upwards = up_vector / (np.abs(up_vector).max() or 1.0)  # so that squares neither overflow nor vanish
+        right = np.cross(forward, upwards)
         length = np.linalg.norm(right)
-        if not length > 1e-9 * np.linalg.norm(up_vector):
+        if not length > 1e-9 * np.linalg.norm(upwards):
             raise ValueError(f"up: expected a direction that is not along the view, got {_text(up_vector)}")
         right /= length
         rotation = np.stack([right, np.cross(forward, right), forward])

@@ -1,0 +1,100 @@
+"""What the fuzzers and the replay of what they found call: readers, and what must hold whatever they read."""
+
+import hashlib
+import json
+import struct
+from pathlib import Path
+
+from random_bundle import random_bundle
+from v3dg._json import is_one_line
+from v3dg.bundle import Bundle
+from v3dg.camera_file import read_cameras
+from v3dg.io import load
+from v3dg.scene_file import read_scene
+
+BUNDLES = {"a": random_bundle(0), "a.v3dg": random_bundle(1), "sub/b.v3dg": random_bundle(2)}
+
+
+def read_ply(content, folder):
+    path = put(folder / "fuzz.ply", content)
+    with only_errors_that_name(path):
+        assert len(load(path)) <= len(content)
+
+
+def read_bundle(content, folder):
+    """Nearly every change of a file is found by its hashes, so it is read again with hashes that fit."""
+    for data in (content, with_fitting_hashes(content)):
+        path = put(folder / "fuzz.v3dg", data)
+        with only_errors_that_name(path):
+            bundle = Bundle.open(path)
+            assert 4 * (11 + 3 * (bundle.sh_degree + 1) ** 2) * bundle.num_gaussians <= len(data)
+            bundle.info()
+            assert len(bundle.gaussians) == bundle.num_gaussians
+
+
+def read_json(content, folder):
+    path = put(folder / "fuzz.json", content)
+    with only_errors_that_name(path.name):
+        read_scene(path, bundles=BUNDLES)
+    with only_errors_that_name(path.name):
+        read_cameras(path, size=(64, 48))
+
+
+READERS = {"ply": read_ply, "bundle": read_bundle, "scene": read_json}
+
+
+def put(path, content):
+    Path(path).write_bytes(content)
+    return path
+
+
+class only_errors_that_name:
+    """Lets those errors end the block that a reader may raise: of one line that begins with the name."""
+
+    def __init__(self, name):
+        self.name = name
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, _):
+        if kind is None or not issubclass(kind, ValueError | FileNotFoundError):
+            return False
+        assert str(error).startswith(f"{self.name}: "), error
+        assert is_one_line(str(error)), error
+        return True
+
+
+def parts_of(data):
+    """Header, its end, and from there the ends of pages and file's hash; None where they are not there."""
+    start = 8 + int.from_bytes(data[:8], "little")
+    try:
+        header = json.loads(data[8:start])
+        ends = [header[name]["data_offsets"][1] for name in ("pages", "hash")]
+        return (header, start, *ends) if 0 <= ends[0] < ends[1] <= len(data) - start else None
+    except Exception:  # any kind of damage
+        return None
+
+
+def with_fitting_hashes(data):
+    """The file with the hashes of its pages and its own made anew, as far as its header leads to them."""
+    data = bytearray(data)
+    try:
+        header, start, pages_end, hash_end = parts_of(data)
+        tables = {
+            name: slice(*(start + offset for offset in header[name]["data_offsets"]))
+            for name in ("pages.offset", "pages.bytes", "pages.hash")
+        }
+        offsets, sizes = (
+            struct.unpack(f"<{len(data[tables[name]]) // 8}q", data[tables[name]])
+            for name in ("pages.offset", "pages.bytes")
+        )
+        pages = [data[start + a : start + a + n + -n % 4096] for a, n in zip(offsets, sizes, strict=True)]
+        hashes = b"".join(hashlib.blake2b(page, digest_size=16).digest() for page in pages)
+        if len(hashes) == len(data[tables["pages.hash"]]):
+            data[tables["pages.hash"]] = hashes
+        covered = data[:start] + data[start + pages_end : start + hash_end - 16]
+        data[start + hash_end - 16 : start + hash_end] = hashlib.blake2b(covered, digest_size=16).digest()
+    except Exception:  # the header leads nowhere
+        pass
+    return bytes(data)
