@@ -157,6 +157,10 @@ BAD = {
         with_frame(transform_matrix=(np.diag([-1, 1, 1, 1]) @ np.array(MATRIX)).tolist()),
         "frames[1].transform_matrix: expected a rotation in the upper left 3x3",
     ),
+    "position beyond doubles": (
+        with_frame(transform_matrix=[[0.6, 0.8, 0, 1.7e308], [-0.8, 0.6, 0, 1.7e308], [0, 0, 1, 0]]),
+        "frames[1].viewmat: expected finite numbers, got",
+    ),
     "no focal length": (
         without("fl_x", "fl_y"),
         "frames[0]: expected fl_x or camera_angle_x, in the frame or at the top, got neither",

@@ -128,8 +128,9 @@ def _applied(top: Mapping[str, Node]) -> tuple[Floats, float]:
 
 def _undone(viewmat: Floats, transform: Floats, scale: float) -> Floats:
     """World to camera for the world before the transform and the scale."""
-    before = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
-    before[:3] /= scale  # the camera's own unit goes along
+    with np.errstate(over="ignore", invalid="ignore"):  # the camera refuses what comes of it
+        before = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
+        before[:3] /= scale  # the camera's own unit goes along
     return before
 
 

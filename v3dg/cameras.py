@@ -210,7 +210,8 @@ def turntable(
 def _rigid(rotation: Floats, eye: Floats) -> Floats:
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ eye
+    with np.errstate(over="ignore", invalid="ignore"):  # the camera refuses what comes of it
+        viewmat[:3, 3] = -rotation @ eye
     return viewmat
 
 

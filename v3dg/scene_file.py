@@ -47,14 +47,11 @@ def read_scene(
     path = Path(path)
     root = read_json(path)
     known = dict(bundles or {})
-    try:
-        if root.has("layouts"):
-            return _read_layouts(root, path.parent, known)
-        if root.has("asset") and not root.has("format"):
-            return _read_flat_layout(root, path.parent, known)
-        return _read_scene(root, path.parent, known)
-    except RecursionError:
-        raise ValueError(f"{path.name}: expected JSON, got values that are nested too deep") from None
+    if root.has("layouts"):
+        return _read_layouts(root, path.parent, known)
+    if root.has("asset") and not root.has("format"):
+        return _read_flat_layout(root, path.parent, known)
+    return _read_scene(root, path.parent, known)
 
 
 def write_scene(
