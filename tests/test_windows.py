@@ -5,7 +5,7 @@ import pytest
 
 import scenes_lod
 from v3dg import Camera, Scene, _core, render, select
-from v3dg._resident import instances_of
+from v3dg._resident import instances_on_host
 from v3dg.render import _table
 from v3dg.select import camera_of
 
@@ -26,7 +26,7 @@ def draw_window(scene, camera, window):
     selection = select(scene, camera, tolerance=0.0)
     return _core.render_selection(
         [_table(bundle, "appearance") for bundle in scene.bundles],
-        instances_of(scene, on_host=True),
+        instances_on_host(scene),
         camera_of(camera),
         selection.instance_ids,
         selection.cluster_ids,

@@ -28,6 +28,7 @@ class ResidentScene:
         ]
         self.core = _core.DeviceScene(tables, _device.current_stream())
         self.drawings: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._poses: tuple[Any, Any, Any] | None = None
         self._seen = (-1, -1)
 
     def update(self, scene: Scene) -> None:
@@ -42,27 +43,21 @@ class ResidentScene:
         self.drawings.clear()
         stream = _device.current_stream()
         if self._seen[0] != scene.num_changes:
-            self.core.set_instances(instances_of(scene), stream)
-        else:
-            positions, quaternions, scales = _poses(scene)
-            self.core.set_poses(positions, quaternions, scales, stream)
+            self.core.set_instances(scene.instance_bundle, scene.importance, stream)
+        # What is on the device is read there, and so has to stay.
+        positions, quaternions, scales = (self._here(rows) for rows in scene.poses_anywhere())
+        self._poses = (positions, quaternions, scales)
+        self.core.set_poses(positions, quaternions, scales, stream)
         self._seen = (scene.num_changes, scene.num_moves)
 
-
-def instances_of(scene: Scene, *, on_host: bool = False) -> tuple[Any, ...]:
-    """The instances as the core takes them."""
-    poses = (scene.positions, scene.quaternions, scene.scales) if on_host else _poses(scene)
-    return (scene.instance_bundle, *poses, scene.importance)
+    def _here(self, rows: Any) -> Any:
+        is_elsewhere = getattr(rows, "is_cuda", False) and rows.device.index != self.device
+        return rows.to(self.device) if is_elsewhere else rows
 
 
-def _poses(scene: Scene) -> tuple[Any, ...]:
-    """Where they are; on the current device, if they are on another one."""
-    poses = scene.poses_anywhere()
-    device = _device.current_device()
-    return tuple(
-        rows.to(device) if getattr(rows, "is_cuda", False) and rows.device.index != device else rows
-        for rows in poses
-    )
+def instances_on_host(scene: Scene) -> tuple[Any, ...]:
+    """The instances as the CPU's half takes them."""
+    return (scene.instance_bundle, scene.positions, scene.quaternions, scene.scales, scene.importance)
 
 
 # Of scenes and bundles, as long as those live.

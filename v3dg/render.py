@@ -179,7 +179,7 @@ def _render_on_cpu(
     selected = time.perf_counter()
     color, alpha, depth, counts = _core.render_selection(
         tables,
-        _resident.instances_of(scene, on_host=True),
+        _resident.instances_on_host(scene),
         camera_of(camera),
         selection.instance_ids,
         selection.cluster_ids,

@@ -193,9 +193,7 @@ def _select(subject: Scene | Bundle, camera: Camera, rule: tuple[Any, ...], on_c
         resident = _resident.resident_of(subject)
         found = resident.core.select(camera_of(camera), rule, _device.current_stream())
     else:
-        found = _core.select(
-            scene.tables, _resident.instances_of(scene, on_host=True), camera_of(camera), rule
-        )
+        found = _core.select(scene.tables, _resident.instances_on_host(scene), camera_of(camera), rule)
     instance_ids, cluster_ids, count, tolerance, fits_budget = found
     if not fits_budget:
         raise over_budget(rule[1], count)
@@ -209,7 +207,7 @@ def group_metrics(
     scene = Scene.of(scene_or_bundle)
     metric, offset = _core.group_metrics(
         scene.tables,
-        _resident.instances_of(scene, on_host=True),
+        _resident.instances_on_host(scene),
         camera_of(camera),
         rule_of(0.0, None, 0, footprint, False),
     )

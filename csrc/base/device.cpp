@@ -74,5 +74,10 @@ void release(void* pointer, cudaStream_t stream) noexcept {
     if (pointer != nullptr && cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
 }
 
+void trim_pool(cudaStream_t stream) {
+    check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+    check(cudaMemPoolTrimTo(pool_of_current_device(), 0), "cudaMemPoolTrimTo");
+}
+
 }  // namespace cuda
 }  // namespace v3dg

@@ -35,6 +35,8 @@ unsigned num_multiprocessors();
 // Throws OutOfMemory.
 void* allocate(size_t bytes, cudaStream_t stream);
 void release(void* pointer, cudaStream_t stream) noexcept;
+// Waits for the stream, and returns to the driver what the pool keeps.
+void trim_pool(cudaStream_t stream);
 
 // Owned elements of a plain type on the device, not initialised. Grows by forgetting what it held. Whoever
 // uses it on several streams orders them.

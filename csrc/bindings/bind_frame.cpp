@@ -62,9 +62,11 @@ class BoundScene {
     cuda::SceneTables& tables() { return *tables_; }
     const std::vector<int64_t>& num_gaussians() const { return num_gaussians_; }
 
-    void set_instances(const py::tuple& instances, uintptr_t stream) {
-        tables_->set_instances(instance_table(instances, num_gaussians_.size(), doubles_anywhere),
-                               stream_of(stream));
+    void set_instances(const py::array& bundle, const py::array& importance, uintptr_t stream) {
+        const Span<const int32_t> bundles = bundle_of_instance(bundle, num_gaussians_.size());
+        tables_->set_instances(
+            bundles, span_of<const float>(importance, "importance", {static_cast<py::ssize_t>(bundles.size)}),
+            stream_of(stream));
     }
     void set_poses(const py::object& positions, const py::object& quaternions, const py::object& scales,
                    uintptr_t stream) {
@@ -86,11 +88,11 @@ class BoundScene {
     }
 
   private:
-    // On the host or on the device.
-    static Span<const double> doubles_anywhere(const py::handle& array, const char* name, Shape shape) {
-        return py::hasattr(array, "__cuda_array_interface__")
-                   ? device_span_of<const double>(array, name, shape)
-                   : span_of<const double>(array.cast<py::array>(), name, shape);
+    static cuda::PoseSpan doubles_anywhere(const py::handle& array, const char* name,
+                                           std::initializer_list<py::ssize_t> shape) {
+        if (py::hasattr(array, "__cuda_array_interface__"))
+            return {device_span_of<const double>(array, name, shape), true};
+        return {span_of<const double>(array.cast<py::array>(), name, shape), false};
     }
 
     std::vector<int64_t> num_gaussians_;  // of each bundle
@@ -189,7 +191,7 @@ void bind_frame(py::module_& m) {
              "Waits for the picture; what was counted and how long it took.");
     py::class_<BoundScene>(m, "DeviceScene", "What selection reads of a scene, on a device.")
         .def(py::init<const py::list&, uintptr_t>(), "bundles"_a, "stream"_a)
-        .def("set_instances", &BoundScene::set_instances, "instances"_a, "stream"_a)
+        .def("set_instances", &BoundScene::set_instances, "bundle"_a, "importance"_a, "stream"_a)
         .def("set_poses", &BoundScene::set_poses, "positions"_a, "quaternions"_a, "scales"_a, "stream"_a)
         .def("select", &BoundScene::select, "camera"_a, "rule"_a, "stream"_a, "As select on the host does.");
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles.")

@@ -166,7 +166,7 @@ static py::tuple render_selection(const py::list& bundles, const py::tuple& inst
     static SharedWorkspace shared;
     std::vector<BundleClusters> tables;
     for (const py::handle& item : bundles) tables.push_back(clusters_of(item));
-    const InstanceTable placed = host_instances(instances, tables.size());
+    const InstanceTable placed = instance_table(instances, tables.size());
     const Span<const int32_t> instance = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
     const Span<const int32_t> clusters =
         span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instance.size)});

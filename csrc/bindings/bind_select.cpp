@@ -14,7 +14,7 @@ struct Arguments {
         for (const py::handle table : tables_of_bundles)
             tables.push_back(table.cast<const BoundTable&>().table());
         input.bundles = {tables.data(), tables.size()};
-        input.instances = host_instances(instances, tables.size());
+        input.instances = instance_table(instances, tables.size());
         input.camera = select_camera(camera);
         input.rule = select_rule(rule);
     }

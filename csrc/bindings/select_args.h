@@ -134,19 +134,24 @@ inline SelectRule select_rule(const py::tuple& t) {
     return rule;
 }
 
-// Borrows the arrays of a scene's instances: (bundle (I,), positions (I, 3), quaternions (I, 4), scales (I,),
-// importance (I,)). `doubles(array, name, shape)` borrows those that make the poses.
-template <class Doubles>
-InstanceTable instance_table(const py::tuple& t, size_t num_bundles, const Doubles& doubles) {
-    const py::array bundles = t[0].cast<py::array>(), importance = t[4].cast<py::array>();
-    const Span<const int32_t> bundle = span_of<const int32_t>(bundles, "instance_bundle", {-1});
-    const py::ssize_t count = static_cast<py::ssize_t>(bundle.size);
+inline Span<const int32_t> bundle_of_instance(const py::array& array, size_t num_bundles) {
+    const Span<const int32_t> bundle = span_of<const int32_t>(array, "instance_bundle", {-1});
     for (const int32_t b : bundle)
         if (b < 0 || static_cast<size_t>(b) >= num_bundles)
             throw py::value_error("instance_bundle: expected a bundle below " + std::to_string(num_bundles) +
                                   ", got " + std::to_string(b));
-    return {bundle, doubles(t[1], "positions", {count, 3}), doubles(t[2], "quaternions", {count, 4}),
-            doubles(t[3], "scales", {count}), span_of<const float>(importance, "importance", {count})};
+    return bundle;
+}
+
+// Borrows the arrays of a scene's instances: (bundle (I,), positions (I, 3), quaternions (I, 4), scales (I,),
+// importance (I,)).
+inline InstanceTable instance_table(const py::tuple& t, size_t num_bundles) {
+    const Span<const int32_t> bundle = bundle_of_instance(t[0].cast<py::array>(), num_bundles);
+    const py::ssize_t count = static_cast<py::ssize_t>(bundle.size);
+    return {bundle, span_of<const double>(t[1].cast<py::array>(), "positions", {count, 3}),
+            span_of<const double>(t[2].cast<py::array>(), "quaternions", {count, 4}),
+            span_of<const double>(t[3].cast<py::array>(), "scales", {count}),
+            span_of<const float>(t[4].cast<py::array>(), "importance", {count})};
 }
 
 template <class T>
@@ -156,14 +161,6 @@ py::array_t<T> array_of(const std::vector<T>& values) {
 inline py::tuple tuple_of(const SelectOutput& out) {
     return py::make_tuple(array_of(out.instance), array_of(out.cluster), out.num_gaussians, out.tolerance_px2,
                           out.fits_budget);
-}
-
-using Shape = std::initializer_list<py::ssize_t>;
-
-inline InstanceTable host_instances(const py::tuple& t, size_t num_bundles) {
-    return instance_table(t, num_bundles, [](const py::handle& array, const char* name, Shape shape) {
-        return span_of<const double>(array.cast<py::array>(), name, shape);
-    });
 }
 
 }  // namespace v3dg

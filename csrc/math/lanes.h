@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <type_traits>
 
 #include "base/host_device.h"
@@ -15,6 +16,12 @@
 #endif
 
 namespace v3dg {
+
+// Constants, because nvcc does not let device code call constexpr functions of the host.
+template <class T>
+constexpr T kLargest = std::numeric_limits<T>::max();
+template <class T>
+constexpr T kInfinite = std::numeric_limits<T>::infinity();
 
 V3DG_HD inline float sqrt_of(float x) { return ::sqrtf(x); }
 V3DG_HD inline double sqrt_of(double x) { return ::sqrt(x); }

@@ -99,6 +99,13 @@ void Frame::enlarge(const State& s) {
     grow(capacity_.large, s.num_large);
     grow(capacity_.entries, s.counters.entries);
     capacity_.records = std::min<size_t>(capacity_.records, kMostFrameRecords);
+    if (was_captured_) return;
+    // The largest buffers go before larger ones come, and not into the pool: pieces of the old size are of no
+    // use.
+    records_ = {};
+    entries_ = {};
+    scratch_ = {};
+    trim_pool(last_stream_);
 }
 
 std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream) {
@@ -137,12 +144,13 @@ void Frame::enqueue(Drawing& drawing) {
     const ItemList items{room(items_, capacity.items, drawing), &state->counters, capacity.items,
                          capacity.records};
     Record<float>* records = room(records_, capacity.records, drawing);
-    FewTiles* few = room(few_, capacity.records, drawing);
     uint32_t* item_records = room(item_records_, capacity.items, drawing);
     ItemTiles* item_tiles = room(item_tiles_, capacity.items, drawing);
     LargeRecord* large = room(large_, capacity.large, drawing);
     TileEntry* entries = room(entries_, capacity.entries, drawing);
-    TileEntry* scratch = room(scratch_, capacity.entries, drawing);
+    // Which tiles a record is in has been read when the blend stage begins.
+    FewTiles* few = room(scratch_, std::max(capacity.records, capacity.entries), drawing);
+    TileEntry* scratch = reinterpret_cast<TileEntry*>(few);
     const bool keeps_tape = keeps_ == Keeps::tape;
     uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
     const TileBinOutput bins{room(tile_first_, batch.num_tiles + 1, drawing),
@@ -191,11 +199,16 @@ void Frame::enqueue(Drawing& drawing) {
 }
 
 FrameTape Frame::tape() const {
-    const FrameLists lists{last_batch_.images,    image_of_tile_.data(),
-                           last_batch_.num_tiles, records_.data(),
-                           tile_first_.data(),    entries_.data(),
-                           scratch_.data(),       &reinterpret_cast<const State*>(cleared_.data())->counters,
-                           capacity_.records,     capacity_.entries,
+    const FrameLists lists{last_batch_.images,
+                           image_of_tile_.data(),
+                           last_batch_.num_tiles,
+                           records_.data(),
+                           tile_first_.data(),
+                           entries_.data(),
+                           nullptr,
+                           &reinterpret_cast<const State*>(cleared_.data())->counters,
+                           capacity_.records,
+                           capacity_.entries,
                            plans_.data()};
     return {lists,
             {order_.data(), blended_.data()},

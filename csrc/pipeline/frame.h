@@ -86,10 +86,10 @@ class Frame {
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
     DeviceBuffer<Record<float>> records_;
-    DeviceBuffer<FewTiles> few_;
     DeviceBuffer<ItemTiles> item_tiles_;
     DeviceBuffer<LargeRecord> large_;
-    DeviceBuffer<TileEntry> entries_, scratch_;
+    DeviceBuffer<TileEntry> entries_;
+    DeviceBuffer<unsigned long long> scratch_;  // the few tiles of records, then of the blend stage
     DeviceBuffer<unsigned long long> tile_first_;
     DeviceBuffer<TilePlan> plans_;
     DeviceBuffer<unsigned char> cleared_;  // State, states of the scan, counts of the tiles

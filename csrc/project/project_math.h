@@ -6,8 +6,6 @@
 // covariance is A Aᵀ + filter I with A = J W R S (2x3), so its determinant is |a1 x a2|² plus terms that are
 // positive: nothing cancels, however thin the gaussian is.
 
-#include <limits>
-
 #include "math/lanes.h"
 #include "math/quat.h"
 #include "math/sh.h"
@@ -155,8 +153,7 @@ template <class V>
 V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Projection<V>& s, V& half_x,
                                    V& half_y) {
     using T = Lane<V>;
-    constexpr T kMost = std::numeric_limits<T>::max();
-    const V huge = all_lanes<V>(kMost);
+    const V huge = all_lanes<V>(kLargest<T>);
     const V reach = e.log2_opacity - all_lanes<V>(T(kLog2MinAlpha));
     half_x = sqrt_of(reach * s.c11) * T(1 / kFalloffScale);
     half_y = sqrt_of(reach * s.c22) * T(1 / kFalloffScale);
@@ -354,7 +351,6 @@ template <class V, class T>
 V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelView<T>& mv, const V* sh,
                                      V color[3]) {
     using L = Lane<V>;
-    constexpr L kInfinity = std::numeric_limits<L>::infinity();
     V basis[kMaxShBases];
     V dir[3] = {mean[0] - mv.eye[0], mean[1] - mv.eye[1], mean[2] - mv.eye[2]};
     if (degree > 0) {
@@ -367,7 +363,7 @@ V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelVie
         V sum = all_lanes<V>(T(0.5));
         for (int b = 0; b < num_sh_bases(degree); ++b) sum += basis[b] * sh[3 * b + c];
         sum = max_of(sum, V{});
-        color[c] = sum < all_lanes<V>(kInfinity) ? sum : V{};
+        color[c] = sum < all_lanes<V>(kInfinite<L>) ? sum : V{};
     }
 }
 

@@ -4,10 +4,13 @@
 // which clusters are drawn, and their places in the list by a prefix sum over parts.
 //
 // A budget puts two kernels in between: one adds up by how much each tolerance changes the cut, one chooses.
+// They take no tolerance below half of what was chosen last time, which spares them the tables of what is
+// far. Where that is too much, all three run once more without it.
 
 #include "select/select_cuda.h"
 
 #include <algorithm>
+#include <cmath>
 
 #include "base/scan.cuh"
 
@@ -20,6 +23,22 @@ struct CutPart {
     uint32_t instance, first, tops;
 };
 
+// What is known of the clusters of a part of a table, whatever the view.
+struct PartBounds {
+    Box box;
+    Ball parents, owns;  // around the centres of the balls of the groups above and of their own
+    float most_parent_radius, most_parent_weight;
+    float least_own_radius, least_own_weight;
+    int32_t least_own_level;
+    bool has_leaf, has_root;
+};
+
+// What one budget leaves for the next.
+struct BudgetState {
+    float guess;     // a tolerance that is likely to be too small
+    unsigned again;  // whether it was too large, and the second round counts
+};
+
 namespace {
 
 constexpr unsigned kEach = 8;  // clusters of a part that a lane looks at
@@ -27,6 +46,11 @@ constexpr unsigned kPartSize = 32 * kEach;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 constexpr unsigned kPlaceThreads = 64;  // few, so that a few thousand instances spread over the device
 constexpr unsigned kChooseThreads = 1024;
+// Bins of a warp of choose_kernel.
+constexpr uint32_t kChooseShare = (kNumBudgetBins + kChooseThreads - 1) / kChooseThreads * 32;
+// More than rounding can do to a metric, which is compared with what bounds it.
+constexpr float kBoundMargin = 1e-3f;
+constexpr float kMostGuess = 1 << 20;
 static_assert(kEach <= 8, "a byte says which top clusters are drawn");
 
 using Count = unsigned long long;
@@ -45,6 +69,18 @@ struct SceneOnDevice {
     InstanceView* views;  // of instances whose tables are looked at
     uint8_t* tops;        // of those whose tops are the cut: a bit for each that is drawn
     CutPart* parts;
+};
+
+// The tolerance that a round begins with. Without a budget there is one round and no state.
+struct BudgetRound {
+    const BudgetState* state;
+    bool is_second;
+
+    // Whether there is nothing to do: the first round was enough.
+    __device__ bool is_over() const { return is_second && state->again == 0; }
+    __device__ float tolerance(const SelectRule& rule) const {
+        return state == nullptr || is_second ? rule.tolerance_px2 : fmaxf(rule.tolerance_px2, state->guess);
+    }
 };
 
 enum class Look { nothing, tops, table };
@@ -73,7 +109,9 @@ __device__ Look place_instance(const SceneOnDevice& scene, size_t i, const Selec
 }
 
 __global__ void place_kernel(SceneOnDevice scene, SelectCamera camera, SelectRule rule, FrameImage image,
-                             FrameImage* images, Placement* placements, Scratch scratch) {
+                             FrameImage* images, Placement* placements, BudgetRound round, Scratch scratch) {
+    if (round.is_over()) return;
+    rule.tolerance_px2 = round.tolerance(rule);
     const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
     if (i == 0 && images != nullptr) images[0] = image;
     const size_t num_instances = scene.instances.scale.size;
@@ -144,36 +182,71 @@ __device__ LaneClusters clusters_of_lane(const SceneOnDevice& scene, const CutPa
     return mine;
 }
 
-// Calls visit(k, cluster) for the clusters of a table that the lane looks at.
-template <class Visit>
-__device__ void for_each_cluster(const LaneClusters& mine, const Visit& visit) {
-    for (unsigned k = 0; k < kEach; ++k)
-        if (mine.first + k < mine.bundle->table.own_group.size)
-            visit(k, static_cast<int32_t>(mine.first + k));
+// Whether all the groups above the clusters of a part fit, so that none is drawn.
+__device__ bool parents_fit(const PartBounds& part, const InstanceView& view, const SelectRule& rule) {
+    if (part.has_root || rule.footprint == Footprint::paper) return false;
+    const float distance = sqrtf(distance2_to(part.parents, view)) - part.parents.radius;
+    return distance > 0.0f &&
+           footprint_at(part.most_parent_radius, distance * distance, view) * part.most_parent_weight <=
+               (1.0f - kBoundMargin) * rule.tolerance_px2;
+}
+
+// Whether none of the clusters of a part has a group of its own that fits.
+__device__ bool owns_do_not_fit(const PartBounds& part, const InstanceView& view, const SelectRule& rule) {
+    if (part.has_leaf || part.least_own_level <= rule.min_level || rule.footprint == Footprint::paper)
+        return false;
+    const float distance = sqrtf(distance2_to(part.owns, view)) + part.owns.radius;
+    return footprint_at(part.least_own_radius, distance * distance, view) * part.least_own_weight >
+           (1.0f + kBoundMargin) * rule.tolerance_px2;
+}
+
+// The groups of the clusters that the lane looks at; -2 past the last cluster.
+__device__ void load_groups(Span<const int32_t> groups, uint32_t first, int32_t out[kEach]) {
+    if (first + kEach <= groups.size) {
+#pragma unroll
+        for (unsigned k = 0; k < kEach; k += 4) {
+            const int4 four = *reinterpret_cast<const int4*>(groups.data + first + k);
+            out[k] = four.x;
+            out[k + 1] = four.y;
+            out[k + 2] = four.z;
+            out[k + 3] = four.w;
+        }
+    } else {
+#pragma unroll
+        for (unsigned k = 0; k < kEach; ++k) out[k] = first + k < groups.size ? groups[first + k] : -2;
+    }
 }
 
 __device__ unsigned drawn_of_table(const SceneOnDevice& scene, const LaneClusters& mine,
                                    const SelectRule& rule) {
     const ClusterTable& table = mine.bundle->table;
-    const InstanceView& view = scene.views[mine.instance];
+    const InstanceView view = scene.views[mine.instance];
+    const PartBounds& bounds = mine.bundle->parts[mine.first / kPartSize];
+    if ((rule.culls && is_outside(bounds.box, view)) || parents_fit(bounds, view, rule) ||
+        owns_do_not_fit(bounds, view, rule))
+        return 0;
+    int32_t own[kEach], parent[kEach];
+    load_groups(table.own_group, mine.first, own);
+    load_groups(table.parent_group, mine.first, parent);
     unsigned drawn = 0;
-    int32_t last_parent = -1;
-    bool last_fits = false;
-    for_each_cluster(mine, [&](unsigned k, int32_t c) {
-        const int32_t own = table.own_group[c], parent = table.parent_group[c];
-        if (parent >= 0 && parent != last_parent) {
-            last_parent = parent;
-            last_fits = fits(table, parent, view, rule);
-        }
-        if ((parent >= 0 && last_fits) || (own >= 0 && !fits(table, own, view, rule))) return;
-        if (!rule.culls || !is_outside(table.box[c], view)) drawn |= 1u << k;
-    });
+#pragma unroll
+    for (unsigned k = 0; k < kEach; ++k) {
+        if (own[k] == -2) continue;
+        const bool own_fits = own[k] < 0 || fits(table, own[k], view, rule);
+        const bool parent_fits = parent[k] >= 0 && fits(table, parent[k], view, rule);
+        if (own_fits && !parent_fits) drawn |= 1u << k;
+    }
+    if (rule.culls)
+        for (unsigned k = 0; k < kEach; ++k)
+            if ((drawn >> k & 1) && is_outside(table.box[mine.first + k], view)) drawn &= ~(1u << k);
     return drawn;
 }
 
 // Adds to `change` what count_instance of the CPU's half does.
-__global__ void change_kernel(SceneOnDevice scene, SelectRule rule, const unsigned* num_parts,
-                              Count* change) {
+__global__ void change_kernel(SceneOnDevice scene, SelectRule rule, BudgetRound round,
+                              const unsigned* num_parts, Count* change) {
+    if (round.is_over()) return;
+    rule.tolerance_px2 = round.tolerance(rule);
     __shared__ Count at_first;
     if (threadIdx.x == 0) at_first = 0;
     __syncthreads();
@@ -185,19 +258,26 @@ __global__ void change_kernel(SceneOnDevice scene, SelectRule rule, const unsign
                 if (mine.drawn >> k & 1) kept += mine.size(k);
         } else {
             const ClusterTable& table = mine.bundle->table;
-            const InstanceView& view = scene.views[mine.instance];
-            for_each_cluster(mine, [&](unsigned k, int32_t c) {
-                const int32_t own = table.own_group[c], parent = table.parent_group[c];
-                const uint32_t first = own < 0 ? 0 : bin_of_group(table, own, view, rule),
-                               last = parent < 0 ? kNumBudgetBins : bin_of_group(table, parent, view, rule);
-                if (first >= last || (rule.culls && is_outside(table.box[c], view))) return;
+            const InstanceView view = scene.views[mine.instance];
+            const PartBounds& bounds = mine.bundle->parts[mine.first / kPartSize];
+            if ((rule.culls && is_outside(bounds.box, view)) || parents_fit(bounds, view, rule)) continue;
+            int32_t own[kEach], parent[kEach];
+            load_groups(table.own_group, mine.first, own);
+            load_groups(table.parent_group, mine.first, parent);
+#pragma unroll
+            for (unsigned k = 0; k < kEach; ++k) {
+                if (own[k] == -2) continue;
+                const uint32_t first = own[k] < 0 ? 0 : bin_of_group(table, own[k], view, rule),
+                               last = parent[k] < 0 ? kNumBudgetBins
+                                                    : bin_of_group(table, parent[k], view, rule);
+                if (first >= last || (rule.culls && is_outside(table.box[mine.first + k], view))) continue;
                 const Count size = mine.size(k);
                 if (first == 0)
                     kept += size;
                 else
                     atomicAdd(&change[first], size);
                 if (last < kNumBudgetBins) atomicAdd(&change[last], ~size + 1);
-            });
+            }
         }
         kept = warp_sum(kept);
         if (threadIdx.x % 32 == 0 && kept > 0) atomicAdd(&at_first, kept);
@@ -207,24 +287,51 @@ __global__ void change_kernel(SceneOnDevice scene, SelectRule rule, const unsign
 }
 
 // One block. The least tolerance whose cut is within the budget; where there is none, nothing is left to cut.
-__global__ void choose_kernel(SelectRule rule, const Count* change, CutChoice* choice, unsigned* num_parts) {
-    constexpr uint32_t kOwn = (kNumBudgetBins + kChooseThreads - 1) / kChooseThreads;
+__global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change, CutChoice* choice,
+                              BudgetState* state, unsigned* num_parts) {
+    if (round.is_over()) return;
+    const float least_tolerance = round.tolerance(rule);
     __shared__ uint32_t chosen;
-    if (threadIdx.x == 0) chosen = kNumBudgetBins;
-    const uint32_t first = kOwn * threadIdx.x, last = min(first + kOwn, kNumBudgetBins);
+    __shared__ Count before_warp[kChooseThreads / 32 + 1];
+    const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    const uint32_t first = kChooseShare * warp, last = min(first + kChooseShare, kNumBudgetBins);
     Count sum = 0;
-    for (uint32_t bin = first; bin < last; ++bin) sum += change[bin];
-    Count total, count = block_prefix(sum, total);  // which waits for the others
-    for (uint32_t bin = first; bin < last; ++bin) {
-        count += change[bin];
-        if (count > rule.budget) continue;
-        atomicMin(&chosen, bin);
-        break;
+    for (uint32_t bin = first + lane; bin < last; bin += 32) sum += change[bin];
+    sum = warp_sum(sum);
+    if (lane == 0) before_warp[warp + 1] = sum;
+    if (threadIdx.x == 0) {
+        before_warp[0] = 0;
+        chosen = kNumBudgetBins;
     }
     __syncthreads();
+    if (threadIdx.x == 0)
+        for (unsigned w = 0; w < kChooseThreads / 32; ++w) before_warp[w + 1] += before_warp[w];
+    __syncthreads();
+    Count count = before_warp[warp];
+    for (uint32_t from = first; from < last; from += 32) {
+        const uint32_t bin = from + lane;
+        Count here = bin < last ? change[bin] : 0;
+#pragma unroll
+        for (unsigned offset = 1; offset < 32; offset *= 2) {
+            const Count below = __shfl_up_sync(kAllLanes, here, offset);
+            if (lane >= offset) here += below;
+        }
+        const unsigned within = __ballot_sync(kAllLanes, bin < last && count + here <= rule.budget);
+        if (within != 0) {
+            if (lane == 0) atomicMin(&chosen, from + __ffs(within) - 1);
+            break;
+        }
+        count += __shfl_sync(kAllLanes, here, 31);
+    }
+    __syncthreads();
+    const bool is_first_in_vain = chosen == 0 && least_tolerance > rule.tolerance_px2;
+    if (is_first_in_vain)
+        for (uint32_t bin = threadIdx.x; bin < kNumBudgetBins; bin += kChooseThreads) change[bin] = 0;
     if (threadIdx.x != 0) return;
     const bool fits_budget = chosen < kNumBudgetBins;
-    *choice = {fits_budget ? tolerance_of_bin(chosen, rule.tolerance_px2) : INFINITY, !fits_budget, total};
+    const float tolerance = fits_budget ? tolerance_of_bin(chosen, least_tolerance) : INFINITY;
+    *choice = {tolerance, !fits_budget, before_warp[kChooseThreads / 32]};
+    *state = {fminf(0.5f * tolerance, kMostGuess), is_first_in_vain || round.is_second};
     if (!fits_budget) *num_parts = 0;
 }
 
@@ -306,8 +413,9 @@ __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool i
 
 template <class Output>
 __global__ void __launch_bounds__(kCutThreads)
-    cut_kernel(SceneOnDevice scene, SelectRule rule, const CutChoice* choice, Scratch scratch,
-               Output output) {
+    cut_kernel(SceneOnDevice scene, SelectRule rule, const CutChoice* choice, const BudgetState* state,
+               Scratch scratch, Scratch second_scratch, Output output) {
+    if (state != nullptr && state->again != 0) scratch = second_scratch;
     const unsigned num_parts = *scratch.num_parts, num_tickets = blocks_for(num_parts, kCutWarps);
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
     if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
@@ -354,18 +462,71 @@ unsigned place_blocks(size_t num_instances) { return std::max(1u, blocks_for(num
 // Words of Scratch before the states of the cut: three counters and the states of place_kernel's blocks.
 size_t cleared_words(size_t num_instances) { return 2 + place_blocks(num_instances); }
 
+size_t scratch_words(size_t num_instances, size_t num_tickets) {
+    return cleared_words(num_instances) + 2 * num_tickets;
+}
+
 Scratch scratch_in(Count* words, size_t num_instances, size_t num_tickets) {
     auto* counters = reinterpret_cast<unsigned*>(words);
     Count* states = words + cleared_words(num_instances);
     return {counters, counters + 1, counters + 2, words + 2, states, states + num_tickets};
 }
 
-template <class T>
-void copy(DeviceBuffer<T>& to, Span<const T> from, cudaStream_t stream) {
-    to.reserve(from.size, stream);
-    if (from.size > 0)
-        check(cudaMemcpyAsync(to.data(), from.data, from.size * sizeof(T), cudaMemcpyDefault, stream),
-              "cudaMemcpyAsync to the device");
+// Around the centres of balls.
+class CenterBounds {
+  public:
+    void add(const Ball& ball) { centers_.push_back(ball); }
+    Ball ball() const {
+        double middle[3] = {0, 0, 0}, radius2 = 0;
+        for (const Ball& b : centers_) {
+            const float center[3] = {b.x, b.y, b.z};
+            for (int a = 0; a < 3; ++a) middle[a] += center[a] / static_cast<double>(centers_.size());
+        }
+        const float m[3] = {float(middle[0]), float(middle[1]), float(middle[2])};
+        for (const Ball& b : centers_) {
+            const double d[3] = {double(b.x) - m[0], double(b.y) - m[1], double(b.z) - m[2]};
+            radius2 = std::max(radius2, d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+        }
+        return {m[0], m[1], m[2], static_cast<float>(std::sqrt(radius2) * (1 + 1e-6))};
+    }
+
+  private:
+    std::vector<Ball> centers_;
+};
+
+PartBounds bounds_of_part(const ClusterTable& table, size_t first, size_t last) {
+    PartBounds part{table.box[first], {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false};
+    CenterBounds parents, owns;
+    for (size_t c = first; c < last; ++c) {
+        for (int a = 0; a < 3; ++a) {  // written so that NaN stays and nothing is ever dropped
+            if (!(table.box[c].lo[a] >= part.box.lo[a])) part.box.lo[a] = table.box[c].lo[a];
+            if (!(table.box[c].hi[a] <= part.box.hi[a])) part.box.hi[a] = table.box[c].hi[a];
+        }
+        const int32_t own = table.own_group[c], parent = table.parent_group[c];
+        part.has_leaf |= own < 0;
+        part.has_root |= parent < 0;
+        if (own >= 0) {
+            owns.add(table.ball[own]);
+            part.least_own_radius = std::min(part.least_own_radius, table.ball[own].radius);
+            part.least_own_weight = std::min(part.least_own_weight, table.weight[own]);
+            part.least_own_level = std::min(part.least_own_level, table.level[own]);
+        }
+        if (parent >= 0) {
+            parents.add(table.ball[parent]);
+            part.most_parent_radius = std::max(part.most_parent_radius, table.ball[parent].radius);
+            part.most_parent_weight = std::max(part.most_parent_weight, table.weight[parent]);
+        }
+    }
+    part.parents = parents.ball();
+    part.owns = owns.ball();
+    return part;
+}
+
+std::vector<PartBounds> bounds_of_parts(const ClusterTable& table) {
+    std::vector<PartBounds> parts;
+    for (size_t first = 0; first < table.own_group.size; first += kPartSize)
+        parts.push_back(bounds_of_part(table, first, std::min(first + kPartSize, table.own_group.size)));
+    return parts;
 }
 
 template <class T>
@@ -399,40 +560,46 @@ SceneTables::SceneTables(Span<const ClusterTable> tables, Span<const ClusterFilt
         table.offset = upload(table.offset);
         table.top_group = upload(table.top_group);
         table.top_cluster = upload(table.top_cluster);
+        const std::vector<PartBounds> parts = bounds_of_parts(tables[b]);
+        bundles[b].parts = upload(Span<const PartBounds>{parts.data(), parts.size()}).data;
         bundles[b].filters = {upload(filters[b].filter_px2), upload(filters[b].compensate)};
         num_clusters_.push_back(table.own_group.size);
     }
     bundles_.copy_from({bundles.data(), bundles.size()}, stream);
+    const BudgetState none{};
+    budget_.copy_from({&none, 1}, stream);
 }
 
-void SceneTables::set_instances(const InstanceTable& instances, cudaStream_t stream) {
-    const size_t count = instances.scale.size;
-    bundle_of_instance_.assign(instances.bundle.begin(), instances.bundle.end());
+void SceneTables::set_instances(Span<const int32_t> bundle, Span<const float> importance,
+                                cudaStream_t stream) {
+    const size_t count = bundle.size;
+    bundle_of_instance_.assign(bundle.begin(), bundle.end());
     most_parts_ = 0;
-    for (const int32_t b : bundle_of_instance_)
-        most_parts_ += std::max<size_t>(1, blocks_for(num_clusters_[b], kPartSize));
-    bundle_.copy_from(instances.bundle, stream);
-    importance_.copy_from(instances.importance, stream);
-    set_poses(instances.position, instances.quaternion, instances.scale, stream);
+    for (const int32_t b : bundle) most_parts_ += std::max(1u, blocks_for(num_clusters_[b], kPartSize));
+    bundle_.copy_from(bundle, stream);
+    importance_.copy_from(importance, stream);
     views_.reserve(count, stream);
     tops_.reserve(count, stream);
     parts_.reserve(most_parts_, stream);
-    scratch_.reserve(cleared_words(count) + 2 * blocks_for(most_parts_, kCutWarps), stream);
+    scratch_.reserve(2 * scratch_words(count, blocks_for(most_parts_, kCutWarps)), stream);
 }
 
-void SceneTables::set_poses(Span<const double> position, Span<const double> quaternion,
-                            Span<const double> scale, cudaStream_t stream) {
-    copy(position_, position, stream);
-    copy(quaternion_, quaternion, stream);
-    copy(scale_, scale, stream);
+void SceneTables::set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
+                            cudaStream_t stream) {
+    const auto take = [&](const PoseSpan& from, int k) {
+        return from.is_on_device ? from.values.data : uploaded_[k].copy_from(from.values, stream);
+    };
+    position_ = take(position, 0);
+    quaternion_ = take(quaternion, 1);
+    scale_ = take(scale, 2);
 }
 
 InstanceTable SceneTables::instances() const {
     const size_t count = num_instances();
     return {{bundle_.data(), count},
-            {position_.data(), 3 * count},
-            {quaternion_.data(), 4 * count},
-            {scale_.data(), count},
+            {position_, 3 * count},
+            {quaternion_, 4 * count},
+            {scale_, count},
             {importance_.data(), count}};
 }
 
@@ -440,25 +607,33 @@ template <class Output>
 void SceneTables::cut(const SelectCamera& camera, const SelectRule& rule, const FrameImage* image,
                       FrameImage* images, Placement* placements, CutChoice* choice, const Output& output,
                       cudaStream_t stream) {
-    const size_t count = num_instances();
-    const Scratch scratch = scratch_in(scratch_.data(), count, blocks_for(most_parts_, kCutWarps));
+    const size_t count = num_instances(), num_tickets = blocks_for(most_parts_, kCutWarps);
+    Count* words = scratch_.data();
+    const Scratch scratches[2] = {scratch_in(words, count, num_tickets),
+                                  scratch_in(words + scratch_words(count, num_tickets), count, num_tickets)};
     const SceneOnDevice scene{bundles_.data(), instances(), views_.data(), tops_.data(), parts_.data()};
-    const unsigned blocks = static_cast<unsigned>(std::clamp<size_t>(
-        blocks_for(most_parts_, kCutWarps), 1, (2048 / kCutThreads) * num_multiprocessors()));
-    check(cudaMemsetAsync(scratch_.data(), 0, cleared_words(count) * sizeof(Count), stream),
-          "cudaMemsetAsync");
-    launch("place_kernel", place_kernel, place_blocks(count), kPlaceThreads, 0, stream, scene, camera, rule,
-           image == nullptr ? FrameImage{} : *image, images, placements, scratch);
-    if (rule.budget != kNoBudget) {
-        Count* change = change_.reserve(kNumBudgetBins, stream);
+    const unsigned blocks = static_cast<unsigned>(
+        std::clamp<size_t>(num_tickets, 1, (2048 / kCutThreads) * num_multiprocessors()));
+    const bool has_budget = rule.budget != kNoBudget;
+    BudgetState* state = has_budget ? budget_.data() : nullptr;
+    Count* change = has_budget ? change_.reserve(kNumBudgetBins, stream) : nullptr;
+    if (has_budget)
         check(cudaMemsetAsync(change, 0, kNumBudgetBins * sizeof(Count), stream), "cudaMemsetAsync");
-        launch("change_kernel", change_kernel, blocks, kCutThreads, 0, stream, scene, rule, scratch.num_parts,
-               change);
-        launch("choose_kernel", choose_kernel, 1, kChooseThreads, 0, stream, rule, change, choice,
-               scratch.num_parts);
+    for (const bool is_second : {false, true}) {
+        const Scratch& scratch = scratches[is_second];
+        const BudgetRound round{state, is_second};
+        check(cudaMemsetAsync(scratch.place_ticket, 0, cleared_words(count) * sizeof(Count), stream),
+              "cudaMemsetAsync");
+        launch("place_kernel", place_kernel, place_blocks(count), kPlaceThreads, 0, stream, scene, camera,
+               rule, image == nullptr ? FrameImage{} : *image, images, placements, round, scratch);
+        if (!has_budget) break;
+        launch("change_kernel", change_kernel, blocks, kCutThreads, 0, stream, scene, rule, round,
+               scratch.num_parts, change);
+        launch("choose_kernel", choose_kernel, 1, kChooseThreads, 0, stream, rule, round, change, choice,
+               state, scratch.num_parts);
     }
-    launch("cut_kernel", cut_kernel<Output>, blocks, kCutThreads, 0, stream, scene, rule, choice, scratch,
-           output);
+    launch("cut_kernel", cut_kernel<Output>, blocks, kCutThreads, 0, stream, scene, rule, choice, state,
+           scratches[0], scratches[1], output);
 }
 
 void SceneTables::cut_items(const SelectCamera& camera, const SelectRule& rule, const FrameImage& image,
@@ -472,7 +647,7 @@ void SceneTables::given_items(const SelectCamera& camera, Span<const int32_t> in
                               Placement* placements, const ItemList& items, cudaStream_t stream) {
     const SceneOnDevice scene{bundles_.data(), instances(), nullptr, nullptr, nullptr};
     const unsigned blocks = std::max(1u, blocks_for(instance.size, kCutThreads));
-    const size_t words = cleared_words(0) + 2 * size_t(blocks);
+    const size_t words = scratch_words(0, blocks);
     const Scratch scratch = scratch_in(scratch_.reserve(words, stream), 0, blocks);
     check(cudaMemsetAsync(scratch_.data(), 0, words * sizeof(Count), stream), "cudaMemsetAsync");
     launch("place_all_kernel", place_all_kernel, place_blocks(num_instances()), kPlaceThreads, 0, stream,

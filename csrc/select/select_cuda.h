@@ -15,13 +15,22 @@ struct ClusterFilters {
     Span<const uint8_t> compensate;  // [C]
 };
 
+struct PartBounds;
+
 // A bundle's tables on the device.
 struct DeviceBundle {
     ClusterTable table;
     ClusterFilters filters;
+    const PartBounds* parts;  // of kPartSize clusters each
+};
+
+struct PoseSpan {
+    Span<const double> values;
+    bool is_on_device;
 };
 
 struct CutPart;
+struct BudgetState;
 
 // A scene's instances and the tables of its bundles, resident on the device, and the cut of one view.
 // Everything is enqueued on the stream that is passed; whoever uses several orders them.
@@ -30,11 +39,10 @@ class SceneTables {
     // Host memory may be reused on return.
     SceneTables(Span<const ClusterTable> tables, Span<const ClusterFilters> filters, cudaStream_t stream);
 
-    // Takes the place of all instances. Poses may be the host's or the device's; what is the host's may be
-    // reused on return.
-    void set_instances(const InstanceTable& instances, cudaStream_t stream);
-    // Moves the instances that there are.
-    void set_poses(Span<const double> position, Span<const double> quaternion, Span<const double> scale,
+    // Takes the place of all instances; poses come next.
+    void set_instances(Span<const int32_t> bundle, Span<const float> importance, cudaStream_t stream);
+    // Each of the three is either the host's, which may be reused on return, or the device's, which stays.
+    void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
                    cudaStream_t stream);
 
     size_t num_instances() const { return bundle_of_instance_.size(); }
@@ -73,11 +81,13 @@ class SceneTables {
     DeviceBuffer<DeviceBundle> bundles_;
     DeviceBuffer<int32_t> bundle_;
     DeviceBuffer<float> importance_;
-    DeviceBuffer<double> position_, quaternion_, scale_;
+    DeviceBuffer<double> uploaded_[3];
+    const double *position_ = nullptr, *quaternion_ = nullptr, *scale_ = nullptr;
     DeviceBuffer<InstanceView> views_;
     DeviceBuffer<uint8_t> tops_;
     DeviceBuffer<CutPart> parts_;
     DeviceBuffer<unsigned long long> scratch_, change_;
+    DeviceBuffer<BudgetState> budget_;
     DeviceBuffer<int32_t> pair_instance_, pair_cluster_;
     DeviceBuffer<Pairs> pairs_;
 };

@@ -72,18 +72,25 @@ struct SelectRule {
     uint64_t budget = kNoBudget;  // most gaussians; the tolerance is raised until they fit
 };
 
-// Screen area that the ball covers, px2. +inf when the eye is inside, or where there is no number.
-V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view, Footprint footprint) {
+V3DG_HD inline float distance2_to(const Ball& ball, const InstanceView& view) {
     const float dx = ball.x - view.eye[0], dy = ball.y - view.eye[1], dz = ball.z - view.eye[2];
-    const float radius2 = ball.radius * ball.radius;
-    if (footprint == Footprint::paper) {
-        const float depth = dx * view.forward[0] + dy * view.forward[1] + dz * view.forward[2];
-        const float area = float(kPi) * (radius2 / (depth * depth)) * view.px2_per_steradian;
-        return area >= 0.0f ? area : INFINITY;
-    }
-    const float x2 = radius2 / (dx * dx + dy * dy + dz * dz);
+    return dx * dx + dy * dy + dz * dz;
+}
+
+// Of a ball so far away, squared, from the eye.
+V3DG_HD inline float footprint_at(float radius, float distance2, const InstanceView& view) {
+    const float x2 = radius * radius / distance2;
     if (!(x2 < 1.0f)) return INFINITY;
     return solid_angle_of_ball(x2) * view.px2_per_steradian;
+}
+
+// Screen area that the ball covers, px2. +inf when the eye is inside, or where there is no number.
+V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view, Footprint footprint) {
+    if (footprint == Footprint::solid_angle) return footprint_at(ball.radius, distance2_to(ball, view), view);
+    const float depth = (ball.x - view.eye[0]) * view.forward[0] + (ball.y - view.eye[1]) * view.forward[1] +
+                        (ball.z - view.eye[2]) * view.forward[2];
+    const float area = float(kPi) * (ball.radius * ball.radius / (depth * depth)) * view.px2_per_steradian;
+    return area >= 0.0f ? area : INFINITY;
 }
 
 // Screen area, px2, that one gaussian of the clusters made by group g stands for; none where nothing finer
