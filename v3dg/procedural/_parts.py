@@ -275,13 +275,14 @@ def sample(
     back_u, back_v = np.where(u > 0.5, -step, step), np.where(v > 0.5, -step, step)
     du = (surface(u + back_u, v) - points) / back_u[:, None]
     dv = (surface(u, v + back_v) - points) / back_v[:, None]
-    room = np.stack(
-        [
-            np.full(n, np.inf) if name in closed else np.linalg.norm(slope, axis=1) * np.minimum(x, 1 - x)
-            for name, slope, x in (("u", du, u), ("v", dv, v))
-        ],
-        -1,
-    )
+    length_u, length_v = np.linalg.norm(du, axis=1), np.linalg.norm(dv, axis=1)
+    cosine = np.abs(np.sum(du * dv, axis=1)) / np.maximum(length_u * length_v, 1e-12)
+    sine = np.sqrt(np.maximum(1 - cosine**2, 0))
+    endless = np.full(n, np.inf)
+    room_u = endless if "u" in closed else length_u * np.minimum(u, 1 - u)
+    room_v = endless if "v" in closed else length_v * np.minimum(v, 1 - v) * sine
+    # Where the surface is skew, its side borders are met across the tangent, too.
+    room = np.stack([room_u, np.minimum(room_v, room_u * sine / np.maximum(cosine, 1e-9))], -1)
     return Patch(points, unit(np.cross(du, dv)), unit(du), u, v, room, float(ends[-1]))
 
 
@@ -327,7 +328,7 @@ def cover(
         beside = room.min(axis=1) < 2 * long
         lengthwise = room[:, 1] <= room[:, 0]
         angle = np.where(beside, np.where(lengthwise, 0.0, np.pi / 2), angle)
-        space = np.maximum(0.6 * room, 0.22 * spacing[:, None])
+        space = np.maximum(0.45 * room, 0.22 * spacing[:, None])  # two deviations reach the border
         free = np.where(beside, np.where(lengthwise, space[:, 0], space[:, 1]), np.inf)
         long = np.minimum(long, free)
         free = np.where(beside, np.where(lengthwise, space[:, 1], space[:, 0]), np.inf)

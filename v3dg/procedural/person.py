@@ -1,14 +1,13 @@
-"""People: bodies of smoothly joined round cones, dressed, with hair."""
+"""People: the skin, clothes, shoes and hair of figures."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from v3dg.gaussians import Gaussians
+from v3dg.procedural._body import Figure, Shape, random_figure
 from v3dg.procedural._light import gaussians_of
 from v3dg.procedural._parts import UP, Array, Noise, Part, cover, mix, smoothstep, unit
 
@@ -49,217 +48,6 @@ _TROUSERS = np.array(
 )
 
 
-@dataclass(frozen=True)
-class _Cone:
-    """Spheres of radius a at p to radius b at q, and all between them; ``flat`` squeezes it along y."""
-
-    p: Array
-    q: Array
-    a: float
-    b: float
-    flat: float = 1.0
-
-
-def _cone(p: npt.ArrayLike, q: npt.ArrayLike, a: float, b: float, flat: float = 1.0) -> _Cone:
-    return _Cone(np.array(p, dtype=np.float64), np.array(q, dtype=np.float64), a, b, flat)
-
-
-@dataclass(frozen=True)
-class _Shape:
-    """Round cones joined smoothly: a layer of the body or of its clothes."""
-
-    cones: tuple[_Cone, ...]
-    blend: float  # how far joints are rounded, in metres
-
-    def distance(self, points: Array) -> tuple[Array, Array]:
-        """Signed distance, nearly, negative inside, and the direction in which it grows, (n,) and (n,3)."""
-        total, gradient = np.zeros(len(points)), np.zeros((len(points), 3))
-        for cone in self.cones:
-            axis = cone.q - cone.p
-            squeeze = np.array([1.0, 1 / cone.flat, 1.0])
-            away = (points - cone.p) * squeeze
-            t = np.clip(away @ axis / max(float(axis @ axis), 1e-12), 0, 1)
-            away = away - t[:, None] * axis
-            length = np.maximum(np.sqrt(np.einsum("ij,ij->i", away, away)), 1e-9)
-            weight = np.exp(np.clip((cone.a + (cone.b - cone.a) * t - length) / self.blend, -40, 40))
-            total += weight
-            gradient += (weight / length)[:, None] * away * squeeze
-        return -self.blend * np.log(total), unit(gradient)
-
-    def spread(self, n: int, rng: np.random.Generator) -> tuple[Array, Array, float]:
-        """n points on the surface, nearly even, their normals, and the spacing."""
-        areas = np.array(
-            [
-                np.pi * (c.a + c.b) * (np.linalg.norm(c.q - c.p) + c.a + c.b) * (1 + c.flat) / 2
-                for c in self.cones
-            ]
-        )
-        # More than enough, as what falls inside another cone is dropped.
-        many = int(1.6 * n) + 64
-        which = rng.choice(len(areas), many, p=areas / areas.sum())
-        p, q = (np.stack([getattr(c, name) for c in self.cones])[which] for name in "pq")
-        a, b, flat = (np.array([getattr(c, name) for c in self.cones])[which] for name in ("a", "b", "flat"))
-        length = np.linalg.norm(q - p, axis=1)
-        reach = rng.uniform(-a, length + b)
-        axis = unit(np.where(length[:, None] > 1e-6, q - p, UP))
-        side = unit(np.cross(axis, [0.3, 0.9, 0.2]))
-        angle = rng.uniform(0, 2 * np.pi, many)
-        around = side * np.cos(angle)[:, None] + np.cross(axis, side) * np.sin(angle)[:, None]
-        t = np.clip(reach / np.maximum(length, 1e-6), 0, 1)
-        radius = a + (b - a) * t
-        beyond = reach - np.clip(reach, 0, length)
-        ring = np.sqrt(np.maximum(radius**2 - beyond**2, 0))
-        offset = (around * ring[:, None] + axis * beyond[:, None]) * np.stack(
-            [np.ones(many), flat, np.ones(many)], -1
-        )
-        points = p + (q - p) * t[:, None] + offset
-        start, _ = self.distance(points)
-        points = points[start > -1.2 * self.blend]
-        for _ in range(2):
-            d, normal = self.distance(points)
-            points = points - d[:, None] * normal
-        d, normal = self.distance(points)
-        kept = np.flatnonzero(np.abs(d) < 0.004)
-        kept = rng.permutation(kept)[:n] if len(kept) >= n else rng.choice(kept, n)
-        area = float(areas.sum()) * len(points) / many
-        return points[kept], normal[kept], float(np.sqrt(area / n))
-
-
-@dataclass(frozen=True)
-class _Figure:
-    """A person's layers, in metres; the body looks along -y."""
-
-    limbs: tuple[_Shape, ...]  # each arm, and the legs where a skirt shows them
-    face: _Shape  # head and neck
-    shirt: _Shape
-    trousers: _Shape
-    shoes: _Shape
-    scalp: _Shape
-    head: Array  # centre
-    hips: float  # height
-    shirt_hem: float  # heights
-    trouser_hem: float
-
-
-def _figure(rng: np.random.Generator) -> _Figure:
-    woman = rng.random() < 0.5
-    size = rng.normal(0.965 if woman else 1.03, 0.035)
-    stout = rng.normal(1.0, 0.09)
-    sway, stride = 0.05 * rng.standard_normal(), 0.05 + 0.05 * rng.random()
-    shoulder = (0.165 if woman else 0.195) * (0.5 + 0.5 * stout)
-    hip = (0.105 if woman else 0.095) * stout
-    waist, chest = (0.115 if woman else 0.130) * stout, (0.130 if woman else 0.150) * stout
-    z_hip, z_waist, z_chest, z_neck = 0.93, 1.08, 1.29, 1.47
-    head = np.array([0.3 * sway, -0.02, 1.64])
-
-    legs, shoes, sleeves, trousers = [], [], [], []
-    arms: list[list[_Cone]] = []
-    raised = rng.uniform(0.05, 0.28, 2)  # rad that the arms stand off
-    bent = rng.uniform(0.1, 0.9, 2)  # and the elbows bend
-    long_sleeves, skirt = rng.random() < 0.5, woman and rng.random() < 0.45
-    for i, s in enumerate((-1.0, 1.0)):
-        knee = (s * 0.095, -0.02 - 0.4 * s * stride, 0.50)
-        ankle = (s * 0.105, 0.03 + s * stride, 0.09)
-        top = (s * hip, 0.0, z_hip - 0.04)
-        legs += [
-            _cone((0.5 * (top[0] + knee[0]), 0.0, 0.7), knee, 0.064 * stout, 0.052),
-            _cone(knee, ankle, 0.052, 0.036),
-        ]
-        trousers += [
-            _cone(top, knee, 0.094 * stout, 0.072),
-            _cone(knee, (ankle[0], ankle[1], 0.07), 0.072, 0.062),
-        ]
-        toe = (ankle[0] + s * 0.025, ankle[1] - 0.165, 0.034)
-        shoes += [
-            _cone((ankle[0], ankle[1] + 0.02, 0.046), toe, 0.044, 0.034),
-            _cone((ankle[0], ankle[1] + 0.02, 0.046), (ankle[0], ankle[1] + 0.01, 0.085), 0.044, 0.043),
-        ]
-        joint = np.array([s * shoulder, 0.0, z_neck - 0.105])
-        out = np.array([s * np.sin(raised[i]), 0.03, -np.cos(raised[i])])
-        elbow = joint + 0.295 * out
-        fore = unit(
-            np.array([-0.15 * s * bent[i] + s * np.sin(raised[i]) * 0.6, -np.sin(bent[i]), -np.cos(bent[i])])
-        )
-        wrist = elbow + 0.25 * fore
-        arm = [_cone(joint, elbow, 0.047, 0.037), _cone(elbow, wrist, 0.037, 0.026)]
-        palm = wrist + 0.075 * fore
-        arm.append(_cone(wrist, palm, 0.027, 0.034, 0.8))
-        side = unit(np.cross(fore, [1.0, 0.0, 0.0]) + 1e-6)
-        for finger in range(4):
-            root = palm + side * (0.020 * (finger - 1.5)) + 0.015 * fore
-            arm.append(
-                _cone(
-                    root,
-                    root + fore * (0.075 - 0.012 * abs(finger - 1.3)) - 0.02 * s * np.array([1, 0, 0]),
-                    0.0095,
-                    0.0075,
-                )
-            )
-        arm.append(_cone(wrist + 0.03 * fore, wrist + 0.065 * fore + 0.045 * side, 0.012, 0.009))
-        arms.append(arm)
-        sleeves.append(_cone(joint, elbow, 0.066, 0.056))
-        if long_sleeves:
-            sleeves.append(_cone(elbow, wrist - 0.01 * fore, 0.055, 0.042))
-        else:
-            sleeves[-1] = _cone(joint, joint + 0.19 * out, 0.066, 0.062)
-    torso = [
-        _cone((-0.6 * hip, 0, z_hip), (0.6 * hip, 0, z_hip), 0.125 * stout, 0.125 * stout, 0.9),
-        _cone((0, 0, z_hip), (0, 0, z_waist), waist + 0.02, waist, 0.8),
-        _cone((0, 0, z_waist), (0, 0, z_chest), waist, chest, 0.78),
-        _cone(
-            (-0.55 * shoulder, 0.0, z_chest + 0.03),
-            (0.55 * shoulder, 0.0, z_chest + 0.03),
-            0.085,
-            0.085,
-            0.95,
-        ),
-        _cone((0, 0.015, z_neck - 0.065), (-0.8 * shoulder, 0, z_neck - 0.115), 0.060, 0.042),
-        _cone((0, 0.015, z_neck - 0.065), (0.8 * shoulder, 0, z_neck - 0.115), 0.060, 0.042),
-    ]
-    if woman:
-        torso += [
-            _cone((s * 0.068, -0.075, z_chest - 0.015), (s * 0.068, -0.07, z_chest - 0.02), 0.056, 0.056)
-            for s in (-1.0, 1.0)
-        ]
-    x, y, z = head
-    face = [
-        _cone((x, y + 0.018, z + 0.022), (x, y + 0.012, z + 0.028), 0.094, 0.092, 1.05),
-        _cone((x, y - 0.012, z - 0.02), (x, y - 0.038, z - 0.085), 0.070, 0.036, 1.0),
-        _cone((x - 0.024, y - 0.034, z - 0.080), (x + 0.024, y - 0.034, z - 0.080), 0.024, 0.024),
-        _cone((x, y - 0.040, z + 0.015), (x, y - 0.044, z - 0.050), 0.046, 0.040),
-        _cone((x, y - 0.086, z + 0.008), (x, y - 0.101, z - 0.028), 0.007, 0.0115),  # nose
-        _cone((x - 0.016, y - 0.077, z - 0.061), (x + 0.016, y - 0.077, z - 0.061), 0.0085, 0.0085),  # lips
-        _cone((x - 0.030, y - 0.076, z + 0.030), (x + 0.030, y - 0.076, z + 0.030), 0.014, 0.014),  # brow
-        _cone((x - 0.088, y + 0.022, z - 0.01), (x - 0.092, y + 0.030, z + 0.02), 0.011, 0.014),  # ears
-        _cone((x + 0.088, y + 0.022, z - 0.01), (x + 0.092, y + 0.030, z + 0.02), 0.011, 0.014),
-        _cone((0, 0.015, z_neck - 0.05), (x, y + 0.02, z - 0.06), 0.058, 0.052),
-    ]
-    if skirt:
-        trousers = [_cone((0, 0, z_hip + 0.03), (0, 0, 0.52), 0.145 * stout, 0.235, 0.78)]
-    belt = [torso[0], _cone((0, 0, z_hip), (0, 0, z_waist - 0.02), waist + 0.020, waist, 0.80)]
-    shirt = [_Cone(c.p, c.q, c.a + 0.014, c.b + 0.014, c.flat) for c in torso]
-    shirt.append(_cone((0, 0.01, z_hip - 0.03), (0, 0, z_waist), waist + 0.050, waist + 0.022, 0.84))
-
-    def scaled(cones: Sequence[_Cone], blend: float) -> _Shape:
-        return _Shape(
-            tuple(_Cone(size * c.p, size * c.q, size * c.a, size * c.b, c.flat) for c in cones), blend
-        )
-
-    scalp = [face[0], _cone((x, y + 0.045, z + 0.01), (x, y + 0.055, z - 0.045), 0.083, 0.062)]
-    return _Figure(
-        tuple(scaled(cones, 0.0075) for cones in (*arms, *([legs] if skirt else []))),
-        scaled(face, 0.0075),
-        scaled([*shirt, *sleeves], 0.016),
-        scaled([*trousers, *belt], 0.014),
-        scaled(shoes, 0.006),
-        scaled(scalp, 0.006),
-        size * head,
-        size * z_hip,
-        size * (z_hip - 0.06),
-        size * (0.49 if skirt else 0.055),
-    )
-
-
 def make_person(num_gaussians: int = 343_274, *, seed: int = 0, sh_degree: int = 1) -> Gaussians:
     """Make a standing person in shirt, trousers or skirt, and shoes.
 
@@ -278,7 +66,7 @@ def make_person(num_gaussians: int = 343_274, *, seed: int = 0, sh_degree: int =
         raise ValueError(f"num_gaussians: expected at least 2000, got {num_gaussians}")
     rng = np.random.default_rng([seed, 7])
     noise = Noise(rng)
-    figure = _figure(rng)
+    figure = random_figure(rng)
     skin = _SKINS[rng.integers(len(_SKINS))]
     hair = _HAIRS[rng.integers(len(_HAIRS))]
     n = num_gaussians
@@ -310,7 +98,7 @@ def make_person(num_gaussians: int = 343_274, *, seed: int = 0, sh_degree: int =
     return gaussians_of(Part.concatenate(parts), sh_degree, rng)
 
 
-def _seen(figure: _Figure, points: Array, *, behind: Sequence[_Shape]) -> Array:
+def _seen(figure: Figure, points: Array, *, behind: Sequence[Shape]) -> Array:
     """Which points no other layer hides."""
     free = np.ones(len(points), bool)
     for shape in behind:
@@ -321,7 +109,7 @@ def _seen(figure: _Figure, points: Array, *, behind: Sequence[_Shape]) -> Array:
 
 
 def _enough(
-    shape: _Shape, n: int, figure: _Figure, behind: Sequence[_Shape], rng: np.random.Generator
+    shape: Shape, n: int, figure: Figure, behind: Sequence[Shape], rng: np.random.Generator
 ) -> tuple[Array, Array, float]:
     """n points of a layer that no other hides."""
     probe, _, _ = shape.spread(600, rng)
@@ -332,7 +120,7 @@ def _enough(
     return points[chosen], normals[chosen], spacing * float(np.sqrt(max(len(seen) / n, 1.0)))
 
 
-def _skin(figure: _Figure, n: int, skin: Array, hair: Array, noise: Noise, rng: np.random.Generator) -> Part:
+def _skin(figure: Figure, n: int, skin: Array, hair: Array, noise: Noise, rng: np.random.Generator) -> Part:
     n_face = int(0.55 * n)
     clothes = (figure.shirt, figure.trousers, figure.shoes)
     parts = []
@@ -389,9 +177,9 @@ def _face(at: Array, tone: Array, hair: Array, noise: Noise) -> Array:
 
 
 def _cloth(
-    shape: _Shape,
+    shape: Shape,
     n: int,
-    figure: _Figure,
+    figure: Figure,
     colours: Array,
     pattern: int,
     noise: Noise,
@@ -427,7 +215,7 @@ def _cloth(
     )
 
 
-def _shoes(figure: _Figure, n: int, noise: Noise, rng: np.random.Generator) -> Part:
+def _shoes(figure: Figure, n: int, noise: Noise, rng: np.random.Generator) -> Part:
     points, normals, spacing = _enough(figure.shoes, n, figure, (figure.trousers,), rng)
     points[:, 2] = np.maximum(points[:, 2], 0.002)
     leather = _TROUSERS[rng.integers(1, 5)] * 0.8
@@ -442,7 +230,7 @@ def _shoes(figure: _Figure, n: int, noise: Noise, rng: np.random.Generator) -> P
     return cover(points, normals, tangents, spacing, colour, rng, gloss=0.3, bend=0.03, opacity=1.3)
 
 
-def _hair(figure: _Figure, n: int, hair: Array, noise: Noise, rng: np.random.Generator) -> Part:
+def _hair(figure: Figure, n: int, hair: Array, noise: Noise, rng: np.random.Generator) -> Part:
     """Strands of a few needles each that grow from the scalp and fall."""
     length = float(rng.choice([0.030, 0.055, 0.20, 0.30]))
     rows = 4 if length < 0.1 else 10

@@ -275,7 +275,7 @@ def _bark(levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.r
     length = np.linalg.norm(end - start, axis=1)
     area = 2 * np.pi * 0.5 * (r0 + r1) * length
     # Thin branches get more than their area's share, else they would be too few to see.
-    weight = area**0.68
+    weight = area**0.78
     ends = np.cumsum(weight)
     which = np.minimum(np.searchsorted(ends, (np.arange(n) + rng.random(n)) / n * ends[-1]), len(area) - 1)
     here = np.bincount(which, minlength=len(area))[which]
@@ -294,18 +294,28 @@ def _bark(levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.r
     points = centre + normal * (radius * (1 + 0.16 * thick * (furrow - 0.5)))[:, None]
     colour = mix(shape.bark[0], shape.bark[1], np.clip(1.7 * furrow - 0.35, 0, 1))
     if shape.bands:
-        band = noise(points * [0.35, 0.35, 2.6] + 3, 3.2)
-        stripe = np.clip((band - 0.60) * 9, 0, 1) * shape.bands
+        band = noise(points * [3.5, 3.5, 16.0] + 3, 1.0)
+        stripe = np.clip((band - 0.53) * 9, 0, 1) * shape.bands
         colour = mix(np.ones(3), [0.06, 0.055, 0.05], stripe) * colour
     mossy = np.clip(noise(points + 11, 1.5) - 0.45, 0, 1) * np.exp(-np.maximum(points[:, 2], 0) / 1.2)
     colour = colour + mossy[:, None] * np.array([0.05, 0.10, 0.0])
     spacing = np.sqrt(area[which] / here)
-    part = cover(points, normal, along, spacing, colour, rng, aligned=0.75, opacity=1.2)
+    part = cover(
+        points,
+        normal,
+        along,
+        spacing,
+        colour,
+        rng,
+        aligned=0.5 if shape.bands else 0.8,  # bands would blur along the trunk
+        opacity=1.2,
+        bend=radius,
+    )
     # A branch thinner than its gaussians are apart is drawn by needles along its axis.
     limit = 0.30 * radius
     part.scales[:, 1] = np.minimum(part.scales[:, 1], np.maximum(limit, 0.0015))
     part.scales[:, 2] = np.minimum(part.scales[:, 2], part.scales[:, 1])
-    part.scales[:, 0] = np.clip(part.scales[:, 0], part.scales[:, 1], np.maximum(0.45 * length[which], 0.002))
+    part.scales[:, 0] = np.clip(part.scales[:, 0], part.scales[:, 1], np.maximum(0.30 * length[which], 0.002))
     above = np.maximum(points[:, 2], 0)  # none reaches far below the ground
     part.scales[:, 0] = np.minimum(part.scales[:, 0], np.maximum(0.3 * above + 0.02, part.scales[:, 1]))
     return part
