@@ -27,6 +27,7 @@ TINY = replace(
     world_steps=2,
     size=(64, 36),
     distances=2,
+    line_distances=2,
     repeats=1,
     composed_repeats=1,
     steps=(0, 2),

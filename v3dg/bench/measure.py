@@ -82,10 +82,10 @@ def _cuda_ms(call: Callable[[], Any]) -> float:
     return float(start.elapsed_time(end))
 
 
-def draw_truth(subject: Any, camera: Camera, device: str) -> Picture:
-    """All gaussians at `SUPERSAMPLING` times the resolution, clipped as a screen does, box-averaged."""
-    color = render(subject, camera.scaled(SUPERSAMPLING), tolerance=0.0, device=device).color
-    return as_picture(metrics.box_downsample(color.clip(0, 1), SUPERSAMPLING))
+def draw_truth(subject: Any, camera: Camera, device: str, supersampling: int = SUPERSAMPLING) -> Picture:
+    """All gaussians at so many times the resolution, clipped as a screen does, box-averaged."""
+    color = render(subject, camera.scaled(supersampling), tolerance=0.0, device=device).color
+    return as_picture(metrics.box_downsample(color.clip(0, 1), supersampling))
 
 
 def as_picture(color: Any) -> Picture:

@@ -17,7 +17,8 @@ class Settings:
         size: Width and height of pictures in px.
         elevations: Degrees above the horizon of the cameras of "composed"; other parts take the middle.
         directions: How many of the paper's four directions "composed" looks from.
-        distances: Cameras a direction.
+        distances: Cameras a direction in "composed", and in "large".
+        line_distances: Cameras of the one line on which the other parts compare.
         judged_directions: Of how many directions FLIP is taken, which needs a second a picture.
         repeats: Timed calls, of which the median counts ...
         composed_repeats: ... and in "composed", which has by far the most views.
@@ -42,6 +43,7 @@ class Settings:
     elevations: tuple[float, ...]
     directions: int
     distances: int
+    line_distances: int
     judged_directions: int
     repeats: int
     composed_repeats: int
@@ -60,14 +62,15 @@ class Settings:
 
 PRESETS = {
     "small": Settings(
-        asset_gaussians=20_000,
+        asset_gaussians=16_500,
         instances=100,
-        worlds={"forest": (24, 4_000), "temples": (12, 8_000), "crowd": (36, 2_000)},
+        worlds={"forest": (80, 6_000), "temples": (30, 8_000), "crowd": (100, 2_000)},
         world_steps=80,
         size=(320, 180),
         elevations=(45.0,),
         directions=1,
         distances=4,
+        line_distances=3,
         judged_directions=1,
         repeats=3,
         composed_repeats=3,
@@ -92,12 +95,13 @@ PRESETS = {
         elevations=(15.0, 30.0, 45.0, 60.0, 75.0),
         directions=4,
         distances=20,
+        line_distances=10,
         judged_directions=1,
         repeats=5,
         composed_repeats=3,
         steps=(0, 40, 160, 640),
         tree_steps=640,
-        large_copies=285,
+        large_copies=225,
         large_steps=800,
         motion_frames=48,
         hierarchy_instances=128,

@@ -228,7 +228,8 @@ class Stage:
         """The views of one direction and the middle elevation, from near to far."""
         middle = sorted(self.settings.elevations)[len(self.settings.elevations) // 2]
         first = self.all_views[0].azimuth
-        return [v for v in self.all_views if abs(v.azimuth - first) < 0.5 and abs(v.elevation - middle) < 0.5]
+        line = [v for v in self.all_views if abs(v.azimuth - first) < 0.5 and abs(v.elevation - middle) < 0.5]
+        return every(line, self.settings.line_distances)
 
     def truth(self, index: int) -> Picture:
         """The true picture of the line's view."""
