@@ -370,7 +370,10 @@ def _leaves(levels: list[_Branches], n: int, shape: _Kind, rng: np.random.Genera
     )
     part.albedo = np.repeat(_leaf_colour(shape, k, which, rng), each, axis=0)
     part.albedo *= (1.12 - 0.25 * np.abs(s))[:, None]
-    part.opacities *= 1 - 0.35 * t * t  # the rim lets the background through
+    # The rim lets the background through, and training leaves some much fainter than others.
+    logits = np.log(part.opacities / (1 - part.opacities)) - 1.2 * t * t + 1.6 * rng.standard_normal(k * each)
+    part.opacities = 1 / (1 + np.exp(-logits))
+    part.scales[:, 2] *= np.exp(0.6 * rng.standard_normal(k * each))
     part.translucency[:] = 0.6
     part.gloss[:] = 0.12
     rest = n - k * each
@@ -385,7 +388,7 @@ def _needles(levels: list[_Branches], n: int, shape: _Kind, rng: np.random.Gener
     out = unit(0.75 * along + aside + 0.2 * rng.standard_normal((n, 3)))
     length = shape.leaf[0] * grown * np.exp(0.3 * rng.standard_normal(n))
     width = 0.5 * shape.leaf[1] * grown * np.exp(0.25 * rng.standard_normal(n))
-    logits = 1.6 + 1.6 * rng.standard_normal(n)
+    logits = 1.6 + 2.0 * rng.standard_normal(n)
     return Part(
         place + 0.5 * out * length[:, None],
         out,
