@@ -1,5 +1,5 @@
+#include <atomic>
 #include <memory>
-#include <mutex>
 #include <optional>
 
 #include "bindings/select_args.h"
@@ -124,22 +124,23 @@ static py::tuple rasterize_backward(const Tape<T>& tape, const py::array& d_colo
 }
 
 // A workspace lent to one caller at a time, kept from frame to frame; a second caller gets one of its own.
+// Without a lock, which a fork() in the middle would leave closed.
 class SharedWorkspace {
   public:
+    ~SharedWorkspace() { delete kept_.load(); }
     std::unique_ptr<Workspace<float>> take() {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return kept_ ? std::move(kept_) : std::make_unique<Workspace<float>>();
+        std::unique_ptr<Workspace<float>> kept(kept_.exchange(nullptr));
+        return kept ? std::move(kept) : std::make_unique<Workspace<float>>();
     }
     // Keeps what the next frame is likely to need, but does not sit on the memory of an exceptional one.
     void give_back(std::unique_ptr<Workspace<float>> workspace) {
         constexpr size_t kMostRecords = size_t(16) << 20;
-        const std::lock_guard<std::mutex> lock(mutex_);
-        if (workspace->records.capacity() <= kMostRecords) kept_ = std::move(workspace);
+        if (workspace->records.capacity() <= kMostRecords)
+            workspace.reset(kept_.exchange(workspace.release()));
     }
 
   private:
-    std::mutex mutex_;
-    std::unique_ptr<Workspace<float>> kept_;
+    std::atomic<Workspace<float>*> kept_{nullptr};
 };
 
 // The clusters of one bundle as render_selection needs them.

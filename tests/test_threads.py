@@ -1,0 +1,250 @@
+"""Several threads, forked processes, torch beside us: the same results, and no deadlock."""
+
+import hashlib
+import os
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import scenes
+import scenes_lod
+import v3dg
+
+CAMERA = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
+SECONDS = 120  # more than any of this takes, on a machine that has more to do
+
+
+def digest(*arrays):
+    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
+
+
+def asset(seed=20, num=3000):
+    return scenes.trained_like(seed, CAMERA, num)
+
+
+def picture(gaussians):
+    raster = v3dg.rasterize(gaussians, CAMERA, filter_px2=0.1)
+    return digest(raster.color, raster.alpha, raster.depth)
+
+
+def gradient(gaussians):
+
+    g = gaussians.torch()
+    g.means.requires_grad_()
+    v3dg.rasterize(g, CAMERA, filter_px2=0.1).color.square().sum().backward()
+    return digest(g.means.grad.numpy())
+
+
+def crowd(seed=0):
+    rng = np.random.default_rng(seed)
+    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 600, sh_degree=1), 64)
+    return scenes_lod.random_scene(rng, bundle, 40, spread=3.0)
+
+
+def frame(scene):
+    camera = v3dg.Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
+    image = v3dg.render(scene, camera, tolerance=1.0)
+    return digest(image.color, image.alpha, image.depth)
+
+
+def bundle_of(gaussians):
+    config = v3dg.BuildConfig(cluster_size=64, steps=3, num_views=4, image_size=16)
+    bundle = v3dg.build_bundle(gaussians, config=config, device="cpu", progress=False)
+    return digest(bundle.gaussians.means, bundle.gaussians.sh, bundle.groups.ball)
+
+
+# ---- threads of Python
+
+
+@pytest.mark.parametrize(
+    ("work", "subjects"),
+    [
+        (picture, [asset(seed) for seed in range(3)]),
+        (gradient, [asset(seed) for seed in range(3)]),
+        (frame, [crowd(seed) for seed in range(3)]),
+        (bundle_of, [asset(seed, 300) for seed in range(3)]),
+    ],
+    ids=["rasterize", "backward", "render", "build"],
+)
+def test_threads_get_what_one_gets_alone(work, subjects):
+    if work is gradient:
+        pytest.importorskip("torch")
+    alone = [work(subject) for subject in subjects]
+    with ThreadPoolExecutor(8) as pool:
+        jobs = [pool.submit(work, subjects[i % 3]) for i in range(24)]
+        together = [job.result(SECONDS) for job in jobs]
+    assert together == [alone[i % 3] for i in range(24)]
+
+
+def test_threads_may_draw_a_bundle_that_was_never_drawn():
+    """What is kept of a bundle is made when it is first drawn, by all of them at once."""
+    expected = frame(crowd(3))
+    scene, start = crowd(3), threading.Barrier(8)
+
+    def draw(_):
+        start.wait(SECONDS)
+        return frame(scene)
+
+    with ThreadPoolExecutor(8) as pool:
+        assert set(pool.map(draw, range(8))) == {expected}
+
+
+READING = {"ply_read", "ply_write"}
+DRAWING = {"rasterize", "rasterize_backward", "select", "render_selection", "gather"}
+BUILDING = {"median_split", "bound_spheres", "merge", "bound_by_boxes", "fit_level"}
+LONG = READING | DRAWING | BUILDING
+
+
+def call_what_takes_long(folder):
+    import torch
+
+    many = scenes.random_gaussians(0, CAMERA, 100_000, sh_degree=1)
+    v3dg.save(folder / "many.ply", many)
+    v3dg.load(folder / "many.ply")
+    gradient(many)
+    with torch.no_grad():
+        picture(many)
+    config = v3dg.BuildConfig(cluster_size=256, steps=0, num_views=4, image_size=16)
+    v3dg.build_bundle(many, config=config, device="cpu", progress=False)
+    scene = crowd()
+    scene.add(scene.bundles[0], positions=np.zeros((3000, 3)))
+    frame(scene)
+    v3dg.select(scene, CAMERA, tolerance=0.0).gaussians()
+
+
+def test_other_threads_go_on_while_the_core_is_at_work(tmp_path, monkeypatch):
+    """A thread that looks at the clock all the time is never kept from it for most of a call."""
+    pytest.importorskip("torch")
+    looks, stop, blocked = [], threading.Event(), dict.fromkeys(LONG, 1.0)
+
+    def look():
+        while not stop.wait(1e-4):
+            looks.append(time.monotonic())
+
+    def watched(name, call):
+        def run(*args, **options):
+            del looks[:]
+            begin = time.monotonic()
+            result = call(*args, **options)
+            end = time.monotonic()
+            gaps = np.diff([begin, *(t for t in looks if begin < t < end), end])
+            blocked[name] = min(blocked[name], gaps.max() / (end - begin))
+            return result
+
+        return run
+
+    for name in LONG:
+        monkeypatch.setattr(v3dg._core, name, watched(name, getattr(v3dg._core, name)))
+    watcher = threading.Thread(target=look)
+    watcher.start()
+    try:
+        for _ in range(10):  # the machine may be busy
+            call_what_takes_long(tmp_path)
+            if max(blocked.values()) < 0.5:
+                break
+    finally:
+        stop.set()
+        watcher.join()
+    assert max(blocked.values()) < 0.5, blocked
+
+
+# ---- processes
+
+
+def run(script, **environment):
+    """What a script of its own prints, which may not hang."""
+    here = Path(__file__).parent
+    paths = [str(here), str(Path(v3dg.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", script],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=SECONDS,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+ALL = """
+from test_threads import asset, bundle_of, crowd, frame, picture
+def everything():
+    return picture(asset()), frame(crowd()), bundle_of(asset(num=300))
+"""
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return [picture(asset()), frame(crowd()), bundle_of(asset(num=300))]
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_one_thread_gives_the_same(expected, threads):
+    assert run(ALL + "print(*everything())", OMP_NUM_THREADS=threads) == expected
+
+
+def test_forked_process_gives_the_same(expected):
+    """Also a child's child, and the parent afterwards."""
+    script = """
+import os
+def in_child(work):
+    sys.stdout.flush()
+    pid = os.fork()
+    if pid == 0:
+        work()
+        sys.stdout.flush()
+        os._exit(0)
+    assert os.waitpid(pid, 0)[1] == 0
+show = lambda: print(*everything())
+show()
+in_child(lambda: (show(), in_child(show)))
+show()
+"""
+    assert run("import sys\n" + ALL + script, OMP_NUM_THREADS="4") == 4 * expected
+
+
+def test_processes_may_be_forked_while_threads_draw(expected):
+    """As data loaders do: multiprocessing's fork, from a process whose threads are at work."""
+    script = """
+import multiprocessing, threading
+stop = threading.Event()
+def draw():
+    while not stop.is_set():
+        everything()
+everything()
+threads = [threading.Thread(target=draw) for _ in range(2)]
+for t in threads: t.start()
+with multiprocessing.get_context("fork").Pool(2) as pool:
+    for result in [pool.apply_async(everything) for _ in range(4)]:
+        print(*result.get(100))
+stop.set()
+for t in threads: t.join()
+"""
+    assert run(ALL + script, OMP_NUM_THREADS="4") == 4 * expected
+
+
+def test_threads_of_torch_are_no_hindrance(expected):
+    pytest.importorskip("torch")
+    script = """
+import threading
+import torch
+stop = threading.Event()
+matrix = torch.rand(300, 300)
+product = matrix @ matrix
+def multiply():
+    while not stop.is_set():
+        assert torch.equal(matrix @ matrix, product)
+threads = [threading.Thread(target=multiply) for _ in range(2)]
+for t in threads: t.start()
+print(*everything())
+stop.set()
+for t in threads: t.join()
+"""
+    assert run(ALL + script) == expected
