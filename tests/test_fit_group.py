@@ -134,21 +134,21 @@ def mean_colour_over_views(device, coefficient, config, **options):
     return (error[0] / error[1] - 1) / (0.2 * scenes.SH_C0)
 
 
-@pytest.mark.parametrize("num_views", [14, 16])  # all of them are in the residual
-def test_fixed_views_lie_evenly_on_the_sphere(device, num_views):
-    """Up to degree 3, functions on the sphere average out as they do not over 16 random views."""
+@pytest.mark.parametrize("num_views", [1, 16])
+def test_views_held_out_lie_evenly_on_the_sphere(device, num_views):
+    """Up to degree 2, functions on the sphere average out as they do not over 8 random views."""
     config = replace(PLAIN, num_views=num_views)
-    means = [mean_colour_over_views(device, k, config, seed=seed) for k in range(1, 16) for seed in range(3)]
+    means = [mean_colour_over_views(device, k, config, seed=seed) for k in range(1, 9) for seed in range(3)]
     assert np.abs(means).max() < 0.2
-    assert np.sqrt(np.mean(np.square(means))) < 0.08  # 0.25 if they were random
+    assert np.sqrt(np.mean(np.square(means))) < 0.08  # 0.35 if they were random
 
 
 def test_fresh_views_are_random_and_uniform(device):
     config = replace(PLAIN, num_views=0)
     for k in (*range(1, 9), 12, 15):
         means = np.array([mean_colour_over_views(device, k, config, stream=stream) for stream in range(100)])
-        assert abs(means.mean()) < 4 * 0.25 / 10  # 4 sigma of 100 means over 16
-        assert 0.7 < means.std() / 0.25 < 1.3
+        assert abs(means.mean()) < 4 * 0.35 / 10  # 4 sigma of 100 means over 8
+        assert 0.7 < means.std() / 0.35 < 1.3
 
 
 def test_seed_and_stream_change_the_views(device):
@@ -319,6 +319,41 @@ def test_result_no_better_than_its_start_is_thrown_away(device):
         out, error = fit(device, start, target, replace(PLAIN, **FROZEN | {step: 1e8}, steps=5))
         assert all(np.array_equal(getattr(out, n), getattr(start, n)) for n in scenes.NAMES), step
         np.testing.assert_array_equal(error, before)
+
+
+def test_result_that_pleases_only_the_views_it_was_fitted_to_is_thrown_away(device):
+    """The target is red from one side; the start has its mean colour, which fits all around best."""
+    sh = np.zeros((1, 4, 3), np.float32)
+    sh[0, 0], sh[0, 1:, 0] = 1.0, [0.4, -0.4, 0.4]
+    target = ball(0.9, (0, 0, 0), sh=sh)
+    start = with_bases(scenes.replaced(target, sh=sh[:, :1].copy()), 1)
+    config = replace(PLAIN, **FROZEN | {"step_sh0": 0.02}, num_views=1, steps=100)
+    _, before = fit(device, start, target, replace(config, steps=0))
+    out, error = fit(device, start, target, config)
+    np.testing.assert_array_equal(out.sh, start.sh)
+    np.testing.assert_array_equal(error, before)
+
+
+@pytest.mark.parametrize(
+    ("step", "target"),
+    [
+        (
+            "step_position",
+            scenes.replaced(ball(0.9, (1, 1, 1)), means=CENTER[None] + np.float32([[1, 0, 0]])),
+        ),
+        ("step_log_scale", ball(0.9, (1, 1, 1), scale=5.0)),
+        ("step_logit", ball(1.0, (1, 1, 1))),
+    ],
+)
+def test_nothing_runs_away(device, step, target):
+    """A target outside the ball, larger than it, or opaque, that is fitted in steps as large."""
+    start = ball(0.3, (1, 1, 1))
+    out, error = fit(device, start, target, replace(PLAIN, **FROZEN | {step: 30.0}, steps=3))
+    _, before = fit(device, start, target, replace(PLAIN, steps=0))
+    assert error.sum() < before.sum()  # it was kept
+    assert np.abs(out.means - CENTER).max() <= RADIUS * (1 + 1e-6)
+    assert out.scales.max() <= RADIUS * (1 + 1e-6)
+    assert out.opacities.max() <= 1 - 0.99e-4
 
 
 def test_groups_do_not_touch_each_other(device):

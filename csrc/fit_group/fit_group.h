@@ -17,7 +17,7 @@ namespace v3dg {
 struct FitConfig {
     int steps;
     int views_per_step;
-    int num_views;           // fixed views, cached; 0: a fresh one each time
+    int num_views;           // fixed views, cached, beside those held out; 0: a fresh one each time
     int supersample;         // targets are drawn this much larger and box-averaged
     int image_size;          // px; 0: as large as the group is when it is selected
     float px2_per_gaussian;  // of the ball's footprint, where image_size is 0
@@ -76,15 +76,16 @@ struct FitScratch {
     Buffer<uint64_t> order, order_scratch;
 };
 
-// View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random; fresh ones anywhere.
+// View `index` of a group; those held out have the indices that held_out_view() gives.
 FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index);
 
 // Draws the target in one view.
 V3DG_DECLARE_PER_ISA(void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget& target,
                                      const FitView& view, FitScratch& scratch, FitImage& image))
 
-// Fits one group; `targets` holds the fixed views' pictures. Writes the residual of the result, mean |colour|
-// and |alpha| over the views. A result that is no better than the start is thrown away.
+// Fits one group; `targets` holds the pictures of the fixed views and then of those held out. Writes the
+// residual of the result, mean |colour| and |alpha| over the views held out. A result that is no better there
+// than the start, or not finite, is thrown away.
 V3DG_DECLARE_PER_ISA(void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& target,
                                     const FitImage* targets, const FitRows& rows, float error[2],
                                     const std::atomic<bool>& cancel))

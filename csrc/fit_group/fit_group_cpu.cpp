@@ -151,6 +151,7 @@ class Student {
         const FitStep step = fit_step(config_, index);
         size_t at = 0;
         at = adam(at, 3 * n_, position_step(config_, group_, step), step);
+        for (size_t i = 0; i < 3 * n_; ++i) value_[i] = held_in_box(value_[i]);
         at = adam(at, 4 * n_, step.quat, step);
         at = adam(at, 3 * n_, step.log_scale, step);
         at = adam(at, n_, step.logit, step);
@@ -376,15 +377,14 @@ void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& 
     const uint64_t stride = visiting_stride(config);
     const auto measure = [&](const Student& s, double sum[2]) {
         sum[0] = sum[1] = 0;
-        const int count = num_residual_views(config);
-        for (int i = 0; i < count; ++i) {
-            const uint64_t index = residual_view(config, stride, i);
+        for (int i = 0; i < kHeldOutViews; ++i) {
+            const uint64_t index = held_out_view(config, i);
             const FitView view = fit_view(config, group, index);
             if (config.num_views == 0) fit_target(config, group, target, view, target_scratch, fresh);
             comparison.residual(s, view, config.num_views > 0 ? targets[index] : fresh, sum);
         }
-        sum[0] /= count;
-        sum[1] /= count;
+        sum[0] /= kHeldOutViews;
+        sum[1] /= kHeldOutViews;
     };
     double start[2], end[2];
     measure(student, start);

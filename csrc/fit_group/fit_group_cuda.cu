@@ -976,8 +976,9 @@ struct Fit {
                 size = step.logit;
             else if (num_sh > 3 && (k - 11 * n) % num_sh >= 3)
                 size = step.sh_rest;
-            value[k] =
+            const float moved =
                 adam_step(value[k], sum_of_views, m[k], v[k], size, step.correction1, step.correction2);
+            value[k] = k < 3 * n ? held_in_box(moved) : moved;
         }
     }
 
@@ -1033,16 +1034,16 @@ struct Fit {
         project_backward(cameras, num_views, turn);
     }
 
-    // The residual's views, those of all steps, and the residual's again, in batches of at most kViewsAtOnce.
+    // The views held out, those of all steps, and those held out again, in batches of at most kViewsAtOnce.
     __device__ void fit() {
         const FitConfig& config = in.config;
-        const int views_per_step = config.views_per_step, num_residual = num_residual_views(config);
+        const int views_per_step = config.views_per_step;
         const int64_t num_visits = static_cast<int64_t>(config.steps) * views_per_step;
-        // Visits of steps count from 0; the residual's lie before and after.
+        // Visits of steps count from 0; those of the views held out lie before and after.
         const auto views_at = [&](int64_t visit) {
             const int64_t left = visit < 0            ? -visit
                                  : visit < num_visits ? views_per_step - visit % views_per_step
-                                                      : num_visits + num_residual - visit;
+                                                      : num_visits + kHeldOutViews - visit;
             return static_cast<int>(min(static_cast<int64_t>(kViewsAtOnce), left));
         };
         // Of the views of a batch, this block's.
@@ -1059,18 +1060,18 @@ struct Fit {
             if (visit >= 0 && visit < num_visits) {
                 picture = visited_view(config, in.stride, visit);
             } else {
-                const int i = static_cast<int>(visit < 0 ? visit + num_residual : visit - num_visits);
-                picture = config.num_views > 0 ? residual_view(config, in.stride, i) : num_visits + i;
+                picture =
+                    num_fitted_pictures(config) + (visit < 0 ? visit + kHeldOutViews : visit - num_visits);
             }
             look(cameras, b, picture);
         };
         double error[2][2] = {{0, 0}, {0, 0}};  // before and after
         start();
-        look_from(s.cameras[0], -num_residual);
+        look_from(s.cameras[0], -kHeldOutViews);
         if (leads()) team.unit = 0;
         sync();
         int turn = 0;
-        for (int64_t visit = -num_residual; visit < num_visits + num_residual; turn ^= 1) {
+        for (int64_t visit = -kHeldOutViews; visit < num_visits + kHeldOutViews; turn ^= 1) {
             const int num_views = views_at(visit);
             const int num_own = own_of(num_views);
             const Cameras& cameras = s.cameras[turn];
@@ -1108,7 +1109,7 @@ struct Fit {
             }
             if (view_rank > 0) return;
         }
-        const double num_pixels = static_cast<double>(job.size) * job.size * num_residual;
+        const double num_pixels = static_cast<double>(job.size) * job.size * kHeldOutViews;
         for (auto& e : error) {
             e[0] /= 3 * num_pixels;
             e[1] /= num_pixels;

@@ -34,17 +34,17 @@ struct FitGroupsInput {
     FitSignals* signals;
 };
 
-// Pictures that a group is compared with: its fixed views, or those of all steps and then of the residual.
+// Pictures that a group is compared with: its fixed views, or those of all steps; then those held out.
+V3DG_HD inline uint64_t num_fitted_pictures(const FitConfig& config) {
+    return config.num_views > 0 ? static_cast<uint64_t>(config.num_views)
+                                : static_cast<uint64_t>(config.steps) * config.views_per_step;
+}
 V3DG_HD inline uint64_t num_pictures(const FitConfig& config) {
-    return config.num_views > 0
-               ? static_cast<uint64_t>(config.num_views)
-               : static_cast<uint64_t>(config.steps) * config.views_per_step + kResidualViews;
+    return num_fitted_pictures(config) + kHeldOutViews;
 }
 V3DG_HD inline uint64_t view_of_picture(const FitConfig& config, uint64_t picture) {
-    const uint64_t num_visits = static_cast<uint64_t>(config.steps) * config.views_per_step;
-    return config.num_views > 0 || picture < num_visits
-               ? picture
-               : residual_view(config, 0, static_cast<int>(picture - num_visits));
+    const uint64_t num_fitted = num_fitted_pictures(config);
+    return picture < num_fitted ? picture : held_out_view(config, static_cast<int>(picture - num_fitted));
 }
 
 // As v3dg::fit_group, for all groups at once; jobs are best ordered by falling size. The jobs are read by the

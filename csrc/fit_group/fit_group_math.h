@@ -19,8 +19,8 @@ namespace v3dg {
 constexpr double kFocalPerSize = 88.9 / 64;
 // Room around the ball for what its gaussians draw beyond it.
 constexpr double kMarginPx = 2.5;
-// Views on which start and result are compared, and the residual is measured.
-constexpr int kResidualViews = 16;
+// Views that no step looks at: on them start and result are compared, and the residual is measured.
+constexpr int kHeldOutViews = 8;
 
 V3DG_HD V3DG_INLINE void multiply(const double a[9], const double b[9], double out[9]) {
     for (int i = 0; i < 3; ++i)
@@ -43,17 +43,20 @@ V3DG_HD V3DG_INLINE void random_rotation(double u0, double u1, double u2, double
     r[8] = 1 - 2 * (x * x + y * y);
 }
 
-// View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random; fresh ones anywhere.
+// View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random, and those held out,
+// which follow them, on one of their own; fresh ones lie anywhere.
 V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGroup& group, uint64_t index) {
     const auto uniform = [&](uint64_t counter) { return random_uniform(config.seed, group.stream, counter); };
     double rotation[9];
     if (config.num_views > 0) {
         // A Fibonacci lattice of directions, each with a random roll, all turned together.
         double lattice[9], turn[9];
-        const double z = 1 - (2.0 * static_cast<double>(index) + 1) / config.num_views,
+        const auto num_fixed = static_cast<uint64_t>(config.num_views);
+        const bool is_held_out = index >= num_fixed;
+        const auto place = static_cast<double>(is_held_out ? index - num_fixed : index);
+        const double z = 1 - (2 * place + 1) / (is_held_out ? kHeldOutViews : config.num_views),
                      r = sqrt_of(max_of(0.0, 1 - z * z));
-        const double angle = static_cast<double>(index) * kPi * (3 - sqrt_of(5.0)),
-                     roll = 2 * kPi * uniform(16 + 3 * index);
+        const double angle = place * kPi * (3 - sqrt_of(5.0)), roll = 2 * kPi * uniform(16 + 3 * index);
         const double forward[3] = {r * ::cos(angle), r * ::sin(angle), z};
         const double side[3] = {-::sin(angle), ::cos(angle), 0};
         const double up[3] = {forward[1] * side[2] - forward[2] * side[1],
@@ -64,7 +67,8 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
             lattice[3 + k] = ::cos(roll) * up[k] - ::sin(roll) * side[k];
             lattice[6 + k] = forward[k];
         }
-        random_rotation(uniform(0), uniform(1), uniform(2), turn);
+        const uint64_t turned = is_held_out ? 3 : 0;
+        random_rotation(uniform(turned), uniform(turned + 1), uniform(turned + 2), turn);
         multiply(lattice, turn, rotation);
     } else {
         // Far from the numbers that shift the picture.
@@ -105,12 +109,9 @@ V3DG_HD inline uint64_t visited_view(const FitConfig& config, uint64_t stride, u
     return config.num_views > 0 ? visit * stride % static_cast<uint64_t>(config.num_views) : visit;
 }
 
-// Of those on which the residual is measured. Fresh ones take numbers that no step takes.
-V3DG_HD inline int num_residual_views(const FitConfig& config) {
-    return config.num_views > 0 && config.num_views < kResidualViews ? config.num_views : kResidualViews;
-}
-V3DG_HD inline uint64_t residual_view(const FitConfig& config, uint64_t stride, int i) {
-    return config.num_views > 0 ? visited_view(config, stride, i) : ~uint64_t(0) - i;
+// Fresh ones that are held out take numbers that no step takes.
+V3DG_HD inline uint64_t held_out_view(const FitConfig& config, int i) {
+    return config.num_views > 0 ? static_cast<uint64_t>(config.num_views + i) : ~uint64_t(0) - i;
 }
 
 // Group frame to view.
@@ -156,14 +157,25 @@ V3DG_HD V3DG_INLINE float logit_of_opacity(float opacity) {
     return ::logf(o / (1 - o));
 }
 
-// No scale outgrows the ball, none vanishes: a value that ran away could not come back.
+// No mean leaves the box around the ball: from out there it may reach no picture of the group, and would be
+// left where nothing compares it with anything.
+template <class V>
+V3DG_HD V3DG_INLINE V held_in_box(V x) {
+    return min_of(all_lanes<V>(1.0f), max_of(all_lanes<V>(-1.0f), x));
+}
+
+// No scale outgrows the ball's radius, which holds those of all that the group stands for, and none vanishes:
+// a value that ran away could not come back.
 template <class V>
 V3DG_HD V3DG_INLINE V scale_of_log(V x) {
-    return exp2_in_range(min_of(all_lanes<V>(1.0f), max_of(all_lanes<V>(-20.0f), x * kLog2e)));
+    return exp2_in_range(min_of(all_lanes<V>(0.0f), max_of(all_lanes<V>(-20.0f), x * kLog2e)));
 }
+// Nor does an opacity come closer to 0 and 1 than `kLeastOpacity`, where its gradient vanishes. Alpha is cut
+// at 0.999, so no more is needed.
 template <class V>
 V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
-    return 1 / (1 + exp2_in_range(min_of(all_lanes<V>(60.0f), max_of(all_lanes<V>(-60.0f), x * -kLog2e))));
+    constexpr float kMost = 13.287568f;  // log2 of 1 / kLeastOpacity - 1
+    return 1 / (1 + exp2_in_range(min_of(all_lanes<V>(kMost), max_of(all_lanes<V>(-kMost), x * -kLog2e))));
 }
 
 // ---- steps
