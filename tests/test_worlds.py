@@ -1,8 +1,11 @@
+import json
+
 import numpy as np
 import pytest
 
 import v3dg
 from v3dg import worlds
+from v3dg.cli import main
 from v3dg.scene import rotation_from_quaternion
 
 
@@ -154,6 +157,20 @@ def test_a_written_world_is_read_and_drawn(tmp_path):
     assert np.array_equal(scene.positions, all_of(world, "positions"))
     assert len(v3dg.load(path.parent / "person_00.ply")) == 2000
     assert v3dg.render(scene, world.cameras(width=64, height=36)["059_camera_19"]).alpha.max() > 0.5
+
+
+def test_command_line_writes_a_world(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(worlds.SMALL, "crowd", {"instances": 2, "num_gaussians": 2000, "persons": 1})
+    folder = tmp_path / "people"
+    arguments = ["world", "crowd", "-o", str(folder), "--seed", "3", "--device", "cpu", "--quiet", "--json"]
+    assert main(arguments) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["output"] == str(folder / "crowd.json")
+    assert (result["instances"], result["gaussians"]) == (2, 4000)
+    assert np.array_equal(
+        v3dg.load(folder / "person_00.ply").means,
+        worlds.crowd(2, 2000, persons=1, seed=3).assets["person_00"].make().means,
+    )
 
 
 @pytest.mark.parametrize("name", worlds.WORLDS)

@@ -245,7 +245,7 @@ def _scattered(
         if (which == k).any()
     }
     assets = {asset: assets[asset] for asset in placements}
-    return World(name, assets, placements, 1.3 * float((np.hypot(*places.T) + room).max()))
+    return World(name, assets, placements, 2.0 * float((np.hypot(*places.T) + room).max()))
 
 
 def _clear_place(

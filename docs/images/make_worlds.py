@@ -27,8 +27,8 @@ ASSETS: list[tuple[Any, tuple[float, float, float, tuple[float, float, float]]]]
 # World, its arguments, camera.
 WORLDS: list[tuple[str, dict[str, int], str]] = [
     ("donut_sea", {"instances": 500, "num_gaussians": 20_000}, "053_camera_13"),
-    ("forest", {"instances": 60, "num_gaussians": 60_000}, "038_camera_18"),
-    ("temples", {"instances": 14, "num_gaussians": 200_000}, "037_camera_17"),
+    ("forest", {"instances": 60, "num_gaussians": 60_000}, "032_camera_12"),
+    ("temples", {"instances": 14, "num_gaussians": 200_000}, "031_camera_11"),
     ("crowd", {"instances": 100, "num_gaussians": 40_000, "persons": 8}, "235_camera_15"),
 ]
 

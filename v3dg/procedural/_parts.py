@@ -224,6 +224,18 @@ def quaternions(tangents: Array, normals: Array) -> Array:
     return unit(candidates[np.arange(len(m)), np.argmax(squares, 1)])
 
 
+def allot(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Which of the weighted things each of n gaussians is for, in order, as evenly as the weights allow."""
+    ends = np.cumsum(weights)
+    at = (np.arange(n) + rng.random(n)) / max(n, 1) * ends[-1]
+    return np.asarray(np.minimum(np.searchsorted(ends, at, side="right"), len(weights) - 1))
+
+
+def leaf_outline(t: Array) -> Array:
+    """Half width along a leaf, at most 1: round at the foot, narrow at the tip."""
+    return np.sqrt(np.clip(t * (1.06 - t) * 3.6, 0.03, 1))
+
+
 @dataclass
 class Patch:
     """n points spread evenly over a parametric surface."""
@@ -267,9 +279,7 @@ def sample(
     ``closed`` names u or v where the surface has no border in that direction.
     """
     areas = _cell_areas(surface, cells)
-    ends = np.cumsum(areas)
-    cell = np.searchsorted(ends, (np.arange(n) + rng.random(n)) / max(n, 1) * ends[-1], side="right")
-    cell = np.minimum(cell, len(areas) - 1)
+    cell = allot(areas, n, rng)
     u, v = (cell // cells + rng.random(n)) / cells, (cell % cells + rng.random(n)) / cells
     points, step = surface(u, v), 1e-4
     back_u, back_v = np.where(u > 0.5, -step, step), np.where(v > 0.5, -step, step)
@@ -283,7 +293,7 @@ def sample(
     room_v = endless if "v" in closed else length_v * np.minimum(v, 1 - v) * sine
     # Where the surface is skew, its side borders are met across the tangent, too.
     room = np.stack([room_u, np.minimum(room_v, room_u * sine / np.maximum(cosine, 1e-9))], -1)
-    return Patch(points, unit(np.cross(du, dv)), unit(du), u, v, room, float(ends[-1]))
+    return Patch(points, unit(np.cross(du, dv)), unit(du), u, v, room, float(areas.sum()))
 
 
 def cover(

@@ -132,7 +132,7 @@ def _skin(figure: Figure, n: int, skin: Array, hair: Array, noise: Noise, rng: n
         flush = noise(points + 7, 14.0)
         tone = tone * (1 + np.stack([0.10 * flush, -0.06 * flush, -0.06 * flush], -1))
         if shape is figure.face:
-            tone = _face(points - figure.head, tone, hair, noise)
+            tone = _face(points - figure.head, tone, hair)
         parts.append(
             cover(
                 points,
@@ -149,7 +149,7 @@ def _skin(figure: Figure, n: int, skin: Array, hair: Array, noise: Noise, rng: n
     return Part.concatenate(parts)
 
 
-def _face(at: Array, tone: Array, hair: Array, noise: Noise) -> Array:
+def _face(at: Array, tone: Array, hair: Array) -> Array:
     """Eyes, brows, lips and cheeks painted at places relative to the head's centre."""
     front = at[:, 1] < -0.03
     x, z = np.abs(at[:, 0]), at[:, 2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,8 +15,10 @@ from v3dg.procedural._parts import (
     Array,
     Noise,
     Part,
+    Patch,
     SurfaceMap,
     cover,
+    leaf_outline,
     mix,
     sample,
     smoothstep,
@@ -169,7 +172,7 @@ def _roof() -> list[_Face]:
             x = sign * half_x * v
             return np.stack([x, y, _RIDGE + (_EAVES - _RIDGE) * v + lift], -1)
 
-        faces.append(_Face(slope, surface_area(slope, 700), "tile", 0.10, 700))
+        faces.append(_Face(slope, surface_area(slope, 352), "tile", 0.10, 352))
         under = (
             (sign * half_x, -half_y, _EAVES),
             (0, -half_y, _RIDGE),
@@ -207,7 +210,8 @@ def _roof() -> list[_Face]:
     return faces
 
 
-def _faces() -> list[_Face]:
+@functools.cache
+def _faces() -> tuple[_Face, ...]:
     faces: list[_Face] = []
     for i in range(3):
         out = 0.85 + (2 - i) * _TREAD
@@ -255,8 +259,7 @@ def _faces() -> list[_Face]:
     faces += _frieze()
     faces += _ring(_HALF_X + 0.62, _HALF_Y + 0.62, 1.2, _CORNICE, _CORNICE + 0.10, "marble")
     faces += _ring(_HALF_X + _OVERHANG, _HALF_Y + _OVERHANG, 1.4, _CORNICE + 0.10, _EAVES, "marble")
-    faces += _roof()
-    return faces
+    return (*faces, *_roof())
 
 
 # How many gaussians a material gets on equal areas, and whether they run along the surface's first direction.
@@ -298,98 +301,39 @@ def make_temple(num_gaussians: int = 1_350_487, *, seed: int = 0, sh_degree: int
     shares = np.array([face.area * _DENSITY.get(face.material, 1.0) for face in faces])
     ends = np.round(np.cumsum(shares) / shares.sum() * n).astype(int)
     counts = np.diff(ends, prepend=0)
-    rows: dict[str, list[tuple[Array, ...]]] = {}
+    patches: dict[str, list[tuple[Patch, float]]] = {}
     for face, count in zip(faces, counts, strict=True):
         if count:
             patch = sample(face.surface, count, rng, face.cells, closed=face.closed)
-            spread, bend = np.full(count, patch.spacing), np.full(count, face.bend)
-            row = (patch.points, patch.normals, patch.tangents, spread, bend, patch.room)
-            rows.setdefault(face.material, []).append(row)
-    parts = []
-    for material, patches in rows.items():
-        points, normals, tangents, spacing, bend, room = (
-            np.concatenate(column) for column in zip(*patches, strict=True)
-        )
-        parts.append(_stone(material, points, normals, tangents, spacing, bend, room, noise, rng))
+            patches.setdefault(face.material, []).append((patch, face.bend))
+    parts = [_stone(material, of_it, noise, rng) for material, of_it in patches.items()]
     return gaussians_of(Part.concatenate([*parts, *plants]), sh_degree, rng)
 
 
-def _stone(
-    material: str,
-    points: Array,
-    normals: Array,
-    tangents: Array,
-    spacing: Array,
-    bend: Array,
-    room: Array,
-    noise: Noise,
-    rng: np.random.Generator,
-) -> Part:
-    """Gaussians of one material with its colour: grain, joints between blocks, stains, lichen."""
-    grain, cloud = noise(points, 9.0), noise(points + 31, 0.55)
-    x, y, z = points.T
-    flat = np.abs(normals[:, 2]) > 0.7
-    sideways = np.where(np.abs(normals[:, 0]) > np.abs(normals[:, 1]), y, x)
-    if material == "tile":
-        colour = mix(
-            [0.36, 0.11, 0.045],
-            [0.72, 0.31, 0.14],
-            np.clip(0.7 * noise(np.round(points * [1.2, 1.55, 1.2]) * 7.7, 1.0, 1) + 0.5 * grain, 0, 1),
-        )
-    elif material == "wood":
-        colour = mix([0.05, 0.028, 0.014], [0.16, 0.09, 0.045], noise(points * [6, 0.6, 6], 1.0))
-    else:
-        colour = mix([0.50, 0.40, 0.27], [0.86, 0.80, 0.69], np.clip(0.75 * cloud + 0.55 * grain - 0.1, 0, 1))
-    if material in ("metope", "pediment"):
-        colour = colour * (
-            np.array([0.62, 0.30, 0.22]) if material == "metope" else np.array([0.50, 0.56, 0.66])
-        )
-    # Joints: courses of blocks on walls, slabs on floors; drums of columns.
-    if material in ("wall", "step", "floor"):
-        height = np.where(flat, y, z)
-        tall, long = (1.1, 1.3) if material != "wall" else (0.52, 1.24)
-        course = np.floor(height / tall)
-        joint = np.minimum(
-            _to_joint(height, tall),
-            _to_joint(sideways if material != "floor" else x, long, course * 0.5 * long),
-        )
-        block = noise(
-            np.stack([course, np.floor((sideways + 0.5 * long * course) / long), 0 * x], -1) * 3.7, 1.0, 1
-        )
-        colour = colour * ((0.86 + 0.28 * block) * (1 - 0.6 * smoothstep(0.022, 0.006, joint)))[:, None]
-    elif material == "column":
-        joint = _to_joint(z - _FLOOR, _SHAFT / 5)
-        colour = colour * (1 - 0.55 * smoothstep(0.02, 0.005, joint))[:, None]
+def _stone(material: str, patches: list[tuple[Patch, float]], noise: Noise, rng: np.random.Generator) -> Part:
+    """Gaussians that cover patches of one material, worn and coloured."""
+    points, normals, tangents, room = (
+        np.concatenate([getattr(patch, name) for patch, _ in patches])
+        for name in ("points", "normals", "tangents", "room")
+    )
+    counts = [len(patch.u) for patch, _ in patches]
+    spacing = np.repeat([patch.spacing for patch, _ in patches], counts)
+    bend = np.repeat([bend for _, bend in patches], counts)
+    colour = _material_colour(material, points, noise) * _joints(material, points, normals, noise)[:, None]
     if material == "pediment":
-        relief = noise(points * [1.0, 0.0, 1.0] + 5, 1.9)
-        points = points + normals * (0.30 * smoothstep(0.46, 0.62, relief))[:, None]
-        colour = mix(np.ones(3), [1.35, 1.05, 0.80], smoothstep(0.46, 0.60, relief)) * colour
-    # Rain leaves dark streaks below ledges; lichen grows where it is flat.
-    streak = noise(points * [1.0, 1.0, 0.07] + 17, 2.4) * noise(points + 57, 0.6)
-    stain = np.clip(4.5 * (streak - 0.30), 0, 0.75) * (material not in ("wood",))
-    colour = colour * (1 - stain[:, None] * np.array([0.55, 0.58, 0.62]))
-    lichen = (
-        smoothstep(0.62, 0.72, noise(points + 71, 3.1))
-        * (0.25 + 0.75 * flat)
-        * (material not in ("wood", "wall"))
-    )
-    colour = colour * (1 - 0.6 * lichen[:, None]) + 0.6 * lichen[:, None] * np.array([0.36, 0.34, 0.08])
-    worn = (
-        points
-        + normals
-        * (0.035 * (noise(points + 91, 1.7) - 0.5) - 0.05 * smoothstep(0.66, 0.74, noise(points + 3, 2.3)))[
-            :, None
-        ]
-    )
-    gloss = 0.0 if material in ("wood", "tile") else 0.10
+        figures = smoothstep(0.46, 0.62, noise(points * [1.0, 0.0, 1.0] + 5, 1.9))
+        points = points + normals * (0.30 * figures)[:, None]
+        colour = mix(np.ones(3), [1.35, 1.05, 0.80], figures) * colour
+    dents = 0.05 * smoothstep(0.66, 0.74, noise(points + 3, 2.3))
+    wear = 0.035 * (noise(points + 91, 1.7) - 0.5) - dents
     return cover(
-        worn,
+        points + normals * wear[:, None],
         normals,
         tangents,
         spacing,
-        np.clip(colour, 0, 1),
+        np.clip(_weathered(material, points, normals, colour, noise), 0, 1),
         rng,
-        gloss=gloss,
+        gloss=0.0 if material in ("wood", "tile") else 0.10,
         bend=bend,
         room=room,
         aligned=0.9 if material == "column" else 0.0,
@@ -397,10 +341,52 @@ def _stone(
     )
 
 
-def _to_joint(x: Array, length: float, shift: Array | float = 0.0) -> Array:
+def _material_colour(material: str, points: Array, noise: Noise) -> Array:
+    grain = noise(points, 9.0)
+    if material == "tile":
+        each = noise(np.round(points * [1.2, 1.55, 1.2]) * 7.7, 1.0, 1)  # a shade for each tile
+        return mix([0.36, 0.11, 0.045], [0.72, 0.31, 0.14], np.clip(0.7 * each + 0.5 * grain, 0, 1))
+    if material == "wood":
+        return mix([0.05, 0.028, 0.014], [0.16, 0.09, 0.045], noise(points * [6, 0.6, 6], 1.0))
+    cloud = np.clip(0.75 * noise(points + 31, 0.55) + 0.55 * grain - 0.1, 0, 1)
+    marble = mix([0.50, 0.40, 0.27], [0.86, 0.80, 0.69], cloud)
+    paint = {"metope": [0.62, 0.30, 0.22], "pediment": [0.50, 0.56, 0.66]}.get(material, [1.0, 1.0, 1.0])
+    return np.asarray(marble * np.array(paint))
+
+
+def _joints(material: str, points: Array, normals: Array, noise: Noise) -> Array:
+    """How bright the joints are, and each stone: courses on walls, slabs on floors, drums of columns."""
+    x, y, z = points.T
+    if material == "column":
+        return 1 - 0.55 * smoothstep(0.02, 0.005, _to_joint(z - _FLOOR, _SHAFT / 5))
+    if material not in ("wall", "step", "floor"):
+        return np.ones(len(points))
+    tall, long = (0.52, 1.24) if material == "wall" else (1.1, 1.3)
+    height = np.where(np.abs(normals[:, 2]) > 0.7, y, z)
+    along = x if material == "floor" else np.where(np.abs(normals[:, 0]) > np.abs(normals[:, 1]), y, x)
+    course = np.floor(height / tall)
+    shifted = along + 0.5 * long * course
+    joint = np.minimum(_to_joint(height, tall), _to_joint(shifted, long))
+    stone = noise(np.stack([course, np.floor(shifted / long), 0 * x], -1) * 3.7, 1.0, 1)
+    return (0.86 + 0.28 * stone) * (1 - 0.6 * smoothstep(0.022, 0.006, joint))
+
+
+def _weathered(material: str, points: Array, normals: Array, colour: Array, noise: Noise) -> Array:
+    """Rain leaves dark streaks below ledges; lichen grows where it is flat."""
+    if material == "wood":
+        return colour
+    streak = noise(points * [1.0, 1.0, 0.07] + 17, 2.4) * noise(points + 57, 0.6)
+    stain = np.clip(4.5 * (streak - 0.30), 0, 0.75)
+    colour = colour * (1 - stain[:, None] * np.array([0.55, 0.58, 0.62]))
+    if material == "wall":
+        return colour
+    lichen = smoothstep(0.62, 0.72, noise(points + 71, 3.1)) * (0.25 + 0.75 * (np.abs(normals[:, 2]) > 0.7))
+    return mix(colour, [0.36, 0.34, 0.08], 0.6 * lichen)
+
+
+def _to_joint(x: Array, length: float) -> Array:
     """Distance to the nearest joint between blocks of one length."""
-    place = (x + shift) / length
-    return np.asarray(np.abs(place - np.round(place)) * length)
+    return np.asarray(np.abs(x / length - np.round(x / length)) * length)
 
 
 def _grass(n: int, rng: np.random.Generator) -> Part:
@@ -475,7 +461,7 @@ def _ivy(n: int, noise: Noise, rng: np.random.Generator) -> Part:
         rng.uniform(0, 0.3, k),
         rows,
         columns,
-        lambda t: np.sqrt(np.clip(t * (1.05 - t) * 3.7, 0.03, 1)),
+        leaf_outline,
         rng,
     )
     shade = np.repeat(rng.random(k), rows * columns)

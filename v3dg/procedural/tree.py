@@ -9,7 +9,19 @@ from numpy.typing import NDArray
 
 from v3dg.gaussians import Gaussians
 from v3dg.procedural._light import gaussians_of
-from v3dg.procedural._parts import GOLDEN_ANGLE, UP, Array, Noise, Part, cover, mix, strips, unit
+from v3dg.procedural._parts import (
+    GOLDEN_ANGLE,
+    UP,
+    Array,
+    Noise,
+    Part,
+    allot,
+    cover,
+    leaf_outline,
+    mix,
+    strips,
+    unit,
+)
 
 _STEPS = 10  # segments of a branch
 _CLEARANCE = 0.3  # m: no branch comes nearer to the ground
@@ -275,9 +287,7 @@ def _bark(levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.r
     length = np.linalg.norm(end - start, axis=1)
     area = 2 * np.pi * 0.5 * (r0 + r1) * length
     # Thin branches get more than their area's share, else they would be too few to see.
-    weight = area**0.78
-    ends = np.cumsum(weight)
-    which = np.minimum(np.searchsorted(ends, (np.arange(n) + rng.random(n)) / n * ends[-1]), len(area) - 1)
+    which = allot(area**0.78, n, rng)
     here = np.bincount(which, minlength=len(area))[which]
     t, angle = rng.random(n), rng.uniform(0, 2 * np.pi, n)
     along = unit(end - start)[which]
@@ -321,26 +331,26 @@ def _bark(levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.r
     return part
 
 
-def _seats(levels: list[_Branches], k: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """k places on the outer branches, in proportion to length, with the branches' directions; tips too."""
+def _seats(
+    levels: list[_Branches], k: int, rng: np.random.Generator
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """k places on the outer branches, in proportion to length, their directions, and which they are."""
     twigs, limbs = levels[-1], levels[-2]
     points = np.concatenate([twigs.points, limbs.points])
     lengths = np.concatenate([twigs.lengths, 0.4 * limbs.lengths])
     branches = _Branches(points, lengths, np.zeros(points.shape[:2]))
-    ends = np.cumsum(lengths)
-    which = np.minimum(np.searchsorted(ends, (np.arange(k) + rng.random(k)) / k * ends[-1]), len(lengths) - 1)
+    which = allot(lengths, k, rng)
     t = rng.random(k)
     t = np.where(which < len(twigs.lengths), 0.1 + 0.9 * t, 0.45 + 0.55 * t)
     place, along, _ = _at(branches, which, t)
-    return place, along, which.astype(np.float64)
+    return place, along, which
 
 
-def _leaf_colour(shape: _Kind, k: int, which: Array, rng: np.random.Generator) -> Array:
-    """A colour for each leaf: leaves of one twig are alike."""
-    twig = np.random.default_rng(int(rng.integers(1 << 31))).random(int(which.max()) + 1)
-    x = np.clip(
-        0.5 * twig[which.astype(np.int64)] + 0.5 * rng.random(k) + 0.10 * rng.standard_normal(k), 0, 1
-    )
+def _leaf_colours(shape: _Kind, twigs: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """A colour for each leaf; leaves of one twig are alike."""
+    k = len(twigs)
+    of_twig = rng.random(int(twigs.max(initial=0)) + 1)[twigs]
+    x = np.clip(0.5 * of_twig + 0.5 * rng.random(k) + 0.10 * rng.standard_normal(k), 0, 1)
     a, b, c = (np.array(colour) for colour in shape.leaves)
     first, second = np.minimum(2 * x, 1)[:, None], np.maximum(2 * x - 1, 0)[:, None]
     return np.asarray(a * (1 - first) + b * (first - second) + c * second)
@@ -365,10 +375,10 @@ def _leaves(levels: list[_Branches], n: int, shape: _Kind, rng: np.random.Genera
         rng.uniform(0.0, 0.5, k),
         _LEAF_ROWS,
         _LEAF_COLUMNS,
-        lambda t: np.sqrt(np.clip(t * (1.08 - t) * 3.6, 0.03, 1)),
+        leaf_outline,
         rng,
     )
-    part.albedo = np.repeat(_leaf_colour(shape, k, which, rng), each, axis=0)
+    part.albedo = np.repeat(_leaf_colours(shape, which, rng), each, axis=0)
     part.albedo *= (1.12 - 0.25 * np.abs(s))[:, None]
     # The rim lets the background through, and training leaves some much fainter than others.
     logits = np.log(part.opacities / (1 - part.opacities)) - 1.2 * t * t + 1.6 * rng.standard_normal(k * each)
@@ -395,7 +405,7 @@ def _needles(levels: list[_Branches], n: int, shape: _Kind, rng: np.random.Gener
         unit(np.cross(out, rng.standard_normal((n, 3)))),
         np.stack([0.33 * length, width, 0.6 * width], -1),
         1 / (1 + np.exp(-logits)),
-        _leaf_colour(shape, n, which, rng),
+        _leaf_colours(shape, which, rng),
         np.full(n, 0.08),
         np.full(n, 0.45),
         np.ones(n),
