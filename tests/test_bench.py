@@ -254,3 +254,13 @@ def test_plots_are_drawn(results):
 def test_report_of_an_empty_folder_says_what_to_run(tmp_path):
     with pytest.raises(ValueError, match="run `v3dg bench` first"):
         report.read_results(tmp_path)
+
+
+@pytest.mark.gpu
+@pytest.mark.slow
+def test_parts_run_on_cuda(tmp_path):
+    stage = bench.Stage(TINY, "cuda", tmp_path)
+    measured = bench.run(stage, "tiny", ("tolerance", "clipping", "hierarchy", "motion"), quiet=True)
+    for row in measured["clipping"]["rows"]:
+        assert 0.9 * row["ours_in_frustum"] < row["clipped_in_frustum"] <= row["ours_in_frustum"]
+    assert all(row["theirs_selected"] >= row["ours_selected"] for row in measured["hierarchy"]["rows"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import threading
 from types import TracebackType
 from typing import Any
@@ -95,6 +96,11 @@ def _left_products(quaternions: Any) -> Any:
     w, x, y, z = torch.as_tensor(quaternions).unbind(-1)
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def has_gsplat() -> bool:
+    """Whether there is a peer to measure; results name its version, or do not have it."""
+    return importlib.util.find_spec("gsplat") is not None
 
 
 def time_gsplat(gaussians: v3dg.Gaussians, camera: Camera, repeats: int) -> Time:

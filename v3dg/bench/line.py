@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from v3dg.bench.measure import Row, mean_of
+from v3dg.bench.measure import Row, mean_of, tolerance_for
 from v3dg.bench.stage import Stage
 from v3dg.bench.table import Column
 from v3dg.build import BuildConfig
@@ -21,7 +21,19 @@ def build_row(stage: Stage, name: str, config: BuildConfig, tolerance: float) ->
     return {**row, "steps": config.steps, "build_seconds": round(built.seconds, 3)}
 
 
-def summary(stage: Stage, name: str, tolerance: float, line: list[Row]) -> Row:
+def as_many_row(stage: Stage, name: str, config: BuildConfig, rival: Row) -> Row:
+    """What this build gives with at most as many gaussians as another row has, view by view."""
+    built = stage.build(config)
+    scene = stage.place(built.bundle)
+    shots = [
+        stage.shoot(scene, view, tolerance_for(scene, view.camera, of_rival["drawn_selected"]))
+        for view, of_rival in zip(stage.line, rival["line"], strict=True)
+    ]
+    row = summary(stage, name, None, stage.line_rows(shots, "drawn"))
+    return {**row, "steps": config.steps, "build_seconds": round(built.seconds, 3)}
+
+
+def summary(stage: Stage, name: str, tolerance: float | None, line: list[Row]) -> Row:
     means = mean_of(line, "drawn_selected", "drawn_in_frustum", "drawn_ms", "drawn_flip", "drawn_psnr")
     full = mean_of([shot.row("drawn") for shot in stage.full_line], "drawn_in_frustum", "drawn_ms")
     return {

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from v3dg import _core, _device, _operations
+from v3dg.bench import gpu
 from v3dg.bench.assets import like_trained, many_copies
 from v3dg.bench.measure import Row, as_picture, time_ms
 from v3dg.bench.stage import Stage
@@ -22,7 +23,7 @@ from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.metrics import psnr
 from v3dg.rasterize import intrinsics, rows_of, view_of_world
-from v3dg.render import render
+from v3dg.render import Renderer, render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE, select
 
@@ -79,9 +80,9 @@ def rasterize_row(stage: Stage, count: int, bandwidth: float) -> Row:
 
     picture = draw()
     row: Row = {"gaussians": count, "gaussians_in_frustum": picture.stats.gaussians_in_frustum}
-    if stage.device == "cuda":
+    if stage.device == "cuda" and gpu.has_gsplat():
         row |= gsplat_peer(stage, gaussians, camera, picture.color)
-    else:
+    elif stage.device == "cpu":
         row["psnr_to_float64"] = psnr_to_float64(gaussians, camera, picture.color)
     renderer = _renderer(gaussians, stage.device)
     timed = time_ms(lambda: renderer(camera), stage.device, stage.settings.repeats)
@@ -98,8 +99,6 @@ def rasterize_row(stage: Stage, count: int, bandwidth: float) -> Row:
 def _renderer(gaussians: Gaussians, device: str) -> Any:
     """What draws an asset that is where it is drawn, without handing it over each time."""
     if device == "cuda":
-        from v3dg.render import Renderer
-
         renderer = Renderer(gaussians)
         return lambda camera: renderer.render(camera).stats
     return lambda camera: render(gaussians, camera).stats
@@ -121,8 +120,6 @@ def _checked_psnr(expected: Any, color: Any) -> float:
 
 def gsplat_peer(stage: Stage, gaussians: Gaussians, camera: Camera, color: Any) -> Row:
     import torch
-
-    from v3dg.bench import gpu
 
     with torch.no_grad():
         expected = gpu.gsplat_picture(gaussians, camera, packed=True)[0]
@@ -198,10 +195,11 @@ _SCRIPT = """
 import json, sys
 import numpy as np
 from v3dg import _operations
+from v3dg.bench import gpu
 from v3dg.bench.assets import like_trained
 from v3dg.bench.measure import time_ms
 from v3dg.cameras import Camera
-from v3dg.render import render
+from v3dg.render import Renderer, render
 count, width, height = map(int, sys.argv[1:])
 camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=width, height=height)
 gaussians = like_trained(count, camera, "cpu")

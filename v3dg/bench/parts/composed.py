@@ -83,14 +83,15 @@ def strips(rows: list[Row], judged: list[tuple[int, Picture, Picture, Picture]],
     )
 
 
-_NAMES = ("in_frustum", "ms", "flip", "psnr")
+_NAMES = ("in_frustum", "ms", "least_ms", "flip", "psnr")
 
 
 def by_distance(scene: Row) -> list[Row]:
     """Means over directions and elevations."""
     groups: dict[float, list[Row]] = {}
     for row in scene["views"]:
-        groups.setdefault(round(row["distance"], 3), []).append(row)
+        least = {f"{who}_least_ms": row[f"{who}_ms_range"][0] for who in ("full", "ours")}
+        groups.setdefault(round(row["distance"], 3), []).append(row | least)
     columns = [f"{who}_{name}" for who in ("full", "ours") for name in _NAMES]
     return [{"distance": d, **mean_of(rows, *columns)} for d, rows in sorted(groups.items())]
 
@@ -126,12 +127,13 @@ def verdict(result: dict[str, Any]) -> Verdict:
             f"{far['ours_flip']:.4f} instead of {far['full_flip']:.4f}"
         )
         out.judge(far["ours_ms"] < far["full_ms"] and far["ours_flip"] <= far["full_flip"], text)
-        slower = [row for row in by_distance(scene) if row["ours_ms"] > 1.02 * row["full_ms"]]
+        # By the quickest frames, which other work on the machine disturbs least.
+        slower = [row for row in by_distance(scene) if row["ours_least_ms"] > 1.02 * row["full_least_ms"]]
         if slower:
-            worst = max(slower, key=lambda row: row["ours_ms"] / row["full_ms"])
+            worst = max(slower, key=lambda row: row["ours_least_ms"] / row["full_least_ms"])
             out.losses.append(
-                f"{scene['scene']} at distance {worst['distance']:.3g}: {worst['ours_ms']:.2f} ms against "
-                f"{worst['full_ms']:.2f} without levels"
+                f"{scene['scene']} at distance {worst['distance']:.3g}: {worst['ours_least_ms']:.2f} ms "
+                f"against {worst['full_least_ms']:.2f} without levels"
             )
     return out
 

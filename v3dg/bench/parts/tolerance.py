@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from v3dg.bench import gpu
 from v3dg.bench.line import COLUMNS, build_row, full_row, summary
-from v3dg.bench.measure import Row
+from v3dg.bench.measure import Row, as_picture
 from v3dg.bench.stage import Stage, paper_tolerance
 from v3dg.bench.table import markdown
 from v3dg.bench.verdict import Verdict
 from v3dg.build import BuildConfig
+from v3dg.select import select
 
 TITLE = "Tolerance: time against error"
 ABOUT = (
@@ -30,7 +32,7 @@ def run(stage: Stage) -> dict[str, Any]:
     )
     for name, config, tolerances in sweeps:
         rows += [build_row(stage, name, config, tolerance) for tolerance in tolerances]
-    if stage.device == "cuda":
+    if stage.device == "cuda" and gpu.has_gsplat():
         rows.append(gsplat_row(stage))
     return {"rows": rows}
 
@@ -38,10 +40,6 @@ def run(stage: Stage) -> dict[str, Any]:
 def gsplat_row(stage: Stage) -> Row:
     """gsplat draws every gaussian of the scene, which it is given in the world."""
     import torch
-
-    from v3dg.bench import gpu
-    from v3dg.bench.measure import as_picture
-    from v3dg.select import select
 
     every_one = select(stage.full_scene, stage.line[0].camera, tolerance=0.0, cull=False)
     placed = every_one.gaussians(device="cuda")

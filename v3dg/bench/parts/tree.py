@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from v3dg.bench.line import COLUMNS, build_row, full_row
+from v3dg.bench.line import COLUMNS, as_many_row, build_row, full_row
 from v3dg.bench.stage import PAPER_TOLERANCE, Stage
 from v3dg.bench.table import Column, markdown
 from v3dg.bench.verdict import Verdict
@@ -33,6 +33,7 @@ def run(stage: Stage) -> dict[str, Any]:
     ours = BuildConfig()
     name = f"ours, {ours.cluster_size} x {ours.group_size}"
     rows.append(build_row(stage, name, ours, DEFAULT_TOLERANCE))
+    rows.append(as_many_row(stage, "ours, as many as 4096 x 2", ours, rows[len(_SHAPES)]))
     return {"rows": rows}
 
 
@@ -43,13 +44,13 @@ def tables(result: dict[str, Any]) -> str:
 
 def verdict(result: dict[str, Any]) -> Verdict:
     shapes = [row for row in result["rows"][1:] if not row["levels"].startswith("ours")]
-    ours = result["rows"][-1]
+    ours, rival = result["rows"][-1], shapes[-1]
     flips = [row["drawn_flip"] for row in shapes]
     out = Verdict()
     out.judge(
-        ours["drawn_flip"] < min(flips),
-        f"tree or DAG, the paper's settings stay between FLIP {min(flips):.4f} and {max(flips):.4f} with "
-        f"{min(r['share'] for r in shapes):.0%} to {max(r['share'] for r in shapes):.0%} of the gaussians; "
-        f"our tree is at {ours['drawn_flip']:.4f} with {ours['share']:.0%}",
+        ours["drawn_flip"] < rival["drawn_flip"],
+        f"tree or DAG makes little difference to the paper's settings (FLIP {min(flips):.4f} to "
+        f"{max(flips):.4f}); its tree is at {rival['drawn_flip']:.4f} and {rival['drawn_psnr']:.1f} dB, "
+        f"ours with as many gaussians at {ours['drawn_flip']:.4f} and {ours['drawn_psnr']:.1f} dB",
     )
     return out

@@ -21,6 +21,7 @@ ABOUT = (
 )
 
 _ELEVATION = 30.0
+_NOTICED_DB = 0.01
 
 
 def run(stage: Stage) -> dict[str, Any]:
@@ -96,11 +97,15 @@ def tables(result: dict[str, Any]) -> str:
 
 def verdict(result: dict[str, Any]) -> Verdict:
     out = Verdict()
-    for row in result["rows"]:
-        drop = row["full_psnr"] - row["ours_psnr"]
-        out.judge(
-            drop <= 0.01,
-            f"{row['asset']} in close views: {row['share']:.0%} of the gaussians, PSNR {-drop:+.2f} dB to "
-            f"the full asset's, {row['acceleration']:.2f} x its speed",
-        )
+    worst = max(result["rows"], key=_drop)
+    out.judge(
+        _drop(worst) <= _NOTICED_DB,
+        f"in close views, {min(row['share'] for row in result['rows']):.0%} or more of an asset's gaussians "
+        f"are drawn; PSNR falls by at most {max(0.0, _drop(worst)):.2f} dB ({worst['asset']})",
+    )
     return out
+
+
+def _drop(row: Row) -> float:
+    """PSNR lost to the full asset, dB."""
+    return float(row["full_psnr"] - row["ours_psnr"])
