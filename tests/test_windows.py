@@ -6,7 +6,7 @@ import pytest
 import scenes_lod
 from v3dg import Camera, Scene, _core, render, select
 from v3dg._resident import instances_on_host
-from v3dg.render import _table
+from v3dg.render import cluster_tables
 from v3dg.select import camera_of
 
 CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
@@ -25,14 +25,13 @@ def draw_window(scene, camera, window):
     """Colour, alpha, depth and counts of the pixels [x0, x1) x [y0, y1)."""
     selection = select(scene, camera, tolerance=0.0)
     return _core.render_selection(
-        [_table(bundle, "appearance") for bundle in scene.bundles],
+        cluster_tables(scene),
         instances_on_host(scene),
-        camera_of(camera),
+        camera_of(camera, window),
         selection.instance_ids,
         selection.cluster_ids,
         [0.1, 0.2, 0.3],
         True,
-        window,
     )
 
 

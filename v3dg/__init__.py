@@ -15,6 +15,7 @@ from v3dg.camera_file import read_cameras, write_cameras
 from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
+from v3dg.pick import Pick, pick
 from v3dg.rasterize import Raster, rasterize
 from v3dg.render import Image, Renderer, Stats, render
 from v3dg.scene import Scene
@@ -30,6 +31,7 @@ __all__ = [
     "Gaussians",
     "Groups",
     "Image",
+    "Pick",
     "Raster",
     "Renderer",
     "Scene",
@@ -38,6 +40,7 @@ __all__ = [
     "__version__",
     "build_bundle",
     "load",
+    "pick",
     "rasterize",
     "read_cameras",
     "read_scene",

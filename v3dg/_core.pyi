@@ -89,7 +89,7 @@ class ClusterTable:
     ) -> None: ...
 
 # Instances are (bundle, positions, quaternions, scales, importance), a camera (viewmat, eye, K, width,
-# height, near), a rule (tolerance, budget or None, min_level, footprint, cull).
+# height, near, window or None), a rule (tolerance, budget or None, min_level, footprint, cull).
 SelectedPairs: TypeAlias = tuple[NDArray[np.int32], NDArray[np.int32], int, float, bool]
 
 def select(
@@ -181,8 +181,14 @@ def render_selection(
     cluster_ids: NDArray[np.int32],
     background: Sequence[float],
     with_depth: bool,
-    window: Sequence[int] | None = None,
 ) -> tuple[Float32, Float32, Float32, dict[str, Any]]: ...
+def pick_selection(
+    bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
+    instances: tuple[Any, ...],
+    camera: tuple[Any, ...],
+    instance_ids: NDArray[np.int32],
+    cluster_ids: NDArray[np.int32],
+) -> tuple[int, float, float] | None: ...
 
 # frame, with CUDA only; arrays on the device are whatever has __cuda_array_interface__
 class Drawing:

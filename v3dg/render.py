@@ -172,7 +172,7 @@ def _render_on_cpu(
         return Image(color, alpha, depth, lambda: asset_stats)
 
     scene = Scene.of(subject)
-    tables = [_table(bundle, color_by) for bundle in scene.bundles]
+    tables = cluster_tables(scene, color_by)
     start = time.perf_counter()
     cut = options.pop("cut")
     selection = select(scene, camera, **options) if cut is None else _checked(cut, subject, **options)
@@ -367,6 +367,11 @@ def _uploaded(array: Any) -> Any:
 
 # A bundle's gaussians as the core lays them out, made when it is first drawn.
 _models: weakref.WeakKeyDictionary[Bundle, dict[str, Any]] = weakref.WeakKeyDictionary()
+
+
+def cluster_tables(scene: Scene, color_by: ColorBy = "appearance") -> list[tuple[Any, ...]]:
+    """Gaussians and clusters of the scene's bundles as the CPU's half takes them."""
+    return [_table(bundle, color_by) for bundle in scene.bundles]
 
 
 def _table(bundle: Bundle, color_by: ColorBy) -> tuple[Any, ...]:

@@ -1,6 +1,6 @@
+#include <algorithm>
 #include <atomic>
 #include <memory>
-#include <optional>
 
 #include "bindings/select_args.h"
 #include "pipeline/model.h"
@@ -43,15 +43,6 @@ struct PictureArrays {
 };
 
 // x0, y0, x1, y1.
-static Window window_of(const std::array<int, 4>& w, int width, int height) {
-    if (w[0] < 0 || w[1] < 0 || w[2] > width || w[3] > height || w[0] >= w[2] || w[1] >= w[3])
-        throw py::value_error("window: expected x0 < x1 and y0 < y1 within " + std::to_string(width) + " x " +
-                              std::to_string(height) + " px, got " + std::to_string(w[0]) + ", " +
-                              std::to_string(w[1]) + ", " + std::to_string(w[2]) + ", " +
-                              std::to_string(w[3]));
-    return {w[0], w[1], w[2], w[3]};
-}
-
 static py::dict dict_of(const RenderCounts& c) {
     return py::dict("in_frustum"_a = c.in_frustum, "records"_a = c.records, "entries"_a = c.entries,
                     "project_seconds"_a = c.project_seconds, "bin_seconds"_a = c.bin_seconds,
@@ -160,63 +151,98 @@ static BundleClusters clusters_of(const py::handle& item) {
             span_of<const uint8_t>(t[3].cast<py::array>(), "antialiased", {c})};
 }
 
+// The clusters of a selection as draws. Neighbouring clusters of one instance are neighbours in memory: one
+// draw.
+struct SelectionDraws {
+    std::vector<BundleClusters> tables;  // which keep the models
+    std::vector<Draw<float>> draws;
+    std::vector<uint64_t> last_gaussian;  // of each pair, among the gaussians of all draws
+
+    SelectionDraws(const py::list& bundles, const py::tuple& instances, const SelectCamera& eye,
+                   const py::array& instance_ids, const py::array& cluster_ids) {
+        for (const py::handle& item : bundles) tables.push_back(clusters_of(item));
+        const InstanceTable placed = instance_table(instances, tables.size());
+        const Span<const int32_t> instance = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
+        const Span<const int32_t> clusters =
+            span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instance.size)});
+        int32_t last_instance = -1;
+        uint64_t num_gaussians = 0;
+        ModelView<float> view{};
+        for (size_t s = 0; s < instance.size; ++s) {
+            const int32_t i = instance[s], c = clusters[s];
+            if (i < 0 || static_cast<size_t>(i) >= placed.bundle.size)
+                throw py::value_error("instance_ids: expected ids of the scene's instances, got " +
+                                      std::to_string(i));
+            const BundleClusters& b = tables[placed.bundle[i]];
+            if (c < 0 || static_cast<size_t>(c) >= b.filter_px2.size)
+                throw py::value_error("cluster_ids: expected ids of the bundle's clusters, got " +
+                                      std::to_string(c));
+            const uint64_t first = b.offset[c], last = b.offset[c + 1];
+            if (last < first || last > b.model->size())
+                throw py::value_error("offset: expected ranges of the bundle's gaussians");
+            last_gaussian.push_back(num_gaussians);
+            if (i != last_instance) {
+                const Pose pose = placed.pose(i);
+                if (!is_placed(pose)) continue;
+                view = model_view_from_instance(axes_of_instance(eye, pose), pose);
+            }
+            last_gaussian.back() = num_gaussians += last - first;
+            const float filter = b.filter_px2[c];
+            const bool compensate = b.compensate[c] != 0;
+            if (i == last_instance) {
+                Draw<float>& d = draws.back();
+                if (d.first + d.count == first && d.filter_px2 == filter && d.compensate == compensate) {
+                    d.count += last - first;
+                    continue;
+                }
+            }
+            draws.push_back({&b.model->planes(), first, last - first, view, filter, compensate});
+            last_instance = i;
+        }
+    }
+};
+
+static Window window_of(const SelectCamera& c) {
+    return {static_cast<int>(c.x0), static_cast<int>(c.y0), static_cast<int>(c.x1), static_cast<int>(c.y1)};
+}
+
 static py::tuple render_selection(const py::list& bundles, const py::tuple& instances,
                                   const py::tuple& camera, const py::array& instance_ids,
                                   const py::array& cluster_ids, const std::array<double, 3>& background,
-                                  bool with_depth, const std::optional<std::array<int, 4>>& window) {
+                                  bool with_depth) {
     static SharedWorkspace shared;
-    std::vector<BundleClusters> tables;
-    for (const py::handle& item : bundles) tables.push_back(clusters_of(item));
-    const InstanceTable placed = instance_table(instances, tables.size());
-    const Span<const int32_t> instance = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
-    const Span<const int32_t> clusters =
-        span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instance.size)});
     const SelectCamera eye = select_camera(camera);
+    const SelectionDraws selected(bundles, instances, eye, instance_ids, cluster_ids);
+    PictureArrays<float> out(window_of(eye), background, with_depth);
     const Pinhole<float> pinhole = pinhole_of(eye);
-    const int width = static_cast<int>(eye.width), height = static_cast<int>(eye.height);
-    const Window part = window ? window_of(*window, width, height) : Window{0, 0, width, height};
-
-    // Neighbouring clusters of one instance are neighbours in memory: one draw.
-    std::vector<Draw<float>> draws;
-    int32_t last_instance = -1;
-    ModelView<float> view{};
-    for (size_t s = 0; s < instance.size; ++s) {
-        const int32_t i = instance[s], c = clusters[s];
-        if (i < 0 || static_cast<size_t>(i) >= placed.bundle.size)
-            throw py::value_error("instance_ids: expected ids of the scene's instances, got " +
-                                  std::to_string(i));
-        const BundleClusters& b = tables[placed.bundle[i]];
-        if (c < 0 || static_cast<size_t>(c) >= b.filter_px2.size)
-            throw py::value_error("cluster_ids: expected ids of the bundle's clusters, got " +
-                                  std::to_string(c));
-        const uint64_t first = b.offset[c], last = b.offset[c + 1];
-        if (last < first || last > b.model->size())
-            throw py::value_error("offset: expected ranges of the bundle's gaussians");
-        const float filter = b.filter_px2[c];
-        const bool compensate = b.compensate[c] != 0;
-        if (i == last_instance) {
-            Draw<float>& d = draws.back();
-            if (d.first + d.count == first && d.filter_px2 == filter && d.compensate == compensate) {
-                d.count += last - first;
-                continue;
-            }
-        } else {
-            const Pose pose = placed.pose(i);
-            if (!is_placed(pose)) continue;
-            view = model_view_from_instance(axes_of_instance(eye, pose), pose);
-        }
-        draws.push_back({&b.model->planes(), first, last - first, view, filter, compensate});
-        last_instance = i;
-    }
-    PictureArrays<float> out(part, background, with_depth);
     RenderCounts counts;
     {
         py::gil_scoped_release unlocked;
         std::unique_ptr<Workspace<float>> workspace = shared.take();
-        counts = render<float>(draws, pinhole, out.picture, false, *workspace);
+        counts = render<float>(selected.draws, pinhole, out.picture, false, *workspace);
         shared.give_back(std::move(workspace));
     }
     return py::make_tuple(out.color, out.alpha, out.depth_or_none(), dict_of(counts));
+}
+
+// Of the first pixel of the camera's window: (place in the selection, weight, depth) of the gaussian that it
+// shows most of, or None.
+static py::object pick_selection(const py::list& bundles, const py::tuple& instances, const py::tuple& camera,
+                                 const py::array& instance_ids, const py::array& cluster_ids) {
+    const SelectCamera eye = select_camera(camera);
+    const SelectionDraws selected(bundles, instances, eye, instance_ids, cluster_ids);
+    const Pinhole<float> pinhole = pinhole_of(eye);
+    const Window window = window_of(eye);
+    Pick picked{};
+    bool shows_any;
+    {
+        py::gil_scoped_release unlocked;
+        shows_any = pick(selected.draws, pinhole, window.x0, window.y0, picked);
+    }
+    if (!shows_any) return py::none();
+    const auto pair =
+        std::upper_bound(selected.last_gaussian.begin(), selected.last_gaussian.end(), picked.gaussian);
+    return py::make_tuple(pair - selected.last_gaussian.begin(), picked.weight, picked.depth);
 }
 
 template <class T>
@@ -235,7 +261,9 @@ void bind_render(py::module_& m) {
     bind_precision<float>(m, "Model", "Tape");
     bind_precision<double>(m, "ModelDouble", "TapeDouble");
     m.def("render_selection", &render_selection, "bundles"_a, "instances"_a, "camera"_a, "instance_ids"_a,
-          "cluster_ids"_a, "background"_a, "with_depth"_a, "window"_a = py::none());
+          "cluster_ids"_a, "background"_a, "with_depth"_a);
+    m.def("pick_selection", &pick_selection, "bundles"_a, "instances"_a, "camera"_a, "instance_ids"_a,
+          "cluster_ids"_a);
 }
 
 }  // namespace v3dg

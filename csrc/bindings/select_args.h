@@ -96,7 +96,8 @@ inline Footprint footprint_of(const std::string& name) {
     throw py::value_error("footprint: expected solid_angle or paper, got " + name);
 }
 
-// Of (viewmat (4, 4), eye (3,), K (3, 3), width, height, near).
+// Of (viewmat (4, 4), eye (3,), K (3, 3), width, height, near, window). A window (x0, y0, x1, y1) is a part
+// of the image, or None.
 inline SelectCamera select_camera(const py::tuple& t) {
     const py::array viewmat = t[0].cast<py::array>(), eye = t[1].cast<py::array>(),
                     K = t[2].cast<py::array>();
@@ -115,6 +116,17 @@ inline SelectCamera select_camera(const py::tuple& t) {
     camera.width = t[3].cast<int>();
     camera.height = t[4].cast<int>();
     camera.near = t[5].cast<double>();
+    const int width = t[3].cast<int>(), height = t[4].cast<int>();
+    std::array<int, 4> w{0, 0, width, height};
+    if (!t[6].is_none()) w = t[6].cast<std::array<int, 4>>();
+    if (!(0 <= w[0] && w[0] < w[2] && w[2] <= width && 0 <= w[1] && w[1] < w[3] && w[3] <= height))
+        throw py::value_error("window: expected x0 < x1 and y0 < y1 within " + std::to_string(width) + " x " +
+                              std::to_string(height) + " px, got " +
+                              py::str(py::cast(w)).cast<std::string>());
+    camera.x0 = w[0];
+    camera.y0 = w[1];
+    camera.x1 = w[2];
+    camera.y1 = w[3];
     return camera;
 }
 

@@ -11,6 +11,7 @@
 #include <string>
 
 #include "base/parallel_for.h"
+#include "rasterize/rasterize_math.h"
 
 namespace v3dg {
 
@@ -282,6 +283,27 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
         V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(), count,
                           camera, out);
     });
+}
+
+bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, int x, int y, Pick& picked) {
+    float color[3], alpha;
+    const Picture<float> pixel{{x, y, x + 1, y + 1}, {0, 0, 0}, color, &alpha, nullptr};
+    Workspace<float> ws;
+    render<float>(draws, camera, pixel, true, ws);
+    picked.weight = 0.0f;
+    float transmittance = 1.0f;
+    for (uint64_t e = ws.lists.offset.data()[0]; e < ws.lists.offset.data()[1]; ++e) {
+        const uint32_t place = record_of(ws.lists.entry.data()[e]);
+        const Record<float>& r = ws.records.data()[place];
+        const Falloff<float> f = falloff_at(static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f, r.u,
+                                            r.v, r.l11, r.l12, r.l22, r.log2_opacity);
+        if (!contributes(f)) continue;
+        float weight;
+        const bool goes_on = blend_live(alpha_of(f), transmittance, weight);
+        if (weight > picked.weight) picked = {ws.source.data()[place], weight, r.depth};
+        if (!goes_on) break;
+    }
+    return picked.weight > 0.0f;
 }
 
 #define V3DG_INSTANTIATE(T)                                                                                  \

@@ -37,6 +37,16 @@ template <class T>
 RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera, const Picture<T>& picture,
                     bool keep_source, Workspace<T>& workspace);
 
+// The gaussian that a pixel shows most of.
+struct Pick {
+    uint64_t gaussian;  // among the gaussians of all draws
+    float weight;       // its share of the pixel
+    float depth;
+};
+
+// Returns whether there is any.
+bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, int x, int y, Pick& picked);
+
 // Gradients of the gaussians of a single draw from those of the picture that `workspace` was left by. Adds to
 // nothing: `out` is overwritten for gaussians with a record and left alone for others.
 template <class T>

@@ -15,6 +15,7 @@ struct SelectCamera {
     double rotation[9];  // world to camera, rows
     double eye[3];
     double fx, fy, cx, cy, width, height, near;  // px; near in world units
+    double x0, y0, x1, y1;                       // the part of the image that is wanted, px
 };
 
 // A similarity transform p -> scale * rotation p + position.
@@ -62,7 +63,7 @@ V3DG_HD inline InstanceAxes axes_of_instance(const SelectCamera& camera, const P
     return out;
 }
 
-// What selection needs. Frustum planes lie pad_px outside the image.
+// What selection needs. Frustum planes lie pad_px outside the part of the image that is wanted.
 V3DG_HD inline InstanceView view_from_instance(const SelectCamera& camera, const InstanceAxes& in,
                                                const Pose& pose, float importance, double pad_px) {
     InstanceView view;
@@ -82,7 +83,9 @@ V3DG_HD inline InstanceView view_from_instance(const SelectCamera& camera, const
         const double size = is_x ? camera.width : camera.height;
         const double middle = is_x ? camera.cx : camera.cy;
         const double edge_px = sign > 0 ? size - middle : middle;
-        const double slope = (edge_px + pad_px) / focal;
+        const double wanted_px =
+            sign > 0 ? (is_x ? camera.x1 : camera.y1) - middle : middle - (is_x ? camera.x0 : camera.y0);
+        const double slope = (wanted_px + pad_px) / focal;
         // The projection is linearised no farther out than this.
         const double linearised = (edge_px + kFovMargin * size / 2) / focal;
         const double* axis = in.axes + (is_x ? 0 : 3);

@@ -1,0 +1,79 @@
+"""Picking: what a pixel shows."""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass
+
+import numpy as np
+
+from v3dg import _core, _resident
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera, Floats
+from v3dg.render import cluster_tables
+from v3dg.scene import Scene
+from v3dg.select import camera_of, rule_of, select
+
+
+@dataclass(frozen=True)
+class Pick:
+    """The gaussian that a pixel shows most of, and what it belongs to.
+
+    Attributes:
+        instance: Its instance.
+        cluster: Its cluster, within the instance's bundle.
+        level: The cluster's level.
+        weight: Its share of the pixel, 0 to 1.
+        depth: Its depth along the camera's axis, world units.
+        position: (3,) float64, the point of the pixel's ray at that depth, in the world.
+    """
+
+    instance: int
+    cluster: int
+    level: int
+    weight: float
+    depth: float
+    position: Floats
+
+
+def pick(
+    scene_or_bundle: Scene | Bundle,
+    camera: Camera,
+    x: int,
+    y: int,
+    *,
+    tolerance: float | None = None,
+    budget: int | None = None,
+    min_level: int = 0,
+) -> Pick | None:
+    """Return what pixel (x, y) of the picture that `v3dg.render` draws shows most of; None where it is empty.
+
+    Looks at nothing but the pixel, on the CPU; the cut is the same on every device.
+
+    Args:
+        x: Column, from 0 at the left.
+        y: Row, from 0 at the top.
+        tolerance: As for the picture; so are `budget` and `min_level`.
+
+    Raises:
+        ValueError: The pixel is not in the image, or another argument is not as in `v3dg.render`.
+    """
+    x, y = operator.index(x), operator.index(y)
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        raise ValueError(f"x, y: expected a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
+    scene = Scene.of(scene_or_bundle)
+    if budget is not None:  # which is for the whole picture
+        tolerance = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level).tolerance
+    rule = rule_of(tolerance, None, min_level, "solid_angle", True)
+    pixel = camera_of(camera, (x, y, x + 1, y + 1))
+    instances = _resident.instances_on_host(scene)
+    instance_ids, cluster_ids, *_ = _core.select(scene.tables, instances, pixel, rule)
+    found = _core.pick_selection(cluster_tables(scene), instances, pixel, instance_ids, cluster_ids)
+    if found is None:
+        return None
+    place, weight, depth = found
+    instance, cluster = int(instance_ids[place]), int(cluster_ids[place])
+    level = int(scene.bundles[scene.instance_bundle[instance]].clusters.level[cluster])
+    ray = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
+    position = camera.position + depth * ray @ camera.viewmat[:3, :3]
+    return Pick(instance, cluster, level, weight, depth, position)
