@@ -307,7 +307,7 @@ def cover(
     gloss: Array | float = 0.0,
     translucency: Array | float = 0.0,
     aligned: float = 0.0,
-    opacity: float = 0.8,
+    opacity: float = 0.3,
     bend: Array | float = np.inf,
     room: Array | None = None,
 ) -> Part:
@@ -325,13 +325,13 @@ def cover(
     spacing = np.broadcast_to(np.asarray(spacing, dtype=np.float64), n)
     middle_ratio = np.exp(0.4 * rng.gamma(3.0, size=n))
     thin_ratio = np.exp(0.5 * rng.gamma(3.0, size=n))
-    size = 0.8 * spacing * np.exp(0.55 * rng.standard_normal(n))
+    size = 0.75 * spacing * np.exp(0.7 * rng.standard_normal(n))
     base = (
         rng.random(n) < 0.12
     )  # large and solid, a little below the others: nothing shines through between those
     size[base] = 2.2 * spacing[base]
     middle_ratio[base] = np.minimum(middle_ratio[base], 2)
-    longest = np.sqrt(0.5 * bend * spacing)  # the ends, two deviations out, then rise by the spacing
+    longest = np.sqrt(0.4 * bend * spacing)  # the ends, two deviations out, then rise by less than the spacing
     long, middle = size * np.sqrt(middle_ratio), np.minimum(size / np.sqrt(middle_ratio), longest)
     angle = rng.uniform(-np.pi / 2, np.pi / 2, n) * (1 - aligned) + 0.1 * rng.standard_normal(n)
     if room is not None:

@@ -143,7 +143,6 @@ def _skin(figure: Figure, n: int, skin: Array, hair: Array, noise: Noise, rng: n
                 rng,
                 gloss=0.16,
                 bend=0.03,
-                opacity=1.3,
             )
         )
     return Part.concatenate(parts)
@@ -227,7 +226,7 @@ def _shoes(figure: Figure, n: int, noise: Noise, rng: np.random.Generator) -> Pa
         sole,
     )
     tangents = unit(np.cross(normals, [0.9, 0.3, 0.1]))
-    return cover(points, normals, tangents, spacing, colour, rng, gloss=0.3, bend=0.03, opacity=1.3)
+    return cover(points, normals, tangents, spacing, colour, rng, gloss=0.3, bend=0.03)
 
 
 def _hair(figure: Figure, n: int, hair: Array, noise: Noise, rng: np.random.Generator) -> Part:

@@ -337,7 +337,6 @@ def _stone(material: str, patches: list[tuple[Patch, float]], noise: Noise, rng:
         bend=bend,
         room=room,
         aligned=0.9 if material == "column" else 0.0,
-        opacity=1.3,
     )
 
 

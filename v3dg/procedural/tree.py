@@ -318,7 +318,6 @@ def _bark(levels: list[_Branches], n: int, shape: _Kind, noise: Noise, rng: np.r
         colour,
         rng,
         aligned=0.5 if shape.bands else 0.8,  # bands would blur along the trunk
-        opacity=1.2,
         bend=radius,
     )
     # A branch thinner than its gaussians are apart is drawn by needles along its axis.
