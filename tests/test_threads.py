@@ -248,3 +248,33 @@ stop.set()
 for t in threads: t.join()
 """
     assert run(ALL + script) == expected
+
+
+def test_memory_that_runs_out_is_an_error_and_nothing_else():
+    """At any moment: the process goes on, and once there is memory again, the results are the same."""
+    script = """
+import resource
+from collections import Counter
+from test_threads import asset, bundle_of, crowd, frame, gradient, picture
+def size():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[0]) * resource.getpagesize()
+for work, subject in ((picture, asset()), (gradient, asset()), (frame, crowd()), (bundle_of, asset(num=300))):
+    expected, seen = work(subject), Counter()
+    for room in [*range(0, 2 << 20, 128 << 10), *range(2 << 20, 24 << 20, 1 << 20)]:
+        resource.setrlimit(resource.RLIMIT_AS, (size() + room, resource.RLIM_INFINITY))
+        try:
+            assert work(subject) == expected
+            seen["done"] += 1
+        except (MemoryError, RuntimeError) as error:  # of threads that cannot start
+            seen[type(error).__name__] += 1
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY,) * 2)
+    print(work.__name__, seen["MemoryError"] > 0, work(subject) == expected)
+"""
+    pytest.importorskip("torch")
+    # One arena that gives back at once what it is given, so that the limit is soon felt.
+    allocator = {"MALLOC_ARENA_MAX": "1", "MALLOC_TRIM_THRESHOLD_": "0", "MALLOC_MMAP_THRESHOLD_": "16384"}
+    printed = run(script, OMP_NUM_THREADS="1", **allocator)
+    works = ("picture", "gradient", "frame", "bundle_of")
+    assert printed == [word for work in works for word in (work, "True", "True")]

@@ -2,17 +2,23 @@
 
 #include <cstddef>
 
+#include "base/first_error.h"
+
 namespace v3dg {
 
-// Calls body(i) for every i < count on all threads; `chunk` neighbours go to one thread together.
-// Bodies may not throw and may not depend on which thread runs them.
+// Calls body(i) for every i < count on all threads; `chunk` neighbours go to one thread together. Results may
+// not depend on which thread runs a body. What bodies throw, mostly for lack of memory, goes to the caller.
 template <class Body>
 void parallel_for(size_t count, size_t chunk, const Body& body) {
+    FirstError error;
 #pragma omp parallel for schedule(dynamic, 1) if (count > chunk)
     for (size_t first = 0; first < count; first += chunk) {
         const size_t last = first + chunk < count ? first + chunk : count;
-        for (size_t i = first; i < last; ++i) body(i);
+        error.run(first, [&] {
+            for (size_t i = first; i < last; ++i) body(i);
+        });
     }
+    error.rethrow();
 }
 
 }  // namespace v3dg

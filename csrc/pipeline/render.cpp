@@ -173,19 +173,15 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
 
     const uint64_t* offset = ws.lists.offset.data();
     const std::vector<uint32_t> order = tiles_by_load(offset, grid.size());
-#pragma omp parallel
-    {
-        Buffer<uint64_t> scratch;
-#pragma omp for schedule(dynamic, 1)
-        for (size_t i = 0; i < order.size(); ++i) {
-            const uint32_t t = order[i];
-            uint64_t* entry = ws.lists.entry.data() + offset[t];
-            const size_t count = offset[t + 1] - offset[t];
-            sort_tile(records, entry, count, scratch.reserve(count));
-            V3DG_DISPATCH_ISA(rasterize_tile<T>, records, entry, count, kTileSize * grid.column(t),
-                              kTileSize * grid.row(t), picture);
-        }
-    }
+    std::vector<Buffer<uint64_t>> scratch(num_threads);
+    parallel_for(order.size(), 1, [&](size_t i) {
+        const uint32_t t = order[i];
+        uint64_t* entry = ws.lists.entry.data() + offset[t];
+        const size_t count = offset[t + 1] - offset[t];
+        sort_tile(records, entry, count, scratch[omp_get_thread_num()].reserve(count));
+        V3DG_DISPATCH_ISA(rasterize_tile<T>, records, entry, count, kTileSize * grid.column(t),
+                          kTileSize * grid.row(t), picture);
+    });
     counts.entries += ws.lists.num_entries;
     counts.project_seconds += projected - start;
     counts.bin_seconds += binned - projected;
@@ -247,27 +243,23 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
     std::vector<RecordGradient<T>> d_pair(num_pairs);
     std::vector<T> d_background_of_tile(3 * grid.size(), T(0));
     const std::vector<uint32_t> order = tiles_by_load(offset, grid.size());
-#pragma omp parallel
-    {
-        std::vector<RecordGradient<T>> d_entry;
-#pragma omp for schedule(dynamic, 1)
-        for (size_t i = 0; i < order.size(); ++i) {
-            const uint32_t t = order[i];
-            const size_t count = offset[t + 1] - offset[t];
-            const int column = grid.column(t), row = grid.row(t);
-            d_entry.assign(count, RecordGradient<T>{});
-            V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, entry + offset[t], count,
-                              kTileSize * column, kTileSize * row, picture, d_picture, d_entry.data(),
-                              &d_background_of_tile[3 * t]);
-            for (size_t e = 0; e < count; ++e) {
-                const uint32_t r = record_of(entry[offset[t] + e]);
-                const int x0 = records[r].x0 / kTileSize, x1 = records[r].x1 / kTileSize,
-                          y0 = records[r].y0 / kTileSize;
-                d_pair[pair_first[r] + static_cast<uint64_t>(row - y0) * (x1 - x0 + 1) + (column - x0)] =
-                    d_entry[e];
-            }
+    std::vector<std::vector<RecordGradient<T>>> d_entries(omp_get_max_threads());
+    parallel_for(order.size(), 1, [&](size_t i) {
+        const uint32_t t = order[i];
+        const size_t count = offset[t + 1] - offset[t];
+        const int column = grid.column(t), row = grid.row(t);
+        std::vector<RecordGradient<T>>& d_entry = d_entries[omp_get_thread_num()];
+        d_entry.assign(count, RecordGradient<T>{});
+        V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, entry + offset[t], count, kTileSize * column,
+                          kTileSize * row, picture, d_picture, d_entry.data(), &d_background_of_tile[3 * t]);
+        for (size_t e = 0; e < count; ++e) {
+            const uint32_t r = record_of(entry[offset[t] + e]);
+            const int x0 = records[r].x0 / kTileSize, x1 = records[r].x1 / kTileSize,
+                      y0 = records[r].y0 / kTileSize;
+            d_pair[pair_first[r] + static_cast<uint64_t>(row - y0) * (x1 - x0 + 1) + (column - x0)] =
+                d_entry[e];
         }
-    }
+    });
     for (size_t t = 0; t < grid.size(); ++t)
         for (int c = 0; c < 3; ++c) d_background[c] += d_background_of_tile[3 * t + c];
 

@@ -13,7 +13,7 @@
 
 #include <omp.h>
 
-#include "ply/first_error.h"
+#include "base/first_error.h"
 #include "ply/ply.h"
 
 namespace v3dg {
