@@ -57,11 +57,12 @@ void move_median(IndexedPoint* first, IndexedPoint* middle, IndexedPoint* last) 
     });
 }
 
-// Splits points first .. last into the node's 2^depth leaves.
-void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, Span<int64_t> order) {
+// Splits points first .. last into the node's 2^depth leaves. Plain arguments: LLVM's OpenMP, which stands in
+// for gcc's where threads are checked (.ci/sanitize), forgets to copy others into a task that runs at once.
+void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth, int64_t* order) {
     if (depth == 0) {
         for (ptrdiff_t i = first; i < last; ++i) order[i] = points[i].index;
-        std::sort(order.data + first, order.data + last);
+        std::sort(order + first, order + last);
         return;
     }
     const ptrdiff_t middle = first + (last - first + 1) / 2;
@@ -143,7 +144,7 @@ void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int 
             points[i] = {{means[i].axis[0], means[i].axis[1], means[i].axis[2]}, uint32_t(i)};
 #pragma omp for schedule(dynamic, 1)
         for (ptrdiff_t s = 0; s < num_segments; ++s)
-            split_node(points.data(), offset[s], offset[s + 1], depth, order);
+            split_node(points.data(), offset[s], offset[s + 1], depth, order.data);
     }
 }
 

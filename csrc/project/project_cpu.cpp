@@ -77,7 +77,9 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         reach.drawn += __builtin_popcount(drawn_bits);
         top = min_of(top, drawn ? y0 : top);
         bottom = max_of(bottom, drawn ? y1 : bottom);
-        pairs += drawn ? tiles_of(x0, x1) * tiles_of(y0, y1) : I{};
+        // Of what is not drawn, the product could overflow.
+        const I columns = drawn ? tiles_of(x0, x1) : I{}, rows = drawn ? tiles_of(y0, y1) : I{};
+        pairs += columns * rows;
 
         x0 = max_of(x0, I{} + window.x0), x1 = min_of(x1, I{} + (window.x1 - 1));
         y0 = max_of(y0, I{} + window.y0), y1 = min_of(y1, I{} + (window.y1 - 1));
