@@ -71,7 +71,8 @@ def parts_of(data):
     try:
         header = json.loads(data[8:start])
         ends = [header[name]["data_offsets"][1] for name in ("pages", "hash")]
-        return (header, start, *ends) if 0 <= ends[0] < ends[1] <= len(data) - start else None
+        is_inside = {int} == set(map(type, ends)) and 0 <= ends[0] < ends[1] <= len(data) - start
+        return (header, start, *ends) if is_inside else None
     except Exception:  # any kind of damage
         return None
 
