@@ -1,17 +1,28 @@
+#include <dlfcn.h>
 #include <omp.h>
 #include <pthread.h>
+
+#include <cstring>
+#include <new>
 
 #include "base/isa.h"
 #include "bindings/args.h"
 #include "project/project_math.h"
 
-// A child of fork() has none of the threads that OpenMP keeps for the next loop, but would wait for them
-// without end. So the thread that forks lets its own go first; they come back, on either side, with the next
-// loop.
+// A child of fork() has none of the threads that GNU's OpenMP keeps for the next loop, but would wait for
+// them without end. So the thread that forks lets its own go first; they come back, on either side, with the
+// next loop. LLVM's OpenMP, which may stand in, minds forks itself and then holds locks that this would wait
+// for.
 static void let_threads_go() { omp_pause_resource_all(omp_pause_hard); }
+static bool must_let_threads_go() {
+    Dl_info found;
+    return dladdr(reinterpret_cast<void*>(&omp_pause_resource_all), &found) != 0 &&
+           std::strstr(found.dli_fname, "libgomp") != nullptr;
+}
 
 PYBIND11_MODULE(_core, m) {
-    if (pthread_atfork(&let_threads_go, nullptr, nullptr) != 0) throw std::bad_alloc();
+    if (must_let_threads_go() && pthread_atfork(&let_threads_go, nullptr, nullptr) != 0)
+        throw std::bad_alloc();
     m.doc() = "Compiled operations of v3dg; the public interface is the package v3dg.";
     m.attr("reach_sigmas") = v3dg::kReachSigmas;
     m.attr("has_cuda") = V3DG_WITH_CUDA != 0;
