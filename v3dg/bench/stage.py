@@ -21,7 +21,6 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.io import load
-from v3dg.pictures import write_picture
 from v3dg.procedural import make_asset
 from v3dg.render import Stats, render
 from v3dg.scene import Scene
@@ -29,6 +28,7 @@ from v3dg.scene_file import read_scene
 from v3dg.select import DEFAULT_TOLERANCE
 
 FOV_X = math.pi / 4  # the paper's
+_MOST_PICTURE_PX = 1400, 2000
 PAPER_CLUSTER_SIZE = BuildConfig.paper().cluster_size
 
 
@@ -307,10 +307,13 @@ class Stage:
             yield name, self._world_bundle(world, name)
 
     def save(self, name: str, picture: Picture) -> None:
-        """Keep a picture as a JPEG."""
-        path = self.folder / f"{name}.jpg"
-        write_picture(path, picture)
-        self.pictures.append(path.name)
+        """Keep a picture as a JPEG that is small enough for a repository."""
+        from PIL import Image
+
+        image = Image.fromarray(picture)
+        image.thumbnail(_MOST_PICTURE_PX)
+        image.save(self.folder / f"{name}.jpg", quality=80)
+        self.pictures.append(f"{name}.jpg")
 
 
 def every(items: Sequence[Any], count: int) -> list[Any]:
