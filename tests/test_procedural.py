@@ -12,6 +12,8 @@ from v3dg.procedural import (
     place_field,
 )
 from v3dg.procedural._light import sh_basis
+from v3dg.procedural._parts import sample
+from v3dg.procedural.temple import _faces
 
 
 def rotations(quats):
@@ -111,6 +113,21 @@ def test_temple_stands_on_the_ground():
     low, high = np.percentile(temple.means, (0.1, 99.9), axis=0)
     assert temple.means[:, 2].min() > -0.1
     assert np.allclose(high - low, [15.5, 27.3, 10.2], atol=0.6)
+
+
+def test_faces_of_the_temple_look_outwards():
+    below = {"wood"}  # seen from below
+    for face in _faces():
+        patch = sample(face.surface, 400, np.random.default_rng(0), face.cells)
+        normal = patch.normals.mean(axis=0)
+        if face.material == "tile" or face.material in below:
+            assert normal[2] * (-1 if face.material in below else 1) > 0.5
+        elif face.material == "pediment":
+            outwards = patch.points.mean(axis=0) - [0, 0, 1]
+            assert normal @ outwards > 0
+        elif face.material == "column":
+            axis = patch.points.mean(axis=0)
+            assert (np.sum((patch.points - axis)[:, :2] * patch.normals[:, :2], axis=1) > 0).mean() > 0.95
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -331,7 +331,9 @@ def cover(
     )  # large and solid, a little below the others: nothing shines through between those
     size[base] = 2.2 * spacing[base]
     middle_ratio[base] = np.minimum(middle_ratio[base], 2)
-    longest = np.sqrt(0.4 * bend * spacing)  # the ends, two deviations out, then rise by less than the spacing
+    longest = np.sqrt(
+        0.4 * bend * spacing
+    )  # the ends, two deviations out, then rise by less than the spacing
     long, middle = size * np.sqrt(middle_ratio), np.minimum(size / np.sqrt(middle_ratio), longest)
     angle = rng.uniform(-np.pi / 2, np.pi / 2, n) * (1 - aligned) + 0.1 * rng.standard_normal(n)
     if room is not None:

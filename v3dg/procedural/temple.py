@@ -168,7 +168,7 @@ def _roof() -> list[_Face]:
             down = (rows * v) % 1.0
             hump = 0.085 * smoothstep(0.2, 0.0, np.minimum(across, 1 - across))
             lift = hump + 0.05 * (down - smoothstep(0.85, 1.0, down))  # no row's end is upright
-            y = sign * half_y * (2 * u - 1)
+            y = sign * half_y * (1 - 2 * u)
             x = sign * half_x * v
             return np.stack([x, y, _RIDGE + (_EAVES - _RIDGE) * v + lift], -1)
 
@@ -179,7 +179,7 @@ def _roof() -> list[_Face]:
             (0, half_y, _RIDGE),
             (sign * half_x, half_y, _EAVES),
         )
-        faces.append(_flat([(x, sign * y, z - 0.07) for x, y, z in under], "wood"))
+        faces.append(_flat([(x, sign * y, z - 0.25) for x, y, z in under], "wood"))
     for sign in (-1.0, 1.0):
         y = sign * (_HALF_Y + 0.45)
         left, right, top = (-half_x, y, _EAVES), (half_x, y, _EAVES), (0.0, y, _RIDGE - 0.1)
@@ -205,7 +205,7 @@ def _roof() -> list[_Face]:
                         (b[0], high_y, b[1]),
                         (a[0], high_y, a[1]),
                     )
-                flip = (side * sign > 0) if name == "front" else side > 0
+                flip = (side * sign < 0) if name == "front" else side < 0
                 faces.append(_flat(quad[::-1] if flip else quad, "marble"))
     return faces
 
@@ -268,7 +268,7 @@ _DENSITY = {
     "tile": 1.0,
     "triglyph": 1.6,
     "pediment": 1.3,
-    "wood": 0.3,
+    "wood": 0.6,
     "floor": 0.6,
     "wall": 0.8,
 }
