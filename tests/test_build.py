@@ -332,7 +332,7 @@ def test_gaussians_with_wrong_values_are_left_out(asset, name, value, kind, reas
 
 def test_gaussians_that_no_pixel_can_show_are_left_out_silently(asset, device):
     opacities = np.maximum(asset.opacities, np.float32(0.01))
-    opacities[[3, 700, 900]] = 0, 1 / 260, 0.0038
+    opacities[[3, 700, 900]] = 0, 1 / 256, 0.0038
     bundle = build(scenes.replaced(asset, opacities=opacities), device=device, unusable="refuse")
     assert bundle.config["dropped"] == {"transparent": 3}
     assert len(bundle.level_gaussians(0)) == 1197

@@ -15,8 +15,8 @@ from v3dg.gaussians import Array, Gaussians
 
 LARGEST = 1e18
 """Of a coordinate or a scale, in world units: squares of more are no float32 numbers."""
-SMALLEST_OPACITY = 0.0039
-"""A gaussian is drawn where its alpha is 1/255 or more; this is below it, by more than rounding."""
+SMALLEST_OPACITY = float(np.float32(1 / 255))
+"""A gaussian is drawn where its alpha is this or more, so one whose opacity is below is never drawn."""
 OUTLIER_DISTANCE = 20.0
 """From the median of the positions, in median distances; sky and floaters lie there, and slips."""
 
