@@ -99,6 +99,7 @@ constexpr int kLanes = kVectorBytes / static_cast<int>(sizeof(T));
 
 typedef int32_t IntVec32 __attribute__((vector_size(kVectorBytes)));
 typedef int64_t IntVec64 __attribute__((vector_size(kVectorBytes)));
+typedef uint32_t BitsVec32 __attribute__((vector_size(kVectorBytes)));  // for arithmetic that may wrap
 
 template <>
 struct LaneOf<Vec<float>> {
@@ -157,7 +158,7 @@ V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
     p = p * f + 0.24022242f;
     p = p * f + 0.69314698f;
     p = p * f + 1.0f;
-    return (Vec<float>)((IntVec32)p + (((IntVec32)shifted - (IntVec32)magic) << 23));
+    return (Vec<float>)((BitsVec32)p + (((BitsVec32)shifted - (BitsVec32)magic) << 23));
 }
 V3DG_INLINE Vec<double> exp2_in_range(Vec<double> x) {
     for (int i = 0; i < kLanes<double>; ++i) x[i] = ::exp2(x[i]);
@@ -167,7 +168,7 @@ V3DG_INLINE Vec<double> exp2_in_range(Vec<double> x) {
 // log2 of positive normal x, error below 2e-7 * max(1, |log2 x|).
 V3DG_INLINE Vec<float> log2_of(Vec<float> x) {
     // x = m * 2^k with m in [sqrt(1/2), sqrt(2)); then atanh((m - 1) / (m + 1)), fitted.
-    const IntVec32 bits = (IntVec32)x - 0x3f3504f3;
+    const IntVec32 bits = (IntVec32)((BitsVec32)x - 0x3f3504f3u);
     const IntVec32 k = bits >> 23;
     const Vec<float> m = (Vec<float>)((bits & 0x007fffff) + 0x3f3504f3);
     const Vec<float> s = (m - 1.0f) / (m + 1.0f);
