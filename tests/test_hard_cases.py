@@ -148,3 +148,26 @@ def test_scene_out_of_sight_is_the_background(device, count):
     assert (host(image.color) == np.float32((0.1, 0.2, 0.3))).all()
     assert not host(image.alpha).any()
     assert image.stats.gaussians_in_frustum == 0
+
+
+@pytest.mark.gpu
+def test_more_pairs_than_31_bits_count(torch):
+    """Every pixel has stopped long before the 5,000th gaussian, so the others change nothing."""
+    num, tiles = 550_000, 60 * 68  # 1920 x 1080 in tiles of 32 x 16
+    assert num * tiles > 1 << 31
+    if torch.cuda.mem_get_info()[0] < 64 << 30:
+        pytest.skip("expected 64 GiB of free device memory")
+    camera = scenes.camera(1920, 1080, fx=1000.0)
+    rng = np.random.default_rng(0)
+    depth = np.linspace(1, 2, num)
+    everywhere = scenes.gaussians(
+        np.column_stack([rng.normal(0, 0.1, (num, 2)), depth]),
+        scales=5.0,
+        opacities=0.0075,
+        color=rng.uniform(0, 1, (num, 3)),
+    )
+    few = v3dg.rasterize(everywhere.subset(slice(5000)).torch("cuda"), camera)
+    assert few.alpha.min() > 0.999
+    many = v3dg.rasterize(everywhere.torch("cuda"), camera)
+    for got, expected in ((many.color, few.color), (many.alpha, few.alpha), (many.depth, few.depth)):
+        np.testing.assert_array_equal(host(got), host(expected))
