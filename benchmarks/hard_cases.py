@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import record
 import tyro
+
+from v3dg.bench import record
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
@@ -105,7 +106,7 @@ def main(config: Config) -> None:
     for name, case in cases.hard_cases().items():
         measured[name] = measure(case, config.device)
         print(f"{name:36}", *(f"{m['percent']} {m['largest']:.0e}" for m in measured[name].values()))
-    record.write(config.output, {"device": config.device, "decades": DECADES, "cases": measured})
+    record.write(config.output, {"decades": DECADES, "cases": measured}, config.device)
 
 
 if __name__ == "__main__":
