@@ -11,11 +11,15 @@ namespace v3dg {
 template <class T>
 Span<T> device_span_of(const py::handle& array, const char* name, std::initializer_list<py::ssize_t> shape) {
     using Value = std::remove_const_t<T>;
-    const py::object found = py::getattr(array, "__cuda_array_interface__", py::none());
-    if (found.is_none())
+    PyObject* found = PyObject_GetAttrString(array.ptr(), "__cuda_array_interface__");
+    if (found == nullptr) {
+        // An interrupt may arrive here, too.
+        if (!PyErr_ExceptionMatches(PyExc_AttributeError)) throw py::error_already_set();
+        PyErr_Clear();
         throw py::type_error(std::string(name) + ": expected an array on a CUDA device, got " +
                              py::str(py::type::of(array)).cast<std::string>());
-    const py::dict face = found.cast<py::dict>();
+    }
+    const py::dict face = py::reinterpret_steal<py::object>(found).cast<py::dict>();
     const std::string dtype = face["typestr"].cast<std::string>();
     const std::string wanted_dtype = py::dtype::of<Value>().attr("str").template cast<std::string>();
     if (dtype != wanted_dtype)
