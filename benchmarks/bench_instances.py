@@ -1,0 +1,207 @@
+"""Scenes of many instances on a GPU: frames beside gsplat's, error, memory, movement, budgets.
+
+Two parts: a layout of instances of one asset, with a range of its cameras, and fields of very many instances
+in view at once, whose error is measured on crops, since nothing draws all of them in full.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+import v3dg
+from v3dg.bench import gpu, record
+from v3dg.bench.measure import Judge, Picture, Row, as_picture, draw_truth, mean_of, time_ms
+from v3dg.build import build_bundle
+from v3dg.cameras import Camera
+from v3dg.procedural import make_asset
+from v3dg.render import Renderer
+from v3dg.scene import Scene
+from v3dg.scene_file import read_scene
+from v3dg.select import DEFAULT_TOLERANCE
+
+
+@dataclass
+class Config:
+    asset: Path | None = None
+    """A .ply file; by default the procedural asset."""
+    layout: Path | None = None
+    """A layout of instances of that asset; without one, that part is left out."""
+    cameras: tuple[int, int] = (40, 60)
+    """First camera of the layout, and the one after the last."""
+    tolerances: tuple[float, ...] = (DEFAULT_TOLERANCE, 9.0, 9.5)
+    budget: int = 3_000_000
+    fields: tuple[int, ...] = (100_000, 2_000_000)
+    """Instances of each field."""
+    crops: int = 4
+    """Crops of a field, each of 64 x 36 px, on which it is compared with all of its gaussians."""
+    repeats: int = 11
+    gsplat: bool = True
+    output: str | None = None
+
+
+def main(config: Config) -> None:
+    asset = make_asset() if config.asset is None else v3dg.load(config.asset)
+    with gpu.PeakMemory():  # takes note of an idle process
+        torch.zeros(1, device=gpu.DEVICE)
+    bundle = build_bundle(asset, progress=False, device=gpu.DEVICE)
+    result: dict[str, Any] = {"repeats": config.repeats}
+    judge = Judge()
+    if config.layout is not None:
+        name = json.loads(config.layout.read_text())["asset"]
+        scene, cameras = read_scene(config.layout, bundles={name: bundle})
+        chosen = list(cameras.values())[slice(*config.cameras)]
+        result["layout"] = layout(scene, chosen, config, judge)
+    result["fields"] = [field(bundle, count, config, judge) for count in config.fields]
+    judge.close()
+    record.write(config.output, result)
+
+
+def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge) -> Row:
+    # All that is timed comes before pictures are judged, which takes every core.
+    runs = [frames(scene, cameras, {"tolerance": t}, config.repeats) for t in config.tolerances]
+    runs.append(frames(scene, cameras, {"budget": config.budget}, config.repeats))
+    moving = movement(scene, cameras[-1], config)
+    truths = [draw_truth(scene, camera, gpu.DEVICE) for camera in cameras]
+    peer_ms, peer_pictures = gsplat(scene, cameras, config) if config.gsplat else ([], [])
+    rows = []
+    for row, pictures in runs:
+        errors = judge.errors(zip(truths, pictures, strict=True))
+        row |= mean_of(errors, "flip", "psnr")
+        row["flip_of_each"] = [e["flip"] for e in errors]
+        if peer_ms:
+            ratios = [ours / peer for ours, peer in zip(row["frame_ms_of_each"], peer_ms, strict=True)]
+            row["worst_ratio_to_gsplat"] = round(max(ratios), 4)
+        print({k: v for k, v in row.items() if not k.endswith("of_each")}, flush=True)
+        print("  farthest:", row["frame_ms_of_each"][-1], "ms, FLIP", row["flip_of_each"][-1], flush=True)
+        rows.append(row)
+    result: Row = {"instances": len(scene), "cameras": config.cameras, "frames": rows, "moving": moving}
+    if peer_ms:
+        errors = judge.errors(zip(truths, peer_pictures, strict=True))
+        result["gsplat"] = {
+            "frame_ms": round(statistics.fmean(peer_ms), 3),
+            "frame_ms_of_each": [round(ms, 3) for ms in peer_ms],
+            **mean_of(errors, "flip", "psnr"),
+            "flip_of_each": [e["flip"] for e in errors],
+        }
+        print("gsplat", result["gsplat"]["frame_ms"], result["gsplat"]["flip"], flush=True)
+    print(moving, flush=True)
+    return result
+
+
+def frames(
+    scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
+) -> tuple[Row, list[Picture]]:
+    """Every camera, near to far, with one renderer: as a flight through the scene finds it."""
+    ms, select_ms, counts, pictures = [], [], [], []
+    with gpu.PeakMemory() as peak:
+        renderer = Renderer(scene)
+        for camera in cameras:
+
+            def frame(camera: Camera = camera) -> Any:
+                image = renderer.render(camera, **options)
+                image.stats  # noqa: B018  waits for the picture
+                return image
+
+            ms.append(time_ms(frame, gpu.DEVICE, repeats).median)
+            stats = [frame().stats for _ in range(repeats)]
+            select_ms.append(statistics.median(s.select_ms for s in stats))
+            counts.append(stats[-1].gaussians_in_frustum)
+            pictures.append(as_picture(frame().color))
+    row = {
+        **options,
+        "frame_ms": round(statistics.fmean(ms), 3),
+        "select_ms": round(statistics.fmean(select_ms), 4),
+        "gaussians_in_frustum": round(statistics.fmean(counts)),
+        "peak_gigabytes": round(peak.gigabytes, 2),
+        "frame_ms_of_each": [round(t, 3) for t in ms],
+        "select_ms_of_each": [round(t, 4) for t in select_ms],
+        "gaussians_in_frustum_of_each": counts,
+    }
+    return row, pictures
+
+
+def movement(scene: Scene, camera: Camera, config: Config) -> Row:
+    """What it costs that every instance has another place and rotation in every frame."""
+    renderer = Renderer(scene)
+    tolerance = config.tolerances[-1]
+    host = tuple(np.array(a) for a in (scene.positions, scene.quaternions, scene.scales))
+    device = tuple(torch.from_numpy(rows).to(gpu.DEVICE) for rows in host)
+
+    def still() -> None:
+        renderer.render(camera, tolerance=tolerance).stats  # noqa: B018
+
+    def moving(poses: tuple[Any, ...]) -> float:
+        def frame() -> None:
+            positions, quaternions, scales = poses
+            scene.move(positions=positions, quaternions=quaternions, scales=scales)
+            still()
+
+        return round(time_ms(frame, gpu.DEVICE, 3 * config.repeats).median, 3)
+
+    row = {
+        "still_ms": round(time_ms(still, gpu.DEVICE, 3 * config.repeats).median, 3),
+        "moved_from_numpy_ms": moving(host),
+        "moved_on_device_ms": moving(device),
+    }
+    positions, quaternions, scales = host
+    scene.move(positions=positions, quaternions=quaternions, scales=scales)
+    return row
+
+
+def gsplat(scene: Scene, cameras: Sequence[Camera], config: Config) -> tuple[list[float], list[Picture]]:
+    placed = gpu.placed_gaussians(scene)
+    ms, pictures = [], []
+    with torch.no_grad():
+        for camera in cameras:
+            ms.append(gpu.time_gsplat(placed, camera, max(3, config.repeats // 3)).median)
+            pictures.append(as_picture(gpu.gsplat_picture(placed, camera, packed=True)[0]))
+    return ms, pictures
+
+
+def field(bundle: v3dg.Bundle, count: int, config: Config, judge: Judge) -> Row:
+    """Instances at random turns and sizes on a square, all in view."""
+    rng = np.random.default_rng(0)
+    side = math.isqrt(count - 1) + 1
+    means = bundle.level_gaussians(0).means
+    pitch = 2.2 * float(np.ptp(means, axis=0).max())
+    cells = np.stack(np.divmod(np.arange(count), side), 1) - (side - 1) / 2
+    positions = np.concatenate([pitch * cells, np.zeros((count, 1))], 1)
+    positions += 0.3 * pitch * rng.uniform(-1, 1, (count, 3))
+    scene = Scene()
+    scene.add(bundle, positions, rng.normal(size=(count, 4)), rng.uniform(0.7, 1.4, count))
+    eye = side * pitch * np.array([0.0, -0.95, 0.45])
+    camera = Camera.look_at(eye, (0, 0, -0.1 * side * pitch), width=1920, height=1080, fov_x=1.05)
+    row, _ = frames(scene, [camera], {"tolerance": DEFAULT_TOLERANCE}, config.repeats)
+    budget = round(0.7 * row["gaussians_in_frustum"])
+    if budget > v3dg.select(scene, camera, tolerance=math.inf, device=gpu.DEVICE).num_gaussians:
+        limited, _ = frames(scene, [camera], {"budget": budget}, config.repeats)
+        row["with_budget"] = {key: limited[key] for key in ("budget", "frame_ms", "select_ms")}
+    pairs = []
+    for _ in range(config.crops):
+        x, y = rng.integers((400, 500), (1456, 800))
+        K = camera.K - [[0, 0, x], [0, 0, y], [0, 0, 0]]
+        crop = replace(camera, K=K, width=64, height=36)
+        ours = v3dg.render(scene, crop, device=gpu.DEVICE).color
+        pairs.append((draw_truth(scene, crop, gpu.DEVICE), as_picture(ours)))
+    row |= {
+        "instances": count,
+        "gaussians": count * len(means),
+        **mean_of(judge.errors(pairs), "flip", "psnr"),
+    }
+    row = {key: value for key, value in row.items() if not key.endswith("of_each")}
+    print(row, flush=True)
+    return row
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
