@@ -169,7 +169,11 @@ class Scene:
     @property
     def quaternions(self) -> Floats:
         """(I, 4) float64, w x y z, unit length."""
-        return self._on_host("quaternions")
+        quaternions = self._on_host("quaternions")
+        if isinstance(self._poses["quaternions"], np.ndarray):
+            return quaternions
+        with np.errstate(invalid="ignore"):  # what is no rotation becomes no number, and is not drawn
+            return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
 
     @property
     def scales(self) -> Floats:
@@ -242,7 +246,9 @@ def _rows(values: Any, name: str, count: int) -> Any:
     row = _ROW[name]
     is_on_device = getattr(values, "is_cuda", False)
     if is_on_device:
-        array = values.detach().double()
+        import torch
+
+        array = values.detach().to(torch.float64, copy=True)
     else:
         array = _finite(values.detach().numpy() if hasattr(values, "detach") else values, name)
     if name != "positions" and tuple(array.shape) == row:
@@ -251,9 +257,7 @@ def _rows(values: Any, name: str, count: int) -> Any:
         shown = ", ".join(str(length) for length in (count, *row)) + ("," if not row else "")
         raise ValueError(f"{name}: expected shape ({shown}), got {tuple(array.shape)}")
     if is_on_device:
-        if name == "quaternions":
-            array = array / array.norm(dim=1, keepdim=True)
-        return array.clone() if array.data_ptr() == values.data_ptr() else array.contiguous()
+        return array.contiguous()
     if name == "scales" and (array <= 0).any():
         raise ValueError(f"scales: expected positive numbers, got {array[array <= 0][0]:g}")
     if name == "quaternions":

@@ -23,8 +23,8 @@ struct CutPart {
     uint32_t instance, first, tops;
 };
 
-// What is known of the clusters of a part of a table, whatever the view.
-struct PartBounds {
+// What is known of kEach clusters of a table, neighbours, whatever the view.
+struct ClusterBounds {
     Box box;
     Ball parents, owns;  // around the centres of the balls of the groups above and of their own
     float most_parent_radius, most_parent_weight;
@@ -182,64 +182,69 @@ __device__ LaneClusters clusters_of_lane(const SceneOnDevice& scene, const CutPa
     return mine;
 }
 
-// Whether all the groups above the clusters of a part fit, so that none is drawn.
-__device__ bool parents_fit(const PartBounds& part, const InstanceView& view, const SelectRule& rule) {
-    if (part.has_root || rule.footprint == Footprint::paper) return false;
-    const float distance = sqrtf(distance2_to(part.parents, view)) - part.parents.radius;
+// Whether all the groups above the clusters fit, so that none is drawn.
+__device__ bool parents_fit(const ClusterBounds& bounds, const InstanceView& view, const SelectRule& rule) {
+    if (bounds.has_root || rule.footprint == Footprint::paper) return false;
+    const float distance = sqrtf(distance2_to(bounds.parents, view)) - bounds.parents.radius;
     return distance > 0.0f &&
-           footprint_at(part.most_parent_radius, distance * distance, view) * part.most_parent_weight <=
+           footprint_at(bounds.most_parent_radius, distance * distance, view) * bounds.most_parent_weight <=
                (1.0f - kBoundMargin) * rule.tolerance_px2;
 }
 
-// Whether none of the clusters of a part has a group of its own that fits.
-__device__ bool owns_do_not_fit(const PartBounds& part, const InstanceView& view, const SelectRule& rule) {
-    if (part.has_leaf || part.least_own_level <= rule.min_level || rule.footprint == Footprint::paper)
+// Whether none of the clusters has a group of its own that fits.
+__device__ bool owns_do_not_fit(const ClusterBounds& bounds, const InstanceView& view,
+                                const SelectRule& rule) {
+    if (bounds.has_leaf || bounds.least_own_level <= rule.min_level || rule.footprint == Footprint::paper)
         return false;
-    const float distance = sqrtf(distance2_to(part.owns, view)) + part.owns.radius;
-    return footprint_at(part.least_own_radius, distance * distance, view) * part.least_own_weight >
+    const float distance = sqrtf(distance2_to(bounds.owns, view)) + bounds.owns.radius;
+    return footprint_at(bounds.least_own_radius, distance * distance, view) * bounds.least_own_weight >
            (1.0f + kBoundMargin) * rule.tolerance_px2;
 }
 
-// The groups of the clusters that the lane looks at; -2 past the last cluster.
-__device__ void load_groups(Span<const int32_t> groups, uint32_t first, int32_t out[kEach]) {
-    if (first + kEach <= groups.size) {
-#pragma unroll
-        for (unsigned k = 0; k < kEach; k += 4) {
-            const int4 four = *reinterpret_cast<const int4*>(groups.data + first + k);
-            out[k] = four.x;
-            out[k + 1] = four.y;
-            out[k + 2] = four.z;
-            out[k + 3] = four.w;
+// Calls visit(cluster) for clusters of a part of a table, a lane a cluster: for those of each lane that is
+// `active`, four lanes' at a time. Returns to each lane a bit for each of its own where that returned true.
+template <class Visit>
+__device__ unsigned visit_clusters(const LaneClusters& mine, bool active, const Visit& visit) {
+    const unsigned lane = threadIdx.x % 32;
+    const uint32_t part_first = mine.first - kEach * lane;
+    unsigned todo = __ballot_sync(kAllLanes, active), found = 0;
+    while (todo != 0) {
+        unsigned owners = 0, owner = 32;  // in bytes; of this lane
+        for (unsigned at = 0; at < 32; at += kEach) {
+            const unsigned next = todo != 0 ? __ffs(todo) - 1 : 32;
+            todo &= todo - 1;
+            owners |= next << at;
+            if (lane / kEach == at / kEach) owner = next;
         }
-    } else {
-#pragma unroll
-        for (unsigned k = 0; k < kEach; ++k) out[k] = first + k < groups.size ? groups[first + k] : -2;
+        const uint32_t c = part_first + kEach * owner + lane % kEach;
+        const bool is_one = owner < 32 && c < mine.bundle->table.own_group.size;
+        const unsigned bits = __ballot_sync(kAllLanes, is_one && visit(static_cast<int32_t>(c)));
+        for (unsigned at = 0; at < 32; at += kEach)
+            if ((owners >> at & 255) == lane) found = bits >> at & 255;
     }
+    return found;
+}
+
+// Whether some of the lane's clusters may be drawn, at this tolerance or, if `coarser` are asked for, a
+// higher.
+__device__ bool may_draw(const LaneClusters& mine, const InstanceView& view, const SelectRule& rule,
+                         bool coarser) {
+    if (mine.first >= mine.bundle->table.own_group.size) return false;
+    const ClusterBounds& bounds = mine.bundle->bounds[mine.first / kEach];
+    return !(rule.culls && is_outside(bounds.box, view)) && !parents_fit(bounds, view, rule) &&
+           (coarser || !owns_do_not_fit(bounds, view, rule));
 }
 
 __device__ unsigned drawn_of_table(const SceneOnDevice& scene, const LaneClusters& mine,
                                    const SelectRule& rule) {
     const ClusterTable& table = mine.bundle->table;
     const InstanceView view = scene.views[mine.instance];
-    const PartBounds& bounds = mine.bundle->parts[mine.first / kPartSize];
-    if ((rule.culls && is_outside(bounds.box, view)) || parents_fit(bounds, view, rule) ||
-        owns_do_not_fit(bounds, view, rule))
-        return 0;
-    int32_t own[kEach], parent[kEach];
-    load_groups(table.own_group, mine.first, own);
-    load_groups(table.parent_group, mine.first, parent);
-    unsigned drawn = 0;
-#pragma unroll
-    for (unsigned k = 0; k < kEach; ++k) {
-        if (own[k] == -2) continue;
-        const bool own_fits = own[k] < 0 || fits(table, own[k], view, rule);
-        const bool parent_fits = parent[k] >= 0 && fits(table, parent[k], view, rule);
-        if (own_fits && !parent_fits) drawn |= 1u << k;
-    }
-    if (rule.culls)
-        for (unsigned k = 0; k < kEach; ++k)
-            if ((drawn >> k & 1) && is_outside(table.box[mine.first + k], view)) drawn &= ~(1u << k);
-    return drawn;
+    return visit_clusters(mine, may_draw(mine, view, rule, false), [&](int32_t c) {
+        const int32_t own = table.own_group[c], parent = table.parent_group[c];
+        const bool own_fits = own < 0 || fits(table, own, view, rule);
+        const bool parent_fits = parent >= 0 && fits(table, parent, view, rule);
+        return own_fits && !parent_fits && !(rule.culls && is_outside(table.box[c], view));
+    });
 }
 
 // Adds to `change` what count_instance of the CPU's half does.
@@ -259,25 +264,19 @@ __global__ void change_kernel(SceneOnDevice scene, SelectRule rule, BudgetRound 
         } else {
             const ClusterTable& table = mine.bundle->table;
             const InstanceView view = scene.views[mine.instance];
-            const PartBounds& bounds = mine.bundle->parts[mine.first / kPartSize];
-            if ((rule.culls && is_outside(bounds.box, view)) || parents_fit(bounds, view, rule)) continue;
-            int32_t own[kEach], parent[kEach];
-            load_groups(table.own_group, mine.first, own);
-            load_groups(table.parent_group, mine.first, parent);
-#pragma unroll
-            for (unsigned k = 0; k < kEach; ++k) {
-                if (own[k] == -2) continue;
-                const uint32_t first = own[k] < 0 ? 0 : bin_of_group(table, own[k], view, rule),
-                               last = parent[k] < 0 ? kNumBudgetBins
-                                                    : bin_of_group(table, parent[k], view, rule);
-                if (first >= last || (rule.culls && is_outside(table.box[mine.first + k], view))) continue;
-                const Count size = mine.size(k);
+            visit_clusters(mine, may_draw(mine, view, rule, true), [&](int32_t c) {
+                const int32_t own = table.own_group[c], parent = table.parent_group[c];
+                const uint32_t first = own < 0 ? 0 : bin_of_group(table, own, view, rule),
+                               last = parent < 0 ? kNumBudgetBins : bin_of_group(table, parent, view, rule);
+                if (first >= last || (rule.culls && is_outside(table.box[c], view))) return false;
+                const Count size = static_cast<Count>(table.offset[c + 1] - table.offset[c]);
                 if (first == 0)
                     kept += size;
                 else
                     atomicAdd(&change[first], size);
                 if (last < kNumBudgetBins) atomicAdd(&change[last], ~size + 1);
-            }
+                return true;
+            });
         }
         kept = warp_sum(kept);
         if (threadIdx.x % 32 == 0 && kept > 0) atomicAdd(&at_first, kept);
@@ -494,8 +493,8 @@ class CenterBounds {
     std::vector<Ball> centers_;
 };
 
-PartBounds bounds_of_part(const ClusterTable& table, size_t first, size_t last) {
-    PartBounds part{table.box[first], {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false};
+ClusterBounds bounds_of(const ClusterTable& table, size_t first, size_t last) {
+    ClusterBounds part{table.box[first], {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false};
     CenterBounds parents, owns;
     for (size_t c = first; c < last; ++c) {
         for (int a = 0; a < 3; ++a) {  // written so that NaN stays and nothing is ever dropped
@@ -522,11 +521,11 @@ PartBounds bounds_of_part(const ClusterTable& table, size_t first, size_t last) 
     return part;
 }
 
-std::vector<PartBounds> bounds_of_parts(const ClusterTable& table) {
-    std::vector<PartBounds> parts;
-    for (size_t first = 0; first < table.own_group.size; first += kPartSize)
-        parts.push_back(bounds_of_part(table, first, std::min(first + kPartSize, table.own_group.size)));
-    return parts;
+std::vector<ClusterBounds> bounds_of(const ClusterTable& table) {
+    std::vector<ClusterBounds> bounds;
+    for (size_t first = 0; first < table.own_group.size; first += kEach)
+        bounds.push_back(bounds_of(table, first, std::min(first + kEach, table.own_group.size)));
+    return bounds;
 }
 
 template <class T>
@@ -560,8 +559,8 @@ SceneTables::SceneTables(Span<const ClusterTable> tables, Span<const ClusterFilt
         table.offset = upload(table.offset);
         table.top_group = upload(table.top_group);
         table.top_cluster = upload(table.top_cluster);
-        const std::vector<PartBounds> parts = bounds_of_parts(tables[b]);
-        bundles[b].parts = upload(Span<const PartBounds>{parts.data(), parts.size()}).data;
+        const std::vector<ClusterBounds> bounds = bounds_of(tables[b]);
+        bundles[b].bounds = upload(Span<const ClusterBounds>{bounds.data(), bounds.size()}).data;
         bundles[b].filters = {upload(filters[b].filter_px2), upload(filters[b].compensate)};
         num_clusters_.push_back(table.own_group.size);
     }

@@ -15,13 +15,13 @@ struct ClusterFilters {
     Span<const uint8_t> compensate;  // [C]
 };
 
-struct PartBounds;
+struct ClusterBounds;
 
 // A bundle's tables on the device.
 struct DeviceBundle {
     ClusterTable table;
     ClusterFilters filters;
-    const PartBounds* parts;  // of kPartSize clusters each
+    const ClusterBounds* bounds;  // of a few clusters each
 };
 
 struct PoseSpan {
