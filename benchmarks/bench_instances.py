@@ -29,7 +29,6 @@ from v3dg.scene import Scene
 from v3dg.scene_file import read_scene
 from v3dg.select import DEFAULT_TOLERANCE
 
-
 # An instance of a field can be smaller than a pixel, and its gaussians are not filtered.
 _CROP_SUPERSAMPLING = 16
 
