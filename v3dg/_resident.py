@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import weakref
 from typing import Any
 
@@ -62,6 +63,7 @@ def instances_on_host(scene: Scene) -> tuple[Any, ...]:
 
 # Of scenes and bundles, as long as those live.
 _residents: weakref.WeakKeyDictionary[Scene | Bundle, ResidentScene] = weakref.WeakKeyDictionary()
+atexit.register(_residents.clear)  # while the driver is there
 
 
 def resident_of(subject: Scene | Bundle) -> ResidentScene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import time
 import weakref
 from dataclasses import dataclass
@@ -327,6 +328,8 @@ def _checked(cut: Selection, subject: Scene | Bundle, **options: Any) -> Selecti
 # Drawers of scenes and bundles, and bundles' gaussians, as long as those live.
 _drawers: weakref.WeakKeyDictionary[Scene | Bundle, dict[str, _Drawer]] = weakref.WeakKeyDictionary()
 _rows: weakref.WeakKeyDictionary[Bundle, dict[str, tuple[int, tuple[Any, ...]]]] = weakref.WeakKeyDictionary()
+
+atexit.register(_drawers.clear)  # while the driver is there
 
 
 def _drawer_of(subject: Scene | Bundle | Gaussians, color_by: ColorBy) -> _Drawer:
