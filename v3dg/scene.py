@@ -173,7 +173,7 @@ class Scene:
         if isinstance(self._poses["quaternions"], np.ndarray):
             return quaternions
         with np.errstate(invalid="ignore"):  # what is no rotation becomes no number, and is not drawn
-            return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+            return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
 
     @property
     def scales(self) -> Floats:
@@ -261,12 +261,19 @@ def _rows(values: Any, name: str, count: int) -> Any:
     if name == "scales" and (array <= 0).any():
         raise ValueError(f"scales: expected positive numbers, got {array[array <= 0][0]:g}")
     if name == "quaternions":
-        largest = np.abs(array).max(axis=1, initial=0.0, keepdims=True)
+        array = _unit(array)
+    return np.ascontiguousarray(array)
+
+
+def _unit(quaternions: Floats) -> Floats:
+    length2 = np.einsum("ij,ij->i", quaternions, quaternions)
+    if not ((length2 > 1e-200) & (length2 < 1e200)).all():  # squares overflow or vanish
+        largest = np.abs(quaternions).max(axis=1, keepdims=True)
         if (largest == 0).any():
             raise ValueError("quaternions: expected a rotation, got a quaternion of zeros")
-        array = array / largest  # so that squares neither overflow nor vanish
-        array = array / np.linalg.norm(array, axis=1, keepdims=True)
-    return np.ascontiguousarray(array)
+        quaternions = quaternions / largest
+        length2 = np.einsum("ij,ij->i", quaternions, quaternions)
+    return np.asarray(quaternions / np.sqrt(length2)[:, None])
 
 
 def _finite(values: npt.ArrayLike, name: str) -> Floats:

@@ -43,13 +43,14 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]]:
 def page(folders: Sequence[Path], output: Path) -> str:
     """The page; pictures are linked relative to where it will be."""
     sections = [(folder, read_results(folder)) for folder in folders]
-    first = next(iter(sections[0][1].values()))
-    verdict = verdict_of(sections[0][1])
+    machines = [machine(next(iter(results.values()))) for _, results in sections]
+    # The first folder counts; the others for parts that it does not have.
+    verdict = verdict_of({name: part for _, results in reversed(sections) for name, part in results.items()})
     lines = [
         "# Results",
         "",
         "Written by `python -m v3dg.bench.report` from recorded JSON, never by hand; here on "
-        f"{machine(first)}.",
+        f"{'; what is not measured there, on '.join(machines)}.",
         "",
         f"**Where we win**: {_joined(verdict.wins)}.",
         "",
