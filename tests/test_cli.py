@@ -225,6 +225,25 @@ def test_render_scene(folder, tmp_path):
         assert picture.size == (48, 32)
 
 
+def test_render_within_a_budget(folder, tmp_path):
+    out = tmp_path / "small.png"
+    options = ("--camera", "near", "--budget", 400, "--color-by", "level", "--json")
+    done = run("render", folder / "scene.json", "-o", out, *options)
+    assert done.returncode == 0, done.stderr
+    (picture,) = json.loads(done.stdout)["pictures"]
+    assert 0 < picture["gaussians_selected"] <= 400
+    assert picture["tolerance"] > 0
+    levels = ("--camera", "near", "--tolerance", 0, "--min-level", 1, "--json")
+    done = run("render", folder / "scene.json", "-o", out, *levels)
+    assert 0 < json.loads(done.stdout)["pictures"][0]["gaussians_selected"] < 3 * 1000
+    fails(
+        1,
+        "budget: expected at least",
+        *("render", folder / "scene.json", "--camera", "near", "--budget", 1, "-o", tmp_path / "no.png"),
+        cwd=tmp_path,
+    )
+
+
 def test_render_from_a_camera_file(folder, tmp_path):
     matrix = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0.5], [0, 0, 0, 1]]
     frames = [{"file_path": f"train/r_{i}", "transform_matrix": matrix} for i in range(2)]

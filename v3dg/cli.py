@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import math
 import os
 import sys
 import textwrap
@@ -95,6 +96,12 @@ class Render:
     """The turntable's axis."""
     tolerance: Annotated[float | None, tyro.conf.arg(metavar="PX2")] = None
     """Screen area in px² that one gaussian of a coarser cluster may stand for; 0 draws everything."""
+    budget: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Most gaussians to draw in one picture; without a tolerance, as fine as that allows."""
+    min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Draw no level finer than this, except where an asset has no coarser one."""
+    color_by: Literal["appearance", "level", "cluster"] = "appearance"
+    """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Colour behind, each 0 to 1."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -458,17 +465,24 @@ def _render(options: Render) -> None:
     from v3dg import _device
     from v3dg.pictures import check_picture_path, write_picture
     from v3dg.render import render
-    from v3dg.select import DEFAULT_TOLERANCE
 
     if min(options.views, *options.size) < 1:
         raise _UsageError("--views, --size: expected at least 1")
     output = check_picture_path(options.output or Path(options.subject.with_suffix(".png").name))
     device = _device.resolve(options.device)
     subject, cameras = _subject_and_cameras(options)
-    tolerance = DEFAULT_TOLERANCE if options.tolerance is None else options.tolerance
     results = []
     for name, camera in cameras.items():
-        image = render(subject, camera, tolerance=tolerance, background=options.background, device=device)
+        image = render(
+            subject,
+            camera,
+            tolerance=options.tolerance,
+            budget=options.budget,
+            min_level=options.min_level,
+            color_by=options.color_by,
+            background=options.background,
+            device=device,
+        )
         path = output
         if len(cameras) > 1:
             path = output.with_name(f"{output.stem}_{_safe(name)}{output.suffix}")
@@ -482,6 +496,8 @@ def _render(options: Render) -> None:
                 "height": camera.height,
                 "gaussians_selected": stats.gaussians_selected,
                 "gaussians_in_frustum": stats.gaussians_in_frustum,
+                # JSON has no infinity, which a budget can come to.
+                "tolerance": stats.tolerance if math.isfinite(stats.tolerance) else None,
                 "select_ms": stats.select_ms,
                 "draw_ms": stats.draw_ms,
             }
@@ -500,7 +516,7 @@ def _render(options: Render) -> None:
     header = ("picture", "size", "selected", "in frustum", "select ms", "draw ms")
     _print(
         options.json,
-        {"subject": str(options.subject), "tolerance": tolerance, "pictures": results},
+        {"subject": str(options.subject), "pictures": results},
         lambda: "\n".join(_table(header, rows)),
     )
 

@@ -12,6 +12,7 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kChunk = 16;
+constexpr size_t kBudgetShares = 16;
 
 struct SeenInstance {
     const ClusterTable& table;
@@ -94,19 +95,17 @@ void count_instance(const SelectInput& in, size_t i, std::vector<uint32_t>& bins
 // fits.
 int64_t meet_budget(const SelectInput& in, SelectRule& rule) {
     const size_t num_instances = in.instances.bundle.size, num_groups = most_groups(in);
-    std::vector<int64_t> change(kNumBudgetBins + 1, 0);
-#pragma omp parallel
-    {
-        std::vector<int64_t> own(kNumBudgetBins + 1, 0);
+    // Shares of the instances, dealt out in turn, since neighbours cost alike.
+    std::vector<std::vector<int64_t>> changes(std::min(kBudgetShares, num_instances));
+    parallel_for(changes.size(), 1, [&](size_t share) {
+        changes[share].assign(kNumBudgetBins + 1, 0);
         std::vector<uint32_t> bins(num_groups);
-#pragma omp for schedule(dynamic, kChunk)
-        for (size_t i = 0; i < num_instances; ++i) count_instance(in, i, bins, own);
-#pragma omp critical
-        for (size_t bin = 0; bin < change.size(); ++bin) change[bin] += own[bin];
-    }
+        for (size_t i = share; i < num_instances; i += changes.size())
+            count_instance(in, i, bins, changes[share]);
+    });
     int64_t count = 0;
     for (uint32_t bin = 0; bin < kNumBudgetBins; ++bin) {
-        count += change[bin];
+        for (const std::vector<int64_t>& change : changes) count += change[bin];
         if (static_cast<uint64_t>(count) > rule.budget) continue;
         rule.tolerance_px2 = tolerance_of_bin(bin, in.rule.tolerance_px2);
         return count;
