@@ -26,8 +26,9 @@ def same_picture(a, b):
         np.testing.assert_array_equal(host(getattr(a, name)), host(getattr(b, name)))
 
 
-def finer_step(tolerance):
-    return float((np.float32(tolerance).view(np.uint32) - np.uint32(STEP_BITS)).view(np.float32))
+def step_from(tolerance, steps):
+    """The tolerance so many steps coarser."""
+    return float((np.float32(tolerance).view(np.int32) + np.int32(steps * STEP_BITS)).view(np.float32))
 
 
 def composed(rng, count=40, **change):
@@ -52,8 +53,11 @@ def test_budget_is_met_by_the_finest_cut(device, seed):
         if cut.tolerance == 0:
             assert cut.num_gaussians == full
         elif np.isfinite(cut.tolerance) and cut.tolerance > 2**-10:
-            finer = select(scene, camera, tolerance=finer_step(cut.tolerance), device=device)
+            finer = select(scene, camera, tolerance=step_from(cut.tolerance, -1), device=device)
             assert finer.num_gaussians > budget
+            for steps in (1, 2, 3, 10, 100, 1000):
+                coarser = select(scene, camera, tolerance=step_from(cut.tolerance, steps), device=device)
+                assert coarser.num_gaussians <= budget
 
 
 def test_tolerance_and_budget_both_hold(device):
@@ -337,6 +341,21 @@ def test_both_devices_choose_the_same():
             cpu, cuda = (select(scene, camera, device=d, **choice, **options) for d in ("cpu", "cuda"))
             assert pairs(cpu) == pairs(cuda)
             assert (cpu.num_gaussians, cpu.tolerance) == (cuda.num_gaussians, cuda.tolerance)
+
+
+@pytest.mark.gpu
+def test_budgets_before_do_not_matter():
+    # Few clusters, many of them at the edge of the picture: a coarser cut can have more gaussians.
+    rng = np.random.default_rng(19)
+    for _ in range(20):
+        scene = random_scene(rng, lod_bundle(rng, blob(rng, 120), 8), 3, spread=1)
+        camera = random_camera(rng, distance=1)
+        least = select(scene, camera, tolerance=np.inf).num_gaussians
+        full = select(scene, camera, tolerance=0.0).num_gaussians
+        for budget in rng.integers(least, full + 2, 12):
+            cpu, cuda = (select(scene, camera, budget=int(budget), device=d) for d in ("cpu", "cuda"))
+            assert cpu.tolerance == cuda.tolerance
+            assert pairs(cpu) == pairs(cuda)
 
 
 @pytest.mark.gpu

@@ -165,7 +165,7 @@ def select(
             full detail wherever it covers anything, infinity the coarsest clusters. `DEFAULT_TOLERANCE` if
             None; with a budget, 0.
         budget: Most gaussians that one view may have. The tolerance is raised, alike for all instances, until
-            they fit: to the least of 2,048 values an octave, so that no finer cut would.
+            they fit: to the least of 2,048 values an octave from which on no cut has more.
         min_level: No cluster of a finer level is chosen, except where an asset has no coarser one.
         footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with which a path can
             have more than one cluster.

@@ -25,8 +25,9 @@ struct InstanceTable {
 // Selected pairs are in ascending order of instance, then cluster. Pairs outside the frustum are left out,
 // unless they could touch a pixel. Both halves give the same bits for any number of threads.
 //
-// With a budget, the tolerance is the least of those that a budget chooses from (select_math.h) whose cut has
-// no more gaussians. There may be none: then `fits_budget` is false, nothing is selected and `num_gaussians`
+// With a budget, the tolerance is the least of those that a budget chooses from (select_math.h) from which on
+// no cut has more gaussians: a coarser cut can have more than a finer one where the frustum cuts through it.
+// There may be none: then `fits_budget` is false, nothing is selected and `num_gaussians`
 // is what the coarsest cut has.
 //
 // Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the footprint and the

@@ -103,14 +103,18 @@ int64_t meet_budget(const SelectInput& in, SelectRule& rule) {
         for (size_t i = share; i < num_instances; i += changes.size())
             count_instance(in, i, bins, changes[share]);
     });
-    int64_t count = 0;
+    int64_t count = 0, chosen_count = 0;
+    uint32_t chosen = 0;
     for (uint32_t bin = 0; bin < kNumBudgetBins; ++bin) {
         for (const std::vector<int64_t>& change : changes) count += change[bin];
-        if (static_cast<uint64_t>(count) > rule.budget) continue;
-        rule.tolerance_px2 = tolerance_of_bin(bin, in.rule.tolerance_px2);
-        return count;
+        if (static_cast<uint64_t>(count) > rule.budget)
+            chosen = bin + 1;
+        else if (bin == chosen)
+            chosen_count = count;
     }
-    return count;
+    if (chosen == kNumBudgetBins) return count;
+    rule.tolerance_px2 = tolerance_of_bin(chosen, in.rule.tolerance_px2);
+    return chosen_count;
 }
 
 }  // namespace

@@ -285,7 +285,8 @@ __global__ void change_kernel(SceneOnDevice scene, SelectRule rule, BudgetRound 
     if (threadIdx.x == 0 && at_first > 0) atomicAdd(&change[0], at_first);
 }
 
-// One block. The least tolerance whose cut is within the budget; where there is none, nothing is left to cut.
+// One block. The tolerance after the last whose cut exceeds the budget; where there is none, nothing is left
+// to cut.
 __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change, CutChoice* choice,
                               BudgetState* state, unsigned* num_parts) {
     if (round.is_over()) return;
@@ -300,7 +301,7 @@ __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change,
     if (lane == 0) before_warp[warp + 1] = sum;
     if (threadIdx.x == 0) {
         before_warp[0] = 0;
-        chosen = kNumBudgetBins;
+        chosen = 0;
     }
     __syncthreads();
     if (threadIdx.x == 0)
@@ -315,11 +316,8 @@ __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change,
             const Count below = __shfl_up_sync(kAllLanes, here, offset);
             if (lane >= offset) here += below;
         }
-        const unsigned within = __ballot_sync(kAllLanes, bin < last && count + here <= rule.budget);
-        if (within != 0) {
-            if (lane == 0) atomicMin(&chosen, from + __ffs(within) - 1);
-            break;
-        }
+        const unsigned beyond = __ballot_sync(kAllLanes, bin < last && count + here > rule.budget);
+        if (lane == 0 && beyond != 0) atomicMax(&chosen, from + 32 - __clz(static_cast<int>(beyond)));
         count += __shfl_sync(kAllLanes, here, 31);
     }
     __syncthreads();
