@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <string>
 #include <vector>
 
@@ -74,15 +73,9 @@ class BoundTable {
         table_.top_cluster = {top_cluster_.data(), top_cluster_.size()};
     }
 
-    // A box that is not a number makes the bounds so: nothing of the instance is ever dropped.
     void find_bounds() {
-        constexpr float kInfinity = std::numeric_limits<float>::infinity();
-        table_.bounds = {{kInfinity, kInfinity, kInfinity}, {-kInfinity, -kInfinity, -kInfinity}};
-        for (const Box& box : table_.box)
-            for (int a = 0; a < 3; ++a) {
-                if (!(table_.bounds.lo[a] <= box.lo[a])) table_.bounds.lo[a] = box.lo[a];
-                if (!(table_.bounds.hi[a] >= box.hi[a])) table_.bounds.hi[a] = box.hi[a];
-            }
+        table_.bounds = kNoBox;
+        for (const Box& box : table_.box) include_box(box, table_.bounds);
     }
 
     std::vector<py::array> arrays_;

@@ -492,13 +492,10 @@ class CenterBounds {
 };
 
 ClusterBounds bounds_of(const ClusterTable& table, size_t first, size_t last) {
-    ClusterBounds part{table.box[first], {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false};
+    ClusterBounds part{kNoBox, {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false};
     CenterBounds parents, owns;
     for (size_t c = first; c < last; ++c) {
-        for (int a = 0; a < 3; ++a) {  // written so that NaN stays and nothing is ever dropped
-            if (!(table.box[c].lo[a] >= part.box.lo[a])) part.box.lo[a] = table.box[c].lo[a];
-            if (!(table.box[c].hi[a] <= part.box.hi[a])) part.box.hi[a] = table.box[c].hi[a];
-        }
+        include_box(table.box[c], part.box);
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         part.has_leaf |= own < 0;
         part.has_root |= parent < 0;
@@ -570,7 +567,7 @@ SceneTables::SceneTables(Span<const ClusterTable> tables, Span<const ClusterFilt
 void SceneTables::set_instances(Span<const int32_t> bundle, Span<const float> importance,
                                 cudaStream_t stream) {
     const size_t count = bundle.size;
-    bundle_of_instance_.assign(bundle.begin(), bundle.end());
+    num_instances_ = count;
     most_parts_ = 0;
     for (const int32_t b : bundle) most_parts_ += std::max(1u, blocks_for(num_clusters_[b], kPartSize));
     bundle_.copy_from(bundle, stream);

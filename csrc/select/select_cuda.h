@@ -45,11 +45,7 @@ class SceneTables {
     void set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
                    cudaStream_t stream);
 
-    size_t num_instances() const { return bundle_of_instance_.size(); }
-    size_t num_clusters(size_t bundle) const { return num_clusters_[bundle]; }
-    Span<const int32_t> bundle_of_instance() const {
-        return {bundle_of_instance_.data(), bundle_of_instance_.size()};
-    }
+    size_t num_instances() const { return num_instances_; }
 
     // Selected clusters as the items of a frame. Instance i becomes placement i of model bundle[i] in image
     // 0, and `image` is written to images[0].
@@ -74,9 +70,8 @@ class SceneTables {
              Placement* placements, CutChoice* choice, const Output& output, cudaStream_t stream);
     InstanceTable instances() const;
 
-    size_t most_parts_ = 0;
+    size_t num_instances_ = 0, most_parts_ = 0;
     std::vector<size_t> num_clusters_;                  // of each bundle
-    std::vector<int32_t> bundle_of_instance_;           // the host's copy
     std::vector<DeviceBuffer<unsigned char>> storage_;  // what the spans of the tables point into
     DeviceBuffer<DeviceBundle> bundles_;
     DeviceBuffer<int32_t> bundle_;
