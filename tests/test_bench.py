@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -196,6 +197,16 @@ def test_a_picture_that_changes_between_runs_is_refused(tmp_path, scene, monkeyp
     monkeypatch.setattr(bench.stage, "render", flickering)
     with pytest.raises(RuntimeError, match="same on every run"):
         stage.shoot(scene, view)
+
+
+def test_a_folder_called_v3dg_is_not_mistaken_for_the_package(tmp_path, monkeypatch):
+    (tmp_path / "v3dg").mkdir()
+    (tmp_path / "v3dg" / "__init__.py").write_text("raise ImportError('the wrong one')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    rows = bench.part("alone").threads_rows(bench.Stage(TINY, "cpu", tmp_path))
+    assert rows[0]["threads"] == 1
+    assert all(row["frame_ms"] > 0 for row in rows)
 
 
 def test_unknown_part_is_refused(capsys, tmp_path):

@@ -190,17 +190,17 @@ def build_row(stage: Stage, count: int) -> Row:
     }
 
 
-# A process a number of threads: OpenMP reads it once. Prints milliseconds of a split and of a frame.
+# A process a number of threads: OpenMP reads it once. Prints milliseconds of a split and of a frame. It looks
+# for modules where this process does: the folder that it starts in may hold a v3dg of its own.
 _SCRIPT = """
 import json, sys
-import numpy as np
+sys.path[:] = json.loads(sys.argv[1])
 from v3dg import _operations
-from v3dg.bench import gpu
 from v3dg.bench.assets import like_trained
 from v3dg.bench.measure import time_ms
 from v3dg.cameras import Camera
-from v3dg.render import Renderer, render
-count, width, height = map(int, sys.argv[1:])
+from v3dg.render import render
+count, width, height = map(int, sys.argv[2:])
 camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=width, height=height)
 gaussians = like_trained(count, camera, "cpu")
 times = {
@@ -218,9 +218,12 @@ def threads_rows(stage: Stage) -> list[Row]:
     rows = []
     for number in numbers:
         done = subprocess.run(
-            [sys.executable, "-c", _SCRIPT, str(count), *map(str, stage.settings.size)],
+            [
+                *(sys.executable, "-c", _SCRIPT, json.dumps(sys.path)),
+                *map(str, (count, *stage.settings.size)),
+            ],
             env={**os.environ, "OMP_NUM_THREADS": str(number)},
-            capture_output=True,
+            stdout=subprocess.PIPE,
             text=True,
             check=True,
         )
