@@ -16,7 +16,7 @@ from v3dg.procedural import make_asset
 
 # The package under test, wherever the command starts.
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
-COMMAND = [sys.executable, "-m", "v3dg.cli"]
+COMMAND = [sys.executable, "-m", "v3dg"]
 
 
 def run(*arguments, cwd=None):
@@ -310,7 +310,7 @@ def test_interrupt_leaves_no_bundle_and_says_so(tmp_path):
 
 
 def test_closed_pipe_is_quiet(folder):
-    command = f"{sys.executable} -m v3dg.cli info tuft.v3dg --json | head -c 1"
+    command = f"{sys.executable} -m v3dg info tuft.v3dg --json | head -c 1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=folder, env=ENVIRONMENT)
     assert done.stderr == ""
 

@@ -56,7 +56,7 @@ def test_demo_refuses_a_bad_path_before_it_works(tmp_path):
 
 def test_demo_command(tmp_path):
     arguments = ["--gaussians", "1000", "--instances", "7", "--size", "64", "64", "--json", "--quiet"]
-    command = [sys.executable, "-m", "v3dg.cli", "demo", *arguments]
+    command = [sys.executable, "-m", "v3dg", "demo", *arguments]
     environment = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr

@@ -17,7 +17,7 @@ from v3dg.procedural import make_asset
 
 KILLS = int(os.environ.get("V3DG_KILLS", "3"))
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(v3dg.__file__).parent.parent)}
-BUILD = [sys.executable, "-m", "v3dg.cli", "build", "asset.ply", "-o", "out.v3dg", "--quiet"]
+BUILD = [sys.executable, "-m", "v3dg", "build", "asset.ply", "-o", "out.v3dg", "--quiet"]
 
 
 def started(folder, *options):

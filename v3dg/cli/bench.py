@@ -1,0 +1,67 @@
+"""`v3dg bench`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from v3dg.cli._common import UsageError, print_result, require_file
+
+
+@dataclass
+class Bench:
+    """Measure speed against error, beside peers, and write JSON, tables and pictures (docs/results.md)."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("v3dg_bench")
+    """Folder for the results; made if it is not there."""
+    preset: Literal["small", "full"] = "small"
+    """small takes minutes on two cores, full wants a GPU."""
+    parts: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
+    """Which parts of the evaluation; all if not given."""
+    asset: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Trained asset, a .ply file, in place of the one that v3dg makes itself."""
+    layout: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    """Published layout (.json) of the instances of that asset and of cameras."""
+    peers: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """What other tools made of that asset (v3dg/bench/parts/merging.py says how)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to build and draw; auto is a CUDA device where there is one and torch can use it."""
+    seed: int = 0
+    """Seed of assets, layouts and builds."""
+    threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """CPU threads; all if not given."""
+    json: bool = False
+    """Print the results as JSON."""
+    quiet: bool = False
+    """Show no progress."""
+
+
+def run(options: Bench) -> None:
+    for path, suffix in ((options.asset, ".ply"), (options.layout, ".json")):
+        if path is not None:
+            require_file(path, suffix)
+    if options.layout is not None and options.asset is None:
+        raise UsageError("--layout: expected --asset with it, the asset that it places")
+    from v3dg import _device, bench
+
+    stage = bench.Stage(
+        bench.PRESETS[options.preset],
+        _device.resolve(options.device),
+        options.output,
+        seed=options.seed,
+        asset_path=options.asset,
+        layout_path=options.layout,
+        peers=options.peers,
+    )
+    results = bench.run(stage, options.preset, options.parts or bench.NAMES, quiet=options.quiet)
+
+    def text() -> str:
+        sections = [
+            f"## {bench.part(name).TITLE}\n\n{bench.part(name).tables(r)}" for name, r in results.items()
+        ]
+        return "\n\n".join([*sections, f"Plots and a page: python -m v3dg.bench.report {options.output}"])
+
+    print_result(options.json, results, text)

@@ -1,0 +1,181 @@
+"""`v3dg info`."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import tyro
+
+from v3dg.cli._common import (
+    bytes_text,
+    level_size,
+    load_asset_or_bundle,
+    print_result,
+    require_file,
+    table_lines,
+)
+
+if TYPE_CHECKING:
+    from v3dg.bundle import Bundle
+    from v3dg.cameras import Camera
+    from v3dg.gaussians import Gaussians
+    from v3dg.scene import Scene
+
+
+@dataclass
+class Info:
+    """Describe an asset (.ply), a bundle (.v3dg) or a scene (.json)."""
+
+    file: tyro.conf.Positional[Path]
+    """File to describe."""
+    json: bool = False
+    """Print the description as JSON."""
+
+
+def run(options: Info) -> None:
+    require_file(options.file, ".ply", ".v3dg", ".json")
+    if options.file.suffix == ".json":
+        from v3dg.scene_file import read_scene
+
+        result, text = _scene_info(options.file, *read_scene(options.file))
+    else:
+        loaded = load_asset_or_bundle(options.file)
+        describe = _bundle_info if options.file.suffix == ".v3dg" else _asset_info
+        result, text = describe(options.file, cast(Any, loaded))
+    print_result(options.json, result, lambda: text)
+
+
+def _asset_info(path: Path, asset: Gaussians) -> tuple[dict[str, Any], str]:
+    import numpy as np
+
+    from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
+
+    findings = examine(asset)
+    drawable = asset.subset(findings.drawable)
+    far = outliers(drawable.means)
+    boxes = {"box": _box(drawable.means), "box_without_outliers": _box(drawable.means[~far])}
+    spread = {}
+    if len(drawable):
+        spread = {
+            name: [float(q) for q in np.percentile(values, (5, 50, 95))]
+            for name, values in (
+                ("longest_scale", drawable.scales.max(axis=1)),
+                ("opacity", drawable.opacities),
+            )
+        }
+    result = {
+        "path": str(path),
+        "kind": "asset",
+        "gaussians": len(asset),
+        "drawable": len(drawable),
+        "not_drawable": findings.counts,
+        "outliers": int(far.sum()),
+        "sh_degree": asset.sh_degree,
+        "bytes": path.stat().st_size,
+        **boxes,
+        "percentiles_5_50_95": spread,
+    }
+    lines = [
+        f"{path}: asset, {bytes_text(path.stat().st_size)}",
+        f"{len(asset):,} gaussians, SH degree {asset.sh_degree}",
+    ]
+    if findings.counts:
+        lines.append(f"{findings.num_dropped:,} cannot be drawn: {describe(findings.counts)}")
+    if len(drawable):
+        lines.append("means from {} to {}".format(*map(_point, boxes["box"])))
+    if far.any():
+        lines.append("without outliers from {} to {}".format(*map(_point, boxes["box_without_outliers"])))
+        lines.append(
+            f"{far.sum():,} outliers, {OUTLIER_DISTANCE:g} median distances from the median or farther"
+        )
+    for name, (p5, p50, p95) in spread.items():
+        name = name.replace("_", " ")
+        lines.append(f"{name}: 5 % below {p5:.3g}, half below {p50:.3g}, 95 % below {p95:.3g}")
+    return result, "\n".join(lines)
+
+
+def _box(means: Any) -> list[list[float]]:
+    """Lower and upper corner of positions; nothing for none."""
+    return [means.min(axis=0).tolist(), means.max(axis=0).tolist()] if len(means) else []
+
+
+def _point(values: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+
+def _bundle_info(path: Path, bundle: Bundle) -> tuple[dict[str, Any], str]:
+    result = {**bundle.info(), "path": str(path), "kind": "bundle"}
+    rows = [
+        (
+            str(level["level"]),
+            f"{level['clusters']:,}",
+            f"{level['gaussians']:,}",
+            bytes_text(level["bytes"]),
+            number_text(level["error_color"]),
+            number_text(level["error_alpha"]),
+        )
+        for level in result["levels"]
+    ]
+    lines = [
+        f"{path}: bundle, version {result['version']}, {bytes_text(result['bytes'])}",
+        f"{bundle.num_gaussians:,} gaussians, SH degree {bundle.sh_degree}, "
+        f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, {result['num_pages']:,} pages",
+        "",
+        *table_lines(("level", "clusters", "gaussians", "size", "colour error", "alpha error"), rows),
+    ]
+    if result["config"]:
+        settings = ", ".join(f"{name}={value}" for name, value in _settings(result["config"]))
+        lines += ["", *textwrap.wrap(f"built with {settings}", 100, break_on_hyphens=False)]
+    return result, "\n".join(lines)
+
+
+def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> tuple[dict[str, Any], str]:
+    counts = [int((scene.instance_bundle == b).sum()) for b in range(len(scene.bundles))]
+    full = [int(len(bundle.level_range(0)) and level_size(bundle, 0)) for bundle in scene.bundles]
+    total = sum(n * m for n, m in zip(counts, full, strict=True))
+    result = {
+        "path": str(path),
+        "kind": "scene",
+        "instances": len(scene),
+        "gaussians_at_full_detail": total,
+        "bundles": [
+            {"path": bundle.path, "instances": n, "asset_gaussians": m}
+            for bundle, n, m in zip(scene.bundles, counts, full, strict=True)
+        ],
+        "cameras": [
+            {"name": name, "width": camera.width, "height": camera.height} for name, camera in cameras.items()
+        ],
+    }
+    lines = [
+        f"{path}: scene, {len(scene):,} instances, {total:,} gaussians at full detail",
+        "",
+        *table_lines(
+            ("bundle", "instances", "asset gaussians"),
+            [
+                (str(b.path or "-"), f"{n:,}", f"{m:,}")
+                for b, n, m in zip(scene.bundles, counts, full, strict=True)
+            ],
+        ),
+    ]
+    if cameras:
+        rows = [(name, f"{camera.width} x {camera.height}") for name, camera in cameras.items()]
+        lines += ["", *table_lines(("camera", "size"), rows)]
+    return result, "\n".join(lines)
+
+
+def _settings(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Names and values of a bundle's config, without its nesting."""
+    for name, value in config.items():
+        if isinstance(value, dict):
+            yield from _settings(value)
+        else:
+            yield name, value if isinstance(value, str) else json.dumps(value)
+
+
+def number_text(value: float | None) -> str:
+    return "-" if value is None or value != value else f"{value:.4f}"

@@ -1,0 +1,63 @@
+"""`v3dg world`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from v3dg.cli._common import print_result
+
+
+@dataclass
+class World:
+    """Make a world: its assets, their bundles, and a scene file with 400 cameras."""
+
+    name: tyro.conf.Positional[Literal["donut_sea", "forest", "temples", "crowd"]]
+    """Which of the V3DG paper's four."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    """Folder to write to, made if it is not there; the world's name if not given."""
+    scale: Literal["small", "full"] = "small"
+    """How large: full is about 100 million gaussians, and hours of a CPU or minutes of a GPU."""
+    seed: int = 0
+    """Seed of the assets, of the layout and of the builds."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to build; auto is a CUDA device where there is one and torch can use it."""
+    threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """CPU threads; all if not given."""
+    json: bool = False
+    """Print the result as JSON."""
+    quiet: bool = False
+    """Show no progress."""
+
+
+def run(options: World) -> None:
+    from v3dg import _device, worlds
+
+    start = time.perf_counter()
+    arguments = worlds.SMALL[options.name] if options.scale == "small" else {}
+    world = worlds.WORLDS[options.name](**arguments, seed=options.seed)
+    path = worlds.write_world(
+        world,
+        options.output or Path(options.name),
+        seed=options.seed,
+        device=_device.resolve(options.device),
+        progress=not options.quiet,
+    )
+    result = {
+        "output": str(path),
+        "assets": list(world.assets),
+        "instances": world.num_instances,
+        "gaussians": world.num_gaussians,
+        "extent": world.extent,
+        "seconds": time.perf_counter() - start,
+    }
+    text = (
+        f"{path}: {world.num_instances:,} instances of {len(world.assets)} assets, "
+        f"{world.num_gaussians:,} gaussians, {result['seconds']:.0f} s\n"
+        f"draw it with `v3dg render {path} --camera 059_camera_19`"
+    )
+    print_result(options.json, result, lambda: text)
