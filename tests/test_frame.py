@@ -7,7 +7,7 @@ import scenes
 import scenes_lod
 from compare import PICTURE_FLOAT
 from devices import host
-from v3dg import Camera, Gaussians, Renderer, Scene, render
+from v3dg import Camera, Gaussians, Renderer, Scene, render, select
 
 pytestmark = pytest.mark.gpu
 
@@ -52,6 +52,31 @@ def test_scene_looks_as_on_the_cpu(sh_degree, tolerance):
     expected = render(scene, CAMERA, tolerance=tolerance, background=BACKGROUND)
     image = render(scene, CAMERA, tolerance=tolerance, background=BACKGROUND, device="cuda")
     assert_like_cpu(image, expected)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 3])
+@pytest.mark.parametrize("tops", [5, 20, 150])
+def test_neighbours_that_share_a_cluster_look_as_on_the_cpu(sh_degree, tops):
+    """Instances so far that their top clusters are drawn: alone, several at once, of two bundles in turn."""
+    rng = np.random.default_rng(tops)
+    bundles = [
+        scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, n, sh_degree=sh_degree), tops, past_root=0)
+        for n in (2 * tops, 3 * tops)
+    ]
+    scene = Scene()
+    for block in range(12):
+        count = int(rng.integers(1, 40))
+        scene.add(
+            bundles[block % 2],
+            positions=8 * rng.normal(size=(count, 3)),
+            quaternions=rng.normal(size=(count, 4)),
+            scales=np.exp(rng.normal(size=count) - 1),
+        )
+    expected = render(scene, CAMERA, tolerance=np.inf, background=BACKGROUND)
+    image = render(scene, CAMERA, tolerance=np.inf, background=BACKGROUND, device="cuda")
+    assert_like_cpu(image, expected)
+    one_by_one = select(scene, CAMERA, tolerance=np.inf, device="cuda")
+    assert_same_bytes(image, render(scene, CAMERA, cut=one_by_one, background=BACKGROUND, device="cuda"))
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])

@@ -75,7 +75,8 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items, un
                                          min(static_cast<uint32_t>(kItemSize), count - first),
                                          p.first_record + first,
                                          t.filter_px2,
-                                         t.compensate};
+                                         t.compensate,
+                                         0};
     }
 }
 

@@ -21,6 +21,7 @@ struct FrameBatch {
     const FrameImage* images;
     uint32_t num_images, num_tiles;      // of all images together
     const PackedRows* packed = nullptr;  // of the same models
+    bool has_shared_items = false;       // whether there may be any; a frame that keeps a tape has none
 };
 
 // What a frame leaves for the way back, valid until the next is drawn.

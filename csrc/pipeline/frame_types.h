@@ -13,7 +13,7 @@ namespace cuda {
 
 // A block blends one tile, a warp 8 x 4 of its pixels.
 constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
-// Gaussians that one block projects.
+// Records that an item may make: as many as a block has threads.
 constexpr int kItemSize = 256;
 
 // Gaussians as rows, as users hold them (GaussianRows), on the device. Quaternions and SH coefficients start
@@ -61,12 +61,15 @@ struct FrameCounters {
     CutChoice choice;          // where there is a budget
 };
 
-// At most kItemSize neighbouring gaussians of a placed model. There is room for their records at
-// [record, record + count); those that become one stand at its beginning, in their own order.
+// Neighbouring gaussians of a placed model, or of a model that several placements share: those at
+// `placement` + k for each bit k of `sharers`, where it is not 0. They are to have one picture, and to make
+// kItemSize records at most: there is room for those from `record` on, and they stand at its beginning, by
+// gaussian and then by placement.
 struct DrawItem {
     uint32_t placement, first, count, record;
     float filter_px2;
     uint32_t compensate;
+    uint32_t sharers;
 };
 
 // Where the items of a frame are written, in their order. Counts what there is, stores what there is room

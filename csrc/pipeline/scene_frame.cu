@@ -45,9 +45,13 @@ SceneFrame::SceneFrame(std::vector<PackedModel> models, cudaStream_t stream)
 
 std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& tables, const FrameImage& image,
                                           Frame::Prepare prepare, cudaStream_t stream) {
-    const FrameBatch batch{rows_.data(),     placements_.reserve(tables.num_instances(), stream),
-                           images_.data(),   1,
-                           num_tiles(image), packed_.data()};
+    const FrameBatch batch{rows_.data(),
+                           placements_.reserve(tables.num_instances(), stream),
+                           images_.data(),
+                           1,
+                           num_tiles(image),
+                           packed_.data(),
+                           true};
     return frame_.draw(batch, std::move(prepare), stream);
 }
 
@@ -90,7 +94,7 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
     const uint32_t at = static_cast<uint32_t>(first);
     const uint32_t size =
         static_cast<uint32_t>(min(static_cast<unsigned long long>(kItemSize), count - first));
-    items.items[i] = {0, at, size, at, filter_px2, compensate};
+    items.items[i] = {0, at, size, at, filter_px2, compensate, 0};
 }
 
 std::unique_ptr<Drawing> ModelFrame::draw(const DeviceRows& rows, size_t count, const ModelView<float>& view,

@@ -1,6 +1,10 @@
 // A warp takes an item, and every so many items another. It looks at the spheres of 32 gaussians at a time;
 // those that may reach a pixel centre queue up, and are projected as soon as there are 32 of them. So no lane
 // waits for a gaussian that is not drawn, and records come out in order without asking another warp.
+//
+// Of a shared item it looks at one gaussian at a time, in front of up to 32 placements: many far instances of
+// a cluster of few gaussians are then a few items with full warps, and read those gaussians once. A kernel of
+// its own does that, which keeps its registers out of the other.
 
 #include "project/project_cuda.h"
 
@@ -29,7 +33,7 @@ struct ItemTables {
 // A gaussian in front of the camera.
 struct Queued {
     float p[3];      // view space
-    uint32_t place;  // in the item
+    uint32_t place;  // in the item; of a shared one, 32 times that, and the sharer's bit
 };
 
 // Shared memory of a warp.
@@ -82,8 +86,8 @@ struct RowSource {
     }
 
     // s.p is set; `color` is that of degree 0.
-    static __device__ Ellipse<float> project(const ItemTables<Model>& in, uint32_t g, Projection<float>& s,
-                                             float color[3]) {
+    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
+                                             uint32_t g, Projection<float>& s, float color[3]) {
         const DeviceRows& m = in.model;
         Gaussian3d<float> gaussian{{}, {}, {}, __ldg(m.opacities + g)};
         for (int k = 0; k < 3; ++k) gaussian.mean[k] = __ldg(m.means + 3 * size_t(g) + k);
@@ -93,9 +97,9 @@ struct RowSource {
         gaussian.quat[1] = quat.y;
         gaussian.quat[2] = quat.z;
         gaussian.quat[3] = quat.w;
-        if (m.sh_degree == 0) color_of<0>(m.sh, g, gaussian.mean, in.placement.view, color);
-        return project_gaussian(gaussian, in.placement.view, in.image.camera, in.item.filter_px2,
-                                in.item.compensate != 0, s);
+        if (m.sh_degree == 0) color_of<0>(m.sh, g, gaussian.mean, view, color);
+        return project_gaussian(gaussian, view, in.image.camera, in.item.filter_px2, in.item.compensate != 0,
+                                s);
     }
 };
 
@@ -104,15 +108,15 @@ struct PackedSource {
 
     static __device__ float4 load_sphere(const PackedRows& m, uint32_t g) { return load4(m.plane[0], g); }
 
-    static __device__ Ellipse<float> project(const ItemTables<Model>& in, uint32_t g, Projection<float>& s,
-                                             float color[3]) {
+    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
+                                             uint32_t g, Projection<float>& s, float color[3]) {
         const PackedRows& m = in.model;
         const float4 a = load4(m.plane[1], g), b = load4(m.plane[2], g), c = load4(m.plane[3], g);
         color[0] = c.y;
         color[1] = c.z;
         color[2] = c.w;
         const PackedGaussian gaussian{{}, 0.0f, {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, c.x};
-        return project_packed(gaussian, in.placement.view, in.image.camera, in.limits, in.item.filter_px2,
+        return project_packed(gaussian, view, in.image.camera, in.limits, in.item.filter_px2,
                               in.item.compensate != 0, s);
     }
 };
@@ -143,11 +147,11 @@ __device__ Sphere look_at_sphere(const ItemTables<Model>& in, const float p[3], 
 
 // The record of gaussian g at p in view space. Returns whether it reaches a pixel centre.
 template <class Source>
-__device__ bool project_one(const ItemTables<typename Source::Model>& in, uint32_t g, const float p[3],
-                            Record<float>& r, unsigned& num_in_frustum) {
+__device__ bool project_one(const ItemTables<typename Source::Model>& in, const ModelView<float>& view,
+                            uint32_t g, const float p[3], Record<float>& r, unsigned& num_in_frustum) {
     Projection<float> s;
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
-    const Ellipse<float> e = Source::project(in, g, s, r.color);
+    const Ellipse<float> e = Source::project(in, view, g, s, r.color);
     float half_x, half_y;
     const Pinhole<float>& cam = in.image.camera;
     // The sphere has told that it is not too faint.
@@ -165,7 +169,6 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in, uint32
     if (in.model.sh_degree > 0) {
         const float4 sphere = Source::load_sphere(in.model, g);
         const float mean[3] = {sphere.x, sphere.y, sphere.z};
-        const ModelView<float>& view = in.placement.view;
         switch (in.model.sh_degree) {
             case 1: color_of<1>(in.model.sh, g, mean, view, r.color); break;
             case 2: color_of<2>(in.model.sh, g, mean, view, r.color); break;
@@ -198,10 +201,11 @@ __device__ void put_record(const Record<float>& r, uint4* to) {
 static_assert(sizeof(Record<float>) == 3 * sizeof(uint4), "written as whole words");
 
 // Writes the records of up to 32 queued gaussians, in their order, and counts them into tiles. Returns how
-// many there are.
-template <class Source>
-__device__ unsigned write_records(WarpSpace<typename Source::Model>& space, unsigned head, unsigned count,
-                                  uint32_t first, const ProjectOutput& out, unsigned& num_in_frustum) {
+// many there are. `sharers` are the placements of a shared item.
+template <class Source, bool kIsShared>
+__device__ unsigned write_records(WarpSpace<typename Source::Model>& space, const Placement* sharers,
+                                  unsigned head, unsigned count, uint32_t first, const ProjectOutput& out,
+                                  unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
     Record<float> r;
@@ -209,8 +213,9 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, unsi
     uint32_t g = 0;
     if (lane < count) {
         const Queued queued = space.queue[(head + lane) % kQueue];
-        g = in.item.first + queued.place;
-        reaches_pixel = project_one<Source>(in, g, queued.p, r, num_in_frustum);
+        g = in.item.first + (kIsShared ? queued.place / 32 : queued.place);
+        const ModelView<float>& view = kIsShared ? sharers[queued.place % 32].view : in.placement.view;
+        reaches_pixel = project_one<Source>(in, view, g, queued.p, r, num_in_frustum);
     }
     const unsigned kept = __ballot_sync(kAllLanes, reaches_pixel);
     if (kept == 0) return 0;
@@ -248,18 +253,115 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, unsi
     return __popc(kept);
 }
 
+// Whose tables a warp has.
+struct Loaded {
+    uint32_t image = ~0u, model = ~0u;
+};
+
+// The tables of an item, from their words.
+template <class Model>
+__device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint32_t placement_word,
+                             const ProjectInput& in, const Model* models, Loaded& loaded) {
+    store_word(tables.item, item_word);
+    store_word(tables.placement, placement_word);
+    __syncwarp();
+    if (tables.placement.image != loaded.image) {
+        loaded.image = tables.placement.image;
+        store_word(tables.image, load_word(in.images[loaded.image]));
+        __syncwarp();
+        if (threadIdx.x % 32 == 0) tables.limits = slope_limits(tables.image.camera);
+    }
+    if (tables.placement.model != loaded.model) {
+        loaded.model = tables.placement.model;
+        store_word(tables.model, load_word(models[loaded.model]));
+    }
+    __syncwarp();
+}
+
+// The item whose tables are there. Returns how many records it has.
+template <class Source, bool kIsShared>
+__device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
+                                 const ProjectOutput& out, unsigned& num_in_frustum) {
+    constexpr unsigned kRound = kIsShared ? 1 : 32;  // gaussians
+    const auto& tables = space.tables;
+    const unsigned lane = threadIdx.x % 32, count = tables.item.count;
+    const bool sees = !kIsShared || (tables.item.sharers >> lane & 1) != 0;
+    ModelView<float> of_sharer;
+    if (kIsShared && sees) of_sharer = sharers[lane].view;
+    const ModelView<float>& view = kIsShared ? of_sharer : tables.placement.view;
+    const auto reach_scale_of = [&] {
+        const float* linear = view.linear;
+        const float scale = sqrt_of(linear[6] * linear[6] + linear[7] * linear[7] + linear[8] * linear[8]);
+        return sees_its_axis(tables.limits) ? max_of(tables.image.camera.fx, tables.image.camera.fy) * scale
+                                            : NAN;
+    };
+    const float reach_scale = sees ? reach_scale_of() : 0;
+    unsigned head = 0, waiting = 0, written = 0;
+    float4 next_sphere = {0, 0, 0, 0};
+    if ((kIsShared ? 0 : lane) < count)
+        next_sphere = Source::load_sphere(tables.model, tables.item.first + (kIsShared ? 0 : lane));
+    for (unsigned first = 0; first < count || waiting > 0; first += kRound) {
+        const float4 sphere = next_sphere;
+        const unsigned place = kIsShared ? first : first + lane;
+        if (place + kRound < count)
+            next_sphere = Source::load_sphere(tables.model, tables.item.first + place + kRound);
+        bool may_reach = false;
+        float p[3];
+        if (place < count && sees) {
+            for (int k = 0; k < 3; ++k)
+                p[k] = view.linear[3 * k] * sphere.x + view.linear[3 * k + 1] * sphere.y +
+                       view.linear[3 * k + 2] * sphere.z + view.translation[k];
+            const Sphere told = look_at_sphere(tables, p, sphere.w, reach_scale);
+            may_reach = told.may_reach;
+            num_in_frustum += told.misses_centers;
+        }
+        const unsigned come = __ballot_sync(kAllLanes, may_reach);
+        if (may_reach)
+            space.queue[(head + waiting + __popc(come & ((1u << lane) - 1))) % kQueue] = {
+                {p[0], p[1], p[2]}, kIsShared ? 32 * place + lane : place};
+        waiting += __popc(come);
+        __syncwarp();
+        if (waiting < 32 && first + kRound < count) continue;
+        // After the last there may be two rounds left.
+        const unsigned taken = min(waiting, 32u);
+        written += write_records<Source, kIsShared>(space, sharers, head, taken, tables.item.record + written,
+                                                    out, num_in_frustum);
+        head += taken;
+        waiting -= taken;
+        __syncwarp();  // before the queue and the records are written again
+    }
+    return written;
+}
+
+template <class Model>
+__device__ void report_item(const ItemTables<Model>& tables, unsigned item, unsigned num_records,
+                            const ProjectOutput& out) {
+    if (threadIdx.x % 32 != 0) return;
+    out.item_records[item] = num_records;
+    out.item_tiles[item] = {num_records, tables.item.record, tables.image.first_tile,
+                            static_cast<uint32_t>(tables.image.tile_columns)};
+}
+
+__device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum, unsigned num_records) {
+    num_in_frustum = warp_sum(num_in_frustum);
+    if (threadIdx.x % 32 != 0) return;
+    atomicAdd(&counters.in_frustum, static_cast<unsigned long long>(num_in_frustum));
+    atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));
+}
+
+__device__ bool have_room(const ItemList& items) {
+    return items.counters->items <= items.item_capacity && items.counters->gaussians <= items.record_capacity;
+}
+
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out) {
-    FrameCounters& counters = *in.items.counters;
-    if (counters.items > in.items.item_capacity || counters.gaussians > in.items.record_capacity) return;
+    if (!have_room(in.items)) return;
     __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
     WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
-    auto& tables = space.tables;
-    const unsigned lane = threadIdx.x % 32;
-    const unsigned num_items = static_cast<unsigned>(counters.items), stride = gridDim.x * kWarps;
+    const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
     unsigned num_in_frustum = 0, num_records = 0;
-    uint32_t image = ~0u, model = ~0u;  // whose tables are there
+    Loaded loaded;
     // The item after this one and its placement are fetched while this one is projected.
     unsigned i = blockIdx.x * kWarps + threadIdx.x / 32;
     uint32_t item_word = 0, placement_word = 0, next_item_word = 0;
@@ -269,79 +371,48 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         if (i + stride < num_items) next_item_word = load_word(in.items.items[i + stride]);
     }
     for (; i < num_items; i += stride) {
-        __syncwarp();
-        store_word(tables.item, item_word);
-        store_word(tables.placement, placement_word);
-        __syncwarp();
+        const uint32_t this_item_word = item_word, this_placement_word = placement_word;
         if (i + stride < num_items) {
             item_word = next_item_word;
             placement_word = load_word(in.placements[__shfl_sync(kAllLanes, item_word, 0)]);
             if (i + 2 * stride < num_items) next_item_word = load_word(in.items.items[i + 2 * stride]);
         }
-        if (tables.placement.image != image) {
-            image = tables.placement.image;
-            store_word(tables.image, load_word(in.images[image]));
-            __syncwarp();
-            if (lane == 0) tables.limits = slope_limits(tables.image.camera);
-        }
-        if (tables.placement.model != model) {
-            model = tables.placement.model;
-            store_word(tables.model, load_word(models[model]));
-        }
         __syncwarp();
-
-        const float* linear = tables.placement.view.linear;
-        const float scale = sqrt_of(linear[6] * linear[6] + linear[7] * linear[7] + linear[8] * linear[8]);
-        const float reach_scale = sees_its_axis(tables.limits)
-                                      ? max_of(tables.image.camera.fx, tables.image.camera.fy) * scale
-                                      : NAN;
-        const unsigned count = tables.item.count;
-        unsigned head = 0, waiting = 0, written = 0;
-        float4 next_sphere = {0, 0, 0, 0};
-        if (lane < count) next_sphere = Source::load_sphere(tables.model, tables.item.first + lane);
-        for (unsigned first = 0; first < count || waiting > 0; first += 32) {
-            const float4 sphere = next_sphere;
-            const unsigned place = first + lane;
-            if (place + 32 < count)
-                next_sphere = Source::load_sphere(tables.model, tables.item.first + place + 32);
-            bool may_reach = false;
-            float p[3];
-            if (place < count) {
-                const ModelView<float>& view = tables.placement.view;
-                for (int k = 0; k < 3; ++k)
-                    p[k] = view.linear[3 * k] * sphere.x + view.linear[3 * k + 1] * sphere.y +
-                           view.linear[3 * k + 2] * sphere.z + view.translation[k];
-                const Sphere told = look_at_sphere(tables, p, sphere.w, reach_scale);
-                may_reach = told.may_reach;
-                num_in_frustum += told.misses_centers;
-            }
-            const unsigned come = __ballot_sync(kAllLanes, may_reach);
-            if (may_reach)
-                space.queue[(head + waiting + __popc(come & ((1u << lane) - 1))) % kQueue] = {
-                    {p[0], p[1], p[2]}, place};
-            waiting += __popc(come);
-            __syncwarp();
-            if (waiting < 32 && first + 32 < count) continue;
-            // After the last there may be two rounds left.
-            const unsigned taken = min(waiting, 32u);
-            written +=
-                write_records<Source>(space, head, taken, tables.item.record + written, out, num_in_frustum);
-            head += taken;
-            waiting -= taken;
-            __syncwarp();  // before the queue and the records are written again
-        }
+        store_tables(space.tables, this_item_word, this_placement_word, in, models, loaded);
+        if (space.tables.item.sharers != 0) continue;
+        const unsigned written = project_item<Source, false>(space, nullptr, out, num_in_frustum);
         num_records += written;
-        if (lane == 0) {
-            out.item_records[i] = written;
-            out.item_tiles[i] = {written, tables.item.record, tables.image.first_tile,
-                                 static_cast<uint32_t>(tables.image.tile_columns)};
+        report_item(space.tables, i, written, out);
+    }
+    report_counts(*in.items.counters, num_in_frustum, num_records);
+}
+
+// Most frames have few shared items, so a warp looks for them among 32 items at a time.
+template <class Source>
+__global__ void __launch_bounds__(32 * kWarps, kBlocks)
+    project_shared_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out) {
+    if (!have_room(in.items)) return;
+    __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
+    WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
+    const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
+    unsigned num_in_frustum = 0, num_records = 0;
+    Loaded loaded;
+    for (unsigned first = blockIdx.x * kWarps + threadIdx.x / 32; first < num_items; first += 32 * stride) {
+        const unsigned mine = first + threadIdx.x % 32 * stride;
+        unsigned todo = __ballot_sync(kAllLanes, mine < num_items && in.items.items[mine].sharers != 0);
+        for (; todo != 0; todo &= todo - 1) {
+            const unsigned i = first + (__ffs(todo) - 1) * stride;
+            const DrawItem& item = in.items.items[i];
+            const Placement* sharers = in.placements + item.placement;
+            __syncwarp();
+            store_tables(space.tables, load_word(item), load_word(sharers[__ffs(item.sharers) - 1]), in,
+                         models, loaded);
+            const unsigned written = project_item<Source, true>(space, sharers, out, num_in_frustum);
+            num_records += written;
+            report_item(space.tables, i, written, out);
         }
     }
-    num_in_frustum = warp_sum(num_in_frustum);
-    if (lane == 0) {
-        atomicAdd(&counters.in_frustum, static_cast<unsigned long long>(num_in_frustum));
-        atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));
-    }
+    report_counts(*in.items.counters, num_in_frustum, num_records);
 }
 
 // A thread a gaussian.
@@ -372,14 +443,21 @@ PackedRows pack(const DeviceRows& rows, size_t count, float* planes, cudaStream_
     return {{planes, planes + 4 * count, planes + 8 * count, planes + 12 * count}, rows.sh, rows.sh_degree};
 }
 
-void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream) {
+template <class Source>
+static void project_from(const typename Source::Model* models, const ProjectInput& in,
+                         const ProjectOutput& out, cudaStream_t stream) {
     const unsigned blocks = kBlocks * num_multiprocessors();
+    launch("project_kernel", project_kernel<Source>, blocks, 32 * kWarps, 0, stream, in, models, out);
+    if (in.has_shared_items)
+        launch("project_shared_kernel", project_shared_kernel<Source>, blocks, 32 * kWarps, 0, stream, in,
+               models, out);
+}
+
+void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream) {
     if (in.packed != nullptr)
-        launch("project_kernel", project_kernel<PackedSource>, blocks, 32 * kWarps, 0, stream, in, in.packed,
-               out);
+        project_from<PackedSource>(in.packed, in, out, stream);
     else
-        launch("project_kernel", project_kernel<RowSource>, blocks, 32 * kWarps, 0, stream, in, in.models,
-               out);
+        project_from<RowSource>(in.models, in, out, stream);
 }
 
 }  // namespace cuda

@@ -11,7 +11,8 @@ struct ProjectInput {
     const PackedRows* packed;  // read in place of `models` where it is not null
     const Placement* placements;
     const FrameImage* images;
-    ItemList items;  // in the counters: sets in_frustum and records, which start at 0
+    ItemList items;         // in the counters: sets in_frustum and records, which start at 0
+    bool has_shared_items;  // whether there may be any
 };
 
 struct ProjectOutput {
@@ -25,9 +26,9 @@ struct ProjectOutput {
     unsigned long long large_capacity;
 };
 
-// As v3dg::project, for all items of a frame: writes a record, in the order of items and gaussians, for each
-// gaussian that reaches a pixel centre, and counts into the tiles that it touches. Does nothing when the
-// items are over a capacity.
+// As v3dg::project, for all items of a frame: writes a record, in the items' order, for each gaussian that
+// reaches a pixel centre, and counts into the tiles that it touches. Does nothing when the items are over a
+// capacity.
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream);
 
 // `planes` has room for (4, count, 4).

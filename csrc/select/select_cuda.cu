@@ -332,17 +332,33 @@ __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change,
     if (!fits_budget) *num_parts = 0;
 }
 
+// What a lane writes of its warp's clusters.
+struct Share {
+    unsigned units, gaussians;  // units: elements of the list
+};
+
 // Selected clusters as (instance, cluster).
 struct PairOutput {
     int32_t *instance, *cluster;
     Count capacity;
     Count *pairs, *gaussians;
 
-    __device__ unsigned units(unsigned) const { return 1; }
-    __device__ void write(const LaneClusters& c, unsigned k, Count first, Count) const {
-        if (first >= capacity) return;
-        instance[first] = static_cast<int32_t>(c.instance);
-        cluster[first] = c.cluster(k);
+    __device__ Share share(const LaneClusters& mine) const {
+        Share share{0, 0};
+        for (unsigned k = 0; k < kEach; ++k)
+            if (mine.drawn >> k & 1) {
+                ++share.units;
+                share.gaussians += mine.size(k);
+            }
+        return share;
+    }
+    __device__ void write(const LaneClusters& mine, Count first, Count) const {
+        for (unsigned k = 0; k < kEach; ++k)
+            if (mine.drawn >> k & 1) {
+                if (first >= capacity) return;
+                instance[first] = static_cast<int32_t>(mine.instance);
+                cluster[first++] = mine.cluster(k);
+            }
     }
     __device__ void finish(Count units, Count gaussians_drawn) const {
         *pairs = units;
@@ -350,23 +366,73 @@ struct PairOutput {
     }
 };
 
-// Selected clusters as items.
+// A cluster that is drawn for the `count` instances of `sharers`, bits above the first of the part; or, where
+// those are none, for the lane's.
+struct DrawnCluster {
+    unsigned k;
+    uint32_t sharers;
+    unsigned count;
+
+    __device__ unsigned gaussians_an_item() const { return kItemSize / count; }
+};
+
+// Whether a warp is quicker with a cluster's gaussians one by one, each for all its instances at once, than
+// with the instances one by one. An item takes as long as two more rounds.
+__device__ bool is_worth_sharing(unsigned num_gaussians, unsigned num_instances) {
+    return num_instances > 1 && num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
+}
+
+// Calls visit(DrawnCluster) in the lane that writes it; for whole warps.
+template <class Visit>
+__device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
+    if (!mine.are_tops) {
+        for (unsigned k = 0; k < kEach; ++k)
+            if (mine.drawn >> k & 1) visit(DrawnCluster{k, 0, 1});
+        return;
+    }
+    const unsigned same_bundle =
+        __match_any_sync(kAllLanes, reinterpret_cast<unsigned long long>(mine.bundle));
+    for (unsigned k = 0; __any_sync(kAllLanes, mine.drawn >> k != 0); ++k) {
+        const bool is_drawn = (mine.drawn >> k & 1) != 0;
+        const unsigned sharers = __ballot_sync(kAllLanes, is_drawn) & same_bundle, count = __popc(sharers);
+        if (!is_drawn) continue;
+        if (!is_worth_sharing(mine.size(k), count))
+            visit(DrawnCluster{k, 0, 1});
+        else if (threadIdx.x % 32 + 1 == static_cast<unsigned>(__ffs(sharers)))
+            visit(DrawnCluster{k, sharers, count});
+    }
+}
+
+// Selected clusters as items; the tops of neighbours share theirs.
 struct ItemOutput {
     ItemList items;
 
-    __device__ unsigned units(unsigned size) const { return (size + kItemSize - 1) / kItemSize; }
-    __device__ void write(const LaneClusters& c, unsigned k, Count first, Count record) const {
-        const int32_t cluster = c.cluster(k);
-        const unsigned size = c.size(k);
-        const uint32_t gaussian = static_cast<uint32_t>(c.bundle->table.offset[cluster]);
-        const float filter_px2 = c.bundle->filters.filter_px2[cluster];
-        const uint32_t compensate = c.bundle->filters.compensate[cluster];
-        for (unsigned skip = 0; skip < size; skip += kItemSize, ++first) {
-            const unsigned count = min(static_cast<unsigned>(kItemSize), size - skip);
-            if (first >= items.item_capacity || record + skip + count > items.record_capacity) return;
-            items.items[first] = {c.instance, gaussian + skip, count, static_cast<uint32_t>(record) + skip,
-                                  filter_px2, compensate};
-        }
+    __device__ Share share(const LaneClusters& mine) const {
+        Share share{0, 0};
+        for_each_drawn(mine, [&](const DrawnCluster& c) {
+            const unsigned size = mine.size(c.k);
+            share.units += blocks_for(size, c.gaussians_an_item());
+            share.gaussians += c.count * size;
+        });
+        return share;
+    }
+    __device__ void write(const LaneClusters& mine, Count first, Count record) const {
+        for_each_drawn(mine, [&](const DrawnCluster& c) {
+            const int32_t cluster = mine.cluster(c.k);
+            const unsigned size = mine.size(c.k), step = c.gaussians_an_item();
+            const uint32_t placement = c.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
+            const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.offset[cluster]);
+            const float filter_px2 = mine.bundle->filters.filter_px2[cluster];
+            const uint32_t compensate = mine.bundle->filters.compensate[cluster];
+            for (unsigned skip = 0; skip < size; skip += step, ++first) {
+                const unsigned count = min(step, size - skip);
+                if (first < items.item_capacity && record + c.count * count <= items.record_capacity)
+                    items.items[first] = {
+                        placement,  gaussian + skip, count,    static_cast<uint32_t>(record),
+                        filter_px2, compensate,      c.sharers};
+                record += c.count * count;
+            }
+        });
     }
     __device__ void finish(Count units, Count gaussians) const {
         items.counters->items = units;
@@ -379,16 +445,10 @@ template <class Output>
 __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool is_last, Count* unit_state,
                                Count* count_state, const Output& output) {
     __shared__ Count before_units, before_gaussians;
-    unsigned units = 0, gaussians = 0;
-    for (unsigned k = 0; k < kEach; ++k)
-        if (mine.drawn >> k & 1) {
-            const unsigned size = mine.size(k);
-            units += output.units(size);
-            gaussians += size;
-        }
+    const Share share = output.share(mine);
     unsigned num_units, num_gaussians;
-    const unsigned units_before = block_prefix(units, num_units),
-                   gaussians_before = block_prefix(gaussians, num_gaussians);
+    const unsigned units_before = block_prefix(share.units, num_units),
+                   gaussians_before = block_prefix(share.gaussians, num_gaussians);
     if (threadIdx.x < 64) {  // a warp each
         const bool is_units = threadIdx.x < 32;
         const Count before =
@@ -396,14 +456,7 @@ __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool i
         if (threadIdx.x % 32 == 0) (is_units ? before_units : before_gaussians) = before;
     }
     __syncthreads();
-    Count unit = before_units + units_before, gaussian = before_gaussians + gaussians_before;
-    for (unsigned k = 0; k < kEach; ++k)
-        if (mine.drawn >> k & 1) {
-            const unsigned size = mine.size(k);
-            output.write(mine, k, unit, gaussian);
-            unit += output.units(size);
-            gaussian += size;
-        }
+    output.write(mine, before_units + units_before, before_gaussians + gaussians_before);
     if (is_last && threadIdx.x == 0)
         output.finish(before_units + num_units, before_gaussians + num_gaussians);
 }
