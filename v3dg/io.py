@@ -8,6 +8,9 @@ from typing import Literal
 from v3dg import _core, _files
 from v3dg.gaussians import Gaussians
 
+SUFFIXES = (".ply",)
+"""How the names of files end that `load` reads."""
+
 PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 
 
@@ -55,6 +58,7 @@ def save(
 
 
 def _check_suffix(path: str | os.PathLike[str]) -> None:
-    suffix = os.path.splitext(os.fspath(path))[1]
-    if suffix.lower() != ".ply":
-        raise ValueError(f"{os.fspath(path)}: expected a file name that ends in .ply, got '{suffix}'")
+    name = os.fspath(path)
+    if not name.lower().endswith(SUFFIXES):
+        suffix = os.path.splitext(name)[1]
+        raise ValueError(f"{name}: expected a file name that ends in {', '.join(SUFFIXES)}, got '{suffix}'")

@@ -19,20 +19,30 @@ import tyro
 
 from v3dg._version import __version__
 from v3dg.cli import bench, build, demo, info, render, world
-from v3dg.cli._common import UsageError
+from v3dg.cli._common import FAILURES, UsageError, failure_text
 
 # Options and what runs on them, by the command's name, in the order of the help.
 _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], None]]] = {
     "build": (build.Build, build.run),
     "info": (info.Info, info.run),
     "render": (render.Render, render.run),
+    "world": (world.World, world.run),
     "demo": (demo.Demo, demo.run),
     "bench": (bench.Bench, bench.run),
-    "world": (world.World, world.run),
 }
 
+_DESCRIPTION = """\
+Level of detail for 3D Gaussian Splatting, in three steps:
+    v3dg build donut.ply               makes clusters at halving levels of detail
+    v3dg render donut.v3dg --views 8   draws those that are just detailed enough
+    v3dg compare donut.ply donut.v3dg  says what that costs in quality
 
-def _parse(arguments: Sequence[str]) -> Any:
+No asset at hand? `v3dg demo` makes one, `v3dg world forest` a whole scene.
+`v3dg COMMAND --help` has the options, `v3dg --version` prints the version.
+"""
+
+
+def parse(arguments: Sequence[str]) -> Any:
     """Parse the command line; tyro's boxed message becomes one line."""
     subcommands: Any = [
         Annotated[options, tyro.conf.subcommand(name)] for name, (options, _) in _COMMANDS.items()
@@ -43,7 +53,7 @@ def _parse(arguments: Sequence[str]) -> Any:
             parsed = tyro.cli(
                 functools.reduce(operator.or_, subcommands),
                 prog="v3dg",
-                description="Level of detail for 3D Gaussian Splatting. `v3dg --version` prints the version.",
+                description=_DESCRIPTION,
                 args=arguments,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
@@ -83,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"v3dg {__version__}")
         return 0
     try:
-        options = _parse(arguments)
+        options = parse(arguments)
         if is_program:
             _set_threads(getattr(options, "threads", None))
         run = next(run for kind, run in _COMMANDS.values() if isinstance(options, kind))
@@ -96,16 +106,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone: nobody is left to tell
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except OSError as error:
-        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error), 1)
-    except MemoryError as error:
-        numbers = f" ({error})" if str(error) else ""
-        return _fail(f"not enough memory{numbers}; use smaller pictures or a smaller asset", 1)
-    except (ValueError, RuntimeError, ImportError) as error:
-        return _fail(str(error), 1)
+    except FAILURES as error:
+        return _fail(failure_text(error), 1)
     return 0
 
 
 def _fail(message: str, code: int) -> int:
-    print("v3dg: error: " + " ".join(message.split()), file=sys.stderr)
+    print(f"v3dg: error: {' '.join(message.split())}", file=sys.stderr)
     return code

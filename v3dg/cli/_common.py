@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+import tyro
+
+from v3dg.io import SUFFIXES
 
 if TYPE_CHECKING:
     from v3dg.bundle import Bundle
@@ -16,6 +20,31 @@ class UsageError(Exception):
     """Arguments that cannot be meant; exit code 2."""
 
 
+# What a command may fail with, in one line on stderr; else there is a mistake of ours to be seen.
+FAILURES = (OSError, MemoryError, ValueError, RuntimeError, ImportError)
+
+
+def failure_text(error: BaseException) -> str:
+    """One line that says what failed."""
+    if isinstance(error, OSError) and error.filename:
+        text = f"{error.filename}: {error.strerror}"
+    elif isinstance(error, MemoryError):
+        numbers = f" ({error})" if str(error) else ""
+        text = f"not enough memory{numbers}; use smaller pictures or a smaller asset"
+    else:
+        text = str(error)
+    return " ".join(text.split())
+
+
+def option(metavar: str, *aliases: str) -> Any:
+    """Annotation of an option that is None where it is not given, of which its help says what that means."""
+    return tyro.conf.arg(metavar=metavar, aliases=aliases or None, help_behavior_hint="")
+
+
+Flag: TypeAlias = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
+Threads: TypeAlias = Annotated[int | None, option("N")]
+
+
 def load_asset_or_bundle(path: Path) -> Gaussians | Bundle:
     from v3dg.bundle import Bundle
     from v3dg.io import load
@@ -24,10 +53,15 @@ def load_asset_or_bundle(path: Path) -> Gaussians | Bundle:
 
 
 def require_file(path: Path, *suffixes: str) -> None:
-    if path.suffix not in suffixes:
+    if not path.name.lower().endswith(suffixes):
         raise ValueError(f"{path}: expected a file ending in {', '.join(suffixes)}")
     if not path.exists():
         raise ValueError(f"{path}: expected a file, got nothing there; check the path")
+
+
+def require_subject(path: Path) -> None:
+    """Check that a file is there and is a scene, a bundle or an asset by its name."""
+    require_file(path, *SUFFIXES, ".v3dg", ".json")
 
 
 def level_size(bundle: Bundle, level: int) -> int:

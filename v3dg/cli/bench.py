@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from v3dg.cli._common import UsageError, print_result, require_file
+from v3dg.cli._common import Flag, Threads, UsageError, option, print_result, require_file
 
 
 @dataclass
@@ -21,21 +21,21 @@ class Bench:
     """small takes minutes on two cores, full wants a GPU."""
     parts: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
     """Which parts of the evaluation; all if not given."""
-    asset: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    asset: Annotated[Path | None, option("PATH")] = None
     """Trained asset, a .ply file, in place of the one that v3dg makes itself."""
-    layout: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
+    layout: Annotated[Path | None, option("PATH")] = None
     """Published layout (.json) of the instances of that asset and of cameras."""
-    peers: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    peers: Annotated[Path | None, option("FOLDER")] = None
     """What other tools made of that asset (v3dg/bench/parts/merging.py says how)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to build and draw; auto is a CUDA device where there is one and torch can use it."""
     seed: int = 0
     """Seed of assets, layouts and builds."""
-    threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    threads: Threads = None
     """CPU threads; all if not given."""
-    json: bool = False
+    json: Flag = False
     """Print the results as JSON."""
-    quiet: bool = False
+    quiet: Flag = False
     """Show no progress."""
 
 

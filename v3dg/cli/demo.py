@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from v3dg.cli._common import print_result
+from v3dg.cli._common import Flag, Threads, option, print_result
 
 
 @dataclass
@@ -23,15 +23,15 @@ class Demo:
     """How often it is placed."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (380, 440)
     """Width and height of one panel in px."""
-    tolerance: Annotated[float | None, tyro.conf.arg(metavar="PX2")] = None
+    tolerance: Annotated[float | None, option("PX2")] = None
     """Screen area in px² that one gaussian of a coarser cluster may stand for."""
     seed: int = 0
     """Seed of the asset, of the meadow and of the build."""
-    threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    threads: Threads = None
     """CPU threads; all if not given."""
-    json: bool = False
+    json: Flag = False
     """Print the numbers as JSON."""
-    quiet: bool = False
+    quiet: Flag = False
     """Show no progress."""
 
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import tyro
 
 from v3dg.cli._common import (
+    Flag,
     bytes_text,
     level_size,
     load_asset_or_bundle,
     print_result,
-    require_file,
+    require_subject,
     table_lines,
 )
 
@@ -33,12 +34,12 @@ class Info:
 
     file: tyro.conf.Positional[Path]
     """File to describe."""
-    json: bool = False
+    json: Flag = False
     """Print the description as JSON."""
 
 
 def run(options: Info) -> None:
-    require_file(options.file, ".ply", ".v3dg", ".json")
+    require_subject(options.file)
     if options.file.suffix == ".json":
         from v3dg.scene_file import read_scene
 
@@ -109,6 +110,8 @@ def _point(values: Sequence[float]) -> str:
 
 
 def _bundle_info(path: Path, bundle: Bundle) -> tuple[dict[str, Any], str]:
+    from v3dg.build import BuildConfig
+
     result = {**bundle.info(), "path": str(path), "kind": "bundle"}
     rows = [
         (
@@ -128,9 +131,16 @@ def _bundle_info(path: Path, bundle: Bundle) -> tuple[dict[str, Any], str]:
         "",
         *table_lines(("level", "clusters", "gaussians", "size", "colour error", "alpha error"), rows),
     ]
-    if result["config"]:
-        settings = ", ".join(f"{name}={value}" for name, value in _settings(result["config"]))
-        lines += ["", *textwrap.wrap(f"built with {settings}", 100, break_on_hyphens=False)]
+    lines += ["", "errors: what the fits were left with, a pixel, at the size at which a level is drawn"]
+    if bundle.config:
+        usual = asdict(BuildConfig())
+        others = [
+            f"{name}={value if isinstance(value, str) else json.dumps(value)}"
+            for name, value in _settings(bundle.config)
+            if name not in usual or value != usual[name]
+        ]
+        text = f"built with {', '.join(others)}, all else by default" if others else "built by default"
+        lines += textwrap.wrap(text, 100, break_on_hyphens=False)
     return result, "\n".join(lines)
 
 
@@ -168,13 +178,13 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> tuple[d
     return result, "\n".join(lines)
 
 
-def _settings(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def _settings(config: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Names and values of a bundle's config, without its nesting."""
     for name, value in config.items():
         if isinstance(value, dict):
             yield from _settings(value)
         else:
-            yield name, value if isinstance(value, str) else json.dumps(value)
+            yield name, value
 
 
 def number_text(value: float | None) -> str:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from v3dg.cli._common import print_result
+from v3dg.cli._common import Flag, Threads, option, print_result
 
 
 @dataclass
@@ -18,7 +18,7 @@ class World:
 
     name: tyro.conf.Positional[Literal["donut_sea", "forest", "temples", "crowd"]]
     """Which of the V3DG paper's four."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    output: Annotated[Path | None, option("FOLDER", "-o")] = None
     """Folder to write to, made if it is not there; the world's name if not given."""
     scale: Literal["small", "full"] = "small"
     """How large: full is about 100 million gaussians, and hours of a CPU or minutes of a GPU."""
@@ -26,11 +26,11 @@ class World:
     """Seed of the assets, of the layout and of the builds."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to build; auto is a CUDA device where there is one and torch can use it."""
-    threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    threads: Threads = None
     """CPU threads; all if not given."""
-    json: bool = False
+    json: Flag = False
     """Print the result as JSON."""
-    quiet: bool = False
+    quiet: Flag = False
     """Show no progress."""
 
 

@@ -1,0 +1,28 @@
+"""The command line as a user starts it."""
+
+import os
+import subprocess
+import sys
+
+import v3dg
+
+# The package under test, wherever the command starts.
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
+COMMAND = [sys.executable, "-m", "v3dg"]
+
+
+def run(*arguments, cwd=None):
+    command = [*COMMAND, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=ENVIRONMENT)
+
+
+def fails(code, message, *arguments, cwd):
+    """Runs a command that must fail with one line on stderr, an exit code and nothing new in the folder."""
+    before = sorted(os.listdir(cwd))
+    done = run(*arguments, cwd=cwd)
+    assert done.returncode == code, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("v3dg: error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert sorted(os.listdir(cwd)) == before

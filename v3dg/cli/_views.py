@@ -1,0 +1,134 @@
+"""Where commands look from: the cameras of a file, a scene's own, or a turntable around the subject."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+
+import tyro
+
+from v3dg.cli._common import UsageError, level_size, load_asset_or_bundle, option
+
+if TYPE_CHECKING:
+    from v3dg.bundle import Bundle
+    from v3dg.cameras import Camera
+    from v3dg.gaussians import Gaussians
+    from v3dg.scene import Scene
+
+    Subject: TypeAlias = Scene | Bundle | Gaussians
+
+# Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
+_ENOUGH_TO_FRAME = 50_000
+
+
+@dataclass
+class ViewOptions:
+    """From where to look: a scene's own cameras, those of a camera file, or a turntable."""
+
+    cameras: Annotated[Path | None, option("PATH")] = None
+    """Draw from the cameras of this nerfstudio transforms.json."""
+    distortion: Literal["refuse", "ignore"] = "refuse"
+    """Whether lens distortion in that file is an error, or left out of the pictures."""
+    camera: Annotated[str | None, option("NAME")] = None
+    """Draw only this camera of a file with cameras: its name, or its place in the file, from 0."""
+    views: int = 1
+    """Views around the turntable."""
+    size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
+    """Width and height in px of a turntable's pictures, and of cameras whose file gives them no size."""
+    elevation: float = 20.0
+    """Height of the turntable's cameras above the horizon in degrees."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    """The turntable's axis."""
+
+    def check(self, *subjects: Path) -> None:
+        """Refuse, before anything is read, what cannot be meant for these subjects."""
+        if min(self.views, *self.size) < 1:
+            raise UsageError("--views, --size: expected at least 1")
+        is_from_file = self.cameras is not None or any(path.suffix == ".json" for path in subjects)
+        if self.camera is not None and not is_from_file:
+            raise UsageError("--camera: expected --cameras or a scene (.json) to take it from; leave it out")
+
+
+# Field of a command's options that holds them; on the command line they stand beside the others.
+Views: TypeAlias = Annotated[ViewOptions, tyro.conf.OmitArgPrefixes]
+
+
+def load_subject(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
+    """A scene with its cameras, or a bundle or an asset, which have none."""
+    if path.suffix != ".json":
+        return load_asset_or_bundle(path), None
+    from v3dg.scene_file import read_scene
+
+    return read_scene(path)
+
+
+def choose_cameras(
+    options: ViewOptions, path: Path, subject: Subject, own: dict[str, Camera] | None
+) -> dict[str, Camera]:
+    """The cameras of --cameras, else the subject's own, else a turntable around it."""
+    if options.cameras is not None:
+        from v3dg.camera_file import read_cameras
+
+        own = read_cameras(options.cameras, size=options.size, distortion=options.distortion)
+    if own is None:
+        return _turntable(subject, options)
+    if not own:
+        raise ValueError(f"{options.cameras or path}: expected cameras, got a file without; add some to it")
+    return own if options.camera is None else _one_camera(own, options.camera)
+
+
+def _one_camera(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
+    """The camera of that name or at that place."""
+    names = list(cameras)
+    if name not in cameras and name.isdecimal() and int(name) < len(names):
+        name = names[int(name)]
+    if name not in cameras:
+        known = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+        raise ValueError(f"--camera: expected one of {known}, or 0 to {len(names) - 1}, got {name}")
+    return {name: cameras[name]}
+
+
+def _turntable(subject: Subject, options: ViewOptions) -> dict[str, Camera]:
+    """Cameras around where most of the gaussians are, at a distance that shows nearly all of it."""
+    import numpy as np
+
+    from v3dg.bundle import Bundle
+    from v3dg.cameras import DEFAULT_FOV_X, turntable
+    from v3dg.gaussians import Gaussians
+
+    if isinstance(subject, Gaussians):
+        means = subject.means
+    else:
+        assert isinstance(subject, Bundle)
+        sizes = [level_size(subject, level) for level in range(subject.num_levels)]
+        level = next((i for i, size in enumerate(sizes) if size <= _ENOUGH_TO_FRAME), len(sizes) - 1)
+        means = subject.level_gaussians(level).means if sizes else np.zeros((0, 3), np.float32)
+    # Trained assets have a few gaussians far away from all others.
+    low, high = np.percentile(means, (1, 99), axis=0) if len(means) else (np.zeros(3), np.ones(3))
+    centre = (low + high) / 2
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    narrow = math.tan(DEFAULT_FOV_X / 2) * min(1.0, options.size[1] / options.size[0])
+    distance = 0.9 * radius / math.sin(math.atan(narrow))
+    axis = np.eye(3)["xyz".index(options.up[-1])] * (-1 if options.up[0] == "-" else 1)
+    cameras = turntable(
+        centre,
+        distance,
+        options.views,
+        math.radians(options.elevation),
+        up=axis,
+        width=options.size[0],
+        height=options.size[1],
+        near=min(0.01, 0.01 * distance),
+    )
+    digits = len(str(options.views - 1))
+    return {f"{i:0{digits}}": camera for i, camera in enumerate(cameras)}
+
+
+def picture_path(output: Path, name: str, count: int) -> Path:
+    """Where the picture of a camera goes; of several, each has its camera's name in its own."""
+    if count == 1:
+        return output
+    safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
+    return output.with_name(f"{output.stem}_{safe}{output.suffix}")
