@@ -2,68 +2,168 @@
 
 from __future__ import annotations
 
+import sys
 import time
 import warnings
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from v3dg.cli._common import bytes_text, print_result, require_file
+from v3dg.cli._common import (
+    FAILURES,
+    Flag,
+    Threads,
+    UsageError,
+    bytes_text,
+    failure_text,
+    option,
+    print_result,
+    require_file,
+    table_lines,
+)
+from v3dg.io import SUFFIXES
+
+if TYPE_CHECKING:
+    from v3dg.build import BuildConfig
+    from v3dg.bundle import Bundle
+
+_SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
 
 @dataclass
 class Build:
-    """Build a bundle from a trained asset."""
+    """Build a bundle from a trained asset, or from each of many, of which one that fails stops no other."""
 
-    asset: tyro.conf.Positional[Path]
-    """Trained gaussians, a .ply file."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
-    """Bundle to write; the asset's name with .v3dg if not given."""
+    assets: Annotated[tuple[Path, ...], tyro.conf.Positional, _SEVERAL]
+    """Files of trained gaussians, or folders of such files."""
+    output: Annotated[Path | None, option("PATH", "-o")] = None
+    """Bundle to write, for many assets the folder; if not given, beside the asset, its name with .v3dg."""
     config: Literal["default", "paper"] = "default"
     """Settings to start from: ours, or those of the V3DG paper."""
-    cluster_size: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    cluster_size: Annotated[int | None, option("N")] = None
     """Most gaussians in a cluster; the config's own if not given."""
     seed: int = 0
     """The same seed gives the same file, byte for byte, on the same kind of device."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto is a CUDA device where there is one and torch can use it."""
-    strict: bool = False
+    strict: Flag = False
     """Refuse an asset with wrong values, instead of leaving out the gaussians that have them."""
-    resume: bool = False
-    """Continue an interrupted build from its last finished level."""
-    threads: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    resume: Flag = False
+    """Continue after the last finished level; keep bundles newer than their asset and of these settings."""
+    threads: Threads = None
     """CPU threads; all if not given. The result does not depend on it."""
-    json: bool = False
+    json: Flag = False
     """Print the result as JSON."""
-    quiet: bool = False
+    quiet: Flag = False
     """Show no progress."""
 
 
 def run(options: Build) -> None:
-    require_file(options.asset, ".ply")
-    from dataclasses import replace
+    if not options.assets:
+        raise UsageError(
+            "PATH: expected an asset, several, or a folder of them, got nothing; run v3dg build --help"
+        )
+    if len(options.assets) == 1 and not options.assets[0].is_dir():
+        asset = options.assets[0]
+        result = _build(options, asset, options.output or asset.with_suffix(".v3dg"))
+        print_result(options.json, result, lambda: _text(result))
+    else:
+        _run_many(options)
 
+
+def _run_many(options: Build) -> None:
+    outputs = _outputs(options)
+    start = time.perf_counter()
+    results: list[dict[str, Any]] = []
+    for asset, output in outputs.items():
+        if not options.quiet:
+            print(f"[{len(results) + 1}/{len(outputs)}] {asset}", file=sys.stderr)
+        try:
+            results.append(_build(options, asset, output))
+        except FAILURES as error:
+            results.append({"asset": str(asset), "status": "failed", "error": failure_text(error)})
+            if not options.quiet:
+                print(f"failed: {results[-1]['error']}", file=sys.stderr)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"interrupted with {len(results)} of {len(outputs)} assets done; `--resume` continues"
+            ) from None
+    counts = Counter(result["status"] for result in results)
+    summary = {name: counts[name] for name in ("built", "kept", "failed")}
+    seconds = time.perf_counter() - start
+    print_result(
+        options.json,
+        {**summary, "seconds": seconds, "assets": results},
+        lambda: "\n".join(
+            [
+                *table_lines(
+                    ("asset", "bundle", "levels", "gaussians", "left out", "size", "time"), _rows(results)
+                ),
+                "",
+                ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s",
+            ]
+        ),
+    )
+    failed = [result for result in results if result["status"] == "failed"]
+    if failed:
+        others = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
+        raise RuntimeError(f"{len(failed)} of {len(results)} assets failed: {failed[0]['error']}{others}")
+
+
+def _outputs(options: Build) -> dict[Path, Path]:
+    """Where the bundle of each asset goes, by asset."""
+    folder = options.output
+    if folder is not None and folder.suffix == ".v3dg":
+        raise UsageError(f"--output: expected a folder for the bundles of many assets, got {folder}")
+    assets: list[Path] = []
+    for path in options.assets:
+        found = [path]
+        if path.is_dir():
+            found = sorted(p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file())
+            if not found:
+                raise ValueError(
+                    f"{path}: expected a folder with assets ({', '.join(SUFFIXES)}), got none in it"
+                )
+        assets += found
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    outputs: dict[Path, Path] = {}
+    asset_of: dict[Path, Path] = {}
+    for asset in dict.fromkeys(assets):
+        output = (asset if folder is None else folder / asset.name).with_suffix(".v3dg")
+        if output in asset_of:
+            raise ValueError(
+                f"{output}: expected one asset for it, got {asset_of[output]} and {asset}; rename one"
+            )
+        outputs[asset], asset_of[output] = output, asset
+    return outputs
+
+
+def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
+    """Build and save one bundle; what was done, as JSON values."""
+    require_file(asset_path, *SUFFIXES)
     from v3dg import _device
-    from v3dg.build import BuildConfig, build_bundle, discard_levels
-    from v3dg.cleaning import AssetWarning, describe
+    from v3dg.build import build_bundle, discard_levels
+    from v3dg.bundle import Bundle
+    from v3dg.cleaning import AssetWarning
     from v3dg.io import load
 
-    output = options.output or options.asset.with_suffix(".v3dg")
     if output.suffix != ".v3dg":
         raise ValueError(f"{output}: expected a file name ending in .v3dg")
     if not output.parent.is_dir():
         raise ValueError(f"{output}: expected an existing folder, got {output.parent}; create it first")
-    config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
-    if options.cluster_size is not None:
-        config = replace(config, cluster_size=options.cluster_size)
+    config = _config(options)
     partial = output.with_name(output.name + ".partial")
-    if not options.resume:
-        discard_levels(partial)
     device = _device.resolve(options.device)
     start = time.perf_counter()
-    asset = load(options.asset)
+    if options.resume and _is_current(output, asset_path, config, options.seed):
+        return _result(asset_path, output, Bundle.open(output), "kept", start)
+    if not options.resume:
+        discard_levels(partial)
+    asset = load(asset_path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AssetWarning)  # the result says it
@@ -78,33 +178,80 @@ def run(options: Build) -> None:
             )
         bundle.save(output)
     except ValueError as error:
-        place = f"{options.asset}: " if str(error).startswith("asset: ") else ""
+        place = f"{asset_path}: " if str(error).startswith("asset: ") else ""
         raise ValueError(f"{place}{error}") from None
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{_to_resume(partial)}") from None
     except OSError as error:  # a full disk, say
         raise OSError(error.errno, f"{error.strerror}{_to_resume(partial)}", error.filename) from None
     partial.unlink(missing_ok=True)
-    dropped = bundle.config["dropped"]
-    result = {
+    return _result(asset_path, output, bundle, "built", start)
+
+
+def _result(asset: Path, output: Path, bundle: Bundle, status: str, start: float) -> dict[str, Any]:
+    return {
+        "asset": str(asset),
         "output": str(output),
-        "asset_gaussians": len(asset),
-        "dropped": dropped,
+        "status": status,
+        "asset_gaussians": bundle.config["asset_gaussians"],
+        "dropped": bundle.config["dropped"],
         "gaussians": bundle.num_gaussians,
         "clusters": len(bundle.clusters),
         "levels": bundle.num_levels,
         "bytes": output.stat().st_size,
         "seconds": time.perf_counter() - start,
     }
-    text = (
-        f"{output}: {bundle.num_levels} levels, {len(bundle.clusters):,} clusters, "
-        f"{bundle.num_gaussians:,} gaussians ({len(asset):,} in the asset), "
-        f"{bytes_text(output.stat().st_size)}, {result['seconds']:.1f} s"
-    )
-    if dropped:
-        text += "\nleft out: " + describe(dropped)
-    print_result(options.json, result, lambda: text)
+
+
+def _config(options: Build) -> BuildConfig:
+    from v3dg.build import BuildConfig
+
+    config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
+    return config if options.cluster_size is None else replace(config, cluster_size=options.cluster_size)
+
+
+def _is_current(output: Path, asset: Path, config: BuildConfig, seed: int) -> bool:
+    """Whether the bundle is there, was made with these settings, and the asset has not changed since."""
+    from v3dg.bundle import Bundle
+
+    if not output.is_file() or output.stat().st_mtime_ns < asset.stat().st_mtime_ns:
+        return False
+    try:
+        made_with = Bundle.open(output).config
+    except ValueError:  # damaged, or of another version: build it again
+        return False
+    is_ours = made_with.keys() >= {"build", "seed", "asset_gaussians", "dropped"}
+    return is_ours and made_with["build"] == asdict(config) and made_with["seed"] == seed
 
 
 def _to_resume(partial: Path) -> str:
     return f"; `--resume` continues from {partial}" if partial.exists() else ""
+
+
+def _text(result: dict[str, Any]) -> str:
+    from v3dg.cleaning import describe
+
+    text = (
+        f"{result['output']}: {result['levels']} levels, {result['clusters']:,} clusters, "
+        f"{result['gaussians']:,} gaussians ({result['asset_gaussians']:,} in the asset), "
+        f"{bytes_text(result['bytes'])}, "
+    )
+    text += "kept as it was" if result["status"] == "kept" else f"{result['seconds']:.1f} s"
+    return text + ("\nleft out: " + describe(result["dropped"]) if result["dropped"] else "")
+
+
+def _rows(results: list[dict[str, Any]]) -> list[tuple[str, ...]]:
+    return [
+        (r["asset"], "failed", "-", "-", "-", "-", "-")
+        if r["status"] == "failed"
+        else (
+            r["asset"],
+            r["status"],
+            str(r["levels"]),
+            f"{r['gaussians']:,}",
+            f"{sum(r['dropped'].values()):,}",
+            bytes_text(r["bytes"]),
+            f"{r['seconds']:.1f} s",
+        )
+        for r in results
+    ]

@@ -1,0 +1,104 @@
+import json
+import os
+import signal
+import subprocess
+import time
+
+import pytest
+
+import v3dg
+from command_line import COMMAND, ENVIRONMENT, fails, run
+from v3dg.procedural import make_asset
+
+FAST = ("--quiet", "--cluster-size", 64)
+
+
+def tiny(seed=0):
+    return make_asset(1000, seed=seed).subset(slice(300))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Three assets, one of which cannot be read, and a file that is no asset."""
+    for name in ("a", "c"):
+        v3dg.save(tmp_path / f"{name}.ply", tiny(ord(name)))
+    (tmp_path / "b.ply").write_bytes(b"ply\n")
+    (tmp_path / "notes.txt").write_text("not an asset")
+    return tmp_path
+
+
+def test_one_that_fails_does_not_stop_the_others(folder):
+    done = run("build", ".", *FAST, "--json", cwd=folder)
+    assert done.returncode == 1
+    assert done.stderr.startswith("v3dg: error: 1 of 3 assets failed: b.ply: ")
+    assert done.stderr.count("\n") == 1
+    result = json.loads(done.stdout)
+    assert [(r["asset"], r["status"]) for r in result["assets"]] == [
+        ("a.ply", "built"),
+        ("b.ply", "failed"),
+        ("c.ply", "built"),
+    ]
+    assert "b.ply" in result["assets"][1]["error"]
+    assert (result["built"], result["kept"], result["failed"]) == (2, 0, 1)
+    assert sorted(os.listdir(folder)) == ["a.ply", "a.v3dg", "b.ply", "c.ply", "c.v3dg", "notes.txt"]
+
+
+def test_bundles_go_to_the_output_folder_and_are_those_of_single_builds(folder):
+    (folder / "b.ply").unlink()
+    done = run("build", "a.ply", "c.ply", "-o", "new/out", *FAST, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1].startswith("2 built, 0 kept, 0 failed, ")
+    assert sorted(os.listdir(folder / "new" / "out")) == ["a.v3dg", "c.v3dg"]
+    assert run("build", "c.ply", *FAST, cwd=folder).returncode == 0
+    assert (folder / "c.v3dg").read_bytes() == (folder / "new" / "out" / "c.v3dg").read_bytes()
+
+
+def test_resume_keeps_what_is_done_with_these_settings(folder):
+    (folder / "b.ply").unlink()
+
+    def statuses(*options):
+        done = run("build", ".", *FAST, "--resume", "--json", *options, cwd=folder)
+        assert done.returncode == 0, done.stderr
+        return [r["status"] for r in json.loads(done.stdout)["assets"]]
+
+    assert statuses() == ["built", "built"]
+    assert statuses() == ["kept", "kept"]
+    assert statuses("--seed", 1) == ["built", "built"]
+    soon = time.time_ns() + 10**9
+    os.utime(folder / "a.ply", ns=(soon, soon))  # the asset has changed since
+    (folder / "c.v3dg").write_bytes(b"cut off")
+    assert statuses("--seed", 1) == ["built", "built"]
+
+
+def test_an_interrupt_says_how_far_it_got(folder):
+    (folder / "b.ply").unlink()
+    v3dg.save(folder / "b.ply", make_asset(60_000))
+    process = subprocess.Popen(
+        [*COMMAND, "build", ".", "--cluster-size", "64"],
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        env=ENVIRONMENT,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    lines = iter(process.stderr.readline, "")
+    assert any(line.startswith("[2/3] b.ply") for line in lines)
+    time.sleep(1)
+    process.send_signal(signal.SIGINT)
+    _, rest = process.communicate(timeout=60)
+    assert process.returncode == 130
+    message = "v3dg: error: interrupted with 1 of 3 assets done; `--resume` continues"
+    assert rest.splitlines()[-1] == message
+    assert (folder / "a.v3dg").exists()
+    assert not (folder / "b.v3dg").exists()
+
+
+def test_errors_before_anything_is_built(folder):
+    fails(2, "PATH: expected an asset", "build", cwd=folder)
+    fails(2, "expected a folder for the bundles", "build", ".", "-o", "all.v3dg", cwd=folder)
+    (folder / "empty").mkdir()
+    fails(1, "empty: expected a folder with assets (.ply", "build", "empty", cwd=folder)
+    v3dg.save(folder / "empty" / "a.ply", tiny())
+    message = "out/a.v3dg: expected one asset for it, got a.ply and empty/a.ply"
+    (folder / "out").mkdir()
+    fails(1, message, "build", "a.ply", "empty", "-o", "out", cwd=folder)
