@@ -1,6 +1,8 @@
 import json
 import os
 import resource
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,29 +13,9 @@ import pytest
 from PIL import Image
 
 import v3dg
+from command_line import COMMAND, ENVIRONMENT, fails, run
 from v3dg import cli
 from v3dg.procedural import make_asset
-
-# The package under test, wherever the command starts.
-ENVIRONMENT = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
-COMMAND = [sys.executable, "-m", "v3dg"]
-
-
-def run(*arguments, cwd=None):
-    command = [*COMMAND, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=ENVIRONMENT)
-
-
-def fails(code, message, *arguments, cwd):
-    """Runs a command that must fail with one line on stderr, an exit code and nothing new in the folder."""
-    before = sorted(os.listdir(cwd))
-    done = run(*arguments, cwd=cwd)
-    assert done.returncode == code, done.stderr
-    assert done.stdout == ""
-    assert done.stderr.startswith("v3dg: error: ")
-    assert done.stderr.count("\n") == 1
-    assert message in done.stderr
-    assert sorted(os.listdir(cwd)) == before
 
 
 @pytest.fixture(scope="module")
@@ -72,12 +54,34 @@ def test_version():
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--help"], ["build", "--help"], ["demo", "--help"], ["world", "--help"]]
+    "command", ["build", "info", "render", "compare", "world", "demo", "bench", "completion"]
 )
-def test_help(arguments):
-    done = run(*arguments)
+def test_help(command):
+    done = run(command, "--help")
     assert done.returncode == 0
-    assert "usage: v3dg" in done.stdout
+    assert f"usage: v3dg {command}" in done.stdout
+    assert "(default: None)" not in done.stdout
+    assert command in run("--help").stdout
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_a_script_that_knows_commands_and_options(shell):
+    done = run("completion", shell)
+    assert done.returncode == 0, done.stderr
+    assert "compare" in done.stdout
+    assert "tolerance" in done.stdout
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_bash_completes_what_the_script_says():
+    typed = f"""
+        eval "$({shlex.join(COMMAND)} completion bash)"
+        COMP_WORDS=(v3dg ren) COMP_CWORD=1; _tyro_v3dg; echo "${{COMPREPLY[@]}}"
+        COMP_WORDS=(v3dg render --tol) COMP_CWORD=2; _tyro_v3dg; echo "${{COMPREPLY[@]}}"
+    """
+    done = subprocess.run(["bash", "-c", typed], capture_output=True, text=True, env=ENVIRONMENT)
+    assert done.stderr == ""
+    assert done.stdout.split() == ["render", "--tolerance"]
 
 
 def test_module_runs_too():

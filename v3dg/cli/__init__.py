@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import tyro
 
 from v3dg._version import __version__
-from v3dg.cli import bench, build, demo, info, render, world
+from v3dg.cli import bench, build, compare, completion, demo, info, render, world
 from v3dg.cli._common import FAILURES, UsageError, failure_text
 
 # Options and what runs on them, by the command's name, in the order of the help.
@@ -26,9 +26,11 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], None]]] = {
     "build": (build.Build, build.run),
     "info": (info.Info, info.run),
     "render": (render.Render, render.run),
+    "compare": (compare.Compare, compare.run),
     "world": (world.World, world.run),
     "demo": (demo.Demo, demo.run),
     "bench": (bench.Bench, bench.run),
+    "completion": (completion.Completion, completion.run),
 }
 
 _DESCRIPTION = """\

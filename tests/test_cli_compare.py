@@ -1,0 +1,130 @@
+import json
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import v3dg
+from command_line import fails, run
+from v3dg import metrics
+from v3dg.pictures import write_picture
+from v3dg.procedural import make_asset
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """An asset, its bundle, and a scene of it with one near and one far camera."""
+    folder = tmp_path_factory.mktemp("compare")
+    asset = make_asset(1000)
+    v3dg.save(folder / "tuft.ply", asset)
+    bundle = v3dg.build_bundle(asset, config=v3dg.BuildConfig(steps=20), progress=False, device="cpu")
+    bundle.save(folder / "tuft.v3dg")
+    scene = v3dg.Scene()
+    scene.add(bundle, positions=[[0, 0, 0]])
+    cameras = {
+        name: v3dg.Camera.look_at((0, -distance, 1), (0, 0, 0.4), width=64, height=48)
+        for name, distance in (("near", 4), ("far", 20))
+    }
+    v3dg.write_scene(folder / "scene.json", scene, ["tuft.v3dg"], cameras)
+    return folder
+
+
+def compare(folder, *arguments):
+    done = run("compare", *arguments, "--quiet", "--json", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_an_asset_and_itself_are_equal(folder, tmp_path):
+    options = ("--views", 2, "--size", 64, 48, "-o", tmp_path / "c.png")
+    result = compare(folder, "tuft.ply", "tuft.ply", *options)
+    assert [view["camera"] for view in result["views"]] == ["0", "1"]
+    for numbers in (*result["views"], result["mean"]):
+        assert (numbers["flip"], numbers["psnr"], numbers["ssim"]) == (0, None, 1)
+
+
+def test_error_grows_with_the_tolerance_and_shrinks_the_cut(folder, tmp_path):
+    def mean(tolerance):
+        options = ("--views", 2, "--size", 64, 48, "-o", tmp_path / "c.png", "--tolerance", tolerance)
+        return compare(folder, "tuft.ply", "tuft.v3dg", *options)["mean"]
+
+    fine, coarse = mean(10), mean(300)
+    assert 0 < fine["flip"] < coarse["flip"]
+    assert fine["psnr"] > coarse["psnr"]
+    assert fine["ssim"] > coarse["ssim"]
+    assert fine["gaussians_selected"] > coarse["gaussians_selected"] > 0
+
+
+def test_a_scene_is_compared_from_its_own_cameras(folder, tmp_path):
+    result = compare(
+        folder, "scene.json", "scene.json", "--budget", 300, "--pictures", "all", "-o", tmp_path / "c.png"
+    )
+    assert [view["camera"] for view in result["views"]] == ["near", "far"]
+    assert all(0 < view["gaussians_selected"] <= 300 for view in result["views"])
+    assert sorted(os.listdir(tmp_path)) == ["c_far.png", "c_near.png"]
+    assert result["worst"] == max(result["views"], key=lambda view: view["flip"])["camera"]
+
+
+def test_the_scene_gives_the_cameras_whichever_it_is(folder, tmp_path):
+    result = compare(
+        folder, "tuft.ply", "scene.json", "--camera", "near", "--tolerance", 0, "-o", tmp_path / "c.png"
+    )
+    assert [view["camera"] for view in result["views"]] == ["near"]
+    assert result["mean"]["flip"] < 1e-3
+
+
+def test_supersampling_the_reference_shows_aliasing(folder, tmp_path):
+    options = ("--camera", "far", "--tolerance", 0, "-o", tmp_path / "c.png", "--supersample")
+    once, thrice = (compare(folder, "scene.json", "scene.json", *options, n)["mean"] for n in (1, 3))
+    assert once["flip"] == 0
+    assert thrice["flip"] > 0
+
+
+def test_two_pictures(folder, tmp_path):
+    rng = np.random.default_rng(1)
+    reference = rng.random((40, 60, 3))
+    write_picture(tmp_path / "a.png", reference)
+    write_picture(tmp_path / "b.png", reference * 0.8)
+    result = compare(tmp_path, "a.png", "b.png")
+    eight_bit = [np.asarray(Image.open(tmp_path / f"{name}.png")) / 255 for name in "ab"]
+    assert result["mean"]["psnr"] == pytest.approx(metrics.psnr(*eight_bit), rel=1e-4)
+    assert result["mean"]["ssim"] == pytest.approx(metrics.ssim(*eight_bit), rel=1e-4)
+    assert result["mean"]["flip"] == pytest.approx(metrics.flip(*eight_bit), rel=1e-3)
+    with Image.open(tmp_path / "compare.png") as sheet:
+        left = np.asarray(sheet)
+    shown = np.asarray(Image.open(tmp_path / "a.png"))
+    assert any((left[top : top + 40, 6:66] == shown).all() for top in range(left.shape[0] - 40)), (
+        "the reference is shown as it is"
+    )
+
+
+def test_text_names_the_view_that_differs_most(folder, tmp_path):
+    done = run(
+        "compare",
+        "scene.json",
+        "scene.json",
+        "--tolerance",
+        30,
+        "-o",
+        tmp_path / "c.png",
+        "--quiet",
+        cwd=folder,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0].split() == ["view", "FLIP", "PSNR", "SSIM", "gaussians"]
+    assert [line.split()[0] for line in lines[1:4]] == ["near", "far", "mean"]
+    assert "which differs most" in lines[-1]
+
+
+def test_errors(folder, tmp_path):
+    write_picture(tmp_path / "a.png", np.zeros((8, 8, 3)))
+    write_picture(tmp_path / "b.png", np.zeros((8, 9, 3)))
+    fails(2, "got one of each", "compare", tmp_path / "a.png", "tuft.ply", cwd=folder)
+    fails(1, "b.png: expected 8 x 8 px", "compare", "a.png", "b.png", cwd=tmp_path)
+    fails(1, "nowhere.ply", "compare", "nowhere.ply", "tuft.v3dg", cwd=folder)
+    fails(1, "c.gif", "compare", "tuft.ply", "tuft.v3dg", "-o", "c.gif", cwd=folder)
+    fails(2, "--supersample", "compare", "tuft.ply", "tuft.ply", "--supersample", 0, cwd=folder)
+    (tmp_path / "c.png").write_bytes(b"not a picture")
+    fails(1, "c.png", "compare", "a.png", "c.png", cwd=tmp_path)

@@ -1,0 +1,206 @@
+"""`v3dg compare`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from v3dg.cli._common import (
+    Flag,
+    Threads,
+    UsageError,
+    option,
+    print_result,
+    require_subject,
+    table_lines,
+)
+from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_path
+from v3dg.pictures import SUFFIXES as PICTURE_SUFFIXES
+
+if TYPE_CHECKING:
+    from v3dg.bench.measure import Picture
+
+
+@dataclass
+class Compare:
+    """Draw two subjects from the same cameras, or take two pictures, and measure how far apart they look."""
+
+    reference: tyro.conf.Positional[Path]
+    """An asset, a bundle (.v3dg) or a scene (.json), to be drawn with all gaussians; or a picture (.png)."""
+    test: tyro.conf.Positional[Path]
+    """What to compare with it: any of those, or a picture of the same size."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("compare.png")
+    """Picture to write, .png or .jpg: reference, test and a map of FLIP, side by side."""
+    pictures: Literal["worst", "all"] = "worst"
+    """Show the view that differs most, or write a picture of every view."""
+    tolerance: Annotated[float | None, option("PX2")] = None
+    """Screen area in px² that one gaussian of the test's coarser clusters may stand for; 3 if not given."""
+    budget: Annotated[int | None, option("N")] = None
+    """Most gaussians of the test to draw in one picture."""
+    supersample: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Draw the reference so many times larger and average; 2 tells detail from aliasing."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to draw; auto is a CUDA device where there is one and torch can use it."""
+    threads: Threads = None
+    """CPU threads; all if not given."""
+    json: Flag = False
+    """Print the numbers as JSON."""
+    quiet: Flag = False
+    """Show no progress."""
+    view: Views = field(default_factory=lambda: ViewOptions(views=8))
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two pictures of one view."""
+
+    name: str
+    reference: Picture
+    test: Picture
+    gaussians: int | None  # of the test that were selected
+
+
+def run(options: Compare) -> None:
+    from tqdm import tqdm
+
+    from v3dg.bench.measure import mean_of
+    from v3dg.pictures import check_picture_path
+
+    output = check_picture_path(options.output)
+    are_pictures = [p.suffix.lower() in PICTURE_SUFFIXES for p in (options.reference, options.test)]
+    if any(are_pictures) and not all(are_pictures):
+        raise UsageError("PATH: expected two pictures, or two subjects to draw, got one of each")
+    count, pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
+    rows, worst = [], None
+    for pair in tqdm(pairs, total=count, unit="view", leave=False, disable=options.quiet):
+        row = {"camera": pair.name, **_errors(pair), "gaussians_selected": pair.gaussians}
+        if options.pictures == "all":
+            path = picture_path(output, pair.name, count)
+            _write(options, path, pair, row["flip"])
+            row["picture"] = str(path)
+        if worst is None or row["flip"] > worst[1]["flip"]:
+            worst = (pair, row)
+        rows.append(row)
+    assert worst is not None
+    if options.pictures == "worst":
+        _write(options, output, worst[0], worst[1]["flip"])
+        worst[1]["picture"] = str(output)
+    mean = mean_of(rows, "flip", "psnr", "ssim", "gaussians_selected")
+    result = {
+        "reference": str(options.reference),
+        "test": str(options.test),
+        "mean": mean,
+        "worst": worst[1]["camera"],
+        "views": rows,
+    }
+    table = [_cells(row) for row in rows]
+    if count > 1:
+        table.append(_cells({"camera": "mean", **mean}))
+    print_result(
+        options.json,
+        result,
+        lambda: "\n".join(
+            [
+                *table_lines(("view", "FLIP", "PSNR", "SSIM", "gaussians"), table),
+                "",
+                f"{worst[1]['picture']}: reference, test and FLIP of view {worst[1]['camera']}, "
+                "which differs most",
+            ]
+        ),
+    )
+
+
+def _read_pictures(options: Compare) -> tuple[int, Iterator[_Pair]]:
+    import numpy as np
+    from PIL import Image
+
+    def read(path: Path) -> Picture:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+
+    reference, test = read(options.reference), read(options.test)
+    if reference.shape != test.shape:
+        (height, width, _), (test_height, test_width, _) = reference.shape, test.shape
+        raise ValueError(
+            f"{options.test}: expected {width} x {height} px like {options.reference}, "
+            f"got {test_width} x {test_height}"
+        )
+    return 1, iter([_Pair(options.test.stem, reference, test, None)])
+
+
+def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
+    """How many views there are, and pictures of one after the other."""
+    for path in (options.reference, options.test):
+        require_subject(path)
+    options.view.check(options.reference, options.test)
+    if options.supersample < 1:
+        raise UsageError(f"--supersample: expected at least 1, got {options.supersample}")
+    from v3dg import _device
+    from v3dg.bench.measure import as_picture, draw_truth
+    from v3dg.render import render
+
+    device = _device.resolve(options.device)
+    reference, reference_cameras = load_subject(options.reference)
+    test, test_cameras = load_subject(options.test)
+    own, path = reference_cameras, options.reference
+    if own is None and test_cameras is not None:
+        own, path = test_cameras, options.test
+    cameras = choose_cameras(options.view, path, reference, own)
+
+    def pairs() -> Iterator[_Pair]:
+        for name, camera in cameras.items():
+            truth = draw_truth(reference, camera, device, options.supersample)
+            image = render(test, camera, tolerance=options.tolerance, budget=options.budget, device=device)
+            yield _Pair(name, truth, as_picture(image.color), image.stats.gaussians_selected)
+
+    return len(cameras), pairs()
+
+
+def _errors(pair: _Pair) -> dict[str, float | None]:
+    """FLIP, PSNR (None for equal pictures) and SSIM of what a screen shows."""
+    from v3dg import metrics
+
+    shown = _shown(pair)
+    psnr = metrics.psnr(*shown)
+    return {
+        "flip": metrics.flip(*shown),
+        "psnr": psnr if math.isfinite(psnr) else None,
+        "ssim": metrics.ssim(*shown),
+    }
+
+
+def _shown(pair: _Pair) -> list[Any]:
+    import numpy as np
+
+    return [picture.astype(np.float32) / np.float32(255) for picture in (pair.reference, pair.test)]
+
+
+def _write(options: Compare, path: Path, pair: _Pair, flip: float) -> None:
+    from v3dg import metrics
+    from v3dg.bench.sheet import sheet
+    from v3dg.pictures import to_8bit, write_picture
+
+    row = [
+        (options.reference.name, pair.reference),
+        (options.test.name, pair.test),
+        (f"FLIP {flip:.4f}", to_8bit(metrics.error_image(*_shown(pair)))),
+    ]
+    write_picture(path, sheet([row]))
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    def text(name: str, form: str) -> str:
+        return "-" if row[name] is None else format(row[name], form)
+
+    return (
+        row["camera"],
+        text("flip", ".4f"),
+        text("psnr", ".2f"),
+        text("ssim", ".4f"),
+        text("gaussians_selected", ",.0f"),
+    )
