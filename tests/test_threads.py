@@ -15,30 +15,30 @@ import pytest
 import scenes
 import scenes_lod
 import v3dg
+from devices import host
 
 CAMERA = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
 SECONDS = 120  # more than any of this takes, on a machine that has more to do
 
 
 def digest(*arrays):
-    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
+    return hashlib.sha256(b"".join(np.ascontiguousarray(host(a)).tobytes() for a in arrays)).hexdigest()
 
 
 def asset(seed=20, num=3000):
     return scenes.trained_like(seed, CAMERA, num)
 
 
-def picture(gaussians):
-    raster = v3dg.rasterize(gaussians, CAMERA, filter_px2=0.1)
+def picture(gaussians, device="cpu"):
+    raster = v3dg.rasterize(gaussians if device == "cpu" else gaussians.torch(device), CAMERA, filter_px2=0.1)
     return digest(raster.color, raster.alpha, raster.depth)
 
 
-def gradient(gaussians):
-
-    g = gaussians.torch()
+def gradient(gaussians, device="cpu"):
+    g = gaussians.torch(device)
     g.means.requires_grad_()
     v3dg.rasterize(g, CAMERA, filter_px2=0.1).color.square().sum().backward()
-    return digest(g.means.grad.numpy())
+    return digest(g.means.grad)
 
 
 def crowd(seed=0):
@@ -47,15 +47,21 @@ def crowd(seed=0):
     return scenes_lod.random_scene(rng, bundle, 40, spread=3.0)
 
 
-def frame(scene):
+def frame(scene, device="cpu"):
     camera = v3dg.Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
-    image = v3dg.render(scene, camera, tolerance=1.0)
+    image = v3dg.render(scene, camera, tolerance=1.0, device=device)
     return digest(image.color, image.alpha, image.depth)
 
 
-def bundle_of(gaussians):
+def frame_and_cut(scene, device):
+    """Both use what is kept of a scene."""
+    cut = v3dg.select(scene, CAMERA, tolerance=2.0, device=device)
+    return frame(scene, device), digest(cut.instance_ids, cut.cluster_ids)
+
+
+def bundle_of(gaussians, device="cpu"):
     config = v3dg.BuildConfig(cluster_size=64, steps=3, num_views=4, image_size=16)
-    bundle = v3dg.build_bundle(gaussians, config=config, device="cpu", progress=False)
+    bundle = v3dg.build_bundle(gaussians, config=config, device=device, progress=False)
     return digest(bundle.gaussians.means, bundle.gaussians.sh, bundle.groups.ball)
 
 
@@ -67,32 +73,47 @@ def bundle_of(gaussians):
     [
         (picture, [asset(seed) for seed in range(3)]),
         (gradient, [asset(seed) for seed in range(3)]),
-        (frame, [crowd(seed) for seed in range(3)]),
+        (frame_and_cut, [crowd(seed) for seed in range(3)]),
         (bundle_of, [asset(seed, 300) for seed in range(3)]),
     ],
     ids=["rasterize", "backward", "render", "build"],
 )
-def test_threads_get_what_one_gets_alone(work, subjects):
+def test_threads_get_what_one_gets_alone(work, subjects, device):
     if work is gradient:
         pytest.importorskip("torch")
-    alone = [work(subject) for subject in subjects]
+    alone = [work(subject, device) for subject in subjects]
     with ThreadPoolExecutor(8) as pool:
-        jobs = [pool.submit(work, subjects[i % 3]) for i in range(24)]
+        jobs = [pool.submit(work, subjects[i % 3], device) for i in range(24)]
         together = [job.result(SECONDS) for job in jobs]
     assert together == [alone[i % 3] for i in range(24)]
 
 
-def test_threads_may_draw_a_bundle_that_was_never_drawn():
+def test_threads_may_draw_a_bundle_that_was_never_drawn(device):
     """What is kept of a bundle is made when it is first drawn, by all of them at once."""
-    expected = frame(crowd(3))
+    expected = frame(crowd(3), device)
     scene, start = crowd(3), threading.Barrier(8)
 
     def draw(_):
         start.wait(SECONDS)
-        return frame(scene)
+        return frame(scene, device)
 
     with ThreadPoolExecutor(8) as pool:
         assert set(pool.map(draw, range(8))) == {expected}
+
+
+@pytest.mark.gpu
+def test_streams_of_several_threads_get_what_one_gets_alone():
+    torch = pytest.importorskip("torch")
+    scene = crowd(4)
+    expected = frame_and_cut(scene, "cuda")
+
+    def on_a_stream_of_its_own(_):
+        with torch.cuda.stream(torch.cuda.Stream()):
+            return [frame_and_cut(scene, "cuda") for _ in range(10)]
+
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(on_a_stream_of_its_own, range(4)):
+            assert found == 10 * [expected]
 
 
 READING = {"ply_read", "ply_write"}

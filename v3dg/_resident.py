@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import threading
 import weakref
 from typing import Any
 
@@ -17,7 +18,6 @@ class ResidentScene:
     Attributes:
         core: The compiled module's part.
         num_bundles: How many of the scene's bundles are there.
-        drawings: Frames that may be under way.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -28,7 +28,8 @@ class ResidentScene:
             for table, bundle in zip(scene.tables, scene.bundles, strict=True)
         ]
         self.core = _core.DeviceScene(tables, _device.current_stream())
-        self.drawings: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._drawings: weakref.WeakSet[Any] = weakref.WeakSet()  # that may be under way
+        self._lock = threading.Lock()  # of that set
         self._poses: tuple[Any, Any, Any] | None = None
         self._seen = (-1, -1)
 
@@ -39,9 +40,7 @@ class ResidentScene:
         """
         if self._seen == (scene.num_changes, scene.num_moves):
             return
-        for drawing in self.drawings:
-            drawing.finish()
-        self.drawings.clear()
+        self._finish_drawings()
         stream = _device.current_stream()
         if self._seen[0] != scene.num_changes:
             self.core.set_instances(scene.instance_bundle, scene.importance, stream)
@@ -50,6 +49,18 @@ class ResidentScene:
         self._poses = (positions, quaternions, scales)
         self.core.set_poses(positions, quaternions, scales, stream)
         self._seen = (scene.num_changes, scene.num_moves)
+
+    def add_drawing(self, drawing: Any) -> None:
+        """Remember a frame that may be under way."""
+        with self._lock:
+            self._drawings.add(drawing)
+
+    def _finish_drawings(self) -> None:
+        with self._lock:
+            under_way = list(self._drawings)
+            self._drawings.clear()
+        for drawing in under_way:
+            drawing.finish()
 
     def _here(self, rows: Any) -> Any:
         is_elsewhere = getattr(rows, "is_cuda", False) and rows.device.index != self.device

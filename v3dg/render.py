@@ -276,7 +276,7 @@ class _Drawer:
             selection = _checked(cut, subject, **options)
             pairs = (_uploaded(selection.instance_ids), _uploaded(selection.cluster_ids))
             drawing = self._frame.draw_cut(scene, camera_of(camera), *pairs, shade, picture, stream)
-        resident.drawings.add(drawing)
+        resident.add_drawing(drawing)
 
         def finish() -> Stats:
             counts = drawing.finish()

@@ -74,6 +74,31 @@ void release(void* pointer, cudaStream_t stream) noexcept {
     if (pointer != nullptr && cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
 }
 
+bool is_capturing(cudaStream_t stream) {
+    cudaStreamCaptureStatus status;
+    check(cudaStreamIsCapturing(stream, &status), "cudaStreamIsCapturing");
+    return status != cudaStreamCaptureStatusNone;
+}
+
+Turns::Turns() { check(cudaEventCreateWithFlags(&done_, cudaEventDisableTiming), "cudaEventCreate"); }
+
+Turns::~Turns() {
+    if (cudaEventDestroy(done_) != cudaSuccess) cudaGetLastError();  // at exit the driver may be gone
+}
+
+Turn::Turn(Turns& turns, cudaStream_t stream)
+    : lock_(turns.busy_), turns_(turns), stream_(stream), is_captured_(is_capturing(stream)) {
+    if (!is_captured_ && stream != turns.last_)
+        check(cudaStreamWaitEvent(stream, turns.done_, 0), "cudaStreamWaitEvent");
+}
+
+Turn::~Turn() {
+    if (is_captured_) return;
+    turns_.last_ = stream_;
+    if (cudaEventRecord(turns_.done_, stream_) != cudaSuccess)
+        cudaGetLastError();  // the next turn will see it
+}
+
 void trim_pool(cudaStream_t stream) {
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
     check(cudaMemPoolTrimTo(pool_of_current_device(), 0), "cudaMemPoolTrimTo");

@@ -4,6 +4,7 @@
 
 #include <cuda_runtime.h>
 
+#include <mutex>
 #include <new>
 #include <stdexcept>
 #include <string>
@@ -37,6 +38,39 @@ void* allocate(size_t bytes, cudaStream_t stream);
 void release(void* pointer, cudaStream_t stream) noexcept;
 // Waits for the stream, and returns to the driver what the pool keeps.
 void trim_pool(cudaStream_t stream);
+
+bool is_capturing(cudaStream_t stream);
+
+// Memory that several threads and streams use, one after the other.
+class Turns {
+  public:
+    Turns();
+    ~Turns();
+    Turns(const Turns&) = delete;
+    Turns& operator=(const Turns&) = delete;
+
+  private:
+    friend class Turn;
+    std::mutex busy_;
+    cudaEvent_t done_ = nullptr;
+    cudaStream_t last_ = nullptr;
+};
+
+// While it lives, the memory is one thread's, and what that enqueues on the stream runs after the turn
+// before. What a graph captures is not ordered so: whoever replays it does that.
+class Turn {
+  public:
+    Turn(Turns& turns, cudaStream_t stream);
+    ~Turn();
+    Turn(const Turn&) = delete;
+    Turn& operator=(const Turn&) = delete;
+
+  private:
+    const std::lock_guard<std::mutex> lock_;
+    Turns& turns_;
+    cudaStream_t stream_;
+    bool is_captured_;
+};
 
 // Owned elements of a plain type on the device, not initialised. Grows by forgetting what it held. Whoever
 // uses it on several streams orders them.

@@ -36,24 +36,15 @@ struct Frame::Slot {
     }
 };
 
-static bool is_capturing(cudaStream_t stream) {
-    cudaStreamCaptureStatus status;
-    check(cudaStreamIsCapturing(stream, &status), "cudaStreamIsCapturing");
-    return status != cudaStreamCaptureStatusNone;
-}
-
 // So many frames can be in flight, or be captured, without a new slot.
 constexpr size_t kSlots = 8;
 
 Frame::Frame(Keeps keeps) : keeps_(keeps) {
     for (size_t i = 0; i < kSlots; ++i) slots_.push_back(std::make_unique<Slot>());
     for (const auto& slot : slots_) free_slots_.push_back(slot.get());
-    check(cudaEventCreateWithFlags(&last_done_, cudaEventDisableTiming), "cudaEventCreate");
 }
 
-Frame::~Frame() {
-    if (cudaEventDestroy(last_done_) != cudaSuccess) cudaGetLastError();
-}
+Frame::~Frame() = default;
 
 template <class T>
 T* Frame::room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing) {
@@ -130,8 +121,7 @@ void Frame::enqueue(Drawing& drawing) {
     const Slot& slot = *drawing.slot_;
     const bool capturing = drawing.is_captured_;
     const Capacity& capacity = drawing.capacity_ = capacity_;
-    if (!capturing && stream != last_stream_)
-        check(cudaStreamWaitEvent(stream, last_done_, 0), "cudaStreamWaitEvent");
+    const Turn turn(turns_, stream);
 
     const size_t parts = tile_bin_parts(batch.num_tiles);
     const size_t cleared_bytes =
@@ -190,10 +180,7 @@ void Frame::enqueue(Drawing& drawing) {
     }
     rasterize(lists, keeps_tape ? &tape : nullptr, stream);
     if (!keeps_tape) report();
-    if (!capturing) {
-        check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
-        check(cudaEventRecord(last_done_, stream), "cudaEventRecord");
-    }
+    if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
 }

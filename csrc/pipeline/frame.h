@@ -102,7 +102,7 @@ class Frame {
     Drawing* last_ = nullptr;
     FrameBatch last_batch_{};
     cudaStream_t last_stream_ = nullptr;
-    cudaEvent_t last_done_ = nullptr;
+    Turns turns_;
 };
 
 // A frame that has been enqueued. The Frame must outlive it.

@@ -619,6 +619,7 @@ SceneTables::SceneTables(Span<const ClusterTable> tables, Span<const ClusterFilt
 
 void SceneTables::set_instances(Span<const int32_t> bundle, Span<const float> importance,
                                 cudaStream_t stream) {
+    const Turn turn(turns_, stream);
     const size_t count = bundle.size;
     num_instances_ = count;
     most_parts_ = 0;
@@ -633,6 +634,7 @@ void SceneTables::set_instances(Span<const int32_t> bundle, Span<const float> im
 
 void SceneTables::set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
                             cudaStream_t stream) {
+    const Turn turn(turns_, stream);
     const auto take = [&](const PoseSpan& from, int k) {
         return from.is_on_device ? from.values.data : uploaded_[k].copy_from(from.values, stream);
     };
@@ -686,12 +688,14 @@ void SceneTables::cut(const SelectCamera& camera, const SelectRule& rule, const 
 void SceneTables::cut_items(const SelectCamera& camera, const SelectRule& rule, const FrameImage& image,
                             FrameImage* images, Placement* placements, const ItemList& items,
                             cudaStream_t stream) {
+    const Turn turn(turns_, stream);
     cut(camera, rule, &image, images, placements, &items.counters->choice, ItemOutput{items}, stream);
 }
 
 void SceneTables::given_items(const SelectCamera& camera, Span<const int32_t> instance,
                               Span<const int32_t> cluster, const FrameImage& image, FrameImage* images,
                               Placement* placements, const ItemList& items, cudaStream_t stream) {
+    const Turn turn(turns_, stream);
     const SceneOnDevice scene{bundles_.data(), instances(), nullptr, nullptr, nullptr};
     const unsigned blocks = std::max(1u, blocks_for(instance.size, kCutThreads));
     const size_t words = scratch_words(0, blocks);
@@ -705,6 +709,7 @@ void SceneTables::given_items(const SelectCamera& camera, Span<const int32_t> in
 
 void SceneTables::select(const SelectCamera& camera, const SelectRule& rule, SelectOutput& out,
                          cudaStream_t stream) {
+    const Turn turn(turns_, stream);
     Pairs* on_device = pairs_.reserve(1, stream);
     Pairs counts{};
     // Most cuts of most scenes fit at once.

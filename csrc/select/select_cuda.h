@@ -33,7 +33,7 @@ struct CutPart;
 struct BudgetState;
 
 // A scene's instances and the tables of its bundles, resident on the device, and the cut of one view.
-// Everything is enqueued on the stream that is passed; whoever uses several orders them.
+// Everything is enqueued on the stream that is passed. Several threads and streams take turns.
 class SceneTables {
   public:
     // Host memory may be reused on return.
@@ -70,6 +70,7 @@ class SceneTables {
              Placement* placements, CutChoice* choice, const Output& output, cudaStream_t stream);
     InstanceTable instances() const;
 
+    Turns turns_;
     size_t num_instances_ = 0, most_parts_ = 0;
     std::vector<size_t> num_clusters_;                  // of each bundle
     std::vector<DeviceBuffer<unsigned char>> storage_;  // what the spans of the tables point into
