@@ -1,64 +1,99 @@
-"""Reading and writing Gaussians by file suffix."""
+"""Reading and writing Gaussians by file name; a format is a module of v3dg.formats."""
 
 from __future__ import annotations
 
 import os
-from typing import Literal
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
-from v3dg import _core, _files
+from v3dg.formats import checkpoint, compressed_ply, ply, sog, splat, spz
+from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
-SUFFIXES = (".ply",)
+Path = str | os.PathLike[str]
+Format = TypeVar("Format", bound=Callable[..., Any])
+
+# By the end of a file's name. The first that fits counts.
+_READERS: dict[str, Callable[[Path], Gaussians]] = {
+    ".ply": ply.read,
+    ".splat": splat.read,
+    ".spz": spz.read,
+    ".sog": sog.read,
+    "meta.json": sog.read,
+    ".ckpt": checkpoint.read,
+    ".pt": checkpoint.read,
+}
+_WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
+    ".compressed.ply": compressed_ply.write,
+    ".ply": ply.write,
+    ".spz": spz.write,
+}
+
+SUFFIXES = tuple(_READERS)
 """How the names of files end that `load` reads."""
 
-PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
+SAVE_SUFFIXES = tuple(_WRITERS)
+"""How the names of files end that `save` writes."""
 
 
-def load(path: str | os.PathLike[str]) -> Gaussians:
-    """Read an asset from a 3DGS `.ply` file.
+def load(path: Path) -> Gaussians:
+    """Read an asset; the end of the file's name tells its kind (docs/formats.md):
 
-    The file may be ascii or binary of either byte order, with its properties in any order and of any scalar
-    type, among others that are ignored, for SH degree 0 to 3. Files hold log scales and logit opacities;
-    memory gets values, each computed in double precision and rounded once. Quaternions are normalised, except
-    those of length zero, which stay as they are. Values that are not finite are passed on.
-    Little more memory is needed than for the result.
+    - `.ply`, as trainers write it: ascii or binary of either byte order, its properties in any order and of
+      any scalar type, among others that are ignored, for SH degree 0 to 3. Files hold log scales and logit
+      opacities; memory gets values, each computed in double precision and rounded once. Quaternions are
+      normalised, except those of length zero, which stay as they are. Values that are not finite are passed
+      on. Little more memory is needed than for the result. A compressed `.ply`, of PlayCanvas and
+      SuperSplat, is told by its content.
+    - `.splat`, of antimatter15; `.spz`, of Niantic, version 1 to 4; `.sog` of PlayCanvas, version 2, or the
+      `meta.json` of one that is not in a zip.
+    - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto, from which nothing
+      but tensors is taken.
 
-    Raises:
-        ValueError: another suffix, or the content is not a 3DGS `.ply`; says what was expected and found.
-        OSError: the file cannot be opened or read (FileNotFoundError, IsADirectoryError, ...).
-    """
-    _check_suffix(path)
-    return Gaussians(*_core.ply_read(os.fspath(path)))
-
-
-def save(
-    path: str | os.PathLike[str],
-    gaussians: Gaussians,
-    *,
-    encoding: PlyEncoding = "binary_little_endian",
-) -> None:
-    """Write an asset to a 3DGS `.ply` file, replacing what is there in one step once all is written.
-
-    The layout is the original one without its normals, which are always zero: x y z, f_dc, f_rest (channel
-    by channel), opacity (logit), scale (log), rot. An opacity of 1 is written as logit 20 and of 0 as logit
-    -110, a scale of 0 as log -110: finite, and they read back as exactly 1, 0 and 0.
+    Coordinates are those of the file: no axes are turned.
 
     Raises:
-        ValueError: another suffix, an unknown encoding, a negative scale, or an opacity outside [0, 1].
-        OSError: the file cannot be written.
+        ValueError: Another name, or the content is not of its kind; says what was expected and found.
+        ImportError: The format needs a package that is missing; names it.
+        OSError: The file cannot be opened or read (FileNotFoundError, IsADirectoryError, ...).
     """
-    _check_suffix(path)
+    return _by_name(path, _READERS)(path)
+
+
+def save(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "binary_little_endian") -> None:
+    """Write an asset, replacing what is there in one step once all is written.
+
+    The end of the name tells the kind (docs/formats.md has what each loses):
+
+    - `.ply`: the original layout without its normals, which are always zero: x y z, f_dc, f_rest (channel by
+      channel), opacity (logit), scale (log), rot. An opacity of 1 is written as logit 20 and of 0 as logit
+      -110, a scale of 0 as log -110: finite, and they read back as exactly 1, 0 and 0.
+    - `.compressed.ply`: 16 bytes a gaussian and one a coefficient of higher SH. The order changes.
+    - `.spz`: version 3.
+
+    Args:
+        encoding: Of a `.ply`; the others have one only.
+
+    Raises:
+        ValueError: Another name, an unknown encoding, or values that the format cannot hold: a negative
+            scale, an opacity outside [0, 1]; in all but `.ply` also what is not finite, and quaternions of
+            length zero.
+        OSError: The file cannot be written.
+    """
     if not isinstance(gaussians, Gaussians):
         raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}")
-    host = gaussians.numpy()
-    with _files.replacing(path) as temporary:
-        _core.ply_write(
-            temporary, host.means, host.quats, host.scales, host.opacities, host.sh, encoding=encoding
-        )
+    write = _by_name(path, _WRITERS)
+    if write is ply.write:
+        ply.write(path, gaussians, encoding)
+    elif encoding == "binary_little_endian":
+        write(path, gaussians)
+    else:
+        raise ValueError(f"encoding: expected none for {os.fspath(path)}, which is no .ply, got {encoding!r}")
 
 
-def _check_suffix(path: str | os.PathLike[str]) -> None:
-    name = os.fspath(path)
-    if not name.lower().endswith(SUFFIXES):
-        suffix = os.path.splitext(name)[1]
-        raise ValueError(f"{name}: expected a file name that ends in {', '.join(SUFFIXES)}, got '{suffix}'")
+def _by_name(path: Path, formats: Mapping[str, Format]) -> Format:
+    name = os.path.basename(os.fspath(path)).lower()
+    for ending, function in formats.items():
+        if name.endswith(ending):
+            return function
+    raise ValueError(f"{os.fspath(path)}: expected a file name that ends in {', '.join(formats)}")

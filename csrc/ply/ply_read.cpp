@@ -64,9 +64,6 @@ std::string missing_text(const PlyElement& vertex, const std::vector<std::string
     if (vertex.properties.empty()) text += "none";
     if (vertex.properties.size() > kMaxNames)
         text += " and " + std::to_string(vertex.properties.size() - kMaxNames) + " more";
-    for (const PlyProperty& property : vertex.properties)
-        if (property.name == "packed_position")
-            return text + "; this is a compressed .ply, decompress it first";
     return text + (missing.size() < 4 ? "" : "; this is not a file of gaussians");
 }
 

@@ -1,0 +1,668 @@
+"""Files of other programs: what other people's tools wrote and read, and what a hostile file can do to us.
+
+Who wrote the fixtures, and how, is in fixtures/README.md.
+What all readers share is in test_malformed.py.
+"""
+
+import gzip
+import struct
+import sys
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from test_ply import random_gaussians
+from v3dg import Gaussians, load, save
+
+FIXTURES = Path(__file__).parent / "fixtures"
+SH_C0 = 0.28209479177387814
+
+# The most that a component of a unit quaternion changes by when three are stored with an error e: those by e,
+# the fourth, which is at least a half, by at most 3 * e * sqrt(1/2) / (1/2).
+QUAT = 3 * np.sqrt(2)
+
+
+def spz_bounds(sh_bits_1=8, sh_bits_rest=8):
+    return {
+        "means": 0.5 * 2**-12,  # 12 bits after the point
+        "log_scales": 0.5 / 16,  # sixteenths
+        "quats": QUAT * 0.5 * np.sqrt(0.5) / 511 * 1.01,  # 9 bits and a sign for up to sqrt(1/2)
+        "opacities": 0.5 / 255,
+        "color": 0.5 / 255 / 0.15,  # a byte for 1 / 0.15
+        # A byte for -1 to 1 whose lower bits may be dropped, to the nearest or, at its end, the last below.
+        "band 1": (0.5 * 2.0 ** (8 - sh_bits_1) + 1) / 128,
+        "higher": (0.5 * 2.0 ** (8 - sh_bits_rest) + 1) / 128,
+    }
+
+
+def compressed_ply_bounds(reference):
+    extent = np.ptp(reference.means, axis=0).max()
+    color = np.ptp(reference.sh[:, 0], axis=0).max()
+    return {
+        "means": extent * 0.5 / 1023,  # 10 bits of y, 11 of x and z, of the extent of a chunk
+        "log_scales": np.ptp(np.log(reference.scales)) * 0.5 / 1023,
+        "quats": QUAT * np.sqrt(2) * 0.5 / 1023 * 1.01,  # 10 bits for -sqrt(1/2) to sqrt(1/2)
+        "opacities": 0.5 / 255,
+        "color": color * 0.5 / 255,
+        "band 1": 0.5 * 8 / 256,  # a byte for -4 to 4
+        "higher": 0.5 * 8 / 256,
+    }
+
+
+def sog_bounds(reference):
+    logs = np.log1p(np.abs(reference.means))
+    # Of 256 values that are nearer to each other where there is more: none is further from its value than two
+    # steps of equal length.
+    step = 2 / 256
+    return {
+        # 16 bits, cut off, of sign(x) ln(1 + |x|), whose derivative is at least 1 / (1 + |x|).
+        "means": np.ptp(np.sign(reference.means) * logs, axis=0).max()
+        / 65535
+        * (1 + np.abs(reference.means).max()),
+        "log_scales": np.ptp(np.log(reference.scales)) * step,
+        "quats": QUAT * np.sqrt(2) / 255 * 1.02,  # a byte, cut off, for -sqrt(1/2) to sqrt(1/2)
+        "opacities": 1.001 / 255,  # cut off
+        "color": np.ptp(reference.sh[:, 0]) * step,
+        "band 1": np.ptp(reference.sh[:, 1:]) * step if reference.sh_degree else 0,
+        "higher": np.ptp(reference.sh[:, 1:]) * step if reference.sh_degree else 0,
+    }
+
+
+SPLAT_BOUNDS = {
+    "means": 0,
+    "log_scales": 1e-6,  # the writer's float32 exp
+    "quats": QUAT / 128,  # a byte, cut off, for -1 to 1
+    "opacities": 1.001 / 255,  # cut off
+    "color": 1.001 / 255 / SH_C0,  # cut off, of what is within black and white
+}
+
+# File, the asset that it was made of, its bounds; who wrote it is in fixtures/README.md.
+FOREIGN = {
+    "sh0.compressed.ply": compressed_ply_bounds,
+    "sh3.compressed.ply": compressed_ply_bounds,
+    "sh0.sog": sog_bounds,
+    "sh3.sog": sog_bounds,
+    "sog_folder/meta.json": sog_bounds,
+    "sh0_v3.spz": lambda _: spz_bounds(),
+    "sh3_v3.spz": lambda _: spz_bounds(5, 4),
+    "sh0_gaussforge.spz": lambda _: spz_bounds(),
+    "sh0_v4.spz": lambda _: spz_bounds(),
+    "sh3_v4.spz": lambda _: spz_bounds(5, 4),
+    "sh3_gsply_v4.spz": lambda _: spz_bounds(),
+    "sh0_gaussforge.splat": lambda _: SPLAT_BOUNDS,
+}
+
+
+def reference_of(name):
+    return load(FIXTURES / ("sh3.ply" if "sh3" in name else "sh0.ply"))
+
+
+def in_order_of(reference, gaussians):
+    """The gaussians, each at the place of the reference's that is nearest to it."""
+    squared = np.square(reference.means[:, None].astype(float) - gaussians.means).sum(axis=2)
+    nearest = squared.argmin(axis=1)
+    assert len(set(nearest)) == len(reference) == len(gaussians)
+    return gaussians.subset(nearest)
+
+
+def unit(quats):
+    return quats / np.linalg.norm(quats.astype(float), axis=1, keepdims=True)
+
+
+def largest_errors(gaussians, reference):
+    found, wanted = gaussians, reference
+    turned = [np.abs(unit(found.quats) - sign * unit(wanted.quats)).max(axis=1) for sign in (1, -1)]
+    parts = {"color": slice(0, 1), "band 1": slice(1, 4), "higher": slice(4, 16)}
+    return {
+        "means": np.abs(found.means - wanted.means.astype(float)).max(initial=0),
+        "log_scales": np.abs(np.log(found.scales) - np.log(wanted.scales.astype(float))).max(initial=0),
+        "quats": np.minimum(*turned).max(initial=0),
+        "opacities": np.abs(found.opacities - wanted.opacities.astype(float)).max(initial=0),
+        **{
+            name: np.abs(found.sh[:, rows] - wanted.sh[:, rows].astype(float)).max(initial=0)
+            for name, rows in parts.items()
+        },
+    }
+
+
+def assert_within(gaussians, reference, bounds):
+    assert gaussians.sh_degree == reference.sh_degree
+    for name, error in largest_errors(gaussians, reference).items():
+        # Besides, float32's own rounding of values of up to 8.
+        assert error <= bounds.get(name, 0) + 1e-6, name
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_what_other_tools_write_is_read(name):
+    reference = reference_of(name)
+    gaussians = in_order_of(reference, load(FIXTURES / name))
+    if name.endswith(".splat"):
+        black, white = (-0.5 / SH_C0, 0.5 / SH_C0)
+        sh = np.clip(reference.sh, black, white).astype(np.float32)
+        reference = Gaussians(reference.means, reference.quats, reference.scales, reference.opacities, sh)
+    assert_within(gaussians, reference, FOREIGN[name](reference))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz"])
+def test_what_is_written_reads_back(tmp_path, suffix, degree):
+    reference = load(FIXTURES / "sh3.ply")
+    sh = np.ascontiguousarray(reference.sh[:, : (degree + 1) ** 2])
+    reference = Gaussians(reference.means, reference.quats, reference.scales, reference.opacities, sh)
+    path = tmp_path / f"a{suffix}"
+    save(path, reference)
+    bounds = spz_bounds() if suffix == ".spz" else compressed_ply_bounds(reference)
+    assert_within(in_order_of(reference, load(path)), reference, bounds)
+    assert path.stat().st_size < 64 * (20 + 3 * sh.shape[1]) + 2500
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz"])
+def test_gsply_reads_what_we_write(tmp_path, suffix, degree):
+    reference = load(FIXTURES / f"sh{degree}.ply")
+    path = tmp_path / f"a{suffix}"
+    save(path, reference)
+    theirs = gsply.read_spz(str(path)) if suffix == ".spz" else gsply.plyread(str(path))
+    num = len(reference)
+    sh = theirs.sh0[:, None] if not degree else np.concatenate([theirs.sh0[:, None], theirs.shN], axis=1)
+    values = {
+        "means": theirs.means,
+        "quats": theirs.quats,
+        "scales": np.exp(theirs.scales),
+        "opacities": 1 / (1 + np.exp(-theirs.opacities.reshape(num).astype(float))),
+        "sh": sh,
+    }
+    found = Gaussians(**{name: np.ascontiguousarray(array, np.float32) for name, array in values.items()})
+    bounds = spz_bounds() if suffix == ".spz" else compressed_ply_bounds(reference)
+    # It moves opacities of 0 and 1 by 1e-6.
+    assert_within(
+        in_order_of(reference, found), reference, bounds | {"opacities": bounds["opacities"] + 1e-6}
+    )
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz"])
+def test_no_gaussians_and_extreme_ones_are_written(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    save(path, random_gaussians(0, 1))
+    assert len(load(path)) == 0
+    one = random_gaussians(1, 0)
+    one.scales[:] = 0, 1e-30, 1e30
+    one.opacities[:] = 1
+    one.quats[:] = -1e-20, 0, 0, 0
+    save(path, one)
+    back = load(path)
+    np.testing.assert_array_equal(back.opacities, one.opacities)
+    np.testing.assert_allclose(np.abs(back.quats), [[1, 0, 0, 0]], atol=1e-3)
+    assert np.isfinite(back.scales).all()
+
+
+def test_small_and_large_assets_keep_their_shape_in_spz(tmp_path):
+    for size in (1e-4, 1.0, 1e3, 4e6):
+        asset = random_gaussians(100, 0)
+        means = (asset.means / np.abs(asset.means).max() * size).astype(np.float32)
+        save(tmp_path / "a.spz", Gaussians(means, asset.quats, asset.scales, asset.opacities, asset.sh))
+        assert np.abs(load(tmp_path / "a.spz").means - means).max() <= max(size * 2**-17, 2**-22)
+    with pytest.raises(
+        ValueError, match=r"means: expected coordinates within ±8388607 for \.spz, got 1e\+07"
+    ):
+        save(
+            tmp_path / "b.spz",
+            Gaussians(means * np.float32(2.5), asset.quats, asset.scales, asset.opacities, asset.sh),
+        )
+    assert not (tmp_path / "b.spz").exists()
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz"])
+@pytest.mark.parametrize(
+    ("name", "row", "value", "message"),
+    [
+        ("means", (3, 1), np.nan, r"means\[3\]: expected finite values"),
+        ("sh", (3, 0, 1), np.inf, r"sh\[3\]: expected finite values"),
+        ("quats", 3, 0, r"quats\[3\]: expected a length above 0, got \[0\.0, 0\.0, 0\.0, 0\.0\]"),
+        ("scales", (3, 1), -1, r"scales\[3\]: expected values >= 0"),
+        ("opacities", 3, 1.5, r"opacities\[3\]: expected values in \[0, 1\], got 1\.5"),
+    ],
+)
+def test_what_a_format_cannot_hold_is_refused(tmp_path, suffix, name, row, value, message):
+    asset = random_gaussians(10, 0)
+    getattr(asset, name)[row] = value
+    with pytest.raises(ValueError, match=message):
+        save(tmp_path / f"a{suffix}", asset)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_encoding_is_for_ply_only(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"encoding: expected none for .*a\.spz, which is no \.ply, got 'ascii'"
+    ):
+        save(tmp_path / "a.spz", random_gaussians(1, 0), encoding="ascii")
+
+
+def test_a_compressed_ply_is_told_by_its_content(tmp_path):
+    (tmp_path / "a.ply").write_bytes((FIXTURES / "sh0.compressed.ply").read_bytes())
+    np.testing.assert_array_equal(load(tmp_path / "a.ply").means, load(FIXTURES / "sh0.compressed.ply").means)
+    save(tmp_path / "b.ply", random_gaussians(3, 0))
+    (tmp_path / "b.ply").rename(tmp_path / "b.compressed.ply")
+    assert len(load(tmp_path / "b.compressed.ply")) == 3
+
+
+def test_chunks_without_colours_mean_black_to_white(tmp_path):
+    """Files from before the ranges of colour were added."""
+    content = (FIXTURES / "sh0.compressed.ply").read_bytes()
+    head, body = content.split(b"end_header\n", 1)
+    lines = [
+        line
+        for line in head.splitlines()
+        if line.split()[-1] not in (b"min_r", b"min_g", b"min_b", b"max_r", b"max_g", b"max_b")
+    ]
+    chunks = np.frombuffer(body, "<f4", 2 * 18).reshape(2, 18)[:, :12]
+    old = tmp_path / "old.compressed.ply"
+    old.write_bytes(b"\n".join(lines) + b"\nend_header\n" + chunks.tobytes() + body[2 * 72 :])
+    words = np.frombuffer(body, "<u4", 4 * 300, 2 * 72).reshape(300, 4)[:, 3]
+    red = (words >> 24) / 255
+    np.testing.assert_allclose(load(old).sh[:, 0, 0], (red - 0.5) / SH_C0, atol=1e-6)
+
+
+def spz_of_version(version, asset, fraction_bits=12):
+    """Bytes of a file of a version that no tool writes any more, from Niantic's description."""
+    num = len(asset)
+    positions = (
+        asset.means.astype("<f2").tobytes()
+        if version == 1
+        else np.rint(asset.means * 2**fraction_bits).astype("<i4").view("u1").reshape(-1, 4)[:, :3].tobytes()
+    )
+    quats = unit(asset.quats) * np.where(asset.quats[:, :1] < 0, -1, 1)
+    sections = (
+        asset.opacities * 255,
+        (asset.sh[:, 0] * 0.15 + 0.5) * 255,
+        (np.log(asset.scales) + 10) * 16,
+        (quats[:, 1:] + 1) * 127.5,
+        asset.sh[:, 1:] * 128 + 128,
+    )
+    packed = b"".join(np.clip(np.rint(section), 0, 255).astype("u1").tobytes() for section in sections)
+    header = struct.pack("<IIIBBBB", 0x5053474E, version, num, asset.sh_degree, fraction_bits, 0, 0)
+    return header + positions + packed
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_old_versions_of_spz_are_read(tmp_path, version):
+    reference = load(FIXTURES / "sh3.ply")
+    (tmp_path / "a.spz").write_bytes(gzip.compress(spz_of_version(version, reference)))
+    bounds = spz_bounds() | {"quats": 0.1}  # where w is nearly 0, it has the square root of x y z's errors
+    if version == 1:
+        bounds["means"] = np.abs(reference.means).max() * 2**-11  # half precision
+    assert_within(load(tmp_path / "a.spz"), reference, bounds)
+
+
+def spz(**changes):
+    header = {
+        "magic": 0x5053474E,
+        "version": 3,
+        "count": 2,
+        "degree": 0,
+        "bits": 12,
+        "flags": 0,
+        "reserved": 0,
+    }
+    return struct.pack("<IIIBBBB", *(header | changes).values()) + bytes(40)
+
+
+HOSTILE_SPZ = {
+    "magic": (spz(magic=1), "expected .spz, which begins with NGSP, got 01 00 00 00"),
+    "version": (spz(version=5), "expected .spz of version 1 to 4, got 5"),
+    "version 0": (spz(version=0), "expected .spz of version 1 to 4, got 0"),
+    "version 4 in gzip": (spz(version=4), "expected version 1 to 3 in gzip, got 4"),
+    "degree": (spz(degree=4), "expected SH degree 0 to 3, got 4"),
+    "fraction bits": (spz(bits=25), "expected at most 24 fraction bits, got 25"),
+    "too short": (spz()[:-1], "expected 40 bytes of gaussians, got a file that does not end with them"),
+    "header only": (spz()[:16], "expected 40 bytes of gaussians, got a file that does not end with them"),
+    "no header": (spz()[:15], "expected a header of 16 bytes, got 15"),
+    "huge count": (
+        spz(count=2**32 - 1),
+        "expected the 85899345900 bytes that its header promises, got a file of",
+    ),
+    "a long trailer": (spz() + bytes(2 << 20), "got a file that does not end with them"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_SPZ)
+def test_hostile_spz_is_refused(tmp_path, case):
+    content, message = HOSTILE_SPZ[case]
+    (tmp_path / "a.spz").write_bytes(gzip.compress(content))
+    assert_refused_cheaply(tmp_path / "a.spz", message)
+
+
+def assert_refused_cheaply(path, message):
+    with pytest.raises(ValueError, match=f"^{path}: "):  # what is imported late is imported here
+        load(path)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=f"^{path}: ") as error:
+            load(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert message in str(error.value)
+    assert str(error.value).isprintable()
+    assert peak < 8 << 20
+
+
+def test_extensions_after_the_gaussians_of_spz_are_passed_over(tmp_path):
+    (tmp_path / "a.spz").write_bytes(gzip.compress(spz(flags=2) + b"extension" * 100))
+    assert len(load(tmp_path / "a.spz")) == 2
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (15, 5, "expected a table of 6 streams after the header, got 5 at 32"),
+        (16, 31, "expected a table of 6 streams after the header, got 6 at 31"),
+        (19, 255, "expected a table of 6 streams after the header, got 6 at 42"),
+        (8, 65, "expected 585 bytes in stream 0, got 576"),
+        (11, 255, "bytes that its header promises, got a file of 2635"),
+        (32 + 7, 255, "expected 576 bytes in stream 0, got 576 of"),
+        (4, 3, "expected version 3 in gzip, got it as it is"),
+        (128, 0, "expected a zstd stream, got one that is damaged"),
+    ],
+)
+def test_hostile_spz_of_version_4_is_refused(tmp_path, place, value, message):
+    content = bytearray((FIXTURES / "sh3_v4.spz").read_bytes())
+    content[place] = value
+    (tmp_path / "a.spz").write_bytes(content)
+    assert_refused_cheaply(tmp_path / "a.spz", message)
+
+
+def test_zstandard_is_asked_for_where_it_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with pytest.raises(
+        ImportError, match=r"sh0_v4\.spz: .* needs the package zstandard; pip install 'v3dg\[formats\]'"
+    ):
+        load(FIXTURES / "sh0_v4.spz")
+
+
+def sog_with(tmp_path, edit=None, files=None, compression=zipfile.ZIP_STORED):
+    """The fixture with `edit` of the text of its meta.json, and other contents of some files."""
+    path = tmp_path / "a.sog"
+    with zipfile.ZipFile(FIXTURES / "sh0.sog") as source, zipfile.ZipFile(path, "w", compression) as target:
+        for name in source.namelist():
+            content = source.read(name)
+            if name == "meta.json" and edit:
+                content = edit(content.decode()).encode()
+            content = (files or {}).get(name, content)
+            if content is not None:
+                target.writestr(name, content)
+    return path
+
+
+def replaced(old, new):
+    def edit(text):
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return edit
+
+
+HOSTILE_SOG = {
+    "version": (replaced('"version":2', '"version":3'), "version: expected SOG version 2, got 3"),
+    "no version": (
+        replaced('"version":2,', ""),
+        "expected SOG version 2, got an older file; convert it with",
+    ),
+    "count": (replaced('"count":300', '"count":-1'), "count: expected a number of gaussians, got -1"),
+    "more than the pictures hold": (
+        replaced('"count":300', '"count":400'),
+        "expected 400 pixels in 'means_l.webp'",
+    ),
+    "huge count": (
+        replaced('"count":300', '"count":99999999999'),
+        "expected 99999999999 pixels in 'means_l.webp'",
+    ),
+    "path": (replaced('"means_l.webp"', '"../means_l.webp"'), "expected the name of a file beside meta.json"),
+    "parent": (replaced('"means_l.webp"', '".."'), "expected the name of a file beside meta.json"),
+    "absolute path": (
+        replaced('"means_l.webp"', '"/etc/passwd"'),
+        "expected the name of a file beside meta.json",
+    ),
+    "missing file": (
+        replaced('"means_l.webp"', '"other.webp"'),
+        "expected 'other.webp' in the zip, got none",
+    ),
+    "no codebook": (
+        replaced('"codebook":[', '"codebook":[[],'),
+        "scales.codebook: expected 1 to 256 numbers",
+    ),
+    "no JSON": (lambda text: text[:-1], "expected JSON in meta.json, got text that does not parse"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_SOG)
+def test_hostile_sog_is_refused(tmp_path, case):
+    edit, message = HOSTILE_SOG[case]
+    assert_refused_cheaply(sog_with(tmp_path, edit), message)
+
+
+def picture(width, height, kind="WEBP"):
+    import io
+
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.new("RGBA", (width, height), (1, 2, 3, 252)).save(
+        stream, kind, **({"lossless": True} if kind == "WEBP" else {})
+    )
+    return stream.getvalue()
+
+
+def test_pictures_that_claim_more_than_a_file_can_hold_are_refused(tmp_path):
+    bomb = picture(4000, 4000)
+    assert len(bomb) < 2000
+    path = sog_with(tmp_path, files={"quats.webp": bomb})
+    assert_refused_cheaply(path, "got one that claims 16000000 pixels")
+
+
+def test_zips_that_expand_are_refused(tmp_path):
+    path = sog_with(tmp_path, files={"quats.webp": bytes(1 << 26)}, compression=zipfile.ZIP_DEFLATED)
+    assert_refused_cheaply(path, "expected 'quats.webp' no larger than the zip, got 67108864 bytes")
+
+
+def test_other_pictures_are_refused_or_read(tmp_path):
+    assert_refused_cheaply(
+        sog_with(tmp_path, files={"quats.webp": b"no picture"}), "expected a picture in 'quats.webp'"
+    )
+    assert_refused_cheaply(
+        sog_with(tmp_path, files={"quats.webp": picture(20, 20, "TIFF")}), "expected a picture in"
+    )
+    path = sog_with(tmp_path, files={"quats.webp": picture(20, 20, "PNG")})
+    assert len(load(path)) == 300
+    small = picture(4, 4)
+    assert_refused_cheaply(
+        sog_with(tmp_path, files={"quats.webp": small}), "expected 300 pixels in 'quats.webp'"
+    )
+
+
+def test_a_first_value_that_is_null_continues_its_codebook(tmp_path):
+    """As some versions of splat-transform wrote it."""
+    import json
+    import re
+
+    codebook = json.loads(zipfile.ZipFile(FIXTURES / "sh0.sog").read("meta.json"))["scales"]["codebook"]
+    path = sog_with(
+        tmp_path, lambda text: re.sub(r'("scales":\{"codebook":\[)[^,]+', r"\1null", text, count=1)
+    )
+    first = codebook[1] + (codebook[1] - codebook[255]) / 255
+    assert np.isclose(np.log(load(path).scales.min()), first, rtol=1e-5)
+
+
+def test_splat_of_another_length_is_refused(tmp_path):
+    (tmp_path / "a.splat").write_bytes((FIXTURES / "sh0_gaussforge.splat").read_bytes()[:-1])
+    assert_refused_cheaply(
+        tmp_path / "a.splat", "expected a multiple of 32 bytes, got 9599; is the file complete?"
+    )
+
+
+HOSTILE_COMPRESSED_PLY = {
+    "too few chunks": (b"element chunk 2", b"element chunk 1", "expected 2 chunks for 300 gaussians, got 1"),
+    "too many rows": (
+        b"element vertex 300",
+        b"element vertex 301",
+        "expected 301 rows of element 'vertex' with 16",
+    ),
+    "too few rows": (b"element vertex 300", b"element vertex 299", "expected the end of the file after"),
+    "huge count": (
+        b"element vertex 300",
+        b"element vertex 999999999999",
+        "expected 999999999999 rows of element",
+    ),
+    "another type": (
+        b"uint packed_rotation",
+        b"float packed_rotation",
+        "expected 'property uint packed_rotation'",
+    ),
+    "no such property": (b"packed_rotation", b"packed_rotatiom", "expected 'property uint packed_rotation'"),
+    "a property twice": (
+        b"packed_rotation",
+        b"packed_scale",
+        "expected properties of element 'vertex', each once",
+    ),
+    "a list": (
+        b"property uint packed_r",
+        b"property list uint uint packed_r",
+        "expected 'property float|uint|uchar",
+    ),
+    "ascii": (
+        b"binary_little_endian",
+        b"ascii",
+        "expected 'format binary_little_endian 1.0' in a compressed .ply",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_COMPRESSED_PLY)
+def test_hostile_compressed_ply_is_refused(tmp_path, case):
+    old, new, message = HOSTILE_COMPRESSED_PLY[case]
+    content = (FIXTURES / "sh0.compressed.ply").read_bytes()
+    assert old in content
+    if case == "too few chunks":
+        content = content.replace(b"end_header\n", b"end_header\n", 1)[:-72]
+    (tmp_path / "a.ply").write_bytes(content.replace(old, new, 1))
+    assert_refused_cheaply(tmp_path / "a.ply", message)
+
+
+@settings(max_examples=300)
+@example(name="sh3.sog", edits=[(230, 128)], in_header=True)  # a file name in a zip that is no UTF-8
+@given(
+    name=st.sampled_from(["sh0.compressed.ply", "sh3.compressed.ply", "sh3.sog", "sh3_v3.spz", "sh3_v4.spz"]),
+    edits=st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(0, 255)), min_size=1, max_size=4),
+    in_header=st.booleans(),
+)
+def test_changed_bytes_never_do_worse_than_an_error(tmp_path_factory, name, edits, in_header):
+    content = bytearray((FIXTURES / name).read_bytes())
+    unpacked = gzip.decompress(content) if name.endswith("v3.spz") else content
+    content = bytearray(unpacked)
+    for place, value in edits:
+        content[place % (200 if in_header else len(content))] = value
+    path = tmp_path_factory.getbasetemp() / name
+    path.write_bytes(
+        gzip.compress(content) if unpacked is not content and name.endswith("v3.spz") else content
+    )
+    try:
+        assert len(load(path)) <= 64 * len(content)
+    except ValueError as error:
+        assert str(error).startswith(f"{path}")  # noqa: PT017 (either outcome is right)
+
+
+def gsplat_tensors(asset):
+    """What gsplat's trainer calls the parameters of an asset."""
+    tensors = asset.torch()
+    return {
+        "means": tensors.means,
+        "scales": tensors.scales.log(),
+        "quats": tensors.quats * 3,
+        "opacities": tensors.opacities.logit(),
+        "sh0": tensors.sh[:, :1],
+        "shN": tensors.sh[:, 1:],
+    }
+
+
+def assert_same(gaussians, asset):
+    for name in ("means", "sh"):
+        np.testing.assert_array_equal(getattr(gaussians, name), getattr(asset, name))
+    np.testing.assert_allclose(gaussians.scales, asset.scales, rtol=8e-7)  # of the log in float32
+    np.testing.assert_allclose(gaussians.opacities, asset.opacities, atol=1e-6)
+    np.testing.assert_allclose(gaussians.quats, unit(asset.quats), atol=2e-7)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_checkpoints_of_gsplat_are_read(tmp_path, degree):
+    asset = random_gaussians(50, degree)
+    splats = torch.nn.ParameterDict(gsplat_tensors(asset)).state_dict()
+    torch.save({"step": 29999, "splats": splats}, tmp_path / "ckpt_29999_rank0.pt")
+    assert_same(load(tmp_path / "ckpt_29999_rank0.pt"), asset)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_checkpoints_of_nerfstudio_are_read(tmp_path, degree):
+    asset = random_gaussians(50, degree)
+    names = {"sh0": "features_dc", "shN": "features_rest"}
+    tensors = {names.get(name, name): tensor for name, tensor in gsplat_tensors(asset).items()}
+    tensors["features_dc"] = tensors["features_dc"][:, 0]
+    tensors["opacities"] = tensors["opacities"][:, None]
+    parameters = torch.nn.ParameterList([tensors["means"]])
+    optimizer = torch.optim.Adam(parameters)
+    parameters[0].grad = torch.ones_like(parameters[0])
+    optimizer.step()
+    pipeline = {f"_model.gauss_params.{name}": tensor for name, tensor in tensors.items()}
+    content = {
+        "step": 29999,
+        "pipeline": {"_model.camera_optimizer.pose_adjustment": torch.zeros(3, 6), **pipeline},
+        "optimizers": {"means": optimizer.state_dict()},
+        "scalers": {},
+    }
+    asset = Gaussians(tensors["means"].numpy(), asset.quats, asset.scales, asset.opacities, asset.sh)
+    torch.save(content, tmp_path / "step-000029999.ckpt")
+    assert_same(load(tmp_path / "step-000029999.ckpt"), asset)
+
+
+class Harmful:
+    def __reduce__(self):
+        return (Path.touch, (Path("harm"),))
+
+
+def test_a_checkpoint_executes_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"splats": gsplat_tensors(random_gaussians(2, 0)), "extra": Harmful()}, "a.pt")
+    assert_refused_cheaply(
+        Path("a.pt"), "expected a checkpoint of tensors and plain values, got one that wants more"
+    )
+    assert not Path("harm").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"means": None}, "expected a tensor of floats means in the checkpoint, got NoneType"),
+        ({"means": torch.zeros(2, 3, dtype=torch.int32)}, "expected a tensor of floats means"),
+        ({"quats": torch.zeros(2, 3)}, "expected quats of shape (2, 4), got (2, 3)"),
+        ({"scales": torch.zeros(3, 3)}, "expected scales of shape (2, 3), got (3, 3)"),
+        ({"shN": torch.zeros(2, 5, 3)}, "expected SH degree 0 to 3, got shN of shape (2, 5, 3)"),
+    ],
+)
+def test_checkpoints_that_do_not_fit_are_refused(tmp_path, change, message):
+    torch.save({"splats": gsplat_tensors(random_gaussians(2, 1)) | change}, tmp_path / "a.pt")
+    assert_refused_cheaply(tmp_path / "a.pt", message)
+    torch.save({"model": 3}, tmp_path / "a.pt")
+    assert_refused_cheaply(tmp_path / "a.pt", "expected 'splats' (gsplat) or 'pipeline' (nerfstudio)")
+
+
+def test_torch_is_asked_for_where_it_is_missing(tmp_path, monkeypatch):
+    torch.save({}, tmp_path / "a.pt")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(ImportError, match=r"a\.pt: a checkpoint needs torch; pip install 'v3dg\[torch\]'"):
+        load(tmp_path / "a.pt")

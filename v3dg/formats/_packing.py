@@ -1,0 +1,151 @@
+"""What the readers and writers of quantised formats share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3dg import _files
+from v3dg.gaussians import Gaussians
+
+Floats: TypeAlias = NDArray[np.floating[Any]]
+
+SH_C0 = 0.28209479177387814
+"""The basis function of degree 0: colour is SH_C0 times its coefficient, plus ½."""
+
+DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
+"""SH degree by the number of coefficients a channel past the first."""
+
+_BLOCK = 1 << 16  # gaussians decoded at once: the double precision of a block stays in the cache's reach
+_MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
+_MORTON_BITS = 21
+
+# The components that stay when one is left out, in ascending order.
+_KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """All of a regular file.
+
+    Raises:
+        ValueError: It is a directory, a device or a pipe.
+        OSError: It cannot be read.
+    """
+    with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
+        return file.read()
+
+
+def problem(path: str | os.PathLike[str], text: str) -> ValueError:
+    return ValueError(f"{os.fspath(path)}: {text}")
+
+
+def blocks(count: int) -> Iterator[slice]:
+    for start in range(0, count, _BLOCK):
+        yield slice(start, min(start + _BLOCK, count))
+
+
+def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ...]]) -> Gaussians:
+    """Gaussians of what ``decode`` gives for a block: means, quats, scales, opacities and sh."""
+    arrays = (
+        np.empty((count, 3), np.float32),
+        np.empty((count, 4), np.float32),
+        np.empty((count, 3), np.float32),
+        np.empty(count, np.float32),
+        np.empty((count, (degree + 1) ** 2, 3), np.float32),
+    )
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is passed on
+        for block in blocks(count):
+            for array, values in zip(arrays, decode(block), strict=True):
+                array[block] = values
+    return Gaussians(*arrays)
+
+
+def quats_from_three(three: Floats, left_out: NDArray[Any]) -> Floats:
+    """Unit quaternions (N, 4) of their three other components and the index of the one left out, >= 0."""
+    rest = np.sqrt(np.maximum(0.0, 1.0 - np.square(three).sum(axis=1)))
+    quats = np.empty((len(three), 4))
+    np.put_along_axis(quats, _KEPT[left_out], three, axis=1)
+    np.put_along_axis(quats, left_out[:, None].astype(np.intp), rest[:, None], axis=1)
+    return quats
+
+
+def three_of_quats(quats: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """The inverse: three components (N, 3) within ±√½ and the index (N,) of the largest, left out."""
+    unit = normalised(quats)
+    largest = np.abs(unit).argmax(axis=1)
+    sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    return np.take_along_axis(unit, _KEPT[largest], axis=1) * sign, largest
+
+
+def normalised(quats: Floats) -> Floats:
+    """Quaternions of length one, in double precision; those of length zero stay."""
+    quats = quats.astype(np.float64)
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    np.divide(quats, length, out=quats, where=length > 0)
+    return quats
+
+
+def log_scales(scales: Floats) -> Floats:
+    """Natural logs in double precision, at least -20."""
+    with np.errstate(divide="ignore"):
+        return np.maximum(np.log(scales.astype(np.float64)), _MIN_LOG_SCALE)
+
+
+def to_integers(values: Floats, largest: int) -> NDArray[np.uint32]:
+    """Nearest whole numbers within 0 to ``largest``."""
+    return np.clip(np.rint(values), 0, largest).astype(np.uint32)
+
+
+def check_writable(gaussians: Gaussians) -> Gaussians:
+    """The gaussians on the host.
+
+    Raises:
+        TypeError: They are not Gaussians.
+        ValueError: They have values that a quantised format cannot hold; names the first.
+    """
+    if not isinstance(gaussians, Gaussians):
+        raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}")
+    host = gaussians.numpy()
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        values = getattr(host, name)
+        _check_all(name, values, np.isfinite(values), "finite values")
+    _check_all("quats", host.quats, (host.quats != 0).any(axis=1), "a length above 0")
+    _check_all("scales", host.scales, host.scales >= 0, "values >= 0")
+    _check_all("opacities", host.opacities, abs(host.opacities - 0.5) <= 0.5, "values in [0, 1]")
+    return host
+
+
+def _check_all(name: str, values: Floats, good: NDArray[np.bool_], expected: str) -> None:
+    if not good.all():
+        row = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
+        raise ValueError(f"{name}[{row}]: expected {expected}, got {values[row].tolist()}")
+
+
+def morton_order(means: Floats) -> NDArray[np.intp]:
+    """Indices that put points (N, 3) along a curve that keeps neighbours together; the same on every run."""
+    if not len(means):
+        return np.zeros(0, np.intp)
+    low = means.min(axis=0).astype(np.float64)
+    extent = np.maximum(means.max(axis=0) - low, np.finfo(np.float32).tiny)
+    cells = ((means - low) / extent * ((1 << _MORTON_BITS) - 1)).astype(np.uint64)
+    code = np.zeros(len(means), np.uint64)
+    for axis in range(3):
+        code |= _spread(cells[:, axis]) << np.uint64(axis)
+    return np.argsort(code, kind="stable")
+
+
+def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """The lowest 21 bits, two zeros after each."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
+    return bits

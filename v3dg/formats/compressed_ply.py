@@ -1,0 +1,257 @@
+"""`.compressed.ply`, of PlayCanvas and SuperSplat: 16 bytes a gaussian, within the ranges of chunks of 256.
+
+Element `chunk` holds the lowest and highest position, log scale and colour of its gaussians as floats,
+element `vertex` a position and a scale (11, 10 and 11 bits of that range), a quaternion (index of its largest
+component, 10 bits each for the others), colour and opacity (8 bits each), and element `sh` a byte a
+coefficient, channel by channel, for -4 to 4. See docs/formats.md.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3dg import _files
+from v3dg.formats._packing import (
+    DEGREES,
+    SH_C0,
+    Floats,
+    assemble,
+    blocks,
+    check_writable,
+    log_scales,
+    morton_order,
+    problem,
+    quats_from_three,
+    read_bytes,
+    three_of_quats,
+    to_integers,
+)
+from v3dg.gaussians import Gaussians
+
+_CHUNK = 256
+_MAX_HEADER = 1 << 16
+_PLY_TYPES = {"float": "<f4", "float32": "<f4", "uint": "<u4", "uint32": "<u4", "uchar": "u1", "uint8": "u1"}
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
+_SQRT2 = float(np.sqrt(2.0))
+# Where the fields of a word begin, and the largest value of each.
+_XYZ_SHIFT, _XYZ_MAX = (21, 11, 0), (2047, 1023, 2047)
+_THREE_SHIFT, _THREE_MAX = (20, 10, 0), (1023, 1023, 1023)
+_RGBA_SHIFT, _RGBA_MAX = (24, 16, 8, 0), (255, 255, 255, 255)
+
+
+def is_compressed(path: str | os.PathLike[str]) -> bool:
+    """Whether a `.ply` has packed positions. What is wrong with other files is for their reader to say."""
+    try:
+        descriptor = _files.open_regular(path)
+    except ValueError:
+        return False
+    with _files.naming_errors(path), open(descriptor, "rb") as file:
+        header = file.read(_MAX_HEADER).split(b"end_header", 1)[0]
+    return any(line.split()[-1:] == [b"packed_position"] for line in header.splitlines())
+
+
+def read(path: str | os.PathLike[str]) -> Gaussians:
+    """Read a `.compressed.ply` file.
+
+    Raises:
+        ValueError: It is none, or incomplete; says what was expected.
+        OSError: It cannot be read.
+    """
+    content = read_bytes(path)
+    elements = _elements(path, content)
+    for name in ("chunk", "vertex"):
+        if name not in elements:
+            raise problem(path, f"expected the elements chunk and vertex of a compressed .ply, got no {name}")
+    chunk, vertex, sh = elements["chunk"], elements["vertex"], elements.get("sh")
+    count = len(vertex)
+    ranges = _ranges(path, chunk)
+    _require(path, "vertex", vertex, dict.fromkeys(_PACKED, "<u4"))
+    if len(chunk) * _CHUNK < count:
+        raise problem(path, f"expected {-(-count // _CHUNK)} chunks for {count} gaussians, got {len(chunk)}")
+    rest, degree = _rest(path, sh, count)
+
+    def decode(rows: slice) -> tuple[Floats, ...]:
+        block = vertex[rows]
+        chunks = np.arange(rows.start, rows.stop) // _CHUNK
+
+        def within(kind: str, fractions: Floats) -> Floats:
+            low, high = ranges[kind][0][chunks], ranges[kind][1][chunks]
+            return np.asarray(low * (1.0 - fractions) + high * fractions)
+
+        rotation = block["packed_rotation"]
+        three = (_fractions(rotation, _THREE_SHIFT, _THREE_MAX) - 0.5) * _SQRT2
+        rgba = _fractions(block["packed_color"], _RGBA_SHIFT, _RGBA_MAX)
+        color = (within("color", rgba[:, :3]) - 0.5) / SH_C0
+        means = within("", _fractions(block["packed_position"], _XYZ_SHIFT, _XYZ_MAX))
+        scales = np.exp(within("scale_", _fractions(block["packed_scale"], _XYZ_SHIFT, _XYZ_MAX)))
+        quats = quats_from_three(three, rotation >> 30)
+        higher = _REST_VALUE[rest[rows]].reshape(len(block), 3, -1).transpose(0, 2, 1)
+        return means, quats, scales, rgba[:, 3], np.concatenate([color[:, None], higher], axis=1)
+
+    return assemble(count, degree, decode)
+
+
+def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Write a `.compressed.ply` file; gaussians are put in an order that keeps neighbours together.
+
+    Raises:
+        ValueError: A value that the format cannot hold.
+        OSError: It cannot be written.
+    """
+    host = check_writable(gaussians)
+    order = morton_order(host.means)
+    count, num_rest = len(host), 3 * (host.sh.shape[1] - 1)
+    num_chunks = -(-count // _CHUNK)
+    values = {
+        "": host.means[order].astype(np.float64),
+        "scale_": np.minimum(log_scales(host.scales[order]), 20.0),
+        "color": host.sh[order, 0].astype(np.float64) * SH_C0 + 0.5,
+    }
+    starts = np.arange(num_chunks) * _CHUNK
+    lows, highs, fractions = [], [], {}
+    for kind, array in values.items():
+        if not count:
+            continue
+        # Rounded first, so that writer and reader mean the same range.
+        low = np.minimum.reduceat(array, starts).astype(np.float32)
+        high = np.maximum.reduceat(array, starts).astype(np.float32)
+        lows.append(low)
+        highs.append(high)
+        chunks = np.arange(count) // _CHUNK
+        extent = np.where(high > low, high.astype(np.float64) - low, 1.0)[chunks]
+        fractions[kind] = np.clip((array - low[chunks]) / extent, 0.0, 1.0)
+    header = ["ply", "format binary_little_endian 1.0", "comment made by v3dg", f"element chunk {num_chunks}"]
+    header += [
+        f"property float {name}" for kind in _RANGES for name in (*_names("min", kind), *_names("max", kind))
+    ]
+    header += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
+    if num_rest:
+        header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(num_rest))]
+    with _files.replacing(path) as temporary, open(temporary, "wb") as file:
+        file.write("\n".join([*header, "end_header\n"]).encode())
+        pairs = [array for pair in zip(lows, highs, strict=True) for array in pair]
+        if pairs:
+            file.write(np.concatenate(pairs, axis=1).astype("<f4").tobytes())
+        for block in blocks(count):
+            rows = order[block]
+            three, largest = three_of_quats(host.quats[rows])
+            words = np.empty((len(rows), 4), "<u4")
+            words[:, 0] = _word(fractions[""][block], _XYZ_SHIFT, _XYZ_MAX)
+            words[:, 1] = _word(three / _SQRT2 + 0.5, _THREE_SHIFT, _THREE_MAX) | (largest.astype("u4") << 30)
+            words[:, 2] = _word(fractions["scale_"][block], _XYZ_SHIFT, _XYZ_MAX)
+            rgba = np.concatenate([fractions["color"][block], host.opacities[rows, None]], axis=1)
+            words[:, 3] = _word(rgba, _RGBA_SHIFT, _RGBA_MAX)
+            file.write(words.tobytes())
+        for block in blocks(count if num_rest else 0):
+            rest = host.sh[order[block], 1:].transpose(0, 2, 1).astype(np.float64)
+            file.write(np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
+
+
+# The middle of what a byte of SH stands for; the ends are exact.
+_REST_VALUE = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
+_REST_VALUE[[0, 255]] = -4.0, 4.0
+
+
+def _fractions(words: NDArray[Any], shifts: tuple[int, ...], largest: tuple[int, ...]) -> Floats:
+    return np.stack(
+        [((words >> shift) & most) / float(most) for shift, most in zip(shifts, largest, strict=True)], axis=1
+    )
+
+
+def _word(fractions: Floats, shifts: tuple[int, ...], largest: tuple[int, ...]) -> NDArray[np.uint32]:
+    word = np.zeros(len(fractions), np.uint32)
+    for column, shift, most in zip(fractions.T, shifts, largest, strict=True):
+        word |= to_integers(column * most, most) << np.uint32(shift)
+    return word
+
+
+def _names(end: str, kind: str) -> list[str]:
+    return [f"{end}_{'' if kind == 'color' else kind}{axis}" for axis in _RANGES[kind]]
+
+
+def _ranges(path: str | os.PathLike[str], chunk: NDArray[Any]) -> dict[str, tuple[Floats, Floats]]:
+    """Lowest and highest of each chunk, (C, 3) each; files without ranges of colour mean 0 to 1."""
+    kinds = [kind for kind in _RANGES if kind != "color" or "min_r" in (chunk.dtype.names or ())]
+    ranges: dict[str, tuple[Floats, Floats]] = {
+        "color": (np.zeros((len(chunk), 3)), np.ones((len(chunk), 3)))
+    }
+    for kind in kinds:
+        _require(path, "chunk", chunk, dict.fromkeys([*_names("min", kind), *_names("max", kind)], "<f4"))
+        low, high = (np.stack([chunk[name] for name in _names(end, kind)], axis=1) for end in ("min", "max"))
+        with np.errstate(invalid="ignore"):  # signalling NaN
+            ranges[kind] = (low.astype(np.float64), high.astype(np.float64))
+    return ranges
+
+
+def _rest(path: str | os.PathLike[str], sh: NDArray[Any] | None, count: int) -> tuple[NDArray[Any], int]:
+    """(N, 3 K) bytes, channel by channel, and the degree."""
+    if sh is None:
+        return np.zeros((count, 0), np.uint8), 0
+    names = [f"f_rest_{i}" for i in range(len(sh.dtype.names or ()))]
+    degree = DEGREES.get(len(names) // 3) if len(names) % 3 == 0 else None
+    if degree is None:
+        raise problem(
+            path, f"expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {len(names)}"
+        )
+    _require(path, "sh", sh, dict.fromkeys(names, "u1"))
+    if len(sh) != count:
+        raise problem(path, f"expected {count} rows of element sh like vertex, got {len(sh)}")
+    return np.stack([sh[name] for name in names], axis=1), degree
+
+
+def _require(path: str | os.PathLike[str], element: str, rows: NDArray[Any], types: dict[str, str]) -> None:
+    for name, dtype in types.items():
+        if name not in (rows.dtype.names or ()) or rows.dtype[name] != np.dtype(dtype):
+            kind = next(ply for ply, numpy in _PLY_TYPES.items() if numpy == dtype)
+            raise problem(path, f"expected 'property {kind} {name}' in element {element}, got none")
+
+
+def _elements(path: str | os.PathLike[str], content: bytes) -> dict[str, NDArray[Any]]:
+    """The rows of each element, as the header lists them."""
+    head, mark, _ = content[:_MAX_HEADER].partition(b"end_header\n")
+    if not mark:
+        head, mark, _ = content[:_MAX_HEADER].partition(b"end_header\r\n")
+    if not mark:
+        raise problem(path, f"expected end_header within the first {_MAX_HEADER} bytes, got none")
+    lines = head.decode("ascii", "replace").splitlines()
+    if lines[:1] != ["ply"]:
+        raise problem(path, "expected a first line 'ply'")
+    if "format binary_little_endian 1.0" not in lines:
+        raise problem(
+            path, "expected 'format binary_little_endian 1.0' in a compressed .ply, got another format"
+        )
+    counts: dict[str, int] = {}
+    fields: dict[str, list[tuple[str, str]]] = {}
+    for line in lines:
+        words = line.split()
+        if words[:1] == ["element"]:
+            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 12 or words[1] in counts:
+                raise problem(path, f"expected 'element NAME COUNT', each name once, got {line[:60]!a}")
+            counts[words[1]], fields[words[1]] = int(words[2]), []
+        elif words[:1] == ["property"]:
+            if len(words) != 3 or words[1] not in _PLY_TYPES or not counts:
+                raise problem(path, f"expected 'property float|uint|uchar NAME', got {line[:60]!a}")
+            fields[list(counts)[-1]].append((words[2], _PLY_TYPES[words[1]]))
+    rows: dict[str, NDArray[Any]] = {}
+    offset = len(head) + len(mark)
+    for name, count in counts.items():
+        names = [field for field, _ in fields[name]]
+        if not names or len(set(names)) < len(names):
+            raise problem(path, f"expected properties of element {name[:40]!a}, each once")
+        dtype = np.dtype(fields[name])
+        if count * dtype.itemsize > len(content) - offset:
+            raise problem(
+                path,
+                f"expected {count} rows of element {name[:40]!a} with {dtype.itemsize} bytes each, "
+                f"got {len(content) - offset} bytes",
+            )
+        rows[name] = np.frombuffer(content, dtype, count, offset)
+        offset += count * dtype.itemsize
+    if offset != len(content):
+        raise problem(path, f"expected the end of the file after {offset} bytes, got {len(content)}")
+    return rows
