@@ -173,6 +173,14 @@ def rasterize_backward_cuda(
     d_background: Any,
     stream: int,
 ) -> None: ...
+
+class Stop:
+    """Asks, from any thread, for a picture under way to be given up: it is then left unfinished."""
+
+    @property
+    def is_requested(self) -> bool: ...
+    def request(self) -> None: ...
+
 def render_selection(
     bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
     instances: tuple[Any, ...],
@@ -181,7 +189,16 @@ def render_selection(
     cluster_ids: NDArray[np.int32],
     background: Sequence[float],
     with_depth: bool,
+    stop: Stop | None = None,
 ) -> tuple[Float32, Float32, Float32, dict[str, Any]]: ...
+def count_selection(
+    bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
+    instances: tuple[Any, ...],
+    camera: tuple[Any, ...],
+    instance_ids: NDArray[np.int32],
+    cluster_ids: NDArray[np.int32],
+    stop: Stop | None = None,
+) -> tuple[Float32, dict[str, Any]]: ...
 def pick_selection(
     bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
     instances: tuple[Any, ...],

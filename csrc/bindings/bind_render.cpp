@@ -1,6 +1,7 @@
 #include <algorithm>
 #include <atomic>
 #include <memory>
+#include <utility>
 
 #include "bindings/select_args.h"
 #include "pipeline/model.h"
@@ -202,27 +203,61 @@ struct SelectionDraws {
     }
 };
 
+// Asks, from any thread, for work under way to end early.
+class Stop {
+  public:
+    void request() { requested_.store(true, std::memory_order_relaxed); }
+    bool is_requested() const { return requested_.load(std::memory_order_relaxed); }
+    const std::atomic<bool>* flag() const { return &requested_; }
+
+  private:
+    std::atomic<bool> requested_{false};
+};
+
+static const std::atomic<bool>* flag_of(const Stop* stop) { return stop == nullptr ? nullptr : stop->flag(); }
+
 static Window window_of(const SelectCamera& c) {
     return {static_cast<int>(c.x0), static_cast<int>(c.y0), static_cast<int>(c.x1), static_cast<int>(c.y1)};
+}
+
+static SharedWorkspace& shared_workspace() {
+    static SharedWorkspace shared;
+    return shared;
+}
+
+// Draws with the shared workspace, without Python's lock.
+static RenderCounts render_shared(const SelectionDraws& selected, const SelectCamera& eye,
+                                  const Picture<float>& picture, const Stop* stop) {
+    const Pinhole<float> pinhole = pinhole_of(eye);
+    py::gil_scoped_release unlocked;
+    std::unique_ptr<Workspace<float>> workspace = shared_workspace().take();
+    const RenderCounts counts =
+        render<float>(selected.draws, pinhole, picture, false, *workspace, flag_of(stop));
+    shared_workspace().give_back(std::move(workspace));
+    return counts;
 }
 
 static py::tuple render_selection(const py::list& bundles, const py::tuple& instances,
                                   const py::tuple& camera, const py::array& instance_ids,
                                   const py::array& cluster_ids, const std::array<double, 3>& background,
-                                  bool with_depth) {
-    static SharedWorkspace shared;
+                                  bool with_depth, const Stop* stop) {
     const SelectCamera eye = select_camera(camera);
     const SelectionDraws selected(bundles, instances, eye, instance_ids, cluster_ids);
     PictureArrays<float> out(window_of(eye), background, with_depth);
-    const Pinhole<float> pinhole = pinhole_of(eye);
-    RenderCounts counts;
-    {
-        py::gil_scoped_release unlocked;
-        std::unique_ptr<Workspace<float>> workspace = shared.take();
-        counts = render<float>(selected.draws, pinhole, out.picture, false, *workspace);
-        shared.give_back(std::move(workspace));
-    }
+    const RenderCounts counts = render_shared(selected, eye, out.picture, stop);
     return py::make_tuple(out.color, out.alpha, out.depth_or_none(), dict_of(counts));
+}
+
+// The number of gaussians that each pixel is blended of, and the counts of the frame.
+static py::tuple count_selection(const py::list& bundles, const py::tuple& instances, const py::tuple& camera,
+                                 const py::array& instance_ids, const py::array& cluster_ids,
+                                 const Stop* stop) {
+    const SelectCamera eye = select_camera(camera);
+    const SelectionDraws selected(bundles, instances, eye, instance_ids, cluster_ids);
+    PictureArrays<float> out(window_of(eye), {0, 0, 0}, true);
+    std::swap(out.picture.depth, out.picture.count);
+    const RenderCounts counts = render_shared(selected, eye, out.picture, stop);
+    return py::make_tuple(out.depth, dict_of(counts));
 }
 
 // Of the first pixel of the camera's window: (place in the selection, weight, depth) of the gaussian that it
@@ -260,8 +295,14 @@ static void bind_precision(py::module_& m, const char* model_name, const char* t
 void bind_render(py::module_& m) {
     bind_precision<float>(m, "Model", "Tape");
     bind_precision<double>(m, "ModelDouble", "TapeDouble");
+    py::class_<Stop>(m, "Stop", "Asks, from any thread, for a picture under way to be given up.")
+        .def(py::init<>())
+        .def("request", &Stop::request)
+        .def_property_readonly("is_requested", &Stop::is_requested);
     m.def("render_selection", &render_selection, "bundles"_a, "instances"_a, "camera"_a, "instance_ids"_a,
-          "cluster_ids"_a, "background"_a, "with_depth"_a);
+          "cluster_ids"_a, "background"_a, "with_depth"_a, "stop"_a = nullptr);
+    m.def("count_selection", &count_selection, "bundles"_a, "instances"_a, "camera"_a, "instance_ids"_a,
+          "cluster_ids"_a, "stop"_a = nullptr);
     m.def("pick_selection", &pick_selection, "bundles"_a, "instances"_a, "camera"_a, "instance_ids"_a,
           "cluster_ids"_a);
 }

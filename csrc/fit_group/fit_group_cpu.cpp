@@ -42,12 +42,12 @@ static bool misses_tile(const Record<float>& g, int left, int top) {
 static void blend_sorted(const FitScratch& scratch, size_t count, int left, int top, int size,
                          TilePlanes<float>& tile) {
     const BlockPixels<float> pixels;
-    uint64_t alive = clear_tile(tile, left, top, square(size), false);
+    uint64_t alive = clear_tile(tile, left, top, square(size), Extra::kNothing);
     for (size_t i = 0; i < count && alive != 0; ++i) {
         const Record<float>& g = scratch.records.data()[record_of(scratch.order.data()[i])];
         if (misses_tile(g, left, top)) continue;
         const uint64_t blocks = live_blocks(g, left, top, alive);
-        if (blocks != 0) blend_record<float, false>(g, blocks, left, top, pixels, tile, alive);
+        if (blocks != 0) blend_record<float, Extra::kNothing>(g, blocks, left, top, pixels, tile, alive);
     }
 }
 
@@ -268,7 +268,7 @@ class Comparison {
                 for (int c = 0; c < 3; ++c) total += load(grad.d_color[c] + p) * load(tile.color[c] + p);
                 store(grad.total + p, total);
             }
-            uint64_t alive = clear_tile(tile, left, top, square(view.size), false);
+            uint64_t alive = clear_tile(tile, left, top, square(view.size), Extra::kNothing);
             for (size_t i = 0; i < count && alive != 0; ++i) {
                 const uint32_t r = record_of(scratch_.order.data()[i]);
                 const Record<float>& g = scratch_.records.data()[r];

@@ -76,6 +76,8 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
 
 // Bytes of records and entries that a frame holds at once, or about.
 constexpr double kBandBytes = 768 << 20;
+// With a stop, which is seldom looked at while a band is binned.
+constexpr double kStoppableBandBytes = 96 << 20;
 // So few gaussians need no look at how much they cover.
 constexpr uint64_t kFewGaussians = 65536;
 
@@ -83,7 +85,7 @@ constexpr uint64_t kFewGaussians = 65536;
 // gaussians of a piece tell where it is drawn and how much it covers.
 template <class T>
 static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
-                                    const Pinhole<T>& camera, const Window& window) {
+                                    const Pinhole<T>& camera, const Window& window, double band_bytes) {
     if (pieces.empty() || pieces.back().first + pieces.back().count <= kFewGaussians) return {window};
     constexpr uint64_t kFew = 16;
     std::vector<Reach> reach(pieces.size());
@@ -108,7 +110,7 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std
             bytes += share;
         }
     }
-    const double num_bands = std::ceil(bytes / kBandBytes);
+    const double num_bands = std::ceil(bytes / band_bytes);
     std::vector<Window> bands{window};
     double above = 0;
     for (int r = 0; r + 1 < grid.rows; ++r) {
@@ -122,11 +124,15 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std
     return bands;
 }
 
+static bool is_stopped(const std::atomic<bool>* stop) {
+    return stop != nullptr && stop->load(std::memory_order_relaxed);
+}
+
 // Draws one band; `is_first` of a picture's bands finds out what each piece reaches.
 template <class T>
 static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& pieces, bool is_first,
                         const Pinhole<T>& camera, const Picture<T>& picture, bool keep_source,
-                        Workspace<T>& ws, RenderCounts& counts) {
+                        Workspace<T>& ws, const std::atomic<bool>* stop, RenderCounts& counts) {
     const double start = now();
     const Window& window = picture.window;
     const TileGrid grid(window);
@@ -148,6 +154,8 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
     ws.thread_source.reserve(keep_source ? num_threads * longest : 0);
     std::atomic<uint64_t> num_records{0};
     parallel_for(chunks.size(), 1, [&](size_t c) {
+        chunk_first[c] = chunk_count[c] = 0;
+        if (is_stopped(stop)) return;
         const size_t room = omp_get_thread_num() * longest;
         Record<T>* mine = ws.thread_records.data() + room;
         uint32_t* my_source = keep_source ? ws.thread_source.data() + room : nullptr;
@@ -175,6 +183,7 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
     const std::vector<uint32_t> order = tiles_by_load(offset, grid.size());
     std::vector<Buffer<uint64_t>> scratch(num_threads);
     parallel_for(order.size(), 1, [&](size_t i) {
+        if (is_stopped(stop)) return;
         const uint32_t t = order[i];
         uint64_t* entry = ws.lists.entry.data() + offset[t];
         const size_t count = offset[t + 1] - offset[t];
@@ -198,18 +207,22 @@ static Picture<T> band_of(const Picture<T>& picture, const Window& band) {
     part.color += 3 * skip;
     part.alpha += skip;
     if (part.depth != nullptr) part.depth += skip;
+    if (part.count != nullptr) part.count += skip;
     return part;
 }
 
 template <class T>
 RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera, const Picture<T>& picture,
-                    bool keep_source, Workspace<T>& ws) {
+                    bool keep_source, Workspace<T>& ws, const std::atomic<bool>* stop) {
     RenderCounts counts{};
     std::vector<Piece> pieces = pieces_of(draws);
     const std::vector<Window> bands =
-        keep_source ? std::vector<Window>{picture.window} : bands_of(draws, pieces, camera, picture.window);
-    for (size_t b = 0; b < bands.size(); ++b)
-        render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws, counts);
+        keep_source ? std::vector<Window>{picture.window}
+                    : bands_of(draws, pieces, camera, picture.window,
+                               stop == nullptr ? kBandBytes : kStoppableBandBytes);
+    for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b)
+        render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws, stop,
+                    counts);
     for (const Piece& piece : pieces) {
         counts.in_frustum += piece.reach.in_frustum;
         counts.records += piece.reach.drawn;
@@ -300,7 +313,7 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
 
 #define V3DG_INSTANTIATE(T)                                                                                  \
     template RenderCounts render<T>(const std::vector<Draw<T>>&, const Pinhole<T>&, const Picture<T>&, bool, \
-                                    Workspace<T>&);                                                          \
+                                    Workspace<T>&, const std::atomic<bool>*);                                                          \
     template void render_backward<T>(const Draw<T>&, const Pinhole<T>&, const Picture<T>&,                   \
                                      const PictureGradient<T>&, const Workspace<T>&,                         \
                                      const GaussianGradients<T>&, T*);

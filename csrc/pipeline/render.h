@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <vector>
 
 #include "rasterize/rasterize.h"
@@ -33,9 +34,10 @@ struct RenderCounts {
 // the order of the draws. What is too much for memory at once is drawn in bands of tile rows, with the same
 // result. With `keep_source` it is one band, and the workspace can go to render_backward: `source` is then
 // each record's place among the gaussians of all draws. Throws std::length_error past 2^32 gaussians.
+// Once `stop` is true, returns soon and leaves the picture and the counts unfinished.
 template <class T>
 RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera, const Picture<T>& picture,
-                    bool keep_source, Workspace<T>& workspace);
+                    bool keep_source, Workspace<T>& workspace, const std::atomic<bool>* stop = nullptr);
 
 // The gaussian that a pixel shows most of.
 struct Pick {

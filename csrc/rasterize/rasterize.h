@@ -11,7 +11,8 @@ struct Picture {
     T background[3];
     T* color;  // premultiplied, the background composed last
     T* alpha;
-    T* depth;  // expected depth, sum of weight * depth over alpha, 0 where alpha is 0; may be null
+    T* depth;            // expected depth, sum of weight * depth over alpha, 0 where alpha is 0; may be null
+    T* count = nullptr;  // gaussians that were blended, in place of depth; may be null
 };
 
 // Gradients of the picture, laid out as it is; `depth` may be null.

@@ -16,16 +16,16 @@ static V3DG_INLINE void prefetch(const Record<T>* records, const uint64_t* entry
     __builtin_prefetch(at + sizeof(Record<T>) - 1);
 }
 
-template <class T, bool kWithDepth>
+template <class T, Extra kExtra>
 static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
                        const Window& window, TilePlanes<T>& tile) {
     const BlockPixels<T> pixels;
-    uint64_t alive = clear_tile(tile, left, top, window, kWithDepth);
+    uint64_t alive = clear_tile(tile, left, top, window, kExtra);
     for (size_t i = 0; i < count && alive != 0; ++i) {
         prefetch(records, entry, i, count);
         const Record<T>& g = records[record_of(entry[i])];
         const uint64_t blocks = live_blocks(g, left, top, alive);
-        if (blocks != 0) blend_record<T, kWithDepth>(g, blocks, left, top, pixels, tile, alive);
+        if (blocks != 0) blend_record<T, kExtra>(g, blocks, left, top, pixels, tile, alive);
     }
 }
 
@@ -45,15 +45,20 @@ template <class T>
 void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
                     const Picture<T>& picture) {
     TilePlanes<T> tile;
-    if (picture.depth != nullptr)
-        blend_tile<T, true>(records, entry, count, left, top, picture.window, tile);
+    if (picture.count != nullptr)
+        blend_tile<T, Extra::kCount>(records, entry, count, left, top, picture.window, tile);
+    else if (picture.depth != nullptr)
+        blend_tile<T, Extra::kDepth>(records, entry, count, left, top, picture.window, tile);
     else
-        blend_tile<T, false>(records, entry, count, left, top, picture.window, tile);
+        blend_tile<T, Extra::kNothing>(records, entry, count, left, top, picture.window, tile);
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
         for (int c = 0; c < 3; ++c) picture.color[3 * out + c] = tile.color[c][p] + t * picture.background[c];
         picture.alpha[out] = 1 - t;
-        if (picture.depth != nullptr) picture.depth[out] = t < 1 ? tile.depth[p] / (1 - t) : T(0);
+        if (picture.count != nullptr)
+            picture.count[out] = tile.extra[p];
+        else if (picture.depth != nullptr)
+            picture.depth[out] = t < 1 ? tile.extra[p] / (1 - t) : T(0);
     });
 }
 
@@ -62,7 +67,8 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
                      const Picture<T>& picture, const PictureGradient<T>& d_picture,
                      RecordGradient<T>* d_entry, T* d_background) {
     TilePlanes<T> tile;
-    blend_tile<T, kWithDepth>(records, entry, count, left, top, picture.window, tile);
+    constexpr Extra kExtra = kWithDepth ? Extra::kDepth : Extra::kNothing;
+    blend_tile<T, kExtra>(records, entry, count, left, top, picture.window, tile);
     TileGradient<T> grad = {};
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
@@ -77,14 +83,14 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
         if (kWithDepth && t < 1) {
             const T d = d_picture.depth[out] / (1 - t);
             grad.d_depth[p] = d;
-            d_weight -= d * tile.depth[p] / (1 - t);
-            total += d * tile.depth[p];
+            d_weight -= d * tile.extra[p] / (1 - t);
+            total += d * tile.extra[p];
         }
         grad.d_weight[p] = d_weight;
         grad.total[p] = total + d_weight * (1 - t);
     });
     const BlockPixels<T> pixels;
-    uint64_t alive = clear_tile(tile, left, top, picture.window, false);
+    uint64_t alive = clear_tile(tile, left, top, picture.window, Extra::kNothing);
     for (size_t i = 0; i < count && alive != 0; ++i) {
         prefetch(records, entry, i, count);
         const Record<T>& g = records[record_of(entry[i])];

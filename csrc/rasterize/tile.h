@@ -19,12 +19,15 @@ constexpr int kBlockPixels = kBlockSize * kBlockSize;
 constexpr int kTileBlocks = kTileSize / kBlockSize;
 constexpr int kTilePixels = kTileSize * kTileSize;
 
+// What a tile has beside colour and transmittance.
+enum class Extra { kNothing, kDepth, kCount };
+
 // Planes of a tile, block after block, 16 pixels each.
 template <class T>
 struct TilePlanes {
     alignas(64) T transmittance[kTilePixels];
     alignas(64) T color[3][kTilePixels];
-    alignas(64) T depth[kTilePixels];  // sum of weight * depth
+    alignas(64) T extra[kTilePixels];  // sum of weight * depth, or the number of gaussians
 };
 
 // What the way back reads of each pixel, and the sums it keeps.
@@ -86,7 +89,7 @@ V3DG_INLINE uint64_t live_blocks(const Record<T>& g, int left, int top, uint64_t
 // Sets the planes to an empty picture and returns the blocks with a pixel in the window. Pixels outside count
 // as stopped.
 template <class T>
-inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window& window, bool with_depth) {
+inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window& window, Extra extra) {
     uint64_t alive = 0;
     for (int block = 0; block < kTileBlocks * kTileBlocks; ++block) {
         const int x = left + kBlockSize * (block % kTileBlocks), y = top + kBlockSize * (block / kTileBlocks);
@@ -98,7 +101,7 @@ inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window&
             const int px = x + i % kBlockSize, py = y + i / kBlockSize;
             tile.transmittance[p] = window.contains(px, py) ? T(1) : T(-1);
             tile.color[0][p] = tile.color[1][p] = tile.color[2][p] = T(0);
-            if (with_depth) tile.depth[p] = T(0);
+            if (extra != Extra::kNothing) tile.extra[p] = T(0);
         }
     }
     return alive;
@@ -116,7 +119,7 @@ struct BlockPixels {
 };
 
 // Blends one record over the live blocks of a tile; clears the bits of blocks that have stopped.
-template <class T, bool kWithDepth>
+template <class T, Extra kExtra>
 V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int top,
                               const BlockPixels<T>& pixels, TilePlanes<T>& tile, uint64_t& alive) {
     using V = Vec<T>;
@@ -148,7 +151,11 @@ V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int
             store(tile.color[0] + p, load(tile.color[0] + p) + weight * red);
             store(tile.color[1] + p, load(tile.color[1] + p) + weight * green);
             store(tile.color[2] + p, load(tile.color[2] + p) + weight * blue);
-            if (kWithDepth) store(tile.depth + p, load(tile.depth + p) + weight * g.depth);
+            if (kExtra == Extra::kDepth) store(tile.extra + p, load(tile.extra + p) + weight * g.depth);
+            if (kExtra == Extra::kCount) {
+                const V one = weight > V{} ? all_lanes<V>(T(1)) : V{};
+                store(tile.extra + p, load(tile.extra + p) + one);
+            }
         }
         if (live == 0) alive &= ~(uint64_t(1) << block);
     }
