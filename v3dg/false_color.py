@@ -15,7 +15,7 @@ ColorBy: TypeAlias = Literal["appearance", "level", "cluster"]
 
 _SH_BASE = 0.28209479177387814  # of degree 0
 # From fine to coarse, and around again: neighbours differ in hue and in lightness.
-_LEVEL_COLORS = np.array(
+LEVEL_COLORS = np.array(
     [
         (0.90, 0.24, 0.22),
         (0.98, 0.60, 0.17),
@@ -44,7 +44,7 @@ def false_color(bundle: Bundle, by: ColorBy) -> Gaussians:
         return gaussians
     clusters = bundle.clusters
     if by == "level":
-        colors = _LEVEL_COLORS[clusters.level % len(_LEVEL_COLORS)]
+        colors = LEVEL_COLORS[clusters.level % len(LEVEL_COLORS)]
     else:
         colors = _scattered_colors(len(clusters.level))
     per_gaussian = np.repeat(colors, np.diff(clusters.offset), axis=0)

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import tyro
 
 from v3dg._version import __version__
-from v3dg.cli import bench, build, compare, completion, demo, info, render, world
+from v3dg.cli import bench, build, compare, completion, demo, info, render, view, world
 from v3dg.cli._common import FAILURES, UsageError, failure_text
 
 # Options and what runs on them, by the command's name, in the order of the help.
@@ -26,6 +26,7 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], None]]] = {
     "build": (build.Build, build.run),
     "info": (info.Info, info.run),
     "render": (render.Render, render.run),
+    "view": (view.View, view.run),
     "compare": (compare.Compare, compare.run),
     "world": (world.World, world.run),
     "demo": (demo.Demo, demo.run),
@@ -34,9 +35,10 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any], None]]] = {
 }
 
 _DESCRIPTION = """\
-Level of detail for 3D Gaussian Splatting, in three steps:
+Level of detail for 3D Gaussian Splatting, in four steps:
     v3dg build donut.ply               makes clusters at halving levels of detail
     v3dg render donut.v3dg --views 8   draws those that are just detailed enough
+    v3dg view donut.v3dg               shows it in a web browser
     v3dg compare donut.ply donut.v3dg  says what that costs in quality
 
 No asset at hand? `v3dg demo` makes one, `v3dg world forest` a whole scene.

@@ -1,0 +1,478 @@
+"""The viewer without a browser; test_viewer_page.py opens it in one."""
+
+import math
+import threading
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import scenes_lod
+import v3dg
+from v3dg import Camera, Gaussians, Scene, _core
+from v3dg.pictures import to_8bit
+from v3dg.viewer.frame import MOST_COUNTED, Frame, Settings, Stage, Stopped, ramp
+from v3dg.viewer.pacing import Pacer, Painter, Request, finer_sizes
+from v3dg.viewer.path import CameraPath
+from v3dg.viewer.view import View, look_at
+
+SIZE = (96, 64)
+SECONDS = 20  # that nothing here takes
+
+
+# Views.
+
+
+def test_view_takes_over_a_camera_and_gives_it_back():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        camera = scenes_lod.random_camera(rng)
+        again = View.of_camera(camera).camera(camera.width, camera.height, camera.near)
+        np.testing.assert_allclose(again.viewmat, camera.viewmat, atol=1e-12)
+        np.testing.assert_allclose(again.K, camera.K, rtol=1e-12)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 2)])
+def test_view_takes_over_half_turns(axis):
+    axis = np.array(axis) / np.linalg.norm(axis)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = 2 * np.outer(axis, axis) - np.eye(3)
+    camera = Camera(viewmat, [[50, 0, 32], [0, 50, 24], [0, 0, 1]], 64, 48)
+    again = View.of_camera(camera).camera(64, 48, 0.01)
+    np.testing.assert_allclose(again.viewmat, viewmat, atol=1e-12)
+
+
+def test_view_shows_the_same_at_any_size():
+    view = look_at((1, -4, 2), (0, 0, 0), (0, 0, 1), 0.8, 1.5)
+    small, large = view.camera(61, 40, 0.01), view.camera(610, 401, 0.01)
+    np.testing.assert_allclose(small.K[:2] / [[61], [40]], large.K[:2] / [[610], [401]])
+    assert 2 * math.atan(large.height / 2 / large.fy) == pytest.approx(0.8)
+    assert large.width / large.fx / (large.height / large.fy) == pytest.approx(1.5)
+
+
+# Frames.
+
+
+def stack(opacities):
+    """Round gaussians one behind the other, on the axis of `AXIS`."""
+    count = len(opacities)
+    means = np.zeros((count, 3), np.float32)
+    means[:, 1] = np.arange(count) * 0.01
+    return Gaussians(
+        means=means,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        scales=np.full((count, 3), 0.2, np.float32),
+        opacities=np.asarray(opacities, np.float32),
+        sh=np.ones((count, 1, 3), np.float32),
+    )
+
+
+AXIS = look_at((0, -3, 0), (0, 0, 0), (0, 0, 1), 0.8, 1.5)
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    rng = np.random.default_rng(3)
+    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 600, size=0.3), 32)
+    scene = Scene()
+    scene.add(bundle, positions=rng.normal(size=(40, 3)), quaternions=rng.normal(size=(40, 4)))
+    return scene
+
+
+@pytest.fixture(scope="module")
+def view():
+    return look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.7, 1.5)
+
+
+@pytest.fixture
+def stage(crowd, device):
+    return Stage(crowd, device=device)
+
+
+def drawn(stage, view, device, **options):
+    """What `v3dg.render` draws there, and its figures."""
+    image = v3dg.render(stage.scene, view.camera(*SIZE, stage.near), device=device, **options)
+    color = image.color if device == "cpu" else image.color.cpu().numpy()
+    return to_8bit(color), image.stats
+
+
+@pytest.mark.parametrize("shows", ["appearance", "level", "cluster"])
+def test_frame_is_the_picture_of_render(stage, view, device, shows):
+    frame = stage.frame(view, SIZE, Settings(shows=shows, tolerance=20.0))
+    picture, stats = drawn(stage, view, device, tolerance=20.0, color_by=shows)
+    np.testing.assert_array_equal(frame.pixels, picture)
+    assert frame.figures.gaussians_selected == stats.gaussians_selected
+    assert frame.figures.gaussians_in_view == stats.gaussians_in_frustum
+    assert frame.size == SIZE
+
+
+def test_figures_count_gaussians_by_level(stage, view):
+    figures = stage.frame(view, SIZE, Settings(tolerance=20.0)).figures
+    assert figures.levels.sum() == figures.gaussians_selected
+    assert np.count_nonzero(figures.levels) > 2
+    finest = stage.frame(view, SIZE, Settings(tolerance=0.0)).figures
+    assert finest.levels[0] == finest.gaussians_selected > figures.gaussians_selected
+    coarse = stage.frame(view, SIZE, Settings(tolerance=0.0, min_level=2)).figures
+    assert (coarse.levels[:2] == 0).all()
+    assert coarse.levels[2] == coarse.gaussians_selected
+    assert figures.memory_bytes > 10 << 20
+
+
+def test_budget_is_kept_and_one_too_small_is_an_error(stage, view):
+    budget = 3000
+    figures = stage.frame(view, SIZE, Settings(tolerance=0.0, budget=budget)).figures
+    assert 0 < figures.gaussians_selected <= budget
+    assert figures.tolerance > 0
+    with pytest.raises(ValueError, match="budget: expected at least"):
+        stage.frame(view, SIZE, Settings(tolerance=0.0, budget=1))
+
+
+def test_alpha_and_depth_are_shown(stage, view, device):
+    image = v3dg.render(stage.scene, view.camera(*SIZE, stage.near), tolerance=0.0, device=device)
+    alpha, depth = (np.asarray(p if device == "cpu" else p.cpu()) for p in (image.alpha, image.depth))
+    shown = stage.frame(view, SIZE, Settings(shows="alpha", tolerance=0.0))
+    np.testing.assert_array_equal(shown.pixels, np.repeat(to_8bit(alpha)[..., None], 3, axis=2))
+    shown = stage.frame(view, SIZE, Settings(shows="depth", tolerance=0.0))
+    far, near = shown.value_range
+    inside = (alpha > 0.99) & (depth > near) & (depth < far)
+    assert inside.sum() > 100
+    brightness = shown.pixels.astype(float).sum(axis=2)[inside]
+    assert (np.diff(brightness[np.argsort(depth[inside])]) < 30).all()
+    assert brightness[np.argmin(depth[inside])] > brightness[np.argmax(depth[inside])] + 100
+    assert (shown.pixels[alpha == 0] == 0).all()
+
+
+def test_an_empty_picture_is_black_in_every_mode(stage):
+    away = look_at((0, -60, 0), (0, -70, 0), (0, 0, 1), 0.5, 1.5)
+    for shows in ("appearance", "level", "depth", "alpha", "count", "difference"):
+        frame = stage.frame(away, SIZE, Settings(shows=shows, split=0.0))
+        assert not frame.pixels.any()
+        assert frame.figures.gaussians_in_view == 0
+
+
+@pytest.mark.parametrize(
+    ("opacities", "count"),
+    [([0.1] * 5, 5), ([0.1] * 40, 40), ([1.0, 0.999, 0.5, 0.5], 1), ([0.91] * 8, 3)],
+)
+def test_count_is_of_the_gaussians_that_a_pixel_is_blended_of(opacities, count):
+    """A gaussian that would take the transmittance to 1e-4 or below is not blended, nor what is behind it."""
+    stage = Stage(stack(opacities))
+    camera = AXIS.camera(33, 33, 0.01)
+    cut = v3dg.select(stage.scene, camera)
+    window = (0, 0, 33, 33)
+    counts, in_view = stage._count(cut, camera, window, None)
+    assert counts[16, 16] == count
+    assert in_view == len(opacities)
+    alpha = v3dg.render(stage.scene, camera).alpha
+    np.testing.assert_array_equal(counts > 0, alpha > 0)
+
+
+def test_count_is_shown_on_a_scale_of_octaves(device):
+    pixels = {}
+    for number in (2, 16):
+        frame = Stage(stack([0.01] * number), device=device).frame(AXIS, (33, 33), Settings(shows="count"))
+        pixels[number] = frame.pixels[16, 16]
+        assert frame.value_range == (1.0, MOST_COUNTED)
+    for number, pixel in pixels.items():
+        np.testing.assert_array_equal(pixel, to_8bit(ramp(np.array(math.log2(number) / 8))))
+
+
+def test_difference_is_to_all_gaussians_and_amplified(stage, view):
+    none = stage.frame(view, SIZE, Settings(shows="difference", tolerance=0.0))
+    assert not none.pixels.any()
+    one, ten = (
+        stage.frame(view, SIZE, Settings(shows="difference", tolerance=20.0, gain=gain)).pixels.astype(int)
+        for gain in (1, 10)
+    )
+    assert one.max() > 10
+    assert abs(np.minimum(10 * one, 255) - ten).max() <= 5
+
+
+def test_split_shows_all_gaussians_on_the_left(stage, view, device):
+    settings = Settings(tolerance=20.0, split=0.25)
+    pixels = stage.frame(view, SIZE, settings).pixels
+    fine, _ = drawn(stage, view, device, tolerance=0.0)
+    coarse, _ = drawn(stage, view, device, tolerance=20.0)
+    np.testing.assert_array_equal(pixels[:, :23], fine[:, :23])
+    np.testing.assert_array_equal(pixels[:, 25:], coarse[:, 25:])
+    assert (pixels[:, 23:25] == 255).all()
+    assert not np.array_equal(fine[:, :23], coarse[:, :23])
+    np.testing.assert_array_equal(
+        stage.frame(view, SIZE, replace(settings, split=1.0)).pixels[:, :-1], fine[:, :-1]
+    )
+
+
+def test_frozen_cut_stays_while_the_camera_moves(stage, view):
+    far = look_at((0, -30, 1), (0, 0, 0), (0, 0, 1), 0.7, 1.5)
+    there = stage.frame(far, SIZE, Settings())
+    here = stage.frame(view, SIZE, Settings())
+    frozen = stage.frame(view, SIZE, Settings(frozen=far))
+    np.testing.assert_array_equal(frozen.figures.levels, there.figures.levels)
+    assert frozen.figures.gaussians_selected < here.figures.gaussians_selected
+    assert not np.array_equal(frozen.pixels, here.pixels)
+    assert not np.array_equal(frozen.pixels, there.pixels)
+
+
+def test_asset_is_drawn_whole_and_has_one_level(view):
+    asset = scenes_lod.blob(np.random.default_rng(1), 500)
+    stage = Stage(asset)
+    assert stage.num_levels == 1
+    assert stage.num_gaussians == 500
+    frame = stage.frame(view, SIZE, Settings())
+    whole = to_8bit(v3dg.render(asset, view.camera(*SIZE, stage.near)).color)
+    assert abs(frame.pixels.astype(int) - whole).max() <= 1
+    assert whole.any()
+
+
+def test_scene_of_nothing_is_drawn():
+    frame = Stage(Scene()).frame(AXIS, SIZE, Settings())
+    assert not frame.pixels.any()
+
+
+def test_a_picture_that_is_stopped_is_given_up(crowd, view):
+    stage, stop = Stage(crowd), _core.Stop()
+    stop.request()
+    for shows in ("appearance", "count", "difference"):
+        with pytest.raises(Stopped):
+            stage.frame(view, SIZE, Settings(shows=shows), stop)
+
+
+def test_a_stop_ends_a_long_picture_early():
+    rng = np.random.default_rng(5)
+    scene = Scene()
+    scene.add(
+        scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 4000, size=0.2), 256),
+        positions=rng.normal(size=(2000, 3)),
+    )
+    stage, settings = Stage(scene), Settings(tolerance=0.0)
+    view = look_at((0, -9, 0), (0, 0, 0), (0, 0, 1), 0.7, 1.5)
+    start = time.monotonic()
+    stage.frame(view, (800, 600), settings)
+    whole = time.monotonic() - start
+    stop = _core.Stop()
+    timer = threading.Timer(whole / 4, stop.request)
+    start = time.monotonic()
+    timer.start()
+    with pytest.raises(Stopped):
+        stage.frame(view, (800, 600), settings, stop)
+    assert time.monotonic() - start < 0.8 * whole
+
+
+# Pacing.
+
+
+def paced(milliseconds, full=(1920, 1080), pictures=40):
+    """Sizes that a pacer chooses where a picture of so many pixels takes that long."""
+    pacer, sizes = Pacer(60.0), []
+    for _ in range(pictures):
+        size = pacer.size(full)
+        sizes.append(size)
+        pacer.drew(size, milliseconds(size[0] * size[1]))
+    return sizes
+
+
+def test_pacer_finds_the_largest_picture_in_time_and_stays_there():
+    def cost(pixels):
+        return 10 + pixels / 4000
+
+    sizes = paced(cost)
+    assert len(set(sizes[20:])) == 1
+    width, height = sizes[-1]
+    assert width / height == pytest.approx(16 / 9, rel=0.02)
+    assert 0.5 * 60 < cost(width * height) <= 60
+
+
+def test_pacer_draws_in_full_what_is_quick_and_no_smaller_than_it_must():
+    assert paced(lambda pixels: 1.0)[-1] == (1920, 1080)
+    assert paced(lambda pixels: 1000.0)[-1] == (320, 180)
+
+
+def test_pacer_gives_way_at_once_and_takes_back_slowly():
+    pacer, full = Pacer(60.0), (1600, 800)
+    pacer.drew(full, 60.0)
+    assert pacer.size(full) == full
+    pacer.drew(full, 240.0)
+    assert pacer.size(full) == (800, 400)
+    pacer.drew((800, 400), 15.0)
+    assert 800 < pacer.size(full)[0] < 1600
+
+
+def test_sizes_double_up_to_the_full_one():
+    assert finer_sizes((100, 50), (800, 400)) == [(200, 100), (400, 200), (800, 400)]
+    assert finer_sizes((300, 150), (800, 400)) == [(800, 400)]
+    assert finer_sizes((800, 400), (800, 400)) == []
+
+
+# The painter.
+
+
+class FakeStage:
+    """Notes what is drawn; `hold` makes larger pictures wait until they are stopped."""
+
+    compares_while_moving = False
+
+    def __init__(self):
+        self.drawn, self.hold = [], False
+        self.is_held = threading.Event()
+
+    def frame(self, view, size, settings, stop=None):
+        self.drawn.append((view, size, settings))
+        if isinstance(view, Exception):
+            raise view
+        while stop is not None and self.hold:
+            self.is_held.set()
+            if stop.is_requested:
+                raise Stopped
+            time.sleep(1e-3)
+        return Frame(np.full((size[1], size[0], 3), view, np.uint8), None, None)
+
+
+@pytest.fixture
+def painting():
+    """A painter, its stage, and what it sent: (view, size, is it final)."""
+    stage, sent, errors, is_final = FakeStage(), [], [], threading.Event()
+
+    def send(frame, final):
+        sent.append((frame.pixels[0, 0, 0], frame.size, final))
+        if final:
+            is_final.set()
+
+    def fail(error):
+        errors.append(error)
+        is_final.set()
+
+    painter = Painter(stage, send, fail)
+    yield SimpleNamespace(painter=painter, stage=stage, sent=sent, errors=errors, is_final=is_final)
+    painter.close()
+
+
+def wait(event):
+    assert event.wait(SECONDS)
+    event.clear()
+
+
+def test_a_request_is_answered_small_and_then_in_full(painting):
+    painting.painter.ask(Request(7, (160, 80), Settings()))
+    wait(painting.is_final)
+    assert painting.sent == [(7, (40, 20), False), (7, (80, 40), False), (7, (160, 80), True)]
+
+
+def test_a_new_request_ends_a_large_picture(painting):
+    painting.stage.hold = True
+    painting.painter.ask(Request(1, (160, 80), Settings()))
+    wait(painting.stage.is_held)
+    painting.stage.hold = False
+    painting.painter.ask(Request(2, (160, 80), Settings()))
+    wait(painting.is_final)
+    assert (1, (160, 80), True) not in painting.sent
+    assert painting.sent[-1] == (2, (160, 80), True)
+
+
+def test_of_many_requests_the_last_is_drawn(painting):
+    for view in range(200):
+        painting.painter.ask(Request(view, (160, 80), Settings()))
+    wait(painting.is_final)
+    assert painting.sent[-1] == (199, (160, 80), True)
+    assert len(painting.sent) < 200
+
+
+def test_a_comparison_with_too_many_gaussians_waits_for_the_rest(painting):
+    settings = Settings(shows="difference", split=0.5)
+    painting.painter.ask(Request(3, (160, 80), settings))
+    wait(painting.is_final)
+    first, *others = painting.stage.drawn
+    assert not first[2].compares
+    assert all(other[2] == settings for other in others)
+
+
+def test_an_error_is_told_and_the_next_request_is_drawn(painting):
+    painting.painter.ask(Request(ValueError("no such cut"), (160, 80), Settings()))
+    wait(painting.is_final)
+    assert [str(error) for error in painting.errors] == ["no such cut"]
+    painting.painter.ask(Request(5, (160, 80), Settings()))
+    wait(painting.is_final)
+    assert painting.sent[-1] == (5, (160, 80), True)
+
+
+def test_closing_ends_the_thread_in_the_middle_of_a_picture(painting):
+    painting.stage.hold = True
+    painting.painter.ask(Request(1, (160, 80), Settings()))
+    wait(painting.stage.is_held)
+    painting.painter.close()
+    assert not any(thread.name == "v3dg painter" for thread in threading.enumerate())
+
+
+# Paths.
+
+
+def path_of(views, seconds=1.0):
+    path = CameraPath()
+    for view in views:
+        path.add(view, seconds)
+    return path
+
+
+def turned(angle, sign=1.0):
+    return View(
+        (sign * math.cos(angle / 2), 0.0, 0.0, sign * math.sin(angle / 2)), (angle, 2.0, 3.0), 0.7, 1.5
+    )
+
+
+def test_path_goes_through_its_views():
+    views = [
+        look_at((math.cos(a), math.sin(2 * a), a), (0, 0, 0), (0, 0, 1), 0.7 + a / 9, 1.5) for a in (0, 1, 2)
+    ]
+    path = path_of(views, 2.0)
+    assert path.seconds == 4.0
+    for place, view in enumerate(views):
+        at = path.at(2.0 * place)
+        np.testing.assert_allclose(at.position, view.position, atol=1e-12)
+        np.testing.assert_allclose(abs(np.dot(at.wxyz, view.wxyz)), 1, atol=1e-12)
+        assert at.fov_y == pytest.approx(view.fov_y)
+    assert path.at(-1.0).position == pytest.approx(views[0].position)
+    assert path.at(9.0).position == pytest.approx(views[-1].position)
+
+
+def test_path_does_not_care_for_a_quaternions_sign():
+    plain, flipped = (path_of([turned(0.1), turned(0.5, sign), turned(0.9)]) for sign in (1.0, -1.0))
+    for t in np.linspace(0, 2, 9):
+        assert abs(np.dot(plain.at(t).wxyz, flipped.at(t).wxyz)) == pytest.approx(1)
+
+
+def test_straight_path_at_one_speed_stays_so():
+    path = path_of([turned(0.2 * i) for i in range(5)])
+    for t in np.linspace(0, 4, 17):
+        np.testing.assert_allclose(path.at(t).position, (0.2 * t, 2, 3), atol=1e-12)
+
+
+def test_path_is_smooth_where_times_are_uneven():
+    path = CameraPath()
+    for view, seconds in ((turned(0.0), 1.0), (turned(0.3), 0.5), (turned(1.0), 2.0), (turned(0.2), 1.0)):
+        path.add(view, seconds)
+    hair = 1e-5
+    for joint in path.times[1:-1]:
+        before, at, after = (np.array(path.at(joint + shift).position) for shift in (-hair, 0, hair))
+        np.testing.assert_allclose((at - before) / hair, (after - at) / hair, atol=1e-3)
+
+
+def test_path_becomes_cameras():
+    path = path_of([turned(0.0), turned(1.0)])
+    cameras = path.cameras(10, 64, 48, 0.01)
+    assert list(cameras) == [f"{i:02}" for i in range(11)]
+    np.testing.assert_allclose(cameras["10"].position, (1, 2, 3))
+    assert len(path_of([turned(0.0)]).cameras(10, 64, 48, 0.01)) == 2
+
+
+def test_recorded_views_are_not_denser_than_a_film():
+    path = CameraPath()
+    for i in range(100):
+        path.record(turned(i / 100), 5.0 + i / 100)
+    assert 20 < len(path) < 35
+    assert path.seconds == pytest.approx(1.0, abs=0.05)
+
+
+def test_empty_path_is_an_error():
+    with pytest.raises(ValueError, match="path: expected at least one view, got none"):
+        CameraPath().at(0.0)

@@ -1,0 +1,71 @@
+"""`v3dg view`."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from v3dg.cli._common import Threads, UsageError, option, require_subject
+from v3dg.cli._views import load_subject
+
+
+@dataclass
+class View:
+    """Look at a scene, a bundle or an asset in a web browser."""
+
+    subject: tyro.conf.Positional[Path]
+    """A scene (.json), a bundle (.v3dg) or an asset (.ply)."""
+    host: str = "127.0.0.1"
+    """Address to listen at; the default lets in this machine alone, 0.0.0.0 anyone who reaches it."""
+    port: int = 8080
+    """Port to listen at; the next free one where it is taken."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    """Which way is up."""
+    tolerance: Annotated[float | None, option("PX2")] = None
+    """Screen area in px² that one gaussian of a coarser cluster may stand for, to begin with."""
+    budget: Annotated[int | None, option("N")] = None
+    """Most gaussians to draw in one picture, to begin with."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to draw; auto is a CUDA device where there is one and torch can use it."""
+    threads: Threads = None
+    """CPU threads; all if not given."""
+
+
+def run(options: View) -> None:
+    require_subject(options.subject)
+    if not 0 <= options.port <= 65535:
+        raise UsageError(f"--port: expected 0 to 65535, got {options.port}")
+    import numpy as np
+
+    from v3dg.select import DEFAULT_TOLERANCE, rule_of
+    from v3dg.viewer.frame import Stage
+    from v3dg.viewer.page import Site
+
+    rule_of(options.tolerance, options.budget, 0, "solid_angle", True)
+    subject, cameras = load_subject(options.subject)
+    stage = Stage(subject, device=options.device)
+    axis = np.eye(3)["xyz".index(options.up[-1])] * (-1 if options.up[0] == "-" else 1)
+    site = Site(
+        stage,
+        name=options.subject.stem,
+        cameras=cameras,
+        host=options.host,
+        port=options.port,
+        tolerance=DEFAULT_TOLERANCE if options.tolerance is None else options.tolerance,
+        budget=options.budget,
+        up=axis,
+    )
+    try:
+        if options.port not in (0, site.port):
+            print(f"port {options.port} is taken, listening at {site.port}")
+        host = "localhost" if options.host == "0.0.0.0" else options.host
+        print(f"http://{host}:{site.port} shows {options.subject}; Ctrl-C ends it", flush=True)
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print()
+    finally:
+        site.close()

@@ -1,0 +1,308 @@
+"""One picture of the viewer: a scene, a view and settings become pixels and figures."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _core, _device, _resident
+from v3dg.build import BuildConfig, build_bundle
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera, Floats
+from v3dg.false_color import ColorBy
+from v3dg.gaussians import Gaussians
+from v3dg.pictures import to_8bit
+from v3dg.render import cluster_tables, render
+from v3dg.scene import Scene
+from v3dg.select import DEFAULT_TOLERANCE, Selection, camera_of, rule_of, select
+from v3dg.viewer.view import View
+
+Pixels: TypeAlias = npt.NDArray[np.uint8]
+Window: TypeAlias = tuple[int, int, int, int]
+Shows: TypeAlias = Literal["appearance", "level", "cluster", "depth", "alpha", "count", "difference"]
+
+# Gaussians in a pixel that get the brightest colour.
+MOST_COUNTED = 256
+# So many gaussians are drawn whole while the camera moves, too.
+_FEW_GAUSSIANS = 500_000
+# From dark to bright, even in lightness.
+_RAMP = np.array(
+    [
+        (0.05, 0.03, 0.15),
+        (0.27, 0.06, 0.39),
+        (0.53, 0.13, 0.42),
+        (0.77, 0.23, 0.33),
+        (0.94, 0.42, 0.20),
+        (0.99, 0.66, 0.22),
+        (0.99, 0.95, 0.65),
+    ],
+    np.float32,
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a picture shows, and how finely.
+
+    Attributes:
+        shows: The colours, those of a level or a cluster, expected depth, alpha, how many gaussians a pixel
+            is blended of, or the difference to the picture of all gaussians.
+        tolerance, budget, min_level: As in `v3dg.render`, but that a tolerance is always given.
+        gain: What a difference is multiplied by.
+        split: Share of the width, from the left, that shows all gaussians; 0 for none.
+        frozen: The view that the cut is chosen for; None for the one that is looked from.
+    """
+
+    shows: Shows = "appearance"
+    tolerance: float = DEFAULT_TOLERANCE
+    budget: int | None = None
+    min_level: int = 0
+    gain: float = 5.0
+    split: float = 0.0
+    frozen: View | None = None
+
+    @property
+    def compares(self) -> bool:
+        """Whether all gaussians have to be drawn, too."""
+        return self.split > 0 or self.shows == "difference"
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a picture cost.
+
+    Attributes:
+        gaussians_selected, gaussians_in_view, tolerance, select_ms, draw_ms: As in `v3dg.Stats`, of the cut;
+            times of the whole picture.
+        levels: (L,) selected gaussians by level.
+        memory_bytes: Of the whole process.
+    """
+
+    gaussians_selected: int
+    gaussians_in_view: int
+    tolerance: float
+    select_ms: float
+    draw_ms: float
+    levels: npt.NDArray[np.int64]
+    memory_bytes: int
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Pixels (H, W, 3), what they cost, and the values of the darkest and the brightest colour if any."""
+
+    pixels: Pixels
+    figures: Figures
+    value_range: tuple[float, float] | None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+
+def ramp(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """(..., 3) colours of values in [0, 1], dark to bright."""
+    at = np.linspace(0.0, 1.0, len(_RAMP))
+    return np.stack([np.interp(values, at, _RAMP[:, c]) for c in range(3)], axis=-1).astype(np.float32)
+
+
+class Stopped(Exception):
+    """A picture was given up because another one is wanted."""
+
+
+class Stage:
+    """Draws pictures of one scene; any number of threads may ask, one picture is drawn at a time.
+
+    Args:
+        subject: A scene, a bundle, or an asset, which is split into clusters but gets no coarser levels.
+        device: "cpu" or "cuda".
+        near: As in `v3dg.Camera`; None for what suits the scene's size.
+
+    Attributes:
+        scene: The subject as a scene.
+        center, radius: A ball that holds nearly all of it, world units.
+    """
+
+    def __init__(
+        self, subject: Scene | Bundle | Gaussians, *, device: str = "cpu", near: float | None = None
+    ) -> None:
+        if isinstance(subject, Gaussians):
+            only_leaves = BuildConfig(min_clusters=1 << 31)
+            subject = build_bundle(subject, config=only_leaves, device="cpu", progress=False)
+        self.scene = Scene.of(subject)
+        self.device = _device.resolve(device)
+        self.center, self.radius = _bounds(self.scene)
+        self.near = min(0.01, 1e-3 * self.radius) if near is None else near
+        self.num_levels = max((bundle.num_levels for bundle in self.scene.bundles), default=1)
+        sizes = [bundle.clusters.offset[bundle.level_range(0).stop] for bundle in self.scene.bundles]
+        instances = np.bincount(self.scene.instance_bundle, minlength=len(sizes))
+        self.num_gaussians = int(np.dot(np.asarray(sizes, np.int64), instances)) if sizes else 0
+
+    @property
+    def compares_while_moving(self) -> bool:
+        """Whether all gaussians are few enough to be drawn in every picture."""
+        return self.device == "cuda" or self.num_gaussians <= _FEW_GAUSSIANS
+
+    def frame(
+        self, view: View, size: tuple[int, int], settings: Settings, stop: _core.Stop | None = None
+    ) -> Frame:
+        """Draw a picture of ``size`` (width, height) px.
+
+        Raises:
+            Stopped: ``stop`` was requested; it is raised soon after.
+            ValueError: The budget is too small for any cut.
+        """
+        camera = view.camera(*size, self.near)
+        chooser = camera if settings.frozen is None else settings.frozen.camera(*size, self.near)
+        start = time.perf_counter()
+        cut = select(
+            self.scene,
+            chooser,
+            tolerance=settings.tolerance,
+            budget=settings.budget,
+            min_level=settings.min_level,
+            device=self.device,
+        )
+        selected = time.perf_counter()
+        width, height = size
+        edge = round(settings.split * width)
+        window = (edge, 0, width, height)
+        value_range, in_view = None, 0
+        picture = np.zeros((height, width, 3), np.float32)
+        if edge < width:
+            picture[:, edge:], value_range, in_view = self._shown(cut, camera, window, settings, stop)
+        if edge > 0:
+            picture[:, :edge] = self._all_gaussians(camera, (0, 0, edge, height), stop)
+            picture[:, max(edge - 1, 0) : edge + 1] = 1.0
+        figures = Figures(
+            gaussians_selected=cut.num_gaussians,
+            gaussians_in_view=in_view,
+            tolerance=cut.tolerance,
+            select_ms=1e3 * (selected - start),
+            draw_ms=1e3 * (time.perf_counter() - selected),
+            levels=self._levels(cut),
+            memory_bytes=_resident_bytes(),
+        )
+        return Frame(to_8bit(picture), figures, value_range)
+
+    def _shown(
+        self, cut: Selection, camera: Camera, window: Window, settings: Settings, stop: _core.Stop | None
+    ) -> tuple[npt.NDArray[np.float32], tuple[float, float] | None, int]:
+        """The window's colours, the values of the darkest and the brightest if any, gaussians in view."""
+        shows = settings.shows
+        if shows == "count":
+            count, in_view = self._count(cut, camera, window, stop)
+            values = np.log2(np.maximum(count, 1)) / np.log2(MOST_COUNTED)
+            return ramp(values) * (count > 0)[..., None], (1.0, MOST_COUNTED), in_view
+        color_by: ColorBy = shows if shows in ("level", "cluster") else "appearance"
+        color, alpha, depth, in_view = self._draw(cut, camera, window, color_by, stop)
+        if shows == "alpha":
+            return np.repeat(alpha[..., None], 3, axis=2), (0.0, 1.0), in_view
+        if shows == "depth":
+            covered = depth[alpha > 0.5]
+            # A few gaussians far from all others would take all the colours.
+            near, far = np.percentile(covered, (1, 99)) if covered.size else (0.0, 1.0)
+            values = np.clip((far - depth) / max(far - near, 1e-12), 0, 1)
+            return ramp(values) * alpha[..., None], (float(far), float(near)), in_view
+        if shows == "difference":
+            difference = np.abs(color - self._all_gaussians(camera, window, stop))
+            return np.minimum(settings.gain * difference, np.float32(1)), None, in_view
+        return color, None, in_view
+
+    def _all_gaussians(
+        self, camera: Camera, window: Window, stop: _core.Stop | None
+    ) -> npt.NDArray[np.float32]:
+        if self.device == "cuda":
+            cut = select(self.scene, camera, tolerance=0.0, device="cuda")
+        else:  # which leaves out what is beside the window
+            instances = _resident.instances_on_host(self.scene)
+            rule = rule_of(0.0, None, 0, "solid_angle", True)
+            found = _core.select(self.scene.tables, instances, camera_of(camera, window), rule)
+            cut = Selection(self.scene, found[0], found[1], found[2], 0.0, 0.0)
+        color: npt.NDArray[np.float32] = self._draw(cut, camera, window, "appearance", stop)[0]
+        return color
+
+    def _draw(
+        self, cut: Selection, camera: Camera, window: Window, color_by: ColorBy, stop: _core.Stop | None
+    ) -> tuple[Any, Any, Any, int]:
+        """Colour, alpha and depth of the window, and the gaussians in view of the whole picture."""
+        if self.device == "cuda":
+            image = render(self.scene, camera, cut=cut, color_by=color_by, device="cuda")
+            x0, y0, x1, y1 = window
+            planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
+            color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
+            return color, alpha, depth, image.stats.gaussians_in_frustum
+        color, alpha, depth, counts = _core.render_selection(
+            cluster_tables(self.scene, color_by),
+            _resident.instances_on_host(self.scene),
+            camera_of(camera, window),
+            cut.instance_ids,
+            cut.cluster_ids,
+            (0.0, 0.0, 0.0),
+            True,
+            stop,
+        )
+        _check(stop)
+        return color, alpha, depth, counts["in_frustum"]
+
+    def _count(
+        self, cut: Selection, camera: Camera, window: Window, stop: _core.Stop | None
+    ) -> tuple[npt.NDArray[np.float32], int]:
+        """(H, W) gaussians that each pixel is blended of; drawn on the CPU on any device."""
+        count, counts = _core.count_selection(
+            cluster_tables(self.scene),
+            _resident.instances_on_host(self.scene),
+            camera_of(camera, window),
+            cut.instance_ids,
+            cut.cluster_ids,
+            stop,
+        )
+        _check(stop)
+        return count, counts["in_frustum"]
+
+    def _levels(self, cut: Selection) -> npt.NDArray[np.int64]:
+        """(L,) selected gaussians by level."""
+        levels = np.zeros(self.num_levels, np.int64)
+        bundle_of_pair = self.scene.instance_bundle[cut.instance_ids]
+        for b, bundle in enumerate(self.scene.bundles):
+            clusters = cut.cluster_ids[bundle_of_pair == b]
+            sizes = np.diff(bundle.clusters.offset)[clusters]
+            here = np.bincount(bundle.clusters.level[clusters], sizes, self.num_levels)
+            levels += here.astype(np.int64)
+        return levels
+
+
+def _check(stop: _core.Stop | None) -> None:
+    if stop is not None and stop.is_requested:
+        raise Stopped
+
+
+def _bounds(scene: Scene) -> tuple[Floats, float]:
+    """Centre and radius of a ball around nearly all of the scene: trained assets have a few far outliers."""
+    corners = [np.zeros((0, 3))]
+    for b, bundle in enumerate(scene.bundles):
+        mine = scene.instance_bundle == b
+        leaves = bundle.clusters.box[: bundle.level_range(0).stop].reshape(-1, 3)
+        if not len(leaves):
+            continue
+        low, high = np.percentile(leaves.astype(np.float64), (2, 98), axis=0)
+        box = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+        turned = np.einsum("iab,kb->ika", scene.rotations[mine], box)
+        placed = scene.scales[mine, None, None] * turned + scene.positions[mine, None]
+        corners.append(placed.reshape(-1, 3))
+    points = np.concatenate(corners)
+    if not len(points):
+        return np.zeros(3), 1.0
+    low, high = np.percentile(points, (1, 99), axis=0)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
+def _resident_bytes() -> int:
+    """Memory that this process holds."""
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

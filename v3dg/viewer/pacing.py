@@ -1,0 +1,158 @@
+"""How large to draw, and when: small while things move, larger step by step once they rest."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from v3dg import _core
+from v3dg.viewer.frame import Frame, Settings, Stage, Stopped
+from v3dg.viewer.view import View
+
+Size = tuple[int, int]
+
+# Of one picture while the camera moves; a drag then has an answer in less than twice that.
+TARGET_MS = 60.0
+# Without a change for so long, a larger picture is begun.
+REST_SECONDS = 0.15
+# Smaller ones show nothing, and take about as long.
+_SMALLEST = 1 / 6
+# Sizes are this far apart, so that they do not change from picture to picture.
+_STEPS_AN_OCTAVE = 4
+
+
+class Pacer:
+    """Chooses how large a picture may be to be drawn in time, from how long earlier ones took.
+
+    Time is taken to be proportional to pixels, measured at the size that was drawn last: where it is not, the
+    choice still settles at the size that takes the target.
+    """
+
+    def __init__(self, target_ms: float = TARGET_MS) -> None:
+        self._target_ms = target_ms
+        self._pixels_per_ms = 0.0
+
+    def size(self, full: Size) -> Size:
+        """Return a size with about the shape of ``full``, not larger; first a quarter of its width."""
+        pixels = self._target_ms * self._pixels_per_ms or full[0] * full[1] / 16
+        scale = math.sqrt(pixels / (full[0] * full[1]))
+        # A hair more, lest rounding takes a step that fits.
+        scale = 2 ** (math.floor(_STEPS_AN_OCTAVE * math.log2(scale) + 1e-6) / _STEPS_AN_OCTAVE)
+        return scaled(full, min(max(scale, _SMALLEST), 1.0))
+
+    def drew(self, size: Size, milliseconds: float) -> None:
+        """Take note of how long a picture took."""
+        speed = size[0] * size[1] / max(milliseconds, 0.1)
+        # Slower counts at once, faster only where it lasts.
+        share = 0.3 if speed > self._pixels_per_ms > 0 else 1.0
+        self._pixels_per_ms += share * (speed - self._pixels_per_ms)
+
+
+def scaled(full: Size, scale: float) -> Size:
+    return max(1, round(scale * full[0])), max(1, round(scale * full[1]))
+
+
+def finer_sizes(drawn: Size, full: Size) -> list[Size]:
+    """Return the sizes to go on with, each twice the one before, to ``full``; empty where that is drawn."""
+    sizes = []
+    width = drawn[0]
+    while width < full[0]:
+        # The last step is not worth a picture of its own where it is small.
+        width = 2 * width if 3 * width < full[0] else full[0]
+        sizes.append(full if width == full[0] else scaled(full, width / full[0]))
+    return sizes
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a page wants to see: full size in px, a view, settings."""
+
+    view: View
+    size: Size
+    settings: Settings
+
+
+class Painter:
+    """Draws what one page asked for last, in a thread of its own, as often and as large as time allows.
+
+    A request is answered by a small picture; after a rest larger ones follow, up to the full size. A new
+    request ends a larger picture at once.
+
+    Args:
+        send: Called with each picture and whether it is the final one; in the painter's thread.
+        fail: Called with what could not be drawn; in the painter's thread.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        send: Callable[[Frame, bool], None],
+        fail: Callable[[Exception], None],
+        pacer: Pacer | None = None,
+    ) -> None:
+        self._stage, self._send, self._fail = stage, send, fail
+        self._pacer = pacer or Pacer()
+        self._changed = threading.Condition()
+        self._request: Request | None = None
+        self._is_closed = False
+        self._stop = _core.Stop()
+        self._thread = threading.Thread(target=self._run, name="v3dg painter", daemon=True)
+        self._thread.start()
+
+    def ask(self, request: Request) -> None:
+        """Ask for a picture, in place of what was asked for before."""
+        with self._changed:
+            self._request = request
+            self._stop.request()
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Draw nothing more, and wait for what is under way to end."""
+        with self._changed:
+            self._is_closed = True
+            self._stop.request()
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._is_closed or self._request is not None)
+                request, self._request = self._request, None
+            if self._is_closed or request is None:
+                return
+            try:
+                self._paint(request)
+            except Stopped:
+                pass
+            except Exception as error:  # a page that shows the reason is better than one that stands still
+                self._fail(error)
+
+    def _paint(self, request: Request) -> None:
+        settings, size = request.settings, self._pacer.size(request.size)
+        draft = settings
+        if settings.compares and not self._stage.compares_while_moving:
+            draft = replace(settings, shows="appearance", split=0.0)
+        start = time.perf_counter()
+        frame = self._stage.frame(request.view, size, draft)
+        self._pacer.drew(size, 1e3 * (time.perf_counter() - start))
+        sizes = finer_sizes(size, request.size)
+        if draft is not settings and not sizes:
+            sizes = [size]
+        self._send(frame, not sizes)
+        for place, finer in enumerate(sizes):
+            stop = self._rest(REST_SECONDS if place == 0 else 0.0)
+            if stop is None:
+                return
+            self._send(self._stage.frame(request.view, finer, settings, stop), finer == request.size)
+
+    def _rest(self, seconds: float) -> _core.Stop | None:
+        """Wait whether something new is asked for; None if so, else what a new request will end."""
+        with self._changed:
+            if self._changed.wait_for(lambda: self._is_closed or self._request is not None, seconds):
+                return None
+            self._stop = _core.Stop()
+            return self._stop

@@ -1,0 +1,82 @@
+"""From where a page looks: what a browser knows of its camera, and the pinhole camera that it makes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from v3dg.cameras import Camera, Floats, VectorLike
+from v3dg.scene import rotation_from_quaternion
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera without a size in pixels.
+
+    Attributes:
+        wxyz: Rotation from camera (x right, y down, z forward) to world, a quaternion of any length but zero.
+        position: The eye, world units.
+        fov_y: Vertical field of view in radians.
+        aspect: Width over height.
+    """
+
+    wxyz: tuple[float, float, float, float]
+    position: tuple[float, float, float]
+    fov_y: float
+    aspect: float
+
+    @classmethod
+    def of_camera(cls, camera: Camera) -> View:
+        """Take over pose and field of view; a principal point off the middle is lost."""
+        w, x, y, z = quaternion_from_rotation(camera.viewmat[:3, :3].T)
+        eye = camera.position
+        half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
+        return cls(
+            (w, x, y, z),
+            (float(eye[0]), float(eye[1]), float(eye[2])),
+            2 * math.atan(half_y),
+            half_x / half_y,
+        )
+
+    def camera(self, width: int, height: int, near: float) -> Camera:
+        """Return the camera whose picture of that size fills the view; its pixels need not be square."""
+        quaternion = np.asarray(self.wxyz, np.float64)
+        rotation = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion)).T
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = rotation
+        viewmat[:3, 3] = -rotation @ np.asarray(self.position, np.float64)
+        half_y = math.tan(self.fov_y / 2)
+        K = np.array(
+            [
+                [width / 2 / (half_y * self.aspect), 0.0, width / 2],
+                [0.0, height / 2 / half_y, height / 2],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+        return Camera(viewmat, K, width, height, near)
+
+
+def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, float]:
+    """Unit quaternion w x y z with w >= 0 of a (3, 3) rotation."""
+    # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinctions, stable for any angle.
+    r = np.asarray(rotation, np.float64)
+    symmetric = np.array(
+        [
+            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [0.0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [0.0, 0.0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+            [0.0, 0.0, 0.0, r[2, 2] - r[0, 0] - r[1, 1]],
+        ]
+    )
+    w, x, y, z = np.linalg.eigh(symmetric, UPLO="U")[1][:, -1]
+    sign = -1.0 if w < 0 else 1.0
+    return sign * float(w), sign * float(x), sign * float(y), sign * float(z)
+
+
+def look_at(eye: VectorLike, target: VectorLike, up: VectorLike, fov_y: float, aspect: float) -> View:
+    """Return the view at ``eye`` with ``target`` in the middle and ``up`` upwards."""
+    camera = Camera.look_at(eye, target, up, width=1, height=1)
+    of_camera = View.of_camera(camera)
+    return View(of_camera.wxyz, of_camera.position, fov_y, aspect)
