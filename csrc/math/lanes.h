@@ -98,7 +98,6 @@ template <class T>
 constexpr int kLanes = kVectorBytes / static_cast<int>(sizeof(T));
 
 typedef int32_t IntVec32 __attribute__((vector_size(kVectorBytes)));
-typedef int64_t IntVec64 __attribute__((vector_size(kVectorBytes)));
 typedef uint32_t BitsVec32 __attribute__((vector_size(kVectorBytes)));  // for arithmetic that may wrap
 
 template <>
@@ -127,23 +126,20 @@ V3DG_INLINE Vec<double> sqrt_of(Vec<double> x) {
     return x;
 }
 
-// Bit i is set where lane i of a comparison holds.
-V3DG_INLINE unsigned bits_of(IntVec32 mask) {
+// Bit i is set where lane i of a comparison holds. Compilers differ in the type of 64-bit lanes.
+template <class Mask>
+V3DG_INLINE unsigned bits_of(Mask mask) {
+    if constexpr (sizeof(mask[0]) == 4) {
 #if defined(__AVX512F__)
-    return _mm512_movepi32_mask((__m512i)mask);
+        return _mm512_movepi32_mask((__m512i)mask);
 #elif defined(__AVX2__)
-    return static_cast<unsigned>(_mm256_movemask_ps((__m256)mask));
+        return static_cast<unsigned>(_mm256_movemask_ps((__m256)mask));
 #elif defined(__SSE2__)
-    return static_cast<unsigned>(_mm_movemask_ps((__m128)mask));
-#else
-    unsigned bits = 0;
-    for (int i = 0; i < kLanes<float>; ++i) bits |= unsigned(mask[i] & 1) << i;
-    return bits;
+        return static_cast<unsigned>(_mm_movemask_ps((__m128)mask));
 #endif
-}
-V3DG_INLINE unsigned bits_of(IntVec64 mask) {
+    }
     unsigned bits = 0;
-    for (int i = 0; i < kLanes<double>; ++i) bits |= unsigned(mask[i] & 1) << i;
+    for (size_t i = 0; i < sizeof mask / sizeof(mask[0]); ++i) bits |= unsigned(mask[i] & 1) << i;
     return bits;
 }
 
