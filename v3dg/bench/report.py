@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import tyro
 
 from v3dg.bench.parts import NAMES, part
-from v3dg.bench.verdict import Verdict
 
 
 @dataclass
@@ -45,16 +44,33 @@ def page(folders: Sequence[Path], output: Path) -> str:
     sections = [(folder, read_results(folder)) for folder in folders]
     machines = [machine(next(iter(results.values()))) for _, results in sections]
     # The first folder counts; the others for parts that it does not have.
-    verdict = verdict_of({name: part for _, results in reversed(sections) for name, part in results.items()})
+    measured = {name: result for _, results in reversed(sections) for name, result in results.items()}
+    home = place(next(iter(sections[0][1].values())))
+    wins, losses = [], []
+    for name, result in measured.items():
+        verdict = part(name).verdict(result)
+        where = "" if place(result) == home else f" (on {place(result)})"
+        wins.append([sentence + where for sentence in verdict.wins])
+        losses.append([sentence + where for sentence in verdict.losses])
     lines = [
         "# Results",
+        "",
+        f"**Where we win**: {_heads(wins)} ([all](#where-we-win)).",
+        "",
+        f"**Where we do not**: {_heads(losses)} ([all](#where-we-do-not)).",
         "",
         "Written by `python -m v3dg.bench.report` from recorded JSON, never by hand; here on "
         f"{'; what is not measured there, on '.join(machines)}.",
         "",
-        f"**Where we win**: {_joined(verdict.wins)}.",
+        "## Where we win",
         "",
-        f"**Where we do not**: {_joined(verdict.losses)}.",
+        *(f"- {sentence}" for sentences in wins for sentence in sentences),
+        "",
+        "## Where we do not",
+        "",
+        *(f"- {sentence}" for sentences in losses for sentence in sentences),
+        "",
+        "## How it is measured",
         "",
         "Error is FLIP (67 pixels per degree) and PSNR to the full scene at twice the resolution, "
         "box-averaged. Times are medians of single frames after a warm-up, selection included, from an "
@@ -68,18 +84,14 @@ def page(folders: Sequence[Path], output: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def verdict_of(results: dict[str, dict[str, Any]]) -> Verdict:
-    """What all parts say together."""
-    both = Verdict()
-    for name, result in results.items():
-        found = part(name).verdict(result)
-        both.wins += found.wins
-        both.losses += found.losses
-    return both
+def _heads(sentences_of_parts: Sequence[Sequence[str]]) -> str:
+    """The first sentences of the first parts that have some: what a reader in a hurry gets."""
+    return "; ".join([s[0] for s in sentences_of_parts if s][:4]) or "nowhere in what was measured"
 
 
-def _joined(sentences: Sequence[str]) -> str:
-    return "; ".join(sentences) or "nothing that was measured"
+def place(result: dict[str, Any]) -> str:
+    """The device in a few words."""
+    return str(result.get("gpu") or f"{result['threads']} CPU threads")
 
 
 def machine(result: dict[str, Any]) -> str:
@@ -92,8 +104,7 @@ def machine(result: dict[str, Any]) -> str:
 
 
 def heading(result: dict[str, Any]) -> str:
-    where = result.get("gpu") or f"{result['threads']} CPU threads"
-    return f"{result['preset'].capitalize()} preset, {where}, {result['asset']} asset"
+    return f"{result['preset'].capitalize()} preset, {place(result)}, {result['asset']} asset"
 
 
 def _part_lines(name: str, result: dict[str, Any], link: Path, folder: Path) -> list[str]:

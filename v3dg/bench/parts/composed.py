@@ -122,7 +122,7 @@ def verdict(result: dict[str, Any]) -> Verdict:
     for scene in result["scenes"]:
         far = by_distance(scene)[-1]
         text = (
-            f"{scene['scene']} from its farthest: {far['ours_ms']:.2f} ms a frame instead of "
+            f"{scene['scene']} from its farthest camera: {far['ours_ms']:.2f} ms a frame instead of "
             f"{far['full_ms']:.2f} ({far['full_ms'] / far['ours_ms']:.1f} x) with FLIP "
             f"{far['ours_flip']:.4f} instead of {far['full_flip']:.4f}"
         )
