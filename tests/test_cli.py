@@ -54,7 +54,7 @@ def test_version():
 
 
 @pytest.mark.parametrize(
-    "command", ["build", "info", "render", "compare", "world", "demo", "bench", "completion"]
+    "command", ["build", "info", "render", "compare", "convert", "world", "demo", "bench", "completion"]
 )
 def test_help(command):
     done = run(command, "--help")

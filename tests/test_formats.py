@@ -83,6 +83,15 @@ SPLAT_BOUNDS = {
     "color": 1.001 / 255 / SH_C0,  # cut off, of what is within black and white
 }
 
+# Formats that we write; SOG's bytes are rounded to the nearest then.
+WRITTEN = {
+    ".compressed.ply": compressed_ply_bounds,
+    ".spz": lambda _: spz_bounds(),
+    ".sog": lambda reference: (
+        sog_bounds(reference) | {"opacities": 0.5 / 255, "quats": QUAT / np.sqrt(2) / 255 * 1.01}
+    ),
+}
+
 # File, the asset that it was made of, its bounds; who wrote it is in fixtures/README.md.
 FOREIGN = {
     "sh0.compressed.ply": compressed_ply_bounds,
@@ -151,16 +160,15 @@ def test_what_other_tools_write_is_read(name):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz"])
+@pytest.mark.parametrize("suffix", WRITTEN)
 def test_what_is_written_reads_back(tmp_path, suffix, degree):
     reference = load(FIXTURES / "sh3.ply")
     sh = np.ascontiguousarray(reference.sh[:, : (degree + 1) ** 2])
     reference = Gaussians(reference.means, reference.quats, reference.scales, reference.opacities, sh)
     path = tmp_path / f"a{suffix}"
     save(path, reference)
-    bounds = spz_bounds() if suffix == ".spz" else compressed_ply_bounds(reference)
-    assert_within(in_order_of(reference, load(path)), reference, bounds)
-    assert path.stat().st_size < 64 * (20 + 3 * sh.shape[1]) + 2500
+    assert_within(in_order_of(reference, load(path)), reference, WRITTEN[suffix](reference))
+    assert path.stat().st_size < 64 * (20 + 3 * sh.shape[1]) + 17_000  # SOG's tables
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -180,14 +188,14 @@ def test_gsply_reads_what_we_write(tmp_path, suffix, degree):
         "sh": sh,
     }
     found = Gaussians(**{name: np.ascontiguousarray(array, np.float32) for name, array in values.items()})
-    bounds = spz_bounds() if suffix == ".spz" else compressed_ply_bounds(reference)
+    bounds = WRITTEN[suffix](reference)
     # It moves opacities of 0 and 1 by 1e-6.
     assert_within(
         in_order_of(reference, found), reference, bounds | {"opacities": bounds["opacities"] + 1e-6}
     )
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz"])
+@pytest.mark.parametrize("suffix", WRITTEN)
 def test_no_gaussians_and_extreme_ones_are_written(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     save(path, random_gaussians(0, 1))
@@ -199,7 +207,7 @@ def test_no_gaussians_and_extreme_ones_are_written(tmp_path, suffix):
     save(path, one)
     back = load(path)
     np.testing.assert_array_equal(back.opacities, one.opacities)
-    np.testing.assert_allclose(np.abs(back.quats), [[1, 0, 0, 0]], atol=1e-3)
+    np.testing.assert_allclose(np.abs(back.quats), [[1, 0, 0, 0]], atol=4e-3)
     assert np.isfinite(back.scales).all()
 
 
@@ -219,7 +227,7 @@ def test_small_and_large_assets_keep_their_shape_in_spz(tmp_path):
     assert not (tmp_path / "b.spz").exists()
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz"])
+@pytest.mark.parametrize("suffix", WRITTEN)
 @pytest.mark.parametrize(
     ("name", "row", "value", "message"),
     [

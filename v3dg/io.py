@@ -27,6 +27,7 @@ _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
     ".compressed.ply": compressed_ply.write,
     ".ply": ply.write,
     ".spz": spz.write,
+    ".sog": sog.write,
 }
 
 SUFFIXES = tuple(_READERS)
@@ -70,6 +71,7 @@ def save(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "binary_li
       -110, a scale of 0 as log -110: finite, and they read back as exactly 1, 0 and 0.
     - `.compressed.ply`: 16 bytes a gaussian and one a coefficient of higher SH. The order changes.
     - `.spz`: version 3.
+    - `.sog`: version 2. The order changes.
 
     Args:
         encoding: Of a `.ply`; the others have one only.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 import tyro
 
 from v3dg.cli._common import UsageError, level_size, load_asset_or_bundle, option
+from v3dg.io import SUFFIXES
 
 if TYPE_CHECKING:
     from v3dg.bundle import Bundle
@@ -46,7 +47,7 @@ class ViewOptions:
         """Refuse, before anything is read, what cannot be meant for these subjects."""
         if min(self.views, *self.size) < 1:
             raise UsageError("--views, --size: expected at least 1")
-        is_from_file = self.cameras is not None or any(path.suffix == ".json" for path in subjects)
+        is_from_file = self.cameras is not None or any(map(is_scene, subjects))
         if self.camera is not None and not is_from_file:
             raise UsageError("--camera: expected --cameras or a scene (.json) to take it from; leave it out")
 
@@ -55,9 +56,14 @@ class ViewOptions:
 Views: TypeAlias = Annotated[ViewOptions, tyro.conf.OmitArgPrefixes]
 
 
+def is_scene(path: Path) -> bool:
+    """Whether a file is a scene by its name: JSON, but not the `meta.json` of an asset in SOG."""
+    return path.suffix == ".json" and not path.name.endswith(SUFFIXES)
+
+
 def load_subject(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
     """A scene with its cameras, or a bundle or an asset, which have none."""
-    if path.suffix != ".json":
+    if not is_scene(path):
         return load_asset_or_bundle(path), None
     from v3dg.scene_file import read_scene
 

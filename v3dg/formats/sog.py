@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import math
 import os
 import struct
@@ -16,12 +17,27 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from v3dg import _files
 from v3dg._json import Node, parse_json
-from v3dg.formats._packing import Floats, assemble, problem, quats_from_three, read_bytes
+from v3dg._version import __version__
+from v3dg.formats._codebook import nearest, palette_of, table_of
+from v3dg.formats._packing import (
+    Floats,
+    assemble,
+    check_writable,
+    log_scales,
+    morton_order,
+    problem,
+    quats_from_three,
+    read_bytes,
+    three_of_quats,
+    to_integers,
+)
 from v3dg.gaussians import Gaussians
 
 # What compresses better than this was not made of gaussians that differ.
@@ -120,6 +136,94 @@ def _read(path: Path, text: bytes, load: Load) -> Gaussians:
         return means, quats_from_three(three, tags[rows] - 252), widths, color[rows, 3] / 255.0, sh
 
     return assemble(count, degree, decode)
+
+
+def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
+    """Write a `.sog` file; gaussians are put in an order that keeps neighbours together.
+
+    Raises:
+        ValueError: A value that the format cannot hold.
+        OSError: It cannot be written.
+    """
+    host = check_writable(gaussians)
+    files = encode(host.subset(morton_order(host.means)))
+    with _files.replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
+        for name, content in files.items():
+            bundle.writestr(zipfile.ZipInfo(name), content)  # of 1980: the same gaussians, the same file
+
+
+def encode(gaussians: Gaussians) -> dict[str, bytes]:
+    """The files of a SOG, by name: NumPy gaussians with values that can be held, in their order."""
+    count = len(gaussians)
+    width = 4 * max(1, math.ceil(math.sqrt(count) / 4))
+    height = 4 * max(1, math.ceil(count / width / 4))
+
+    def picture(*columns: NDArray[Any]) -> bytes:
+        pixels = np.full((width * height, 4), 255, np.uint8)
+        pixels[:count, : len(columns)] = np.stack(columns, axis=1)
+        return _webp(pixels.reshape(height, width, 4))
+
+    means = gaussians.means.astype(np.float64)
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = (logs.min(axis=0), logs.max(axis=0)) if count else (np.zeros(3), np.zeros(3))
+    whole = to_integers((logs - low) / np.where(high > low, high - low, 1.0) * 65535.0, 65535)
+    three, largest = three_of_quats(gaussians.quats)
+    log_widths = log_scales(gaussians.scales)
+    scale_table, color_table = table_of(log_widths), table_of(gaussians.sh[:, 0])
+    files = {
+        "means_l.webp": picture(*(whole & 255).T),
+        "means_u.webp": picture(*(whole >> 8).T),
+        "scales.webp": picture(*nearest(scale_table, log_widths).T),
+        "quats.webp": picture(*to_integers((three * _SQRT2 + 1.0) * 127.5, 255).T, largest + 252),
+        "sh0.webp": picture(
+            *nearest(color_table, gaussians.sh[:, 0]).T, to_integers(gaussians.opacities * 255.0, 255)
+        ),
+    }
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": f"v3dg {__version__}"},
+        "count": count,
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            "files": ["means_l.webp", "means_u.webp"],
+        },
+        "scales": {"codebook": scale_table.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
+    }
+    if gaussians.sh_degree:
+        coefficients = _COEFFICIENTS[gaussians.sh_degree]
+        palette, labels = palette_of(
+            gaussians.sh[:, 1:].reshape(count, 3 * coefficients), _palette_size(count)
+        )
+        table = table_of(palette)
+        rows = -(-len(palette) // _PALETTE_COLUMNS)
+        pixels = np.full((rows * _PALETTE_COLUMNS, coefficients, 4), 255, np.uint8)
+        pixels[: len(palette), :, :3] = nearest(table, palette).reshape(-1, coefficients, 3)
+        files["shN_centroids.webp"] = _webp(pixels.reshape(rows, _PALETTE_COLUMNS * coefficients, 4))
+        files["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
+        meta["shN"] = {
+            "count": len(palette),
+            "bands": gaussians.sh_degree,
+            "codebook": table.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+    return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **files}
+
+
+def _palette_size(count: int) -> int:
+    """A quarter of the gaussians, but enough for a small asset to keep all its coefficients, and 16 bits."""
+    return min(max(1024, count // 4), 65536)
+
+
+def _webp(pixels: NDArray[np.uint8]) -> bytes:
+    from PIL import Image
+
+    stream = io.BytesIO()
+    # exact: without it, colours of pixels whose alpha is 0 are lost.
+    Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True, quality=50, method=4)
+    return stream.getvalue()
 
 
 class _Pictures:

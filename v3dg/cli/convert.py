@@ -1,0 +1,124 @@
+"""`v3dg convert`."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from v3dg.cli._common import Flag, Threads, UsageError, bytes_text, option, print_result, require_subject
+from v3dg.cli._views import ViewOptions, Views, choose_cameras, is_scene, load_subject
+from v3dg.io import SAVE_SUFFIXES
+
+if TYPE_CHECKING:
+    from v3dg.bundle import Bundle
+    from v3dg.gaussians import Gaussians
+    from v3dg.scene import Scene
+
+
+@dataclass
+class Convert:
+    """Write an asset, a level of a bundle, or the cut that a camera needs of it, in another format."""
+
+    subject: tyro.conf.Positional[Path]
+    """An asset in any format that is read (docs/formats.md), a bundle (.v3dg) or a scene (.json)."""
+    output: tyro.conf.Positional[Path]
+    """File to write, .ply, .compressed.ply, .spz or .sog."""
+    level: Annotated[int | None, option("N")] = None
+    """Write this level of a bundle; 0, the asset itself, if no cut is asked for."""
+    tolerance: Annotated[float | None, option("PX2")] = None
+    """Write the cut of this tolerance, the px² that one gaussian of a coarser cluster may stand for."""
+    budget: Annotated[int | None, option("N")] = None
+    """Write the cut with at most so many gaussians."""
+    outside: Literal["drop", "keep"] = "drop"
+    """What becomes of the part of the cut that the camera does not see."""
+    threads: Threads = None
+    """CPU threads; all if not given."""
+    json: Flag = False
+    """Print the result as JSON."""
+    view: Views = field(default_factory=ViewOptions)
+
+
+def run(options: Convert) -> None:
+    require_subject(options.subject)
+    _check(options)
+    from v3dg.bundle import Bundle
+    from v3dg.gaussians import Gaussians
+    from v3dg.io import save
+
+    start = time.perf_counter()
+    subject, own_cameras = load_subject(options.subject)
+    told: dict[str, Any] = {}
+    if isinstance(subject, Gaussians):
+        if _wants_cut(options) or options.level is not None:
+            raise UsageError("--level, --tolerance, --budget: expected a bundle or a scene; build one first")
+        gaussians = subject
+    elif isinstance(subject, Bundle) and not _wants_cut(options):
+        gaussians, told = _level(subject, options.level or 0)
+    else:
+        cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
+        if len(cameras) != 1:
+            raise UsageError(f"--camera: expected one of {len(cameras)} cameras; give its name or its place")
+        gaussians, told = _cut(options, subject, cameras)
+    save(options.output, gaussians)
+    size = options.output.stat().st_size
+    result = {
+        "output": str(options.output),
+        "gaussians": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+        "bytes": size,
+        "seconds": time.perf_counter() - start,
+        **told,
+    }
+    text = (
+        f"{options.output}: {len(gaussians):,} gaussians, SH degree {gaussians.sh_degree}, {bytes_text(size)}"
+    )
+    print_result(options.json, result, lambda: text)
+
+
+def _check(options: Convert) -> None:
+    """Refuse, before anything is read, what cannot be meant."""
+    options.view.check(options.subject)
+    if not options.output.name.lower().endswith(SAVE_SUFFIXES):
+        raise ValueError(f"{options.output}: expected a file name that ends in {', '.join(SAVE_SUFFIXES)}")
+    if not options.output.parent.is_dir():
+        raise ValueError(
+            f"{options.output}: expected an existing folder, got {options.output.parent}; create it first"
+        )
+    if options.level is not None and _wants_cut(options):
+        raise UsageError("--level: expected no options of a cut beside it; leave it or them out")
+
+
+def _wants_cut(options: Convert) -> bool:
+    view = options.view
+    given = (options.tolerance, options.budget, view.cameras, view.camera)
+    return is_scene(options.subject) or any(value is not None for value in given)
+
+
+def _level(bundle: Bundle, level: int) -> tuple[Gaussians, dict[str, Any]]:
+    if not 0 <= level < max(1, bundle.num_levels):
+        raise UsageError(f"--level: expected 0 to {bundle.num_levels - 1}, got {level}")
+    return bundle.level_gaussians(level), {"level": level}
+
+
+def _cut(
+    options: Convert, subject: Scene | Bundle, cameras: dict[str, Any]
+) -> tuple[Gaussians, dict[str, Any]]:
+    from v3dg.bundle import Bundle
+    from v3dg.gaussians import Gaussians
+    from v3dg.select import select
+
+    ((name, camera),) = cameras.items()
+    keep = options.outside == "keep"
+    selection = select(subject, camera, tolerance=options.tolerance, budget=options.budget, cull=not keep)
+    if isinstance(subject, Bundle) and len(selection):  # its clusters alone are read
+        gaussians = Gaussians.concatenate([subject.cluster_gaussians(int(c)) for c in selection.cluster_ids])
+    else:
+        gaussians = selection.gaussians()
+    # JSON has no infinity, which a budget can come to.
+    tolerance = selection.tolerance if math.isfinite(selection.tolerance) else None
+    return gaussians, {"camera": name, "tolerance": tolerance, "clusters": len(selection)}
