@@ -159,6 +159,38 @@ def test_a_written_world_is_read_and_drawn(tmp_path):
     assert v3dg.render(scene, world.cameras(width=64, height=36)["059_camera_19"]).alpha.max() > 0.5
 
 
+def test_an_interrupted_world_goes_on(tmp_path, monkeypatch):
+    world = worlds.crowd(5, 2000, persons=3, seed=1)
+    options = {"config": v3dg.BuildConfig(steps=1, num_views=4, image_size=16), "progress": False}
+    whole = worlds.write_world(world, tmp_path / "whole", **options).parent
+    built = []
+
+    def build(asset, **rest):
+        if len(built) == 1:
+            raise KeyboardInterrupt
+        built.append(asset)
+        return v3dg.build_bundle(asset, **rest)
+
+    monkeypatch.setattr(worlds, "build_bundle", build)
+    with pytest.raises(KeyboardInterrupt):
+        worlds.write_world(world, tmp_path / "cut", **options)
+    first = (tmp_path / "cut" / "person_00.v3dg").stat().st_mtime_ns
+    monkeypatch.setattr(worlds, "build_bundle", v3dg.build_bundle)
+    path = worlds.write_world(world, tmp_path / "cut", resume=True, **options)
+    assert (path.parent / "person_00.v3dg").stat().st_mtime_ns == first
+    names = sorted(p.name for p in whole.iterdir())
+    assert sorted(p.name for p in path.parent.iterdir()) == names
+    for name in names:
+        assert (whole / name).read_bytes() == (path.parent / name).read_bytes()
+    # Without it, and with other settings, all is made anew.
+    worlds.write_world(world, tmp_path / "cut", **options)
+    again = (path.parent / "person_00.v3dg").stat().st_mtime_ns
+    assert again > first
+    other = options | {"config": v3dg.BuildConfig(steps=0)}
+    worlds.write_world(world, tmp_path / "cut", resume=True, **other)
+    assert (path.parent / "person_00.v3dg").stat().st_mtime_ns > again
+
+
 def test_command_line_writes_a_world(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(worlds.SMALL, "crowd", {"instances": 2, "num_gaussians": 2000, "persons": 1})
     folder = tmp_path / "people"

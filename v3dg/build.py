@@ -656,6 +656,21 @@ class _Checkpoint:
         return [(np.dtype(dtype), shape) for dtype, shape in [*((np.float32, s) for s in real), *tables]]
 
 
+def is_current(
+    bundle_path: str | os.PathLike[str], asset_path: str | os.PathLike[str], config: BuildConfig, seed: int
+) -> bool:
+    """Whether a bundle is there, was made with these settings, and its asset's file has not changed since."""
+    bundle_path = Path(bundle_path)
+    if not bundle_path.is_file() or bundle_path.stat().st_mtime_ns < os.stat(asset_path).st_mtime_ns:
+        return False
+    try:
+        made_with = Bundle.open(bundle_path).config
+    except ValueError:  # damaged, or of another version: build it again
+        return False
+    is_ours = made_with.keys() >= {"build", "seed", "asset_gaussians", "dropped"}
+    return bool(is_ours and made_with["build"] == asdict(config) and made_with["seed"] == seed)
+
+
 def discard_levels(resume_path: str | os.PathLike[str]) -> None:
     """Remove what an interrupted build left there, if anything.
 

@@ -21,11 +21,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from v3dg.build import BuildConfig, build_bundle
+from v3dg.build import BuildConfig, build_bundle, discard_levels, is_current
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.gaussians import Gaussians
-from v3dg.io import save
+from v3dg.io import load, save
 from v3dg.pile import Pile
 from v3dg.procedural import TREE_KINDS, make_donut, make_person, make_temple, make_tree
 from v3dg.procedural.donut import RING, TUBE
@@ -288,6 +288,7 @@ def write_world(
     config: BuildConfig | None = None,
     seed: int = 0,
     device: Literal["auto", "cpu", "cuda"] = "auto",
+    resume: bool = False,
     progress: bool = True,
 ) -> Path:
     """Make a world's assets, build their bundles, and write all of it with a scene file and its cameras.
@@ -296,22 +297,46 @@ def write_world(
         folder: Made if it is not there. It gets ASSET.ply and ASSET.v3dg for each asset, and WORLD.json.
         config: How bundles are built; by default as `build_bundle` does.
         seed: Of the builds.
+        resume: Keep the bundles and finished levels of a call that was interrupted.
 
     Returns:
         The scene file's path.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C; what is finished can be resumed.
+        ValueError, RuntimeError, OSError, MemoryError: As `build_bundle`.
     """
     from tqdm import tqdm
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    config = config or BuildConfig()
     bundles = {}
     for name, asset in tqdm(world.assets.items(), desc=world.name, unit="asset", disable=not progress):
         gaussians = asset.make()
-        save(folder / f"{name}.ply", gaussians)
-        bundle = build_bundle(gaussians, config=config, seed=seed, device=device, progress=progress)
-        bundle.save(folder / f"{name}.v3dg")
-        bundles[name] = bundle
+        asset_path, bundle_path = folder / f"{name}.ply", folder / f"{name}.v3dg"
+        if not (resume and asset_path.is_file() and _is_same(load(asset_path), gaussians)):
+            save(asset_path, gaussians)
+        if resume and is_current(bundle_path, asset_path, config, seed):
+            bundles[name] = Bundle.open(bundle_path)
+            continue
+        levels = folder / f"{name}.v3dg.partial"
+        if not resume:
+            discard_levels(levels)
+        bundles[name] = build_bundle(
+            gaussians, config=config, seed=seed, device=device, resume_path=levels, progress=progress
+        )
+        bundles[name].save(bundle_path)
+        levels.unlink(missing_ok=True)
     path = folder / f"{world.name}.json"
     paths = [f"{name}.v3dg" for name in world.placements]
     write_scene(path, scene_of(world, bundles), paths, world.cameras())
     return path
+
+
+def _is_same(read: Gaussians, made: Gaussians) -> bool:
+    """Whether gaussians read from a file are those that were written; logarithms and logits round."""
+    return len(read) == len(made) and all(
+        np.allclose(a, b, rtol=1e-5, atol=1e-6)
+        for a, b in ((read.means, made.means), (read.scales, made.scales), (read.opacities, made.opacities))
+    )

@@ -6,7 +6,7 @@ import sys
 import time
 import warnings
 from collections import Counter
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -146,7 +146,7 @@ def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
     """Build and save one bundle; what was done, as JSON values."""
     require_file(asset_path, *SUFFIXES)
     from v3dg import _device
-    from v3dg.build import build_bundle, discard_levels
+    from v3dg.build import build_bundle, discard_levels, is_current
     from v3dg.bundle import Bundle
     from v3dg.cleaning import AssetWarning
     from v3dg.io import load
@@ -159,7 +159,7 @@ def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
     partial = output.with_name(output.name + ".partial")
     device = _device.resolve(options.device)
     start = time.perf_counter()
-    if options.resume and _is_current(output, asset_path, config, options.seed):
+    if options.resume and is_current(output, asset_path, config, options.seed):
         return _result(asset_path, output, Bundle.open(output), "kept", start)
     if not options.resume:
         discard_levels(partial)
@@ -208,20 +208,6 @@ def _config(options: Build) -> BuildConfig:
 
     config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
     return config if options.cluster_size is None else replace(config, cluster_size=options.cluster_size)
-
-
-def _is_current(output: Path, asset: Path, config: BuildConfig, seed: int) -> bool:
-    """Whether the bundle is there, was made with these settings, and the asset has not changed since."""
-    from v3dg.bundle import Bundle
-
-    if not output.is_file() or output.stat().st_mtime_ns < asset.stat().st_mtime_ns:
-        return False
-    try:
-        made_with = Bundle.open(output).config
-    except ValueError:  # damaged, or of another version: build it again
-        return False
-    is_ours = made_with.keys() >= {"build", "seed", "asset_gaussians", "dropped"}
-    return is_ours and made_with["build"] == asdict(config) and made_with["seed"] == seed
 
 
 def _to_resume(partial: Path) -> str:

@@ -26,6 +26,8 @@ class World:
     """Seed of the assets, of the layout and of the builds."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to build; auto is a CUDA device where there is one and torch can use it."""
+    resume: Flag = False
+    """Continue an interrupted run: keep what is finished."""
     threads: Threads = None
     """CPU threads; all if not given."""
     json: Flag = False
@@ -40,13 +42,17 @@ def run(options: World) -> None:
     start = time.perf_counter()
     arguments = worlds.SMALL[options.name] if options.scale == "small" else {}
     world = worlds.WORLDS[options.name](**arguments, seed=options.seed)
-    path = worlds.write_world(
-        world,
-        options.output or Path(options.name),
-        seed=options.seed,
-        device=_device.resolve(options.device),
-        progress=not options.quiet,
-    )
+    try:
+        path = worlds.write_world(
+            world,
+            options.output or Path(options.name),
+            seed=options.seed,
+            device=_device.resolve(options.device),
+            resume=options.resume,
+            progress=not options.quiet,
+        )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted; `--resume` continues") from None
     result = {
         "output": str(path),
         "assets": list(world.assets),
