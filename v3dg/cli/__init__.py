@@ -22,7 +22,7 @@ from v3dg.cli import bench, build, compare, completion, convert, demo, info, ren
 from v3dg.cli._common import FAILURES, UsageError, failure_text
 
 # Options and what runs on them, by the command's name, in the order of the help.
-_COMMANDS: dict[str, tuple[type[Any], Callable[[Any], None]]] = {
+COMMANDS: dict[str, tuple[type[Any], Callable[[Any], None]]] = {
     "build": (build.Build, build.run),
     "info": (info.Info, info.run),
     "render": (render.Render, render.run),
@@ -50,7 +50,7 @@ No asset at hand? `v3dg demo` makes one, `v3dg world forest` a whole scene.
 def parse(arguments: Sequence[str]) -> Any:
     """Parse the command line; tyro's boxed message becomes one line."""
     subcommands: Any = [
-        Annotated[options, tyro.conf.subcommand(name)] for name, (options, _) in _COMMANDS.items()
+        Annotated[options, tyro.conf.subcommand(name)] for name, (options, _) in COMMANDS.items()
     ]
     caught = io.StringIO()
     try:
@@ -101,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse(arguments)
         if is_program:
             _set_threads(getattr(options, "threads", None))
-        run = next(run for kind, run in _COMMANDS.values() if isinstance(options, kind))
+        run = next(run for kind, run in COMMANDS.values() if isinstance(options, kind))
         run(options)
         sys.stdout.flush()
     except UsageError as error:

@@ -1,0 +1,168 @@
+"""Make the figures of docs/how_it_works.md and docs/choosing.md; wants the extra `bench`, takes a minute.
+
+The pictures are drawn by v3dg of an asset that it makes itself, the curves are those of recorded results.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+import v3dg
+from v3dg.bench.sheet import sheet
+from v3dg.pictures import to_8bit, write_picture
+from v3dg.procedural import make_asset, place_field
+
+HERE = Path(__file__).parent
+RESULTS = HERE.parent.parent / "benchmarks" / "results"
+
+LEVELS = (0, 2, 4, 6, 8)
+SIDE = 230
+SKY = (0.80, 0.86, 0.90)
+# Ink that can be read on the light and on the dark pages of the site.
+INK, FINE, COARSE, OTHER = "#8a919c", "#2f9e6e", "#e08e2b", "#7d8fd6"
+
+
+def main() -> None:
+    bundle = v3dg.build_bundle(make_asset(40_000), device="cpu")
+    levels(bundle)
+    cut(bundle)
+    with plt.rc_context(
+        {
+            "text.color": INK,
+            "axes.edgecolor": INK,
+            "axes.labelcolor": INK,
+            "xtick.color": INK,
+            "ytick.color": INK,
+            "svg.fonttype": "none",
+            "font.family": "sans-serif",
+            "svg.hashsalt": "v3dg",
+            "font.size": 10,
+        }
+    ):
+        tree()
+        tolerance()
+
+
+def levels(bundle: v3dg.Bundle) -> None:
+    """Levels of one asset at one size, as they look and with a colour a cluster."""
+    camera = v3dg.Camera.look_at((1.6, -2.4, 1.5), (0, 0, 0.35), width=SIDE, height=SIDE)
+    rows = []
+    for color_by in ("appearance", "cluster"):
+        row = []
+        for level in LEVELS:
+            image = v3dg.render(
+                bundle, camera, tolerance=0, min_level=level, color_by=color_by, background=SKY
+            )
+            count = image.stats.gaussians_selected
+            row.append((f"level {level}: {count:,} gaussians" if color_by == "appearance" else "", image))
+        rows.append([(text, to_8bit(image.color)) for text, image in row])
+    write_picture(HERE / "how_levels.jpg", sheet(rows))
+
+
+def cut(bundle: v3dg.Bundle) -> None:
+    """A field of instances, as it looks and with a colour a level."""
+    scene = v3dg.Scene()
+    positions, quaternions, scales = place_field(1500, seed=0)
+    scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
+    camera = v3dg.Camera.look_at((7, -17, 5.0), (-2, 4, -1.0), width=575, height=360)
+    row = []
+    for color_by, text in (
+        ("appearance", "what is drawn"),
+        ("level", "the level of each cluster in the cut"),
+    ):
+        image = v3dg.render(scene, camera, color_by=color_by, background=SKY)
+        row.append(
+            (
+                f"{text}: {image.stats.gaussians_selected / 1e6:.1f} M of "
+                f"{1500 * 40_000 / 1e6:.0f} M gaussians"
+                if color_by == "appearance"
+                else text,
+                to_8bit(image.color),
+            )
+        )
+    write_picture(HERE / "how_cut.jpg", sheet([row]))
+
+
+def tree() -> None:
+    """Clusters of four levels over one asset, and the cut for a camera at its left."""
+    figure, axes = plt.subplots(figsize=(7.6, 3.1))
+    num_leaves, height = 8, 4
+    drawn = {(0, 0), (0, 1), (1, 1), (2, 1)}  # (level, place): fine near the camera, coarse away from it
+    for level in range(height):
+        width = 2**level
+        for place in range(num_leaves // width):
+            left, is_drawn = place * width + 0.06, (level, place) in drawn
+            box = plt.Rectangle(
+                (left, level + 0.1),
+                width - 0.12,
+                0.5,
+                linewidth=1.4,
+                facecolor=FINE if is_drawn else "none",
+                edgecolor=INK,
+                alpha=1.0 if is_drawn else 0.75,
+            )
+            axes.add_patch(box)
+            if level + 1 < height:
+                x, up = (place + 0.5) * width, (place // 2 + 0.5) * 2 * width
+                axes.plot([x, up], [level + 0.6, level + 1.1], color=INK, linewidth=1, zorder=0)
+        axes.text(num_leaves + 0.2, level + 0.35, f"level {level}: {num_leaves // width} x 256", va="center")
+    axes.plot(
+        [-0.05, 2.0, 2.0, 4.0, 4.0, 8.05],
+        [0.85, 0.85, 1.85, 1.85, 2.85, 2.85],
+        color=COARSE,
+        linestyle="--",
+        linewidth=1.5,
+    )
+    axes.text(8.2, 2.85, "the cut", va="center", color=COARSE)
+    axes.plot([-1.05], [0.35], marker=">", markersize=14, color=INK)
+    axes.text(-1.05, 0.85, "camera", ha="center", va="center")
+    axes.set(xlim=(-1.7, 10.3), ylim=(-0.05, height - 0.2))
+    axes.axis("off")
+    save(figure, "how_tree.svg")
+
+
+def tolerance() -> None:
+    """Time against error on the paper's DonutSea, as recorded on a GPU."""
+    rows: list[dict[str, Any]] = json.loads((RESULTS / "full" / "tolerance.json").read_text())["rows"]
+    figure, axes = plt.subplots(figsize=(6.4, 3.6))
+    for name, color, label in (("ours", FINE, "v3dg"), ("paper", OTHER, "the paper's levels")):
+        mine = [row for row in rows if row["levels"] == name]
+        x, y = (np.array([row[key] for row in mine]) for key in ("drawn_ms", "drawn_flip"))
+        axes.plot(x, y, marker="o", color=color, label=label)
+        if name == "ours":
+            for row in mine:
+                above = 0.5 < row["tolerance"] < 3
+                axes.annotate(
+                    f"{row['tolerance']:g}",
+                    (row["drawn_ms"], row["drawn_flip"]),
+                    color=color,
+                    xytext=(0, 7 if above else -14),
+                    textcoords="offset points",
+                    ha="center",
+                    fontweight="bold" if row["tolerance"] == 3 else "normal",
+                )
+    full = next(row for row in rows if row["levels"] == "full")
+    axes.plot(
+        full["drawn_ms"], full["drawn_flip"], marker="s", color=COARSE, linestyle="", label="every gaussian"
+    )
+    axes.set(xlabel="milliseconds a frame", ylabel="FLIP", ylim=(0.03, 0.08), xlim=(1.5, 6.6))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+    save(figure, "choosing_tolerance.svg")
+
+
+def save(figure: Any, name: str) -> None:
+    figure.savefig(HERE / name, transparent=True, bbox_inches="tight", metadata={"Date": None})
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main()
