@@ -56,7 +56,8 @@ def files(tmp_path_factory):
     """What the docs take as given: assets, bundles and folders of them, a scene, cameras."""
     folder = tmp_path_factory.mktemp("docs")
     asset = make_donut(1000, seed=0)
-    v3dg.save(folder / "donut.ply", asset)
+    for name in ("donut.ply", "donut.spz"):
+        v3dg.save(folder / name, asset)
     config = v3dg.BuildConfig(steps=10, cluster_size=64)
     bundle = v3dg.build_bundle(asset, config=config, progress=False, device="cpu")
     bundle.save(folder / "donut.v3dg")
@@ -69,8 +70,9 @@ def files(tmp_path_factory):
         v3dg.save(folder / "assets" / f"asset{i}.ply", tree)
     scene = v3dg.Scene()
     scene.add(bundle, positions=[[0, 0, 0], [1, 0, 0]])
-    camera = v3dg.Camera.look_at((0, -3, 1), (0, 0, 0), width=64, height=48)
-    v3dg.write_scene(folder / "scene.json", scene, ["donut.v3dg"], {"front": camera})
+    around = v3dg.turntable((0, 0, 0), 3, 6, width=64, height=48)
+    cameras = {f"side {i}": camera for i, camera in enumerate(around)}
+    v3dg.write_scene(folder / "scene.json", scene, ["donut.v3dg"], cameras)
     # The folders of the V3DG paper's code.
     theirs = folder / "_3dgs-assets" / "donut" / "donut" / "point_cloud" / "iteration_30000"
     theirs.mkdir(parents=True)
