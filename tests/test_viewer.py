@@ -14,7 +14,7 @@ import v3dg
 from v3dg import Camera, Gaussians, Scene, _core
 from v3dg.pictures import to_8bit
 from v3dg.viewer.frame import MOST_COUNTED, Frame, Settings, Stage, Stopped, ramp
-from v3dg.viewer.pacing import Pacer, Painter, Request, finer_sizes
+from v3dg.viewer.pacing import Draft, Pacer, Painter, Request, finer_sizes
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View, look_at
 
@@ -263,40 +263,50 @@ def test_a_stop_ends_a_long_picture_early():
 # Pacing.
 
 
-def paced(milliseconds, full=(1920, 1080), pictures=40):
-    """Sizes that a pacer chooses where a picture of so many pixels takes that long."""
-    pacer, sizes = Pacer(60.0), []
+def paced(milliseconds, full=(1920, 1080), pictures=60):
+    """Drafts that a pacer chooses where one takes that long."""
+    pacer, drafts = Pacer(60.0), []
     for _ in range(pictures):
-        size = pacer.size(full)
-        sizes.append(size)
-        pacer.drew(size, milliseconds(size[0] * size[1]))
-    return sizes
+        drafts.append(pacer.draft(full))
+        pacer.drew(drafts[-1], milliseconds(drafts[-1]))
+    return drafts
 
 
 def test_pacer_finds_the_largest_picture_in_time_and_stays_there():
-    def cost(pixels):
-        return 10 + pixels / 4000
+    def cost(draft):
+        return 10 + draft.size[0] * draft.size[1] / 4000
 
-    sizes = paced(cost)
-    assert len(set(sizes[20:])) == 1
-    width, height = sizes[-1]
+    drafts = paced(cost)
+    assert len(set(drafts[30:])) == 1
+    width, height = drafts[-1].size
+    assert drafts[-1].coarser == 1
     assert width / height == pytest.approx(16 / 9, rel=0.02)
-    assert 0.5 * 60 < cost(width * height) <= 60
+    assert 0.5 * 60 < cost(drafts[-1]) <= 60
 
 
-def test_pacer_draws_in_full_what_is_quick_and_no_smaller_than_it_must():
-    assert paced(lambda pixels: 1.0)[-1] == (1920, 1080)
-    assert paced(lambda pixels: 1000.0)[-1] == (320, 180)
+def test_pacer_takes_a_coarser_cut_where_the_smallest_picture_is_too_slow():
+    def cost(draft):
+        return 10 + 400 / draft.coarser
+
+    drafts = paced(cost)
+    assert len(set(drafts[30:])) == 1
+    assert drafts[-1].size == (320, 180)
+    assert 0.5 * 60 < cost(drafts[-1]) <= 60
+
+
+def test_pacer_keeps_to_its_limits():
+    assert paced(lambda draft: 1.0)[-1] == Draft((1920, 1080))
+    assert paced(lambda draft: 1e4)[-1] == Draft((320, 180), 32.0)
 
 
 def test_pacer_gives_way_at_once_and_takes_back_slowly():
     pacer, full = Pacer(60.0), (1600, 800)
-    pacer.drew(full, 60.0)
-    assert pacer.size(full) == full
-    pacer.drew(full, 240.0)
-    assert pacer.size(full) == (800, 400)
-    pacer.drew((800, 400), 15.0)
-    assert 800 < pacer.size(full)[0] < 1600
+    pacer.drew(Draft(full), 60.0)
+    assert pacer.draft(full) == Draft(full)
+    pacer.drew(Draft(full), 240.0)
+    assert pacer.draft(full) == Draft((800, 400))
+    pacer.drew(Draft((800, 400)), 15.0)
+    assert 800 < pacer.draft(full).size[0] < 1600
 
 
 def test_sizes_double_up_to_the_full_one():
@@ -311,7 +321,7 @@ def test_sizes_double_up_to_the_full_one():
 class FakeStage:
     """Notes what is drawn; `hold` makes larger pictures wait until they are stopped."""
 
-    compares_while_moving = False
+    draws_all_while_moving = False
 
     def __init__(self):
         self.drawn, self.hold = [], False
@@ -378,13 +388,31 @@ def test_of_many_requests_the_last_is_drawn(painting):
     assert len(painting.sent) < 200
 
 
-def test_a_comparison_with_too_many_gaussians_waits_for_the_rest(painting):
-    settings = Settings(shows="difference", split=0.5)
+def test_a_comparison_of_too_many_gaussians_waits_for_the_rest(painting):
+    settings = Settings(shows="difference", split=0.5, tolerance=0.0)
     painting.painter.ask(Request(3, (160, 80), settings))
     wait(painting.is_final)
     first, *others = painting.stage.drawn
     assert not first[2].compares
+    assert first[2].tolerance > 0
     assert all(other[2] == settings for other in others)
+
+
+def test_few_gaussians_are_compared_while_moving(painting):
+    settings = Settings(shows="difference", tolerance=0.0)
+    painting.stage.draws_all_while_moving = True
+    painting.painter.ask(Request(3, (160, 80), settings))
+    wait(painting.is_final)
+    assert all(drawn[2] == settings for drawn in painting.stage.drawn)
+
+
+def test_a_coarser_cut_is_replaced_at_rest_though_the_size_is_the_same(painting):
+    settings = Settings(tolerance=0.5)
+    for view in range(20):  # until the pacer takes the full size
+        painting.painter.ask(Request(view, (16, 8), settings))
+        wait(painting.is_final)
+    assert painting.stage.drawn[-2][1:] == ((16, 8), replace(settings, tolerance=v3dg.DEFAULT_TOLERANCE))
+    assert painting.stage.drawn[-1][1:] == ((16, 8), settings)
 
 
 def test_an_error_is_told_and_the_next_request_is_drawn(painting):

@@ -144,7 +144,7 @@ class Stage:
         self.num_gaussians = int(np.dot(np.asarray(sizes, np.int64), instances)) if sizes else 0
 
     @property
-    def compares_while_moving(self) -> bool:
+    def draws_all_while_moving(self) -> bool:
         """Whether all gaussians are few enough to be drawn in every picture."""
         return self.device == "cuda" or self.num_gaussians <= _FEW_GAUSSIANS
 

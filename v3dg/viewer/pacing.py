@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from v3dg import _core
+from v3dg.select import DEFAULT_TOLERANCE
 from v3dg.viewer.frame import Frame, Settings, Stage, Stopped
 from v3dg.viewer.view import View
 
@@ -18,37 +19,52 @@ Size = tuple[int, int]
 TARGET_MS = 60.0
 # Without a change for so long, a larger picture is begun.
 REST_SECONDS = 0.15
-# Smaller ones show nothing, and take about as long.
+# Smaller ones show nothing; from there on the cut gets coarser, which shows less.
 _SMALLEST = 1 / 6
+_COARSEST = 32.0
 # Sizes are this far apart, so that they do not change from picture to picture.
 _STEPS_AN_OCTAVE = 4
 
 
-class Pacer:
-    """Chooses how large a picture may be to be drawn in time, from how long earlier ones took.
+@dataclass(frozen=True)
+class Draft:
+    """How to draw what passes by: its size in px, and what the tolerance is multiplied by."""
 
-    Time is taken to be proportional to pixels, measured at the size that was drawn last: where it is not, the
-    choice still settles at the size that takes the target.
+    size: Size
+    coarser: float = 1.0
+
+    @property
+    def work(self) -> float:
+        """What its time is taken to be proportional to: pixels over the factor of the tolerance."""
+        return self.size[0] * self.size[1] / self.coarser
+
+
+class Pacer:
+    """Chooses how to draw a picture in time, from how long earlier ones took.
+
+    Time is taken to be proportional to work, measured with the picture that was drawn last: where it is not,
+    the choice still settles at the one that takes the target.
     """
 
     def __init__(self, target_ms: float = TARGET_MS) -> None:
         self._target_ms = target_ms
-        self._pixels_per_ms = 0.0
+        self._work_per_ms = 0.0
 
-    def size(self, full: Size) -> Size:
-        """Return a size with about the shape of ``full``, not larger; first a quarter of its width."""
-        pixels = self._target_ms * self._pixels_per_ms or full[0] * full[1] / 16
-        scale = math.sqrt(pixels / (full[0] * full[1]))
+    def draft(self, full: Size) -> Draft:
+        """Return a size with about the shape of ``full``, not larger, at first a quarter of its width."""
+        whole = full[0] * full[1]
+        share = (self._target_ms * self._work_per_ms or whole / 16) / whole
         # A hair more, lest rounding takes a step that fits.
-        scale = 2 ** (math.floor(_STEPS_AN_OCTAVE * math.log2(scale) + 1e-6) / _STEPS_AN_OCTAVE)
-        return scaled(full, min(max(scale, _SMALLEST), 1.0))
+        scale = 2 ** (math.floor(_STEPS_AN_OCTAVE * math.log2(share) / 2 + 1e-6) / _STEPS_AN_OCTAVE)
+        coarser = min(max((_SMALLEST / scale) ** 2, 1.0), _COARSEST)
+        return Draft(scaled(full, min(max(scale, _SMALLEST), 1.0)), coarser)
 
-    def drew(self, size: Size, milliseconds: float) -> None:
+    def drew(self, draft: Draft, milliseconds: float) -> None:
         """Take note of how long a picture took."""
-        speed = size[0] * size[1] / max(milliseconds, 0.1)
+        speed = draft.work / max(milliseconds, 0.1)
         # Slower counts at once, faster only where it lasts.
-        share = 0.3 if speed > self._pixels_per_ms > 0 else 1.0
-        self._pixels_per_ms += share * (speed - self._pixels_per_ms)
+        share = 0.3 if speed > self._work_per_ms > 0 else 1.0
+        self._work_per_ms += share * (speed - self._work_per_ms)
 
 
 def scaled(full: Size, scale: float) -> Size:
@@ -132,22 +148,31 @@ class Painter:
                 self._fail(error)
 
     def _paint(self, request: Request) -> None:
-        settings, size = request.settings, self._pacer.size(request.size)
-        draft = settings
-        if settings.compares and not self._stage.compares_while_moving:
-            draft = replace(settings, shows="appearance", split=0.0)
+        draft = self._pacer.draft(request.size)
+        settings = self._while_moving(request.settings, draft)
         start = time.perf_counter()
-        frame = self._stage.frame(request.view, size, draft)
-        self._pacer.drew(size, 1e3 * (time.perf_counter() - start))
-        sizes = finer_sizes(size, request.size)
-        if draft is not settings and not sizes:
-            sizes = [size]
+        frame = self._stage.frame(request.view, draft.size, settings)
+        self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
+        sizes = finer_sizes(draft.size, request.size)
+        if settings != request.settings and not sizes:
+            sizes = [draft.size]
         self._send(frame, not sizes)
         for place, finer in enumerate(sizes):
             stop = self._rest(REST_SECONDS if place == 0 else 0.0)
             if stop is None:
                 return
-            self._send(self._stage.frame(request.view, finer, settings, stop), finer == request.size)
+            is_final = place == len(sizes) - 1
+            self._send(self._stage.frame(request.view, finer, request.settings, stop), is_final)
+
+    def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
+        """What of the settings there is time for."""
+        if self._stage.draws_all_while_moving:
+            least = 0.0 if draft.coarser == 1 else DEFAULT_TOLERANCE
+        else:
+            least = DEFAULT_TOLERANCE
+            if settings.compares:
+                settings = replace(settings, shows="appearance", split=0.0)
+        return replace(settings, tolerance=max(settings.tolerance, least) * draft.coarser)
 
     def _rest(self, seconds: float) -> _core.Stop | None:
         """Wait whether something new is asked for; None if so, else what a new request will end."""

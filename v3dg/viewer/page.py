@@ -11,6 +11,7 @@ import socket
 import tempfile
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -42,6 +43,7 @@ _SHOWS: dict[str, Shows] = {
     "Gaussians per pixel": "count",
     "Difference to all gaussians": "difference",
 }
+_NO_CAMERA = ""
 _FILM_SIZES = {"1280 x 720": (1280, 720), "1920 x 1080": (1920, 1080), "as the window": None}
 _FPS = 30
 # Pictures that pass by, and those that stay.
@@ -93,12 +95,15 @@ class Site:
             raise ValueError(
                 f"host: expected an address of this machine, got {host} ({error.strerror})"
             ) from error
+        # A tab may be closed while a picture is on its way to it.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning, __name__)
         self._pages: dict[int, _Page] = {}
         self._lock = threading.Lock()
         with _quiet():
             self._server = viser.ViserServer(host=host, port=port, label=name, verbose=False)
         self.port = self._server.get_port()
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._server.gui.main_panel.dock_right()  # beside the picture, not over it
         self._server.scene.set_up_direction(_three(up))
         start = start_view(stage, up)
         first = self._server.initial_camera
@@ -140,7 +145,7 @@ def start_view(stage: Stage, up: VectorLike, aspect: float = 16 / 9) -> View:
     aside = np.roll(np.eye(3)[int(np.abs(axis).argmax())], 1)
     aside = aside - (aside @ axis) * axis
     direction = math.cos(0.45) * aside / np.linalg.norm(aside) + math.sin(0.45) * axis
-    distance = 0.8 * stage.radius / math.sin(_FOV_Y / 2)
+    distance = 0.95 * stage.radius / math.sin(_FOV_Y / 2)
     return look_at(stage.center + distance * direction, stage.center, axis, _FOV_Y, aspect)
 
 
@@ -215,11 +220,16 @@ class _Page:
             camera.wxyz = np.asarray(view.wxyz)
             camera.fov = view.fov_y
 
+    def _look_from(self, camera: Camera | None) -> None:
+        if camera is not None:
+            self._look(View.of_camera(camera))
+
     # What is shown.
 
     def _show(self, frame: Frame, is_final: bool) -> None:
         quality = _FINAL_QUALITY if is_final else _DRAFT_QUALITY
         self._client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=quality)
+        self._client.flush()  # which viser would wait for a sixtieth of a second with
         now = time.monotonic()
         if is_final or now - self._last_figures > _SECONDS_BETWEEN_FIGURES:
             self._last_figures = now
@@ -297,8 +307,8 @@ class _Page:
         with gui.add_folder("Camera", expand_by_default=False):
             gui.add_button("Show all").on_click(lambda _: self._look(self._home))
             if cameras:
-                names = gui.add_dropdown("Of the file", tuple(cameras))
-                names.on_update(lambda _: self._look(View.of_camera(cameras[names.value])))
+                names = gui.add_dropdown("Of the file", (_NO_CAMERA, *cameras))
+                names.on_update(lambda _: self._look_from(cameras.get(names.value)))
             gui.add_markdown("Drag to turn, right button to move, wheel to go near, W A S D Q E to fly.")
         with gui.add_folder("Path", expand_by_default=False):
             self._add_path_controls()
@@ -490,6 +500,8 @@ def _legend(frame: Frame, shows: Shows) -> str:
     else:
         low, high = frame.value_range
         marks = [f"{low:.3g}", f"{high:.3g}"]
+        if shows == "depth":
+            marks = [f"far {marks[0]}", f"near {marks[1]}"]
     grey = np.linspace(0, 1, 7)
     colors = np.repeat(grey[:, None], 3, axis=1) if shows == "alpha" else ramp(grey)
     stops = ",".join(_css(color) for color in colors)
