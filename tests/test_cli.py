@@ -54,7 +54,8 @@ def test_version():
 
 
 @pytest.mark.parametrize(
-    "command", ["build", "info", "render", "compare", "convert", "world", "demo", "bench", "completion"]
+    "command",
+    ["build", "info", "render", "compare", "convert", "export", "world", "demo", "bench", "completion"],
 )
 def test_help(command):
     done = run(command, "--help")

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import tyro
 
 from v3dg._version import __version__
-from v3dg.cli import bench, build, compare, completion, convert, demo, info, render, view, world
+from v3dg.cli import bench, build, compare, completion, convert, demo, export, info, render, view, world
 from v3dg.cli._common import FAILURES, UsageError, failure_text
 
 # Options and what runs on them, by the command's name, in the order of the help.
@@ -29,6 +29,7 @@ COMMANDS: dict[str, tuple[type[Any], Callable[[Any], None]]] = {
     "view": (view.View, view.run),
     "compare": (compare.Compare, compare.run),
     "convert": (convert.Convert, convert.run),
+    "export": (export.Export, export.run),
     "world": (world.World, world.run),
     "demo": (demo.Demo, demo.run),
     "bench": (bench.Bench, bench.run),

@@ -1,0 +1,181 @@
+"""`v3dg export`: bundles as streamed SOG, read back; docs/formats.md has them open in a viewer."""
+
+import json
+import os
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+import v3dg
+from command_line import fails, run
+from random_bundle import random_bundle
+from v3dg.export import export_streamed_sog
+
+
+def leaves_of(node):
+    """Leaves of the tree, whose inner nodes must hold their children."""
+    if "lods" in node:
+        return [node]
+    assert len(node["children"]) > 1
+    for child in node["children"]:
+        assert (np.array(child["bound"]["min"]) >= node["bound"]["min"]).all()
+        assert (np.array(child["bound"]["max"]) <= node["bound"]["max"]).all()
+    return [leaf for child in node["children"] for leaf in leaves_of(child)]
+
+
+def assert_holds(folder, bundle, chunk):
+    """Every leaf has all levels; together the leaves have each gaussian once, and the files nothing else."""
+    index = json.loads((folder / "lod-meta.json").read_text())
+    leaves = leaves_of(index["tree"])
+    files = [v3dg.load(folder / name) for name in index["filenames"]]
+    used = [np.zeros(len(file), int) for file in files]
+    for level in range(index["lodLevels"]):
+        wanted = bundle.level_gaussians(level)
+        assert index["counts"][level] == len(wanted)
+        parts = []
+        for leaf in leaves:
+            lod = leaf["lods"][str(level)]
+            rows = slice(lod["offset"], lod["offset"] + lod["count"])
+            used[lod["file"]][rows] += 1
+            part = files[lod["file"]].subset(rows)
+            assert len(part) == lod["count"] <= chunk
+            if level == 0:
+                assert len(part) > 0
+            assert (part.means >= np.array(leaf["bound"]["min"]) - 1e-3).all()
+            assert (part.means <= np.array(leaf["bound"]["max"]) + 1e-3).all()
+            parts.append(part)
+        found = v3dg.Gaussians.concatenate(parts)
+        order = np.lexsort(wanted.means.T)
+        wanted = wanted.subset(order)
+        squared = np.square(found.means[:, None].astype(float) - wanted.means).sum(axis=2)
+        nearest = squared.argmin(axis=0)
+        assert len(set(nearest)) == len(wanted) == len(found)
+        found = found.subset(nearest)
+        np.testing.assert_allclose(found.means, wanted.means, atol=5e-4)
+        np.testing.assert_allclose(found.opacities, wanted.opacities, atol=0.003)
+        np.testing.assert_allclose(found.sh, wanted.sh, atol=0.06)
+    assert all((count == 1).all() for count in used)
+    assert index["count"] == sum(index["counts"])
+    return index, leaves
+
+
+@pytest.fixture(scope="module")
+def bundle():
+    from v3dg.procedural import make_asset
+
+    config = v3dg.BuildConfig(cluster_size=32, steps=0)
+    return v3dg.build_bundle(make_asset(1500), config=config, progress=False)
+
+
+@pytest.mark.parametrize("chunk", [70, 250, 500, 10**9])
+def test_every_gaussian_is_in_one_chunk_of_its_level(tmp_path, bundle, chunk):
+    done = export_streamed_sog(bundle, tmp_path / "web", chunk=chunk)
+    index, leaves = assert_holds(tmp_path / "web", bundle, chunk)
+    assert (done.counts, done.chunks, done.files) == (index["counts"], len(leaves), len(index["filenames"]))
+    assert done.bytes == sum(file.stat().st_size for file in (tmp_path / "web").rglob("*.*"))
+    if chunk == 10**9:
+        assert len(leaves) == 1
+        assert index["lodLevels"] == bundle.num_levels
+    else:  # half of the chunk would do, or the tree would have been cut higher
+        assert max(leaf["lods"]["0"]["count"] for leaf in leaves) > chunk / 2 - 1
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bundles_of_any_shape_are_exported(tmp_path, seed):
+    """Groups of several clusters, clusters without gaussians, one level or four, SH of every degree."""
+    bundle = random_bundle(seed, num_levels=1 + seed % 4, sh_degree=seed % 4, max_cluster=9)
+    export_streamed_sog(bundle, tmp_path / "web", chunk=100)
+    index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
+    for level, count in enumerate(index["counts"]):
+        assert count == len(bundle.level_gaussians(level))
+
+
+def test_many_chunks_share_a_folder_up_to_its_size(tmp_path, bundle, monkeypatch):
+    monkeypatch.setattr(v3dg.export, "_FOLDER_GAUSSIANS", 300)
+    export_streamed_sog(bundle, tmp_path / "web", chunk=150)
+    index, _ = assert_holds(tmp_path / "web", bundle, 150)
+    of_level_0 = [name for name in index["filenames"] if name.startswith("0_")]
+    assert of_level_0 == [f"0_{i}/meta.json" for i in range(len(of_level_0))]
+    sizes = [len(v3dg.load(tmp_path / "web" / name)) for name in of_level_0]
+    assert all(300 <= size < 450 for size in sizes[:-1])
+
+
+def test_an_earlier_export_is_replaced_and_kept_on_failure(tmp_path, bundle, monkeypatch):
+    folder = tmp_path / "web"
+    export_streamed_sog(bundle, folder, chunk=200)
+    before = sorted(os.listdir(folder))
+    with monkeypatch.context() as patch:
+
+        def full_disk(gaussians):
+            raise OSError(28, "No space left on device")
+
+        patch.setattr(v3dg.export.sog, "encode", full_disk)
+        with pytest.raises(OSError, match="No space left on device"):
+            export_streamed_sog(bundle, folder, chunk=10**9)
+    assert sorted(os.listdir(folder)) == before
+    export_streamed_sog(bundle, folder, chunk=10**9)
+    assert sorted(os.listdir(folder)) != before
+    assert os.listdir(tmp_path) == ["web"]
+
+
+def test_a_viewer_starts_where_it_sees_the_asset(tmp_path, bundle):
+    export_streamed_sog(bundle, tmp_path / "web")
+    pose = json.loads((tmp_path / "web" / "settings.json").read_text())["cameras"][0]["initial"]
+    turn = np.diag([-1.0, -1.0, 1.0])  # of an asset in the viewer
+    position, target = (turn @ pose[name] for name in ("position", "target"))
+    means = bundle.level_gaussians(0).means
+    camera = v3dg.Camera.look_at(
+        position, target, (0, -1, 0), fov_x=np.radians(pose["fov"]), width=100, height=100
+    )
+    points = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    pixels = points @ camera.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    assert (points[:, 2] > 0).all()
+    assert ((pixels >= 0) & (pixels <= 100)).all(axis=1).mean() > 0.97
+    assert np.ptp(pixels, axis=0).max() > 40
+
+
+def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").touch()
+    (tmp_path / "file").touch()
+    for name in ("mine", "file"):
+        with pytest.raises(ValueError, match=f"{name}: expected a new folder, or one with an earlier export"):
+            export_streamed_sog(bundle, tmp_path / name)
+    with pytest.raises(
+        ValueError, match=r"chunk: expected at least \d+ gaussians, a group of the asset, got 9"
+    ):
+        export_streamed_sog(bundle, tmp_path / "web", chunk=9)
+    with pytest.raises(ValueError, match="bundle: expected gaussians to export, got none"):
+        export_streamed_sog(random_bundle(num_levels=0), tmp_path / "web")
+    with pytest.raises(FileNotFoundError, match="absent"):
+        export_streamed_sog(bundle, tmp_path / "absent" / "web")
+    assert sorted(os.listdir(tmp_path)) == ["file", "mine"]
+
+
+def test_the_command(tmp_path, bundle):
+    bundle.save(tmp_path / "tuft.v3dg")
+    done = run("export", "tuft.v3dg", "--chunk", 200, "--json", "--quiet", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["output"] == "tuft_web/lod-meta.json"
+    assert result["counts"][0] == len(bundle.level_gaussians(0))
+    assert result["chunks"] > 4
+    assert "levels" in run("export", "tuft.v3dg", "-o", "other", "--quiet", cwd=tmp_path).stdout
+    fails(2, "--chunk: expected at least 1", "export", "tuft.v3dg", "--chunk", "0", cwd=tmp_path)
+    fails(1, "create it first", "export", "tuft.v3dg", "-o", "no/web", cwd=tmp_path)
+    fails(1, "expected a file ending in .v3dg", "export", "tuft_web/lod-meta.json", cwd=tmp_path)
+
+
+@pytest.mark.witness
+@pytest.mark.skipif(shutil.which("splat-transform") is None, reason="needs splat-transform")
+def test_splat_transform_reads_an_export(tmp_path, bundle):
+    export_streamed_sog(bundle, tmp_path / "web", chunk=500)
+    for level in (0, 2):
+        arguments = ["-g", "cpu", "-q", "-w", "-L", str(level), "web/lod-meta.json", "back.ply"]
+        subprocess.run(["splat-transform", *arguments], cwd=tmp_path, check=True)
+        back, wanted = v3dg.load(tmp_path / "back.ply"), bundle.level_gaussians(level)
+        assert len(back) == len(wanted)
+        np.testing.assert_allclose(back.means.mean(axis=0), wanted.means.mean(axis=0), atol=1e-4)

@@ -1,0 +1,63 @@
+"""`v3dg export`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from v3dg.cli._common import Flag, Threads, UsageError, bytes_text, option, print_result, require_file
+
+
+@dataclass
+class Export:
+    """Write a bundle as streamed SOG, for the web viewers of PlayCanvas and SuperSplat (docs/formats.md)."""
+
+    bundle: tyro.conf.Positional[Path]
+    """A bundle (.v3dg)."""
+    output: Annotated[Path | None, option("FOLDER", "-o")] = None
+    """Folder to write; viewers are given its lod-meta.json. The bundle's name with _web if not given."""
+    chunk: Annotated[int | None, option("N")] = None
+    """Most gaussians of the asset in a chunk, for which the viewer chooses a level; 16384 if not given."""
+    threads: Threads = None
+    """CPU threads; all if not given."""
+    json: Flag = False
+    """Print the result as JSON."""
+    quiet: Flag = False
+    """Show no progress."""
+
+
+def run(options: Export) -> None:
+    require_file(options.bundle, ".v3dg")
+    if options.chunk is not None and options.chunk < 1:
+        raise UsageError(f"--chunk: expected at least 1, got {options.chunk}")
+    from v3dg.bundle import Bundle
+    from v3dg.export import DEFAULT_CHUNK, INDEX, export_streamed_sog
+
+    folder = options.output or options.bundle.with_name(f"{options.bundle.stem}_web")
+    if not folder.absolute().parent.is_dir():
+        raise ValueError(f"{folder}: expected an existing folder, got {folder.parent}; create it first")
+    start = time.perf_counter()
+    done = export_streamed_sog(
+        Bundle.open(options.bundle),
+        folder,
+        chunk=DEFAULT_CHUNK if options.chunk is None else options.chunk,
+        progress=not options.quiet,
+    )
+    result = {
+        "output": str(folder / INDEX),
+        "levels": len(done.counts),
+        "counts": done.counts,
+        "chunks": done.chunks,
+        "files": done.files,
+        "bytes": done.bytes,
+        "seconds": time.perf_counter() - start,
+    }
+    text = (
+        f"{folder / INDEX}: {len(done.counts)} levels, {done.chunks:,} chunks, "
+        f"{sum(done.counts):,} gaussians, {bytes_text(done.bytes)}, {result['seconds']:.1f} s"
+    )
+    print_result(options.json, result, lambda: text)

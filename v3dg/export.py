@@ -1,0 +1,285 @@
+"""A bundle for stock web viewers: streamed SOG, the level-of-detail format of PlayCanvas and SuperSplat.
+
+The asset is cut into chunks, which are subtrees of the bundle. Each chunk has the bundle's levels up to the
+one at which a single group is left of it; a viewer chooses a level for each. Chunks of one level are stored
+side by side in folders of SOG, and `lod-meta.json` says which gaussians of which folder they are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3dg import _files
+from v3dg._version import __version__
+from v3dg.bundle import Bundle
+from v3dg.formats import sog
+from v3dg.formats._packing import check_writable, morton_order
+from v3dg.gaussians import Gaussians
+
+INDEX = "lod-meta.json"
+DEFAULT_CHUNK = 16384
+# A folder is filled chunk by chunk until it holds so many gaussians: about a megabyte to load at once.
+_FOLDER_GAUSSIANS = 1 << 17
+_FOV_DEGREES = 50.0  # vertical, of the camera that a viewer starts with
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was written.
+
+    Attributes:
+        counts: Gaussians of each level, finest first.
+        chunks: Chunks in which a viewer chooses a level.
+        files: Folders with SOG.
+        bytes: Of all files.
+    """
+
+    counts: list[int]
+    chunks: int
+    files: int
+    bytes: int
+
+
+def export_streamed_sog(
+    bundle: Bundle, folder: str | os.PathLike[str], *, chunk: int = DEFAULT_CHUNK, progress: bool = False
+) -> Export:
+    """Write a bundle as streamed SOG, replacing an earlier export in one step once all is written.
+
+    Besides, `settings.json` tells SuperSplat's viewer where to start. Memory is needed for one folder of SOG.
+
+    Args:
+        folder: Where to; new, empty, or with an earlier export.
+        chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view more closely, and have
+            fewer levels.
+        progress: Show a bar.
+
+    Raises:
+        ValueError: There is something else at ``folder``, ``chunk`` is too small for the bundle's groups, or
+            a gaussian has values that SOG cannot hold.
+        OSError: A file cannot be written.
+
+    Source: PlayCanvas, the streamed SOG format, version 1.
+    """
+    if not bundle.num_gaussians:
+        raise ValueError("bundle: expected gaussians to export, got none")
+    plan = _Plan.of(bundle, chunk)
+    with _replacing_folder(Path(folder)) as place:
+        names: list[str] = []
+        lods: list[dict[str, dict[str, int]]] = [{} for _ in range(plan.num_chunks)]
+        counts = [0] * plan.num_levels
+        with _bar(plan.num_gaussians, progress) as advance:
+            for level in range(plan.num_levels):
+                for i, (first, parts) in enumerate(_folders(bundle, plan, level)):
+                    gaussians = Gaussians.concatenate(parts)
+                    offset = 0
+                    for number, part in enumerate(parts, first):
+                        lods[number][str(level)] = {"file": len(names), "offset": offset, "count": len(part)}
+                        offset += len(part)
+                    names.append(f"{level}_{i}")
+                    (place / names[-1]).mkdir()
+                    for file, content in sog.encode(gaussians).items():
+                        (place / names[-1] / file).write_bytes(content)
+                    counts[level] += len(gaussians)
+                    advance(len(gaussians))
+        index = {
+            "version": 1,
+            "asset": {"generator": f"v3dg {__version__}"},
+            "count": sum(counts),
+            "counts": counts,
+            "lodLevels": plan.num_levels,
+            "filenames": [f"{name}/meta.json" for name in names],
+            "tree": plan.tree(lods),
+        }
+        settings = _viewer_settings(bundle.level_gaussians(plan.top))
+        for file, document in ((INDEX, index), ("settings.json", settings)):
+            (place / file).write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
+        size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
+    return Export(counts, plan.num_chunks, len(names), size)
+
+
+def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
+    """What SuperSplat's viewer wants beside an asset: a camera that shows most of it, and no effects."""
+    # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn about z.
+    means = gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0)
+    low, high = np.percentile(means, (1, 99), axis=0)  # trained assets have a few gaussians far away
+    centre = (low + high) / 2
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    distance = 1.2 * radius / math.sin(math.radians(_FOV_DEGREES) / 2)
+    towards_camera = np.array([0.4, 0.4, 0.8]) / np.linalg.norm([0.4, 0.4, 0.8])
+    position = centre + distance * towards_camera
+    pose = {"position": position.tolist(), "target": centre.tolist(), "fov": _FOV_DEGREES}
+    return {
+        "version": 2,
+        "tonemapping": "none",
+        "highPrecisionRendering": False,
+        "background": {"color": [0.0, 0.0, 0.0]},
+        "postEffectSettings": {
+            "sharpness": {"enabled": False, "amount": 0},
+            "bloom": {"enabled": False, "intensity": 0.1, "blurLevel": 2},
+            "grading": {"enabled": False, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+            "vignette": {"enabled": False, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
+            "fringing": {"enabled": False, "intensity": 0.5},
+        },
+        "animTracks": [],
+        "cameras": [{"initial": pose}],
+        "annotations": [],
+        "startMode": "default",
+    }
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Chunks of a bundle: the groups of its level `top`, or all of a bundle of one level.
+
+    Attributes:
+        chunk_of_cluster: (C,) number of the chunk, or -1 for clusters of coarser levels than `top`.
+        chunk_of_group: (G,) number of the chunk that a group of level `top` is, else -1.
+    """
+
+    bundle: Bundle
+    top: int
+    num_chunks: int
+    chunk_of_cluster: NDArray[np.int64]
+    chunk_of_group: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, bundle: Bundle, chunk: int) -> _Plan:
+        clusters, groups = bundle.clusters, bundle.groups
+        if bundle.num_levels == 1:
+            return cls(bundle, 0, 1, np.zeros(len(clusters), np.int64), np.zeros(0, np.int64))
+        sizes = np.diff(clusters.offset)
+        leaves = bundle.level_range(0)
+        owner = clusters.parent_group[leaves.start : leaves.stop].astype(np.int64)
+        top = 0
+        for level in range(1, bundle.num_levels):
+            largest = int(np.bincount(owner, sizes[leaves.start : leaves.stop]).max())
+            if largest > chunk:
+                if level == 1:
+                    raise ValueError(
+                        f"chunk: expected at least {largest} gaussians, a group of the asset, got {chunk}"
+                    )
+                break
+            top = level
+            owner = groups.parent[owner].astype(np.int64)
+        number = np.full(len(groups), -1, np.int64)
+        tops = np.flatnonzero(groups.level == top)
+        number[tops] = np.arange(len(tops))
+        ancestor = np.arange(len(groups))
+        for _ in range(top):
+            below = groups.level[ancestor] < top
+            ancestor[below] = groups.parent[ancestor[below]]
+        # A cluster belongs to the group that replaces it; those at the top to the group that made them.
+        group = np.where(clusters.level < top, clusters.parent_group, clusters.own_group)
+        chunk_of_cluster = np.where(clusters.level <= top, number[ancestor[group]], -1)
+        return cls(bundle, top, len(tops), chunk_of_cluster, number)
+
+    @property
+    def num_levels(self) -> int:
+        return self.top + 1
+
+    @property
+    def num_gaussians(self) -> int:
+        return int(np.diff(self.bundle.clusters.offset)[self.chunk_of_cluster >= 0].sum())
+
+    def clusters_of(self, level: int) -> list[NDArray[np.int64]]:
+        """Ids of a level's clusters, by chunk."""
+        clusters = self.bundle.level_range(level)
+        chunks = self.chunk_of_cluster[clusters.start : clusters.stop]
+        order = np.argsort(chunks, kind="stable")
+        ends = np.cumsum(np.bincount(chunks, minlength=self.num_chunks))[:-1]
+        return np.split(order + clusters.start, ends)
+
+    def tree(self, lods: list[dict[str, dict[str, int]]]) -> dict[str, Any]:
+        """The spatial index: the groups above the chunks, with bounds."""
+        low = np.full((self.num_chunks, 3), np.inf)
+        high = np.full((self.num_chunks, 3), -np.inf)
+        clusters = self.bundle.clusters
+        used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
+        np.minimum.at(low, self.chunk_of_cluster[used], clusters.box[used, 0])
+        np.maximum.at(high, self.chunk_of_cluster[used], clusters.box[used, 1])
+
+        def joined(nodes: list[dict[str, Any]]) -> dict[str, Any]:
+            if len(nodes) == 1:
+                return nodes[0]
+            bounds = [node["bound"] for node in nodes]
+            low = np.min([bound["min"] for bound in bounds], axis=0).tolist()
+            high = np.max([bound["max"] for bound in bounds], axis=0).tolist()
+            return {"bound": {"min": low, "max": high}, "children": nodes}
+
+        nodes = {}
+        for chunk, chunk_lods in enumerate(lods):
+            if any(lod["count"] for lod in chunk_lods.values()):
+                bound = {"min": low[chunk].tolist(), "max": high[chunk].tolist()}
+                nodes[chunk] = {"bound": bound, "lods": chunk_lods}
+        groups = self.bundle.groups
+        of_group = {g: nodes[c] for g, c in enumerate(self.chunk_of_group.tolist()) if c in nodes}
+        if not of_group:
+            return nodes[0]
+        while set(groups.parent[list(of_group)].tolist()) != {-1}:
+            children: dict[int, list[dict[str, Any]]] = {}
+            for group, node in of_group.items():
+                children.setdefault(int(groups.parent[group]), []).append(node)
+            of_group = {group: joined(nodes) for group, nodes in children.items()}
+        return joined(list(of_group.values()))
+
+
+def _folders(bundle: Bundle, plan: _Plan, level: int) -> Iterator[tuple[int, list[Gaussians]]]:
+    """The gaussians of a level by chunk, as many as go into a folder, and the number of the first chunk."""
+    first, parts = 0, []
+    for number, clusters in enumerate(plan.clusters_of(level)):
+        chunk = Gaussians.concatenate([bundle.cluster_gaussians(int(c)) for c in clusters])
+        chunk = check_writable(chunk)
+        parts.append(chunk.subset(morton_order(chunk.means)))
+        if sum(map(len, parts)) >= _FOLDER_GAUSSIANS:
+            yield first, parts
+            first, parts = number + 1, []
+    if parts:
+        yield first, parts
+
+
+@contextlib.contextmanager
+def _bar(total: int, progress: bool) -> Iterator[Any]:
+    from tqdm import tqdm
+
+    with tqdm(total=total, unit=" gaussians", unit_scale=True, desc="export", disable=not progress) as bar:
+        yield bar.update
+
+
+@contextlib.contextmanager
+def _replacing_folder(folder: Path) -> Iterator[Path]:
+    """Give a new folder beside `folder` to fill; at the end it takes its place, on failure it is removed."""
+    if folder.exists() and not (
+        folder.is_dir() and ((folder / INDEX).is_file() or not any(folder.iterdir()))
+    ):
+        raise ValueError(
+            f"{folder}: expected a new folder, or one with an earlier export, got something else"
+        )
+    target = folder.resolve()
+    temporary, old = (
+        target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.{end}") for end in ("tmp", "old")
+    )
+    with _files.naming_errors(folder, os.fspath(temporary)):
+        temporary.mkdir()
+        try:
+            yield temporary
+            if target.exists():
+                target.rename(old)
+            temporary.rename(target)
+        except BaseException:
+            if old.exists():
+                old.rename(target)
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
