@@ -141,6 +141,7 @@ def run_shell(block, folder):
         env=environment,
         capture_output=True,
         text=True,
+        timeout=300,
     )
     assert done.returncode == 0, f"{block.place}\n{done.stdout}\n{done.stderr}"
 

@@ -42,4 +42,7 @@ def shrink(set_attribute=setattr, set_item=dict.__setitem__):
 
 if __name__ == "__main__":
     shrink()
+    if sys.argv[1] == "view":  # serves until it is interrupted: here, its options are enough
+        cli.parse(sys.argv[1:])
+        sys.exit()
     sys.exit(cli.main([*sys.argv[1:], *OPTIONS.get(sys.argv[1], [])]))
