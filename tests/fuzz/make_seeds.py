@@ -2,9 +2,10 @@
 
     python tests/fuzz/make_seeds.py FOLDER
 
-makes FOLDER/ply, FOLDER/bundle and FOLDER/scene. What fuzzing found beyond them is kept in tests/fuzz/corpus.
+makes FOLDER/ply, FOLDER/bundle and so on. What fuzzing found beyond them is kept in tests/fuzz/corpus.
 """
 
+import gzip
 import json
 import sys
 from pathlib import Path
@@ -13,8 +14,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
-from random_bundle import random_bundle
+from fuzz.targets import META_IN_SOG, SOG, zipped
+from random_bundle import random_bundle, random_gaussians
 from test_ply import HOSTILE, Element, ply_bytes, random_columns
+from v3dg.io import save
 
 LARGEST_SEED = 10_000  # bytes; a few of the broken files are made to be large
 
@@ -75,9 +78,29 @@ def scene_seeds():
     yield from (json.dumps(document).encode() for document in documents)
 
 
+def format_seeds():
+    path = Path("seed")
+    for kind, suffix in ((0, ".compressed.ply"), (2, ".spz")):
+        for degree in (0, 1):
+            file = path.with_suffix(suffix)
+            save(file, random_gaussians(np.random.default_rng(degree), 3, degree))
+            content = file.read_bytes()
+            file.unlink()
+            yield bytes([kind]) + content
+            if suffix == ".spz":
+                yield bytes([3]) + gzip.decompress(content)
+    yield bytes([1]) + bytes(range(64))
+    yield bytes([META_IN_SOG - 1]) + zipped(SOG)
+    yield bytes([META_IN_SOG]) + SOG["meta.json"]
+    yield bytes([META_IN_SOG + 1]) + SOG["shN_centroids.webp"]
+
+
+SEEDS = {"ply": ply_seeds, "bundle": bundle_seeds, "scene": scene_seeds, "formats": format_seeds}
+
+
 def main():
     folder = Path(sys.argv[1])
-    for name, seeds in (("ply", ply_seeds), ("bundle", bundle_seeds), ("scene", scene_seeds)):
+    for name, seeds in SEEDS.items():
         (folder / name).mkdir(parents=True, exist_ok=True)
         for i, content in enumerate(seeds()):
             (folder / name / f"seed_{i:02}").write_bytes(content)

@@ -1,6 +1,6 @@
 """Run a fuzzer for some time, and keep the inputs that reach all it reached.
 
-    python tests/fuzz/run.py ply|bundle|scene SECONDS
+    python tests/fuzz/run.py ply|bundle|scene|formats SECONDS
 
 The .ply fuzzer is C++ and wants clang++ (CLANG names another one), the others want atheris. They work in
 build/fuzz; what stops one is there as crash-*. Inputs go to tests/fuzz/corpus, which test_fuzz.py replays.
@@ -14,8 +14,8 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
-MAX_BYTES = {"ply": 8192, "bundle": 20_000, "scene": 8192}
-KEPT_BYTES = {"ply": 1000, "bundle": 10_000, "scene": 3000}
+MAX_BYTES = {"ply": 8192, "bundle": 20_000, "scene": 8192, "formats": 4096}
+KEPT_BYTES = {"ply": 1000, "bundle": 10_000, "scene": 3000, "formats": 3000}
 
 
 def command_of(name, folder):

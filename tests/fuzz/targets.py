@@ -1,14 +1,20 @@
 """What the fuzzers and the replay of what they found call: readers, and what must hold whatever they read."""
 
+import gzip
 import hashlib
+import io
 import json
 import struct
+import zipfile
 from pathlib import Path
 
-from random_bundle import random_bundle
+import numpy as np
+
+from random_bundle import random_bundle, random_gaussians
 from v3dg._json import is_one_line
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
+from v3dg.formats import sog
 from v3dg.io import load
 from v3dg.scene_file import read_scene
 
@@ -40,7 +46,44 @@ def read_json(content, folder):
         read_cameras(path, size=(64, 48))
 
 
-READERS = {"ply": read_ply, "bundle": read_bundle, "scene": read_json}
+def read_format(content, folder):
+    """The first byte tells the format, and whether the rest is a file of it or what is packed in one."""
+    suffix, packed = FORMATS[content[0] % len(FORMATS)] if content else FORMATS[0]
+    path = put(folder / f"fuzz{suffix}", packed(content[1:]))
+    with only_errors_that_name(path):
+        assert len(load(path)) <= 1032 * path.stat().st_size  # the most that deflate can make of a byte
+
+
+def zipped(files):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as bundle:
+        for name, content in files.items():
+            bundle.writestr(zipfile.ZipInfo(name), content)
+    return stream.getvalue()
+
+
+def small_sog():
+    """The files of a SOG, its tables cut to four values, so that most changes of it change something else."""
+    files = sog.encode(random_gaussians(np.random.default_rng(0), 3, sh_degree=1))
+    meta = json.loads(files["meta.json"])
+    for name in ("scales", "sh0", "shN"):
+        meta[name]["codebook"] = meta[name]["codebook"][:4]
+    return files | {"meta.json": json.dumps(meta).encode()}
+
+
+SOG = small_sog()
+FORMATS = (
+    (".ply", bytes),
+    (".splat", bytes),
+    (".spz", bytes),
+    (".spz", lambda body: gzip.compress(body, mtime=0)),
+    (".sog", bytes),
+    (".sog", lambda meta: zipped(SOG | {"meta.json": meta})),
+    (".sog", lambda picture: zipped(SOG | {"shN_centroids.webp": picture})),
+)
+META_IN_SOG = 5  # of FORMATS
+
+READERS = {"ply": read_ply, "bundle": read_bundle, "scene": read_json, "formats": read_format}
 
 
 def put(path, content):
