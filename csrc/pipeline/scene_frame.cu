@@ -51,7 +51,7 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& tables, const Frame
                            1,
                            num_tiles(image),
                            packed_.data(),
-                           true};
+                           tables.num_instances() > 1};
     return frame_.draw(batch, std::move(prepare), stream);
 }
 
