@@ -13,6 +13,7 @@ import json
 import math
 import os
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -245,7 +246,12 @@ class _Pictures:
 
         content = self._load(name)
         try:
-            with Image.open(io.BytesIO(content), formats=("WEBP", "PNG")) as picture:
+            with warnings.catch_warnings():
+                warnings.simplefilter(
+                    "ignore", Image.DecompressionBombWarning
+                )  # what is too large is told below
+                picture = Image.open(io.BytesIO(content), formats=("WEBP", "PNG"))
+            with picture:
                 num_pixels = picture.width * picture.height
                 if num_pixels < at_least or (width is not None and picture.width != width):
                     shape = f"{at_least} pixels" + ("" if width is None else f" in rows of {width}")
