@@ -49,6 +49,8 @@ def main():
         zipfile.ZipFile(archive).extractall(found)
     environment = os.environ | {
         "OMP_NUM_THREADS": "1",
+        # Each input is a file for a moment: a disk would be most of the time.
+        **({"TMPDIR": "/dev/shm"} if Path("/dev/shm").is_dir() else {}),
         # Merging starts the program anew by its own name, and with it the interpreter.
         "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
     }
