@@ -6,6 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+
+import v3dg
+from v3dg.procedural import make_donut
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -43,3 +47,56 @@ def test_donuts_are_seen_and_fall(film):
         assert seen.mean() > 0.01
         rows.append(np.argwhere(seen)[:, 0].mean())
     assert rows[-1] > rows[0] + 3, "further down in the picture"
+
+
+@pytest.fixture
+def gsplat_example(tmp_path):
+    """The example, and its settings for a field of small donuts."""
+    example = load_example("with_gsplat")
+    config = v3dg.BuildConfig(cluster_size=64, steps=0)
+    v3dg.build_bundle(make_donut(2000), config=config, progress=False).save(tmp_path / "donut.v3dg")
+    return example, example.Config(
+        tmp_path / "donut.v3dg", tmp_path / "picture.png", rows=4, size=(160, 120), tolerance=30
+    )
+
+
+def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
+    """What it hands over is all that a rasterizer needs: ours, which has gsplat's meaning, draws it."""
+    example, config = gsplat_example
+    scene, camera = example.make_scene(config)
+    camera = v3dg.Camera(camera.viewmat, camera.K, camera.width, camera.height, near=0.02)
+    selection = v3dg.select(scene, camera, tolerance=config.tolerance)
+    assert selection.num_gaussians < example.num_gaussians(scene) / 4
+    arguments = example.gsplat_arguments(selection, camera, "cpu")
+    tensors = [value for value in arguments.values() if isinstance(value, torch.Tensor)]
+    assert len(tensors) == 7
+    assert all(tensor.dtype == torch.float32 and tensor.is_contiguous() for tensor in tensors)
+    assert arguments["rasterize_mode"] == "antialiased"
+    gaussians = v3dg.Gaussians(
+        *(arguments[name] for name in ("means", "quats", "scales", "opacities", "colors"))
+    )
+    assert arguments["sh_degree"] == gaussians.sh_degree == 3
+    drawn = v3dg.rasterize(
+        gaussians,
+        v3dg.Camera(
+            arguments["viewmats"][0].double().numpy(),
+            arguments["Ks"][0].double().numpy(),
+            arguments["width"],
+            arguments["height"],
+            arguments["near_plane"],
+        ),
+        filter_px2=arguments["eps2d"],
+        antialiased=True,
+    )
+    wanted = v3dg.render(scene, camera, tolerance=config.tolerance)
+    assert wanted.alpha.max() > 0.9
+    # Coarser levels have the filter of the arguments; what is left is rounding of the translation.
+    assert v3dg.metrics.psnr(wanted.color, drawn.color.numpy()) > 100
+
+
+@pytest.mark.gpu
+def test_gsplat_draws_what_v3dg_does(gsplat_example):
+    pytest.importorskip("gsplat")
+    example, config = gsplat_example
+    assert example.main(config) > 50
+    assert config.output.is_file()

@@ -1,0 +1,113 @@
+"""Choose what one view needs with v3dg, and draw it with gsplat: a selection is gaussians for any rasterizer.
+
+Wants a GPU: pip install '.[torch]' gsplat==1.5.3 && python examples/with_gsplat.py
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+import v3dg
+from v3dg.metrics import psnr
+from v3dg.pictures import write_picture
+from v3dg.procedural import make_donut
+
+# What the coarser levels were fitted with: gsplat has one filter for all gaussians, and that is nearest.
+FILTER_PX2 = v3dg.BuildConfig.filter_px2
+
+
+@dataclass
+class Config:
+    """Draw a field of donuts, or copies of a bundle, with gsplat."""
+
+    bundle: Path | None = None
+    """Bundle to show; a donut that is made here if not given."""
+    output: Path = Path("with_gsplat.png")
+    """Picture to write."""
+    rows: int = 20
+    """The field has rows x rows instances."""
+    size: tuple[int, int] = (1280, 720)
+    """Width and height in px."""
+    tolerance: float = v3dg.DEFAULT_TOLERANCE
+    """Screen area in px² that one gaussian of a coarser cluster may stand for."""
+
+
+def main(config: Config) -> float:
+    """Write the picture, and return how near it is to v3dg's own, in dB."""
+    import gsplat
+
+    scene, camera = make_scene(config)
+    selection = v3dg.select(scene, camera, tolerance=config.tolerance, device="cuda")
+    color, _, _ = gsplat.rasterization(**gsplat_arguments(selection, camera, "cuda"))
+    picture = color[0].clamp(0, 1).cpu().numpy()
+    write_picture(config.output, picture)
+    ours = v3dg.render(scene, camera, tolerance=config.tolerance, device="cuda")
+    likeness = psnr(np.clip(ours.color.cpu().numpy(), 0, 1), picture)
+    print(
+        f"{config.output}: {selection.num_gaussians:,} of {num_gaussians(scene):,} gaussians; "
+        f"{likeness:.1f} dB to v3dg's own picture"
+    )
+    return likeness
+
+
+def gsplat_arguments(selection: v3dg.Selection, camera: v3dg.Camera, device: str) -> dict[str, Any]:
+    """What `gsplat.rasterization` takes to draw a selection.
+
+    Gaussians are taken relative to the camera, which is then at the origin: far from the world's origin
+    nothing is lost to float32.
+    """
+    import torch
+
+    chosen = selection.gaussians(origin=camera.position, device=device).torch(device)
+    viewmat = torch.eye(4, device=device)
+    viewmat[:3, :3] = torch.from_numpy(camera.viewmat[:3, :3])
+    return {
+        "means": chosen.means,
+        "quats": chosen.quats,
+        "scales": chosen.scales,
+        "opacities": chosen.opacities,
+        "colors": chosen.sh,
+        "sh_degree": chosen.sh_degree,
+        "viewmats": viewmat[None],
+        "Ks": torch.from_numpy(camera.K).to(device, torch.float32)[None],
+        "width": camera.width,
+        "height": camera.height,
+        "near_plane": camera.near,
+        "eps2d": FILTER_PX2,
+        "rasterize_mode": "antialiased",
+    }
+
+
+def make_scene(config: Config) -> tuple[v3dg.Scene, v3dg.Camera]:
+    """A square of instances, seen from above one of its sides."""
+    if config.bundle is None:
+        bundle = v3dg.build_bundle(make_donut(), device="auto")
+    else:
+        bundle = v3dg.Bundle.open(config.bundle)
+    means = bundle.level_gaussians(bundle.num_levels - 1).means
+    step = 1.3 * float(np.ptp(means, axis=0).max())
+    x, y = np.meshgrid(np.arange(config.rows), np.arange(config.rows))
+    positions = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1) * step
+    scene = v3dg.Scene()
+    scene.add(bundle, positions=positions)
+    middle = step * (config.rows - 1) / 2
+    eye = (middle, -3 * step, 3 * step)
+    camera = v3dg.Camera.look_at(
+        eye, (middle, middle / 2, 0), fov_x=1.0, width=config.size[0], height=config.size[1]
+    )
+    return scene, camera
+
+
+def num_gaussians(scene: v3dg.Scene) -> int:
+    """Gaussians of all instances at full detail."""
+    sizes = np.array([bundle.info()["levels"][0]["gaussians"] for bundle in scene.bundles])
+    return int(sizes[scene.instance_bundle].sum())
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
