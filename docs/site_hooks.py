@@ -41,6 +41,13 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return markdown.replace("](../benchmarks/results/", "](benchmarks/results/")
 
 
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Make links of the pages that docstrings name."""
+    if page.file.src_uri not in ("command_line.md", "python.md"):
+        return html
+    return re.sub(r"\bdocs/(\w+)\.md\b", r'<a href="\1.html">\1</a>', html)
+
+
 def command_text(name: str) -> str:
     """A section on one command: what it does, and tables of its arguments and options."""
     with warnings.catch_warnings():

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Info:
-    """Describe an asset (.ply), a bundle (.v3dg) or a scene (.json)."""
+    """Describe an asset (.ply, .spz, ...), a bundle (.v3dg) or a scene (.json)."""
 
     file: tyro.conf.Positional[Path]
     """File to describe."""

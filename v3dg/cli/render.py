@@ -18,7 +18,7 @@ class Render:
     """Draw a scene from its cameras, a bundle or an asset from a turntable, or any from a camera file."""
 
     subject: tyro.conf.Positional[Path]
-    """A scene (.json), a bundle (.v3dg) or an asset (.ply)."""
+    """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
     output: Annotated[Path | None, option("PATH", "-o")] = None
     """Picture to write, .png or .jpg; several get a number or the camera's name. Default: as the subject."""
     tolerance: Annotated[float | None, option("PX2")] = None
