@@ -83,6 +83,16 @@ SPLAT_BOUNDS = {
     "color": 1.001 / 255 / SH_C0,  # cut off, of what is within black and white
 }
 
+KSPLAT_HALF = {
+    "means": 2.5 / 32767 * 0.51,  # 16 bits for a bucket of side 5
+    "log_scales": 2**-10,  # half precision
+    "quats": 2**-11,
+    "opacities": SPLAT_BOUNDS["opacities"],
+    "color": SPLAT_BOUNDS["color"],
+    "band 1": 0.4 * 2**-10,
+    "higher": 0.4 * 2**-10,
+}
+
 # Formats that we write; SOG's bytes are rounded to the nearest then.
 WRITTEN = {
     ".compressed.ply": compressed_ply_bounds,
@@ -106,6 +116,10 @@ FOREIGN = {
     "sh3_v4.spz": lambda _: spz_bounds(5, 4),
     "sh3_gsply_v4.spz": lambda _: spz_bounds(),
     "sh0_gaussforge.splat": lambda _: SPLAT_BOUNDS,
+    "sh3_mkkellogg_0.ksplat": lambda _: SPLAT_BOUNDS,
+    "sh3_mkkellogg_1.ksplat": lambda _: KSPLAT_HALF,
+    "sh3_mkkellogg_2.ksplat": lambda _: KSPLAT_HALF | {"band 1": 1.001 * 3 / 255, "higher": 1.001 * 3 / 255},
+    "sh0_mkkellogg_1.ksplat": lambda _: KSPLAT_HALF,
 }
 
 
@@ -152,9 +166,9 @@ def assert_within(gaussians, reference, bounds):
 def test_what_other_tools_write_is_read(name):
     reference = reference_of(name)
     gaussians = in_order_of(reference, load(FIXTURES / name))
-    if name.endswith(".splat"):
-        black, white = (-0.5 / SH_C0, 0.5 / SH_C0)
-        sh = np.clip(reference.sh, black, white).astype(np.float32)
+    if name.endswith("splat"):
+        sh = np.ascontiguousarray(reference.sh[:, : gaussians.sh.shape[1]])
+        sh[:, 0] = np.clip(sh[:, 0], -0.5 / SH_C0, 0.5 / SH_C0)  # between black and white
         reference = Gaussians(reference.means, reference.quats, reference.scales, reference.opacities, sh)
     assert_within(gaussians, reference, FOREIGN[name](reference))
 
@@ -515,6 +529,29 @@ def test_splat_of_another_length_is_refused(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (0, 1, "expected .ksplat 0.1 or later and compression 0 to 2, got 1.1, 1"),
+        (20, 3, "expected .ksplat 0.1 or later and compression 0 to 2, got 0.1, 3"),
+        (16, 0, "expected 256 gaussians in the sections, got 300"),
+        (4, 255, "expected headers of 255 sections, got 14496 bytes"),
+        (4096 + 7, 255, "expected section 0 to end within 14496 bytes"),
+        (4096 + 3, 255, "expected SH degree 0 to 2 and 4278190180 <= 100 gaussians"),
+        (4096 + 40, 3, "expected SH degree 0 to 2 and 100 <= 100 gaussians, got degree 3"),
+        (4096 + 15, 255, "expected section 0 to end within 14496 bytes"),
+        (4096 + 20, 11, "buckets in section 0"),
+        (4096 + 34, 255, "buckets in section 0"),
+        (4096 + 3 * 1024, 99, "expected buckets for 100 gaussians in section 0, got fewer"),
+    ],
+)
+def test_hostile_ksplat_is_refused(tmp_path, place, value, message):
+    content = bytearray((FIXTURES / "sh0_mkkellogg_1.ksplat").read_bytes())
+    content[place] = value
+    (tmp_path / "a.ksplat").write_bytes(content)
+    assert_refused_cheaply(tmp_path / "a.ksplat", message)
+
+
 HOSTILE_COMPRESSED_PLY = {
     "too few chunks": (b"element chunk 2", b"element chunk 1", "expected 2 chunks for 300 gaussians, got 1"),
     "too many rows": (
@@ -566,7 +603,16 @@ def test_hostile_compressed_ply_is_refused(tmp_path, case):
 @settings(max_examples=300)
 @example(name="sh3.sog", edits=[(230, 128)], in_header=True)  # a file name in a zip that is no UTF-8
 @given(
-    name=st.sampled_from(["sh0.compressed.ply", "sh3.compressed.ply", "sh3.sog", "sh3_v3.spz", "sh3_v4.spz"]),
+    name=st.sampled_from(
+        [
+            "sh0.compressed.ply",
+            "sh3.compressed.ply",
+            "sh3.sog",
+            "sh3_v3.spz",
+            "sh3_v4.spz",
+            "sh3_mkkellogg_2.ksplat",
+        ]
+    ),
     edits=st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(0, 255)), min_size=1, max_size=4),
     in_header=st.booleans(),
 )

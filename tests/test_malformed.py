@@ -63,6 +63,7 @@ READERS = {
     "compressed ply": ("a.ply", lambda folder: written(folder / "w.compressed.ply"), v3dg.load),
     "spz": ("a.spz", lambda folder: written(folder / "w.spz"), v3dg.load),
     "spz 4": ("a.spz", lambda _: (FIXTURES / "sh3_v4.spz").read_bytes(), v3dg.load),
+    "ksplat": ("a.ksplat", lambda _: (FIXTURES / "sh3_mkkellogg_2.ksplat").read_bytes(), v3dg.load),
     "sog": ("a.sog", lambda _: (FIXTURES / "sh3.sog").read_bytes(), v3dg.load),
     "checkpoint": ("a.pt", lambda folder: checkpoint(folder / "w.pt"), v3dg.load),
     "cameras": ("a.json", lambda _: json.dumps(CAPTURE).encode(), v3dg.read_cameras),
@@ -201,8 +202,8 @@ def test_every_truncation_is_refused(tmp_path, reader):
     good = content(tmp_path)
     # The last number of a text is still a number when its last digits are gone.
     last = good.rfind(b" ") + 1 if reader == "ply" else len(good)
-    # Every offset of a bundle is in its own tests, and of the other two most bytes are not looked at.
-    step = {"bundle": 37, "sog": 37, "checkpoint": 37}.get(reader, 1)
+    # Every offset of a bundle is in its own tests, and of the others most bytes are not looked at.
+    step = {"bundle": 37, "sog": 37, "ksplat": 37, "checkpoint": 37}.get(reader, 1)
     for size in range(0, last, step):
         (tmp_path / name).write_bytes(good[:size])
         assert_refused(read, tmp_path / name)

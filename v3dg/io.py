@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from v3dg.formats import checkpoint, compressed_ply, ply, sog, splat, spz
+from v3dg.formats import checkpoint, compressed_ply, ksplat, ply, sog, splat, spz
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
@@ -17,6 +17,7 @@ Format = TypeVar("Format", bound=Callable[..., Any])
 _READERS: dict[str, Callable[[Path], Gaussians]] = {
     ".ply": ply.read,
     ".splat": splat.read,
+    ".ksplat": ksplat.read,
     ".spz": spz.read,
     ".sog": sog.read,
     "meta.json": sog.read,
@@ -46,8 +47,8 @@ def load(path: Path) -> Gaussians:
       normalised, except those of length zero, which stay as they are. Values that are not finite are passed
       on. Little more memory is needed than for the result. A compressed `.ply`, of PlayCanvas and
       SuperSplat, is told by its content.
-    - `.splat`, of antimatter15; `.spz`, of Niantic, version 1 to 4; `.sog` of PlayCanvas, version 2, or the
-      `meta.json` of one that is not in a zip.
+    - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1 to 4; `.sog` of
+      PlayCanvas, version 2, or the `meta.json` of one that is not in a zip.
     - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto, from which nothing
       but tensors is taken.
 
