@@ -213,11 +213,14 @@ class _Page:
         self._painter.ask(Request(self._view(), self._size(), self._settings()))
 
     def _look(self, view: View) -> None:
-        """Take the browser's camera there."""
-        camera = self._client.camera
+        """Take the browser's camera there, to turn about what is in the middle at the depth of the scene's."""
+        camera, eye = self._client.camera, np.asarray(view.position)
+        forward = view.camera(1, 1, self._stage.near).viewmat[2, :3]
+        distance = max(float((self._stage.center - eye) @ forward), 0.05 * self._stage.radius)
         with self._client.atomic():
-            camera.position = np.asarray(view.position)
-            camera.wxyz = np.asarray(view.wxyz)
+            camera.position = eye
+            camera.look_at = eye + distance * forward
+            camera.wxyz = np.asarray(view.wxyz)  # whose roll the point alone leaves open
             camera.fov = view.fov_y
 
     def _look_from(self, camera: Camera | None) -> None:
@@ -352,7 +355,7 @@ class _Page:
                 "/frozen",
                 self._frozen.fov_y,
                 self._frozen.aspect,
-                scale=0.1 * self._stage.radius,
+                scale=0.05 * self._stage.radius,
                 thickness=2.0,
                 thickness_units="screen",
                 color=(255, 190, 60),
