@@ -213,7 +213,7 @@ class _Page:
         self._painter.ask(Request(self._view(), self._size(), self._settings()))
 
     def _look(self, view: View) -> None:
-        """Take the browser's camera there, to turn about what is in the middle at the depth of the scene's."""
+        """Take the browser's camera there, to turn about what is in the middle, as far away as the scene."""
         camera, eye = self._client.camera, np.asarray(view.position)
         forward = view.camera(1, 1, self._stage.near).viewmat[2, :3]
         distance = max(float((self._stage.center - eye) @ forward), 0.05 * self._stage.radius)
