@@ -249,9 +249,10 @@ def test_a_stop_ends_a_long_picture_early():
     stage, settings = Stage(scene), Settings(tolerance=0.0)
     view = look_at((0, -9, 0), (0, 0, 0), (0, 0, 1), 0.7, 1.5)
     start = time.monotonic()
-    stage.frame(view, (800, 600), settings)
+    undisturbed = stage.frame(view, (800, 600), settings).pixels
     whole = time.monotonic() - start
     stop = _core.Stop()
+    np.testing.assert_array_equal(stage.frame(view, (800, 600), settings, stop).pixels, undisturbed)
     timer = threading.Timer(whole / 4, stop.request)
     start = time.monotonic()
     timer.start()

@@ -246,9 +246,13 @@ def test_film_of_a_path_is_saved(tab, tmp_path):
     assert (abs(pictures[0].astype(int) - pictures[-1]).max(axis=2) > 20).mean() > 0.02
 
 
-def test_camera_jumps_to_one_of_the_file(tab):
+def test_camera_goes_to_one_of_the_file_and_back(tab):
     first = tab.settled()
     tab.page.get_by_text("Camera", exact=True).click()
+    tab.page.wait_for_timeout(800)  # until the folder is open
+    tab.page.locator('input[class*="Select-input"]:visible').last.click()
+    tab.page.get_by_role("option", name="from the side", exact=True).click()
+    aside = tab.settled()
+    assert differ(first, aside) > 0.02
     tab.press("Show all")
-    tab.page.get_by_text("Of the file").wait_for()
     assert differ(first, tab.settled()) < 0.01

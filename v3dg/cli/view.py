@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ class View:
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     """Which way is up."""
     tolerance: Annotated[float | None, option("PX2")] = None
-    """Screen area in px² that one gaussian of a coarser cluster may stand for, to begin with."""
+    """Largest px² that one gaussian of a coarser cluster may stand for, to begin with; 3, 0 with a budget."""
     budget: Annotated[int | None, option("N")] = None
     """Most gaussians to draw in one picture, to begin with."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -45,7 +46,12 @@ def run(options: View) -> None:
     from v3dg.viewer.frame import Stage
     from v3dg.viewer.page import Site
 
-    rule_of(options.tolerance, options.budget, 0, "solid_angle", True)
+    tolerance = options.tolerance
+    if tolerance is None:
+        tolerance = DEFAULT_TOLERANCE if options.budget is None else 0.0
+    rule_of(tolerance, options.budget, 0, "solid_angle", True)
+    if not math.isfinite(tolerance):
+        raise UsageError(f"--tolerance: expected a number, got {tolerance}")
     subject, cameras = load_subject(options.subject)
     stage = Stage(subject, device=options.device)
     axis = np.eye(3)["xyz".index(options.up[-1])] * (-1 if options.up[0] == "-" else 1)
@@ -55,14 +61,15 @@ def run(options: View) -> None:
         cameras=cameras,
         host=options.host,
         port=options.port,
-        tolerance=DEFAULT_TOLERANCE if options.tolerance is None else options.tolerance,
+        tolerance=tolerance,
         budget=options.budget,
         up=axis,
     )
     try:
         if options.port not in (0, site.port):
             print(f"port {options.port} is taken, listening at {site.port}")
-        host = "localhost" if options.host == "0.0.0.0" else options.host
+        host = {"0.0.0.0": "localhost", "::": "localhost"}.get(options.host, options.host)
+        host = f"[{host}]" if ":" in host else host
         print(f"http://{host}:{site.port} shows {options.subject}; Ctrl-C ends it", flush=True)
         threading.Event().wait()
     except KeyboardInterrupt:

@@ -116,7 +116,7 @@ class Stopped(Exception):
 
 
 class Stage:
-    """Draws pictures of one scene; any number of threads may ask, one picture is drawn at a time.
+    """Draws pictures of one scene, for any number of threads.
 
     Args:
         subject: A scene, a bundle, or an asset, which is split into clusters but gets no coarser levels.

@@ -90,13 +90,15 @@ class Site:
                 "the viewer wants viser, which is not installed; pip install 'v3dg[viewer]'"
             ) from error
         try:  # or viser would try a thousand ports of an address that is not ours, and then wait for ever
-            socket.create_server((host, 0)).close()
+            family, kind, *_ = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, kind) as probe:
+                probe.bind((host, 0))
         except OSError as error:
             raise ValueError(
                 f"host: expected an address of this machine, got {host} ({error.strerror})"
             ) from error
         # A tab may be closed while a picture is on its way to it.
-        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning, __name__)
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         self._pages: dict[int, _Page] = {}
         self._lock = threading.Lock()
         with _quiet():
@@ -254,7 +256,7 @@ class _Page:
             0.0,
             max(32.0, settings.tolerance),
             0.25,
-            settings.tolerance if settings.budget is None else 0.0,
+            settings.tolerance,
             visible=has_levels,
             hint="Screen area that one gaussian of a coarser cluster may stand for; 0 draws all.",
         )
@@ -267,7 +269,7 @@ class _Page:
         )
         self._budget = gui.add_slider(
             "Millions",
-            0.01,
+            min(0.01, millions),
             max(20.0, millions),
             0.01,
             millions,
