@@ -1,6 +1,7 @@
 """`v3dg convert`: assets, levels and cuts as files of any format that is written."""
 
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -129,3 +130,15 @@ def test_what_cannot_be_meant_is_refused(folder):
     )
     fails(1, "create it first", "convert", "tuft.ply", "no/x.ply", cwd=folder)
     fails(1, "budget: expected at least", "convert", "tuft.v3dg", "x.ply", "--budget", "1", cwd=folder)
+
+
+def test_the_meta_json_of_an_asset_is_no_scene(folder):
+    (folder / "sog").mkdir()
+    v3dg.save(folder / "a.sog", v3dg.load(folder / "tuft.ply"))
+    with zipfile.ZipFile(folder / "a.sog") as bundle:
+        bundle.extractall(folder / "sog")
+    for command in (["info"], ["render", "-o", "picture.png", "--size", 64, 48]):
+        done = run(command[0], "sog/meta.json", *command[1:], "--json", cwd=folder)
+        assert done.returncode == 0, done.stderr
+    result, _ = converted(folder, "sog/meta.json", "back.ply")
+    assert result["gaussians"] == 2000

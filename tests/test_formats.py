@@ -242,6 +242,15 @@ def test_small_and_large_assets_keep_their_shape_in_spz(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", WRITTEN)
+def test_what_no_pixel_shows_is_not_rounded_up_to_what_one_does(tmp_path, suffix):
+    asset = random_gaussians(4, 0)
+    asset.opacities[:] = 0.0, 0.9 / 255, 1 / 255, 1.4 / 255
+    save(tmp_path / f"a{suffix}", asset)
+    found = in_order_of(asset, load(tmp_path / f"a{suffix}")).opacities
+    np.testing.assert_allclose(found, np.array([0, 0, 1, 1]) / 255, rtol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", WRITTEN)
 @pytest.mark.parametrize(
     ("name", "row", "value", "message"),
     [

@@ -20,6 +20,7 @@ from v3dg.cli._common import (
     require_subject,
     table_lines,
 )
+from v3dg.cli._views import is_scene
 
 if TYPE_CHECKING:
     from v3dg.bundle import Bundle
@@ -40,7 +41,7 @@ class Info:
 
 def run(options: Info) -> None:
     require_subject(options.file)
-    if options.file.suffix == ".json":
+    if is_scene(options.file):
         from v3dg.scene_file import read_scene
 
         result, text = _scene_info(options.file, *read_scene(options.file))

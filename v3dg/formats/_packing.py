@@ -23,6 +23,7 @@ DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 _BLOCK = 1 << 16  # gaussians decoded at once: the double precision of a block stays in the cache's reach
 _MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
 _MORTON_BITS = 21
+_LEAST_SEEN = np.float32(1 / 255)
 
 # The components that stay when one is left out, in ascending order.
 _KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -98,6 +99,11 @@ def log_scales(scales: Floats) -> Floats:
 def to_integers(values: Floats, largest: int) -> NDArray[np.uint32]:
     """Nearest whole numbers within 0 to ``largest``."""
     return np.clip(np.rint(values), 0, largest).astype(np.uint32)
+
+
+def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
+    """The nearest of 255 steps, but 0 for what no pixel shows: rounded up, it would be seen."""
+    return np.where(opacities < _LEAST_SEEN, 0, to_integers(opacities * 255.0, 255))
 
 
 def check_writable(gaussians: Gaussians) -> Gaussians:

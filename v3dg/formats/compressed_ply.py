@@ -24,6 +24,7 @@ from v3dg.formats._packing import (
     check_writable,
     log_scales,
     morton_order,
+    opacity_bytes,
     problem,
     quats_from_three,
     read_bytes,
@@ -144,8 +145,8 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
             words[:, 0] = _word(fractions[""][block], _XYZ_SHIFT, _XYZ_MAX)
             words[:, 1] = _word(three / _SQRT2 + 0.5, _THREE_SHIFT, _THREE_MAX) | (largest.astype("u4") << 30)
             words[:, 2] = _word(fractions["scale_"][block], _XYZ_SHIFT, _XYZ_MAX)
-            rgba = np.concatenate([fractions["color"][block], host.opacities[rows, None]], axis=1)
-            words[:, 3] = _word(rgba, _RGBA_SHIFT, _RGBA_MAX)
+            rgb = _word(fractions["color"][block], _RGBA_SHIFT[:3], _RGBA_MAX[:3])
+            words[:, 3] = rgb | opacity_bytes(host.opacities[rows])
             file.write(words.tobytes())
         for block in blocks(count if num_rest else 0):
             rest = host.sh[order[block], 1:].transpose(0, 2, 1).astype(np.float64)

@@ -33,6 +33,7 @@ from v3dg.formats._packing import (
     check_writable,
     log_scales,
     morton_order,
+    opacity_bytes,
     problem,
     quats_from_three,
     read_bytes,
@@ -176,9 +177,7 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "means_u.webp": picture(*(whole >> 8).T),
         "scales.webp": picture(*nearest(scale_table, log_widths).T),
         "quats.webp": picture(*to_integers((three * _SQRT2 + 1.0) * 127.5, 255).T, largest + 252),
-        "sh0.webp": picture(
-            *nearest(color_table, gaussians.sh[:, 0]).T, to_integers(gaussians.opacities * 255.0, 255)
-        ),
+        "sh0.webp": picture(*nearest(color_table, gaussians.sh[:, 0]).T, opacity_bytes(gaussians.opacities)),
     }
     meta: dict[str, Any] = {
         "version": 2,

@@ -25,6 +25,7 @@ from v3dg.formats._packing import (
     check_writable,
     log_scales,
     normalised,
+    opacity_bytes,
     problem,
     quats_from_three,
     read_bytes,
@@ -84,7 +85,7 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
             fixed = np.rint(host.means[block].astype(np.float64) * 2**bits).astype("<i4")
             put(fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes())
         for block in blocks(len(host)):
-            put(_bytes(host.opacities[block] * 255.0))
+            put(opacity_bytes(host.opacities[block]).astype(np.uint8).tobytes())
         for block in blocks(len(host)):
             put(_bytes((host.sh[block, 0] * _COLOR_SCALE + 0.5) * 255.0))
         for block in blocks(len(host)):
