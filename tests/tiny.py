@@ -8,9 +8,9 @@ from v3dg import build, cli, demo, worlds
 
 WORLDS = {
     "donut_sea": {"instances": 12, "num_gaussians": 1000},
-    "forest": {"instances": 8, "num_gaussians": 2000},
+    "forest": {"instances": 8, "num_gaussians": 1700},
     "temples": {"instances": 2, "num_gaussians": 5000},
-    "crowd": {"instances": 4, "num_gaussians": 2000, "persons": 2},
+    "crowd": {"instances": 4, "num_gaussians": 2000, "persons": 1},
 }
 # Options that are added to a command, where its own sizes would take long.
 OPTIONS = {
