@@ -16,7 +16,7 @@ from v3dg import _operations
 from v3dg.bench import record
 from v3dg.rasterize import rows_of
 from v3dg.scene import rotation_from_quaternion
-from v3dg.select import _rotations_of_bands
+from v3dg.select import rotations_of_bands
 
 
 @dataclass
@@ -61,7 +61,7 @@ def placements(leaf_offset: np.ndarray, config: Config) -> dict[str, np.ndarray]
         "rotations": rotations,
         "quaternions": quaternions,
         "scales": np.ones(count),
-        "bands": _rotations_of_bands(rotations, (config.sh_degree + 1) ** 2),
+        "bands": rotations_of_bands(rotations, (config.sh_degree + 1) ** 2),
         "instance": np.repeat(np.arange(count, dtype=np.int32), len(leaf_offset) - 1),
         "first_row": np.tile(leaf_offset[:-1], count),
         "offset": np.concatenate([[0], np.cumsum(sizes)]),

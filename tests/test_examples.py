@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import v3dg
+from v3dg.metrics import psnr
 from v3dg.procedural import make_donut
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -91,7 +92,7 @@ def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
     wanted = v3dg.render(scene, camera, tolerance=config.tolerance)
     assert wanted.alpha.max() > 0.9
     # Coarser levels have the filter of the arguments; what is left is rounding of the translation.
-    assert v3dg.metrics.psnr(wanted.color, drawn.color.numpy()) > 100
+    assert psnr(wanted.color, drawn.color.numpy()) > 100
 
 
 @pytest.mark.gpu

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import subprocess
+from itertools import permutations, product
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import v3dg
 from command_line import fails, run
 from random_bundle import random_bundle
 from v3dg.export import export_streamed_sog
+from v3dg.metrics import psnr
 
 
 def leaves_of(node):
@@ -135,6 +137,41 @@ def test_a_viewer_starts_where_it_sees_the_asset(tmp_path, bundle):
     assert (points[:, 2] > 0).all()
     assert ((pixels >= 0) & (pixels <= 100)).all(axis=1).mean() > 0.97
     assert np.ptp(pixels, axis=0).max() > 40
+
+
+def rotation_between(points, turned):
+    """Which of the 24 rotations of a cube takes points, in any order, to where they are turned."""
+    signed = [
+        np.diag(signs)[:, order] for signs in product((1, -1), repeat=3) for order in permutations(range(3))
+    ]
+    rotations = [matrix for matrix in signed if np.linalg.det(matrix) > 0]
+    errors = [np.abs(np.sort(points @ r.T, axis=0) - np.sort(turned, axis=0)).max() for r in rotations]
+    assert sorted(errors)[0] < 1e-4 < sorted(errors)[1]
+    return rotations[int(np.argmin(errors))]
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+def test_what_is_up_becomes_what_viewers_take_to_be_up(tmp_path, up):
+    """The asset looks the same from a camera that was turned with it."""
+    from v3dg.procedural import make_donut
+
+    asset = make_donut(1000)
+    bundle = v3dg.build_bundle(asset, config=v3dg.BuildConfig(steps=0), progress=False)
+    export_streamed_sog(bundle, tmp_path / "web", chunk=2000, up=up)
+    turned = v3dg.load(tmp_path / "web" / "0_0" / "meta.json")
+    axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+    side = np.eye(3)[("xyz".index(up[-1]) + 1) % 3]
+    eye = 0.5 * side + 0.3 * axis
+
+    asset = bundle.level_gaussians(0)
+    rotation = rotation_between(asset.means, turned.means)
+    np.testing.assert_array_equal(rotation @ axis, (0, -1, 0))
+    pictures = []
+    for gaussians, matrix in ((asset, np.eye(3)), (turned, rotation)):
+        camera = v3dg.Camera.look_at(matrix @ eye, (0, 0, 0), matrix @ axis, fov_x=0.7, width=64, height=64)
+        pictures.append(v3dg.rasterize(gaussians, camera).color)
+    assert pictures[0].max() > 0.3
+    assert psnr(*pictures) > 38
 
 
 def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):

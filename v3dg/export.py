@@ -16,23 +16,38 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _files
+from v3dg import _files, _operations
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable, morton_order
 from v3dg.gaussians import Gaussians
+from v3dg.scene import rotation_from_quaternion
+from v3dg.select import rotations_of_bands
+
+Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 INDEX = "lod-meta.json"
 DEFAULT_CHUNK = 16384
 # A folder is filled chunk by chunk until it holds so many gaussians: about a megabyte to load at once.
 _FOLDER_GAUSSIANS = 1 << 17
 _FOV_DEGREES = 50.0  # vertical, of the camera that a viewer starts with
+
+# Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers take it.
+_HALF = math.sqrt(0.5)
+_TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
+    "x": (_HALF, 0.0, 0.0, -_HALF),
+    "y": (0.0, 1.0, 0.0, 0.0),
+    "z": (_HALF, _HALF, 0.0, 0.0),
+    "-x": (_HALF, 0.0, 0.0, _HALF),
+    "-y": (1.0, 0.0, 0.0, 0.0),
+    "-z": (_HALF, -_HALF, 0.0, 0.0),
+}
 
 
 @dataclass(frozen=True)
@@ -53,7 +68,12 @@ class Export:
 
 
 def export_streamed_sog(
-    bundle: Bundle, folder: str | os.PathLike[str], *, chunk: int = DEFAULT_CHUNK, progress: bool = False
+    bundle: Bundle,
+    folder: str | os.PathLike[str],
+    *,
+    chunk: int = DEFAULT_CHUNK,
+    up: Axis = "-y",
+    progress: bool = False,
 ) -> Export:
     """Write a bundle as streamed SOG, replacing an earlier export in one step once all is written.
 
@@ -63,6 +83,8 @@ def export_streamed_sog(
         folder: Where to; new, empty, or with an earlier export.
         chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view more closely, and have
             fewer levels.
+        up: What is up in the asset, which is turned to what viewers take to be up. Trained assets mostly have
+            y down, so nothing is turned.
         progress: Show a bar.
 
     Raises:
@@ -74,6 +96,9 @@ def export_streamed_sog(
     """
     if not bundle.num_gaussians:
         raise ValueError("bundle: expected gaussians to export, got none")
+    if up not in _TO_UPRIGHT:
+        raise ValueError(f"up: expected one of {', '.join(_TO_UPRIGHT)}, got {up!r}")
+    turn = _Turn(_TO_UPRIGHT[up])
     plan = _Plan.of(bundle, chunk)
     with _replacing_folder(Path(folder)) as place:
         names: list[str] = []
@@ -81,7 +106,7 @@ def export_streamed_sog(
         counts = [0] * plan.num_levels
         with _bar(plan.num_gaussians, progress) as advance:
             for level in range(plan.num_levels):
-                for i, (first, parts) in enumerate(_folders(bundle, plan, level)):
+                for i, (first, parts) in enumerate(_folders(bundle, plan, level, turn)):
                     gaussians = Gaussians.concatenate(parts)
                     offset = 0
                     for number, part in enumerate(parts, first):
@@ -100,9 +125,9 @@ def export_streamed_sog(
             "counts": counts,
             "lodLevels": plan.num_levels,
             "filenames": [f"{name}/meta.json" for name in names],
-            "tree": plan.tree(lods),
+            "tree": plan.tree(lods, turn),
         }
-        settings = _viewer_settings(bundle.level_gaussians(plan.top))
+        settings = _viewer_settings(turn.gaussians(bundle.level_gaussians(plan.top)))
         for file, document in ((INDEX, index), ("settings.json", settings)):
             (place / file).write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
         size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
@@ -137,6 +162,35 @@ def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
         "annotations": [],
         "startMode": "default",
     }
+
+
+class _Turn:
+    """A rotation about the origin."""
+
+    def __init__(self, quaternion: tuple[float, float, float, float]) -> None:
+        self._quaternion = np.array([quaternion])
+        self._rotation = rotation_from_quaternion(self._quaternion)
+
+    def gaussians(self, gaussians: Gaussians) -> Gaussians:
+        num_bases = gaussians.sh.shape[1]
+        return _operations.gather(
+            [gaussians],
+            num_bases,
+            bundle=np.zeros(1, np.int32),
+            positions=np.zeros((1, 3)),
+            rotations=self._rotation,
+            quaternions=self._quaternion,
+            scales=np.ones(1),
+            bands=rotations_of_bands(self._rotation, num_bases),
+            instance=np.zeros(1, np.int32),
+            first_row=np.zeros(1, np.int64),
+            offset=np.array([0, len(gaussians)]),
+        )
+
+    def boxes(self, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(N, 2, 3) lower and upper corners, of boxes that stay along the axes."""
+        corners = boxes.astype(np.float64) @ self._rotation[0].T
+        return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -201,14 +255,15 @@ class _Plan:
         ends = np.cumsum(np.bincount(chunks, minlength=self.num_chunks))[:-1]
         return np.split(order + clusters.start, ends)
 
-    def tree(self, lods: list[dict[str, dict[str, int]]]) -> dict[str, Any]:
+    def tree(self, lods: list[dict[str, dict[str, int]]], turn: _Turn) -> dict[str, Any]:
         """The spatial index: the groups above the chunks, with bounds."""
         low = np.full((self.num_chunks, 3), np.inf)
         high = np.full((self.num_chunks, 3), -np.inf)
         clusters = self.bundle.clusters
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
-        np.minimum.at(low, self.chunk_of_cluster[used], clusters.box[used, 0])
-        np.maximum.at(high, self.chunk_of_cluster[used], clusters.box[used, 1])
+        boxes = turn.boxes(clusters.box[used])
+        np.minimum.at(low, self.chunk_of_cluster[used], boxes[:, 0])
+        np.maximum.at(high, self.chunk_of_cluster[used], boxes[:, 1])
 
         def joined(nodes: list[dict[str, Any]]) -> dict[str, Any]:
             if len(nodes) == 1:
@@ -235,12 +290,12 @@ class _Plan:
         return joined(list(of_group.values()))
 
 
-def _folders(bundle: Bundle, plan: _Plan, level: int) -> Iterator[tuple[int, list[Gaussians]]]:
+def _folders(bundle: Bundle, plan: _Plan, level: int, turn: _Turn) -> Iterator[tuple[int, list[Gaussians]]]:
     """The gaussians of a level by chunk, as many as go into a folder, and the number of the first chunk."""
     first, parts = 0, []
     for number, clusters in enumerate(plan.clusters_of(level)):
         chunk = Gaussians.concatenate([bundle.cluster_gaussians(int(c)) for c in clusters])
-        chunk = check_writable(chunk)
+        chunk = turn.gaussians(check_writable(chunk))
         parts.append(chunk.subset(morton_order(chunk.means)))
         if sum(map(len, parts)) >= _FOLDER_GAUSSIANS:
             yield first, parts

@@ -78,7 +78,7 @@ class Selection:
             rotations=scene.rotations[instances],
             quaternions=scene.quaternions[instances],
             scales=scene.scales[instances],
-            bands=_rotations_of_bands(scene.rotations[instances], num_bases),
+            bands=rotations_of_bands(scene.rotations[instances], num_bases),
             instance=instance.astype(np.int32),
             first_row=self._per_pair([table.clusters.offset[:-1] for table in scene.bundles]).astype(
                 np.int64
@@ -274,7 +274,7 @@ def _basis_of_band(degree: int, directions: Floats) -> Floats:
     return factor * np.stack(terms, axis=-1)
 
 
-def _rotations_of_bands(rotations: Floats, num_bases: int) -> Floats:
+def rotations_of_bands(rotations: Floats, num_bases: int) -> Floats:
     """(I, 83): matrices of bands 1, 2, ..., one after another, that take coefficients into the world.
 
     A band is closed under rotation, so the matrix follows from the basis at enough directions: the colour

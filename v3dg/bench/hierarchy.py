@@ -19,7 +19,7 @@ from v3dg import _device, _operations
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene, rotation_from_quaternion
-from v3dg.select import _rotations_of_bands
+from v3dg.select import rotations_of_bands
 
 Ids = npt.NDArray[np.int64]
 
@@ -131,7 +131,7 @@ class HierarchyScene:
 
     def __init__(self, hierarchy: Hierarchy, scene: Scene, device: str) -> None:
         self.scene = scene
-        self._bands = _rotations_of_bands(scene.rotations, hierarchy.gaussians.sh.shape[1])
+        self._bands = rotations_of_bands(scene.rotations, hierarchy.gaussians.sh.shape[1])
         self._nodes = _device.place(hierarchy.gaussians, device)
         self._library: Any = _device.library_of(self._nodes.means)
         self._box = self._place(hierarchy.box)

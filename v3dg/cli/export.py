@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -22,6 +22,8 @@ class Export:
     """Folder to write; viewers are given its lod-meta.json. The bundle's name with _web if not given."""
     chunk: Annotated[int | None, option("N")] = None
     """Most gaussians of the asset in a chunk, for which the viewer chooses a level; 16384 if not given."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "-y"
+    """What is up in the asset, which viewers take to be -y, as in most trained ones."""
     threads: Threads = None
     """CPU threads; all if not given."""
     json: Flag = False
@@ -45,6 +47,7 @@ def run(options: Export) -> None:
         Bundle.open(options.bundle),
         folder,
         chunk=DEFAULT_CHUNK if options.chunk is None else options.chunk,
+        up=options.up,
         progress=not options.quiet,
     )
     result = {
