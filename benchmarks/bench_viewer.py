@@ -6,26 +6,25 @@ work is measured. Each drag orbits the scene, and begins while the picture at re
 
 from __future__ import annotations
 
-import io
 import math
 import statistics
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import tyro
-import viser
-import zstandard
-from PIL import Image
-from websockets.sync.client import ClientConnection, connect
 
 from v3dg.bench import record
 from v3dg.scene_file import read_scene
 from v3dg.viewer.frame import Stage
 from v3dg.viewer.page import Site
 from v3dg.viewer.view import View, look_at
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from viewer_client import Tab
 
 MOVES_A_SECOND = 60
 
@@ -53,12 +52,7 @@ def main(config: Config) -> None:
     rng = np.random.default_rng(0)
     rows = []
     try:
-        with connect(
-            f"ws://127.0.0.1:{site.port}",
-            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
-            compression=None,
-            max_size=None,
-        ) as browser:
+        with Tab(site.port) as browser:
             for place in config.cameras:
                 name, camera = list(cameras.items())[place]
                 view = View.of_camera(camera)
@@ -70,28 +64,28 @@ def main(config: Config) -> None:
 
 
 def drag_around(
-    browser: ClientConnection, view: View, target: np.ndarray, config: Config, rng: np.random.Generator
+    browser: Tab, view: View, target: np.ndarray, config: Config, rng: np.random.Generator
 ) -> dict:
     """Answers to drags around the target."""
     eye, angle = np.array(view.position), 0.0
     answers, gaps, widths = [], [], []
-    send(browser, view, config.size)
+    browser.look(view, config.size)
     settle(browser, config.size)
     for _ in range(config.drags):
-        send(browser, turned(eye, target, angle, view), config.size)  # whose refinement the drag interrupts
+        browser.look(turned(eye, target, angle, view), config.size)  # whose refinement the drag interrupts
         until = time.perf_counter() + rng.uniform(0.3, 1.5)
-        drain(browser, until)
+        browser.pictures(until)
         begin = last = time.perf_counter()
         answered = False
         for move in range(round(config.seconds * MOVES_A_SECOND)):
             angle += 0.01
-            send(browser, turned(eye, target, angle, view), config.size)
-            for at, width in drain(browser, begin + (move + 1) / MOVES_A_SECOND):
-                if width > 0.8 * config.size[0] and not answered:
+            browser.look(turned(eye, target, angle, view), config.size)
+            for at, picture in browser.pictures(begin + (move + 1) / MOVES_A_SECOND):
+                if picture.width > 0.8 * config.size[0] and not answered:
                     continue  # was under way when the drag began
                 (gaps if answered else answers).append(1e3 * (at - (last if answered else begin)))
                 answered, last = True, at
-                widths.append(width)
+                widths.append(picture.width)
     return {
         "answer_ms": summary(answers),
         "between_pictures_ms": summary(gaps),
@@ -109,10 +103,6 @@ def summary(values: list[float]) -> dict[str, float]:
     }
 
 
-def axis_of(view: View) -> np.ndarray:
-    return view.camera(1, 1, 0.01).viewmat[2, :3]
-
-
 def turned(eye: np.ndarray, target: np.ndarray, angle: float, view: View) -> View:
     """The view from the eye turned about the upright line through the target."""
     x, y, z = eye - target
@@ -121,51 +111,9 @@ def turned(eye: np.ndarray, target: np.ndarray, angle: float, view: View) -> Vie
     return look_at(moved, target, (0, 0, 1), view.fov_y, view.aspect)
 
 
-def send(browser: ClientConnection, view: View, size: tuple[int, int]) -> None:
-    message = {
-        "type": "ViewerCameraMessage",
-        "wxyz": view.wxyz,
-        "position": view.position,
-        "fov": view.fov_y,
-        "near": 0.01,
-        "far": 1000.0,
-        "image_height": size[1],
-        "image_width": size[0],
-        "look_at": (np.array(view.position) + axis_of(view)).tolist(),
-        "up_direction": (0.0, 0.0, 1.0),
-    }
-    browser.send(msgspec.msgpack.encode(message))
-
-
-def drain(browser: ClientConnection, until: float) -> list[tuple[float, int]]:
-    """Time and width of the pictures that come until then."""
-    pictures = []
-    while (left := until - time.perf_counter()) > 0:
-        try:
-            data = browser.recv(timeout=left)
-        except TimeoutError:
-            break
-        width = width_of_picture(data)
-        if width:
-            pictures.append((time.perf_counter(), width))
-    return pictures
-
-
-def settle(browser: ClientConnection, size: tuple[int, int]) -> None:
-    while not any(width == size[0] for _, width in drain(browser, time.perf_counter() + 1.0)):
+def settle(browser: Tab, size: tuple[int, int]) -> None:
+    while not any(picture.width == size[0] for _, picture in browser.pictures(time.perf_counter() + 1.0)):
         pass
-
-
-def width_of_picture(data: bytes) -> int:
-    """Width of the last picture among the messages; 0 for none."""
-    packed = int.from_bytes(data[8:16], "little")
-    envelope = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed]))
-    width = 0
-    for message in envelope["messages"]:
-        if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
-            with Image.open(io.BytesIO(message["rgb_data"])) as picture:
-                width = picture.width
-    return width
 
 
 if __name__ == "__main__":

@@ -254,9 +254,9 @@ class _Page:
         self._tolerance = gui.add_slider(
             "Tolerance px²",
             0.0,
-            max(32.0, settings.tolerance),
+            max(32.0, float(settings.tolerance)),
             0.25,
-            settings.tolerance,
+            float(settings.tolerance),  # a slider's values are of the type of its first
             visible=has_levels,
             hint="Screen area that one gaussian of a coarser cluster may stand for; 0 draws all.",
         )
