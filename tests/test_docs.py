@@ -184,7 +184,11 @@ def test_notebook_runs_and_keeps_no_output(tmp_path, monkeypatch):
     notebook = json.loads((ROOT / "examples" / "first_steps.ipynb").read_text(encoding="utf-8"))
     monkeypatch.chdir(tmp_path)
     tiny.shrink(monkeypatch.setattr, monkeypatch.setitem)
-    smaller = {"make_asset(20_000)": "make_asset(1000)", "count = 1000": "count = 10", "width=800, height=450": "width=80, height=46"}
+    smaller = {
+        "make_asset(20_000)": "make_asset(1000)",
+        "count = 1000": "count = 10",
+        "width=800, height=450": "width=80, height=46",
+    }
     names = {}
     for number, cell in enumerate(notebook["cells"]):
         if cell["cell_type"] == "code":

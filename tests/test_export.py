@@ -84,6 +84,59 @@ def test_every_gaussian_is_in_one_chunk_of_its_level(tmp_path, bundle, chunk):
         assert max(leaf["lods"]["0"]["count"] for leaf in leaves) > chunk / 2 - 1
 
 
+def test_the_finest_level_of_an_export_loads(tmp_path, bundle):
+    export_streamed_sog(bundle, tmp_path / "web", chunk=250)
+    loaded, wanted = v3dg.load(tmp_path / "web" / "lod-meta.json"), bundle.level_gaussians(0)
+    np.testing.assert_allclose(np.sort(loaded.means, axis=0), np.sort(wanted.means, axis=0), atol=5e-4)
+
+
+def edited(tmp_path, bundle, **changes):
+    """The index of an export with other values at the top, or in its first leaf's finest level."""
+    export_streamed_sog(bundle, tmp_path / "web", chunk=10**9)
+    path = tmp_path / "web" / "lod-meta.json"
+    index = json.loads(path.read_text())
+    for name, value in changes.items():
+        (index if name in index or name == "environment" else index["tree"]["lods"]["0"])[name] = value
+    path.write_text(json.dumps(index))
+    return path
+
+
+def test_an_environment_is_loaded_with_the_rest(tmp_path, bundle):
+    path = edited(tmp_path, bundle, environment="3_0/meta.json")
+    assert len(v3dg.load(path)) == len(bundle.level_gaussians(0)) + len(bundle.level_gaussians(3))
+
+
+def test_a_leaf_without_its_finest_level_has_the_next(tmp_path, bundle):
+    path = edited(tmp_path, bundle)
+    index = json.loads(path.read_text())
+    index["tree"]["lods"]["0"]["count"] = 0
+    path.write_text(json.dumps(index))
+    assert len(v3dg.load(path)) == len(bundle.level_gaussians(1))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"version": 2}, "version: expected streamed SOG version 1, got 2"),
+        ({"filenames": ["/etc/passwd"] * 9}, "filenames[0]: expected a path below that of lod-meta.json"),
+        ({"filenames": ["../a/meta.json"] * 9}, "filenames[0]: expected a path below that of lod-meta.json"),
+        ({"filenames": []}, "tree.lods.0.file: expected 0 to -1, got 0"),
+        ({"environment": "../meta.json"}, "environment: expected a path below that of lod-meta.json"),
+        ({"offset": 1}, "gaussians of '0_0/meta.json', got more"),
+        ({"offset": -1}, "tree.lods.0.offset: expected a whole number, 0 or more, got -1"),
+        ({"offset": 10**30}, "tree.lods.0.offset: expected a whole number"),
+        ({"tree": {}}, "expected gaussians in the tree, got none"),
+        ({"tree": {"lods": {"x": {}}}}, "tree.lods: expected levels by number"),
+        ({"tree": {"children": [[]]}}, "tree.children[0]: expected an object, got []"),
+    ],
+)
+def test_hostile_indices_are_refused(tmp_path, bundle, changes, message):
+    path = edited(tmp_path, bundle, **changes)
+    with pytest.raises(ValueError, match=r"lod-meta\.json") as error:
+        v3dg.load(path)
+    assert message in str(error.value)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_bundles_of_any_shape_are_exported(tmp_path, seed):
     """Groups of several clusters, clusters without gaussians, one level or four, SH of every degree."""

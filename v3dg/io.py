@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from v3dg.formats import checkpoint, compressed_ply, ksplat, ply, sog, splat, spz
+from v3dg.formats import checkpoint, compressed_ply, ksplat, ply, sog, splat, spz, streamed_sog
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
@@ -20,6 +20,7 @@ _READERS: dict[str, Callable[[Path], Gaussians]] = {
     ".ksplat": ksplat.read,
     ".spz": spz.read,
     ".sog": sog.read,
+    "lod-meta.json": streamed_sog.read,
     "meta.json": sog.read,
     ".ckpt": checkpoint.read,
     ".pt": checkpoint.read,
@@ -48,7 +49,8 @@ def load(path: Path) -> Gaussians:
       on. Little more memory is needed than for the result. A compressed `.ply`, of PlayCanvas and
       SuperSplat, is told by its content.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1 to 4; `.sog` of
-      PlayCanvas, version 2, or the `meta.json` of one that is not in a zip.
+      PlayCanvas, version 2, or the `meta.json` of one that is not in a zip; the finest level of streamed SOG,
+      by its `lod-meta.json`.
     - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto, from which nothing
       but tensors is taken.
 
