@@ -216,13 +216,12 @@ RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
                     bool keep_source, Workspace<T>& ws, const std::atomic<bool>* stop) {
     RenderCounts counts{};
     std::vector<Piece> pieces = pieces_of(draws);
-    const std::vector<Window> bands =
-        keep_source ? std::vector<Window>{picture.window}
-                    : bands_of(draws, pieces, camera, picture.window,
-                               stop == nullptr ? kBandBytes : kStoppableBandBytes);
+    const std::vector<Window> bands = keep_source
+                                          ? std::vector<Window>{picture.window}
+                                          : bands_of(draws, pieces, camera, picture.window,
+                                                     stop == nullptr ? kBandBytes : kStoppableBandBytes);
     for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b)
-        render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws, stop,
-                    counts);
+        render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws, stop, counts);
     for (const Piece& piece : pieces) {
         counts.in_frustum += piece.reach.in_frustum;
         counts.records += piece.reach.drawn;
@@ -313,7 +312,7 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
 
 #define V3DG_INSTANTIATE(T)                                                                                  \
     template RenderCounts render<T>(const std::vector<Draw<T>>&, const Pinhole<T>&, const Picture<T>&, bool, \
-                                    Workspace<T>&, const std::atomic<bool>*);                                                          \
+                                    Workspace<T>&, const std::atomic<bool>*);                                \
     template void render_backward<T>(const Draw<T>&, const Pinhole<T>&, const Picture<T>&,                   \
                                      const PictureGradient<T>&, const Workspace<T>&,                         \
                                      const GaussianGradients<T>&, T*);
