@@ -71,6 +71,9 @@ def test_completion_is_a_script_that_knows_commands_and_options(shell):
     assert done.returncode == 0, done.stderr
     assert "compare" in done.stdout
     assert "tolerance" in done.stdout
+    # Where nothing else fits, files are completed.
+    files = {"bash": "complete -o default -F", "zsh": '-z "$completions"', "fish": "complete --command"}
+    assert files[shell] in done.stdout
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
@@ -79,10 +82,29 @@ def test_bash_completes_what_the_script_says():
         eval "$({shlex.join(COMMAND)} completion bash)"
         COMP_WORDS=(v3dg ren) COMP_CWORD=1; _tyro_v3dg; echo "${{COMPREPLY[@]}}"
         COMP_WORDS=(v3dg render --tol) COMP_CWORD=2; _tyro_v3dg; echo "${{COMPREPLY[@]}}"
+        complete -p v3dg
     """
     done = subprocess.run(["bash", "-c", typed], capture_output=True, text=True, env=ENVIRONMENT)
     assert done.stderr == ""
-    assert done.stdout.split() == ["render", "--tolerance"]
+    *completed, registered = done.stdout.splitlines()
+    assert completed == ["render", "--tolerance"]
+    assert registered == "complete -o default -F _tyro_v3dg v3dg"  # else no file would be completed any more
+
+
+@pytest.mark.witness
+@pytest.mark.skipif(shutil.which("fish") is None, reason="there is no fish")
+def test_fish_completes_what_the_script_says(tmp_path):
+    (tmp_path / "rendered.ply").touch()
+    typed = (
+        f"{shlex.join(COMMAND)} completion fish | source; complete -C 'v3dg ren'; complete -C 'v3dg build r'"
+    )
+    done = subprocess.run(
+        ["fish", "-c", typed], capture_output=True, text=True, cwd=tmp_path, env=ENVIRONMENT
+    )
+    assert done.stderr == ""
+    found = [line.split("\t")[0] for line in done.stdout.splitlines()]
+    assert "render" in found
+    assert "rendered.ply" in found
 
 
 def test_module_runs_too():

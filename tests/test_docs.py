@@ -133,6 +133,7 @@ def run_shell(block, folder):
     paths = [str(folder / "bin"), os.environ["PATH"]]
     environment = os.environ | {
         "PATH": os.pathsep.join(paths),
+        "HOME": str(folder),
         "PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__)),
     }
     done = subprocess.run(
