@@ -1,7 +1,7 @@
 """An export in SuperSplat's own viewer, in Chromium.
 
-Wants playwright, Chromium where PATH finds it, and the viewer: `npm install @playcanvas/supersplat-viewer`, and
-its folder `public` in the environment variable SUPERSPLAT_VIEWER.
+Wants playwright, Chromium where PATH finds it, and the viewer: `npm install @playcanvas/supersplat-viewer`,
+whose folder `public` the environment variable SUPERSPLAT_VIEWER names.
 """
 
 import functools
