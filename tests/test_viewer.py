@@ -337,7 +337,7 @@ class FakeStage:
             if stop.is_requested:
                 raise Stopped
             time.sleep(1e-3)
-        return Frame(np.full((size[1], size[0], 3), view, np.uint8), None, None)
+        return Frame(np.full((size[1], size[0], 3), view, np.uint8), None, settings.shows, None)
 
 
 @pytest.fixture

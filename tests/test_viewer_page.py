@@ -17,6 +17,7 @@ from PIL import Image
 
 import scenes_lod
 import v3dg
+import v3dg.cli
 from v3dg.viewer.frame import Figures, Frame, Settings, Stage
 from v3dg.viewer.page import Site, figures_html, start_view
 from v3dg.viewer.view import look_at
@@ -86,8 +87,8 @@ def test_page_begins_with_all_of_the_scene_in_view(stage, up):
 
 def test_figures_are_in_the_panel():
     figures = Figures(1234567, 7654, 3.0, 1.25, 45.6, np.array([10, 0, 40]), 300 << 20)
-    frame = Frame(np.zeros((9, 16, 3), np.uint8), figures, (8.0, 2.0))
-    text = figures_html(frame, "depth")
+    frame = Frame(np.zeros((9, 16, 3), np.uint8), figures, "depth", (8.0, 2.0))
+    text = figures_html(frame)
     for expected in (
         "1,234,567",
         "7,654",
@@ -126,6 +127,41 @@ def test_command_says_where_and_ends_with_an_interrupt(bundle, tmp_path):
         _, stderr = process.communicate(timeout=60)
     assert process.returncode == 0
     assert stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["asset.ply", "--budget", "9"], "--budget: asset.ply has no levels to choose from; build a bundle"),
+        (["asset.ply", "--port", "70000"], "--port: expected 0 to 65535, got 70000"),
+        (["asset.ply", "--tolerance", "inf"], "--tolerance: expected a number, got inf"),
+        (["asset.ply", "--host", "192.0.2.1"], "host: expected an address of this machine, got 192.0.2.1"),
+        (["nothing.v3dg"], "nothing.v3dg: expected a file, got nothing there"),
+    ],
+)
+def test_command_refuses_what_cannot_be_meant(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    v3dg.save("asset.ply", scenes_lod.blob(np.random.default_rng(0), 50))
+    assert v3dg.cli.main(["view", *arguments]) != 0
+    assert message in capsys.readouterr().err
+
+
+def test_asset_has_no_controls_of_levels():
+    from viewer_client import Tab
+
+    stage = Stage(scenes_lod.blob(np.random.default_rng(0), 500))
+    site = Site(stage, port=0)
+    try:
+        with Tab(site.port) as tab:
+            tab.look(start_view(stage, (0, 0, 1)), SIZE)
+            settled(tab)
+            assert tab.visible("Resolution %")
+            assert not tab.visible("Tolerance px²")
+            assert "Level" not in tab.options("Show")
+            tab.set("Show", "Cluster")
+            assert settled(tab).max() > 30
+    finally:
+        site.close()
 
 
 def test_closing_leaves_no_thread_behind(stage):

@@ -28,7 +28,7 @@ class Tab:
             compression=None,
             max_size=None,
         )
-        self._uuids, self._figures = {}, None
+        self._uuids, self._props, self._figures = {}, {}, None
         self._names, self._parts = {}, {}
         self.text, self.updates, self.notices, self.files = "", [], [], {}
 
@@ -58,6 +58,13 @@ class Tab:
         """Give the control with that label a value; True presses a button."""
         self._send("GuiUpdateMessage", uuid=self._uuids[label], updates={"value": value})
 
+    def visible(self, label):
+        """Whether the control with that label is shown at first."""
+        return self._props[label]["visible"]
+
+    def options(self, label):
+        return self._props[label]["options"]
+
     def pictures(self, until):
         """Take what comes until then; (time, picture) of each picture, 8 bit."""
         found = []
@@ -80,6 +87,7 @@ class Tab:
             self._figures, self.text = message["uuid"], message["props"]["content"]
         elif kind.startswith("Gui") and "label" in message.get("props", {}):
             self._uuids[message["props"]["label"]] = message["uuid"]
+            self._props[message["props"]["label"]] = message["props"]
         elif kind == "GuiUpdateMessage":
             self.updates.append(str(message["updates"]))
             if message["uuid"] == self._figures:

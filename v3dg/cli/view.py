@@ -42,6 +42,7 @@ def run(options: View) -> None:
         raise UsageError(f"--port: expected 0 to 65535, got {options.port}")
     import numpy as np
 
+    from v3dg.gaussians import Gaussians
     from v3dg.select import DEFAULT_TOLERANCE, rule_of
     from v3dg.viewer.frame import Stage
     from v3dg.viewer.page import Site
@@ -53,6 +54,8 @@ def run(options: View) -> None:
     if not math.isfinite(tolerance):
         raise UsageError(f"--tolerance: expected a number, got {tolerance}")
     subject, cameras = load_subject(options.subject)
+    if isinstance(subject, Gaussians) and options.budget is not None:
+        raise UsageError(f"--budget: {options.subject} has no levels to choose from; build a bundle of it")
     stage = Stage(subject, device=options.device)
     axis = np.eye(3)["xyz".index(options.up[-1])] * (-1 if options.up[0] == "-" else 1)
     site = Site(

@@ -94,10 +94,18 @@ class Figures:
 
 @dataclass(frozen=True)
 class Frame:
-    """Pixels (H, W, 3), what they cost, and the values of the darkest and the brightest colour if any."""
+    """A picture.
+
+    Attributes:
+        pixels: (H, W, 3).
+        figures: What it cost.
+        shows: As in its settings.
+        value_range: The values of the darkest and the brightest colour, where colours are values.
+    """
 
     pixels: Pixels
     figures: Figures
+    shows: Shows
     value_range: tuple[float, float] | None
 
     @property
@@ -188,7 +196,7 @@ class Stage:
             levels=self._levels(cut),
             memory_bytes=_resident_bytes(),
         )
-        return Frame(to_8bit(picture), figures, value_range)
+        return Frame(to_8bit(picture), figures, settings.shows, value_range)
 
     def _shown(
         self, cut: Selection, camera: Camera, window: Window, settings: Settings, stop: _core.Stop | None

@@ -43,6 +43,7 @@ _SHOWS: dict[str, Shows] = {
     "Gaussians per pixel": "count",
     "Difference to all gaussians": "difference",
 }
+_WANTS_LEVELS = ("level", "difference")
 _NO_CAMERA = ""
 _FILM_SIZES = {"1280 x 720": (1280, 720), "1920 x 1080": (1920, 1080), "as the window": None}
 _FPS = 30
@@ -238,7 +239,7 @@ class _Page:
         now = time.monotonic()
         if is_final or now - self._last_figures > _SECONDS_BETWEEN_FIGURES:
             self._last_figures = now
-            self._figures.content = figures_html(frame, _SHOWS[self._shows.value])
+            self._figures.content = figures_html(frame)
 
     def _explain(self, error: Exception) -> None:
         self._figures.content = _box(f"<b>Not drawn.</b> {html.escape(' '.join(str(error).split()))}")
@@ -249,65 +250,16 @@ class _Page:
         gui: Any = self._client.gui  # whose types let no value be set
         has_levels = self._stage.num_levels > 1
         self._figures = gui.add_html(_box("drawing ..."))
-        self._shows = gui.add_dropdown("Show", tuple(_SHOWS))
+        names = [name for name, shows in _SHOWS.items() if has_levels or shows not in _WANTS_LEVELS]
+        self._shows = gui.add_dropdown("Show", names)
+        self._shows.on_update(lambda _: self._choose_shows())
         self._gain = gui.add_slider("Amplify", 1, 50, 1, round(settings.gain), visible=False)
-        self._tolerance = gui.add_slider(
-            "Tolerance px²",
-            0.0,
-            max(32.0, float(settings.tolerance)),
-            0.25,
-            float(settings.tolerance),  # a slider's values are of the type of its first
-            visible=has_levels,
-            hint="Screen area that one gaussian of a coarser cluster may stand for; 0 draws all.",
-        )
-        millions = 2.0 if settings.budget is None else settings.budget / 1e6
-        self._limits = gui.add_checkbox(
-            "Limit gaussians",
-            settings.budget is not None,
-            visible=has_levels,
-            hint="The tolerance is raised until no more than so many are selected.",
-        )
-        self._budget = gui.add_slider(
-            "Millions",
-            min(0.01, millions),
-            max(20.0, millions),
-            0.01,
-            millions,
-            visible=has_levels and settings.budget is not None,
-        )
-        self._min_level = gui.add_slider(
-            "Finest level", 0, max(self._stage.num_levels - 1, 1), 1, 0, visible=has_levels
-        )
-        self._split = gui.add_slider(
-            "Split",
-            0.0,
-            1.0,
-            0.01,
-            0.0,
-            visible=has_levels,
-            hint="All gaussians on the left, the cut on the right.",
-        )
+        self._gain.on_update(lambda _: self._ask())
+        self._add_cut_controls(settings, has_levels)
         self._resolution = gui.add_slider(
             "Resolution %", 10, 100, 5, 100, hint="Of the window, at rest; while moving it follows the speed."
         )
-        self._freeze = gui.add_checkbox(
-            "Freeze the cut",
-            False,
-            visible=has_levels,
-            hint="Keep what this camera needs, and fly around it.",
-        )
-        for control in (
-            self._gain,
-            self._tolerance,
-            self._budget,
-            self._min_level,
-            self._split,
-            self._resolution,
-        ):
-            control.on_update(lambda _: self._ask())
-        self._shows.on_update(lambda _: self._choose_shows())
-        self._limits.on_update(lambda _: self._choose_limits())
-        self._freeze.on_update(lambda _: self._choose_freeze())
+        self._resolution.on_update(lambda _: self._ask())
         gui.add_button("Save picture").on_click(lambda _: self._begin(self._save_picture))
         with gui.add_folder("Camera", expand_by_default=False):
             gui.add_button("Show all").on_click(lambda _: self._look(self._home))
@@ -317,6 +269,45 @@ class _Page:
             gui.add_markdown("Drag to turn, right button to move, wheel to go near, W A S D Q E to fly.")
         with gui.add_folder("Path", expand_by_default=False):
             self._add_path_controls()
+
+    def _add_cut_controls(self, settings: Settings, visible: bool) -> None:
+        """Those that choose among levels."""
+        gui: Any = self._client.gui
+        tolerance = float(settings.tolerance)  # a slider's values are of the type of its first
+        self._tolerance = gui.add_slider(
+            "Tolerance px²",
+            0.0,
+            max(32.0, tolerance),
+            0.25,
+            tolerance,
+            visible=visible,
+            hint="Screen area that one gaussian of a coarser cluster may stand for; 0 draws all.",
+        )
+        self._limits = gui.add_checkbox(
+            "Limit gaussians",
+            settings.budget is not None,
+            visible=visible,
+            hint="The tolerance is raised until no more than so many are selected.",
+        )
+        millions = 2.0 if settings.budget is None else settings.budget / 1e6
+        self._budget = gui.add_slider(
+            "Millions",
+            min(0.01, millions),
+            max(20.0, millions),
+            0.01,
+            millions,
+            visible=visible and settings.budget is not None,
+        )
+        last_level = max(self._stage.num_levels - 1, 1)
+        self._min_level = gui.add_slider("Finest level", 0, last_level, 1, 0, visible=visible)
+        hint = "All gaussians on the left, the cut on the right."
+        self._split = gui.add_slider("Split", 0.0, 1.0, 0.01, 0.0, visible=visible, hint=hint)
+        for slider in (self._tolerance, self._budget, self._min_level, self._split):
+            slider.on_update(lambda _: self._ask())
+        self._limits.on_update(lambda _: self._choose_limits())
+        hint = "Keep what this camera needs, and fly around it."
+        self._freeze = gui.add_checkbox("Freeze the cut", False, visible=visible, hint=hint)
+        self._freeze.on_update(lambda _: self._choose_freeze())
 
     def _add_path_controls(self) -> None:
         gui: Any = self._client.gui
@@ -476,7 +467,7 @@ class _Page:
         self._client.send_file_download(name, content, save_immediately=True)
 
 
-def figures_html(frame: Frame, shows: Shows) -> str:
+def figures_html(frame: Frame) -> str:
     """Return a frame's figures, what its colours mean, and its gaussians by level, as HTML."""
     figures = frame.figures
     width, height = frame.size
@@ -494,21 +485,21 @@ def figures_html(frame: Frame, shows: Shows) -> str:
         for name, value in rows
     )
     table = f'<table style="width:100%;border-spacing:0">{cells}</table>'
-    return _box(table + _legend(frame, shows) + _levels(frame))
+    return _box(table + _legend(frame) + _levels(frame))
 
 
-def _legend(frame: Frame, shows: Shows) -> str:
+def _legend(frame: Frame) -> str:
     if frame.value_range is None:
         return ""
-    if shows == "count":
+    if frame.shows == "count":
         marks = ["1", "4", "16", "64", f"{MOST_COUNTED}+"]
     else:
         low, high = frame.value_range
         marks = [f"{low:.3g}", f"{high:.3g}"]
-        if shows == "depth":
+        if frame.shows == "depth":
             marks = [f"far {marks[0]}", f"near {marks[1]}"]
     grey = np.linspace(0, 1, 7)
-    colors = np.repeat(grey[:, None], 3, axis=1) if shows == "alpha" else ramp(grey)
+    colors = np.repeat(grey[:, None], 3, axis=1) if frame.shows == "alpha" else ramp(grey)
     stops = ",".join(_css(color) for color in colors)
     labels = "".join(f"<span>{mark}</span>" for mark in marks)
     return (
