@@ -724,6 +724,20 @@ def test_checkpoints_that_do_not_fit_are_refused(tmp_path, change, message):
     assert_refused_cheaply(tmp_path / "a.pt", "expected 'splats' (gsplat) or 'pipeline' (nerfstudio)")
 
 
+def test_changed_bytes_of_a_checkpoint_never_do_worse_than_an_error(tmp_path):
+    """Where the zip says what it holds: what torch makes of that has no list of errors."""
+    torch.save({"splats": gsplat_tensors(random_gaussians(2, 0))}, tmp_path / "whole.pt")
+    content = (tmp_path / "whole.pt").read_bytes()
+    path = tmp_path / "a.pt"
+    for place in range(len(content) - 600, len(content)):
+        for value in (0, 255):
+            path.write_bytes(content[:place] + bytes([value]) + content[place + 1 :])
+            try:
+                load(path)
+            except ValueError as error:
+                assert str(error).startswith(f"{path}: ")  # noqa: PT017 (either outcome is right)
+
+
 def test_torch_is_asked_for_where_it_is_missing(tmp_path, monkeypatch):
     torch.save({}, tmp_path / "a.pt")
     monkeypatch.setitem(sys.modules, "torch", None)

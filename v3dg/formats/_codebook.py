@@ -7,7 +7,7 @@ import heapq
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.formats._packing import Floats
+from v3dg.formats._packing import Floats, blocks
 
 _TABLE = 256
 _BINS = 4096
@@ -86,4 +86,8 @@ def palette_of(vectors: Floats, size: int) -> tuple[Floats, NDArray[np.uint32]]:
 
 def _spread(vectors: Floats) -> Floats:
     """(D,) squared distances to the mean, summed; 0 for one vector."""
-    return np.asarray(vectors.var(axis=0, dtype=np.float64) * len(vectors))
+    mean = vectors.mean(axis=0, dtype=np.float64)
+    total = np.zeros(vectors.shape[1])
+    for block in blocks(len(vectors)):
+        total += np.square(vectors[block] - mean).sum(axis=0)
+    return total

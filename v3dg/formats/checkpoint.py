@@ -7,6 +7,7 @@ in a dict `splats`, nerfstudio among the values of `pipeline`. Nothing else of t
 from __future__ import annotations
 
 import os
+import warnings
 from typing import Any
 
 from v3dg import _files
@@ -84,11 +85,13 @@ def _loaded(path: str | os.PathLike[str]) -> Any:
     with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
         file.read(1)
     try:
-        # Mapped: a checkpoint's optimiser is twice as large as its gaussians, and is not read.
-        return torch.load(os.fspath(path), map_location="cpu", weights_only=True, mmap=True)
-    except OSError:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what torch warns of in damaged files becomes an error below
+            # Mapped: a checkpoint's optimiser is twice as large as its gaussians, and is not read.
+            return torch.load(os.fspath(path), map_location="cpu", weights_only=True, mmap=True)
+    except MemoryError:
         raise
-    except Exception as error:  # damaged files raise RuntimeError, EOFError, KeyError, UnpicklingError, ...
+    except Exception as error:  # damaged files raise RuntimeError, EOFError, OSError, UnpicklingError, ...
         lines = [ascii(line)[1:-1] for line in str(error).splitlines()]
         wanted = next((line for line in lines if "GLOBAL" in line or "Unsupported" in line), None)
         found = (
