@@ -44,6 +44,16 @@ def test_an_asset_and_itself_are_equal(folder, tmp_path):
         assert (numbers["flip"], numbers["psnr"], numbers["ssim"]) == (0, None, 1)
 
 
+def test_many_views_are_measured_by_several_processes_alike(folder, tmp_path):
+    """View 0 of a turntable is the same, however many there are; the others come in order."""
+    options = ("--size", 64, 48, "-o", tmp_path / "c.png", "--tolerance", 100, "--views")
+    one, many = (compare(folder, "tuft.ply", "tuft.v3dg", *options, n)["views"] for n in (1, 9))
+    assert [view["camera"] for view in many] == list("012345678")
+    assert len({view["flip"] for view in many}) == 9
+    for name in ("flip", "psnr", "ssim"):
+        assert many[0][name] == one[0][name]
+
+
 def test_error_grows_with_the_tolerance_and_shrinks_the_cut(folder, tmp_path):
     def mean(tolerance):
         options = ("--views", 2, "--size", 64, 48, "-o", tmp_path / "c.png", "--tolerance", tolerance)

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
+import os
+import signal
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -24,6 +29,9 @@ from v3dg.pictures import SUFFIXES as PICTURE_SUFFIXES
 
 if TYPE_CHECKING:
     from v3dg.bench.measure import Picture
+
+# Views from which on starting processes to measure them is quicker than doing without.
+_ENOUGH_TO_SHARE = 6
 
 
 @dataclass
@@ -77,8 +85,9 @@ def run(options: Compare) -> None:
         raise UsageError("PATH: expected two pictures, or two subjects to draw, got one of each")
     count, pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
     rows, worst = [], None
-    for pair in tqdm(pairs, total=count, unit="view", leave=False, disable=options.quiet):
-        row = {"camera": pair.name, **_errors(pair), "gaussians_selected": pair.gaussians}
+    judged = _judged(pairs) if count >= _ENOUGH_TO_SHARE else ((pair, _errors(pair)) for pair in pairs)
+    for pair, errors in tqdm(judged, total=count, unit="view", leave=False, disable=options.quiet):
+        row = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
         if options.pictures == "all":
             path = picture_path(output, pair.name, count)
             _write(options, path, pair, row["flip"])
@@ -159,6 +168,22 @@ def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
             yield _Pair(name, truth, as_picture(image.color), image.stats.gaussians_selected)
 
     return len(cameras), pairs()
+
+
+def _judged(pairs: Iterator[_Pair]) -> Iterator[tuple[_Pair, dict[str, float | None]]]:
+    """Pairs with their errors, in order; a core each measures them, while the next ones are drawn."""
+    cores = len(os.sched_getaffinity(0))
+    waiting: deque[tuple[_Pair, Future[dict[str, float | None]]]] = deque()
+    # A forked process would inherit CUDA and OpenMP in a state that neither survives. Ctrl-C is for us.
+    context, ignore = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)
+    with ProcessPoolExecutor(cores, context, signal.signal, ignore) as pool:
+        for pair in pairs:
+            waiting.append((pair, pool.submit(_errors, pair)))
+            if len(waiting) > cores:
+                done, errors = waiting.popleft()
+                yield done, errors.result()
+        for done, errors in waiting:
+            yield done, errors.result()
 
 
 def _errors(pair: _Pair) -> dict[str, float | None]:
