@@ -1,5 +1,6 @@
 """The viewer without a browser; test_viewer_page.py opens it in one."""
 
+import contextlib
 import math
 import threading
 import time
@@ -251,14 +252,19 @@ def test_a_stop_ends_a_long_picture_early():
     start = time.monotonic()
     undisturbed = stage.frame(view, (800, 600), settings).pixels
     whole = time.monotonic() - start
-    stop = _core.Stop()
-    np.testing.assert_array_equal(stage.frame(view, (800, 600), settings, stop).pixels, undisturbed)
-    timer = threading.Timer(whole / 4, stop.request)
-    start = time.monotonic()
-    timer.start()
-    with pytest.raises(Stopped):
-        stage.frame(view, (800, 600), settings, stop)
-    assert time.monotonic() - start < 0.8 * whole
+    in_bands = stage.frame(view, (800, 600), settings, _core.Stop()).pixels
+    np.testing.assert_array_equal(in_bands, undisturbed)
+    shortest = whole
+    for part in range(4, 14):  # the machine may be busy, now or then
+        stop = _core.Stop()
+        timer = threading.Timer(whole / part, stop.request)
+        start = time.monotonic()
+        timer.start()
+        with contextlib.suppress(Stopped):
+            stage.frame(view, (800, 600), settings, stop)
+            continue
+        shortest = min(shortest, time.monotonic() - start)
+    assert shortest < 0.6 * whole
 
 
 # Pacing.
@@ -340,8 +346,18 @@ class FakeStage:
         return Frame(np.full((size[1], size[0], 3), view, np.uint8), None, settings.shows, None)
 
 
+class NoPacer:
+    """Always has time for everything."""
+
+    def draft(self, full):
+        return Draft(full)
+
+    def drew(self, draft, milliseconds):
+        pass
+
+
 @pytest.fixture
-def painting():
+def painting(request):
     """A painter, its stage, and what it sent: (view, size, is it final)."""
     stage, sent, errors, is_final = FakeStage(), [], [], threading.Event()
 
@@ -354,7 +370,7 @@ def painting():
         errors.append(error)
         is_final.set()
 
-    painter = Painter(stage, send, fail)
+    painter = Painter(stage, send, fail, getattr(request, "param", None))
     yield SimpleNamespace(painter=painter, stage=stage, sent=sent, errors=errors, is_final=is_final)
     painter.close()
 
@@ -407,13 +423,23 @@ def test_few_gaussians_are_compared_while_moving(painting):
     assert all(drawn[2] == settings for drawn in painting.stage.drawn)
 
 
+@pytest.mark.parametrize("painting", [NoPacer()], indirect=True)
 def test_a_coarser_cut_is_replaced_at_rest_though_the_size_is_the_same(painting):
     settings = Settings(tolerance=0.5)
-    for view in range(20):  # until the pacer takes the full size
-        painting.painter.ask(Request(view, (16, 8), settings))
-        wait(painting.is_final)
-    assert painting.stage.drawn[-2][1:] == ((16, 8), replace(settings, tolerance=v3dg.DEFAULT_TOLERANCE))
-    assert painting.stage.drawn[-1][1:] == ((16, 8), settings)
+    painting.painter.ask(Request(1, (16, 8), settings))
+    wait(painting.is_final)
+    coarser = replace(settings, tolerance=v3dg.DEFAULT_TOLERANCE)
+    assert painting.stage.drawn == [(1, (16, 8), coarser), (1, (16, 8), settings)]
+    assert [final for *_, final in painting.sent] == [False, True]
+
+
+@pytest.mark.parametrize("painting", [NoPacer()], indirect=True)
+def test_what_is_drawn_in_full_at_once_is_not_drawn_again(painting):
+    painting.painter.ask(Request(1, (16, 8), Settings()))
+    wait(painting.is_final)
+    painting.painter.ask(Request(2, (16, 8), Settings()))
+    wait(painting.is_final)
+    assert painting.sent == [(1, (16, 8), True), (2, (16, 8), True)]
 
 
 def test_an_error_is_told_and_the_next_request_is_drawn(painting):
