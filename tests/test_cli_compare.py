@@ -102,11 +102,10 @@ def test_two_pictures(folder, tmp_path):
     assert result["mean"]["ssim"] == pytest.approx(metrics.ssim(*eight_bit), rel=1e-4)
     assert result["mean"]["flip"] == pytest.approx(metrics.flip(*eight_bit), rel=1e-3)
     with Image.open(tmp_path / "compare.png") as sheet:
-        left = np.asarray(sheet)
-    shown = np.asarray(Image.open(tmp_path / "a.png"))
-    assert any((left[top : top + 40, 6:66] == shown).all() for top in range(left.shape[0] - 40)), (
-        "the reference is shown as it is"
-    )
+        left = np.asarray(sheet)[:, 6 : 6 + 5 * 60]
+    enlarged = np.asarray(Image.open(tmp_path / "a.png")).repeat(5, axis=0).repeat(5, axis=1)
+    shown = [(left[top : top + 5 * 40] == enlarged).all() for top in range(left.shape[0] - 5 * 40)]
+    assert any(shown), "the reference, five times as large"
 
 
 def test_text_names_the_view_that_differs_most(folder, tmp_path):
@@ -126,6 +125,23 @@ def test_text_names_the_view_that_differs_most(folder, tmp_path):
     assert lines[0].split() == ["view", "FLIP", "PSNR", "SSIM", "gaussians"]
     assert [line.split()[0] for line in lines[1:4]] == ["near", "far", "mean"]
     assert "which differs most" in lines[-1]
+
+
+def test_a_view_that_shows_no_coarser_level_says_so(folder, tmp_path):
+    command = (
+        "compare",
+        "tuft.ply",
+        "tuft.v3dg",
+        "-o",
+        tmp_path / "c.png",
+        "--views",
+        1,
+        "--quiet",
+        "--size",
+    )
+    near, far = (run(*command, size, size, cwd=folder).stdout for size in (500, 20))
+    assert "every view needs the finest level" in near
+    assert "every view needs the finest level" not in far
 
 
 def test_errors(folder, tmp_path):

@@ -19,6 +19,7 @@ from v3dg.cli._common import (
     Flag,
     Threads,
     UsageError,
+    level_size,
     option,
     print_result,
     require_subject,
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 
 # Views from which on starting processes to measure them is quicker than doing without.
 _ENOUGH_TO_SHARE = 6
+
+# Smaller pictures are enlarged to about this many px where they are shown side by side.
+_LEAST_WIDTH = 300
 
 
 @dataclass
@@ -70,7 +74,8 @@ class _Pair:
     name: str
     reference: Picture
     test: Picture
-    gaussians: int | None  # of the test that were selected
+    gaussians: int | None = None  # of the test that were selected
+    is_finest: bool = False  # whether those are all of a bundle's finest level
 
 
 def run(options: Compare) -> None:
@@ -84,7 +89,7 @@ def run(options: Compare) -> None:
     if any(are_pictures) and not all(are_pictures):
         raise UsageError("PATH: expected two pictures, or two subjects to draw, got one of each")
     count, pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
-    rows, worst = [], None
+    rows, worst, is_finest = [], None, True
     judged = _judged(pairs) if count >= _ENOUGH_TO_SHARE else ((pair, _errors(pair)) for pair in pairs)
     for pair, errors in tqdm(judged, total=count, unit="view", leave=False, disable=options.quiet):
         row = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
@@ -95,6 +100,7 @@ def run(options: Compare) -> None:
         if worst is None or row["flip"] > worst[1]["flip"]:
             worst = (pair, row)
         rows.append(row)
+        is_finest = is_finest and pair.is_finest
     assert worst is not None
     if options.pictures == "worst":
         _write(options, output, worst[0], worst[1]["flip"])
@@ -110,18 +116,14 @@ def run(options: Compare) -> None:
     table = [_cells(row) for row in rows]
     if count > 1:
         table.append(_cells({"camera": "mean", **mean}))
-    print_result(
-        options.json,
-        result,
-        lambda: "\n".join(
-            [
-                *table_lines(("view", "FLIP", "PSNR", "SSIM", "gaussians"), table),
-                "",
-                f"{worst[1]['picture']}: reference, test and FLIP of view {worst[1]['camera']}, "
-                "which differs most",
-            ]
-        ),
-    )
+    lines = [
+        *table_lines(("view", "FLIP", "PSNR", "SSIM", "gaussians"), table),
+        "",
+        f"{worst[1]['picture']}: reference, test and FLIP of view {worst[1]['camera']}, which differs most",
+    ]
+    if is_finest:
+        lines.append("every view needs the finest level; `--size 100 100` shows the test as from far away")
+    print_result(options.json, result, lambda: "\n".join(lines))
 
 
 def _read_pictures(options: Compare) -> tuple[int, Iterator[_Pair]]:
@@ -139,7 +141,7 @@ def _read_pictures(options: Compare) -> tuple[int, Iterator[_Pair]]:
             f"{options.test}: expected {width} x {height} px like {options.reference}, "
             f"got {test_width} x {test_height}"
         )
-    return 1, iter([_Pair(options.test.stem, reference, test, None)])
+    return 1, iter([_Pair(options.test.stem, reference, test)])
 
 
 def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
@@ -151,6 +153,7 @@ def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
         raise UsageError(f"--supersample: expected at least 1, got {options.supersample}")
     from v3dg import _device
     from v3dg.bench.measure import as_picture, draw_truth
+    from v3dg.bundle import Bundle
     from v3dg.render import render
 
     device = _device.resolve(options.device)
@@ -161,11 +164,14 @@ def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
         own, path = test_cameras, options.test
     cameras = choose_cameras(options.view, path, reference, own)
 
+    finest = level_size(test, 0) if isinstance(test, Bundle) and test.num_levels else None
+
     def pairs() -> Iterator[_Pair]:
         for name, camera in cameras.items():
             truth = draw_truth(reference, camera, device, options.supersample)
             image = render(test, camera, tolerance=options.tolerance, budget=options.budget, device=device)
-            yield _Pair(name, truth, as_picture(image.color), image.stats.gaussians_selected)
+            count = image.stats.gaussians_selected
+            yield _Pair(name, truth, as_picture(image.color), count, count == finest)
 
     return len(cameras), pairs()
 
@@ -210,10 +216,14 @@ def _write(options: Compare, path: Path, pair: _Pair, flip: float) -> None:
     from v3dg.bench.sheet import sheet
     from v3dg.pictures import to_8bit, write_picture
 
+    zoom = max(1, _LEAST_WIDTH // pair.test.shape[1])
     row = [
-        (options.reference.name, pair.reference),
-        (options.test.name, pair.test),
-        (f"FLIP {flip:.4f}", to_8bit(metrics.error_image(*_shown(pair)))),
+        (text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1))
+        for text, picture in (
+            (options.reference.name, pair.reference),
+            (options.test.name, pair.test),
+            (f"FLIP {flip:.4f}", to_8bit(metrics.error_image(*_shown(pair)))),
+        )
     ]
     write_picture(path, sheet([row]))
 
