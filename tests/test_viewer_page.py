@@ -347,6 +347,24 @@ def test_path_is_saved_as_cameras_a_scene_and_a_film(tab, site, tmp_path):
     assert (abs(pictures[0] - pictures[-1]).max(axis=2) > 30).mean() > 0.02
 
 
+def test_flight_is_recorded_and_played(tab, site):
+    x, y, z = site.home.position
+    tab.set("Record", True)
+    tab.pictures(time.perf_counter() + 0.3)
+    for step in range(1, 6):
+        away = look_at((x, y, z + 0.2 * step), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect)
+        tab.look(away, SIZE)
+        tab.pictures(time.perf_counter() + 0.1)
+    tab.set("Record", False)
+    wait_for(tab, lambda: re.search(r"[2-9] views", str(tab.updates)))
+    tab.positions.clear()
+    tab.set("Play", True)
+    wait_for(tab, lambda: tab.positions and abs(tab.positions[-1][2] - z - 1) < 1e-6)
+    heights = [position[2] for position in tab.positions]
+    assert len(heights) > 3
+    assert np.diff(heights).min() > -0.05
+
+
 def test_picture_is_saved_in_full(tab, site):
     tab.look(site.home, SIZE)
     shown = settled(tab)

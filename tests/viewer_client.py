@@ -17,6 +17,7 @@ class Tab:
     Attributes:
         text: The HTML of the panel's figures.
         updates: What the server changed of its controls.
+        positions: Where the server took the camera.
         notices: Notices that popped up.
         files: Contents of the files that were downloaded, by name.
     """
@@ -31,6 +32,7 @@ class Tab:
         self._uuids, self._props, self._figures = {}, {}, None
         self._names, self._parts = {}, {}
         self.text, self.updates, self.notices, self.files = "", [], [], {}
+        self.positions = []
 
     def __enter__(self):
         return self
@@ -92,6 +94,8 @@ class Tab:
             self.updates.append(str(message["updates"]))
             if message["uuid"] == self._figures:
                 self.text = message["updates"].get("content", self.text)
+        elif kind == "SetCameraPositionMessage":
+            self.positions.append(message["position"])
         elif kind == "NotificationShowMessage":
             self.notices.append(message["props"]["body"])
         elif kind == "FileTransferStartDownload":

@@ -370,11 +370,13 @@ class _Page:
         self._tell_path()
 
     def _choose_record(self) -> None:
-        if self._record.value:
-            with self._path_lock:
-                self._path = CameraPath()
-                self._path.record(self._view(), time.monotonic())
         self._recording = self._record.value
+        with self._path_lock:
+            now = time.monotonic()
+            if self._recording:
+                self._path = CameraPath([now], [self._view()])
+            elif len(self._path) and self._path.views[-1] != self._view():
+                self._path.add(self._view(), now - self._path.times[-1])  # to end where the camera rests
         self._tell_path()
 
     def _clear_path(self) -> None:
