@@ -8,6 +8,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -302,3 +303,11 @@ for work, subject in ((picture, asset()), (gradient, asset()), (frame, crowd()),
     printed = run(script, OMP_NUM_THREADS="1", **allocator)
     works = ("picture", "gradient", "frame", "bundle_of")
     assert printed == [word for work in works for word in (work, "True", "True")]
+
+
+def test_thread_that_ends_before_its_first_line_is_an_error(monkeypatch):
+    """As it does where there is no memory to begin; threading.Thread would wait for it for ever."""
+    starts_nothing = SimpleNamespace(start_new_thread=lambda work, arguments: 0)
+    monkeypatch.setattr(sys.modules["v3dg.build"], "_thread", starts_nothing)
+    with pytest.raises(MemoryError, match="ended at once"):
+        bundle_of(asset(num=300))

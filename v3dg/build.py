@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import errno
 import fcntl
 import hashlib
@@ -12,7 +13,9 @@ import os
 import stat
 import struct
 import threading
+import time
 import warnings
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from io import FileIO
@@ -473,7 +476,8 @@ def _run_fit(bar: _Bar, where: Any, fit: Callable[[_core.FitProgress], None]) ->
     failure: list[BaseException] = []
     done = threading.Event()
 
-    def work() -> None:
+    def work(token: _Token) -> None:
+        del token  # the thread itself still has it
         try:
             fit(state)
         except BaseException as error:
@@ -481,21 +485,28 @@ def _run_fit(bar: _Bar, where: Any, fit: Callable[[_core.FitProgress], None]) ->
         finally:
             done.set()
 
-    thread = threading.Thread(target=work)
+    # Not threading.Thread: its start waits for ever for a thread that ends, for want of memory, before its
+    # first line; and Ctrl-C during its join can make Python 3.11 take it for finished while it runs.
+    tokens = [_Token()]
+    runs = weakref.ref(tokens[0])
     try:
-        thread.start()
-        # Not Thread.join: Ctrl-C during it can make Python 3.11 take the thread for finished while it runs.
-        while not done.wait(0.1):
+        _thread.start_new_thread(work, (tokens.pop(),))
+        while runs() is not None and not done.wait(0.1):
             bar.show(state)
     except BaseException:
         state.cancel()
-        while thread.is_alive():
-            done.wait(0.1)
+        while runs() is not None and not done.is_set():
+            time.sleep(0.01)
         raise
-    thread.join()
     if failure:
         raise failure[0]
+    if not done.is_set():
+        raise MemoryError("a thread that had started ended at once")
     bar.show(state)
+
+
+class _Token:
+    """Goes when whoever holds it does."""
 
 
 class _Bar:
