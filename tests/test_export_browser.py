@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import chromium
 import v3dg
 from v3dg.export import export_streamed_sog
 from v3dg.metrics import psnr
@@ -23,24 +24,13 @@ from v3dg.procedural import make_donut
 
 playwright = pytest.importorskip("playwright.sync_api")
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 VIEWER = os.environ.get("SUPERSPLAT_VIEWER")
 pytestmark = [
     pytest.mark.witness,
-    pytest.mark.skipif(CHROMIUM is None, reason="neither chromium nor google-chrome is installed"),
+    pytest.mark.skipif(chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"),
     pytest.mark.skipif(VIEWER is None, reason="SUPERSPLAT_VIEWER does not name its folder"),
 ]
 
-# WebGL in software, and nothing that asks the network.
-ARGUMENTS = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 SIDE = 300
 
 
@@ -73,7 +63,7 @@ def server(tmp_path_factory, bundle):
 @pytest.fixture(scope="module")
 def browser():
     with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=chromium.ARGUMENTS)
         yield browser
         browser.close()
 

@@ -4,13 +4,13 @@ import io
 import itertools
 import json
 import re
-import shutil
 import time
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import chromium
 import scenes_lod
 import v3dg
 from v3dg.viewer.frame import Stage
@@ -19,22 +19,11 @@ from v3dg.viewer.page import Site
 pytest.importorskip("viser")
 playwright = pytest.importorskip("playwright.sync_api")
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = [
     pytest.mark.witness,
-    pytest.mark.skipif(CHROMIUM is None, reason="neither chromium nor google-chrome is installed"),
+    pytest.mark.skipif(chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"),
 ]
 
-# WebGL in software, and nothing that asks the network.
-ARGUMENTS = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 SECONDS = 60
 
 
@@ -56,7 +45,7 @@ def site(tmp_path_factory):
 @pytest.fixture(scope="module")
 def browser():
     with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=chromium.ARGUMENTS)
         yield browser
         browser.close()
 

@@ -8,6 +8,7 @@ import os
 import secrets
 import stat
 from collections.abc import Iterator
+from pathlib import Path
 
 
 @contextlib.contextmanager
@@ -57,6 +58,16 @@ def _flush(path: str) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a place to write to whose folder is not there.
+
+    Raises:
+        ValueError: It is not there.
+    """
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: expected an existing folder, got {path.parent}; create it first")
 
 
 def open_regular(path: str | os.PathLike[str]) -> int:

@@ -102,6 +102,15 @@ def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     return far
 
 
+def ball_of_most(points: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.floating[Any]], float]:
+    """Centre (3,) and radius, above 0, of a ball around nearly all of N > 0 points (N, 3): what to look at.
+
+    Trained assets have a few gaussians far away from all others.
+    """
+    low, high = np.percentile(points, (1, 99), axis=0)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+
+
 def _all(values: Array) -> Any:
     """Whether all of a row is true, for each row of an array of any dimensions."""
     return values.reshape(len(values), math.prod(values.shape[1:])).all(axis=1)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from v3dg import _files, _operations
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
+from v3dg.cleaning import ball_of_most
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable, morton_order
 from v3dg.gaussians import Gaussians
@@ -138,9 +139,7 @@ def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
     """What SuperSplat's viewer wants beside an asset: a camera that shows most of it, and no effects."""
     # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn about z.
     means = gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0)
-    low, high = np.percentile(means, (1, 99), axis=0)  # trained assets have a few gaussians far away
-    centre = (low + high) / 2
-    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    centre, radius = ball_of_most(means)
     distance = 1.2 * radius / math.sin(math.radians(_FOV_DEGREES) / 2)
     towards_camera = np.array([0.4, 0.4, 0.8]) / np.linalg.norm([0.4, 0.4, 0.8])
     position = centre + distance * towards_camera

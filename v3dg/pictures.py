@@ -32,8 +32,7 @@ def check_picture_path(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{path}: expected a file name ending in {', '.join(SUFFIXES)}; choose one of them")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: expected an existing folder, got {path.parent}; create it first")
+    _files.check_folder(path)
     return path
 
 

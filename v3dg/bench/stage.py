@@ -19,6 +19,7 @@ from v3dg.bench.settings import Settings
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
+from v3dg.cleaning import ball_of_most
 from v3dg.gaussians import Gaussians
 from v3dg.io import load
 from v3dg.procedural import make_asset
@@ -83,8 +84,8 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
 
 def close_distance(asset: Gaussians) -> tuple[Any, float]:
     """The middle of an asset and how far from it a square picture is filled; without its few outliers."""
-    low, high = np.percentile(_device.to_host(asset.means), (1, 99), axis=0)
-    return (low + high) / 2, 0.5 * float(np.linalg.norm(high - low)) / math.tan(FOV_X / 2)
+    center, radius = ball_of_most(_device.to_host(asset.means))
+    return center, radius / math.tan(FOV_X / 2)
 
 
 def close_view(asset: Gaussians, size: tuple[int, int]) -> Camera:

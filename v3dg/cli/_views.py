@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     Subject: TypeAlias = Scene | Bundle | Gaussians
 
+Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
+
 # Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
 _ENOUGH_TO_FRAME = 50_000
 
@@ -40,7 +42,7 @@ class ViewOptions:
     """Width and height in px of a turntable's pictures, and of cameras whose file gives them no size."""
     elevation: float = 20.0
     """Height of the turntable's cameras above the horizon in degrees."""
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    up: Axis = "z"
     """The turntable's axis."""
 
     def check(self, *subjects: Path) -> None:
@@ -102,6 +104,7 @@ def _turntable(subject: Subject, options: ViewOptions) -> dict[str, Camera]:
 
     from v3dg.bundle import Bundle
     from v3dg.cameras import DEFAULT_FOV_X, turntable
+    from v3dg.cleaning import ball_of_most
     from v3dg.gaussians import Gaussians
 
     if isinstance(subject, Gaussians):
@@ -111,25 +114,27 @@ def _turntable(subject: Subject, options: ViewOptions) -> dict[str, Camera]:
         sizes = [level_size(subject, level) for level in range(subject.num_levels)]
         level = next((i for i, size in enumerate(sizes) if size <= _ENOUGH_TO_FRAME), len(sizes) - 1)
         means = subject.level_gaussians(level).means if sizes else np.zeros((0, 3), np.float32)
-    # Trained assets have a few gaussians far away from all others.
-    low, high = np.percentile(means, (1, 99), axis=0) if len(means) else (np.zeros(3), np.ones(3))
-    centre = (low + high) / 2
-    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    centre, radius = ball_of_most(means) if len(means) else (np.zeros(3), 1.0)
     narrow = math.tan(DEFAULT_FOV_X / 2) * min(1.0, options.size[1] / options.size[0])
     distance = 0.9 * radius / math.sin(math.atan(narrow))
-    axis = np.eye(3)["xyz".index(options.up[-1])] * (-1 if options.up[0] == "-" else 1)
     cameras = turntable(
         centre,
         distance,
         options.views,
         math.radians(options.elevation),
-        up=axis,
+        up=direction_of(options.up),
         width=options.size[0],
         height=options.size[1],
         near=min(0.01, 0.01 * distance),
     )
     digits = len(str(options.views - 1))
     return {f"{i:0{digits}}": camera for i, camera in enumerate(cameras)}
+
+
+def direction_of(axis: Axis) -> tuple[float, float, float]:
+    """The unit vector along an axis."""
+    x, y, z = ((-1.0 if axis[0] == "-" else 1.0) * (axis[-1] == name) for name in "xyz")
+    return x, y, z
 
 
 def picture_path(output: Path, name: str, count: int) -> Path:

@@ -145,7 +145,7 @@ def _outputs(options: Build) -> dict[Path, Path]:
 def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
     """Build and save one bundle; what was done, as JSON values."""
     require_file(asset_path, *SUFFIXES)
-    from v3dg import _device
+    from v3dg import _device, _files
     from v3dg.build import build_bundle, discard_levels, is_current
     from v3dg.bundle import Bundle
     from v3dg.cleaning import AssetWarning
@@ -153,8 +153,7 @@ def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
 
     if output.suffix != ".v3dg":
         raise ValueError(f"{output}: expected a file name ending in .v3dg")
-    if not output.parent.is_dir():
-        raise ValueError(f"{output}: expected an existing folder, got {output.parent}; create it first")
+    _files.check_folder(output)
     config = _config(options)
     partial = output.with_name(output.name + ".partial")
     device = _device.resolve(options.device)

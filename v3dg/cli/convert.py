@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from v3dg import _files
 from v3dg.cli._common import Flag, Threads, UsageError, bytes_text, option, print_result, require_subject
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, is_scene, load_subject
 from v3dg.io import SAVE_SUFFIXES
@@ -85,10 +86,7 @@ def _check(options: Convert) -> None:
     options.view.check(options.subject)
     if not options.output.name.lower().endswith(SAVE_SUFFIXES):
         raise ValueError(f"{options.output}: expected a file name that ends in {', '.join(SAVE_SUFFIXES)}")
-    if not options.output.parent.is_dir():
-        raise ValueError(
-            f"{options.output}: expected an existing folder, got {options.output.parent}; create it first"
-        )
+    _files.check_folder(options.output)
     if options.level is not None and _wants_cut(options):
         raise UsageError("--level: expected no options of a cut beside it; leave it or them out")
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
+from v3dg import _files
 from v3dg.cli._common import Flag, Threads, UsageError, bytes_text, option, print_result, require_file
+from v3dg.cli._views import Axis
 
 
 @dataclass
@@ -22,7 +24,7 @@ class Export:
     """Folder to write; viewers are given its lod-meta.json. The bundle's name with _web if not given."""
     chunk: Annotated[int | None, option("N")] = None
     """Most gaussians of the asset in a chunk, for which the viewer chooses a level; 16384 if not given."""
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "-y"
+    up: Axis = "-y"
     """What is up in the asset, which viewers take to be -y, as in most trained ones."""
     threads: Threads = None
     """CPU threads; all if not given."""
@@ -40,8 +42,7 @@ def run(options: Export) -> None:
     from v3dg.export import DEFAULT_CHUNK, INDEX, export_streamed_sog
 
     folder = options.output or options.bundle.with_name(f"{options.bundle.stem}_web")
-    if not folder.absolute().parent.is_dir():
-        raise ValueError(f"{folder}: expected an existing folder, got {folder.parent}; create it first")
+    _files.check_folder(folder)
     start = time.perf_counter()
     done = export_streamed_sog(
         Bundle.open(options.bundle),

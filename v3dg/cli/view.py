@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from v3dg.cli._common import Threads, UsageError, option, require_subject
-from v3dg.cli._views import load_subject
+from v3dg.cli._views import Axis, direction_of, load_subject
 
 
 @dataclass
@@ -24,7 +24,7 @@ class View:
     """Address to listen at; the default lets in this machine alone, 0.0.0.0 anyone who reaches it."""
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    up: Axis = "z"
     """Which way is up."""
     tolerance: Annotated[float | None, option("PX2")] = None
     """Largest px² that one gaussian of a coarser cluster may stand for, to begin with; 3, 0 with a budget."""
@@ -40,8 +40,6 @@ def run(options: View) -> None:
     require_subject(options.subject)
     if not 0 <= options.port <= 65535:
         raise UsageError(f"--port: expected 0 to 65535, got {options.port}")
-    import numpy as np
-
     from v3dg.gaussians import Gaussians
     from v3dg.select import DEFAULT_TOLERANCE, rule_of
     from v3dg.viewer.frame import Stage
@@ -57,7 +55,6 @@ def run(options: View) -> None:
     if isinstance(subject, Gaussians) and options.budget is not None:
         raise UsageError(f"--budget: {options.subject} has no levels to choose from; build a bundle of it")
     stage = Stage(subject, device=options.device)
-    axis = np.eye(3)["xyz".index(options.up[-1])] * (-1 if options.up[0] == "-" else 1)
     site = Site(
         stage,
         name=options.subject.stem,
@@ -66,7 +63,7 @@ def run(options: View) -> None:
         port=options.port,
         tolerance=tolerance,
         budget=options.budget,
-        up=axis,
+        up=direction_of(options.up),
     )
     try:
         if options.port not in (0, site.port):

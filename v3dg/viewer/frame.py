@@ -14,6 +14,7 @@ from v3dg import _core, _device, _resident
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
+from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.pictures import to_8bit
@@ -306,8 +307,8 @@ def _bounds(scene: Scene) -> tuple[Floats, float]:
     points = np.concatenate(corners)
     if not len(points):
         return np.zeros(3), 1.0
-    low, high = np.percentile(points, (1, 99), axis=0)
-    return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    center, radius = ball_of_most(points)
+    return np.asarray(center, np.float64), radius
 
 
 def _resident_bytes() -> int:
