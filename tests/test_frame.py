@@ -194,12 +194,22 @@ def test_a_graph_draws_again():
         assert image.stats.gaussians_in_frustum == count
 
 
-def test_a_graph_without_room_is_refused():
+def test_a_graph_of_what_was_not_drawn_before_is_refused():
     import torch
 
-    renderer = Renderer(composed_scene(np.random.default_rng(10)))
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        torch.zeros(1, device="cuda")  # for torch warns of graphs without work
-        with pytest.raises(RuntimeError, match="draw as much once before"):
-            renderer.render(CAMERA)
+    scene, same, moved = (composed_scene(np.random.default_rng(10)) for _ in range(3))
+    renderer = Renderer(scene)
+    poses = 1.5 * scene.positions
+
+    def assert_refused():
+        with torch.cuda.graph(torch.cuda.CUDAGraph()):
+            torch.zeros(1, device="cuda")  # for torch warns of graphs without work
+            with pytest.raises(RuntimeError, match="draw as much once before"):
+                renderer.render(CAMERA)
+
+    assert_refused()
+    assert_same_bytes(renderer.render(CAMERA), Renderer(same).render(CAMERA))
+    scene.move(positions=poses)
+    assert_refused()
+    moved.move(positions=poses)
+    assert_same_bytes(renderer.render(CAMERA), Renderer(moved).render(CAMERA))

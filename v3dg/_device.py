@@ -93,6 +93,13 @@ def current_stream() -> int:
     return int(torch.cuda.current_stream().cuda_stream)
 
 
+def is_capturing() -> bool:
+    """Whether a CUDA graph is being captured on that stream."""
+    import torch
+
+    return bool(torch.cuda.is_current_stream_capturing())
+
+
 def aligned(tensor: Any) -> Any:
     """The tensor, contiguous, where the core can read it in words of 16 bytes."""
     tensor = tensor.contiguous()

@@ -37,9 +37,17 @@ class ResidentScene:
         """Upload what has changed since the last time: nothing, the poses, or all instances.
 
         Frames under way are finished first: one that found a buffer too small will be drawn again.
+
+        Raises:
+            RuntimeError: Something has changed, and a CUDA graph is being captured.
         """
         if self._seen == (scene.num_changes, scene.num_moves):
             return
+        if _device.is_capturing():
+            raise RuntimeError(
+                "scene: expected no change while a CUDA graph is captured, got a new or changed scene; "
+                "draw as much once before"
+            )
         self._finish_drawings()
         stream = _device.current_stream()
         if self._seen[0] != scene.num_changes:

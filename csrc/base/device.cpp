@@ -80,6 +80,12 @@ bool is_capturing(cudaStream_t stream) {
     return status != cudaStreamCaptureStatusNone;
 }
 
+void refuse_capture(cudaStream_t stream) {
+    if (is_capturing(stream))
+        throw std::runtime_error(
+            "cuda: no memory can be had while a graph is captured; draw as much once before");
+}
+
 Turns::Turns() { check(cudaEventCreateWithFlags(&done_, cudaEventDisableTiming), "cudaEventCreate"); }
 
 Turns::~Turns() {

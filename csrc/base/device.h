@@ -40,6 +40,8 @@ void release(void* pointer, cudaStream_t stream) noexcept;
 void trim_pool(cudaStream_t stream);
 
 bool is_capturing(cudaStream_t stream);
+// Throws std::runtime_error while it is: memory from a graph is gone with the graph.
+void refuse_capture(cudaStream_t stream);
 
 // Memory that several threads and streams use, one after the other.
 class Turns {
@@ -90,6 +92,7 @@ class DeviceBuffer {
     // Room for `size` elements, allocated and given back in the order of `stream`.
     T* reserve(size_t size, cudaStream_t stream) {
         if (size > capacity_) {
+            refuse_capture(stream);
             release(data_, stream_);
             data_ = nullptr;
             capacity_ = 0;

@@ -48,12 +48,7 @@ Frame::~Frame() = default;
 
 template <class T>
 T* Frame::room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing) {
-    if (drawing.is_captured_) {
-        if (size <= buffer.capacity()) return buffer.data();
-        throw std::runtime_error(
-            "frame: no memory can be had while a graph is captured; draw as much once before");
-    }
-    if (size > buffer.capacity() && was_captured_)
+    if (size > buffer.capacity() && was_captured_ && !drawing.is_captured_)
         retired_.push_back(std::make_shared<DeviceBuffer<T>>(std::move(buffer)));
     return buffer.reserve(size, drawing.stream_);
 }
