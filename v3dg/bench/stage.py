@@ -64,7 +64,8 @@ def views_of(cameras: Iterable[Camera]) -> list[View]:
         x, y, z = camera.position
         distance = math.sqrt(x * x + y * y + z * z)
         azimuth, elevation = math.degrees(math.atan2(y, x)), math.degrees(math.asin(z / distance))
-        views.append(View(azimuth % 360, elevation, distance, camera))
+        # Files round: what is just below 0 is not a direction of its own at 360.
+        views.append(View(round(azimuth, 2) % 360, elevation, distance, camera))
     return views
 
 
