@@ -89,10 +89,19 @@ def test_crowd_stands_in_a_grid_and_looks_one_way():
     assert len(xs) == len(ys) == 5
     assert np.allclose(np.diff(xs), np.diff(xs)[0])
     assert len(np.unique(positions, axis=0)) == 25
-    assert np.allclose(positions.mean(axis=0), 0)
+    assert np.allclose(positions[:, :2].mean(axis=0), 0)
     assert (all_of(world, "quaternions") == [1, 0, 0, 0]).all()
     counts = [len(placement) for placement in world.placements.values()]
     assert max(counts) - min(counts) <= 1
+
+
+def test_every_camera_sees_some_of_the_crowd():
+    world = worlds.crowd(16, 2000, persons=1)
+    config = v3dg.BuildConfig(steps=0)
+    bundle = v3dg.build_bundle(world.assets["person_00"].make(), config=config, progress=False, device="cpu")
+    scene = worlds.scene_of(world, {"person_00": bundle})
+    for name, camera in world.cameras(width=64, height=36).items():
+        assert v3dg.render(scene, camera).color.any(), name
 
 
 def test_a_crowd_of_fewer_than_there_are_persons():

@@ -183,7 +183,7 @@ def temples(instances: int = 100, num_gaussians: int = 1_350_487, *, seed: int =
 
 
 def crowd(instances: int = 400, num_gaussians: int = 343_274, *, persons: int = 16, seed: int = 0) -> World:
-    """Make a crowd that stands in a square grid and looks one way.
+    """Make a crowd that stands in a square grid and looks one way, its feet at z = -0.85.
 
     Args:
         num_gaussians: Of each asset.
@@ -199,7 +199,9 @@ def crowd(instances: int = 400, num_gaussians: int = 343_274, *, persons: int = 
     pitch, side = 1.2, int(np.ceil(np.sqrt(instances)))
     row, column = np.divmod(np.arange(instances), side)
     half = 0.5 * (side - 1)
-    positions = pitch * np.stack([column - half, row - half, np.zeros(instances)], -1)
+    # Cameras look at the origin: halfway up, for between the persons' feet there is nothing.
+    heights = np.full(instances, -0.85)
+    positions = np.stack([pitch * (column - half), pitch * (row - half), heights], -1)
     # Each person as often as any other, and neighbours differ.
     who = np.concatenate(
         [np.random.default_rng([seed, i]).permutation(persons) for i in range(-(-instances // persons))]
