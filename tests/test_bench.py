@@ -274,4 +274,5 @@ def test_parts_run_on_cuda(tmp_path):
     measured = bench.run(stage, "tiny", ("tolerance", "clipping", "hierarchy", "motion"), quiet=True)
     for row in measured["clipping"]["rows"]:
         assert 0.9 * row["ours_in_frustum"] < row["clipped_in_frustum"] <= row["ours_in_frustum"]
-    assert all(row["theirs_selected"] >= row["ours_selected"] for row in measured["hierarchy"]["rows"])
+    for row in measured["hierarchy"]["rows"]:
+        assert row["ours_selected"] <= row["theirs_selected"] or row["tolerance"] == measure.COARSEST

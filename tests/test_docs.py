@@ -134,7 +134,7 @@ def run_shell(block, folder):
     environment = os.environ | {
         "PATH": os.pathsep.join(paths),
         "HOME": str(folder),
-        "PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__)),
+        "PYTHONPATH": os.pathsep.join([os.path.dirname(os.path.dirname(v3dg.__file__)), *sys.path]),
     }
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", block.code],

@@ -556,13 +556,14 @@ def test_streams_do_not_disturb_each_other(torch):
     camera = scenes.camera(517, 389, fx=300.0)
     scene = [scenes.random_gaussians(seed, camera, 20000, size_px=(0.5, 6)) for seed in range(3)]
     alone = [gradients_of(torch, g, camera, torch.float32, "cuda") for g in scene]
-    inputs = [leaves(torch, g, BACKGROUND, torch.float32, "cuda") for g in scene]
-    torch.cuda.synchronize()
     for _ in range(5):
         gradients = []
-        for i, stream in zip(inputs, (torch.cuda.Stream() for _ in inputs), strict=True):
-            with torch.cuda.stream(stream):
-                gradients.append(torch.autograd.grad(weighted_sum(torch, draw_leaves(i, camera)), i))
+        for g in scene:
+            with torch.cuda.stream(torch.cuda.Stream()):
+                inputs = leaves(torch, g, BACKGROUND, torch.float32, "cuda")
+                gradients.append(
+                    torch.autograd.grad(weighted_sum(torch, draw_leaves(inputs, camera)), inputs)
+                )
         torch.cuda.synchronize()
         for got, expected in zip(gradients, alone, strict=True):
             for a, b in zip(host(got), expected, strict=True):
