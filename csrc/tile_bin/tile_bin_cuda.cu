@@ -24,23 +24,27 @@ __device__ bool is_complete(const TileBinInput& in) {
            *in.counts.num_large <= in.large_capacity;
 }
 
-// Large records that a warp takes together. Neighbours cover the same tiles, so what they do to the counters
-// of those is summed up in shared memory first, where the tiles that they all lie in are few enough: the
-// window.
+// Large records that a warp takes together; lanes 16 apart have the same one. Neighbours cover the same
+// tiles, so where the tiles that they all lie in are few enough, the window, a tile is looked at for all of
+// them at once.
 struct LargeBatch {
-    LargeRecord mine;                // of this lane
-    int rows, rows_after;            // of tiles, of this lane and of all up to it
-    int left, top, columns, window;  // tiles of the window; no window when there are none
+    LargeRecord mine;               // of this lane
+    int first_row, rows;            // of tiles, of this lane; in the window
+    int rows_after;                 // of all up to it
+    int left, top, columns, tiles;  // of the window; no window when there are no tiles
 };
-constexpr int kMostWindow = 256;
+constexpr int kMostTiles = 255, kMostRows = 256;
+
+// For each row of each record of a batch the columns [first, end) of the window: first | end << 8.
+using WindowRuns = uint16_t[kMostRows];
 
 __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first, unsigned long long end) {
-    const unsigned lane = threadIdx.x % 32;
-    LargeBatch batch{{0, 0}, 0, 0, 0, 0, 0, 0};
+    const unsigned k = threadIdx.x % kLargeAtOnce;
+    LargeBatch batch{{0, 0}, 0, 0, 0, 0, 0, 0, 0};
     int left = 1 << 20, top = left, right = -left, bottom = -left;
-    const bool is_mine = lane < kLargeAtOnce && first + lane < end;
-    if (is_mine) {
-        batch.mine = in.large[first + lane];
+    const bool is_there = first + k < end;
+    if (is_there) {
+        batch.mine = in.large[first + k];
         const Record<float>& r = in.records[batch.mine.record];
         left = r.x0 / kFrameTileWidth;
         right = r.x1 / kFrameTileWidth;
@@ -51,19 +55,21 @@ __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long firs
     batch.rows_after = batch.rows;
 #pragma unroll
     for (unsigned offset = 1; offset < kLargeAtOnce; offset *= 2) {
-        const int below = __shfl_up_sync(kAllLanes, batch.rows_after, offset);
-        if (lane >= offset) batch.rows_after += below;
+        const int below = __shfl_up_sync(kAllLanes, batch.rows_after, offset, kLargeAtOnce);
+        if (k >= offset) batch.rows_after += below;
     }
     batch.left = warp_min(left);
     batch.top = warp_min(top);
+    batch.first_row = top - batch.top;
     batch.columns = -warp_min(-right) - batch.left + 1;
-    batch.window = batch.columns * (-warp_min(-bottom) - batch.top + 1);
+    batch.tiles = batch.columns * (-warp_min(-bottom) - batch.top + 1);
     const bool same_image = batch.mine.image == __shfl_sync(kAllLanes, batch.mine.image, 0);
-    if (!__all_sync(kAllLanes, same_image || !is_mine) || batch.window > kMostWindow) batch.window = 0;
+    const bool is_small = batch.tiles <= kMostTiles && batch.rows_after <= kMostRows;
+    if (!__all_sync(kAllLanes, is_small && (same_image || !is_there))) batch.tiles = 0;
     return batch;
 }
 
-// Calls visit(large record, run) for the rows of tiles of a batch, a lane a row.
+// Calls visit(row, large record, run) for the rows of tiles of a batch, a lane a row.
 template <class Visit>
 __device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, const Visit& visit) {
     const int lane = threadIdx.x % 32, total = __shfl_sync(kAllLanes, batch.rows_after, kLargeAtOnce - 1);
@@ -78,7 +84,7 @@ __device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, co
                                         __shfl_sync(kAllLanes, batch.rows, owner));
         const LargeRecord large{__shfl_sync(kAllLanes, batch.mine.record, owner),
                                 __shfl_sync(kAllLanes, batch.mine.image, owner)};
-        if (first + lane < total) visit(large, tile_run(in.records[large.record], row_of_owner));
+        if (first + lane < total) visit(row, large, tile_run(in.records[large.record], row_of_owner));
     }
 }
 
@@ -92,44 +98,77 @@ __device__ void for_each_batch(const TileBinInput& in, const Visit& visit) {
         visit(load_batch(in, at, end));
 }
 
-// How often a batch touches each tile of its window.
-__device__ void count_window(const TileBinInput& in, const LargeBatch& batch, uint32_t* count) {
-    for (int t = threadIdx.x % 32; t < batch.window; t += 32) count[t] = 0;
-    __syncwarp();
-    for_each_run(in, batch, [&](const LargeRecord&, const TileRun& run) {
-        uint32_t* row = count + (run.row - batch.top) * batch.columns + (run.first - batch.left);
-        for (int k = 0; k < run.count; ++k) atomicAdd(row + k, 1u);
+__device__ void write_runs(const TileBinInput& in, const LargeBatch& batch, WindowRuns& runs) {
+    __syncwarp();  // the batch before may still be read
+    for_each_run(in, batch, [&](int row, const LargeRecord&, const TileRun& run) {
+        const int first = run.first - batch.left;
+        runs[row] = run.count == 0 ? 0 : static_cast<uint16_t>(first | (first + run.count) << 8);
     });
     __syncwarp();
 }
 
-// In the batch, of tile t of the window.
-__device__ uint32_t tile_of_window(const TileBinInput& in, const LargeBatch& batch, int t) {
-    const FrameImage& image = in.images[__shfl_sync(kAllLanes, batch.mine.image, 0)];
-    return image.first_tile + (batch.top + t / batch.columns) * image.tile_columns + batch.left +
-           t % batch.columns;
+// A tile of a window.
+struct WindowTile {
+    int row, column;
+
+    __device__ WindowTile(const LargeBatch& batch, int t)
+        : row(t / batch.columns), column(t % batch.columns) {}
+    __device__ void advance_by_two(const LargeBatch& batch) {
+        for (int k = 0; k < 2; ++k)
+            if (++column == batch.columns) {
+                column = 0;
+                ++row;
+            }
+    }
+    __device__ uint32_t index(const FrameImage& image, const LargeBatch& batch) const {
+        return image.first_tile + (batch.top + row) * image.tile_columns + batch.left + column;
+    }
+};
+
+// Calls visit(k, tile) for the tiles of the window from `first` on, 32 at most: a tile for the lower half of
+// the warp and the next one, which may lie past the window, for the upper half. They are the tiles k and
+// k + 1 of those.
+template <class Visit>
+__device__ void for_each_two_tiles(const LargeBatch& batch, int first, const Visit& visit) {
+    WindowTile tile(batch, first + static_cast<int>(threadIdx.x % 32 / kLargeAtOnce));
+    for (int k = 0; k < 32 && first + k < batch.tiles; k += 2, tile.advance_by_two(batch)) visit(k, tile);
+}
+
+// Which records of the batch touch the tile first + lane of its window, a bit each.
+__device__ uint32_t records_of_tile(const LargeBatch& batch, const WindowRuns& runs, int first) {
+    const unsigned lane = threadIdx.x % 32;
+    uint32_t of_tile = 0;
+    for_each_two_tiles(batch, first, [&](unsigned k, const WindowTile& tile) {
+        const int row = tile.row - batch.first_row;
+        const bool has_row = 0 <= row && row < batch.rows;
+        const int run = has_row ? runs[batch.rows_after - batch.rows + row] : 0;
+        const unsigned both = __ballot_sync(kAllLanes, (run & 255) <= tile.column && tile.column < run >> 8);
+        if ((lane & ~1u) == k) of_tile = both >> kLargeAtOnce * (lane & 1) & ((1u << kLargeAtOnce) - 1);
+    });
+    return of_tile;
 }
 
 __global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinInput in) {
     if (!is_complete(in)) return;
-    __shared__ uint32_t counts[kWarps][kMostWindow];
-    uint32_t* count = counts[threadIdx.x / 32];
+    __shared__ WindowRuns all_runs[kWarps];
+    WindowRuns& runs = all_runs[threadIdx.x / 32];
     for_each_batch(in, [&](const LargeBatch& batch) {
-        if (batch.window == 0) {
-            for_each_run(in, batch, [&](const LargeRecord& large, const TileRun& run) {
+        if (batch.tiles == 0) {
+            for_each_run(in, batch, [&](int, const LargeRecord& large, const TileRun& run) {
                 const FrameImage& image = in.images[large.image];
                 uint32_t* to = in.counts.count + image.first_tile + run.row * image.tile_columns + run.first;
                 for (int k = 0; k < run.count; ++k) atomicAdd(to + k, 1u);
             });
             return;
         }
-        count_window(in, batch, count);
-        for (int first = 0; first < batch.window; first += 32) {
-            const int t = first + threadIdx.x % 32;
-            const uint32_t tile = tile_of_window(in, batch, t);
-            if (t < batch.window && count[t] > 0) atomicAdd(in.counts.count + tile, count[t]);
+        write_runs(in, batch, runs);
+        const FrameImage& image = in.images[__shfl_sync(kAllLanes, batch.mine.image, 0)];
+        for (int first = 0; first < batch.tiles; first += 32) {
+            const uint32_t records = records_of_tile(batch, runs, first);
+            const WindowTile tile(batch, first + threadIdx.x % 32);
+            if (records != 0)
+                atomicAdd(in.counts.count + tile.index(image, batch), unsigned(__popc(records)));
         }
-        __syncwarp();
     });
 }
 
@@ -219,6 +258,49 @@ __device__ Record<float> end_of_record(const Record<float>* record) {
     return r;
 }
 
+// A batch without a window.
+__device__ void scatter_runs(const TileBinInput& in, const Scatter& to, const LargeBatch& batch) {
+    for_each_run(in, batch, [&](int, const LargeRecord& large, const TileRun& run) {
+        const Record<float> r = end_of_record(in.records + large.record);
+        const FrameImage& image = in.images[large.image];
+        const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
+        const EntryBox box = entry_box(r);
+        for (int k = 0; k < run.count; ++k) {
+            const uint32_t tile = image.first_tile + run.row * image.tile_columns + run.first + k;
+            to.entries[to.tile_first[tile] + (atomicSub(to.left + tile, 1u) - 1)] =
+                tile_entry(depth, large.record, box, run.first + k, run.row);
+        }
+    });
+}
+
+// A batch with one: what it has for a tile is written at once.
+__device__ void scatter_window(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
+                               WindowRuns& runs) {
+    write_runs(in, batch, runs);
+    const FrameImage& image = in.images[__shfl_sync(kAllLanes, batch.mine.image, 0)];
+    const unsigned lane = threadIdx.x % 32, mine = lane % kLargeAtOnce;
+    const Record<float> r = end_of_record(in.records + batch.mine.record);
+    const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
+    const EntryBox box = entry_box(r);
+    for (int first = 0; first < batch.tiles; first += 32) {
+        const uint32_t records = records_of_tile(batch, runs, first);
+        unsigned long long place = 0;
+        if (records != 0) {
+            const uint32_t tile = WindowTile(batch, first + lane).index(image, batch),
+                           count = __popc(records);
+            place = to.tile_first[tile] + (atomicSub(to.left + tile, count) - count);
+        }
+        for_each_two_tiles(batch, first, [&](unsigned k, const WindowTile& tile) {
+            const unsigned from = k + lane / kLargeAtOnce;
+            const uint32_t of_tile = __shfl_sync(kAllLanes, records, from);
+            const unsigned long long begin = __shfl_sync(kAllLanes, place, from);
+            if (of_tile >> mine & 1)
+                to.entries[begin + __popc(of_tile & ((1u << mine) - 1))] =
+                    tile_entry(depth, batch.mine.record, box, batch.left + tile.column, batch.top + tile.row);
+        });
+    }
+}
+
 // Blocks take items, a thread a record, and then the records over many tiles. An item's table is fetched two
 // items before its turn, its records one.
 __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput in, TileBinOutput out) {
@@ -241,40 +323,13 @@ __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput
         next = later;
         few = next_few;
     }
-    __shared__ uint32_t counts[kWarps][kMostWindow];
-    __shared__ unsigned long long firsts[kWarps][kMostWindow];
-    uint32_t* count = counts[threadIdx.x / 32];
-    unsigned long long* first_place = firsts[threadIdx.x / 32];
+    __shared__ WindowRuns all_runs[kWarps];
+    WindowRuns& runs = all_runs[threadIdx.x / 32];
     for_each_batch(in, [&](const LargeBatch& batch) {
-        if (batch.window > 0) {
-            count_window(in, batch, count);
-            for (int first = 0; first < batch.window; first += 32) {
-                const int t = first + threadIdx.x % 32;
-                const uint32_t tile = tile_of_window(in, batch, t);
-                if (t >= batch.window || count[t] == 0) continue;
-                first_place[t] = to.tile_first[tile] + (atomicSub(to.left + tile, count[t]) - count[t]);
-                count[t] = 0;
-            }
-            __syncwarp();
-        }
-        for_each_run(in, batch, [&](const LargeRecord& large, const TileRun& run) {
-            const Record<float> r = end_of_record(in.records + large.record);
-            const FrameImage& image = in.images[large.image];
-            const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
-            const EntryBox box = entry_box(r);
-            for (int k = 0; k < run.count; ++k) {
-                unsigned long long place;
-                if (batch.window > 0) {
-                    const int t = (run.row - batch.top) * batch.columns + (run.first + k - batch.left);
-                    place = first_place[t] + atomicAdd(count + t, 1u);
-                } else {
-                    const uint32_t tile = image.first_tile + run.row * image.tile_columns + run.first + k;
-                    place = to.tile_first[tile] + (atomicSub(to.left + tile, 1u) - 1);
-                }
-                to.entries[place] = tile_entry(depth, large.record, box, run.first + k, run.row);
-            }
-        });
-        __syncwarp();
+        if (batch.tiles == 0)
+            scatter_runs(in, to, batch);
+        else
+            scatter_window(in, to, batch, runs);
     });
 }
 
