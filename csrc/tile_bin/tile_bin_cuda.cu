@@ -24,6 +24,25 @@ __device__ bool is_complete(const TileBinInput& in) {
            *in.counts.num_large <= in.large_capacity;
 }
 
+// In whole words, and of those what is used; without its colour.
+__device__ Record<float> load_record(const Record<float>* record) {
+    const uint4* words = reinterpret_cast<const uint4*>(record);
+    const uint4 a = words[0], b = words[1], c = words[2];
+    Record<float> r;
+    r.u = __uint_as_float(a.x);
+    r.v = __uint_as_float(a.y);
+    r.l11 = __uint_as_float(a.z);
+    r.l12 = __uint_as_float(a.w);
+    r.l22 = __uint_as_float(b.x);
+    r.log2_opacity = __uint_as_float(b.y);
+    r.depth = __uint_as_float(c.y);
+    r.x0 = static_cast<uint16_t>(c.z);
+    r.x1 = static_cast<uint16_t>(c.z >> 16);
+    r.y0 = static_cast<uint16_t>(c.w);
+    r.y1 = static_cast<uint16_t>(c.w >> 16);
+    return r;
+}
+
 // Large records that a warp takes together; lanes 16 apart have the same one. Neighbours cover the same
 // tiles, so where the tiles that they all lie in are few enough, the window, a tile is looked at for all of
 // them at once.
@@ -32,20 +51,21 @@ struct LargeBatch {
     int first_row, rows;            // of tiles, of this lane; in the window
     int rows_after;                 // of all up to it
     int left, top, columns, tiles;  // of the window; no window when there are no tiles
+    float columns_inverse;
 };
 constexpr int kMostTiles = 255, kMostRows = 256;
 
-// For each row of each record of a batch the columns [first, end) of the window: first | end << 8.
+// For each row of each record of a batch `count` columns of the window from `first` on: first | count << 8.
 using WindowRuns = uint16_t[kMostRows];
 
 __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first, unsigned long long end) {
     const unsigned k = threadIdx.x % kLargeAtOnce;
-    LargeBatch batch{{0, 0}, 0, 0, 0, 0, 0, 0, 0};
+    LargeBatch batch{{0, 0}, 0, 0, 0, 0, 0, 0, 0, 0};
     int left = 1 << 20, top = left, right = -left, bottom = -left;
     const bool is_there = first + k < end;
     if (is_there) {
         batch.mine = in.large[first + k];
-        const Record<float>& r = in.records[batch.mine.record];
+        const Record<float> r = load_record(in.records + batch.mine.record);
         left = r.x0 / kFrameTileWidth;
         right = r.x1 / kFrameTileWidth;
         top = r.y0 / kFrameTileHeight;
@@ -63,6 +83,7 @@ __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long firs
     batch.first_row = top - batch.top;
     batch.columns = -warp_min(-right) - batch.left + 1;
     batch.tiles = batch.columns * (-warp_min(-bottom) - batch.top + 1);
+    batch.columns_inverse = 1 / static_cast<float>(batch.columns);
     const bool same_image = batch.mine.image == __shfl_sync(kAllLanes, batch.mine.image, 0);
     const bool is_small = batch.tiles <= kMostTiles && batch.rows_after <= kMostRows;
     if (!__all_sync(kAllLanes, is_small && (same_image || !is_there))) batch.tiles = 0;
@@ -84,7 +105,8 @@ __device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, co
                                         __shfl_sync(kAllLanes, batch.rows, owner));
         const LargeRecord large{__shfl_sync(kAllLanes, batch.mine.record, owner),
                                 __shfl_sync(kAllLanes, batch.mine.image, owner)};
-        if (first + lane < total) visit(row, large, tile_run(in.records[large.record], row_of_owner));
+        if (first + lane < total)
+            visit(row, large, tile_run(load_record(in.records + large.record), row_of_owner));
     }
 }
 
@@ -101,25 +123,19 @@ __device__ void for_each_batch(const TileBinInput& in, const Visit& visit) {
 __device__ void write_runs(const TileBinInput& in, const LargeBatch& batch, WindowRuns& runs) {
     __syncwarp();  // the batch before may still be read
     for_each_run(in, batch, [&](int row, const LargeRecord&, const TileRun& run) {
-        const int first = run.first - batch.left;
-        runs[row] = run.count == 0 ? 0 : static_cast<uint16_t>(first | (first + run.count) << 8);
+        runs[row] = run.count == 0 ? 0 : static_cast<uint16_t>(run.first - batch.left | run.count << 8);
     });
     __syncwarp();
 }
 
-// A tile of a window.
+// Tile t of a batch's window.
 struct WindowTile {
     int row, column;
 
+    // Halfway between two multiples of 1 / columns, whatever the quotient's last bits.
     __device__ WindowTile(const LargeBatch& batch, int t)
-        : row(t / batch.columns), column(t % batch.columns) {}
-    __device__ void advance_by_two(const LargeBatch& batch) {
-        for (int k = 0; k < 2; ++k)
-            if (++column == batch.columns) {
-                column = 0;
-                ++row;
-            }
-    }
+        : row(static_cast<int>((static_cast<float>(t) + 0.5f) * batch.columns_inverse)),
+          column(t - row * batch.columns) {}
     __device__ uint32_t index(const FrameImage& image, const LargeBatch& batch) const {
         return image.first_tile + (batch.top + row) * image.tile_columns + batch.left + column;
     }
@@ -130,22 +146,24 @@ struct WindowTile {
 // k + 1 of those.
 template <class Visit>
 __device__ void for_each_two_tiles(const LargeBatch& batch, int first, const Visit& visit) {
-    WindowTile tile(batch, first + static_cast<int>(threadIdx.x % 32 / kLargeAtOnce));
-    for (int k = 0; k < 32 && first + k < batch.tiles; k += 2, tile.advance_by_two(batch)) visit(k, tile);
+    const int upper = threadIdx.x % 32 / kLargeAtOnce, end = min(batch.tiles - first, 32);
+    for (int k = 0; k < end; k += 2) visit(k, WindowTile(batch, first + k + upper));
 }
 
 // Which records of the batch touch the tile first + lane of its window, a bit each.
 __device__ uint32_t records_of_tile(const LargeBatch& batch, const WindowRuns& runs, int first) {
     const unsigned lane = threadIdx.x % 32;
+    const int before = batch.rows_after - batch.rows;
     uint32_t of_tile = 0;
     for_each_two_tiles(batch, first, [&](unsigned k, const WindowTile& tile) {
         const int row = tile.row - batch.first_row;
-        const bool has_row = 0 <= row && row < batch.rows;
-        const int run = has_row ? runs[batch.rows_after - batch.rows + row] : 0;
-        const unsigned both = __ballot_sync(kAllLanes, (run & 255) <= tile.column && tile.column < run >> 8);
-        if ((lane & ~1u) == k) of_tile = both >> kLargeAtOnce * (lane & 1) & ((1u << kLargeAtOnce) - 1);
+        const bool has_row = static_cast<unsigned>(row) < static_cast<unsigned>(batch.rows);
+        const int run = runs[has_row ? before + row : 0];
+        const unsigned both = __ballot_sync(
+            kAllLanes, has_row && static_cast<unsigned>(tile.column - (run & 255)) < unsigned(run) >> 8);
+        if ((lane & ~1u) == k) of_tile = both;
     });
-    return of_tile;
+    return of_tile >> kLargeAtOnce * (lane & 1) & ((1u << kLargeAtOnce) - 1);
 }
 
 __global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinInput in) {
@@ -246,22 +264,10 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item, uint32_t r
     }
 }
 
-// Depth and box of a record, which are all that its last 16 bytes hold of it but a colour.
-__device__ Record<float> end_of_record(const Record<float>* record) {
-    const uint4 end = reinterpret_cast<const uint4*>(record)[2];
-    Record<float> r;
-    r.depth = __uint_as_float(end.y);
-    r.x0 = static_cast<uint16_t>(end.z);
-    r.x1 = static_cast<uint16_t>(end.z >> 16);
-    r.y0 = static_cast<uint16_t>(end.w);
-    r.y1 = static_cast<uint16_t>(end.w >> 16);
-    return r;
-}
-
 // A batch without a window.
 __device__ void scatter_runs(const TileBinInput& in, const Scatter& to, const LargeBatch& batch) {
     for_each_run(in, batch, [&](int, const LargeRecord& large, const TileRun& run) {
-        const Record<float> r = end_of_record(in.records + large.record);
+        const Record<float> r = load_record(in.records + large.record);
         const FrameImage& image = in.images[large.image];
         const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
         const EntryBox box = entry_box(r);
@@ -279,7 +285,7 @@ __device__ void scatter_window(const TileBinInput& in, const Scatter& to, const 
     write_runs(in, batch, runs);
     const FrameImage& image = in.images[__shfl_sync(kAllLanes, batch.mine.image, 0)];
     const unsigned lane = threadIdx.x % 32, mine = lane % kLargeAtOnce;
-    const Record<float> r = end_of_record(in.records + batch.mine.record);
+    const Record<float> r = load_record(in.records + batch.mine.record);
     const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
     const EntryBox box = entry_box(r);
     for (int first = 0; first < batch.tiles; first += 32) {
