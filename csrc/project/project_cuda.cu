@@ -344,7 +344,7 @@ __device__ void report_item(const ItemTables<Model>& tables, unsigned item, unsi
 
 __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum, unsigned num_records) {
     num_in_frustum = warp_sum(num_in_frustum);
-    if (threadIdx.x % 32 != 0) return;
+    if (threadIdx.x % 32 != 0 || num_in_frustum == 0) return;  // there is no record that is not in it
     atomicAdd(&counters.in_frustum, static_cast<unsigned long long>(num_in_frustum));
     atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));
 }
