@@ -26,6 +26,13 @@ def test_instances_are_counted_and_composed():
     assert repr(scene) == "Scene(4 instances of 2 bundles)"
 
 
+def test_table_of_a_bundle_is_made_once():
+    """Every picture of a bundle makes a scene of it, and the table has a row a cluster."""
+    table = Scene.of(BUNDLE).tables[0]
+    assert Scene.of(BUNDLE).tables[0] is table
+    assert Scene.of(OTHER).tables[0] is not table
+
+
 @given(quaternion=st.tuples(*[st.floats(-1e150, 1e150)] * 4).filter(any))
 def test_rotations_are_rotations(quaternion):
     scene = Scene()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any
 
 import numpy as np
@@ -224,18 +225,24 @@ def rotation_from_quaternion(quaternions: Floats) -> Floats:
     return np.ascontiguousarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
 
 
+# Of bundles, as long as those live: a bundle is made a scene for every picture of it.
+_tables: weakref.WeakKeyDictionary[Bundle, _core.ClusterTable] = weakref.WeakKeyDictionary()
+
+
 def _table_of(bundle: Bundle) -> _core.ClusterTable:
-    clusters, groups = bundle.clusters, bundle.groups
-    return _core.ClusterTable(
-        groups.ball,
-        groups.weight,
-        groups.level,
-        clusters.own_group,
-        clusters.parent_group,
-        clusters.box,
-        clusters.filter_px2,
-        clusters.offset,
-    )
+    if bundle not in _tables:
+        clusters, groups = bundle.clusters, bundle.groups
+        _tables[bundle] = _core.ClusterTable(
+            groups.ball,
+            groups.weight,
+            groups.level,
+            clusters.own_group,
+            clusters.parent_group,
+            clusters.box,
+            clusters.filter_px2,
+            clusters.offset,
+        )
+    return _tables[bundle]
 
 
 _ROW = {"positions": (3,), "quaternions": (4,), "scales": ()}
