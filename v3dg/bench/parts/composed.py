@@ -127,6 +127,13 @@ def verdict(result: dict[str, Any]) -> Verdict:
             f"{far['ours_flip']:.4f} instead of {far['full_flip']:.4f}"
         )
         out.judge(far["ours_ms"] < far["full_ms"] and far["ours_flip"] <= far["full_flip"], text)
+        blurred = max(by_distance(scene), key=lambda row: row["ours_flip"] - row["full_flip"])
+        if blurred["ours_flip"] > 1.02 * blurred["full_flip"]:
+            out.losses.append(
+                f"{scene['scene']} at distance {blurred['distance']:.3g}: FLIP {blurred['ours_flip']:.4f} "
+                f"against {blurred['full_flip']:.4f} without levels ({blurred['ours_ms']:.2f} ms against "
+                f"{blurred['full_ms']:.2f})"
+            )
         # By the quickest frames, which other work on the machine disturbs least.
         slower = [row for row in by_distance(scene) if row["ours_least_ms"] > 1.02 * row["full_least_ms"]]
         if slower:
