@@ -25,7 +25,7 @@ def provenance(device: str = "cpu") -> dict[str, Any]:
         names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     result: dict[str, Any] = {
         "commit": _commit(),
-        "command": " ".join(Path(a).name if os.sep in a else a for a in sys.argv),
+        "command": _command(),
         "processor": names[0] if names else platform.processor(),
         "cores": os.cpu_count(),
         "threads": int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1)),
@@ -37,6 +37,14 @@ def provenance(device: str = "cpu") -> dict[str, Any]:
 
         result |= {"gpu": torch.cuda.get_device_name(), "cuda": str(torch.version.cuda)}
     return result | {name: version for name in _LIBRARIES if (version := _version(name))}
+
+
+def _command() -> str:
+    """As it was typed, without folders."""
+    words = [Path(word).name if os.sep in word else word for word in sys.argv]
+    if words[0] == "__main__.py":
+        words[0] = f"python -m {Path(sys.argv[0]).parent.name}"
+    return " ".join(words)
 
 
 def _commit() -> str:
