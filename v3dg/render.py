@@ -202,8 +202,9 @@ class Renderer:
     """Draws one scene, bundle or asset on torch's current CUDA device, with what that needs.
 
     Enqueuing a picture waits for nothing, so pictures can be drawn ahead, and captured in a CUDA graph: draw
-    once what the graph will meet, so that there is memory enough, then capture `render`. Keep the renderer as
-    long as the graph. A picture that is under way when its scene is changed is finished first.
+    once what the graph will meet, so that it is all on the device, then capture `render`; what was not drawn
+    before is a RuntimeError. Keep the renderer as long as the graph, and capture again when the scene has
+    changed. A picture that is under way when its scene is changed is finished first.
 
     Args:
         color_by: As in `v3dg.render`.

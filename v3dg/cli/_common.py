@@ -53,10 +53,10 @@ def load_asset_or_bundle(path: Path) -> Gaussians | Bundle:
 
 
 def require_file(path: Path, *suffixes: str) -> None:
-    if not path.name.lower().endswith(suffixes):
-        raise ValueError(f"{path}: expected a file ending in {', '.join(suffixes)}")
     if not path.exists():
         raise ValueError(f"{path}: expected a file, got nothing there; check the path")
+    if not path.name.lower().endswith(suffixes):
+        raise ValueError(f"{path}: expected a file ending in {', '.join(suffixes)}")
 
 
 def require_subject(path: Path) -> None:
