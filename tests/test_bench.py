@@ -267,6 +267,12 @@ def test_report_of_an_empty_folder_says_what_to_run(tmp_path):
         report.read_results(tmp_path)
 
 
+@pytest.mark.parametrize("degrees", [-1e-5, 0.0, 1e-5])
+def test_views_of_rounded_cameras_are_from_one_direction(degrees):
+    camera = bench.stage.orbit_view(degrees, 45, 3, (64, 36)).camera
+    assert bench.stage.views_of([camera])[0].azimuth == 0
+
+
 @pytest.mark.gpu
 @pytest.mark.slow
 def test_parts_run_on_cuda(tmp_path):
