@@ -41,7 +41,9 @@ template <class Model>
 struct WarpSpace {
     ItemTables<Model> tables;
     alignas(16) Queued queue[kQueue];
-    uint4 records[3 * 32];  // on their way out: written by lane, read in a row
+    uint4 records[3 * 32];     // on their way out: written by lane, read in a row
+    unsigned num_large;        // of the item's records so far,
+    uint8_t large[kItemSize];  // and which they are
 };
 
 __device__ float4 load4(const float* rows, uint32_t row) {
@@ -234,10 +236,12 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
     }
     const unsigned large = __ballot_sync(kAllLanes, is_large);
     if (large != 0) {
-        unsigned long long place = 0;
-        if (lane == 0) place = atomicAdd(out.tiles.num_large, static_cast<unsigned long long>(__popc(large)));
-        place = __shfl_sync(kAllLanes, place, 0) + __popc(large & ((1u << lane) - 1));
-        if (is_large && place < out.large_capacity) out.large[place] = {first + rank, in.placement.image};
+        const unsigned before = space.num_large;
+        if (is_large)
+            space.large[before + __popc(large & ((1u << lane) - 1))] =
+                static_cast<uint8_t>(first + rank - in.item.record);
+        __syncwarp();
+        if (lane == 0) space.num_large = before + __popc(large);
     }
     __syncwarp();
     uint4* records = reinterpret_cast<uint4*>(out.records + first);
@@ -251,6 +255,20 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
                        ? in.image.first_tile + tiles.row(k) * in.image.tile_columns + tiles.column(k)
                        : kNoTile);
     return __popc(kept);
+}
+
+// The item's large records, in whole batches.
+template <class Model>
+__device__ void write_large(const WarpSpace<Model>& space, const ProjectOutput& out) {
+    const unsigned num_large = space.num_large;
+    if (num_large == 0) return;
+    const unsigned lane = threadIdx.x % 32, count = blocks_for(num_large, kLargeAtOnce) * kLargeAtOnce;
+    unsigned long long place = 0;
+    if (lane == 0) place = atomicAdd(out.tiles.num_large, static_cast<unsigned long long>(count));
+    place = __shfl_sync(kAllLanes, place, 0);
+    for (unsigned k = lane; k < count && place + k < out.large_capacity; k += 32)
+        out.large[place + k] = {k < num_large ? space.tables.item.record + space.large[k] : kNoRecord,
+                                space.tables.placement.image};
 }
 
 // Whose tables a warp has.
@@ -285,6 +303,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     constexpr unsigned kRound = kIsShared ? 1 : 32;  // gaussians
     const auto& tables = space.tables;
     const unsigned lane = threadIdx.x % 32, count = tables.item.count;
+    if (lane == 0) space.num_large = 0;
     const bool sees = !kIsShared || (tables.item.sharers >> lane & 1) != 0;
     ModelView<float> of_sharer;
     if (kIsShared && sees) of_sharer = sharers[lane].view;
@@ -330,6 +349,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         waiting -= taken;
         __syncwarp();  // before the queue and the records are written again
     }
+    write_large(space, out);
     return written;
 }
 

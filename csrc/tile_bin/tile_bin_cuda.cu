@@ -15,9 +15,8 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
-constexpr unsigned kBlocks = 6;        // on a multiprocessor
-constexpr unsigned kLargeAtOnce = 16;  // records that a warp spreads over its lanes
-constexpr uint32_t kNoItem = ~0u;      // in place of a number of records
+constexpr unsigned kBlocks = 6;    // on a multiprocessor
+constexpr uint32_t kNoItem = ~0u;  // in place of a number of records
 
 __device__ bool is_complete(const TileBinInput& in) {
     return in.counters->items <= in.item_capacity && in.counters->gaussians <= in.record_capacity &&
@@ -47,7 +46,8 @@ __device__ Record<float> load_record(const Record<float>* record) {
 // tiles, so where the tiles that they all lie in are few enough, the window, a tile is looked at for all of
 // them at once.
 struct LargeBatch {
-    LargeRecord mine;               // of this lane
+    uint32_t image;
+    uint32_t record;                // of this lane; the first one where it has none
     int first_row, rows;            // of tiles, of this lane; in the window
     int rows_after;                 // of all up to it
     int left, top, columns, tiles;  // of the window; no window when there are no tiles
@@ -58,14 +58,15 @@ constexpr int kMostTiles = 255, kMostRows = 256;
 // For each row of each record of a batch `count` columns of the window from `first` on: first | count << 8.
 using WindowRuns = uint16_t[kMostRows];
 
-__device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first, unsigned long long end) {
+__device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first) {
     const unsigned k = threadIdx.x % kLargeAtOnce;
-    LargeBatch batch{{0, 0}, 0, 0, 0, 0, 0, 0, 0, 0};
+    const LargeRecord mine = in.large[first + k];
+    const uint32_t first_record = __shfl_sync(kAllLanes, mine.record, 0);
+    LargeBatch batch{mine.image, first_record, 0, 0, 0, 0, 0, 0, 0, 0};
     int left = 1 << 20, top = left, right = -left, bottom = -left;
-    const bool is_there = first + k < end;
-    if (is_there) {
-        batch.mine = in.large[first + k];
-        const Record<float> r = load_record(in.records + batch.mine.record);
+    if (mine.record != kNoRecord) {
+        batch.record = mine.record;
+        const Record<float> r = load_record(in.records + mine.record);
         left = r.x0 / kFrameTileWidth;
         right = r.x1 / kFrameTileWidth;
         top = r.y0 / kFrameTileHeight;
@@ -84,13 +85,11 @@ __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long firs
     batch.columns = -warp_min(-right) - batch.left + 1;
     batch.tiles = batch.columns * (-warp_min(-bottom) - batch.top + 1);
     batch.columns_inverse = 1 / static_cast<float>(batch.columns);
-    const bool same_image = batch.mine.image == __shfl_sync(kAllLanes, batch.mine.image, 0);
-    const bool is_small = batch.tiles <= kMostTiles && batch.rows_after <= kMostRows;
-    if (!__all_sync(kAllLanes, is_small && (same_image || !is_there))) batch.tiles = 0;
+    if (!__all_sync(kAllLanes, batch.tiles <= kMostTiles && batch.rows_after <= kMostRows)) batch.tiles = 0;
     return batch;
 }
 
-// Calls visit(row, large record, run) for the rows of tiles of a batch, a lane a row.
+// Calls visit(row, record, run) for the rows of tiles of a batch, a lane a row.
 template <class Visit>
 __device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, const Visit& visit) {
     const int lane = threadIdx.x % 32, total = __shfl_sync(kAllLanes, batch.rows_after, kLargeAtOnce - 1);
@@ -103,10 +102,9 @@ __device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, co
             if (__shfl_sync(kAllLanes, batch.rows_after, owner + step - 1) <= row) owner += step;
         const int row_of_owner = row - (__shfl_sync(kAllLanes, batch.rows_after, owner) -
                                         __shfl_sync(kAllLanes, batch.rows, owner));
-        const LargeRecord large{__shfl_sync(kAllLanes, batch.mine.record, owner),
-                                __shfl_sync(kAllLanes, batch.mine.image, owner)};
+        const uint32_t record = __shfl_sync(kAllLanes, batch.record, owner);
         if (first + lane < total)
-            visit(row, large, tile_run(load_record(in.records + large.record), row_of_owner));
+            visit(row, record, tile_run(load_record(in.records + record), row_of_owner));
     }
 }
 
@@ -117,12 +115,12 @@ __device__ void for_each_batch(const TileBinInput& in, const Visit& visit) {
     const unsigned long long stride = static_cast<unsigned long long>(gridDim.x) * kWarps * kLargeAtOnce;
     for (unsigned long long at = (blockIdx.x * kWarps + threadIdx.x / 32) * kLargeAtOnce; at < end;
          at += stride)
-        visit(load_batch(in, at, end));
+        visit(load_batch(in, at));
 }
 
 __device__ void write_runs(const TileBinInput& in, const LargeBatch& batch, WindowRuns& runs) {
     __syncwarp();  // the batch before may still be read
-    for_each_run(in, batch, [&](int row, const LargeRecord&, const TileRun& run) {
+    for_each_run(in, batch, [&](int row, uint32_t, const TileRun& run) {
         runs[row] = run.count == 0 ? 0 : static_cast<uint16_t>(run.first - batch.left | run.count << 8);
     });
     __syncwarp();
@@ -171,16 +169,15 @@ __global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinI
     __shared__ WindowRuns all_runs[kWarps];
     WindowRuns& runs = all_runs[threadIdx.x / 32];
     for_each_batch(in, [&](const LargeBatch& batch) {
+        const FrameImage& image = in.images[batch.image];
         if (batch.tiles == 0) {
-            for_each_run(in, batch, [&](int, const LargeRecord& large, const TileRun& run) {
-                const FrameImage& image = in.images[large.image];
+            for_each_run(in, batch, [&](int, uint32_t, const TileRun& run) {
                 uint32_t* to = in.counts.count + image.first_tile + run.row * image.tile_columns + run.first;
                 for (int k = 0; k < run.count; ++k) atomicAdd(to + k, 1u);
             });
             return;
         }
         write_runs(in, batch, runs);
-        const FrameImage& image = in.images[__shfl_sync(kAllLanes, batch.mine.image, 0)];
         for (int first = 0; first < batch.tiles; first += 32) {
             const uint32_t records = records_of_tile(batch, runs, first);
             const WindowTile tile(batch, first + threadIdx.x % 32);
@@ -266,15 +263,15 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item, uint32_t r
 
 // A batch without a window.
 __device__ void scatter_runs(const TileBinInput& in, const Scatter& to, const LargeBatch& batch) {
-    for_each_run(in, batch, [&](int, const LargeRecord& large, const TileRun& run) {
-        const Record<float> r = load_record(in.records + large.record);
-        const FrameImage& image = in.images[large.image];
+    const FrameImage& image = in.images[batch.image];
+    for_each_run(in, batch, [&](int, uint32_t record, const TileRun& run) {
+        const Record<float> r = load_record(in.records + record);
         const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
         const EntryBox box = entry_box(r);
         for (int k = 0; k < run.count; ++k) {
             const uint32_t tile = image.first_tile + run.row * image.tile_columns + run.first + k;
             to.entries[to.tile_first[tile] + (atomicSub(to.left + tile, 1u) - 1)] =
-                tile_entry(depth, large.record, box, run.first + k, run.row);
+                tile_entry(depth, record, box, run.first + k, run.row);
         }
     });
 }
@@ -283,9 +280,9 @@ __device__ void scatter_runs(const TileBinInput& in, const Scatter& to, const La
 __device__ void scatter_window(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
                                WindowRuns& runs) {
     write_runs(in, batch, runs);
-    const FrameImage& image = in.images[__shfl_sync(kAllLanes, batch.mine.image, 0)];
+    const FrameImage& image = in.images[batch.image];
     const unsigned lane = threadIdx.x % 32, mine = lane % kLargeAtOnce;
-    const Record<float> r = load_record(in.records + batch.mine.record);
+    const Record<float> r = load_record(in.records + batch.record);
     const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
     const EntryBox box = entry_box(r);
     for (int first = 0; first < batch.tiles; first += 32) {
@@ -302,7 +299,7 @@ __device__ void scatter_window(const TileBinInput& in, const Scatter& to, const 
             const unsigned long long begin = __shfl_sync(kAllLanes, place, from);
             if (of_tile >> mine & 1)
                 to.entries[begin + __popc(of_tile & ((1u << mine) - 1))] =
-                    tile_entry(depth, batch.mine.record, box, batch.left + tile.column, batch.top + tile.row);
+                    tile_entry(depth, batch.record, box, batch.left + tile.column, batch.top + tile.row);
         });
     }
 }

@@ -6,10 +6,13 @@
 namespace v3dg {
 namespace cuda {
 
-// A record over more than kFewTiles tiles.
+// A record over more than kFewTiles tiles. They come in batches of kLargeAtOnce of one item, so of neighbours
+// in one picture; what a batch lacks is filled up at its end.
 struct LargeRecord {
-    uint32_t record, image;
+    uint32_t record, image;  // kNoRecord where there is none
 };
+constexpr unsigned kLargeAtOnce = 16;
+constexpr uint32_t kNoRecord = ~0u;
 
 // The records of an item, and the tiles of their picture.
 struct ItemTiles {
@@ -19,7 +22,7 @@ struct ItemTiles {
 // What project() has found out of the tiles, and scratch of tile_bin(). Cleared before project().
 struct TileCounts {
     uint32_t* count;  // [num_tiles] of the records over at most kFewTiles; zero after tile_bin()
-    unsigned long long* num_large;
+    unsigned long long* num_large;  // whole batches
     unsigned* ticket;
     unsigned long long* state;  // [tile_bin_parts(num_tiles)]
 };
