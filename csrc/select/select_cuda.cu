@@ -31,6 +31,7 @@ struct ClusterBounds {
     float least_own_radius, least_own_weight;
     int32_t least_own_level;
     bool has_leaf, has_root;
+    uint8_t alike;  // bit k: cluster k is drawn with the filter of the one before
 };
 
 // What one budget leaves for the next.
@@ -51,7 +52,7 @@ constexpr uint32_t kChooseShare = (kNumBudgetBins + kChooseThreads - 1) / kChoos
 // More than rounding can do to a metric, which is compared with what bounds it.
 constexpr float kBoundMargin = 1e-3f;
 constexpr float kMostGuess = 1 << 20;
-static_assert(kEach <= 8, "a byte says which top clusters are drawn");
+static_assert(kEach <= 8, "a byte says which of them are drawn, and which alike");
 
 using Count = unsigned long long;
 
@@ -163,9 +164,9 @@ struct LaneClusters {
     __device__ int32_t cluster(unsigned k) const {
         return are_tops ? bundle->table.top_cluster[k] : static_cast<int32_t>(first + k);
     }
-    __device__ unsigned size(unsigned k) const {
+    __device__ unsigned size(unsigned k, unsigned count = 1) const {
         const int32_t c = cluster(k);
-        return static_cast<unsigned>(bundle->table.offset[c + 1] - bundle->table.offset[c]);
+        return static_cast<unsigned>(bundle->table.offset[c + count] - bundle->table.offset[c]);
     }
 };
 
@@ -366,14 +367,14 @@ struct PairOutput {
     }
 };
 
-// A cluster that is drawn for the `count` instances of `sharers`, bits above the first of the part; or, where
-// those are none, for the lane's.
-struct DrawnCluster {
-    unsigned k;
+// Neighbouring clusters that are drawn alike, for the lane's instance; or one that is drawn for all instances
+// of `sharers`, bits above the first of the part.
+struct DrawnRun {
+    unsigned k, num_clusters;
     uint32_t sharers;
-    unsigned count;
+    unsigned num_instances;
 
-    __device__ unsigned gaussians_an_item() const { return kItemSize / count; }
+    __device__ unsigned gaussians_an_item() const { return kItemSize / num_instances; }
 };
 
 // Whether a warp is quicker with a cluster's gaussians one by one, each for all its instances at once, than
@@ -382,12 +383,18 @@ __device__ bool is_worth_sharing(unsigned num_gaussians, unsigned num_instances)
     return num_instances > 1 && num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
 }
 
-// Calls visit(DrawnCluster) in the lane that writes it; for whole warps.
+// Calls visit(DrawnRun) in the lane that writes it; for whole warps.
 template <class Visit>
 __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     if (!mine.are_tops) {
-        for (unsigned k = 0; k < kEach; ++k)
-            if (mine.drawn >> k & 1) visit(DrawnCluster{k, 0, 1});
+        if (mine.drawn == 0) return;
+        const unsigned alike = mine.bundle->bounds[mine.first / kEach].alike;
+        for (unsigned k = 0, end; k < kEach; k = end) {
+            end = k + 1;
+            if ((mine.drawn >> k & 1) == 0) continue;
+            while ((mine.drawn & alike) >> end & 1) ++end;
+            visit(DrawnRun{k, end - k, 0, 1});
+        }
         return;
     }
     const unsigned same_bundle =
@@ -397,40 +404,41 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
         const unsigned sharers = __ballot_sync(kAllLanes, is_drawn) & same_bundle, count = __popc(sharers);
         if (!is_drawn) continue;
         if (!is_worth_sharing(mine.size(k), count))
-            visit(DrawnCluster{k, 0, 1});
+            visit(DrawnRun{k, 1, 0, 1});
         else if (threadIdx.x % 32 + 1 == static_cast<unsigned>(__ffs(sharers)))
-            visit(DrawnCluster{k, sharers, count});
+            visit(DrawnRun{k, 1, sharers, count});
     }
 }
 
-// Selected clusters as items; the tops of neighbours share theirs.
+// Selected clusters as items, neighbours together; the tops of neighbouring instances share theirs.
 struct ItemOutput {
     ItemList items;
 
     __device__ Share share(const LaneClusters& mine) const {
         Share share{0, 0};
-        for_each_drawn(mine, [&](const DrawnCluster& c) {
-            const unsigned size = mine.size(c.k);
-            share.units += blocks_for(size, c.gaussians_an_item());
-            share.gaussians += c.count * size;
+        for_each_drawn(mine, [&](const DrawnRun& run) {
+            const unsigned size = mine.size(run.k, run.num_clusters);
+            share.units += blocks_for(size, run.gaussians_an_item());
+            share.gaussians += run.num_instances * size;
         });
         return share;
     }
     __device__ void write(const LaneClusters& mine, Count first, Count record) const {
-        for_each_drawn(mine, [&](const DrawnCluster& c) {
-            const int32_t cluster = mine.cluster(c.k);
-            const unsigned size = mine.size(c.k), step = c.gaussians_an_item();
-            const uint32_t placement = c.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
+        for_each_drawn(mine, [&](const DrawnRun& run) {
+            const int32_t cluster = mine.cluster(run.k);
+            const unsigned size = mine.size(run.k, run.num_clusters), step = run.gaussians_an_item();
+            const uint32_t placement = run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
             const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.offset[cluster]);
             const float filter_px2 = mine.bundle->filters.filter_px2[cluster];
             const uint32_t compensate = mine.bundle->filters.compensate[cluster];
             for (unsigned skip = 0; skip < size; skip += step, ++first) {
                 const unsigned count = min(step, size - skip);
-                if (first < items.item_capacity && record + c.count * count <= items.record_capacity)
+                if (first < items.item_capacity &&
+                    record + run.num_instances * count <= items.record_capacity)
                     items.items[first] = {
-                        placement,  gaussian + skip, count,    static_cast<uint32_t>(record),
-                        filter_px2, compensate,      c.sharers};
-                record += c.count * count;
+                        placement,  gaussian + skip, count,      static_cast<uint32_t>(record),
+                        filter_px2, compensate,      run.sharers};
+                record += run.num_instances * count;
             }
         });
     }
@@ -544,10 +552,13 @@ class CenterBounds {
     std::vector<Ball> centers_;
 };
 
-ClusterBounds bounds_of(const ClusterTable& table, size_t first, size_t last) {
-    ClusterBounds part{kNoBox, {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false};
+ClusterBounds bounds_of(const ClusterTable& table, const ClusterFilters& filters, size_t first, size_t last) {
+    ClusterBounds part{kNoBox, {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false, 0};
     CenterBounds parents, owns;
     for (size_t c = first; c < last; ++c) {
+        if (c > first && filters.filter_px2[c] == filters.filter_px2[c - 1] &&
+            filters.compensate[c] == filters.compensate[c - 1])
+            part.alike |= 1 << (c - first);
         include_box(table.box[c], part.box);
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         part.has_leaf |= own < 0;
@@ -569,10 +580,10 @@ ClusterBounds bounds_of(const ClusterTable& table, size_t first, size_t last) {
     return part;
 }
 
-std::vector<ClusterBounds> bounds_of(const ClusterTable& table) {
+std::vector<ClusterBounds> bounds_of(const ClusterTable& table, const ClusterFilters& filters) {
     std::vector<ClusterBounds> bounds;
     for (size_t first = 0; first < table.own_group.size; first += kEach)
-        bounds.push_back(bounds_of(table, first, std::min(first + kEach, table.own_group.size)));
+        bounds.push_back(bounds_of(table, filters, first, std::min(first + kEach, table.own_group.size)));
     return bounds;
 }
 
@@ -607,7 +618,7 @@ SceneTables::SceneTables(Span<const ClusterTable> tables, Span<const ClusterFilt
         table.offset = upload(table.offset);
         table.top_group = upload(table.top_group);
         table.top_cluster = upload(table.top_cluster);
-        const std::vector<ClusterBounds> bounds = bounds_of(tables[b]);
+        const std::vector<ClusterBounds> bounds = bounds_of(tables[b], filters[b]);
         bundles[b].bounds = upload(Span<const ClusterBounds>{bounds.data(), bounds.size()}).data;
         bundles[b].filters = {upload(filters[b].filter_px2), upload(filters[b].compensate)};
         num_clusters_.push_back(table.own_group.size);
