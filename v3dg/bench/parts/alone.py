@@ -37,7 +37,7 @@ ABOUT = (
 
 _COPIED_BYTES = 256 << 20
 _MOST_BUILT = {"cpu": 20_000, "cuda": 1_000_000}
-_MOST_DRAWN = {"cpu": 1_000_000, "cuda": 20_000_000}
+_MOST_DRAWN = {"cpu": 1_000_000, "cuda": 100_000_000}
 _LEAST_PSNR = 40.0
 
 
