@@ -41,7 +41,7 @@ class Config:
     """A layout of instances of that asset; without one, that part is left out."""
     cameras: tuple[int, int] = (40, 60)
     """First camera of the layout, and the one after the last."""
-    tolerances: tuple[float, ...] = (DEFAULT_TOLERANCE, 9.0, 9.5)
+    tolerances: tuple[float, ...] = (DEFAULT_TOLERANCE, 9.0, 9.4)
     budget: int = 3_000_000
     fields: tuple[int, ...] = (100_000, 2_000_000)
     """Instances of each field."""
