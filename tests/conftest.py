@@ -1,6 +1,7 @@
 import pytest
 from hypothesis import settings
 
+import chromium
 from v3dg import _device
 
 # A shared machine can stall for longer than any deadline that would still mean something.
@@ -12,6 +13,17 @@ settings.load_profile("v3dg")
 def device(request):
     """Each device in turn; devices.py brings arrays there and back."""
     return request.param
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium, for tests that ask for playwright and skip without it."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=chromium.ARGUMENTS)
+        yield browser
+        browser.close()
 
 
 def pytest_collection_modifyitems(items):

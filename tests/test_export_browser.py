@@ -22,7 +22,7 @@ from v3dg.export import export_streamed_sog
 from v3dg.metrics import psnr
 from v3dg.procedural import make_donut
 
-playwright = pytest.importorskip("playwright.sync_api")
+pytest.importorskip("playwright.sync_api")
 
 VIEWER = os.environ.get("SUPERSPLAT_VIEWER")
 pytestmark = [
@@ -58,14 +58,6 @@ def server(tmp_path_factory, bundle):
         threading.Thread(target=server.serve_forever).start()
         yield server
         server.shutdown()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=chromium.ARGUMENTS)
-        yield browser
-        browser.close()
 
 
 def seen(browser, server, options=""):

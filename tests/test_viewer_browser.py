@@ -17,7 +17,7 @@ from v3dg.viewer.frame import Stage
 from v3dg.viewer.page import Site
 
 pytest.importorskip("viser")
-playwright = pytest.importorskip("playwright.sync_api")
+pytest.importorskip("playwright.sync_api")
 
 pytestmark = [
     pytest.mark.witness,
@@ -40,14 +40,6 @@ def site(tmp_path_factory):
     site = Site(stage, name="blobs", cameras=cameras, port=0)
     yield site
     site.close()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=chromium.ARGUMENTS)
-        yield browser
-        browser.close()
 
 
 class Tab:
