@@ -88,11 +88,12 @@ atexit.register(_residents.clear)  # while the driver is there
 def resident_of(subject: Scene | Bundle) -> ResidentScene:
     """The scene as it is now, on the current device; a bundle as a scene of one."""
     known = _residents.get(subject)
-    is_here = known is not None and known.device == _device.current_device()
-    if known is not None and is_here and isinstance(subject, Bundle):
+    if known is not None and known.device != _device.current_device():
+        known = None
+    if known is not None and isinstance(subject, Bundle):
         return known  # a bundle stays as it is
     scene = Scene.of(subject)
-    if known is None or not is_here or known.num_bundles != len(scene.bundles):
+    if known is None or known.num_bundles != len(scene.bundles):
         known = _residents[subject] = ResidentScene(scene)
     known.update(scene)
     return known

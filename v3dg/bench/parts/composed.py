@@ -120,14 +120,15 @@ def tables(result: dict[str, Any]) -> str:
 def verdict(result: dict[str, Any]) -> Verdict:
     out = Verdict()
     for scene in result["scenes"]:
-        far = by_distance(scene)[-1]
+        rows = by_distance(scene)
+        far = rows[-1]
         text = (
             f"{scene['scene']} from its farthest camera: {far['ours_ms']:.2f} ms a frame instead of "
             f"{far['full_ms']:.2f} ({far['full_ms'] / far['ours_ms']:.1f} x) with FLIP "
             f"{far['ours_flip']:.4f} instead of {far['full_flip']:.4f}"
         )
         out.judge(far["ours_ms"] < far["full_ms"] and far["ours_flip"] <= far["full_flip"], text)
-        blurred = max(by_distance(scene), key=lambda row: row["ours_flip"] - row["full_flip"])
+        blurred = max(rows, key=lambda row: row["ours_flip"] - row["full_flip"])
         if blurred["ours_flip"] > 1.02 * blurred["full_flip"]:
             out.losses.append(
                 f"{scene['scene']} at distance {blurred['distance']:.3g}: FLIP {blurred['ours_flip']:.4f} "
@@ -135,7 +136,7 @@ def verdict(result: dict[str, Any]) -> Verdict:
                 f"{blurred['full_ms']:.2f})"
             )
         # By the quickest frames, which other work on the machine disturbs least.
-        slower = [row for row in by_distance(scene) if row["ours_least_ms"] > 1.02 * row["full_least_ms"]]
+        slower = [row for row in rows if row["ours_least_ms"] > 1.02 * row["full_least_ms"]]
         if slower:
             worst = max(slower, key=lambda row: row["ours_least_ms"] / row["full_least_ms"])
             out.losses.append(
