@@ -75,7 +75,7 @@ def bundle_of(gaussians, device="cpu"):
         (picture, [asset(seed) for seed in range(3)]),
         (gradient, [asset(seed) for seed in range(3)]),
         (frame_and_cut, [crowd(seed) for seed in range(3)]),
-        (bundle_of, [asset(seed, 300) for seed in range(3)]),
+        (bundle_of, [asset(seed, 100 + 200 * seed) for seed in range(3)]),  # of groups of several sizes
     ],
     ids=["rasterize", "backward", "render", "build"],
 )
