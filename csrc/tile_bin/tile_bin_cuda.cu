@@ -15,7 +15,7 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
-constexpr unsigned kBlocks = 6;    // on a multiprocessor
+constexpr unsigned kBlocks = 5;    // on a multiprocessor
 constexpr uint32_t kNoItem = ~0u;  // in place of a number of records
 
 __device__ bool is_complete(const TileBinInput& in) {
@@ -43,27 +43,27 @@ __device__ Record<float> load_record(const Record<float>* record) {
 }
 
 // Large records that a warp takes together; lanes 16 apart have the same one. Neighbours cover the same
-// tiles, so where the tiles that they all lie in are few enough, the window, a tile is looked at for all of
-// them at once.
+// tiles, so a tile is looked at for all of them at once, in windows of so many tiles, unless they lie
+// scattered over more tiles than they have.
 struct LargeBatch {
     uint32_t image;
-    uint32_t record;                // of this lane; the first one where it has none
-    int first_row, rows;            // of tiles, of this lane; in the window
-    int rows_after;                 // of all up to it
-    int left, top, columns, tiles;  // of the window; no window when there are no tiles
+    uint32_t record;        // of this lane; the first one where it has none
+    int first_row, rows;    // of tiles, of this lane; from `top` on
+    int left, top;          // of the tiles that they all lie in
+    int columns, all_rows;  // of those
+    int window_rows;        // 0 if without windows
     float columns_inverse;
 };
 constexpr int kMostTiles = 255, kMostRows = 256;
 
-// For each row of each record of a batch `count` columns of the window from `first` on: first | count << 8.
+// For each row of each record in a window `count` of its columns from `first` on: first | count << 8.
 using WindowRuns = uint16_t[kMostRows];
 
 __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first) {
-    const unsigned k = threadIdx.x % kLargeAtOnce;
-    const LargeRecord mine = in.large[first + k];
+    const LargeRecord mine = in.large[first + threadIdx.x % kLargeAtOnce];
     const uint32_t first_record = __shfl_sync(kAllLanes, mine.record, 0);
     LargeBatch batch{mine.image, first_record, 0, 0, 0, 0, 0, 0, 0, 0};
-    int left = 1 << 20, top = left, right = -left, bottom = -left;
+    int left = 1 << 20, top = left, right = -left, bottom = -left, boxes = 0;
     if (mine.record != kNoRecord) {
         batch.record = mine.record;
         const Record<float> r = load_record(in.records + mine.record);
@@ -72,61 +72,108 @@ __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long firs
         top = r.y0 / kFrameTileHeight;
         bottom = r.y1 / kFrameTileHeight;
         batch.rows = bottom - top + 1;
-    }
-    batch.rows_after = batch.rows;
-#pragma unroll
-    for (unsigned offset = 1; offset < kLargeAtOnce; offset *= 2) {
-        const int below = __shfl_up_sync(kAllLanes, batch.rows_after, offset, kLargeAtOnce);
-        if (k >= offset) batch.rows_after += below;
+        boxes = batch.rows * (right - left + 1);
     }
     batch.left = warp_min(left);
     batch.top = warp_min(top);
     batch.first_row = top - batch.top;
     batch.columns = -warp_min(-right) - batch.left + 1;
-    batch.tiles = batch.columns * (-warp_min(-bottom) - batch.top + 1);
+    batch.all_rows = -warp_min(-bottom) - batch.top + 1;
     batch.columns_inverse = 1 / static_cast<float>(batch.columns);
-    if (!__all_sync(kAllLanes, batch.tiles <= kMostTiles && batch.rows_after <= kMostRows)) batch.tiles = 0;
+    const int tiles = batch.columns * batch.all_rows;
+    const bool is_dense = tiles <= kMostTiles || tiles <= warp_sum(boxes) / 2;  // two lanes count each box
+    // Halfway between two quotients of whole numbers.
+    const int fitting = static_cast<int>((kMostTiles + 0.5f) * batch.columns_inverse);
+    if (is_dense) batch.window_rows = min(fitting, kMostRows / static_cast<int>(kLargeAtOnce));
     return batch;
 }
 
-// Calls visit(row, record, run) for the rows of tiles of a batch, a lane a row.
+// Some of the rows of tiles that a batch lies in.
+struct LargeRows {
+    int top;              // of the picture's
+    int tiles;            // in the batch's columns
+    int first_row, rows;  // of this lane's record; from `top` on
+    int above;            // of the record's rows
+    int rows_after;       // of all records up to this one
+};
+
+__device__ LargeRows rows_of(const LargeBatch& batch, int first, int count) {
+    const int begin = max(batch.first_row, first), end = min(batch.first_row + batch.rows, first + count);
+    LargeRows rows{batch.top + first,       min(count, batch.all_rows - first) * batch.columns,
+                   begin - first,           max(end - begin, 0),
+                   begin - batch.first_row, 0};
+    rows.rows_after = rows.rows;
+#pragma unroll
+    for (unsigned offset = 1; offset < kLargeAtOnce; offset *= 2) {
+        const int below = __shfl_up_sync(kAllLanes, rows.rows_after, offset, kLargeAtOnce);
+        if (threadIdx.x % kLargeAtOnce >= offset) rows.rows_after += below;
+    }
+    return rows;
+}
+
+// Calls visit(row, record, run) for those rows of a batch's records, a lane a row.
 template <class Visit>
-__device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, const Visit& visit) {
-    const int lane = threadIdx.x % 32, total = __shfl_sync(kAllLanes, batch.rows_after, kLargeAtOnce - 1);
+__device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, const LargeRows& rows,
+                             const Visit& visit) {
+    const int lane = threadIdx.x % 32, total = __shfl_sync(kAllLanes, rows.rows_after, kLargeAtOnce - 1);
+    const int before = rows.rows_after - rows.rows - rows.above;
     for (int first = 0; first < total; first += 32) {
         // The record that the lane's row is of: the first to end after it.
         const int row = min(first + lane, total - 1);
         int owner = 0;
 #pragma unroll
         for (int step = kLargeAtOnce / 2; step > 0; step /= 2)
-            if (__shfl_sync(kAllLanes, batch.rows_after, owner + step - 1) <= row) owner += step;
-        const int row_of_owner = row - (__shfl_sync(kAllLanes, batch.rows_after, owner) -
-                                        __shfl_sync(kAllLanes, batch.rows, owner));
+            if (__shfl_sync(kAllLanes, rows.rows_after, owner + step - 1) <= row) owner += step;
+        const int row_of_owner = row - __shfl_sync(kAllLanes, before, owner);
         const uint32_t record = __shfl_sync(kAllLanes, batch.record, owner);
         if (first + lane < total)
             visit(row, record, tile_run(load_record(in.records + record), row_of_owner));
     }
 }
 
-// Calls visit(batch) for all large records, batch by batch; for whole warps of the grid.
+// A warp's part of a batch: one window in so many, or so many of the rows.
+struct LargePart {
+    int number, log2_parts;
+};
+
+// Calls visit(batch, part) for all large records, batch by batch; for whole warps of the grid. Where there
+// are few batches, several warps take parts of each: a single one may lie over the whole picture.
 template <class Visit>
-__device__ void for_each_batch(const TileBinInput& in, const Visit& visit) {
-    const unsigned long long end = *in.counts.num_large;
-    const unsigned long long stride = static_cast<unsigned long long>(gridDim.x) * kWarps * kLargeAtOnce;
-    for (unsigned long long at = (blockIdx.x * kWarps + threadIdx.x / 32) * kLargeAtOnce; at < end;
-         at += stride)
-        visit(load_batch(in, at));
+__device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
+    constexpr int kLog2MostParts = 2;
+    const unsigned num_warps = gridDim.x * kWarps;
+    const unsigned num_batches = static_cast<unsigned>(*in.counts.num_large / kLargeAtOnce);
+    const unsigned warps_each = num_batches == 0 ? 0 : 8 * num_warps / num_batches;
+    const int log2_parts = min(max(31 - __clz(static_cast<int>(warps_each)), 0), kLog2MostParts);
+    for (unsigned at = blockIdx.x * kWarps + threadIdx.x / 32; at < num_batches << log2_parts;
+         at += num_warps)
+        visit(load_batch(in, static_cast<unsigned long long>(at >> log2_parts) * kLargeAtOnce),
+              LargePart{static_cast<int>(at & ((1u << log2_parts) - 1)), log2_parts});
 }
 
-__device__ void write_runs(const TileBinInput& in, const LargeBatch& batch, WindowRuns& runs) {
-    __syncwarp();  // the batch before may still be read
-    for_each_run(in, batch, [&](int row, uint32_t, const TileRun& run) {
-        runs[row] = run.count == 0 ? 0 : static_cast<uint16_t>(run.first - batch.left | run.count << 8);
-    });
-    __syncwarp();
+// Without windows: the rows of a part of a batch.
+__device__ LargeRows rows_of(const LargeBatch& batch, const LargePart& part) {
+    const int count = (batch.all_rows >> part.log2_parts) + 1;
+    return rows_of(batch, part.number * count, count);
 }
 
-// Tile t of a batch's window.
+// Calls visit(window) for the windows of a part of a batch, whose runs are written down.
+template <class Visit>
+__device__ void for_each_window(const TileBinInput& in, const LargeBatch& batch, const LargePart& part,
+                                WindowRuns& runs, const Visit& visit) {
+    const int step = batch.window_rows << part.log2_parts;
+    for (int first = part.number * batch.window_rows; first < batch.all_rows; first += step) {
+        const LargeRows window = rows_of(batch, first, batch.window_rows);
+        __syncwarp();  // the window before may still be read
+        for_each_run(in, batch, window, [&](int row, uint32_t, const TileRun& run) {
+            runs[row] = run.count == 0 ? 0 : static_cast<uint16_t>(run.first - batch.left | run.count << 8);
+        });
+        __syncwarp();
+        visit(window);
+    }
+}
+
+// Tile t of a window.
 struct WindowTile {
     int row, column;
 
@@ -134,8 +181,9 @@ struct WindowTile {
     __device__ WindowTile(const LargeBatch& batch, int t)
         : row(static_cast<int>((static_cast<float>(t) + 0.5f) * batch.columns_inverse)),
           column(t - row * batch.columns) {}
-    __device__ uint32_t index(const FrameImage& image, const LargeBatch& batch) const {
-        return image.first_tile + (batch.top + row) * image.tile_columns + batch.left + column;
+    __device__ uint32_t index(const FrameImage& image, const LargeBatch& batch,
+                              const LargeRows& window) const {
+        return image.first_tile + (window.top + row) * image.tile_columns + batch.left + column;
     }
 };
 
@@ -143,19 +191,21 @@ struct WindowTile {
 // the warp and the next one, which may lie past the window, for the upper half. They are the tiles k and
 // k + 1 of those.
 template <class Visit>
-__device__ void for_each_two_tiles(const LargeBatch& batch, int first, const Visit& visit) {
-    const int upper = threadIdx.x % 32 / kLargeAtOnce, end = min(batch.tiles - first, 32);
+__device__ void for_each_two_tiles(const LargeBatch& batch, const LargeRows& window, int first,
+                                   const Visit& visit) {
+    const int upper = threadIdx.x % 32 / kLargeAtOnce, end = min(window.tiles - first, 32);
     for (int k = 0; k < end; k += 2) visit(k, WindowTile(batch, first + k + upper));
 }
 
-// Which records of the batch touch the tile first + lane of its window, a bit each.
-__device__ uint32_t records_of_tile(const LargeBatch& batch, const WindowRuns& runs, int first) {
+// Which records of the batch touch the tile first + lane of a window, a bit each.
+__device__ uint32_t records_of_tile(const LargeBatch& batch, const LargeRows& window, const WindowRuns& runs,
+                                    int first) {
     const unsigned lane = threadIdx.x % 32;
-    const int before = batch.rows_after - batch.rows;
+    const int before = window.rows_after - window.rows;
     uint32_t of_tile = 0;
-    for_each_two_tiles(batch, first, [&](unsigned k, const WindowTile& tile) {
-        const int row = tile.row - batch.first_row;
-        const bool has_row = static_cast<unsigned>(row) < static_cast<unsigned>(batch.rows);
+    for_each_two_tiles(batch, window, first, [&](unsigned k, const WindowTile& tile) {
+        const int row = tile.row - window.first_row;
+        const bool has_row = static_cast<unsigned>(row) < static_cast<unsigned>(window.rows);
         const int run = runs[has_row ? before + row : 0];
         const unsigned both = __ballot_sync(
             kAllLanes, has_row && static_cast<unsigned>(tile.column - (run & 255)) < unsigned(run) >> 8);
@@ -168,22 +218,23 @@ __global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinI
     if (!is_complete(in)) return;
     __shared__ WindowRuns all_runs[kWarps];
     WindowRuns& runs = all_runs[threadIdx.x / 32];
-    for_each_batch(in, [&](const LargeBatch& batch) {
+    for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
         const FrameImage& image = in.images[batch.image];
-        if (batch.tiles == 0) {
-            for_each_run(in, batch, [&](int, uint32_t, const TileRun& run) {
+        if (batch.window_rows == 0) {
+            for_each_run(in, batch, rows_of(batch, part), [&](int, uint32_t, const TileRun& run) {
                 uint32_t* to = in.counts.count + image.first_tile + run.row * image.tile_columns + run.first;
                 for (int k = 0; k < run.count; ++k) atomicAdd(to + k, 1u);
             });
             return;
         }
-        write_runs(in, batch, runs);
-        for (int first = 0; first < batch.tiles; first += 32) {
-            const uint32_t records = records_of_tile(batch, runs, first);
-            const WindowTile tile(batch, first + threadIdx.x % 32);
-            if (records != 0)
-                atomicAdd(in.counts.count + tile.index(image, batch), unsigned(__popc(records)));
-        }
+        for_each_window(in, batch, part, runs, [&](const LargeRows& window) {
+            for (int first = 0; first < window.tiles; first += 32) {
+                const uint32_t records = records_of_tile(batch, window, runs, first);
+                const WindowTile tile(batch, first + threadIdx.x % 32);
+                if (records != 0)
+                    atomicAdd(in.counts.count + tile.index(image, batch, window), unsigned(__popc(records)));
+            }
+        });
     });
 }
 
@@ -261,10 +312,11 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item, uint32_t r
     }
 }
 
-// A batch without a window.
-__device__ void scatter_runs(const TileBinInput& in, const Scatter& to, const LargeBatch& batch) {
+// A batch without windows.
+__device__ void scatter_runs(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
+                             const LargePart& part) {
     const FrameImage& image = in.images[batch.image];
-    for_each_run(in, batch, [&](int, uint32_t record, const TileRun& run) {
+    for_each_run(in, batch, rows_of(batch, part), [&](int, uint32_t record, const TileRun& run) {
         const Record<float> r = load_record(in.records + record);
         const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
         const EntryBox box = entry_box(r);
@@ -276,32 +328,33 @@ __device__ void scatter_runs(const TileBinInput& in, const Scatter& to, const La
     });
 }
 
-// A batch with one: what it has for a tile is written at once.
-__device__ void scatter_window(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
-                               WindowRuns& runs) {
-    write_runs(in, batch, runs);
+// A batch with windows: what it has for a tile is written at once.
+__device__ void scatter_windows(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
+                                const LargePart& part, WindowRuns& runs) {
     const FrameImage& image = in.images[batch.image];
     const unsigned lane = threadIdx.x % 32, mine = lane % kLargeAtOnce;
     const Record<float> r = load_record(in.records + batch.record);
     const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
     const EntryBox box = entry_box(r);
-    for (int first = 0; first < batch.tiles; first += 32) {
-        const uint32_t records = records_of_tile(batch, runs, first);
-        unsigned long long place = 0;
-        if (records != 0) {
-            const uint32_t tile = WindowTile(batch, first + lane).index(image, batch),
-                           count = __popc(records);
-            place = to.tile_first[tile] + (atomicSub(to.left + tile, count) - count);
+    for_each_window(in, batch, part, runs, [&](const LargeRows& window) {
+        for (int first = 0; first < window.tiles; first += 32) {
+            const uint32_t records = records_of_tile(batch, window, runs, first);
+            unsigned long long place = 0;
+            if (records != 0) {
+                const uint32_t tile = WindowTile(batch, first + lane).index(image, batch, window),
+                               count = __popc(records);
+                place = to.tile_first[tile] + (atomicSub(to.left + tile, count) - count);
+            }
+            for_each_two_tiles(batch, window, first, [&](unsigned k, const WindowTile& tile) {
+                const unsigned from = k + lane / kLargeAtOnce;
+                const uint32_t of_tile = __shfl_sync(kAllLanes, records, from);
+                const unsigned long long begin = __shfl_sync(kAllLanes, place, from);
+                if (of_tile >> mine & 1)
+                    to.entries[begin + __popc(of_tile & ((1u << mine) - 1))] =
+                        tile_entry(depth, batch.record, box, batch.left + tile.column, window.top + tile.row);
+            });
         }
-        for_each_two_tiles(batch, first, [&](unsigned k, const WindowTile& tile) {
-            const unsigned from = k + lane / kLargeAtOnce;
-            const uint32_t of_tile = __shfl_sync(kAllLanes, records, from);
-            const unsigned long long begin = __shfl_sync(kAllLanes, place, from);
-            if (of_tile >> mine & 1)
-                to.entries[begin + __popc(of_tile & ((1u << mine) - 1))] =
-                    tile_entry(depth, batch.record, box, batch.left + tile.column, batch.top + tile.row);
-        });
-    }
+    });
 }
 
 // Blocks take items, a thread a record, and then the records over many tiles. An item's table is fetched two
@@ -328,11 +381,11 @@ __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput
     }
     __shared__ WindowRuns all_runs[kWarps];
     WindowRuns& runs = all_runs[threadIdx.x / 32];
-    for_each_batch(in, [&](const LargeBatch& batch) {
-        if (batch.tiles == 0)
-            scatter_runs(in, to, batch);
+    for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
+        if (batch.window_rows == 0)
+            scatter_runs(in, to, batch, part);
         else
-            scatter_window(in, to, batch, runs);
+            scatter_windows(in, to, batch, part, runs);
     });
 }
 
