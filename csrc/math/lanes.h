@@ -46,15 +46,26 @@ V3DG_HD inline float rough_sqrt(float x) {
     return ::sqrtf(x);
 #endif
 }
-// 2^n of the integer n nearest to x in [0, 31]; ties go either way.
-V3DG_HD inline uint32_t bit_nearest(float x) {
-    const float shifted = x + 8388608.0f;  // 2^23: adding it rounds to an integer
-    uint32_t bits;
-    std::memcpy(&bits, &shifted, sizeof bits);
+// a b + c cut to [0, 1]; NaN is 0.
+V3DG_HD inline float saturated_fma(float a, float b, float c) {
 #ifdef __CUDA_ARCH__
-    return __funnelshift_l(0u, 1u, bits);  // by the last five bits
+    float x;
+    asm("fma.rn.ftz.sat.f32 %0, %1, %2, %3;" : "=f"(x) : "f"(a), "f"(b), "f"(c));
+    return x;
 #else
-    return 1u << (bits & 31);
+    const float x = a * b + c;
+    return x > 0 ? (x < 1 ? x : 1.0f) : 0.0f;
+#endif
+}
+// `bits` moved to the left by the integer nearest to 8 x, for x in [0, 1]; ties go either way.
+V3DG_HD inline uint32_t shifted_by_eighths(uint32_t bits, float x) {
+    const float number = 8 * x + 8388608.0f;  // 2^23: adding it rounds to an integer
+    uint32_t last_bits;
+    std::memcpy(&last_bits, &number, sizeof last_bits);
+#ifdef __CUDA_ARCH__
+    return __funnelshift_l(0u, bits, last_bits);  // by the last five
+#else
+    return bits << (last_bits & 31);
 #endif
 }
 V3DG_HD inline float exp2_in_range(float x) {

@@ -303,9 +303,8 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
                                             r.v, r.l11, r.l12, r.l22, r.log2_opacity);
         if (!contributes(f)) continue;
         float weight;
-        const bool goes_on = blend_live(alpha_of(f), transmittance, weight);
+        if (!blend_live(alpha_of(f), transmittance, weight)) break;
         if (weight > picked.weight) picked = {ws.source.data()[place], weight, r.depth};
-        if (!goes_on) break;
     }
     return picked.weight > 0.0f;
 }

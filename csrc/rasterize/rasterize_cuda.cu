@@ -21,15 +21,17 @@ namespace {
 
 using Key = unsigned long long;  // of a TileEntry
 
-constexpr int kThreads = 256;
+constexpr int kThreads = 128;
 constexpr int kWarps = kThreads / 32;
+constexpr int kBlocks = 8;                  // on a multiprocessor
 constexpr int kLoads = 4;                   // entries a thread has in flight
 constexpr int kWindow = kLoads * kThreads;  // entries looked at in one go
 constexpr int kPiece = 3 * kWindow / 2;     // entries sorted at once, at most
 constexpr int kLog2Spread = 11;             // buckets of a list, at most
-constexpr int kLog2Sort = 10;               // buckets of a piece
+constexpr int kLog2SpreadAgain = 10;        // of what did not fit into a window
+constexpr int kLog2Sort = 9;                // buckets of a piece
 constexpr int kFewEntries = 64;             // sorted without buckets
-constexpr int kBatch = 256;                 // records blended at once
+constexpr int kBatch = 128;                 // records blended at once
 // Each takes some bits of depth or record, at least 4, after the first one, whose range is a guess.
 constexpr int kMostLevels = 1 + 26 / 4 + 28 / 4 + 2;
 
@@ -42,6 +44,8 @@ constexpr int kSubs = kSubColumns * kFrameTileHeight / kSubHeight;
 
 static_assert(sizeof(Record<float>) == 3 * sizeof(float4), "fetched as whole vectors");
 static_assert(kSubWidth == 8 && kSubHeight == 4, "the window of reached_pixels");
+static_assert(2 * kFewEntries <= kThreads, "two threads rank an entry");
+static_assert(kPiece % 3 == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0, "begins a class of plan_kernel");
 static_assert(kEntryBlockSize == kSubHeight && 2 * kEntryBlockSize == kSubWidth, "a sub-tile is two blocks");
 
 constexpr int kDepthShift = kEntryRecordBits + kEntryBoxBits;
@@ -88,8 +92,9 @@ __device__ void wait_for_copies() {
 }
 
 // What spreading shares in a block.
+template <int kLog2Buckets>
 struct SpreadShared {
-    uint32_t bucket[1 << kLog2Spread];
+    uint32_t bucket[1 << kLog2Buckets];
     uint32_t range[4];
     uint32_t warp_sum[32];
 };
@@ -140,9 +145,9 @@ __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_
 }
 
 // Buckets for entries [first, last): for the range of all of them, or of a sample when `roughly`.
-template <int kBlock>
+template <int kBlock, int kLog2Buckets>
 __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last, bool roughly,
-                                SpreadShared& s) {
+                                SpreadShared<kLog2Buckets>& s) {
     if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
     uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // of depths and records
     const auto widen = [&](TileEntry e) {
@@ -170,22 +175,22 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
     }
     __syncthreads();
     // Some 64 entries a bucket; the fewer, the more of what is written together stays together in the cache.
-    const int log2_buckets = min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Spread);
+    const int log2_buckets = min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
     const bool by_record = !roughly && s.range[0] == s.range[1];
     const uint32_t* range = s.range + (by_record ? 2 : 0);
     return buckets_over(range[0], range[1], log2_buckets, by_record);
 }
 
 // Spreads entries [first, last) into bucket order, from one place to another.
-template <int kBlock>
+template <int kBlock, int kLog2Buckets>
 __device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
-                       const Buckets& buckets, SpreadShared& s) {
-    for (int i = threadIdx.x; i < 1 << kLog2Spread; i += kBlock) s.bucket[i] = 0;
+                       const Buckets& buckets, SpreadShared<kLog2Buckets>& s) {
+    for (int i = threadIdx.x; i < 1 << kLog2Buckets; i += kBlock) s.bucket[i] = 0;
     __syncthreads();
     for_each_entry<kBlock>(from, first, last,
                            [&](TileEntry e) { atomicAdd(&s.bucket[buckets.of(e.key)], 1u); });
     __syncthreads();
-    scan_buckets<1 << kLog2Spread, kBlock>(s.bucket, s.warp_sum);
+    scan_buckets<1 << kLog2Buckets, kBlock>(s.bucket, s.warp_sum);
     for_each_entry<kBlock>(from, first, last,
                            [&](TileEntry e) { to[first + atomicAdd(&s.bucket[buckets.of(e.key)], 1u)] = e; });
     __syncthreads();
@@ -214,7 +219,7 @@ struct Pixels {
 struct Shared {
     Key key[kPiece];  // of the piece, in any order
     union {
-        SpreadShared spreading;
+        SpreadShared<kLog2SpreadAgain> spreading;
         struct {
             uint32_t bucket[1 << kLog2Sort];
             uint32_t warp_sum[kWarps];
@@ -222,9 +227,10 @@ struct Shared {
         };
         float4 record[3][kBatch];
     };
-    uint16_t sorted[kPiece];       // places in `key`
-    uint32_t blocks[kBatch];       // live ones that the batch's records may reach
-    uint8_t list[kWarps][kBatch];  // of the batch, those that may reach the sub-tile of a warp
+    uint16_t sorted[kPiece];  // places in `key`
+    uint32_t blocks[kBatch];  // live ones that the batch's records may reach
+    // Of the batch, those that may reach the sub-tile of a warp: where they begin in a third of `record`.
+    uint32_t list[kWarps][kBatch + 1];
     Pixels pixels;
     uint32_t alive_blocks;  // as blocks_of(TileEntry)
     uint32_t reached[2];    // by some record of the batch, in turn
@@ -369,14 +375,17 @@ __device__ void publish_alive(bool is_alive, int sub, Shared& s) {
 
 // Bit j of lane i becomes bit i of lane j.
 __device__ uint32_t transpose_bits(uint32_t bits) {
-    const int lane = threadIdx.x % 32;
-    uint32_t low_half = 0x0000ffff;
+    const unsigned lane = threadIdx.x % 32;
+    // Halves and bytes are put together whole: lanes 16, then 8 apart exchange what belongs to the other.
+    bits = __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 16), (lane & 16) != 0 ? 0x3276 : 0x5410);
+    bits = __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 8), (lane & 8) != 0 ? 0x3715 : 0x6240);
+    uint32_t low_half = 0x0f0f0f0f;
 #pragma unroll
-    for (int width = 16; width > 0; width /= 2) {
+    for (unsigned width = 4; width > 0; width /= 2) {
         const bool upper = (lane & width) != 0;
+        const uint32_t kept = upper ? ~low_half : low_half;
         const uint32_t other = __shfl_xor_sync(kAllLanes, bits, width);
-        bits = upper ? (bits & ~low_half) | (other >> width & low_half)
-                     : (bits & low_half) | (other << width & ~low_half);
+        bits = (bits & kept) | (__funnelshift_l(other, other, upper ? 32 - width : width) & ~kept);
         low_half ^= low_half << (width / 2);
     }
     return bits;
@@ -386,14 +395,15 @@ __device__ uint32_t transpose_bits(uint32_t bits) {
 template <bool kWithDepth>
 __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s) {
     const int lane = threadIdx.x % 32;
-    uint8_t* list = s.list[threadIdx.x / 32];
+    uint32_t* list = s.list[threadIdx.x / 32];
     const uint32_t own_blocks = 3u << blocks_place(sub);
     int listed = 0;
     for (int g = 0; g < num_groups; ++g) {
         const bool reaches = (s.blocks[32 * g + lane] & own_blocks) != 0;
         const uint32_t reaching = __ballot_sync(kAllLanes, reaches);
         if (reaches)
-            list[listed + __popc(reaching & ((1u << lane) - 1))] = static_cast<uint8_t>(32 * g + lane);
+            list[listed + __popc(reaching & ((1u << lane) - 1))] =
+                static_cast<uint32_t>(sizeof(float4)) * (32 * g + lane);
         listed += __popc(reaching);
     }
     __syncwarp();
@@ -408,18 +418,28 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s)
     for (int c = 0; c < 3; ++c) p.color[c] = pixels.color[c][sub][lane];
     if (kWithDepth) p.depth = pixels.depth[sub][lane];
     bool alive = p.transmittance > 0;
+    const auto third = [&](int k, uint32_t offset) -> const float4& {
+        return *reinterpret_cast<const float4*>(reinterpret_cast<const unsigned char*>(s.record[k]) + offset);
+    };
     for (int first = 0; first < listed; first += 32) {
-        const uint8_t* group = list + first;
+        // The last lane takes the first record, which becomes the highest bit of a pixel.
+        const uint32_t* last_of_group = list + first + 31;
         uint32_t bits = 0;
-        if (first + lane < listed) {
-            const float4 a = s.record[0][group[lane]], b = s.record[1][group[lane]];
+        if (first + 31 - lane < listed) {
+            const uint32_t own = last_of_group[-lane];
+            const float4 a = third(0, own), b = third(1, own);
             bits = reached_pixels(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
         }
         bits = transpose_bits(bits);
         if (!alive) bits = 0;
+        // Where the next record begins is looked up ahead; after the last one it means nothing.
+        int highest = 31 - __clz(static_cast<int>(bits));
+        uint32_t next = last_of_group[-highest];
         while (bits != 0) {
-            const int i = group[__ffs(bits) - 1];
-            const float4 a = s.record[0][i], b = s.record[1][i], c = s.record[2][i];
+            const float4 a = third(0, next), b = third(1, next), c = third(2, next);
+            bits ^= __funnelshift_l(0u, 1u, highest);
+            highest = 31 - __clz(static_cast<int>(bits));
+            next = last_of_group[-highest];
             const Falloff<float> f = falloff_at(p.x, p.y, a.x, a.y, a.z, a.w, b.x, b.y);
             float weight;
             alive = blend_live(alpha_of(f), p.transmittance, weight);
@@ -427,10 +447,11 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s)
             p.color[1] += weight * b.w;
             p.color[2] += weight * c.x;
             if (kWithDepth) p.depth += weight * c.y;
-            bits = alive ? bits & (bits - 1) : 0;
+            if (!alive) bits = 0;
         }
         __syncwarp();
     }
+    if (!alive) p.transmittance = -fabsf(p.transmittance);
     pixels.transmittance[sub][lane] = p.transmittance;
     for (int c = 0; c < 3; ++c) pixels.color[c][sub][lane] = p.color[c];
     if (kWithDepth) pixels.depth[sub][lane] = p.depth;
@@ -440,7 +461,6 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s)
 // Blends the sorted piece.
 template <bool kWithDepth>
 __device__ void blend_piece(const Record<float>* records, uint32_t count, int left, int top, Shared& s) {
-    static_assert(kBatch <= 256, "places in a batch are bytes");
     for (uint32_t first = 0; first < count && s.alive_blocks != 0; first += kBatch) {
         uint32_t* reached = &s.reached[first / kBatch % 2];
         for (uint32_t i = threadIdx.x; i < kBatch; i += kThreads) {
@@ -638,7 +658,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists) {
 
 // Spreads the long lists, a block one after another.
 __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists lists) {
-    __shared__ SpreadShared s;
+    __shared__ SpreadShared<kLog2Spread> s;
     if (!is_complete(lists)) return;
     for (uint32_t i = blockIdx.x; i < lists.num_tiles; i += gridDim.x) {
         TilePlan& plan = lists.plans[i];
@@ -656,7 +676,7 @@ __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists list
     }
 }
 
-__global__ void __launch_bounds__(kThreads, 5) rasterize_kernel(FrameLists lists, RasterTape tape) {
+__global__ void __launch_bounds__(kThreads, kBlocks) rasterize_kernel(FrameLists lists, RasterTape tape) {
     if (!is_complete(lists)) return;
     Shared& s = *reinterpret_cast<Shared*>(shared_memory());
     const TilePlan plan = lists.plans[blockIdx.x];

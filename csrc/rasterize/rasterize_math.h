@@ -135,12 +135,12 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
-// The same for a single pixel that has not stopped; returns whether it goes on.
+// The same for a single pixel that has not stopped. Returns whether it goes on; if not, `t` stays as it was.
 V3DG_HD inline bool blend_live(float alpha, float& t, float& weight) {
     const float next = t * (1 - alpha);
     const bool goes_on = next > static_cast<float>(kMinTransmittance);
     weight = goes_on ? alpha * t : 0.0f;
-    t = goes_on ? next : -t;
+    t = goes_on ? next : t;
     return goes_on;
 }
 
@@ -148,18 +148,23 @@ V3DG_HD inline bool blend_live(float alpha, float& t, float& weight) {
 // that of the first pixel. Some more, so that the blend step alone decides.
 V3DG_HD inline uint32_t reached_pixels(float u, float v, float l11, float l12, float l22,
                                        float log2_opacity) {
+    // Across in windows, so that saturating cuts off what lies outside.
+    constexpr float kEighth = 0.125f, kHair = 1e-2f;
     const float reach = log2_opacity - static_cast<float>(kLog2MinAlpha);
-    const float inverse = rough_reciprocal(l11), slope = -l12 * inverse;
-    constexpr float kHair = 1e-2f;
+    const float inverse = kEighth * rough_reciprocal(l11), slope = -l12 * inverse,
+                wider = inverse * (1 + 2e-3f);
     // Half a pixel more, as the first pixel and the end are rounded to the nearest.
-    const float first_u = u + (0.5f - kHair), end_u = u + (0.5f + kHair), wider = inverse * (1 + 2e-3f);
+    const float first_u = kEighth * u + kEighth * (0.5f - kHair),
+                end_u = kEighth * u + kEighth * (0.5f + kHair);
     uint32_t pixels = 0;
     for (int row = 0; row < 4; ++row) {
         const float y = static_cast<float>(row) - v, t = l22 * y;
         const float half = rough_sqrt(max_of(reach - t * t, 0.0f)) * wider;
-        const float first = min_of(max_of(slope * y + (first_u - half), 0.0f), 8.0f);
-        const float end = min_of(max_of(slope * y + (end_u + half), first), 8.0f);
-        pixels += (bit_nearest(end) - bit_nearest(first)) << (8 * row);
+        const float first = saturated_fma(slope, y, first_u - half);
+        const float end = max_of(saturated_fma(slope, y, end_u + half), first);
+        // Beyond the last row's last bit there is nothing, which is what it should be.
+        const uint32_t row_begin = 1u << (8 * row);
+        pixels += shifted_by_eighths(row_begin, end) - shifted_by_eighths(row_begin, first);
     }
     return pixels;
 }
