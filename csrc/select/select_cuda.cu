@@ -45,6 +45,7 @@ namespace {
 constexpr unsigned kEach = 8;  // clusters of a part that a lane looks at
 constexpr unsigned kPartSize = 32 * kEach;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
+constexpr unsigned kCutBlocks = 4;      // on a multiprocessor
 constexpr unsigned kPlaceThreads = 64;  // few, so that a few thousand instances spread over the device
 constexpr unsigned kChooseThreads = 1024;
 // Bins of a warp of choose_kernel.
@@ -470,7 +471,7 @@ __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool i
 }
 
 template <class Output>
-__global__ void __launch_bounds__(kCutThreads)
+__global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     cut_kernel(SceneOnDevice scene, SelectRule rule, const CutChoice* choice, const BudgetState* state,
                Scratch scratch, Scratch second_scratch, Output output) {
     if (state != nullptr && state->again != 0) scratch = second_scratch;
