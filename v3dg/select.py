@@ -247,7 +247,7 @@ def over_budget(budget: int, least: int) -> ValueError:
 
 def camera_of(camera: Camera, window: tuple[int, int, int, int] | None = None) -> tuple[Any, ...]:
     """The camera as the core takes it, and the pixels [x0, x1) x [y0, y1) of its image that are wanted."""
-    return (camera.viewmat, camera.position, camera.K, camera.width, camera.height, camera.near, window)
+    return (camera.viewmat, camera.K, camera.width, camera.height, camera.near, window)
 
 
 def _basis_of_band(degree: int, directions: Floats) -> Floats:

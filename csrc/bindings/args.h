@@ -35,18 +35,18 @@ Span<T> span_of(const py::array& array, const char* name, std::initializer_list<
                               py::str(py::dtype::of<Value>()).template cast<std::string>() + ", got " +
                               py::str(array.dtype()).cast<std::string>());
     bool same = array.ndim() == static_cast<py::ssize_t>(shape.size());
-    std::string wanted = "(";
     size_t axis = 0;
     for (const py::ssize_t length : shape) {
         if (same && length >= 0 && array.shape(axis) != length) same = false;
-        wanted += length < 0 ? "N" : std::to_string(length);
-        if (axis + 1 < shape.size()) wanted += ", ";
-        if (shape.size() == 1) wanted += ",";
         ++axis;
     }
-    if (!same)
-        throw py::value_error(std::string(name) + ": expected shape " + wanted + "), got " +
-                              shape_text(array));
+    if (!same) {
+        std::string wanted;
+        for (const py::ssize_t length : shape)
+            wanted += (wanted.empty() ? "" : ", ") + (length < 0 ? std::string("N") : std::to_string(length));
+        throw py::value_error(std::string(name) + ": expected shape (" + wanted +
+                              (shape.size() == 1 ? ",)" : ")") + ", got " + shape_text(array));
+    }
     if (!(array.flags() & py::array::c_style))
         throw py::value_error(
             std::string(name) +

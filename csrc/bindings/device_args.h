@@ -20,24 +20,27 @@ Span<T> device_span_of(const py::handle& array, const char* name, std::initializ
                              py::str(py::type::of(array)).cast<std::string>());
     }
     const py::dict face = py::reinterpret_steal<py::object>(found).cast<py::dict>();
+    static const std::string wanted_dtype =
+        py::dtype::of<Value>().attr("str").template cast<std::string>();  // slow to ask for
     const std::string dtype = face["typestr"].cast<std::string>();
-    const std::string wanted_dtype = py::dtype::of<Value>().attr("str").template cast<std::string>();
     if (dtype != wanted_dtype)
         throw py::value_error(std::string(name) + ": expected dtype " + wanted_dtype + ", got " + dtype);
     const py::tuple got = face["shape"].cast<py::tuple>();
     bool same = got.size() == shape.size();
     size_t axis = 0, size = 1;
-    std::string wanted;
     for (const py::ssize_t length : shape) {
         const py::ssize_t here = axis < got.size() ? got[axis].cast<py::ssize_t>() : -1;
         same = same && (length < 0 || here == length);
         size *= static_cast<size_t>(here);
-        wanted += (axis > 0 ? ", " : "") + (length < 0 ? std::string("N") : std::to_string(length));
         ++axis;
     }
-    if (!same)
+    if (!same) {
+        std::string wanted;
+        for (const py::ssize_t length : shape)
+            wanted += (wanted.empty() ? "" : ", ") + (length < 0 ? std::string("N") : std::to_string(length));
         throw py::value_error(std::string(name) + ": expected shape (" + wanted + "), got " +
                               py::str(got).cast<std::string>());
+    }
     if (face.contains("strides") && !face["strides"].is_none())
         throw py::value_error(std::string(name) + ": expected a contiguous array, got a strided one");
     const uintptr_t pointer = face["data"].cast<py::tuple>()[0].cast<uintptr_t>();

@@ -89,29 +89,29 @@ inline Footprint footprint_of(const std::string& name) {
     throw py::value_error("footprint: expected solid_angle or paper, got " + name);
 }
 
-// Of (viewmat (4, 4), eye (3,), K (3, 3), width, height, near, window). A window (x0, y0, x1, y1) is a part
+// Of (viewmat (4, 4), K (3, 3), width, height, near, window). A window (x0, y0, x1, y1) is a part
 // of the image, or None.
 inline SelectCamera select_camera(const py::tuple& t) {
-    const py::array viewmat = t[0].cast<py::array>(), eye = t[1].cast<py::array>(),
-                    K = t[2].cast<py::array>();
+    const py::array viewmat = t[0].cast<py::array>(), K = t[1].cast<py::array>();
     const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
-    const Span<const double> position = span_of<const double>(eye, "eye", {3});
     const Span<const double> intrinsics = span_of<const double>(K, "K", {3, 3});
     SelectCamera camera;
+    double translation[3];
     for (int row = 0; row < 3; ++row) {
-        camera.eye[row] = position[row];
+        translation[row] = view[4 * row + 3];
         for (int k = 0; k < 3; ++k) camera.rotation[3 * row + k] = view[4 * row + k];
     }
+    eye_of(camera.rotation, translation, camera.eye);
     camera.fx = intrinsics[0];
     camera.fy = intrinsics[4];
     camera.cx = intrinsics[2];
     camera.cy = intrinsics[5];
-    camera.width = t[3].cast<int>();
-    camera.height = t[4].cast<int>();
-    camera.near = t[5].cast<double>();
-    const int width = t[3].cast<int>(), height = t[4].cast<int>();
+    camera.width = t[2].cast<int>();
+    camera.height = t[3].cast<int>();
+    camera.near = t[4].cast<double>();
+    const int width = t[2].cast<int>(), height = t[3].cast<int>();
     std::array<int, 4> w{0, 0, width, height};
-    if (!t[6].is_none()) w = t[6].cast<std::array<int, 4>>();
+    if (!t[5].is_none()) w = t[5].cast<std::array<int, 4>>();
     if (!(0 <= w[0] && w[0] < w[2] && w[2] <= width && 0 <= w[1] && w[1] < w[3] && w[3] <= height))
         throw py::value_error("window: expected x0 < x1 and y0 < y1 within " + std::to_string(width) + " x " +
                               std::to_string(height) + " px, got " +

@@ -18,6 +18,24 @@ struct SelectCamera {
     double x0, y0, x1, y1;                       // the part of the image that is wanted, px
 };
 
+// Where a camera is that brings p to rotation p + translation. The rotation may be off by what float32 loses.
+V3DG_HD inline void eye_of(const double rotation[9], const double translation[3], double eye[3]) {
+    // The inverse by its columns, which are cross products of the rows.
+    const double* r = rotation;
+    double determinant = 0.0;
+    for (int a = 0; a < 3; ++a) {
+        const int b = (a + 1) % 3, c = (a + 2) % 3;
+        double sum = 0.0;
+        for (int row = 0; row < 3; ++row) {
+            const double *next = r + 3 * ((row + 1) % 3), *after = r + 3 * ((row + 2) % 3);
+            sum += translation[row] * (next[b] * after[c] - next[c] * after[b]);
+        }
+        eye[a] = -sum;
+        determinant += r[a] * (r[3 + b] * r[6 + c] - r[3 + c] * r[6 + b]);
+    }
+    for (int a = 0; a < 3; ++a) eye[a] /= determinant;
+}
+
 // A similarity transform p -> scale * rotation p + position.
 struct Pose {
     const double* position;    // [3]
