@@ -262,6 +262,14 @@ def test_plots_are_drawn(results):
     assert (folder / "tolerance.png").stat().st_size > 1000
 
 
+def test_page_names_all_commits_that_were_measured():
+    parts = [
+        {"gpu": "a GPU", "commit": commit, "python": "3.12", "torch": "2.11"} for commit in ("aa", "bb", "aa")
+    ]
+    assert report.machine(parts) == "a GPU, commits aa, bb, Python 3.12, torch 2.11"
+    assert report.machine(parts[:1]) == "a GPU, commit aa, Python 3.12, torch 2.11"
+
+
 def test_report_of_an_empty_folder_says_what_to_run(tmp_path):
     with pytest.raises(ValueError, match="run `v3dg bench` first"):
         report.read_results(tmp_path)

@@ -42,7 +42,7 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]]:
 def page(folders: Sequence[Path], output: Path) -> str:
     """The page; pictures are linked relative to where it will be."""
     sections = [(folder, read_results(folder)) for folder in folders]
-    machines = [machine(next(iter(results.values()))) for _, results in sections]
+    machines = [machine(list(results.values())) for _, results in sections]
     # The first folder counts; the others for parts that it does not have.
     measured = {name: result for _, results in reversed(sections) for name, result in results.items()}
     home = place(next(iter(sections[0][1].values())))
@@ -94,13 +94,14 @@ def place(result: dict[str, Any]) -> str:
     return str(result.get("gpu") or f"{result['threads']} CPU threads")
 
 
-def machine(result: dict[str, Any]) -> str:
-    """Device, commit and versions of a result."""
-    where = result.get("gpu") or f"{result['threads']} threads of {result['processor']}"
-    versions = ", ".join(f"{name} {result[name]}" for name in ("torch", "gsplat") if name in result)
-    return (
-        f"{where}, commit {result['commit']}, Python {result['python']}{', ' + versions if versions else ''}"
-    )
+def machine(results: Sequence[dict[str, Any]]) -> str:
+    """Device and versions of results from one machine, and all their commits."""
+    first = results[0]
+    where = first.get("gpu") or f"{first['threads']} threads of {first['processor']}"
+    commits = list(dict.fromkeys(result["commit"] for result in results))
+    versions = [f"Python {first['python']}"]
+    versions += [f"{name} {first[name]}" for name in ("torch", "gsplat") if name in first]
+    return f"{where}, {'commit' if len(commits) == 1 else 'commits'} {', '.join([*commits, *versions])}"
 
 
 def heading(result: dict[str, Any]) -> str:
