@@ -1,5 +1,6 @@
 """The viewer's page: how it is served, and, with Chromium and playwright, how it looks and answers."""
 
+import gc
 import io
 import os
 import re
@@ -23,6 +24,16 @@ from v3dg.viewer.page import Site, figures_html, start_view
 from v3dg.viewer.view import look_at
 
 pytest.importorskip("viser")
+
+# A site that closes while somebody is just connecting leaves viser's end of that connection to the collector.
+pytestmark = pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def collected_connections():
+    """Nothing of that is left to the tests after these."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture(scope="module")
