@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import html
 import io
+import logging
 import math
 import os
 import socket
@@ -102,6 +103,7 @@ class Site:
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         self._pages: dict[int, _Page] = {}
         self._lock = threading.Lock()
+        logging.getLogger("websockets.server").addFilter(_is_news)
         with _quiet():
             self._server = viser.ViserServer(host=host, port=port, label=name, verbose=False)
         self.port = self._server.get_port()
@@ -543,6 +545,11 @@ def _css(color: Any) -> str:
 def _three(vector: VectorLike) -> tuple[float, float, float]:
     x, y, z = (float(v) for v in vector)
     return x, y, z
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Not that somebody connected and said nothing, as browsers and forwarded ports do ahead of time."""
+    return record.getMessage() != "opening handshake failed"
 
 
 @contextlib.contextmanager
