@@ -32,6 +32,15 @@ def test_look_at_centres_the_target(eye, direction, up):
     assert np.linalg.det(rotation) > 0
 
 
+def test_transposed_matrices_are_taken():
+    """Whoever passes `matrix.T` has its columns in memory first; the core reads rows."""
+    turned = Camera.look_at((1, 2, 3), (4, 5, 7), width=64, height=48)
+    camera = Camera(np.asfortranarray(turned.viewmat), np.asfortranarray(turned.K), 64, 48)
+    assert camera.viewmat.flags.c_contiguous
+    assert camera.K.flags.c_contiguous
+    np.testing.assert_array_equal(camera.viewmat, turned.viewmat)
+
+
 def test_look_at_has_up_upwards_and_right_to_the_right():
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), (0, 0, 1), math.pi / 2, width=200, height=100)
     np.testing.assert_allclose(pixel(camera, (0, 0, 1))[0], [100, 30])  # y is down: above is a smaller row

@@ -249,7 +249,7 @@ def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Fl
 
 def _floats(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
     try:
-        array = np.array(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected numbers of shape {shape}, got {type(value).__name__}") from error
     if array.shape != shape:
