@@ -41,6 +41,15 @@ def test_transposed_matrices_are_taken():
     np.testing.assert_array_equal(camera.viewmat, turned.viewmat)
 
 
+def test_position_of_a_rounded_matrix_is_what_it_brings_to_zero():
+    """Rows that are orthonormal only as far as float32 text goes, far from the origin."""
+    exact = Camera.look_at((3e4, -2e4, 5e3), (1, 2, 3), width=64, height=48).viewmat
+    viewmat = np.round(exact, 4)
+    camera = Camera(viewmat, np.diag([50.0, 50.0, 1.0]), 64, 48)
+    assert np.abs(viewmat[:3, :3] @ viewmat[:3, :3].T - np.eye(3)).max() > 1e-6
+    np.testing.assert_allclose(viewmat @ [*camera.position, 1.0], [0, 0, 0, 1], atol=1e-9)
+
+
 def test_look_at_has_up_upwards_and_right_to_the_right():
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), (0, 0, 1), math.pi / 2, width=200, height=100)
     np.testing.assert_allclose(pixel(camera, (0, 0, 1))[0], [100, 30])  # y is down: above is a smaller row

@@ -131,10 +131,11 @@ def test_command_says_where_and_ends_with_an_interrupt(bundle, tmp_path):
     try:
         assert line.startswith("http://127.0.0.1:")
         assert "blob.v3dg" in line
-        with socket.create_connection(("127.0.0.1", int(line.split()[0].rsplit(":")[-1]))) as silent:
+        address = line.split()[0]
+        with socket.create_connection(("127.0.0.1", int(address.rsplit(":", 1)[1]))) as silent:
             silent.shutdown(socket.SHUT_WR)
             assert silent.recv(1) == b""  # the server has seen it
-        with urllib.request.urlopen(line.split()[0]) as page:
+        with urllib.request.urlopen(address) as page:
             assert page.status == 200
     finally:
         process.send_signal(signal.SIGINT)

@@ -92,6 +92,7 @@ class ClusterTable:
 # height, near, window or None), a rule (tolerance, budget or None, min_level, footprint, cull).
 SelectedPairs: TypeAlias = tuple[NDArray[np.int32], NDArray[np.int32], int, float, bool]
 
+def eye_of(viewmat: NDArray[np.float64]) -> NDArray[np.float64]: ...
 def select(
     tables: list[ClusterTable], instances: tuple[Any, ...], camera: tuple[Any, ...], rule: tuple[Any, ...]
 ) -> SelectedPairs: ...

@@ -10,6 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from v3dg import _core
+
 Floats: TypeAlias = npt.NDArray[np.float64]
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
@@ -133,8 +135,7 @@ class Camera:
     @property
     def position(self) -> Floats:
         """(3,) the eye in the world."""
-        eye = -np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3])
-        return np.asarray(eye, dtype=np.float64)
+        return _core.eye_of(self.viewmat)
 
     @property
     def fx(self) -> float:

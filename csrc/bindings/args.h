@@ -18,6 +18,14 @@ namespace py = pybind11;
 template <class T>
 using ArrayOf = py::array_t<T, py::array::c_style>;
 
+// A shape as it is wanted; -1 stands for any length.
+inline std::string shape_text(std::initializer_list<py::ssize_t> shape) {
+    std::string text;
+    for (const py::ssize_t length : shape)
+        text += (text.empty() ? "" : ", ") + (length < 0 ? std::string("N") : std::to_string(length));
+    return "(" + text + (shape.size() == 1 ? ",)" : ")");
+}
+
 inline std::string shape_text(const py::array& array) {
     std::string text = "(";
     for (py::ssize_t i = 0; i < array.ndim(); ++i)
@@ -40,13 +48,9 @@ Span<T> span_of(const py::array& array, const char* name, std::initializer_list<
         if (same && length >= 0 && array.shape(axis) != length) same = false;
         ++axis;
     }
-    if (!same) {
-        std::string wanted;
-        for (const py::ssize_t length : shape)
-            wanted += (wanted.empty() ? "" : ", ") + (length < 0 ? std::string("N") : std::to_string(length));
-        throw py::value_error(std::string(name) + ": expected shape (" + wanted +
-                              (shape.size() == 1 ? ",)" : ")") + ", got " + shape_text(array));
-    }
+    if (!same)
+        throw py::value_error(std::string(name) + ": expected shape " + shape_text(shape) + ", got " +
+                              shape_text(array));
     if (!(array.flags() & py::array::c_style))
         throw py::value_error(
             std::string(name) +

@@ -64,6 +64,14 @@ void bind_select(py::module_& m) {
              "ball"_a, "weight"_a, "level"_a, "own_group"_a, "parent_group"_a, "box"_a, "filter_px2"_a,
              "offset"_a);
     m.def("num_cuda_devices", &num_cuda_devices, "CUDA devices to run on; 0 without CUDA or a driver.");
+    m.def(
+        "eye_of",
+        [](const py::array& viewmat) {
+            py::array_t<double> eye(3);
+            eye_of(span_of<const double>(viewmat, "viewmat", {4, 4}).data, eye.mutable_data());
+            return eye;
+        },
+        "viewmat"_a, "Where a camera (4, 4) is in the world: (3,).");
     m.def("select", &select, "tables"_a, "instances"_a, "camera"_a, "rule"_a,
           "Clusters that one view needs: (instance (S,) int32, cluster (S,) int32, number of gaussians, "
           "tolerance, whether the budget was met).");

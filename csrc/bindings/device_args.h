@@ -34,13 +34,9 @@ Span<T> device_span_of(const py::handle& array, const char* name, std::initializ
         size *= static_cast<size_t>(here);
         ++axis;
     }
-    if (!same) {
-        std::string wanted;
-        for (const py::ssize_t length : shape)
-            wanted += (wanted.empty() ? "" : ", ") + (length < 0 ? std::string("N") : std::to_string(length));
-        throw py::value_error(std::string(name) + ": expected shape (" + wanted + "), got " +
+    if (!same)
+        throw py::value_error(std::string(name) + ": expected shape " + shape_text(shape) + ", got " +
                               py::str(got).cast<std::string>());
-    }
     if (face.contains("strides") && !face["strides"].is_none())
         throw py::value_error(std::string(name) + ": expected a contiguous array, got a strided one");
     const uintptr_t pointer = face["data"].cast<py::tuple>()[0].cast<uintptr_t>();

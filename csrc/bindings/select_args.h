@@ -89,27 +89,24 @@ inline Footprint footprint_of(const std::string& name) {
     throw py::value_error("footprint: expected solid_angle or paper, got " + name);
 }
 
-// Of (viewmat (4, 4), K (3, 3), width, height, near, window). A window (x0, y0, x1, y1) is a part
-// of the image, or None.
+// Of (viewmat (4, 4), K (3, 3), width, height, near, window). A window (x0, y0, x1, y1) is a part of the
+// image, or None.
 inline SelectCamera select_camera(const py::tuple& t) {
     const py::array viewmat = t[0].cast<py::array>(), K = t[1].cast<py::array>();
     const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
     const Span<const double> intrinsics = span_of<const double>(K, "K", {3, 3});
     SelectCamera camera;
-    double translation[3];
-    for (int row = 0; row < 3; ++row) {
-        translation[row] = view[4 * row + 3];
+    for (int row = 0; row < 3; ++row)
         for (int k = 0; k < 3; ++k) camera.rotation[3 * row + k] = view[4 * row + k];
-    }
-    eye_of(camera.rotation, translation, camera.eye);
+    eye_of(view.data, camera.eye);
     camera.fx = intrinsics[0];
     camera.fy = intrinsics[4];
     camera.cx = intrinsics[2];
     camera.cy = intrinsics[5];
-    camera.width = t[2].cast<int>();
-    camera.height = t[3].cast<int>();
-    camera.near = t[4].cast<double>();
     const int width = t[2].cast<int>(), height = t[3].cast<int>();
+    camera.width = width;
+    camera.height = height;
+    camera.near = t[4].cast<double>();
     std::array<int, 4> w{0, 0, width, height};
     if (!t[5].is_none()) w = t[5].cast<std::array<int, 4>>();
     if (!(0 <= w[0] && w[0] < w[2] && w[2] <= width && 0 <= w[1] && w[1] < w[3] && w[3] <= height))

@@ -437,7 +437,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s)
         uint32_t next = last_of_group[-highest];
         while (bits != 0) {
             const float4 a = third(0, next), b = third(1, next), c = third(2, next);
-            bits ^= __funnelshift_l(0u, 1u, highest);
+            bits ^= __funnelshift_l(0u, 1u, highest);  // 1 << highest, without a register for the 1
             highest = 31 - __clz(static_cast<int>(bits));
             next = last_of_group[-highest];
             const Falloff<float> f = falloff_at(p.x, p.y, a.x, a.y, a.z, a.w, b.x, b.y);

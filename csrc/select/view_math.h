@@ -18,20 +18,21 @@ struct SelectCamera {
     double x0, y0, x1, y1;                       // the part of the image that is wanted, px
 };
 
-// Where a camera is that brings p to rotation p + translation. The rotation may be off by what float32 loses.
-V3DG_HD inline void eye_of(const double rotation[9], const double translation[3], double eye[3]) {
-    // The inverse by its columns, which are cross products of the rows.
-    const double* r = rotation;
+// Where a camera is: what its world-to-camera matrix brings to 0. The rotation in it may be off by what
+// float32 loses.
+V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {
+    // The rotation's inverse by columns, which are cross products of its rows.
     double determinant = 0.0;
     for (int a = 0; a < 3; ++a) {
         const int b = (a + 1) % 3, c = (a + 2) % 3;
-        double sum = 0.0;
+        eye[a] = 0.0;
         for (int row = 0; row < 3; ++row) {
-            const double *next = r + 3 * ((row + 1) % 3), *after = r + 3 * ((row + 2) % 3);
-            sum += translation[row] * (next[b] * after[c] - next[c] * after[b]);
+            const double* next = viewmat + 4 * ((row + 1) % 3);
+            const double* after = viewmat + 4 * ((row + 2) % 3);
+            const double cofactor = next[b] * after[c] - next[c] * after[b];
+            eye[a] -= viewmat[4 * row + 3] * cofactor;
+            if (row == 0) determinant += viewmat[a] * cofactor;
         }
-        eye[a] = -sum;
-        determinant += r[a] * (r[3 + b] * r[6 + c] - r[3 + c] * r[6 + b]);
     }
     for (int a = 0; a < 3; ++a) eye[a] /= determinant;
 }
