@@ -64,7 +64,7 @@ void bind_box(py::module_& m);
 void bind_cluster(py::module_& m);
 void bind_gather(py::module_& m);
 void bind_select(py::module_& m);
-void bind_simplify_init(py::module_& m);
+void bind_simplify(py::module_& m);
 void bind_ply(py::module_& m);
 void bind_render(py::module_& m);
 void bind_rasterize_cuda(py::module_& m);

@@ -1,6 +1,6 @@
 #include "bindings/args.h"
 #include "bindings/device_args.h"
-#include "box/box.h"
+#include "cluster/box.h"
 
 namespace v3dg {
 

@@ -66,15 +66,15 @@ py::tuple median_split(const py::array& means, const py::array& offset, int dept
     return py::make_tuple(order, leaf_offset);
 }
 
-Span<const Sphere> spheres_of(Span<const float> rows) {
-    return {reinterpret_cast<const Sphere*>(rows.data), rows.size / 4};
+Span<const Ball> spheres_of(Span<const float> rows) {
+    return {reinterpret_cast<const Ball*>(rows.data), rows.size / 4};
 }
 
 py::array_t<float> bound_spheres(const py::array& spheres, const py::array& offset) {
-    const Span<const Sphere> in = spheres_of(span_of<const float>(spheres, "spheres", {-1, 4}));
+    const Span<const Ball> in = spheres_of(span_of<const float>(spheres, "spheres", {-1, 4}));
     const Span<const int64_t> offsets = offsets_of(offset, in.size);
     py::array_t<float> ball({static_cast<py::ssize_t>(offsets.size - 1), py::ssize_t(4)});
-    const Span<Sphere> out{reinterpret_cast<Sphere*>(ball.mutable_data()), offsets.size - 1};
+    const Span<Ball> out{reinterpret_cast<Ball*>(ball.mutable_data()), offsets.size - 1};
     const py::gil_scoped_release unlocked;
     cpu::bound_spheres(in, offsets, kNestingMargin, out);
     return ball;
@@ -114,14 +114,14 @@ void bind_cluster(py::module_& m) {
         m.def(
             "bound_spheres_cuda",
             [](const py::object& spheres, const py::array& offset, const py::object& ball, uintptr_t stream) {
-                const Span<const Sphere> in =
+                const Span<const Ball> in =
                     spheres_of(device_span_of<const float>(spheres, "spheres", {-1, 4}));
                 const Span<const int64_t> offsets = offsets_of(offset, in.size);
                 const Span<float> out =
                     device_span_of<float>(ball, "ball", {static_cast<py::ssize_t>(offsets.size - 1), 4});
                 const py::gil_scoped_release unlocked;
                 cuda::bound_spheres(in, offsets, kNestingMargin,
-                                    {reinterpret_cast<Sphere*>(out.data), offsets.size - 1},
+                                    {reinterpret_cast<Ball*>(out.data), offsets.size - 1},
                                     reinterpret_cast<cuda::Stream>(stream));
             },
             "spheres"_a, "offset"_a, "ball"_a, "stream"_a, "The same on a device: fills `ball`.");

@@ -56,12 +56,13 @@ void fit_level_arrays(const FitConfig& config, const std::shared_ptr<Model<float
     const int degree = target->planes().sh_degree;
     const std::vector<FitGroup> groups =
         groups_of(target_range, range, ball, stream, static_cast<py::ssize_t>(target->size()), n);
-    const FitRows rows{span_of<float>(means, "means", {n, 3}).data,
-                       span_of<float>(quats, "quats", {n, 4}).data,
-                       span_of<float>(scales, "scales", {n, 3}).data,
-                       span_of<float>(opacities, "opacities", {n}).data,
-                       span_of<float>(sh, "sh", {n, num_sh_bases(degree), 3}).data,
-                       degree};
+    const GaussianRows<float> rows{span_of<float>(means, "means", {n, 3}).data,
+                                   span_of<float>(quats, "quats", {n, 4}).data,
+                                   span_of<float>(scales, "scales", {n, 3}).data,
+                                   span_of<float>(opacities, "opacities", {n}).data,
+                                   span_of<float>(sh, "sh", {n, num_sh_bases(degree), 3}).data,
+                                   static_cast<size_t>(n),
+                                   degree};
     float* errors = errors_of(error, groups.size());
     py::gil_scoped_release unlocked;
     fit_level(config, {groups.data(), groups.size()},
@@ -128,15 +129,16 @@ void bind_fit_level(py::module_& m) {
                     {device_span_of<const float>(target_means, "target_means", {num_targets, 3}).data,
                      device_span_of<const float>(target_quats, "target_quats", {num_targets, 4}).data,
                      device_span_of<const float>(target_scales, "target_scales", {num_targets, 3}).data,
-                     target_opacity.data, target_coefficients.data, degree},
+                     target_opacity.data, target_coefficients.data, target_opacity.size, degree},
                     target_filter_px2,
                     target_compensate};
-                const FitRows rows{device_span_of<float>(means, "means", {n, 3}).data,
-                                   device_span_of<float>(quats, "quats", {n, 4}).data,
-                                   device_span_of<float>(scales, "scales", {n, 3}).data,
-                                   opacity.data,
-                                   device_span_of<float>(sh, "sh", {n, bases, 3}).data,
-                                   degree};
+                const GaussianRows<float> rows{device_span_of<float>(means, "means", {n, 3}).data,
+                                               device_span_of<float>(quats, "quats", {n, 4}).data,
+                                               device_span_of<float>(scales, "scales", {n, 3}).data,
+                                               opacity.data,
+                                               device_span_of<float>(sh, "sh", {n, bases, 3}).data,
+                                               static_cast<size_t>(n),
+                                               degree};
                 const std::vector<FitGroup> groups =
                     groups_of(target_range, range, ball, stream, num_targets, n);
                 float* errors = errors_of(error, groups.size());

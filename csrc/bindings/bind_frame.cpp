@@ -78,7 +78,7 @@ class BoundScene {
 
     py::tuple select(const py::tuple& camera, const py::tuple& rule, uintptr_t stream) {
         SelectOutput out;
-        const SelectCamera c = select_camera(camera);
+        const Camera c = select_camera(camera);
         const SelectRule r = select_rule(rule);
         {
             const py::gil_scoped_release unlocked;
@@ -105,9 +105,9 @@ class BoundSceneFrame {
     BoundSceneFrame(const py::list& rows_of_bundles, uintptr_t stream) : arrays_(rows_of_bundles) {
         std::vector<cuda::PackedModel> models;
         for (const py::handle& arrays : rows_of_bundles) {
-            const Rows rows = rows_of(arrays);
-            models.emplace_back(rows.rows, rows.count, stream_of(stream));
-            num_gaussians_.push_back(static_cast<int64_t>(rows.count));
+            const GaussianRows<const float> rows = rows_of(arrays);
+            models.emplace_back(rows, stream_of(stream));
+            num_gaussians_.push_back(static_cast<int64_t>(rows.size));
         }
         frame_ = std::make_unique<cuda::SceneFrame>(std::move(models), stream_of(stream));
     }
@@ -128,7 +128,7 @@ std::unique_ptr<BoundDrawing> draw_scene(const py::object& frame, const py::obje
                                          const py::tuple& camera, const py::tuple& rule,
                                          const std::array<double, 3>& background, const py::tuple& picture,
                                          uintptr_t stream) {
-    const SelectCamera c = select_camera(camera);
+    const Camera c = select_camera(camera);
     const cuda::FrameImage image = image_of(intrinsics_of(c), background, picture);
     BoundScene& bound = scene.cast<BoundScene&>();
     return std::make_unique<BoundDrawing>(
@@ -141,7 +141,7 @@ std::unique_ptr<BoundDrawing> draw_cut(const py::object& frame, const py::object
                                        const py::tuple& camera, const py::object& instance_ids,
                                        const py::object& cluster_ids, const std::array<double, 3>& background,
                                        const py::tuple& picture, uintptr_t stream) {
-    const SelectCamera c = select_camera(camera);
+    const Camera c = select_camera(camera);
     const cuda::FrameImage image = image_of(intrinsics_of(c), background, picture);
     BoundScene& bound = scene.cast<BoundScene&>();
     const Span<const int32_t> instances = device_span_of<const int32_t>(instance_ids, "instance_ids", {-1});
@@ -160,13 +160,13 @@ class BoundModel {
 
     std::unique_ptr<cuda::Drawing> draw(const ModelView<float>& view, double filter_px2, bool compensate,
                                         const cuda::FrameImage& image, uintptr_t stream) {
-        return frame_.draw(model_.rows(), model_.size(), view, static_cast<float>(filter_px2), compensate,
-                           image, stream_of(stream), &model_.packed());
+        return frame_.draw(model_.rows(), view, static_cast<float>(filter_px2), compensate, image,
+                           stream_of(stream), &model_.packed());
     }
 
   private:
-    BoundModel(const py::tuple& gaussians, const Rows& rows, uintptr_t stream)
-        : arrays_(gaussians), model_(rows.rows, rows.count, stream_of(stream)) {}
+    BoundModel(const py::tuple& gaussians, const GaussianRows<const float>& rows, uintptr_t stream)
+        : arrays_(gaussians), model_(rows, stream_of(stream)) {}
 
     py::object arrays_;
     cuda::PackedModel model_;

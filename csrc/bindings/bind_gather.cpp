@@ -2,6 +2,7 @@
 
 #include "bindings/args.h"
 #include "bindings/device_args.h"
+#include "bindings/render_args.h"
 #include "gather/gather.h"
 
 namespace v3dg {
@@ -32,7 +33,7 @@ Span<T> host_span(const py::object& array, const char* name, std::initializer_li
 
 // The arguments of one call; `input` borrows from them.
 struct Arguments {
-    std::vector<RowsIn> bundles;
+    std::vector<GaussianRows<const float>> bundles;
     std::vector<int64_t> num_rows;
     GatherInput input;
 };
@@ -41,7 +42,7 @@ template <class SpanOf>
 Arguments arguments_of(const py::list& bundles, const py::array& bundle, const py::array& positions,
                        const py::array& rotations, const py::array& quaternions, const py::array& scales,
                        const py::array& bands, const py::array& instance, const py::array& first_row,
-                       const py::array& offset, int num_bases, const SpanOf& span) {
+                       const py::array& offset, const SpanOf& span) {
     Arguments arguments;
     bool has_bands = false;
     for (const py::handle item : bundles) {
@@ -50,8 +51,9 @@ Arguments arguments_of(const py::list& bundles, const py::array& bundle, const p
         if (shape.size() != 3)
             throw py::value_error("sh: expected three dimensions, got " + std::to_string(shape.size()));
         const py::ssize_t num = shape[0].cast<py::ssize_t>(), bases = shape[1].cast<py::ssize_t>();
-        RowsIn rows = rows_of<RowsIn>(arrays, num, bases, span);
-        rows.num_sh = static_cast<int>(3 * bases);
+        GaussianRows<const float> rows = rows_of<GaussianRows<const float>>(arrays, num, bases, span);
+        rows.sh_degree = degree_of_bases(bases, py::str(shape).cast<std::string>());
+        rows.size = static_cast<size_t>(num);
         has_bands = has_bands || bases > 1;
         arguments.bundles.push_back(rows);
         arguments.num_rows.push_back(num);
@@ -69,7 +71,6 @@ Arguments arguments_of(const py::list& bundles, const py::array& bundle, const p
     const py::ssize_t num_clusters = static_cast<py::ssize_t>(in.instance.size);
     in.first_row = span_of<const int64_t>(first_row, "first_row", {num_clusters});
     in.offset = span_of<const int64_t>(offset, "offset", {num_clusters + 1});
-    in.num_sh = 3 * num_bases;
     for (const int32_t b : in.bundle)
         if (b < 0 || static_cast<size_t>(b) >= in.bundles.size)
             throw py::value_error("bundle: expected one below " + std::to_string(in.bundles.size) + ", got " +
@@ -92,15 +93,15 @@ py::tuple gather(const py::list& bundles, const py::array& bundle, const py::arr
                  const py::array& rotations, const py::array& quaternions, const py::array& scales,
                  const py::array& bands, const py::array& instance, const py::array& first_row,
                  const py::array& offset, int num_bases) {
-    const Arguments arguments =
-        arguments_of(bundles, bundle, positions, rotations, quaternions, scales, bands, instance, first_row,
-                     offset, num_bases, host_span<const float>);
+    const Arguments arguments = arguments_of(bundles, bundle, positions, rotations, quaternions, scales,
+                                             bands, instance, first_row, offset, host_span<const float>);
     const GatherInput& in = arguments.input;
     const py::ssize_t n = in.offset[in.instance.size];
     py::array_t<float> means({n, py::ssize_t(3)}), quats({n, py::ssize_t(4)}), sizes({n, py::ssize_t(3)}),
         opacities(n), sh({n, py::ssize_t(num_bases), py::ssize_t(3)});
-    const RowsOut out{means.mutable_data(), quats.mutable_data(), sizes.mutable_data(),
-                      opacities.mutable_data(), sh.mutable_data()};
+    const GaussianRows<float> out{means.mutable_data(),          quats.mutable_data(), sizes.mutable_data(),
+                                  opacities.mutable_data(),      sh.mutable_data(),    static_cast<size_t>(n),
+                                  degree_of_bases(num_bases, "")};
     {
         const py::gil_scoped_release unlocked;
         cpu::gather(in, out);
@@ -123,10 +124,11 @@ void bind_gather(py::module_& m) {
                const py::array& offset, int num_bases, const py::sequence& rows, uintptr_t stream) {
                 const Arguments arguments =
                     arguments_of(bundles, bundle, positions, rotations, quaternions, scales, bands, instance,
-                                 first_row, offset, num_bases, device_span_of<const float>);
+                                 first_row, offset, device_span_of<const float>);
                 const GatherInput& in = arguments.input;
-                const RowsOut out =
-                    rows_of<RowsOut>(rows, in.offset[in.instance.size], num_bases, device_span_of<float>);
+                GaussianRows<float> out = rows_of<GaussianRows<float>>(rows, in.offset[in.instance.size],
+                                                                       num_bases, device_span_of<float>);
+                out.sh_degree = degree_of_bases(num_bases, "");
                 const py::gil_scoped_release unlocked;
                 cuda::gather(in, out, reinterpret_cast<cuda::Stream>(stream));
             },

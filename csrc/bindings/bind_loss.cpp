@@ -1,7 +1,7 @@
 #include <algorithm>
 
 #include "bindings/args.h"
-#include "loss/loss.h"
+#include "fit_group/dssim.h"
 
 namespace v3dg {
 

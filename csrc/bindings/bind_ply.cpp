@@ -2,7 +2,7 @@
 #include <system_error>
 
 #include "bindings/args.h"
-#include "ply/ply.h"
+#include "io/ply.h"
 
 namespace v3dg {
 

@@ -22,17 +22,15 @@ static std::shared_ptr<TapeCuda> rasterize_cuda(const py::tuple& gaussians,
                                                 bool compensate, const std::array<double, 5>& k,
                                                 const std::array<double, 3>& background,
                                                 const py::tuple& picture, uintptr_t stream) {
-    const Rows model = rows_of(gaussians);
+    const GaussianRows<const float> model = rows_of(gaussians);
     const cuda::FrameImage image = image_of(k, background, picture);
-    const cuda::ModelPicture in{
-        model.rows, model.count, view_of<float>(view.data()), static_cast<float>(filter_px2),
-        compensate, image};
+    const cuda::ModelPicture in{model, view_of<float>(view.data()), static_cast<float>(filter_px2),
+                                compensate, image};
     py::gil_scoped_release unlocked;
     std::unique_ptr<cuda::DifferentiableFrame> frame = cuda::take_frame();
     frame->draw(in, stream_of(stream));
-    return std::shared_ptr<TapeCuda>(new TapeCuda{std::move(frame), static_cast<py::ssize_t>(model.count),
-                                                  num_sh_bases(model.rows.sh_degree), image.width,
-                                                  image.height});
+    return std::shared_ptr<TapeCuda>(new TapeCuda{std::move(frame), static_cast<py::ssize_t>(model.size),
+                                                  num_sh_bases(model.sh_degree), image.width, image.height});
 }
 
 static void rasterize_backward_cuda(const TapeCuda& tape, const py::object& d_color,
@@ -44,13 +42,13 @@ static void rasterize_backward_cuda(const TapeCuda& tape, const py::object& d_co
         device_span_of<const float>(d_color, "d_color", {h, w, 3}).data,
         device_span_of<const float>(d_alpha, "d_alpha", {h, w}).data,
         d_depth.is_none() ? nullptr : device_span_of<const float>(d_depth, "d_depth", {h, w}).data};
-    const GaussianGradients<float> out{
-        device_span_of<float>(d_gaussians[0], "d_means", {n, 3}).data,
-        device_span_of<float>(d_gaussians[1], "d_quats", {n, 4}).data,
-        device_span_of<float>(d_gaussians[2], "d_scales", {n, 3}).data,
-        device_span_of<float>(d_gaussians[3], "d_opacities", {n}).data,
-        device_span_of<float>(d_gaussians[4], "d_sh", {n, tape.sh_bases, 3}).data,
-    };
+    const GaussianRows<float> out{device_span_of<float>(d_gaussians[0], "d_means", {n, 3}).data,
+                                  device_span_of<float>(d_gaussians[1], "d_quats", {n, 4}).data,
+                                  device_span_of<float>(d_gaussians[2], "d_scales", {n, 3}).data,
+                                  device_span_of<float>(d_gaussians[3], "d_opacities", {n}).data,
+                                  device_span_of<float>(d_gaussians[4], "d_sh", {n, tape.sh_bases, 3}).data,
+                                  static_cast<size_t>(n),
+                                  degree_of_bases(tape.sh_bases, "")};
     float* background = device_span_of<float>(d_background, "d_background", {3}).data;
     py::gil_scoped_release unlocked;
     tape.frame->backward(d_picture, out, background, stream_of(stream));

@@ -18,10 +18,13 @@ static std::shared_ptr<Model<T>> make_model(const py::array& means, const py::ar
     const py::ssize_t n = opacities.ndim() == 1 ? opacities.shape(0) : -1;
     const py::ssize_t bases = sh.ndim() == 3 ? sh.shape(1) : -1;
     const int degree = degree_of_bases(bases, shape_text(sh));
-    const GaussianRows<T> rows{
-        span_of<const T>(means, "means", {n, 3}),   span_of<const T>(quats, "quats", {n, 4}),
-        span_of<const T>(scales, "scales", {n, 3}), span_of<const T>(opacities, "opacities", {n}),
-        span_of<const T>(sh, "sh", {n, bases, 3}),  degree};
+    const GaussianRows<const T> rows{span_of<const T>(means, "means", {n, 3}).data,
+                                     span_of<const T>(quats, "quats", {n, 4}).data,
+                                     span_of<const T>(scales, "scales", {n, 3}).data,
+                                     span_of<const T>(opacities, "opacities", {n}).data,
+                                     span_of<const T>(sh, "sh", {n, bases, 3}).data,
+                                     static_cast<size_t>(n),
+                                     degree};
     py::gil_scoped_release unlocked;
     return std::make_shared<Model<T>>(rows);
 }
@@ -100,8 +103,9 @@ static py::tuple rasterize_backward(const Tape<T>& tape, const py::array& d_colo
     };
     py::array_t<T> means = zeros({n, 3}), quats = zeros({n, 4}), scales = zeros({n, 3}),
                    opacities = zeros({n}), sh = zeros({n, bases, 3}), background = zeros({3});
-    const GaussianGradients<T> out{means.mutable_data(), quats.mutable_data(), scales.mutable_data(),
-                                   opacities.mutable_data(), sh.mutable_data()};
+    const GaussianRows<T> out{means.mutable_data(),          quats.mutable_data(), scales.mutable_data(),
+                              opacities.mutable_data(),      sh.mutable_data(),    static_cast<size_t>(n),
+                              tape.model->planes().sh_degree};
     T* d_background = background.mutable_data();
     {
         py::gil_scoped_release unlocked;
@@ -159,7 +163,7 @@ struct SelectionDraws {
     std::vector<Draw<float>> draws;
     std::vector<uint64_t> last_gaussian;  // of each pair, among the gaussians of all draws
 
-    SelectionDraws(const py::list& bundles, const py::tuple& instances, const SelectCamera& eye,
+    SelectionDraws(const py::list& bundles, const py::tuple& instances, const Camera& eye,
                    const py::array& instance_ids, const py::array& cluster_ids) {
         for (const py::handle& item : bundles) tables.push_back(clusters_of(item));
         const InstanceTable placed = instance_table(instances, tables.size());
@@ -216,7 +220,7 @@ class Stop {
 
 static const std::atomic<bool>* flag_of(const Stop* stop) { return stop == nullptr ? nullptr : stop->flag(); }
 
-static Window window_of(const SelectCamera& c) {
+static Window window_of(const Camera& c) {
     return {static_cast<int>(c.x0), static_cast<int>(c.y0), static_cast<int>(c.x1), static_cast<int>(c.y1)};
 }
 
@@ -226,7 +230,7 @@ static SharedWorkspace& shared_workspace() {
 }
 
 // Draws with the shared workspace, without Python's lock.
-static RenderCounts render_shared(const SelectionDraws& selected, const SelectCamera& eye,
+static RenderCounts render_shared(const SelectionDraws& selected, const Camera& eye,
                                   const Picture<float>& picture, const Stop* stop) {
     const Pinhole<float> pinhole = pinhole_of(eye);
     py::gil_scoped_release unlocked;
@@ -241,7 +245,7 @@ static py::tuple render_selection(const py::list& bundles, const py::tuple& inst
                                   const py::tuple& camera, const py::array& instance_ids,
                                   const py::array& cluster_ids, const std::array<double, 3>& background,
                                   bool with_depth, const Stop* stop) {
-    const SelectCamera eye = select_camera(camera);
+    const Camera eye = select_camera(camera);
     const SelectionDraws selected(bundles, instances, eye, instance_ids, cluster_ids);
     PictureArrays<float> out(window_of(eye), background, with_depth);
     const RenderCounts counts = render_shared(selected, eye, out.picture, stop);
@@ -252,7 +256,7 @@ static py::tuple render_selection(const py::list& bundles, const py::tuple& inst
 static py::tuple count_selection(const py::list& bundles, const py::tuple& instances, const py::tuple& camera,
                                  const py::array& instance_ids, const py::array& cluster_ids,
                                  const Stop* stop) {
-    const SelectCamera eye = select_camera(camera);
+    const Camera eye = select_camera(camera);
     const SelectionDraws selected(bundles, instances, eye, instance_ids, cluster_ids);
     PictureArrays<float> out(window_of(eye), {0, 0, 0}, true);
     std::swap(out.picture.depth, out.picture.count);
@@ -264,7 +268,7 @@ static py::tuple count_selection(const py::list& bundles, const py::tuple& insta
 // shows most of, or None.
 static py::object pick_selection(const py::list& bundles, const py::tuple& instances, const py::tuple& camera,
                                  const py::array& instance_ids, const py::array& cluster_ids) {
-    const SelectCamera eye = select_camera(camera);
+    const Camera eye = select_camera(camera);
     const SelectionDraws selected(bundles, instances, eye, instance_ids, cluster_ids);
     const Pinhole<float> pinhole = pinhole_of(eye);
     const Window window = window_of(eye);

@@ -10,29 +10,25 @@ namespace v3dg {
 
 inline cudaStream_t stream_of(uintptr_t handle) { return reinterpret_cast<cudaStream_t>(handle); }
 
-struct Rows {
-    cuda::DeviceRows rows;
-    size_t count;
-};
-
 // Borrows (means, quats, scales, opacities, sh) on the device.
-inline Rows rows_of(const py::handle& arrays) {
+inline GaussianRows<const float> rows_of(const py::handle& arrays) {
     const py::tuple t = arrays.cast<py::tuple>();
     const py::tuple shape = py::getattr(t[4], "shape").cast<py::tuple>();
     const py::ssize_t bases = shape.size() == 3 ? shape[1].cast<py::ssize_t>() : -1;
     const int degree = degree_of_bases(bases, py::str(shape).cast<std::string>());
     const Span<const float> opacities = device_span_of<const float>(t[3], "opacities", {-1});
     const py::ssize_t n = static_cast<py::ssize_t>(opacities.size);
-    const cuda::DeviceRows rows{device_span_of<const float>(t[0], "means", {n, 3}).data,
-                                device_span_of<const float>(t[1], "quats", {n, 4}).data,
-                                device_span_of<const float>(t[2], "scales", {n, 3}).data,
-                                opacities.data,
-                                device_span_of<const float>(t[4], "sh", {n, bases, 3}).data,
-                                degree};
+    const GaussianRows<const float> rows{device_span_of<const float>(t[0], "means", {n, 3}).data,
+                                         device_span_of<const float>(t[1], "quats", {n, 4}).data,
+                                         device_span_of<const float>(t[2], "scales", {n, 3}).data,
+                                         opacities.data,
+                                         device_span_of<const float>(t[4], "sh", {n, bases, 3}).data,
+                                         static_cast<size_t>(n),
+                                         degree};
     for (const float* start : {rows.quats, rows.sh})
         if (reinterpret_cast<uintptr_t>(start) % 16 != 0)
             throw py::value_error("quats, sh: expected memory that begins at a multiple of 16 bytes");
-    return {rows, static_cast<size_t>(n)};
+    return rows;
 }
 
 // Of color (H, W, 3), alpha (H, W) and depth (H, W), on the device.

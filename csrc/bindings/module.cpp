@@ -7,7 +7,7 @@
 
 #include "base/isa.h"
 #include "bindings/args.h"
-#include "project/project_math.h"
+#include "math/gaussian.h"
 
 // A child of fork() has none of the threads that GNU's OpenMP keeps for the next loop, but would wait for
 // them without end. So the thread that forks lets its own go first; they come back, on either side, with the
@@ -33,7 +33,7 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_cluster(m);
     v3dg::bind_gather(m);
     v3dg::bind_select(m);
-    v3dg::bind_simplify_init(m);
+    v3dg::bind_simplify(m);
     v3dg::bind_ply(m);
     v3dg::bind_render(m);
     v3dg::bind_rasterize_cuda(m);

@@ -3,7 +3,7 @@
 #include <array>
 
 #include "bindings/args.h"
-#include "project/project_math.h"
+#include "math/gaussian.h"
 
 namespace v3dg {
 

@@ -7,7 +7,7 @@
 
 #include "bindings/args.h"
 #include "bindings/render_args.h"
-#include "project/project_math.h"
+#include "math/gaussian.h"
 #include "select/select.h"
 
 namespace v3dg {
@@ -74,8 +74,8 @@ class BoundTable {
     }
 
     void find_bounds() {
-        table_.bounds = kNoBox;
-        for (const Box& box : table_.box) include_box(box, table_.bounds);
+        table_.bounds = no_box();
+        for (const Box& box : table_.box) grow(table_.bounds, box);
     }
 
     std::vector<py::array> arrays_;
@@ -91,11 +91,11 @@ inline Footprint footprint_of(const std::string& name) {
 
 // Of (viewmat (4, 4), K (3, 3), width, height, near, window). A window (x0, y0, x1, y1) is a part of the
 // image, or None.
-inline SelectCamera select_camera(const py::tuple& t) {
+inline Camera select_camera(const py::tuple& t) {
     const py::array viewmat = t[0].cast<py::array>(), K = t[1].cast<py::array>();
     const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
     const Span<const double> intrinsics = span_of<const double>(K, "K", {3, 3});
-    SelectCamera camera;
+    Camera camera;
     for (int row = 0; row < 3; ++row)
         for (int k = 0; k < 3; ++k) camera.rotation[3 * row + k] = view[4 * row + k];
     eye_of(view.data, camera.eye);
@@ -120,8 +120,8 @@ inline SelectCamera select_camera(const py::tuple& t) {
     return camera;
 }
 
-inline std::array<double, 5> intrinsics_of(const SelectCamera& c) { return {c.fx, c.fy, c.cx, c.cy, c.near}; }
-inline Pinhole<float> pinhole_of(const SelectCamera& c) {
+inline std::array<double, 5> intrinsics_of(const Camera& c) { return {c.fx, c.fy, c.cx, c.cy, c.near}; }
+inline Pinhole<float> pinhole_of(const Camera& c) {
     return pinhole_of<float>(intrinsics_of(c), static_cast<int>(c.width), static_cast<int>(c.height));
 }
 

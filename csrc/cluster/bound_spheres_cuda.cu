@@ -45,8 +45,8 @@ __device__ Farthest farthest_of_warp(Farthest mine) {
     return mine;
 }
 
-__global__ void start_kernel(const Sphere* spheres, const int64_t* offset, size_t num_segments,
-                             Search* searches, Sphere* balls) {
+__global__ void start_kernel(const Ball* spheres, const int64_t* offset, size_t num_segments,
+                             Search* searches, Ball* balls) {
     const size_t s = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
     if (s >= num_segments) return;
     const int64_t count = offset[s + 1] - offset[s];
@@ -58,13 +58,12 @@ __global__ void start_kernel(const Sphere* spheres, const int64_t* offset, size_
 }
 
 // A block takes a chunk of a segment.
-__global__ void farthest_kernel(const Sphere* spheres, const int64_t* offset,
-                                const uint32_t* segment_of_chunk, const uint32_t* first_chunk,
-                                const Search* searches, Farthest* found) {
+__global__ void farthest_kernel(const Ball* spheres, const int64_t* offset, const uint32_t* segment_of_chunk,
+                                const uint32_t* first_chunk, const Search* searches, Farthest* found) {
     const uint32_t s = segment_of_chunk[blockIdx.x];
     if (searches[s].phase == Phase::done) return;
     const Center center = searches[s].center;
-    const Sphere* segment = spheres + offset[s];
+    const Ball* segment = spheres + offset[s];
     const size_t count = static_cast<size_t>(offset[s + 1] - offset[s]);
     const size_t first = (blockIdx.x - first_chunk[s]) * kChunkSize;
     const size_t last = first + kChunkSize < count ? first + kChunkSize : count;
@@ -85,7 +84,7 @@ __global__ void farthest_kernel(const Sphere* spheres, const int64_t* offset,
 
 // Moves `center` towards the centre of the smallest ball around the spheres that the first lanes hold;
 // returns its radius.
-__device__ double center_core(const Sphere& mine, int count, Center& center) {
+__device__ double center_core(const Ball& mine, int count, Center& center) {
     const unsigned lane = threadIdx.x % 32;
     const auto find = [&](const Center& at) {
         const bool counts = static_cast<int>(lane) < count;
@@ -95,7 +94,7 @@ __device__ double center_core(const Sphere& mine, int count, Center& center) {
     Farthest far = find(at);
     double best_radius = far.distance;
     for (int step = kFirstCoreStep; step <= kLastCoreStep; ++step) {
-        const Sphere sphere{
+        const Ball sphere{
             __shfl_sync(kAllLanes, mine.x, far.index), __shfl_sync(kAllLanes, mine.y, far.index),
             __shfl_sync(kAllLanes, mine.z, far.index), __shfl_sync(kAllLanes, mine.radius, far.index)};
         if (!move_center(sphere, far.distance, step, at)) break;
@@ -109,9 +108,9 @@ __device__ double center_core(const Sphere& mine, int count, Center& center) {
 }
 
 // A warp takes a segment.
-__global__ void advance_kernel(const Sphere* spheres, const int64_t* offset, size_t num_segments,
+__global__ void advance_kernel(const Ball* spheres, const int64_t* offset, size_t num_segments,
                                const uint32_t* first_chunk, const Farthest* found, double margin,
-                               Search* searches, Sphere* cores, Sphere* balls) {
+                               Search* searches, Ball* cores, Ball* balls) {
     const size_t s = blockIdx.x * size_t(kWarps) + threadIdx.x / 32;
     if (s >= num_segments) return;
     Search search = searches[s];
@@ -122,7 +121,7 @@ __global__ void advance_kernel(const Sphere* spheres, const int64_t* offset, siz
     far = farthest_of_warp(far);
 
     if (search.phase == Phase::measure) {
-        Sphere ball = ball_at(search.best);
+        Ball ball = ball_at(search.best);
         ball.radius = radius_of_ball(far.distance, margin);
         search.phase = Phase::done;
         if (lane == 0) {
@@ -131,8 +130,8 @@ __global__ void advance_kernel(const Sphere* spheres, const int64_t* offset, siz
         }
         return;
     }
-    Sphere* core = cores + s * kCoreSize;
-    Sphere mine{};
+    Ball* core = cores + s * kCoreSize;
+    Ball mine{};
     if (static_cast<int>(lane) < search.core_size) mine = core[lane];
     if (search.core_size == 0) {
         search.best_radius = far.distance;
@@ -159,7 +158,7 @@ __global__ void advance_kernel(const Sphere* spheres, const int64_t* offset, siz
 
 }  // namespace
 
-void bound_spheres(Span<const Sphere> spheres, Span<const int64_t> offset, double margin, Span<Sphere> ball,
+void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin, Span<Ball> ball,
                    Stream stream) {
     const size_t num_segments = ball.size;
     std::vector<uint32_t> first_chunk{0}, segment_of_chunk;
@@ -174,7 +173,7 @@ void bound_spheres(Span<const Sphere> spheres, Span<const int64_t> offset, doubl
     const DeviceBuffer<uint32_t> segments(
         Span<const uint32_t>{segment_of_chunk.data(), segment_of_chunk.size()}, stream);
     DeviceBuffer<Search> searches(num_segments, stream);
-    DeviceBuffer<Sphere> cores(num_segments * kCoreSize, stream);
+    DeviceBuffer<Ball> cores(num_segments * kCoreSize, stream);
     DeviceBuffer<Farthest> found(segment_of_chunk.size(), stream);
     launch("bound_spheres: start", start_kernel, blocks_for(num_segments, kBlockSize), kBlockSize, 0, stream,
            spheres.data, offsets.data(), num_segments, searches.data(), ball.data);

@@ -38,7 +38,7 @@ void median_split(Span<const Point> means, Span<const int64_t> offset, int depth
 // `margin` widens the ball; kNestingMargin makes it contain the spheres in float32 arithmetic too.
 // Rounded outwards, at least kMinRadius. The result does not depend on the number of threads; both halves
 // give the same bits.
-void bound_spheres(Span<const Sphere> spheres, Span<const int64_t> offset, double margin, Span<Sphere> ball);
+void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin, Span<Ball> ball);
 }  // namespace cpu
 
 // The same with means, order, spheres and ball on the device; offsets stay on the host. Work is queued on the
@@ -46,7 +46,7 @@ void bound_spheres(Span<const Sphere> spheres, Span<const int64_t> offset, doubl
 namespace cuda {
 void median_split(Span<const Point> means, Span<const int64_t> offset, int depth, Span<int64_t> order,
                   Span<int64_t> leaf_offset, Stream stream);
-void bound_spheres(Span<const Sphere> spheres, Span<const int64_t> offset, double margin, Span<Sphere> ball,
+void bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin, Span<Ball> ball,
                    Stream stream);
 }  // namespace cuda
 

@@ -76,7 +76,7 @@ void split_node(IndexedPoint* points, ptrdiff_t first, ptrdiff_t last, int depth
     split_node(points, middle, last, depth - 1, order);
 }
 
-size_t farthest(const Center& center, const Sphere* spheres, size_t count, double* distance) {
+size_t farthest(const Center& center, const Ball* spheres, size_t count, double* distance) {
     size_t best = 0;
     double best_distance = -1.0;
     for (size_t i = 0; i < count; ++i) {
@@ -91,7 +91,7 @@ size_t farthest(const Center& center, const Sphere* spheres, size_t count, doubl
 }
 
 // Moves `center` towards the centre of the smallest ball around a few spheres; returns its radius.
-double center_core(const Sphere* core, size_t count, Center* center) {
+double center_core(const Ball* core, size_t count, Center* center) {
     double best_radius;
     Center at = *center;
     size_t far = farthest(at, core, count, &best_radius);
@@ -108,14 +108,14 @@ double center_core(const Sphere* core, size_t count, Center* center) {
 }
 
 // Centre of nearly the smallest ball around the spheres.
-Center center_of(const Sphere* spheres, size_t count) {
+Center center_of(const Ball* spheres, size_t count) {
     Center center = center_of(spheres[0]);
     if (count == 1) return center;
     double radius;
     size_t far = farthest(center, spheres, count, &radius);
     double best_radius = radius;
     Center best = center;
-    Sphere core[kCoreSize] = {spheres[0], spheres[far]};
+    Ball core[kCoreSize] = {spheres[0], spheres[far]};
     for (int size = 2;; ++size) {
         const double core_radius = center_core(core, size, &center);
         far = farthest(center, spheres, count, &radius);
@@ -148,10 +148,10 @@ void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int 
     }
 }
 
-void cpu::bound_spheres(Span<const Sphere> spheres, Span<const int64_t> offset, double margin,
-                        Span<Sphere> ball) {
+void cpu::bound_spheres(Span<const Ball> spheres, Span<const int64_t> offset, double margin,
+                        Span<Ball> ball) {
     parallel_for(ball.size, 16, [&](size_t s) {
-        const Sphere* first = spheres.data + offset[s];
+        const Ball* first = spheres.data + offset[s];
         const size_t count = offset[s + 1] - offset[s];
         ball[s] = {0, 0, 0, kMinRadius};
         if (count == 0) return;

@@ -3,17 +3,12 @@
 #include <cmath>
 #include <cstddef>
 
-#include "base/host_device.h"
+#include "math/bounds.h"
 
 namespace v3dg {
 
 struct Point {
     float axis[3];
-};
-
-// Centre and radius, in the asset's own frame and units.
-struct Sphere {
-    float x, y, z, radius;
 };
 
 // A ball contains another with this relative margin, so that rounding in the float32 footprint (about 1e-6)
@@ -28,15 +23,9 @@ struct Center {
 };
 
 // Distance from `center` to the farthest point of the sphere.
-V3DG_HD inline double reach(const Center& center, const Sphere& sphere) {
+V3DG_HD inline double reach(const Center& center, const Ball& sphere) {
     const double dx = sphere.x - center.x, dy = sphere.y - center.y, dz = sphere.z - center.z;
     return sqrt(dx * dx + dy * dy + dz * dz) + sphere.radius;
-}
-
-// The smallest float32 that is not below `value`.
-V3DG_HD inline float round_up(double value) {
-    const float nearest = static_cast<float>(value);
-    return nearest < value ? nextafterf(nearest, INFINITY) : nearest;
 }
 
 // The centre of the smallest ball around many spheres comes from a core set of a few: those that were the
@@ -47,7 +36,7 @@ constexpr double kCoreTolerance = 1e-4;
 
 // Moves the centre of a core set towards the sphere that reaches farthest from it, to `radius`. False when
 // the two are concentric, so that there is nothing to move towards.
-V3DG_HD inline bool move_center(const Sphere& farthest, double radius, int step, Center& center) {
+V3DG_HD inline bool move_center(const Ball& farthest, double radius, int step, Center& center) {
     const double distance = radius - farthest.radius;
     if (distance <= 0.0) return false;
     const double move = radius / distance / step;  // the far side of the sphere, not its centre
@@ -63,10 +52,10 @@ V3DG_HD inline bool core_suffices(double radius, double core_radius, int core_si
 }
 
 // The centre as a ball in float32 has it; the radius is still to come.
-V3DG_HD inline Sphere ball_at(const Center& center) {
+V3DG_HD inline Ball ball_at(const Center& center) {
     return {static_cast<float>(center.x), static_cast<float>(center.y), static_cast<float>(center.z), 0.0f};
 }
-V3DG_HD inline Center center_of(const Sphere& ball) { return {ball.x, ball.y, ball.z}; }
+V3DG_HD inline Center center_of(const Ball& ball) { return {ball.x, ball.y, ball.z}; }
 
 V3DG_HD inline float radius_of_ball(double farthest_reach, double margin) {
     const float radius = round_up(farthest_reach * (1.0 + margin));

@@ -6,9 +6,9 @@
 
 #include "base/buffer.h"
 #include "base/isa.h"
-#include "loss/loss.h"
-#include "project/project.h"
-#include "tile_bin/tile_bin.h"
+#include "fit_group/dssim.h"
+#include "frame/record.h"
+#include "math/gaussian.h"
 
 namespace v3dg {
 
@@ -47,12 +47,6 @@ struct FitTarget {
     bool compensate;
 };
 
-// The rows that are fitted: start on entry, result on return. World units, values (no logs or logits).
-struct FitRows {
-    float *means, *quats, *scales, *opacities, *sh;
-    int sh_degree;
-};
-
 // Shared with whoever waits for the result.
 struct FitProgress {
     std::atomic<uint64_t> groups_done{0};
@@ -83,11 +77,12 @@ FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index)
 V3DG_DECLARE_PER_ISA(void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget& target,
                                      const FitView& view, FitScratch& scratch, FitImage& image))
 
-// Fits one group; `targets` holds the pictures of the fixed views and then of those held out. Writes the
+// Fits one group: `rows` hold the start on entry and the result on return, in world units, as values without
+// logs or logits. `targets` holds the pictures of the fixed views and then of those held out. Writes the
 // residual of the result, mean |colour| and |alpha| over the views held out. A result that is no better there
 // than the start, or not finite, is thrown away.
 V3DG_DECLARE_PER_ISA(void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& target,
-                                    const FitImage* targets, const FitRows& rows, float error[2],
+                                    const FitImage* targets, const GaussianRows<float>& rows, float error[2],
                                     const std::atomic<bool>& cancel))
 
 }  // namespace v3dg

@@ -5,7 +5,10 @@
 #include <cstring>
 
 #include "fit_group/fit_group_math.h"
+#include "project/project.h"
+#include "rasterize/rasterize.h"
 #include "rasterize/tile.h"
+#include "tile_bin/tile_bin.h"
 
 // One thread fits one group, start to end. The group's frame has its ball at the origin with radius 1, so
 // step sizes mean the same for every group and nothing is lost far from the world's origin.
@@ -87,7 +90,7 @@ void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget&
 // and two moments of the same shape.
 class Student {
   public:
-    Student(const FitConfig& config, const FitGroup& group, const FitRows& rows)
+    Student(const FitConfig& config, const FitGroup& group, const GaussianRows<float>& rows)
         : config_(config), group_(group), n_(group.count), num_sh_(3 * num_sh_bases(rows.sh_degree)) {
         const size_t size = n_ * (11 + num_sh_);
         const size_t padded = (size + kPlanePadding) / kPlanePadding * kPlanePadding;
@@ -132,7 +135,8 @@ class Student {
                       const RecordGradient<float>* d_records, size_t count) {
         by_value_.resize(gradient_.size());
         float* g = by_value_.data();
-        const GaussianGradients<float> out{g, g + 3 * n_, g + 7 * n_, g + 10 * n_, g + 11 * n_};
+        const GaussianRows<float> out{g,           g + 3 * n_, g + 7 * n_,     g + 10 * n_,
+                                      g + 11 * n_, n_,         model_.sh_degree};
         project_backward<float>(draw, source, d_records, count, camera, out);
         for (size_t i = 0; i < count; ++i) {
             const size_t at = source[i];
@@ -167,7 +171,7 @@ class Student {
     }
 
     // Writes the values back in world units; false, and nothing written, if one of them is not finite.
-    bool write(const FitRows& rows) const {
+    bool write(const GaussianRows<float>& rows) const {
         for (size_t i = 0; i < n_ * (11 + num_sh_); ++i)
             if (!std::isfinite(value_[i])) return false;
         const size_t first = group_.first;
@@ -368,7 +372,7 @@ class Comparison {
 };
 
 void fit_group(const FitConfig& config, const FitGroup& group, const FitTarget& target,
-               const FitImage* targets, const FitRows& rows, float error[2],
+               const FitImage* targets, const GaussianRows<float>& rows, float error[2],
                const std::atomic<bool>& cancel) {
     Student student(config, group, rows);
     Comparison comparison(config);

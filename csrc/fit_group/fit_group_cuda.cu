@@ -251,7 +251,7 @@ struct Fit {
         float* value = at(layout.value);
         float *m = at(layout.m), *v = at(layout.v);
         const float inverse = 1 / job.group.radius;
-        const FitRows& rows = in.rows;
+        const GaussianRows<float>& rows = in.rows;
         for (uint32_t i = first(); i < n; i += stride()) {
             const size_t from = job.group.first + i;
             for (int k = 0; k < 3; ++k) {
@@ -273,7 +273,7 @@ struct Fit {
         for (uint32_t k = threadIdx.x; k < num_values; k += kThreads)
             finite = finite && fabsf(value[k]) <= FLT_MAX;
         if (!__syncthreads_and(finite)) return false;
-        const FitRows& rows = in.rows;
+        const GaussianRows<float>& rows = in.rows;
         const FitGroup& group = job.group;
         for (uint32_t i = first(); i < n; i += stride()) {
             const Gaussian3d<float> g = gaussian(i);

@@ -29,7 +29,7 @@ struct FitGroupsInput {
     Span<const FitJob> jobs;
     const float4* targets;  // colour and alpha, picture by picture, row major
     const FitView* views;   // as many as there are pictures
-    FitRows rows;
+    GaussianRows<float> rows;
     float* error;
     FitSignals* signals;
 };

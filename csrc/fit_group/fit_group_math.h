@@ -4,11 +4,11 @@
 
 #include <numeric>
 
-#include "adam/adam_math.h"
 #include "base/random.h"
 #include "fit_group/fit_group.h"
-#include "loss/loss_math.h"
+#include "math/adam.h"
 #include "math/solid_angle.h"
+#include "math/ssim.h"
 #include "project/project_math.h"
 
 namespace v3dg {

@@ -4,7 +4,7 @@
 
 #include "base/span.h"
 #include "base/stream.h"
-#include "math/rows.h"
+#include "math/gaussian.h"
 
 namespace v3dg {
 
@@ -13,7 +13,7 @@ constexpr int kBandsSize = 3 * 3 + 5 * 5 + 7 * 7;
 
 // Clusters of instances. An instance takes p to scale * rotation p + position.
 struct GatherInput {
-    Span<const RowsIn> bundles;
+    Span<const GaussianRows<const float>> bundles;
     // [I] instances
     Span<const int32_t> bundle;
     Span<const double> position;    // [I * 3]
@@ -25,14 +25,13 @@ struct GatherInput {
     Span<const int32_t> instance;
     Span<const int64_t> first_row;  // in the bundle
     Span<const int64_t> offset;     // [S + 1] in the result, ascending from 0
-    int num_sh;                     // 3 times the number of SH bases of the result; what a bundle lacks is 0
 };
 
-// Writes the gaussians of all clusters in the world, in order. Computed in double precision; both halves give
-// the same bits.
-namespace cpu { void gather(const GatherInput& in, const RowsOut& out); }
+// Writes the gaussians of all clusters in the world, in order; the SH coefficients that a bundle lacks are 0.
+// Computed in double precision; both halves give the same bits.
+namespace cpu { void gather(const GatherInput& in, const GaussianRows<float>& out); }
 // Rows of bundles and `out` are on the device, all else on the host. Work is queued on the stream. Throws
 // std::runtime_error when CUDA reports an error.
-namespace cuda { void gather(const GatherInput& in, const RowsOut& out, Stream stream); }
+namespace cuda { void gather(const GatherInput& in, const GaussianRows<float>& out, Stream stream); }
 
 }  // namespace v3dg

@@ -25,7 +25,8 @@ __device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size
 }
 
 // One thread a row of the result, or one a row and basis: num_items a row.
-__global__ void __launch_bounds__(kBlockSize) gather_kernel(GatherInput in, RowsOut out, int num_items) {
+__global__ void __launch_bounds__(kBlockSize)
+    gather_kernel(GatherInput in, GaussianRows<float> out, int num_items) {
     const int64_t num = in.offset[in.instance.size] * num_items;
     const int64_t first = blockIdx.x * int64_t(kBlockSize);
     const int64_t last = (first + kBlockSize < num ? first + kBlockSize : num) - 1;
@@ -55,16 +56,16 @@ class Copy {
 
 }  // namespace
 
-void gather(const GatherInput& host, const RowsOut& out, Stream stream) {
+void gather(const GatherInput& host, const GaussianRows<float>& out, Stream stream) {
     GatherInput in = host;
-    const int64_t num_items = host.offset[host.instance.size] * (host.num_sh / 3);
-    const Copy<RowsIn> bundles(in.bundles, stream);
+    const int64_t num_items = host.offset[host.instance.size] * num_sh_bases(out.sh_degree);
+    const Copy<GaussianRows<const float>> bundles(in.bundles, stream);
     const Copy<int32_t> bundle(in.bundle, stream), instance(in.instance, stream);
     const Copy<double> position(in.position, stream), rotation(in.rotation, stream),
         quaternion(in.quaternion, stream), scale(in.scale, stream), bands(in.bands, stream);
     const Copy<int64_t> first_row(in.first_row, stream), offset(in.offset, stream);
     launch("gather", gather_kernel, blocks_for(num_items, kBlockSize), kBlockSize, 0, stream, in, out,
-           host.num_sh / 3);
+           num_sh_bases(out.sh_degree));
 }
 
 }  // namespace cuda

@@ -6,10 +6,11 @@
 namespace v3dg {
 
 // Writes all but the SH coefficients of the gaussian `within` cluster s.
-V3DG_HD inline void gather_shape(const GatherInput& in, size_t s, int64_t within, const RowsOut& out) {
+V3DG_HD inline void gather_shape(const GatherInput& in, size_t s, int64_t within,
+                                 const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
     const size_t i = in.instance[s];
-    const RowsIn& rows = in.bundles[in.bundle[i]];
+    const GaussianRows<const float>& rows = in.bundles[in.bundle[i]];
     const double *r = in.rotation.data + 9 * i, *q = in.quaternion.data + 4 * i, scale = in.scale[i];
     const double x = rows.means[3 * from], y = rows.means[3 * from + 1], z = rows.means[3 * from + 2];
     for (int k = 0; k < 3; ++k) {
@@ -28,13 +29,13 @@ V3DG_HD inline void gather_shape(const GatherInput& in, size_t s, int64_t within
 
 // Writes the three coefficients of one SH basis of that gaussian, rotated into the world with its band.
 V3DG_HD inline void gather_sh(const GatherInput& in, size_t s, int64_t within, int basis,
-                              const RowsOut& out) {
+                              const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
     const size_t i = in.instance[s];
-    const RowsIn& rows = in.bundles[in.bundle[i]];
-    const float* coefficients = rows.sh + rows.num_sh * from;
-    float* result = out.sh + in.num_sh * to + 3 * basis;
-    if (basis == 0 || 3 * basis >= rows.num_sh) {
+    const GaussianRows<const float>& rows = in.bundles[in.bundle[i]];
+    const float* coefficients = rows.sh + rows.num_sh() * from;
+    float* result = out.sh + out.num_sh() * to + 3 * basis;
+    if (basis == 0 || 3 * basis >= rows.num_sh()) {
         for (int c = 0; c < 3; ++c) result[c] = basis == 0 ? coefficients[c] : 0.0f;
         return;
     }

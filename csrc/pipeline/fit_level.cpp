@@ -6,6 +6,7 @@
 
 #include "base/isa.h"
 #include "base/parallel_for.h"
+#include "frame/image.h"
 #include "fit_group/fit_group_math.h"
 
 namespace v3dg {
@@ -14,7 +15,7 @@ namespace v3dg {
 constexpr size_t kTargetBytes = size_t(256) << 20;
 
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTarget& target,
-               const FitRows& rows, float* error, FitProgress& progress) {
+               const GaussianRows<float>& rows, float* error, FitProgress& progress) {
     const size_t num_pictures =
         config.num_views > 0 ? config.num_views + kHeldOutViews : 0;  // kept of a group
     std::vector<FitImage> images;

@@ -6,7 +6,7 @@
 #include <thread>
 #include <vector>
 
-#include "fit_group/fit_target_cuda.h"
+#include "pipeline/fit_targets_cuda.h"
 
 namespace v3dg {
 namespace cuda {
@@ -72,8 +72,8 @@ size_t target_bytes(const FitConfig& config, const FitJob& job) {
 // Fits jobs whose pictures fit into memory together.
 class Level {
   public:
-    Level(const FitConfig& config, const DeviceFitTarget& target, const FitRows& rows, size_t num_groups,
-          FitProgress& progress, cudaStream_t stream)
+    Level(const FitConfig& config, const DeviceFitTarget& target, const GaussianRows<float>& rows,
+          size_t num_groups, FitProgress& progress, cudaStream_t stream)
         : config_(config),
           target_(target),
           rows_(rows),
@@ -120,7 +120,7 @@ class Level {
   private:
     const FitConfig& config_;
     const DeviceFitTarget& target_;
-    const FitRows& rows_;
+    const GaussianRows<float>& rows_;
     FitProgress& progress_;
     const cudaStream_t stream_;
     DeviceBuffer<float> error_;
@@ -133,7 +133,7 @@ class Level {
 }  // namespace
 
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const DeviceFitTarget& target,
-               const FitRows& rows, float* error, FitProgress& progress, Stream stream) {
+               const GaussianRows<float>& rows, float* error, FitProgress& progress, Stream stream) {
     if (groups.empty() || progress.cancel) return;
     std::vector<FitJob> jobs = jobs_of(config, groups);
     size_t free_bytes = 0, total_bytes = 0;

@@ -2,14 +2,14 @@
 
 #include "base/stream.h"
 #include "fit_group/fit_group.h"
-#include "pipeline/frame_types.h"
+#include "math/gaussian.h"
 
 namespace v3dg {
 namespace cuda {
 
 // The gaussians that groups should look like, on the device.
 struct DeviceFitTarget {
-    DeviceRows rows;
+    GaussianRows<const float> rows;
     float filter_px2;
     bool compensate;
 };
@@ -21,7 +21,7 @@ struct DeviceFitTarget {
 // differently, as the CPU does. Groups' pictures are drawn before they are fitted, as many groups at once as
 // there is memory for.
 void fit_level(const FitConfig& config, Span<const FitGroup> groups, const DeviceFitTarget& target,
-               const FitRows& rows, float* error, FitProgress& progress, Stream stream);
+               const GaussianRows<float>& rows, float* error, FitProgress& progress, Stream stream);
 
 }  // namespace cuda
 }  // namespace v3dg

@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "base/device.h"
-#include "pipeline/frame_types.h"
+#include "frame/tile_list.h"
 #include "project/project_cuda.h"
 #include "rasterize/rasterize_cuda.h"
 #include "tile_bin/tile_bin_cuda.h"
@@ -16,19 +16,19 @@ namespace cuda {
 
 // What a frame draws; device memory that stays as it is until the frame is drawn.
 struct FrameBatch {
-    const DeviceRows* models;
+    const GaussianRows<const float>* models;
     const Placement* placements;
     const FrameImage* images;
-    uint32_t num_images, num_tiles;      // of all images together
-    const PackedRows* packed = nullptr;  // of the same models
-    bool has_shared_items = false;       // whether there may be any; a frame that keeps a tape has none
+    uint32_t num_images, num_tiles;        // of all images together
+    const PackedPlanes* packed = nullptr;  // of the same models
+    bool has_shared_items = false;         // whether there may be any; a frame that keeps a tape has none
 };
 
 // What a frame leaves for the way back, valid until the next is drawn.
 struct FrameTape {
     FrameLists lists;
     RasterTape raster;
-    const DeviceRows* models;
+    const GaussianRows<const float>* models;
     const Placement* placements;
     const DrawItem* items;         // counters->items
     const uint32_t* item_records;  // how many of an item's gaussians became records

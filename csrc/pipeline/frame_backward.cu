@@ -6,6 +6,8 @@
 #include <string>
 #include <vector>
 
+#include "rasterize/rasterize_backward.h"
+
 namespace v3dg {
 namespace cuda {
 
@@ -25,7 +27,7 @@ void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
     in_ = in;
     check(cudaStreamWaitEvent(stream, gone_back_, 0), "cudaStreamWaitEvent");
     const std::unique_ptr<Drawing> drawing =
-        frame_.draw(in.rows, in.count, in.view, in.filter_px2, in.compensate, in.image, stream);
+        frame_.draw(in.rows, in.view, in.filter_px2, in.compensate, in.image, stream);
     num_slots_ = drawing->settle().slots;
     if (num_slots_ > UINT32_MAX)
         throw std::length_error(
@@ -34,9 +36,8 @@ void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
     check(cudaEventRecord(drawn_, stream), "cudaEventRecord");
 }
 
-void DifferentiableFrame::backward(const PictureGradient<float>& d_picture,
-                                   const GaussianGradients<float>& out, float* d_background,
-                                   cudaStream_t stream) {
+void DifferentiableFrame::backward(const PictureGradient<float>& d_picture, const GaussianRows<float>& out,
+                                   float* d_background, cudaStream_t stream) {
     check(cudaStreamWaitEvent(stream, drawn_, 0), "cudaStreamWaitEvent");
     const FrameTape tape = frame_.tape();
     const DeviceBuffer<RecordGradient<float>> slot(num_slots_, stream);
@@ -47,7 +48,7 @@ void DifferentiableFrame::backward(const PictureGradient<float>& d_picture,
     rasterize_backward({in_.image, tape.lists.records, tape.lists.tile_first, tape.raster.order,
                         tape.raster.blended, tape.lists.plans, d_picture},
                        slots, d_background_of_tile.data(), d_background, stream);
-    project_backward({in_.count, tape.item_records, tape.lists.records, tape.source, in_.rows, in_.view,
+    project_backward({tape.item_records, tape.lists.records, tape.source, in_.rows, in_.view,
                       in_.image.camera, in_.filter_px2, in_.compensate},
                      slots, out, stream);
     check(cudaEventRecord(gone_back_, stream), "cudaEventRecord");

@@ -10,8 +10,7 @@ namespace cuda {
 
 // One model in one picture.
 struct ModelPicture {
-    DeviceRows rows;
-    size_t count;  // gaussians
+    GaussianRows<const float> rows;
     ModelView<float> view;
     float filter_px2;
     bool compensate;
@@ -31,7 +30,7 @@ class DifferentiableFrame {
 
     // Enqueues the gradients of the gaussians and the background (3) of the picture last drawn; its arrays
     // and the gaussians are still as they were. Every element is written, the same on every run.
-    void backward(const PictureGradient<float>& d_picture, const GaussianGradients<float>& out,
+    void backward(const PictureGradient<float>& d_picture, const GaussianRows<float>& out,
                   float* d_background, cudaStream_t stream);
 
   private:

@@ -2,31 +2,21 @@
 
 #include "base/buffer.h"
 #include "base/parallel_for.h"
-#include "base/span.h"
-#include "project/project.h"
+#include "math/gaussian.h"
 
 namespace v3dg {
-
-// Gaussians as users hold them: rows of (N, 3), (N, 4), (N, 3), (N,), (N, bases, 3).
-template <class T>
-struct GaussianRows {
-    Span<const T> means, quats, scales, opacities, sh;
-    int sh_degree;
-    size_t size() const { return opacities.size; }
-};
 
 // Gaussians as the rasterizer reads them: owned planes.
 template <class T>
 class Model {
   public:
-    explicit Model(const GaussianRows<T>& rows) : size_(rows.size()) {
-        const size_t num_sh = 3 * num_sh_bases(rows.sh_degree);
+    explicit Model(const GaussianRows<const T>& rows) : size_(rows.size) {
         const size_t stride = size_ + kPlanePadding;
-        T* plane = storage_.reserve((11 + num_sh) * stride);
-        const auto add = [&](Span<const T> source, size_t width, const T** planes) {
+        T* plane = storage_.reserve((11 + rows.num_sh()) * stride);
+        const auto add = [&](const T* source, size_t width, const T** planes) {
             for (size_t k = 0; k < width; ++k) {
                 planes[k] = plane;
-                parallel_for(size_, 65536, [&, k](size_t i) { plane[i] = source.data[i * width + k]; });
+                parallel_for(size_, 65536, [&, k](size_t i) { plane[i] = source[i * width + k]; });
                 for (size_t i = size_; i < stride; ++i) plane[i] = T(0);
                 plane += stride;
             }
@@ -35,7 +25,7 @@ class Model {
         add(rows.quats, 4, planes_.quat);
         add(rows.scales, 3, planes_.scale);
         add(rows.opacities, 1, &planes_.opacity);
-        add(rows.sh, num_sh, planes_.sh);
+        add(rows.sh, rows.num_sh(), planes_.sh);
         planes_.sh_degree = rows.sh_degree;
     }
     const GaussianPlanes<T>& planes() const { return planes_; }

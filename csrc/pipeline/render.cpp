@@ -11,6 +11,8 @@
 #include <string>
 
 #include "base/parallel_for.h"
+#include "project/project.h"
+#include "rasterize/rasterize.h"
 #include "rasterize/rasterize_math.h"
 
 namespace v3dg {
@@ -237,8 +239,8 @@ static uint64_t num_tiles_of(const Record<T>& r) {
 
 template <class T>
 void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Picture<T>& picture,
-                     const PictureGradient<T>& d_picture, const Workspace<T>& ws,
-                     const GaussianGradients<T>& out, T d_background[3]) {
+                     const PictureGradient<T>& d_picture, const Workspace<T>& ws, const GaussianRows<T>& out,
+                     T d_background[3]) {
     const TileGrid grid(picture.window);
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
@@ -313,8 +315,8 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
     template RenderCounts render<T>(const std::vector<Draw<T>>&, const Pinhole<T>&, const Picture<T>&, bool, \
                                     Workspace<T>&, const std::atomic<bool>*);                                \
     template void render_backward<T>(const Draw<T>&, const Pinhole<T>&, const Picture<T>&,                   \
-                                     const PictureGradient<T>&, const Workspace<T>&,                         \
-                                     const GaussianGradients<T>&, T*);
+                                     const PictureGradient<T>&, const Workspace<T>&, const GaussianRows<T>&, \
+                                     T*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

@@ -3,7 +3,11 @@
 #include <atomic>
 #include <vector>
 
-#include "rasterize/rasterize.h"
+#include "base/buffer.h"
+#include "frame/draw_list.h"
+#include "frame/image.h"
+#include "frame/record.h"
+#include "tile_bin/tile_bin.h"
 
 namespace v3dg {
 
@@ -54,6 +58,6 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
 template <class T>
 void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& workspace,
-                     const GaussianGradients<T>& out, T d_background[3]);
+                     const GaussianRows<T>& out, T d_background[3]);
 
 }  // namespace v3dg

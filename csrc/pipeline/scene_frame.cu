@@ -25,16 +25,13 @@ static uint32_t num_tiles(const FrameImage& image) {
     return static_cast<uint32_t>(image.tile_columns) * static_cast<uint32_t>(image.tile_rows);
 }
 
-PackedModel::PackedModel(const DeviceRows& rows, size_t count, cudaStream_t stream)
-    : rows_(rows),
-      size_(count),
-      planes_(16 * count, stream),
-      packed_(pack(rows, count, planes_.data(), stream)) {}
+PackedModel::PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream)
+    : rows_(rows), planes_(16 * rows.size, stream), packed_(pack(rows, planes_.data(), stream)) {}
 
 SceneFrame::SceneFrame(std::vector<PackedModel> models, cudaStream_t stream)
     : models_(std::move(models)), images_(1, stream) {
-    std::vector<DeviceRows> rows;
-    std::vector<PackedRows> packed;
+    std::vector<GaussianRows<const float>> rows;
+    std::vector<PackedPlanes> packed;
     for (const PackedModel& model : models_) {
         rows.push_back(model.rows());
         packed.push_back(model.packed());
@@ -55,9 +52,8 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& tables, const Frame
     return frame_.draw(batch, std::move(prepare), stream);
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw(SceneTables& tables, const SelectCamera& camera,
-                                          const SelectRule& rule, const FrameImage& image,
-                                          cudaStream_t stream) {
+std::unique_ptr<Drawing> SceneFrame::draw(SceneTables& tables, const Camera& camera, const SelectRule& rule,
+                                          const FrameImage& image, cudaStream_t stream) {
     return draw(
         tables, image,
         [=, &tables](const ItemList& items, cudaStream_t on) {
@@ -66,7 +62,7 @@ std::unique_ptr<Drawing> SceneFrame::draw(SceneTables& tables, const SelectCamer
         stream);
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw_cut(SceneTables& tables, const SelectCamera& camera,
+std::unique_ptr<Drawing> SceneFrame::draw_cut(SceneTables& tables, const Camera& camera,
                                               Span<const int32_t> instance, Span<const int32_t> cluster,
                                               const FrameImage& image, cudaStream_t stream) {
     return draw(
@@ -81,10 +77,10 @@ std::unique_ptr<Drawing> SceneFrame::draw_cut(SceneTables& tables, const SelectC
 constexpr unsigned kModelThreads = 128;
 
 // A thread an item.
-static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, unsigned long long count,
-                                    float filter_px2, bool compensate, ItemList items) {
+static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, float filter_px2,
+                                    bool compensate, ItemList items) {
     const unsigned long long i = blockIdx.x * static_cast<unsigned long long>(blockDim.x) + threadIdx.x;
-    const unsigned long long first = i * kItemSize;
+    const unsigned long long first = i * kItemSize, count = tables.rows.size;
     if (i == 0) {
         *on_device = tables;
         items.counters->items = (count + kItemSize - 1) / kItemSize;
@@ -97,21 +93,21 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
     items.items[i] = {0, at, size, at, filter_px2, compensate, 0};
 }
 
-std::unique_ptr<Drawing> ModelFrame::draw(const DeviceRows& rows, size_t count, const ModelView<float>& view,
+std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
                                           float filter_px2, bool compensate, const FrameImage& image,
-                                          cudaStream_t stream, const PackedRows* packed) {
+                                          cudaStream_t stream, const PackedPlanes* packed) {
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
-    const ModelTables tables{rows, packed == nullptr ? PackedRows{} : *packed, {view, 0, 0}, image};
+    const ModelTables tables{rows, packed == nullptr ? PackedPlanes{} : *packed, {view, 0, 0}, image};
     const FrameBatch batch{&on_device->rows,  &on_device->placement,
                            &on_device->image, 1,
                            num_tiles(image),  packed == nullptr ? nullptr : &on_device->packed};
-    const unsigned blocks = std::max(1u, blocks_for(blocks_for(count, kItemSize), kModelThreads));
+    const unsigned blocks = std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));
     return frame_.draw(
         batch,
         [=](const ItemList& items, cudaStream_t on) {
-            launch("model_kernel", model_kernel, blocks, kModelThreads, 0, on, tables, on_device, count,
-                   filter_px2, compensate, items);
+            launch("model_kernel", model_kernel, blocks, kModelThreads, 0, on, tables, on_device, filter_px2,
+                   compensate, items);
         },
         stream);
 }

@@ -13,16 +13,14 @@ FrameImage frame_image(const Pinhole<float>& camera, int width, int height, cons
 // Gaussians that stay as they are, and packed.
 class PackedModel {
   public:
-    PackedModel(const DeviceRows& rows, size_t count, cudaStream_t stream);
-    const DeviceRows& rows() const { return rows_; }
-    const PackedRows& packed() const { return packed_; }
-    size_t size() const { return size_; }
+    PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream);
+    const GaussianRows<const float>& rows() const { return rows_; }
+    const PackedPlanes& packed() const { return packed_; }
 
   private:
-    DeviceRows rows_;
-    size_t size_;
+    GaussianRows<const float> rows_;
     DeviceBuffer<float> planes_;
-    PackedRows packed_;
+    PackedPlanes packed_;
 };
 
 // Draws a scene that stays on the device: selects, then draws the cut.
@@ -32,20 +30,20 @@ class SceneFrame {
     SceneFrame(std::vector<PackedModel> models, cudaStream_t stream);
 
     // The tables stay as they are until the drawing is finished.
-    std::unique_ptr<Drawing> draw(SceneTables& tables, const SelectCamera& camera, const SelectRule& rule,
+    std::unique_ptr<Drawing> draw(SceneTables& tables, const Camera& camera, const SelectRule& rule,
                                   const FrameImage& image, cudaStream_t stream);
     // Draws pairs that were selected before; they are on the device and stay, too.
-    std::unique_ptr<Drawing> draw_cut(SceneTables& tables, const SelectCamera& camera,
-                                      Span<const int32_t> instance, Span<const int32_t> cluster,
-                                      const FrameImage& image, cudaStream_t stream);
+    std::unique_ptr<Drawing> draw_cut(SceneTables& tables, const Camera& camera, Span<const int32_t> instance,
+                                      Span<const int32_t> cluster, const FrameImage& image,
+                                      cudaStream_t stream);
 
   private:
     std::unique_ptr<Drawing> draw(const SceneTables& tables, const FrameImage& image, Frame::Prepare prepare,
                                   cudaStream_t stream);
 
     std::vector<PackedModel> models_;
-    DeviceBuffer<DeviceRows> rows_;
-    DeviceBuffer<PackedRows> packed_;
+    DeviceBuffer<GaussianRows<const float>> rows_;
+    DeviceBuffer<PackedPlanes> packed_;
     DeviceBuffer<Placement> placements_;
     DeviceBuffer<FrameImage> images_;
     Frame frame_;
@@ -53,8 +51,8 @@ class SceneFrame {
 
 // One model in front of one camera.
 struct ModelTables {
-    DeviceRows rows;
-    PackedRows packed;
+    GaussianRows<const float> rows;
+    PackedPlanes packed;
     Placement placement;
     FrameImage image;
 };
@@ -65,9 +63,9 @@ class ModelFrame {
     explicit ModelFrame(Frame::Keeps keeps = Frame::Keeps::nothing) : frame_(keeps) {}
 
     // The rows, and what is packed of them, stay where they are until the drawing is finished.
-    std::unique_ptr<Drawing> draw(const DeviceRows& rows, size_t count, const ModelView<float>& view,
+    std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
                                   float filter_px2, bool compensate, const FrameImage& image,
-                                  cudaStream_t stream, const PackedRows* packed = nullptr);
+                                  cudaStream_t stream, const PackedPlanes* packed = nullptr);
     FrameTape tape() const { return frame_.tape(); }
 
   private:

@@ -3,8 +3,8 @@
 // The way back from the records of a CUDA frame that shows one model to the gaussians of that model.
 
 #include "base/device.h"
-#include "pipeline/frame_types.h"
-#include "rasterize/rasterize_backward.h"
+#include "frame/draw_list.h"
+#include "frame/gradient_slots.h"
 
 namespace v3dg {
 namespace cuda {
@@ -17,11 +17,10 @@ void place_slots(const ItemList& items, const uint32_t* item_records, const Reco
 struct ProjectBackwardInput {
     // Items of kItemSize gaussians, the last of what is left. The records of item i stand in a row from
     // i * kItemSize on, in the order of their gaussians.
-    uint64_t size;                 // gaussians
     const uint32_t* item_records;  // how many of an item's gaussians became records
     const Record<float>* records;
     const uint32_t* source;  // each record's gaussian
-    DeviceRows rows;
+    GaussianRows<const float> rows;
     ModelView<float> view;
     Pinhole<float> camera;
     float filter_px2;
@@ -31,7 +30,7 @@ struct ProjectBackwardInput {
 // Writes the gradients of every gaussian, zeros for those without a record. Those of the SH coefficients
 // begin at a multiple of 16 bytes, as the coefficients do.
 void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots,
-                      const GaussianGradients<float>& out, cudaStream_t stream);
+                      const GaussianRows<float>& out, cudaStream_t stream);
 
 }  // namespace cuda
 }  // namespace v3dg

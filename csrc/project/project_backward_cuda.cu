@@ -113,13 +113,13 @@ struct ShRow {
 
 template <int kDegree>
 __global__ void __launch_bounds__(kThreads)
-    project_backward_kernel(ProjectBackwardInput in, GradientSlots slots, GaussianGradients<float> out) {
+    project_backward_kernel(ProjectBackwardInput in, GradientSlots slots, GaussianRows<float> out) {
     using Row = ShRow<kDegree>;
     using Word = typename Row::Word;
     Word* sh_rows = reinterpret_cast<Word*>(shared_memory());
     __shared__ bool is_used[kThreads];  // whether anything flows into the gaussian
     const uint64_t first = static_cast<uint64_t>(blockIdx.x) * kItemSize;
-    const int num_here = static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.size - first));
+    const int num_here = static_cast<int>(min(static_cast<uint64_t>(kItemSize), in.rows.size - first));
     is_used[threadIdx.x] = false;
     __syncthreads();
 
@@ -189,9 +189,9 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 template <int kDegree>
-void start(const ProjectBackwardInput& in, const GradientSlots& slots, const GaussianGradients<float>& out,
+void start(const ProjectBackwardInput& in, const GradientSlots& slots, const GaussianRows<float>& out,
            cudaStream_t stream) {
-    launch("project_backward_kernel", &project_backward_kernel<kDegree>, blocks_for(in.size, kItemSize),
+    launch("project_backward_kernel", &project_backward_kernel<kDegree>, blocks_for(in.rows.size, kItemSize),
            kThreads, kThreads * ShRow<kDegree>::kStride * sizeof(typename ShRow<kDegree>::Word), stream, in,
            slots, out);
 }
@@ -205,7 +205,7 @@ void place_slots(const ItemList& items, const uint32_t* item_records, const Reco
 }
 
 void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots,
-                      const GaussianGradients<float>& out, cudaStream_t stream) {
+                      const GaussianRows<float>& out, cudaStream_t stream) {
     switch (in.rows.sh_degree) {
         case 0: return start<0>(in, slots, out, stream);
         case 1: return start<1>(in, slots, out, stream);

@@ -115,7 +115,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
 // Scattered gaussians: lanes are filled one by one, which is small beside the arithmetic.
 template <class T>
 void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordGradient<T>* d_records,
-                      size_t count, const Pinhole<T>& camera, const GaussianGradients<T>& out) {
+                      size_t count, const Pinhole<T>& camera, const GaussianRows<T>& out) {
     using V = Vec<T>;
     constexpr size_t kWidth = kLanes<T>;
     const GaussianPlanes<T>& m = *draw.model;
@@ -168,7 +168,7 @@ void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordG
     template size_t project<T>(const Draw<T>&, uint64_t, uint64_t, const Pinhole<T>&, const Window&,     \
                                Record<T>*, uint32_t*, uint32_t, Reach&);                                 \
     template void project_backward<T>(const Draw<T>&, const uint32_t*, const RecordGradient<T>*, size_t, \
-                                      const Pinhole<T>&, const GaussianGradients<T>&);
+                                      const Pinhole<T>&, const GaussianRows<T>&);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

@@ -9,7 +9,8 @@
 #include "project/project_cuda.h"
 
 #include "base/launch.cuh"
-#include "tile_bin/warp_tiles.cuh"
+#include "frame/count_tile.cuh"
+#include "project/project_math.h"
 
 namespace v3dg {
 namespace cuda {
@@ -74,10 +75,10 @@ __device__ void color_of(const float* rows, uint32_t g, const float mean[3], con
 
 // Gaussians as users hold them.
 struct RowSource {
-    using Model = DeviceRows;
+    using Model = GaussianRows<const float>;
 
     // A gaussian's mean and reach, all that is read of most of those that reach no pixel centre.
-    static __device__ float4 load_sphere(const DeviceRows& m, uint32_t g) {
+    static __device__ float4 load_sphere(const GaussianRows<const float>& m, uint32_t g) {
         Gaussian3d<float> gaussian{{__ldg(m.means + 3 * size_t(g)), __ldg(m.means + 3 * size_t(g) + 1),
                                     __ldg(m.means + 3 * size_t(g) + 2)},
                                    {1, 0, 0, 0},
@@ -90,7 +91,7 @@ struct RowSource {
     // s.p is set; `color` is that of degree 0.
     static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
                                              uint32_t g, Projection<float>& s, float color[3]) {
-        const DeviceRows& m = in.model;
+        const GaussianRows<const float>& m = in.model;
         Gaussian3d<float> gaussian{{}, {}, {}, __ldg(m.opacities + g)};
         for (int k = 0; k < 3; ++k) gaussian.mean[k] = __ldg(m.means + 3 * size_t(g) + k);
         for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
@@ -106,13 +107,13 @@ struct RowSource {
 };
 
 struct PackedSource {
-    using Model = PackedRows;
+    using Model = PackedPlanes;
 
-    static __device__ float4 load_sphere(const PackedRows& m, uint32_t g) { return load4(m.plane[0], g); }
+    static __device__ float4 load_sphere(const PackedPlanes& m, uint32_t g) { return load4(m.plane[0], g); }
 
     static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
                                              uint32_t g, Projection<float>& s, float color[3]) {
-        const PackedRows& m = in.model;
+        const PackedPlanes& m = in.model;
         const float4 a = load4(m.plane[1], g), b = load4(m.plane[2], g), c = load4(m.plane[3], g);
         color[0] = c.y;
         color[1] = c.z;
@@ -436,8 +437,9 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 }
 
 // A thread a gaussian.
-__global__ void pack_kernel(DeviceRows rows, size_t count, float4* planes) {
+__global__ void pack_kernel(GaussianRows<const float> rows, float4* planes) {
     const size_t g = blockIdx.x * size_t(blockDim.x) + threadIdx.x;
+    const size_t count = rows.size;
     if (g >= count) return;
     Gaussian3d<float> gaussian;
     for (int k = 0; k < 3; ++k) gaussian.mean[k] = rows.means[3 * g + k];
@@ -456,9 +458,10 @@ __global__ void pack_kernel(DeviceRows rows, size_t count, float4* planes) {
 
 }  // namespace
 
-PackedRows pack(const DeviceRows& rows, size_t count, float* planes, cudaStream_t stream) {
+PackedPlanes pack(const GaussianRows<const float>& rows, float* planes, cudaStream_t stream) {
+    const size_t count = rows.size;
     constexpr unsigned kThreads = 256;
-    launch("pack_kernel", pack_kernel, blocks_for(count, kThreads), kThreads, 0, stream, rows, count,
+    launch("pack_kernel", pack_kernel, blocks_for(count, kThreads), kThreads, 0, stream, rows,
            reinterpret_cast<float4*>(planes));
     return {{planes, planes + 4 * count, planes + 8 * count, planes + 12 * count}, rows.sh, rows.sh_degree};
 }

@@ -1,14 +1,15 @@
 #pragma once
 
-#include "pipeline/frame_types.h"
-#include "tile_bin/tile_bin_cuda.h"
+#include "base/device.h"
+#include "frame/draw_list.h"
+#include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
 
 struct ProjectInput {
-    const DeviceRows* models;
-    const PackedRows* packed;  // read in place of `models` where it is not null
+    const GaussianRows<const float>* models;
+    const PackedPlanes* packed;  // read in place of `models` where it is not null
     const Placement* placements;
     const FrameImage* images;
     ItemList items;         // in the counters: sets in_frustum and records, which start at 0
@@ -31,8 +32,8 @@ struct ProjectOutput {
 // capacity.
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream);
 
-// `planes` has room for (4, count, 4).
-PackedRows pack(const DeviceRows& rows, size_t count, float* planes, cudaStream_t stream);
+// `planes` has room for (4, N, 4).
+PackedPlanes pack(const GaussianRows<const float>& rows, float* planes, cudaStream_t stream);
 
 }  // namespace cuda
 }  // namespace v3dg

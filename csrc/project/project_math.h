@@ -6,53 +6,13 @@
 // covariance is A Aᵀ + filter I with A = J W R S (2x3), so its determinant is |a1 x a2|² plus terms that are
 // positive: nothing cancels, however thin the gaussian is.
 
-#include "math/lanes.h"
+#include "math/camera.h"
+#include "math/ellipse.h"
+#include "math/gaussian.h"
 #include "math/quat.h"
-#include "math/sh.h"
+#include "math/vec.h"
 
 namespace v3dg {
-
-constexpr double kMinAlpha = 1.0 / 255;     // contributions below it are skipped
-constexpr double kMaxAlpha = 0.999;         // alpha is cut here
-constexpr double kMinTransmittance = 1e-4;  // a pixel stops before it would fall to this
-constexpr double kLog2MinAlpha = -7.994353436858858;
-constexpr double kFovMargin = 0.3;     // of the half field of view: where the Jacobian is clamped
-constexpr double kReachSigmas = 3.33;  // where opacity 1 has fallen below 1/255
-constexpr double kLn2 = 0.6931471805599453;
-constexpr double kFalloffScale = 0.8493218002880191;  // sqrt(log2(e) / 2): exp(-d²/2) = 2^-(scale d)²
-
-// Image side of a pinhole camera. Pixels; pixel (i, j) has its centre at (i + ½, j + ½).
-template <class T>
-struct Pinhole {
-    T fx, fy, cx, cy;
-    T width, height;
-    T near_depth;
-};
-
-// Model space to view space: view = linear * model + translation, linear = uniform scale * rotation.
-template <class T>
-struct ModelView {
-    T linear[9];  // row major
-    T translation[3];
-    T eye[3];  // the camera's position in model space
-};
-
-template <class V>
-struct Gaussian3d {
-    V mean[3];
-    V quat[4];   // w, x, y, z; any length but zero
-    V scale[3];  // standard deviations
-    V opacity;
-};
-
-// Alpha at offset d from the centre is 2^(log2_opacity - |L d|²) with L = [[l11, l12], [0, l22]].
-template <class V>
-struct Ellipse {
-    V u, v;  // px
-    V l11, l12, l22;
-    V log2_opacity;
-    V depth;
-};
 
 // What the way back needs again.
 template <class V>
@@ -63,30 +23,6 @@ struct Projection {
     V slope_x, slope_y;  // x / z and y / z, clamped
     V c11, c12, c22, det0, det;
 };
-
-template <class V>
-V3DG_HD V3DG_INLINE V dot3(const V a[3], const V b[3]) {
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
-template <class V>
-V3DG_HD V3DG_INLINE void cross3(const V a[3], const V b[3], V c[3]) {
-    c[0] = a[1] * b[2] - a[2] * b[1];
-    c[1] = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-// Limits of x / z and y / z past which the Jacobian is held.
-template <class T>
-struct SlopeLimits {
-    T low_x, high_x, low_y, high_y;
-};
-template <class T>
-V3DG_HD V3DG_INLINE SlopeLimits<T> slope_limits(const Pinhole<T>& cam) {
-    const T margin_x = T(kFovMargin) * cam.width / (2 * cam.fx);
-    const T margin_y = T(kFovMargin) * cam.height / (2 * cam.fy);
-    return {-(cam.cx / cam.fx + margin_x), (cam.width - cam.cx) / cam.fx + margin_x,
-            -(cam.cy / cam.fy + margin_y), (cam.height - cam.cy) / cam.fy + margin_y};
-}
 
 // Sets the slopes of s.p.
 template <class V, class T>
@@ -159,62 +95,6 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
     half_y = sqrt_of(reach * s.c22) * T(1 / kFalloffScale);
     return (opacity >= all_lanes<V>(T(kMinAlpha))) & (reach >= V{}) & (s.det > V{}) & (s.det < huge) &
            (half_x < huge) & (half_y < huge);
-}
-
-// How far from its mean a gaussian reaches at most, in its model's units: no less than extent_of() leads to.
-// Negative where it is too faint to be drawn, not a number where it may have no area, or is none.
-V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
-    if (g.opacity < float(kMinAlpha)) return -1.0f;
-    const float least = min_of(g.scale[0], min_of(g.scale[1], g.scale[2]));
-    const float most = max_of(g.scale[0], max_of(g.scale[1], g.scale[2]));
-    const float sigmas = sqrt_of(log2_of(g.opacity) - float(kLog2MinAlpha)) * float(1.001 / kFalloffScale);
-    return least > 0 && g.opacity <= 1 ? most * sigmas : NAN;
-}
-
-// A gaussian in the form that is quickest to project, for what is projected more than once. Its covariance is
-// F Fᵀ with F = [f[0] f[3] 0; f[1] f[4] f[6]; f[2] f[5] f[7]], columns from the longest on.
-struct PackedGaussian {
-    float mean[3];
-    float reach;
-    float f[8];
-    float log2_opacity;
-};
-
-V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
-    PackedGaussian out{};
-    for (int k = 0; k < 3; ++k) out.mean[k] = g.mean[k];
-    out.log2_opacity = log2_of(g.opacity);
-    out.reach = reach_of(g);
-    double quat[4], r[9];
-    for (int k = 0; k < 4; ++k) quat[k] = g.quat[k];
-    rotation_of_quat(quat, r);
-    int order[3] = {0, 1, 2};
-    for (int pass = 0; pass < 3; ++pass) {
-        const int k = pass % 2;
-        if (g.scale[order[k]] >= g.scale[order[k + 1]]) continue;
-        const int other = order[k];
-        order[k] = order[k + 1];
-        order[k + 1] = other;
-    }
-    double column[3][3];
-    for (int k = 0; k < 3; ++k)
-        for (int i = 0; i < 3; ++i) column[k][i] = r[3 * i + order[k]] * double(g.scale[order[k]]);
-    // Turning two columns into each other leaves F Fᵀ; a number becomes 0. The shorter two, whose lengths
-    // then differ least from before.
-    const double x = column[1][0], y = column[2][0], length = sqrt_of(x * x + y * y);
-    const double cosine = length > 0 ? x / length : 1, sine = length > 0 ? y / length : 0;
-    for (int i = 0; i < 3; ++i) {
-        const double a = column[1][i], b = column[2][i];
-        column[1][i] = cosine * a + sine * b;
-        column[2][i] = cosine * b - sine * a;
-    }
-    for (int i = 0; i < 3; ++i) {
-        out.f[i] = static_cast<float>(column[0][i]);
-        out.f[3 + i] = static_cast<float>(column[1][i]);
-    }
-    out.f[6] = static_cast<float>(column[2][1]);
-    out.f[7] = static_cast<float>(column[2][2]);
-    return out;
 }
 
 // As project_gaussian(); s.p is set, s.linear_rs is left alone.
@@ -342,58 +222,6 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g, c
     }
     rotation_of_quat_vjp(g.quat, d_r, out.quat);
     return out;
-}
-
-// Colour in the direction from the camera's position in model space; what is not finite is 0, so that it
-// stays off pixels on which the gaussian has no weight. `sh` holds the coefficients of one gaussian (or of
-// one a lane), base by base, three channels each.
-template <class V, class T>
-V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelView<T>& mv, const V* sh,
-                                     V color[3]) {
-    using L = Lane<V>;
-    V basis[kMaxShBases];
-    V dir[3] = {mean[0] - mv.eye[0], mean[1] - mv.eye[1], mean[2] - mv.eye[2]};
-    if (degree > 0) {
-        const V n2 = dot3(dir, dir);
-        const V inv = n2 > V{} ? 1 / sqrt_of(n2) : V{};
-        for (int i = 0; i < 3; ++i) dir[i] *= inv;
-    }
-    sh_bases(degree, dir[0], dir[1], dir[2], basis);
-    for (int c = 0; c < 3; ++c) {
-        V sum = all_lanes<V>(T(0.5));
-        for (int b = 0; b < num_sh_bases(degree); ++b) sum += basis[b] * sh[3 * b + c];
-        sum = max_of(sum, V{});
-        color[c] = sum < all_lanes<V>(kInfinite<L>) ? sum : V{};
-    }
-}
-
-// Adds to `d_mean` and sets `d_sh` from the gradient of the colour. `d_sh` may be `sh` itself.
-template <class V, class T>
-V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V mean[3], const ModelView<T>& mv, const V* sh,
-                                         const V color[3], const V d_color[3], V d_mean[3], V* d_sh) {
-    V basis[kMaxShBases], d_basis[kMaxShBases];
-    V dir[3] = {mean[0] - mv.eye[0], mean[1] - mv.eye[1], mean[2] - mv.eye[2]};
-    V inv = V{};
-    if (degree > 0) {
-        const V n2 = dot3(dir, dir);
-        inv = n2 > V{} ? 1 / sqrt_of(n2) : V{};
-        for (int i = 0; i < 3; ++i) dir[i] *= inv;
-    }
-    sh_bases(degree, dir[0], dir[1], dir[2], basis);
-    for (int b = 0; b < num_sh_bases(degree); ++b) d_basis[b] = V{};
-    for (int c = 0; c < 3; ++c) {
-        const auto moves = color[c] > V{};
-        const V d = moves ? d_color[c] : V{};
-        for (int b = 0; b < num_sh_bases(degree); ++b) {
-            d_basis[b] += moves ? sh[3 * b + c] * d : V{};
-            d_sh[3 * b + c] = basis[b] * d;
-        }
-    }
-    if (degree == 0) return;
-    V d_dir[3];
-    sh_bases_vjp(degree, dir[0], dir[1], dir[2], d_basis, d_dir);
-    const V along = dot3(dir, d_dir);
-    for (int i = 0; i < 3; ++i) d_mean[i] += inv * (d_dir[i] - along * dir[i]);
 }
 
 }  // namespace v3dg

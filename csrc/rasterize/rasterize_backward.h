@@ -3,29 +3,11 @@
 // The way back through a CUDA frame of one picture: from the picture's gradients to those of its records.
 
 #include "base/device.h"
-#include "pipeline/frame_types.h"
-#include "rasterize/rasterize.h"
+#include "frame/gradient_slots.h"
+#include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
-
-// A record's gradient is the sum of its slots, one for each tile of its pixel box, row by row. A tile writes
-// the slots of the records that it blended and marks them as touched; the others mean nothing.
-struct GradientSlots {
-    const uint32_t* first;  // of each record
-    RecordGradient<float>* slot;
-    uint8_t* is_touched;  // zeros at the start
-};
-
-V3DG_HD inline uint32_t tile_columns_of(const Record<float>& r) {
-    return r.x1 / kFrameTileWidth - r.x0 / kFrameTileWidth + 1u;
-}
-V3DG_HD inline uint32_t num_slots_of(const Record<float>& r) {
-    return tile_columns_of(r) * (r.y1 / kFrameTileHeight - r.y0 / kFrameTileHeight + 1u);
-}
-V3DG_HD inline uint32_t slot_of_tile(const Record<float>& r, uint32_t column, uint32_t row) {
-    return (row - r.y0 / kFrameTileHeight) * tile_columns_of(r) + (column - r.x0 / kFrameTileWidth);
-}
 
 // A picture as it was drawn, the lists it was blended from, and its gradients, all on the device.
 struct RasterizeBackwardInput {

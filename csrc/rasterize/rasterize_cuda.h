@@ -1,7 +1,7 @@
 #pragma once
 
 #include "base/device.h"
-#include "pipeline/frame_types.h"
+#include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {

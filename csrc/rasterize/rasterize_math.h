@@ -4,7 +4,8 @@
 //
 // A pixel's transmittance is negative once it has stopped; its magnitude is then the final value.
 
-#include "project/project_math.h"
+#include "math/ellipse.h"
+#include "math/gaussian.h"
 
 namespace v3dg {
 
@@ -24,40 +25,6 @@ V3DG_HD V3DG_INLINE Falloff<V> falloff_at(V x, V y, V u, V v, V l11, V l12, V l2
     f.t2 = l22 * f.dy;
     f.exponent = log2_opacity - (f.t1 * f.t1 + f.t2 * f.t2);
     return f;
-}
-
-// An ellipse |L d|² = reach as a row of pixels meets it.
-template <class V>
-struct EllipseRows {
-    V reach;
-    V inverse;  // 1 / l11
-    V slope;    // of the line through the middles of the rows' extents
-    V l22;
-    V rightmost;  // height above the centre at which it reaches farthest right; farthest left is opposite
-};
-
-// Of where alpha is 1/255 or more.
-template <class V>
-V3DG_HD V3DG_INLINE EllipseRows<V> ellipse_rows(V l11, V l12, V l22, V log2_opacity) {
-    EllipseRows<V> e;
-    e.reach = log2_opacity - all_lanes<V>(Lane<V>(kLog2MinAlpha));
-    e.inverse = 1 / l11;
-    e.slope = -l12 * e.inverse;
-    e.l22 = l22;
-    e.rightmost = -l12 * sqrt_of(e.reach) / (l22 * sqrt_of(l12 * l12 + l22 * l22));
-    return e;
-}
-
-// Where the ellipse may lie between the heights y0 <= y1: from x0 to x1, all from its centre. A hair more, so
-// that the blend step alone decides. Means nothing where the ellipse's box does not meet the heights.
-template <class V>
-V3DG_HD V3DG_INLINE void row_extent(const EllipseRows<V>& e, V y0, V y1, V& x0, V& x1) {
-    const V a = min_of(max_of(e.rightmost, y0), y1), b = min_of(max_of(-e.rightmost, y0), y1);
-    const V half_a = sqrt_of(max_of(e.reach - e.l22 * e.l22 * a * a, V{})) * e.inverse;
-    const V half_b = sqrt_of(max_of(e.reach - e.l22 * e.l22 * b * b, V{})) * e.inverse;
-    const V hair = Lane<V>(1e-2) + Lane<V>(1e-3) * (half_a + half_b);
-    x0 = e.slope * b - half_b - hair;
-    x1 = e.slope * a + half_a + hair;
 }
 
 // Whether the gaussian counts at all there.

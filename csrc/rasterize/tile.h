@@ -8,7 +8,8 @@
 
 #include <cstdint>
 
-#include "project/project.h"
+#include "frame/image.h"
+#include "frame/record.h"
 #include "rasterize/rasterize_math.h"
 
 namespace v3dg {

@@ -35,7 +35,7 @@ struct InstanceTable {
 struct SelectInput {
     Span<const ClusterTable> bundles;
     InstanceTable instances;
-    SelectCamera camera;
+    Camera camera;
     SelectRule rule;
 };
 

@@ -87,7 +87,7 @@ struct BudgetRound {
 
 enum class Look { nothing, tops, table };
 
-__device__ Look place_instance(const SceneOnDevice& scene, size_t i, const SelectCamera& camera,
+__device__ Look place_instance(const SceneOnDevice& scene, size_t i, const Camera& camera,
                                const SelectRule& rule, Placement* placements) {
     const Pose pose = scene.instances.pose(i);
     if (!is_placed(pose)) return Look::nothing;
@@ -110,7 +110,7 @@ __device__ Look place_instance(const SceneOnDevice& scene, size_t i, const Selec
     return drawn != 0 ? Look::tops : Look::nothing;
 }
 
-__global__ void place_kernel(SceneOnDevice scene, SelectCamera camera, SelectRule rule, FrameImage image,
+__global__ void place_kernel(SceneOnDevice scene, Camera camera, SelectRule rule, FrameImage image,
                              FrameImage* images, Placement* placements, BudgetRound round, Scratch scratch) {
     if (round.is_over()) return;
     rule.tolerance_px2 = round.tolerance(rule);
@@ -492,8 +492,8 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
 }
 
 // A thread an instance.
-__global__ void place_all_kernel(SceneOnDevice scene, SelectCamera camera, FrameImage image,
-                                 FrameImage* images, Placement* placements) {
+__global__ void place_all_kernel(SceneOnDevice scene, Camera camera, FrameImage image, FrameImage* images,
+                                 Placement* placements) {
     const size_t i = size_t(blockIdx.x) * blockDim.x + threadIdx.x;
     if (i == 0) images[0] = image;
     if (i >= scene.instances.scale.size) return;
@@ -554,13 +554,13 @@ class CenterBounds {
 };
 
 ClusterBounds bounds_of(const ClusterTable& table, const ClusterFilters& filters, size_t first, size_t last) {
-    ClusterBounds part{kNoBox, {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false, 0};
+    ClusterBounds part{no_box(), {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false, 0};
     CenterBounds parents, owns;
     for (size_t c = first; c < last; ++c) {
         if (c > first && filters.filter_px2[c] == filters.filter_px2[c - 1] &&
             filters.compensate[c] == filters.compensate[c - 1])
             part.alike |= 1 << (c - first);
-        include_box(table.box[c], part.box);
+        grow(part.box, table.box[c]);
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         part.has_leaf |= own < 0;
         part.has_root |= parent < 0;
@@ -665,7 +665,7 @@ InstanceTable SceneTables::instances() const {
 }
 
 template <class Output>
-void SceneTables::cut(const SelectCamera& camera, const SelectRule& rule, const FrameImage* image,
+void SceneTables::cut(const Camera& camera, const SelectRule& rule, const FrameImage* image,
                       FrameImage* images, Placement* placements, CutChoice* choice, const Output& output,
                       cudaStream_t stream) {
     const size_t count = num_instances(), num_tickets = blocks_for(most_parts_, kCutWarps);
@@ -697,16 +697,16 @@ void SceneTables::cut(const SelectCamera& camera, const SelectRule& rule, const 
            scratches[0], scratches[1], output);
 }
 
-void SceneTables::cut_items(const SelectCamera& camera, const SelectRule& rule, const FrameImage& image,
+void SceneTables::cut_items(const Camera& camera, const SelectRule& rule, const FrameImage& image,
                             FrameImage* images, Placement* placements, const ItemList& items,
                             cudaStream_t stream) {
     const Turn turn(turns_, stream);
     cut(camera, rule, &image, images, placements, &items.counters->choice, ItemOutput{items}, stream);
 }
 
-void SceneTables::given_items(const SelectCamera& camera, Span<const int32_t> instance,
-                              Span<const int32_t> cluster, const FrameImage& image, FrameImage* images,
-                              Placement* placements, const ItemList& items, cudaStream_t stream) {
+void SceneTables::given_items(const Camera& camera, Span<const int32_t> instance, Span<const int32_t> cluster,
+                              const FrameImage& image, FrameImage* images, Placement* placements,
+                              const ItemList& items, cudaStream_t stream) {
     const Turn turn(turns_, stream);
     const SceneOnDevice scene{bundles_.data(), instances(), nullptr, nullptr, nullptr};
     const unsigned blocks = std::max(1u, blocks_for(instance.size, kCutThreads));
@@ -719,7 +719,7 @@ void SceneTables::given_items(const SelectCamera& camera, Span<const int32_t> in
            ItemOutput{items});
 }
 
-void SceneTables::select(const SelectCamera& camera, const SelectRule& rule, SelectOutput& out,
+void SceneTables::select(const Camera& camera, const SelectRule& rule, SelectOutput& out,
                          cudaStream_t stream) {
     const Turn turn(turns_, stream);
     Pairs* on_device = pairs_.reserve(1, stream);

@@ -3,7 +3,8 @@
 #include <vector>
 
 #include "base/device.h"
-#include "pipeline/frame_types.h"
+#include "frame/draw_list.h"
+#include "frame/image.h"
 #include "select/select.h"
 
 namespace v3dg {
@@ -49,16 +50,16 @@ class SceneTables {
 
     // Selected clusters as the items of a frame. Instance i becomes placement i of model bundle[i] in image
     // 0, and `image` is written to images[0].
-    void cut_items(const SelectCamera& camera, const SelectRule& rule, const FrameImage& image,
-                   FrameImage* images, Placement* placements, const ItemList& items, cudaStream_t stream);
+    void cut_items(const Camera& camera, const SelectRule& rule, const FrameImage& image, FrameImage* images,
+                   Placement* placements, const ItemList& items, cudaStream_t stream);
 
     // The same for pairs that were selected before, on the device.
-    void given_items(const SelectCamera& camera, Span<const int32_t> instance, Span<const int32_t> cluster,
+    void given_items(const Camera& camera, Span<const int32_t> instance, Span<const int32_t> cluster,
                      const FrameImage& image, FrameImage* images, Placement* placements,
                      const ItemList& items, cudaStream_t stream);
 
     // Selected clusters as pairs, on the host, after waiting.
-    void select(const SelectCamera& camera, const SelectRule& rule, SelectOutput& out, cudaStream_t stream);
+    void select(const Camera& camera, const SelectRule& rule, SelectOutput& out, cudaStream_t stream);
 
   private:
     struct Pairs {
@@ -66,7 +67,7 @@ class SceneTables {
         CutChoice choice;
     };
     template <class Output>
-    void cut(const SelectCamera& camera, const SelectRule& rule, const FrameImage* image, FrameImage* images,
+    void cut(const Camera& camera, const SelectRule& rule, const FrameImage* image, FrameImage* images,
              Placement* placements, CutChoice* choice, const Output& output, cudaStream_t stream);
     InstanceTable instances() const;
 

@@ -10,29 +10,11 @@
 #include <cstdint>
 #include <cstring>
 
-#include "base/host_device.h"
 #include "base/span.h"
+#include "math/bounds.h"
 #include "math/solid_angle.h"
 
 namespace v3dg {
-
-struct Ball {
-    float x, y, z, radius;
-};
-
-struct Box {
-    float lo[3], hi[3];
-};
-
-constexpr Box kNoBox{{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}};
-
-// Makes `bounds` contain the box, which is finite.
-inline void include_box(const Box& box, Box& bounds) {
-    for (int a = 0; a < 3; ++a) {
-        bounds.lo[a] = fminf(bounds.lo[a], box.lo[a]);
-        bounds.hi[a] = fmaxf(bounds.hi[a], box.hi[a]);
-    }
-}
 
 enum class Footprint {
     solid_angle,  // what the ball covers of the sphere around the eye; turning the camera changes nothing

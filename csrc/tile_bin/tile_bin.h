@@ -4,7 +4,8 @@
 #include <cstdint>
 
 #include "base/buffer.h"
-#include "project/project.h"
+#include "frame/image.h"
+#include "frame/record.h"
 
 namespace v3dg {
 
@@ -29,9 +30,8 @@ struct RecordChunks {
     size_t size;
 };
 
-// The records that touch each tile t, in the order of the chunks: entries offset[t] to offset[t + 1]. An
-// entry is a record's place in its low half; its high half, which orders entries within a tile by depth, is
-// the bits of the float32 depth.
+// The records that touch each tile t, in the order of the chunks: entries offset[t] to offset[t + 1]. Entries
+// are those of frame/record.h.
 struct TileLists {
     Buffer<uint64_t> offset;
     Buffer<uint64_t> entry;
@@ -46,7 +46,5 @@ void tile_bin(const Record<T>* records, const RecordChunks& chunks, const TileGr
 // Double-precision records are ordered by their own depth, which float32 bits do not hold.
 template <class T>
 void sort_tile(const Record<T>* records, uint64_t* entry, size_t count, uint64_t* scratch);
-
-inline uint32_t record_of(uint64_t entry) { return static_cast<uint32_t>(entry); }
 
 }  // namespace v3dg

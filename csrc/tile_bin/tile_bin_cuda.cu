@@ -7,7 +7,7 @@
 #include <algorithm>
 
 #include "base/scan.cuh"
-#include "tile_bin/warp_tiles.cuh"
+#include "frame/count_tile.cuh"
 
 namespace v3dg {
 namespace cuda {

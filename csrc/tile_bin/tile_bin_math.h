@@ -1,51 +1,11 @@
 #pragma once
 
-// Which tiles of a picture a record may touch. Tiles are numbered through a batch, row by row.
+// Which tiles in a row of tiles a record may touch.
 
-#include "pipeline/frame_types.h"
-#include "rasterize/rasterize_math.h"
+#include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
-
-// A record over more tiles than this is looked at row by row of tiles.
-constexpr unsigned kFewTiles = 4;
-
-// The tiles that a record's blocks lie in.
-struct TileBox {
-    int left, top;
-    uint32_t columns, count;
-
-    // Column and row of tile k of at most kFewTiles: with more than two columns there is one row.
-    V3DG_HD int column(uint32_t k) const {
-        return left + static_cast<int>(columns > 2 ? k : columns == 2 ? k & 1 : 0);
-    }
-    V3DG_HD int row(uint32_t k) const {
-        return top + static_cast<int>(columns > 2 ? 0 : columns == 2 ? k >> 1 : k);
-    }
-};
-
-V3DG_HD inline TileBox tile_box(const EntryBox& b) {
-    constexpr int kColumns = kFrameTileWidth / kEntryBlockSize, kRows = kFrameTileHeight / kEntryBlockSize;
-    const int left = b.x0 / kColumns, top = b.y0 / kRows;
-    const uint32_t columns = b.x1 / kColumns - left + 1, rows = b.y1 / kRows - top + 1;
-    return {left, top, columns, columns * rows};
-}
-
-// A record over few tiles as the scattering kernel reads it: depth, and the blocks' first and how many
-// follow.
-using FewTiles = unsigned long long;
-constexpr FewTiles kManyTiles = ~FewTiles(0);
-
-V3DG_HD inline FewTiles few_tiles(uint32_t depth, const EntryBox& b) {
-    return FewTiles(depth) << 38 | FewTiles(b.x0) << 24 | FewTiles(b.x1 - b.x0) << 19 | FewTiles(b.y0) << 5 |
-           FewTiles(b.y1 - b.y0);
-}
-V3DG_HD inline uint32_t depth_of(FewTiles f) { return static_cast<uint32_t>(f >> 38); }
-V3DG_HD inline EntryBox box_of(FewTiles f) {
-    const int x0 = static_cast<int>(f >> 24) & 0x3fff, y0 = static_cast<int>(f >> 5) & 0x3fff;
-    return {x0, x0 + (static_cast<int>(f >> 19) & 31), y0, y0 + (static_cast<int>(f) & 31)};
-}
 
 // The tiles in one row of tiles that a record's ellipse may reach: columns [first, first + count).
 struct TileRun {

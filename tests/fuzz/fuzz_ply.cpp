@@ -8,7 +8,7 @@
 #include <sys/mman.h>
 #include <unistd.h>
 
-#include "ply/ply.h"
+#include "io/ply.h"
 
 namespace {
 

@@ -21,7 +21,7 @@ KEPT_BYTES = {"ply": 1000, "bundle": 10_000, "scene": 3000, "formats": 3000}
 def command_of(name, folder):
     if name != "ply":
         return [str(HERE / f"fuzz_{name}.py")]
-    sources = [HERE / "fuzz_ply.cpp", *(ROOT / "csrc/ply" / f"ply_{part}.cpp" for part in ("header", "read"))]
+    sources = [HERE / "fuzz_ply.cpp", *(ROOT / "csrc/io" / f"ply_{part}.cpp" for part in ("header", "read"))]
     checks = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined"]
     program = folder / "fuzz_ply"
     compiler = os.environ.get("CLANG", "clang++")

@@ -14,7 +14,7 @@
 #include <omp.h>
 
 #include "base/first_error.h"
-#include "ply/ply.h"
+#include "io/ply.h"
 
 namespace v3dg {
 

@@ -1,9 +1,9 @@
 // One thread a cluster.
 
-#include "box/box.h"
+#include "cluster/box.h"
 
 #include "base/parallel_for.h"
-#include "box/box_math.h"
+#include "cluster/box_math.h"
 
 namespace v3dg {
 

@@ -7,8 +7,8 @@
 
 #include "base/launch.cuh"
 #include "cluster/cluster.h"
-#include "simplify_init/simplify_init.h"
-#include "simplify_init/simplify_init_math.h"
+#include "simplify/simplify.h"
+#include "simplify/simplify_math.h"
 
 namespace v3dg {
 namespace cuda {
@@ -22,7 +22,8 @@ struct Cell {
     int64_t first, last, share;
 };
 
-__global__ void score_kernel(RowsIn in, const int64_t* order, size_t count, double* score_at, int64_t* rows) {
+__global__ void score_kernel(GaussianRows<const float> in, const int64_t* order, size_t count,
+                             double* score_at, int64_t* rows) {
     const size_t i = blockIdx.x * size_t(kBlockSize) + threadIdx.x;
     if (i >= count) return;
     const int64_t row = order[i];
@@ -47,7 +48,7 @@ __global__ void keep_kernel(const Cell* cells, const int64_t* order, const doubl
 
 }  // namespace
 
-void prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
+void prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
            Span<int64_t> kept, Stream stream) {
     const size_t num_groups = in_offset.size - 1, count = static_cast<size_t>(in_offset[num_groups]);
     if (count == 0) return;

@@ -6,7 +6,7 @@
 #include <string>
 #include <vector>
 
-#include "ply/posix_file.h"
+#include "io/posix_file.h"
 
 namespace v3dg {
 

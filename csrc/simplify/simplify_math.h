@@ -6,7 +6,7 @@
 #include "base/host_device.h"
 #include "math/quat.h"
 #include "math/sh.h"
-#include "simplify_init/simplify_init.h"
+#include "simplify/simplify.h"
 
 namespace v3dg {
 
@@ -124,12 +124,12 @@ struct MergeNode {
     double cov[6], opacity;
 };
 
-V3DG_HD inline MergeNode merge_node_of(const RowsIn& in, int64_t row) {
+V3DG_HD inline MergeNode merge_node_of(const GaussianRows<const float>& in, int64_t row) {
     MergeNode node;
     double scale[3], quat[4];
     for (int k = 0; k < 3; ++k) {
         node.feature.mean[k] = in.means[3 * row + k];
-        node.feature.color[k] = kShBase0 * in.sh[in.num_sh * row + k];
+        node.feature.color[k] = kShBase0 * in.sh[in.num_sh() * row + k];
         scale[k] = in.scales[3 * row + k];
     }
     for (int k = 0; k < 4; ++k) quat[k] = in.quats[4 * row + k];
@@ -197,7 +197,8 @@ V3DG_HD inline void join(MergeNode& a, const MergeNode& b) {
 }
 
 // Copies all of a row but its SH coefficients.
-V3DG_HD inline void copy_shape(const RowsIn& in, int64_t from, const RowsOut& out, int64_t to) {
+V3DG_HD inline void copy_shape(const GaussianRows<const float>& in, int64_t from,
+                               const GaussianRows<float>& out, int64_t to) {
     for (int k = 0; k < 3; ++k) {
         out.means[3 * to + k] = in.means[3 * from + k];
         out.scales[3 * to + k] = in.scales[3 * from + k];
@@ -207,7 +208,7 @@ V3DG_HD inline void copy_shape(const RowsIn& in, int64_t from, const RowsOut& ou
 }
 
 // Writes place, shape and opacity of a joined gaussian.
-V3DG_HD inline void write_joined(const MergeNode& node, const RowsOut& out, int64_t to) {
+V3DG_HD inline void write_joined(const MergeNode& node, const GaussianRows<float>& out, int64_t to) {
     double scale[3], axes[3][3], quat[4];
     scale_and_axes_of(node.cov, scale, axes);
     quat_of_axes(axes, quat);

@@ -1,6 +1,7 @@
 #include "bindings/args.h"
 #include "bindings/device_args.h"
-#include "simplify_init/simplify_init.h"
+#include "bindings/render_args.h"
+#include "simplify/simplify.h"
 
 namespace v3dg {
 
@@ -44,7 +45,7 @@ py::array_t<int64_t> prune(const py::array& means, const py::array& scales, cons
                            const py::array& in_offset, const py::array& out_offset) {
     const Span<const float> opacity = span_of<const float>(opacities, "opacities", {-1});
     const py::ssize_t n = static_cast<py::ssize_t>(opacity.size);
-    RowsIn in{};
+    GaussianRows<const float> in{};
     in.means = span_of<const float>(means, "means", {n, 3}).data;
     in.scales = span_of<const float>(scales, "scales", {n, 3}).data;
     in.opacities = opacity.data;
@@ -61,18 +62,24 @@ py::tuple merge(const py::array& means, const py::array& quats, const py::array&
                 const py::array& out_offset) {
     const py::ssize_t n = opacities.ndim() == 1 ? opacities.shape(0) : 0;
     const py::ssize_t bases = sh.ndim() == 3 ? sh.shape(1) : 0;
-    const RowsIn in{span_of<const float>(means, "means", {n, 3}).data,
-                    span_of<const float>(quats, "quats", {n, 4}).data,
-                    span_of<const float>(scales, "scales", {n, 3}).data,
-                    span_of<const float>(opacities, "opacities", {n}).data,
-                    span_of<const float>(sh, "sh", {n, bases, 3}).data,
-                    static_cast<int>(3 * bases)};
+    const GaussianRows<const float> in{span_of<const float>(means, "means", {n, 3}).data,
+                                       span_of<const float>(quats, "quats", {n, 4}).data,
+                                       span_of<const float>(scales, "scales", {n, 3}).data,
+                                       span_of<const float>(opacities, "opacities", {n}).data,
+                                       span_of<const float>(sh, "sh", {n, bases, 3}).data,
+                                       static_cast<size_t>(n),
+                                       degree_of_bases(bases, shape_text(sh))};
     const Segments segments(in_offset, out_offset, n);
     const py::ssize_t m = segments.num_out();
     py::array_t<float> out_means({m, py::ssize_t(3)}), out_quats({m, py::ssize_t(4)}),
         out_scales({m, py::ssize_t(3)}), out_opacities(m), out_sh({m, bases, py::ssize_t(3)});
-    const RowsOut out{out_means.mutable_data(), out_quats.mutable_data(), out_scales.mutable_data(),
-                      out_opacities.mutable_data(), out_sh.mutable_data()};
+    const GaussianRows<float> out{out_means.mutable_data(),
+                                  out_quats.mutable_data(),
+                                  out_scales.mutable_data(),
+                                  out_opacities.mutable_data(),
+                                  out_sh.mutable_data(),
+                                  static_cast<size_t>(m),
+                                  in.sh_degree};
     {
         const py::gil_scoped_release unlocked;
         cpu::merge(in, segments.in, segments.out, out);
@@ -82,7 +89,7 @@ py::tuple merge(const py::array& means, const py::array& quats, const py::array&
 
 }  // namespace
 
-void bind_simplify_init(py::module_& m) {
+void bind_simplify(py::module_& m) {
     m.def("prune", &prune, "means"_a, "scales"_a, "opacities"_a, "in_offset"_a, "out_offset"_a,
           "Rows (M,) int64 of the gaussians that survive.");
     m.def("merge", &merge, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "in_offset"_a,
@@ -95,7 +102,7 @@ void bind_simplify_init(py::module_& m) {
                uintptr_t stream) {
                 const Span<const float> opacity = device_span_of<const float>(opacities, "opacities", {-1});
                 const py::ssize_t n = static_cast<py::ssize_t>(opacity.size);
-                RowsIn in{};
+                GaussianRows<const float> in{};
                 in.means = device_span_of<const float>(means, "means", {n, 3}).data;
                 in.scales = device_span_of<const float>(scales, "scales", {n, 3}).data;
                 in.opacities = opacity.data;
@@ -116,19 +123,22 @@ void bind_simplify_init(py::module_& m) {
                 const Span<const float> opacity = device_span_of<const float>(opacities, "opacities", {-1});
                 const py::ssize_t n = static_cast<py::ssize_t>(opacity.size);
                 const py::ssize_t bases = num_bases_of(sh);
-                const RowsIn in{device_span_of<const float>(means, "means", {n, 3}).data,
-                                device_span_of<const float>(quats, "quats", {n, 4}).data,
-                                device_span_of<const float>(scales, "scales", {n, 3}).data,
-                                opacity.data,
-                                device_span_of<const float>(sh, "sh", {n, bases, 3}).data,
-                                static_cast<int>(3 * bases)};
+                const GaussianRows<const float> in{device_span_of<const float>(means, "means", {n, 3}).data,
+                                                   device_span_of<const float>(quats, "quats", {n, 4}).data,
+                                                   device_span_of<const float>(scales, "scales", {n, 3}).data,
+                                                   opacity.data,
+                                                   device_span_of<const float>(sh, "sh", {n, bases, 3}).data,
+                                                   static_cast<size_t>(n),
+                                                   degree_of_bases(bases, "")};
                 const Segments segments(in_offset, out_offset, n);
                 const py::ssize_t m = segments.num_out();
-                const RowsOut out{device_span_of<float>(out_means, "out_means", {m, 3}).data,
-                                  device_span_of<float>(out_quats, "out_quats", {m, 4}).data,
-                                  device_span_of<float>(out_scales, "out_scales", {m, 3}).data,
-                                  device_span_of<float>(out_opacities, "out_opacities", {m}).data,
-                                  device_span_of<float>(out_sh, "out_sh", {m, bases, 3}).data};
+                const GaussianRows<float> out{device_span_of<float>(out_means, "out_means", {m, 3}).data,
+                                              device_span_of<float>(out_quats, "out_quats", {m, 4}).data,
+                                              device_span_of<float>(out_scales, "out_scales", {m, 3}).data,
+                                              device_span_of<float>(out_opacities, "out_opacities", {m}).data,
+                                              device_span_of<float>(out_sh, "out_sh", {m, bases, 3}).data,
+                                              static_cast<size_t>(m),
+                                              in.sh_degree};
                 const py::gil_scoped_release unlocked;
                 cuda::merge(in, segments.in, segments.out, out, reinterpret_cast<cuda::Stream>(stream));
             },

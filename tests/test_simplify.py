@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import scenes
 from compare import MERGE_FLOAT, assert_close
 from devices import host, on
-from reference import simplify_init as reference
+from reference import simplify as reference
 from v3dg import Gaussians, _operations
 
 CAMERA = scenes.CAMERAS["plain"]

@@ -11,8 +11,8 @@
 #include <string>
 
 #include "base/span.h"
-#include "ply/ply_header.h"
-#include "ply/posix_file.h"
+#include "io/ply_header.h"
+#include "io/posix_file.h"
 
 namespace v3dg {
 

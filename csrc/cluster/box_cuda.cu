@@ -1,8 +1,8 @@
 // One warp a cluster.
 
 #include "base/launch.cuh"
-#include "box/box.h"
-#include "box/box_math.h"
+#include "cluster/box.h"
+#include "cluster/box_math.h"
 
 namespace v3dg {
 namespace cuda {

@@ -5,8 +5,8 @@
 #include <cfloat>
 
 #include "base/launch.cuh"
-#include "simplify_init/simplify_init.h"
-#include "simplify_init/simplify_init_math.h"
+#include "simplify/simplify.h"
+#include "simplify/simplify_math.h"
 
 namespace v3dg {
 namespace cuda {
@@ -32,7 +32,7 @@ struct Scratch {
 };
 
 // Makes each row a node; returns the scale of distances.
-__device__ double start_nodes(const RowsIn& in, int64_t first, int count, int64_t wanted,
+__device__ double start_nodes(const GaussianRows<const float>& in, int64_t first, int count, int64_t wanted,
                               const Scratch& group) {
     double low[3] = {DBL_MAX, DBL_MAX, DBL_MAX}, minus_high[3] = {DBL_MAX, DBL_MAX, DBL_MAX};
     for (int i = threadIdx.x; i < count; i += kBlockSize) {
@@ -176,8 +176,8 @@ __device__ void drop_joined(const Scratch& group, int n) {
     }
 }
 
-__device__ void write_rows(const RowsIn& in, int64_t first, const Scratch& group, int n, const RowsOut& out,
-                           int64_t to) {
+__device__ void write_rows(const GaussianRows<const float>& in, int64_t first, const Scratch& group, int n,
+                           const GaussianRows<float>& out, int64_t to) {
     for (int i = threadIdx.x; i < n; i += kBlockSize) {
         const int node = group.alive[i];
         if (group.next[node] < 0)
@@ -185,23 +185,23 @@ __device__ void write_rows(const RowsIn& in, int64_t first, const Scratch& group
         else
             write_joined(group.nodes[node], out, to + i);
     }
-    for (int64_t item = threadIdx.x; item < int64_t(n) * in.num_sh; item += kBlockSize) {
-        const int i = static_cast<int>(item / in.num_sh), k = static_cast<int>(item % in.num_sh);
+    for (int64_t item = threadIdx.x; item < int64_t(n) * in.num_sh(); item += kBlockSize) {
+        const int i = static_cast<int>(item / in.num_sh()), k = static_cast<int>(item % in.num_sh());
         const int node = group.alive[i];
-        float value = in.sh[in.num_sh * (first + node) + k];
+        float value = in.sh[in.num_sh() * (first + node) + k];
         if (group.next[node] >= 0) {
             double sum = 0;
             for (int row = node; row >= 0; row = group.next[row])
-                sum += group.row_weight[row] * in.sh[in.num_sh * (first + row) + k];
+                sum += group.row_weight[row] * in.sh[in.num_sh() * (first + row) + k];
             value = static_cast<float>(sum / group.nodes[node].feature.weight);
         }
-        out.sh[in.num_sh * (to + i) + k] = value;
+        out.sh[in.num_sh() * (to + i) + k] = value;
     }
 }
 
 __global__ void __launch_bounds__(kBlockSize)
-    merge_kernel(RowsIn in, const int64_t* in_offset, const int64_t* out_offset, size_t first_group,
-                 Scratch scratch, RowsOut out) {
+    merge_kernel(GaussianRows<const float> in, const int64_t* in_offset, const int64_t* out_offset,
+                 size_t first_group, Scratch scratch, GaussianRows<float> out) {
     const size_t g = first_group + blockIdx.x;
     const int64_t first = in_offset[g], wanted = out_offset[g + 1] - out_offset[g];
     int n = static_cast<int>(in_offset[g + 1] - first);
@@ -231,8 +231,8 @@ __global__ void __launch_bounds__(kBlockSize)
 
 }  // namespace
 
-void merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
-           const RowsOut& out, Stream stream) {
+void merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
+           const GaussianRows<float>& out, Stream stream) {
     const size_t num_groups = in_offset.size - 1;
     // Runs of groups that share the scratch.
     const auto end_of_run = [&](size_t first) {

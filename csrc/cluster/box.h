@@ -4,7 +4,7 @@
 
 #include "base/span.h"
 #include "base/stream.h"
-#include "select/select_math.h"
+#include "math/bounds.h"
 
 namespace v3dg {
 

@@ -1,4 +1,4 @@
-#include "simplify_init/simplify_init.h"
+#include "simplify/simplify.h"
 
 #include <algorithm>
 #include <cmath>
@@ -6,12 +6,12 @@
 
 #include "base/parallel_for.h"
 #include "cluster/cluster.h"
-#include "simplify_init/simplify_init_math.h"
+#include "simplify/simplify_math.h"
 
 namespace v3dg {
 
-void cpu::prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
-                Span<int64_t> kept) {
+void cpu::prune(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
+                Span<const int64_t> out_offset, Span<int64_t> kept) {
     const size_t num_groups = in_offset.size - 1, count = in_offset[num_groups];
     std::vector<int64_t> order(count), cell(num_groups * kPruneCells + 1);
     median_split({reinterpret_cast<const Point*>(in.means), count}, in_offset, kPruneHalvings,
@@ -35,8 +35,8 @@ void cpu::prune(const RowsIn& in, Span<const int64_t> in_offset, Span<const int6
 namespace {
 
 // Merges rows first .. first + count to `wanted` of them, which are written from row `to` on.
-void merge_segment(const RowsIn& in, int64_t first, int count, int64_t wanted, const RowsOut& out,
-                   int64_t to) {
+void merge_segment(const GaussianRows<const float>& in, int64_t first, int count, int64_t wanted,
+                   const GaussianRows<float>& out, int64_t to) {
     // A node is known by the first row it holds; its other rows follow in a list.
     std::vector<MergeNode> nodes(count);
     std::vector<double> row_weight(count);
@@ -96,14 +96,14 @@ void merge_segment(const RowsIn& in, int64_t first, int count, int64_t wanted, c
     for (const int i : alive) {
         if (next[i] < 0) {
             copy_shape(in, first + i, out, to);
-            std::copy_n(in.sh + in.num_sh * (first + i), in.num_sh, out.sh + in.num_sh * to);
+            std::copy_n(in.sh + in.num_sh() * (first + i), in.num_sh(), out.sh + in.num_sh() * to);
         } else {
             write_joined(nodes[i], out, to);
-            for (int k = 0; k < in.num_sh; ++k) {
+            for (int k = 0; k < in.num_sh(); ++k) {
                 double sum = 0;
                 for (int row = i; row >= 0; row = next[row])
-                    sum += row_weight[row] * in.sh[in.num_sh * (first + row) + k];
-                out.sh[in.num_sh * to + k] = static_cast<float>(sum / nodes[i].feature.weight);
+                    sum += row_weight[row] * in.sh[in.num_sh() * (first + row) + k];
+                out.sh[in.num_sh() * to + k] = static_cast<float>(sum / nodes[i].feature.weight);
             }
         }
         ++to;
@@ -112,8 +112,8 @@ void merge_segment(const RowsIn& in, int64_t first, int count, int64_t wanted, c
 
 }  // namespace
 
-void cpu::merge(const RowsIn& in, Span<const int64_t> in_offset, Span<const int64_t> out_offset,
-                const RowsOut& out) {
+void cpu::merge(const GaussianRows<const float>& in, Span<const int64_t> in_offset,
+                Span<const int64_t> out_offset, const GaussianRows<float>& out) {
     parallel_for(in_offset.size - 1, 1, [&](size_t g) {
         merge_segment(in, in_offset[g], static_cast<int>(in_offset[g + 1] - in_offset[g]),
                       out_offset[g + 1] - out_offset[g], out, out_offset[g]);

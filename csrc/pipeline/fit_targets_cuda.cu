@@ -1,6 +1,6 @@
 // Targets are pictures of a frame, thousands at once, drawn larger and box-averaged.
 
-#include "fit_group/fit_target_cuda.h"
+#include "pipeline/fit_targets_cuda.h"
 
 #include <vector>
 
@@ -117,7 +117,8 @@ void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob
                   const DeviceFitTarget& target, const FitView* views, float4* targets, Frame& frame,
                   cudaStream_t stream) {
     const uint64_t pictures_of_job = num_pictures(config);
-    const DeviceBuffer<DeviceRows> model(Span<const DeviceRows>{&target.rows, 1}, stream);
+    const DeviceBuffer<GaussianRows<const float>> model(
+        Span<const GaussianRows<const float>>{&target.rows, 1}, stream);
     DeviceBuffer<TargetPicture> pictures_on_device;
     DeviceBuffer<float> color, alpha;
     DeviceBuffer<FrameImage> images;

@@ -1,4 +1,4 @@
-#include "ply/ply_header.h"
+#include "io/ply_header.h"
 
 #include <algorithm>
 #include <charconv>

@@ -4,20 +4,10 @@
 
 #include <cmath>
 
-#include "math/quat.h"
-#include "project/project_math.h"
-#include "select/select_math.h"
+#include "math/bounds.h"
+#include "math/gaussian.h"
 
 namespace v3dg {
-
-V3DG_HD inline Box no_box() { return {{INFINITY, INFINITY, INFINITY}, {-INFINITY, -INFINITY, -INFINITY}}; }
-
-V3DG_HD inline void grow(Box& box, const Box& other) {
-    for (int a = 0; a < 3; ++a) {
-        box.lo[a] = other.lo[a] < box.lo[a] ? other.lo[a] : box.lo[a];
-        box.hi[a] = other.hi[a] > box.hi[a] ? other.hi[a] : box.hi[a];
-    }
-}
 
 // What one gaussian draws. In double precision: scales of 1e-6 and 1e6 in one gaussian are legal.
 V3DG_HD inline Box box_of_gaussian(const float* mean, const float* quat, const float* scale) {

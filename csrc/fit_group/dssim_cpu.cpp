@@ -1,6 +1,6 @@
-#include "loss/loss_math.h"
+#include "math/ssim.h"
 
-#include "loss/loss.h"
+#include "fit_group/dssim.h"
 
 namespace v3dg {
 

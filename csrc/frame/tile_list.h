@@ -1,85 +1,17 @@
 #pragma once
 
-// What the stages of a CUDA frame hand to each other, on the device. A frame is a batch of pictures: one for
-// the screen, thousands for the targets of local splatting.
+// Which tiles a record may touch, and the lists that tiles are blended from. Tiles are numbered through a
+// batch of pictures, row by row.
 
 #include <cstdint>
 #include <cstring>
 
-#include "project/project.h"
+#include "frame/counters.h"
+#include "frame/image.h"
+#include "frame/record.h"
 
 namespace v3dg {
 namespace cuda {
-
-// A block blends one tile, a warp 8 x 4 of its pixels.
-constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
-// Records that an item may make: as many as a block has threads.
-constexpr int kItemSize = 256;
-
-// Gaussians as rows, as users hold them (GaussianRows), on the device. Quaternions and SH coefficients start
-// at a multiple of 16 bytes.
-struct DeviceRows {
-    const float *means, *quats, *scales, *opacities, *sh;  // (N, 3), (N, 4), (N, 3), (N,), (N, bases, 3)
-    int sh_degree;
-};
-
-// The same packed: four planes of (N, 4) that hold a PackedGaussian each, and the SH coefficients.
-struct PackedRows {
-    const float* plane[4];
-    const float* sh;
-    int sh_degree;
-};
-
-// One picture of a batch.
-struct FrameImage {
-    Pinhole<float> camera;
-    int width, height;
-    int tile_columns, tile_rows;
-    uint32_t first_tile;  // in the batch, its tiles row by row
-    float background[3];
-    float *color, *alpha, *depth;  // as Picture<float> has them; depth may be null
-};
-
-// A model in front of a picture's camera.
-struct Placement {
-    ModelView<float> view;
-    uint32_t model, image;
-};
-
-// What a budget came to: the tolerance that was used, or that the coarsest cut, of `least` gaussians, exceeds
-// it and nothing was selected.
-struct CutChoice {
-    float tolerance_px2;
-    bool exceeds_budget;
-    unsigned long long least;
-};
-
-// Counted on the device. What exceeds a capacity is counted but not stored, and nothing is then drawn.
-struct FrameCounters {
-    unsigned long long items, gaussians, in_frustum, records, entries;
-    unsigned long long slots;  // of gradients, in a frame that keeps a tape
-    CutChoice choice;          // where there is a budget
-};
-
-// Neighbouring gaussians of a placed model, or of a model that several placements share: those at
-// `placement` + k for each bit k of `sharers`, where it is not 0. They are to have one picture, and to make
-// kItemSize records at most: there is room for those from `record` on, and they stand at its beginning, by
-// gaussian and then by placement.
-struct DrawItem {
-    uint32_t placement, first, count, record;
-    float filter_px2;
-    uint32_t compensate;
-    uint32_t sharers;
-};
-
-// Where the items of a frame are written, in their order. Counts what there is, stores what there is room
-// for: counters->items, and in counters->gaussians the end of the last item's records. Items that would end
-// past record_capacity need not be stored.
-struct ItemList {
-    DrawItem* items;
-    FrameCounters* counters;
-    unsigned long long item_capacity, record_capacity;
-};
 
 // A gaussian in the list of a tile, in one word: 26 bits of depth, the 28 bits of the record, and 10 of where
 // in the tile it is. Lists are blended by ascending depth, ties by record; entries in one step of the key's
@@ -148,6 +80,66 @@ struct FrameLists {
     const FrameCounters* counters;
     unsigned long long record_capacity, entry_capacity;  // records: at most kMostFrameRecords
     TilePlan* plans;                                     // [num_tiles] scratch
+};
+
+// A record over more tiles than this is looked at row by row of tiles.
+constexpr unsigned kFewTiles = 4;
+
+// The tiles that a record's blocks lie in.
+struct TileBox {
+    int left, top;
+    uint32_t columns, count;
+
+    // Column and row of tile k of at most kFewTiles: with more than two columns there is one row.
+    V3DG_HD int column(uint32_t k) const {
+        return left + static_cast<int>(columns > 2 ? k : columns == 2 ? k & 1 : 0);
+    }
+    V3DG_HD int row(uint32_t k) const {
+        return top + static_cast<int>(columns > 2 ? 0 : columns == 2 ? k >> 1 : k);
+    }
+};
+
+V3DG_HD inline TileBox tile_box(const EntryBox& b) {
+    constexpr int kColumns = kFrameTileWidth / kEntryBlockSize, kRows = kFrameTileHeight / kEntryBlockSize;
+    const int left = b.x0 / kColumns, top = b.y0 / kRows;
+    const uint32_t columns = b.x1 / kColumns - left + 1, rows = b.y1 / kRows - top + 1;
+    return {left, top, columns, columns * rows};
+}
+
+// A record over few tiles as the scattering kernel reads it: depth, and the blocks' first and how many
+// follow.
+using FewTiles = unsigned long long;
+constexpr FewTiles kManyTiles = ~FewTiles(0);
+
+V3DG_HD inline FewTiles few_tiles(uint32_t depth, const EntryBox& b) {
+    return FewTiles(depth) << 38 | FewTiles(b.x0) << 24 | FewTiles(b.x1 - b.x0) << 19 | FewTiles(b.y0) << 5 |
+           FewTiles(b.y1 - b.y0);
+}
+V3DG_HD inline uint32_t depth_of(FewTiles f) { return static_cast<uint32_t>(f >> 38); }
+V3DG_HD inline EntryBox box_of(FewTiles f) {
+    const int x0 = static_cast<int>(f >> 24) & 0x3fff, y0 = static_cast<int>(f >> 5) & 0x3fff;
+    return {x0, x0 + (static_cast<int>(f >> 19) & 31), y0, y0 + (static_cast<int>(f) & 31)};
+}
+
+// A record over more than kFewTiles tiles. They come in batches of kLargeAtOnce of one item, so of neighbours
+// in one picture; what a batch lacks is filled up at its end.
+struct LargeRecord {
+    uint32_t record, image;  // kNoRecord where there is none
+};
+constexpr unsigned kLargeAtOnce = 16;
+constexpr uint32_t kNoRecord = ~0u;
+
+// The records of an item, and the tiles of their picture.
+struct ItemTiles {
+    uint32_t num_records, record, first_tile, columns;
+};
+
+// What project() has found out of the tiles, and scratch of tile_bin(). Cleared before project().
+struct TileCounts {
+    uint32_t* count;  // [num_tiles] of the records over at most kFewTiles; zero after tile_bin()
+    unsigned long long* num_large;  // whole batches
+    unsigned* ticket;
+    unsigned long long* state;  // [tile_bin_parts(num_tiles)]
 };
 
 }  // namespace cuda

@@ -4,7 +4,7 @@
 // there together.
 
 #include "base/launch.cuh"
-#include "tile_bin/tile_bin_math.h"
+#include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {

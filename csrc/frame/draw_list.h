@@ -1,0 +1,55 @@
+#pragma once
+
+// What a frame draws: runs of gaussians, placed in front of cameras.
+
+#include <cstdint>
+
+#include "frame/counters.h"
+#include "math/camera.h"
+#include "math/gaussian.h"
+
+namespace v3dg {
+
+// A run of gaussians of one model, placed in front of the camera.
+template <class T>
+struct Draw {
+    const GaussianPlanes<T>* model;
+    uint64_t first, count;
+    ModelView<T> view;
+    T filter_px2;
+    bool compensate;  // opacity for what the filter adds
+};
+
+namespace cuda {
+
+// Records that an item may make: as many as a block has threads.
+constexpr int kItemSize = 256;
+
+// A model in front of a picture's camera.
+struct Placement {
+    ModelView<float> view;
+    uint32_t model, image;
+};
+
+// Neighbouring gaussians of a placed model, or of a model that several placements share: those at
+// `placement` + k for each bit k of `sharers`, where it is not 0. They are to have one picture, and to make
+// kItemSize records at most: there is room for those from `record` on, and they stand at its beginning, by
+// gaussian and then by placement.
+struct DrawItem {
+    uint32_t placement, first, count, record;
+    float filter_px2;
+    uint32_t compensate;
+    uint32_t sharers;
+};
+
+// Where the items of a frame are written, in their order. Counts what there is, stores what there is room
+// for: counters->items, and in counters->gaussians the end of the last item's records. Items that would end
+// past record_capacity need not be stored.
+struct ItemList {
+    DrawItem* items;
+    FrameCounters* counters;
+    unsigned long long item_capacity, record_capacity;
+};
+
+}  // namespace cuda
+}  // namespace v3dg

@@ -1,0 +1,55 @@
+#pragma once
+
+// The pictures that a frame draws, and their tiles.
+
+#include <cstdint>
+
+#include "math/camera.h"
+
+namespace v3dg {
+
+constexpr int kTileSize = 32;  // px; the CPU draws pictures tile by tile
+
+// The pixels [x0, x1) x [y0, y1) of a picture.
+struct Window {
+    int x0, y0, x1, y1;
+    V3DG_INLINE int width() const { return x1 - x0; }
+    V3DG_INLINE int height() const { return y1 - y0; }
+    V3DG_INLINE bool contains(int x, int y) const { return x0 <= x && x < x1 && y0 <= y && y < y1; }
+};
+
+// The pixels of a window, row major; colour has three channels.
+template <class T>
+struct Picture {
+    Window window;
+    T background[3];
+    T* color;  // premultiplied, the background composed last
+    T* alpha;
+    T* depth;            // expected depth, sum of weight * depth over alpha, 0 where alpha is 0; may be null
+    T* count = nullptr;  // gaussians that were blended, in place of depth; may be null
+};
+
+// Gradients of the picture, laid out as it is; `depth` may be null.
+template <class T>
+struct PictureGradient {
+    const T* color;
+    const T* alpha;
+    const T* depth;
+};
+
+namespace cuda {
+
+// A block blends one tile, a warp 8 x 4 of its pixels.
+constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
+// One picture of a batch.
+struct FrameImage {
+    Pinhole<float> camera;
+    int width, height;
+    int tile_columns, tile_rows;
+    uint32_t first_tile;  // in the batch, its tiles row by row
+    float background[3];
+    float *color, *alpha, *depth;  // as Picture<float> has them; depth may be null
+};
+
+}  // namespace cuda
+}  // namespace v3dg

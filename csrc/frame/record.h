@@ -1,0 +1,60 @@
+#pragma once
+
+// A record: one gaussian on the image, ready to blend.
+
+#include <cstdint>
+
+#include "math/ellipse.h"
+
+namespace v3dg {
+
+// Ellipse says what L is.
+template <class T>
+struct Record {
+    T u, v, l11, l12, l22, log2_opacity;
+    T color[3];
+    T depth;
+    // First and last pixel whose centre the gaussian can reach, cut to the image or the window that is drawn.
+    uint16_t x0, x1, y0, y1;
+};
+
+// Sets all of a record but its colour.
+template <class T>
+V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, int x0, int x1, int y0, int y1, Record<T>& r) {
+    r.u = e.u;
+    r.v = e.v;
+    r.l11 = e.l11;
+    r.l12 = e.l12;
+    r.l22 = e.l22;
+    r.log2_opacity = e.log2_opacity;
+    r.depth = e.depth;
+    r.x0 = static_cast<uint16_t>(x0);
+    r.x1 = static_cast<uint16_t>(x1);
+    r.y0 = static_cast<uint16_t>(y0);
+    r.y1 = static_cast<uint16_t>(y1);
+}
+
+// An entry of a tile's list on the CPU holds a record's place in its low half and the bits of its float32 depth,
+// which order the list, in its high half.
+inline uint32_t record_of(uint64_t entry) { return static_cast<uint32_t>(entry); }
+
+// Gradients of the ellipse and colour of one record.
+template <class T>
+struct RecordGradient {
+    Ellipse<T> ellipse;
+    T color[3];
+
+    V3DG_HD RecordGradient& operator+=(const RecordGradient& d) {
+        ellipse.u += d.ellipse.u;
+        ellipse.v += d.ellipse.v;
+        ellipse.l11 += d.ellipse.l11;
+        ellipse.l12 += d.ellipse.l12;
+        ellipse.l22 += d.ellipse.l22;
+        ellipse.log2_opacity += d.ellipse.log2_opacity;
+        ellipse.depth += d.ellipse.depth;
+        for (int c = 0; c < 3; ++c) color[c] += d.color[c];
+        return *this;
+    }
+};
+
+}  // namespace v3dg

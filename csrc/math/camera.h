@@ -1,0 +1,67 @@
+#pragma once
+
+// Pinhole cameras: the image side that projection needs, and a camera in the world.
+
+#include "math/lanes.h"
+
+namespace v3dg {
+
+constexpr double kFovMargin = 0.3;  // of the half field of view: where the Jacobian is clamped
+
+// Image side of a pinhole camera. Pixels; pixel (i, j) has its centre at (i + ½, j + ½).
+template <class T>
+struct Pinhole {
+    T fx, fy, cx, cy;
+    T width, height;
+    T near_depth;
+};
+
+// Model space to view space: view = linear * model + translation, linear = uniform scale * rotation.
+template <class T>
+struct ModelView {
+    T linear[9];  // row major
+    T translation[3];
+    T eye[3];  // the camera's position in model space
+};
+
+// Limits of x / z and y / z past which the Jacobian is held.
+template <class T>
+struct SlopeLimits {
+    T low_x, high_x, low_y, high_y;
+};
+template <class T>
+V3DG_HD V3DG_INLINE SlopeLimits<T> slope_limits(const Pinhole<T>& cam) {
+    const T margin_x = T(kFovMargin) * cam.width / (2 * cam.fx);
+    const T margin_y = T(kFovMargin) * cam.height / (2 * cam.fy);
+    return {-(cam.cx / cam.fx + margin_x), (cam.width - cam.cx) / cam.fx + margin_x,
+            -(cam.cy / cam.fy + margin_y), (cam.height - cam.cy) / cam.fy + margin_y};
+}
+
+// A pinhole camera in the world, in double precision.
+struct Camera {
+    double rotation[9];  // world to camera, rows
+    double eye[3];
+    double fx, fy, cx, cy, width, height, near;  // px; near in world units
+    double x0, y0, x1, y1;                       // the part of the image that is wanted, px
+};
+
+// Where a camera is: what its world-to-camera matrix brings to 0. The rotation in it may be off by what
+// float32 loses.
+V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {
+    // The rotation's inverse by columns, which are cross products of its rows.
+    double determinant = 0.0;
+    for (int a = 0; a < 3; ++a) {
+        const int b = (a + 1) % 3, c = (a + 2) % 3;
+        eye[a] = 0.0;
+        for (int row = 0; row < 3; ++row) {
+            const double* next = viewmat + 4 * ((row + 1) % 3);
+            const double* after = viewmat + 4 * ((row + 2) % 3);
+            const double cofactor = next[b] * after[c] - next[c] * after[b];
+            eye[a] -= viewmat[4 * row + 3] * cofactor;
+            if (row == 0) determinant += viewmat[a] * cofactor;
+        }
+    }
+    for (int a = 0; a < 3; ++a) eye[a] /= determinant;
+}
+
+}  // namespace v3dg

@@ -1,0 +1,52 @@
+#pragma once
+
+// The ellipse that a gaussian covers on the image, and the rows of pixels that it meets.
+
+#include "math/gaussian.h"
+
+namespace v3dg {
+
+// Alpha at offset d from the centre is 2^(log2_opacity - |L d|²) with L = [[l11, l12], [0, l22]].
+template <class V>
+struct Ellipse {
+    V u, v;  // px
+    V l11, l12, l22;
+    V log2_opacity;
+    V depth;
+};
+
+// An ellipse |L d|² = reach as a row of pixels meets it.
+template <class V>
+struct EllipseRows {
+    V reach;
+    V inverse;  // 1 / l11
+    V slope;    // of the line through the middles of the rows' extents
+    V l22;
+    V rightmost;  // height above the centre at which it reaches farthest right; farthest left is opposite
+};
+
+// Of where alpha is 1/255 or more.
+template <class V>
+V3DG_HD V3DG_INLINE EllipseRows<V> ellipse_rows(V l11, V l12, V l22, V log2_opacity) {
+    EllipseRows<V> e;
+    e.reach = log2_opacity - all_lanes<V>(Lane<V>(kLog2MinAlpha));
+    e.inverse = 1 / l11;
+    e.slope = -l12 * e.inverse;
+    e.l22 = l22;
+    e.rightmost = -l12 * sqrt_of(e.reach) / (l22 * sqrt_of(l12 * l12 + l22 * l22));
+    return e;
+}
+
+// Where the ellipse may lie between the heights y0 <= y1: from x0 to x1, all from its centre. A hair more, so
+// that the blend step alone decides. Means nothing where the ellipse's box does not meet the heights.
+template <class V>
+V3DG_HD V3DG_INLINE void row_extent(const EllipseRows<V>& e, V y0, V y1, V& x0, V& x1) {
+    const V a = min_of(max_of(e.rightmost, y0), y1), b = min_of(max_of(-e.rightmost, y0), y1);
+    const V half_a = sqrt_of(max_of(e.reach - e.l22 * e.l22 * a * a, V{})) * e.inverse;
+    const V half_b = sqrt_of(max_of(e.reach - e.l22 * e.l22 * b * b, V{})) * e.inverse;
+    const V hair = Lane<V>(1e-2) + Lane<V>(1e-3) * (half_a + half_b);
+    x0 = e.slope * b - half_b - hair;
+    x1 = e.slope * a + half_a + hair;
+}
+
+}  // namespace v3dg

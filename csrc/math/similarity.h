@@ -1,0 +1,67 @@
+#pragma once
+
+// Poses of instances, and a camera in the world as one instance sees it: composed in double precision, then
+// rounded. Decisions depend on it, so whoever calls it is compiled without contraction.
+
+#include <cfloat>
+
+#include "math/camera.h"
+#include "math/quat.h"
+
+namespace v3dg {
+
+// A similarity transform p -> scale * rotation p + position.
+struct Pose {
+    const double* position;    // [3]
+    const double* quaternion;  // [4] w x y z, of any length but zero
+    double scale;
+};
+
+// Whether a pose is one: what is not finite, or of no size, is not drawn.
+V3DG_HD inline bool is_placed(const Pose& pose) {
+    double sum = pose.scale;
+    for (int k = 0; k < 3; ++k) sum += fabs(pose.position[k]);
+    double length2 = 0.0;
+    for (int k = 0; k < 4; ++k) length2 += pose.quaternion[k] * pose.quaternion[k];
+    return pose.scale > 0.0 && sum <= DBL_MAX && length2 > 0.0 && length2 <= DBL_MAX;
+}
+
+// The camera in the frame of an instance.
+struct InstanceAxes {
+    double axes[9], origin[3];  // camera coordinates of an asset's point p, over the scale: axes p + origin
+    double eye[3];
+};
+
+V3DG_HD inline InstanceAxes axes_of_instance(const Camera& camera, const Pose& pose) {
+    const double inverse_scale = 1.0 / pose.scale;
+    double rotation[9];
+    rotation_of_quat(pose.quaternion, rotation);
+    double eye_from_origin[3];
+    for (int a = 0; a < 3; ++a) eye_from_origin[a] = camera.eye[a] - pose.position[a];
+    InstanceAxes out;
+    for (int row = 0; row < 3; ++row) {
+        double eye = 0.0, origin = 0.0;
+        for (int k = 0; k < 3; ++k) {
+            eye += rotation[3 * k + row] * eye_from_origin[k];
+            origin -= camera.rotation[3 * row + k] * eye_from_origin[k];
+            double axis = 0.0;
+            for (int j = 0; j < 3; ++j) axis += camera.rotation[3 * row + j] * rotation[3 * j + k];
+            out.axes[3 * row + k] = axis;
+        }
+        out.origin[row] = origin * inverse_scale;
+        // Any eye gives an exact cut as long as squares of distances stay finite.
+        out.eye[row] = min_of(max_of(eye * inverse_scale, -1e18), 1e18);
+    }
+    return out;
+}
+
+// What projection needs of it.
+V3DG_HD inline ModelView<float> model_view_from_instance(const InstanceAxes& in, const Pose& pose) {
+    ModelView<float> view;
+    for (int k = 0; k < 9; ++k) view.linear[k] = static_cast<float>(pose.scale * in.axes[k]);
+    for (int k = 0; k < 3; ++k) view.translation[k] = static_cast<float>(pose.scale * in.origin[k]);
+    for (int k = 0; k < 3; ++k) view.eye[k] = static_cast<float>(in.eye[k]);
+    return view;
+}
+
+}  // namespace v3dg
