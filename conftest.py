@@ -13,6 +13,8 @@ IS_COMPILED_HERE = any((ROOT / "v3dg").glob("_core.*.so"))
 if not IS_COMPILED_HERE:
     # `python -m pytest` puts the folder that it runs in first, where v3dg/ would hide the installed package.
     sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() != ROOT]
+if str(ROOT) not in sys.path:
+    sys.path.append(str(ROOT))  # for benchmarks/
 
 
 @pytest.fixture(scope="session", autouse=not IS_COMPILED_HERE)

@@ -6,6 +6,7 @@ Wants the extra `video`: pip install '.[video]' && python examples/falling_donut
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +17,11 @@ import tyro
 from tqdm import tqdm
 
 import v3dg
-from v3dg.films import write_film
-from v3dg.procedural import make_donut
-from v3dg.worlds import donut_shower
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))  # for benchmarks/ of this checkout
+from benchmarks.worlds import donut_shower
+from benchmarks.worlds.procedural import make_donut
+from v3dg.video import write_film
 
 FPS = 30
 STEPS_PER_FRAME = 2  # of the physics: a sixtieth of a second each

@@ -13,9 +13,9 @@ import numpy as np
 import tyro
 
 import v3dg
+from v3dg.donut import make_donut
 from v3dg.metrics import psnr
 from v3dg.pictures import write_picture
-from v3dg.procedural import make_donut
 
 # What the coarser levels were fitted with: gsplat has one filter for all gaussians, and that is nearest.
 FILTER_PX2 = v3dg.BuildConfig.filter_px2

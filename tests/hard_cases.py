@@ -1,7 +1,7 @@
 """What breaks rasterizers, case by case: drawn and differentiated by both halves against float64.
 
-Tests hold each case to its bounds, forward and backward, on both devices; benchmarks/hard_cases.py measures
-how the errors spread and writes the table of docs/numerics.md.
+Tests hold each case to its bounds, forward and backward, on both devices; benchmarks/studies/hard_cases.py
+measures how the errors spread and writes the table of docs/numerics.md.
 """
 
 from __future__ import annotations

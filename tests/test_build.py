@@ -14,9 +14,9 @@ import pytest
 
 import scenes
 import v3dg
+from benchmarks.worlds.procedural import make_asset
 from reference import project as reference_project
 from v3dg import BuildConfig, Camera, Gaussians, build_bundle, metrics, rasterize, render, select
-from v3dg.procedural import make_asset
 
 SMALL = BuildConfig(cluster_size=32, steps=10)
 TABLES = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
@@ -85,7 +85,7 @@ def held_out_psnr(asset, bundle, level):
 THREADS_SCRIPT = """
 import sys
 import v3dg
-from v3dg.procedural import make_asset
+from benchmarks.worlds.procedural import make_asset
 config = v3dg.BuildConfig(cluster_size=32, steps=10)
 asset = make_asset(num_gaussians=1200, seed=0)
 v3dg.build_bundle(asset, config=config, progress=False, device="cpu").save(sys.argv[1])
@@ -98,7 +98,7 @@ def test_same_file_on_any_number_of_threads(asset, tmp_path):
     for threads in (1, 2, 4):
         files.append(tmp_path / f"{threads}.v3dg")
         environment = os.environ | {
-            "PYTHONPATH": str(Path(v3dg.__file__).parent.parent),
+            "PYTHONPATH": os.pathsep.join(str(Path(file).parents[1]) for file in (v3dg.__file__, __file__)),
             "OMP_NUM_THREADS": str(threads),
         }
         command = [sys.executable, "-c", THREADS_SCRIPT, str(files[-1])]

@@ -15,8 +15,8 @@ import pytest
 
 import v3dg
 import v3dg.build
+from benchmarks.worlds.procedural import make_asset
 from v3dg import BuildConfig, build_bundle
-from v3dg.procedural import make_asset
 
 CONFIG = BuildConfig(cluster_size=32, steps=400)
 # Runs for days; only the first level's checkpoint would end it.
@@ -24,7 +24,7 @@ ENDLESS = replace(CONFIG, steps=2_000_000_000)
 SCRIPT = """
 import sys
 import v3dg
-from v3dg.procedural import make_asset
+from benchmarks.worlds.procedural import make_asset
 asset = make_asset(num_gaussians=1000, seed=0)
 config = v3dg.BuildConfig(cluster_size=32, steps=int(sys.argv[1]))
 if sys.argv[4] == "cuda":
@@ -64,7 +64,8 @@ def whole(asset, device, tmp_path_factory):
 @contextmanager
 def started_build(config, device, folder):
     """A build in a process of its own; killed at the end if it still runs."""
-    environment = os.environ | {"PYTHONPATH": str(Path(v3dg.__file__).parent.parent)}
+    roots = os.pathsep.join(str(Path(file).parents[1]) for file in (v3dg.__file__, __file__))
+    environment = os.environ | {"PYTHONPATH": roots}
     arguments = [str(config.steps), str(folder / "levels"), str(folder / "out.v3dg"), device]
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, *arguments],

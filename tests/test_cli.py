@@ -13,9 +13,9 @@ import pytest
 from PIL import Image
 
 import v3dg
+from benchmarks.worlds.procedural import make_asset
 from command_line import COMMAND, ENVIRONMENT, fails, run
 from v3dg import cli
-from v3dg.procedural import make_asset
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_version():
 
 @pytest.mark.parametrize(
     "command",
-    ["build", "info", "render", "compare", "convert", "export", "world", "demo", "bench", "completion"],
+    ["build", "info", "render", "compare", "convert", "export", "demo", "completion"],
 )
 def test_help(command):
     done = run(command, "--help")

@@ -7,8 +7,8 @@ import time
 import pytest
 
 import v3dg
+from benchmarks.worlds.procedural import make_asset
 from command_line import COMMAND, ENVIRONMENT, fails, run
-from v3dg.procedural import make_asset
 
 FAST = ("--quiet", "--cluster-size", 64)
 

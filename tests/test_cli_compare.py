@@ -1,15 +1,16 @@
 import json
 import os
+import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import v3dg
+from benchmarks.worlds.procedural import make_asset
 from command_line import fails, run
-from v3dg import metrics
+from v3dg import cli, metrics
 from v3dg.pictures import write_picture
-from v3dg.procedural import make_asset
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +155,27 @@ def test_errors(folder, tmp_path):
     fails(2, "--supersample", "compare", "tuft.ply", "tuft.ply", "--supersample", 0, cwd=folder)
     (tmp_path / "c.png").write_bytes(b"not a picture")
     fails(1, "c.png", "compare", "a.png", "c.png", cwd=tmp_path)
+
+
+def test_without_flip_views_are_compared_by_psnr(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    subjects = [str(folder / name) for name in ("tuft.ply", "tuft.v3dg")]
+    options = [
+        "--views",
+        "3",
+        "--size",
+        "64",
+        "48",
+        "--tolerance",
+        "300",
+        "-o",
+        str(tmp_path / "c.png"),
+        "--quiet",
+    ]
+    assert cli.main(["compare", *subjects, *options, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["mean"]["flip"] is None
+    worst = min(result["views"], key=lambda view: view["psnr"])
+    assert result["worst"] == worst["camera"]
+    assert cli.main(["compare", *subjects, *options]) == 0
+    assert "pip install 'v3dg[flip]'" in capsys.readouterr().out

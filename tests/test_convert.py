@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import v3dg
+from benchmarks.worlds.procedural import make_asset
 from command_line import fails, run
-from v3dg.procedural import make_asset
 
 
 @pytest.fixture(scope="module")

@@ -82,3 +82,12 @@ def test_counts_have_three_digits(count, text):
 @pytest.mark.parametrize(("milliseconds", "text"), [(34.4, "34 ms"), (1250, "1.25 s"), (12_800, "12.8 s")])
 def test_times_have_few_digits(milliseconds, text):
     assert time_text(milliseconds) == text
+
+
+def test_without_flip_the_error_is_psnr(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    options = {"num_gaussians": 1000, "instances": 7, "size": (64, 64), "views": VIEWS, "progress": False}
+    result = run_demo(tmp_path / "demo.png", **options)
+    assert "PSNR" in table_text(result)
+    assert "FLIP" not in table_text(result)
+    assert result.as_dict()["columns"][0]["full"]["flip"] is None

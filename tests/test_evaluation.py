@@ -10,25 +10,26 @@ import numpy as np
 import pytest
 
 import v3dg
+from benchmarks import evaluation
+from benchmarks.__main__ import PROGRAM
+from benchmarks.evaluation import measure, report
+from benchmarks.evaluation.assets import hair_lines, like_trained, many_copies, sky_dome
+from benchmarks.evaluation.hierarchy import HierarchyScene, build_hierarchy
+from benchmarks.evaluation.parts import motion
+from benchmarks.worlds.procedural import make_asset
 from reference.project import project
-from v3dg import bench, cli
-from v3dg.bench import measure, report
-from v3dg.bench.assets import hair_lines, like_trained, many_copies, sky_dome
-from v3dg.bench.hierarchy import HierarchyScene, build_hierarchy
-from v3dg.bench.parts import motion
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
-from v3dg.procedural import make_asset
 
 TINY = replace(
-    bench.PRESETS["small"],
+    evaluation.PRESETS["small"],
     asset_gaussians=1500,
     instances=7,
     worlds={"forest": (3, 4000)},
     world_steps=2,
     size=(64, 36),
     distances=2,
-    line_distances=2,
+    sweep_distances=2,
     repeats=1,
     composed_repeats=1,
     steps=(0, 2),
@@ -164,7 +165,7 @@ def test_judge_keeps_the_order_and_knows_equal_pictures():
 
 
 def test_popping_is_what_a_frame_changes_beyond_the_truth():
-    row = motion.summary("ours", [0.3, 0.5], [0.1, 0.2], [0.2, 0.2])
+    row = motion.steps_row("ours", [0.3, 0.5], [0.1, 0.2], [0.2, 0.2])
     assert row["above_truth"] == pytest.approx(0.25)
     assert row["worst_above_truth"] == pytest.approx(0.3)
     assert row["above_full"] == pytest.approx(0.2)
@@ -186,17 +187,17 @@ def test_made_assets_are_as_many_as_asked_for_and_repeat():
 
 
 def test_a_picture_that_changes_between_runs_is_refused(tmp_path, scene, monkeypatch):
-    stage = bench.Stage(TINY, "cpu", tmp_path)
-    view = bench.stage.orbit_view(0, 45, 12, (64, 36))
-    real, drawn = bench.stage.render, []
+    made = evaluation.Evaluation(TINY, "cpu", tmp_path)
+    view = evaluation.evaluation.orbit_view(0, 45, 12, (64, 36))
+    real, drawn = evaluation.evaluation.render, []
 
     def flickering(*arguments, **options):
         drawn.append(1)
         return real(*arguments, **options, background=(len(drawn) / 10, 0.0, 0.0))
 
-    monkeypatch.setattr(bench.stage, "render", flickering)
+    monkeypatch.setattr(evaluation.evaluation, "render", flickering)
     with pytest.raises(RuntimeError, match="same on every run"):
-        stage.shoot(scene, view)
+        made.shoot(scene, view)
 
 
 def test_a_folder_called_v3dg_is_not_mistaken_for_the_package(tmp_path, monkeypatch):
@@ -204,35 +205,35 @@ def test_a_folder_called_v3dg_is_not_mistaken_for_the_package(tmp_path, monkeypa
     (tmp_path / "v3dg" / "__init__.py").write_text("raise ImportError('the wrong one')")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
-    rows = bench.part("alone").threads_rows(bench.Stage(TINY, "cpu", tmp_path))
+    rows = evaluation.part("alone").threads_rows(evaluation.Evaluation(TINY, "cpu", tmp_path))
     assert rows[0]["threads"] == 1
     assert all(row["frame_ms"] > 0 for row in rows)
 
 
 def test_unknown_part_is_refused(capsys, tmp_path):
-    assert cli.main(["bench", "-o", str(tmp_path), "--parts", "tolerances"]) == 1
+    assert PROGRAM.main(["evaluate", "-o", str(tmp_path), "--parts", "tolerances"]) == 1
     assert "expected some of tolerance, composed" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     """All parts, as small as can be."""
-    folder = tmp_path_factory.mktemp("bench")
-    stage = bench.Stage(TINY, "cpu", folder)
-    return folder, bench.run(stage, "tiny", bench.NAMES, quiet=True)
+    folder = tmp_path_factory.mktemp("evaluation")
+    made = evaluation.Evaluation(TINY, "cpu", folder)
+    return folder, evaluation.run(made, "tiny", evaluation.NAMES, quiet=True)
 
 
 @pytest.mark.slow
 def test_every_part_writes_what_it_measured(results):
     folder, measured = results
-    assert set(measured) == set(bench.NAMES)
+    assert set(measured) == set(evaluation.NAMES)
     for name, result in measured.items():
         written = json.loads((folder / f"{name}.json").read_text())
         assert {"commit", "command", "processor", "seed", "seconds"} <= set(written)
         assert written["part"] == name
         for picture in result["pictures"]:
             assert (folder / picture).stat().st_size > 0
-        assert "|" in bench.part(name).tables(result)
+        assert "|" in evaluation.part(name).tables(result)
 
 
 @pytest.mark.slow
@@ -249,8 +250,8 @@ def test_page_begins_with_wins_and_losses(results):
     beginning = text.splitlines()[:10]
     assert any(line.startswith("**Where we win**: ") for line in beginning)
     assert any(line.startswith("**Where we do not**: ") for line in beginning)
-    for name in bench.NAMES:
-        assert f"### {bench.part(name).TITLE}" in text
+    for name in evaluation.NAMES:
+        assert f"### {evaluation.part(name).TITLE}" in text
     assert "](clipping.jpg)" in text
 
 
@@ -271,21 +272,21 @@ def test_page_names_all_commits_that_were_measured():
 
 
 def test_report_of_an_empty_folder_says_what_to_run(tmp_path):
-    with pytest.raises(ValueError, match="run `v3dg bench` first"):
+    with pytest.raises(ValueError, match="run `python -m benchmarks evaluate` first"):
         report.read_results(tmp_path)
 
 
 @pytest.mark.parametrize("degrees", [-1e-5, 0.0, 1e-5])
 def test_views_of_rounded_cameras_are_from_one_direction(degrees):
-    camera = bench.stage.orbit_view(degrees, 45, 3, (64, 36)).camera
-    assert bench.stage.views_of([camera])[0].azimuth == 0
+    camera = evaluation.evaluation.orbit_view(degrees, 45, 3, (64, 36)).camera
+    assert evaluation.evaluation.views_of([camera])[0].azimuth == 0
 
 
 @pytest.mark.gpu
 @pytest.mark.slow
 def test_parts_run_on_cuda(tmp_path):
-    stage = bench.Stage(TINY, "cuda", tmp_path)
-    measured = bench.run(stage, "tiny", ("tolerance", "clipping", "hierarchy", "motion"), quiet=True)
+    made = evaluation.Evaluation(TINY, "cuda", tmp_path)
+    measured = evaluation.run(made, "tiny", ("tolerance", "clipping", "hierarchy", "motion"), quiet=True)
     for row in measured["clipping"]["rows"]:
         assert 0.9 * row["ours_in_frustum"] < row["clipped_in_frustum"] <= row["ours_in_frustum"]
     for row in measured["hierarchy"]["rows"]:

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import v3dg
+from benchmarks.worlds.procedural import make_donut
 from v3dg.metrics import psnr
-from v3dg.procedural import make_donut
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -65,7 +65,7 @@ def assert_holds(folder, bundle, chunk):
 
 @pytest.fixture(scope="module")
 def bundle():
-    from v3dg.procedural import make_asset
+    from benchmarks.worlds.procedural import make_asset
 
     config = v3dg.BuildConfig(cluster_size=32, steps=0)
     return v3dg.build_bundle(make_asset(1500), config=config, progress=False)
@@ -206,7 +206,7 @@ def rotation_between(points, turned):
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
 def test_what_is_up_becomes_what_viewers_take_to_be_up(tmp_path, up):
     """The asset looks the same from a camera that was turned with it."""
-    from v3dg.procedural import make_donut
+    from benchmarks.worlds.procedural import make_donut
 
     asset = make_donut(1000)
     bundle = v3dg.build_bundle(asset, config=v3dg.BuildConfig(steps=0), progress=False)

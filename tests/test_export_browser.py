@@ -18,9 +18,9 @@ from PIL import Image
 
 import chromium
 import v3dg
+from benchmarks.worlds.procedural import make_donut
 from v3dg.export import export_streamed_sog
 from v3dg.metrics import psnr
-from v3dg.procedural import make_donut
 
 pytest.importorskip("playwright.sync_api")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import v3dg
-from v3dg.procedural import make_asset
+from benchmarks.worlds.procedural import make_asset
 
 KILLS = int(os.environ.get("V3DG_KILLS", "3"))
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(v3dg.__file__).parent.parent)}

@@ -42,12 +42,14 @@ MAY_INCLUDE = {
     },
 }
 NOT_OPERATIONS = {"base", "math", "io", "frame", "pipeline", "bindings"}
-NEEDS_TORCH = {"v3dg.bench.gpu"}  # measures torch's device and its memory
 TESTED_WITH = {"tile_bin": "rasterize"}
 
 OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)
 SOURCES = sorted(str(p.relative_to(ROOT)) for p in CSRC.rglob("*") if p.suffix in {".cpp", ".cu"})
 MODULES = sorted((ROOT / "v3dg").rglob("*.py"))
+MEASURING = sorted(p for part in ("evaluation", "worlds") for p in (ROOT / "benchmarks" / part).rglob("*.py"))
+MOST_LINES, MOST_LINES_A_FILE = 10_000, 400
+TOO_LONG = {"v3dg/build.py", "v3dg/bundle.py", "v3dg/viewer/page.py"}
 
 
 def module_name(path):
@@ -156,7 +158,9 @@ def imports_when_loaded(path):
 
 def test_modules_do_not_import_in_a_circle():
     modules = {
-        module_name(path): path for path in MODULES if path.parent.name != "v3dg" or path.stem != "__init__"
+        module_name(path): path
+        for path in (*MODULES, *MEASURING)
+        if path.parent.name != "v3dg" or path.stem != "__init__"
     }
     below = {}
     for name, path in modules.items():
@@ -170,7 +174,32 @@ def test_modules_do_not_import_in_a_circle():
         below = {name: imported for name, imported in below.items() if name not in ready}
 
 
-@pytest.mark.parametrize("path", [p for p in MODULES if module_name(p) not in NEEDS_TORCH], ids=module_name)
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
+def test_the_library_needs_nothing_that_it_is_measured_with(path):
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(node.module)
+    assert not {name for name in names if name.split(".")[0] in {"benchmarks", "examples", "tests"}}
+
+
+def test_what_is_installed_is_the_library_alone():
+    settings = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert re.findall(r"^wheel\.packages = (.*)$", settings, re.MULTILINE) == ['["v3dg"]']
+    lines = [line for path in MODULES for line in path.read_text(encoding="utf-8").splitlines()]
+    assert sum(bool(line.strip()) for line in lines) <= MOST_LINES
+
+
+def test_files_of_the_library_are_short():
+    lengths = {
+        p.relative_to(ROOT).as_posix(): len(p.read_text(encoding="utf-8").splitlines()) for p in MODULES
+    }
+    assert {path for path, length in lengths.items() if length > MOST_LINES_A_FILE} <= TOO_LONG
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
 def test_no_module_needs_torch_to_load(path):
     assert not [name for name in imports_when_loaded(path) if name.split(".")[0] == "torch"]
 

@@ -1,7 +1,10 @@
+import sys
+
 import numpy as np
 import pytest
 
-from v3dg import metrics
+from v3dg import Camera, Gaussians, metrics, render
+from v3dg.pictures import to_8bit
 
 
 def picture(seed, height=40, width=56):
@@ -146,3 +149,25 @@ def test_box_downsample_refuses_what_does_not_divide():
         metrics.box_downsample(np.zeros((5, 4, 3)), 2)
     with pytest.raises(ValueError, match="factor: expected at least 1"):
         metrics.box_downsample(np.zeros((4, 4, 3)), 0)
+
+
+def test_without_its_extra_flip_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    assert not metrics.has_flip()
+    with pytest.raises(ImportError, match=r"pip install 'v3dg\[flip\]'"):
+        metrics.flip(picture(0), picture(1))
+
+
+def test_truth_clips_samples_before_it_averages_them():
+    bright = Gaussians(
+        means=np.array([[0.0, 0.0, 2.0]], np.float32),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        scales=np.full((1, 3), 0.002, np.float32),
+        opacities=np.ones(1, np.float32),
+        sh=np.full((1, 1, 3), 100, np.float32),
+    )
+    camera = Camera(np.eye(4), np.array([[500.0, 0, 8], [0, 500, 8], [0, 0, 1]]), 16, 16)
+    samples = render(bright, camera.scaled(2), tolerance=0).color
+    assert samples.max() > 2
+    expected = metrics.box_downsample(np.clip(samples, 0, 1), 2)
+    np.testing.assert_array_equal(metrics.draw_truth(bright, camera), to_8bit(expected))

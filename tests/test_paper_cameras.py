@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.worlds.paper_cameras import trajectories
 from v3dg import Camera
-from v3dg.trajectories import trajectories
 
 # Cameras of the published DonutSea, camera to world in Blender's convention, to its digits.
 PUBLISHED = {

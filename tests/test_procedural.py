@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from reference.sh import basis
-from v3dg.procedural import (
+from benchmarks.worlds.procedural import (
     TREE_KINDS,
     make_asset,
     make_donut,
@@ -11,9 +10,10 @@ from v3dg.procedural import (
     make_tree,
     place_field,
 )
-from v3dg.procedural._light import sh_basis
-from v3dg.procedural._parts import sample
-from v3dg.procedural.temple import _faces
+from benchmarks.worlds.procedural._light import sh_basis
+from benchmarks.worlds.procedural._parts import sample
+from benchmarks.worlds.procedural.temple import _faces
+from reference.sh import basis
 
 
 def rotations(quats):
@@ -157,7 +157,7 @@ def test_leaves_are_thin_and_let_light_through():
     assert np.median(long / thin) > 8
     assert (tree.opacities < 0.75).mean() > 0.2
     # Against the sun a leaf is brighter than along it: the linear terms of green follow the sun's direction.
-    from v3dg.procedural._light import TO_SUN
+    from benchmarks.worlds.procedural._light import TO_SUN
 
     linear = tree.sh[:, 1:4, 1] @ np.array([TO_SUN[1], -TO_SUN[2], TO_SUN[0]])
     assert np.median(linear) < 0

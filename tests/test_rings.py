@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from v3dg.pile import Pile, _near_pairs
+from benchmarks.worlds.rings import Pile, _near_pairs
 from v3dg.scene import rotation_from_quaternion
 
 RING, TUBE = 0.07, 0.04

@@ -1,4 +1,3 @@
-import importlib.util
 import json
 import os
 import subprocess
@@ -10,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.studies import exact_cut
 from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, covariances, lod_bundle, random_camera, random_scene, rotation_matrices, turned
@@ -53,10 +53,6 @@ def tolerances_of(draw, scene, camera):
 
 
 def test_many_random_trials_have_no_violation(capsys):
-    path = Path(__file__).parents[1] / "benchmarks" / "exact_cut.py"
-    spec = importlib.util.spec_from_file_location("exact_cut", path)
-    exact_cut = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(exact_cut)
     assert exact_cut.main(["--trials", "200000", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["violations"] == 0
 

@@ -3,7 +3,7 @@ import sys
 import numpy as np
 import pytest
 
-from v3dg.films import write_film
+from v3dg.video import write_film
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import v3dg
-from v3dg import worlds
-from v3dg.cli import main
+from benchmarks import worlds
+from benchmarks.__main__ import PROGRAM
 from v3dg.scene import rotation_from_quaternion
 
 
@@ -204,7 +204,7 @@ def test_command_line_writes_a_world(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(worlds.SMALL, "crowd", {"instances": 2, "num_gaussians": 2000, "persons": 1})
     folder = tmp_path / "people"
     arguments = ["world", "crowd", "-o", str(folder), "--seed", "3", "--device", "cpu", "--quiet", "--json"]
-    assert main(arguments) == 0
+    assert PROGRAM.main(arguments) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["output"] == str(folder / "crowd.json")
     assert (result["instances"], result["gaussians"]) == (2, 4000)

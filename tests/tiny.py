@@ -1,10 +1,12 @@
-"""v3dg with worlds and builds so small that what the docs say can be run; as a program, the command."""
+"""v3dg and benchmarks with worlds and builds so small that what the docs say can be run; a program, too."""
 
 import sys
 from dataclasses import replace
 
 import v3dg
-from v3dg import build, cli, demo, worlds
+from benchmarks import __main__ as benchmarks
+from benchmarks import worlds
+from v3dg import build, cli, demo
 
 WORLDS = {
     "donut_sea": {"instances": 12, "num_gaussians": 1000},
@@ -42,7 +44,10 @@ def shrink(set_attribute=setattr, set_item=dict.__setitem__):
 
 if __name__ == "__main__":
     shrink()
-    if sys.argv[1] == "view":  # serves until it is interrupted: here, its options are enough
-        cli.parse(sys.argv[1:])
+    program, *arguments = sys.argv[1:]
+    if program == "benchmarks":
+        sys.exit(benchmarks.PROGRAM.main(arguments))
+    if arguments[0] == "view":  # serves until it is interrupted: here, its options are enough
+        cli.parse(arguments)
         sys.exit()
-    sys.exit(cli.main([*sys.argv[1:], *OPTIONS.get(sys.argv[1], [])]))
+    sys.exit(cli.main([*arguments, *OPTIONS.get(arguments[0], [])]))

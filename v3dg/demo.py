@@ -1,8 +1,8 @@
 """The main job without a download: build a bundle, place it 2,000 times, draw it from near to far.
 
 The result is one picture: the full asset above, the selected cut below, a column a distance, each with the
-gaussians drawn, the time and the error. The error is that against the full asset at twice the resolution,
-box-averaged.
+gaussians drawn, the time and the error to the full asset at twice the resolution, box-averaged: FLIP, or PSNR
+where the extra `flip` is not installed.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 from v3dg import _device
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
-from v3dg.metrics import box_downsample, flip, psnr
+from v3dg.donut import make_donut, place_field
+from v3dg.metrics import box_downsample, flip, has_flip, psnr
 from v3dg.pictures import check_picture_path, write_picture
-from v3dg.procedural import make_asset, place_field
 from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from PIL.ImageDraw import ImageDraw
 
-# Distance from the eye to the tuft in the middle, in radii of a tuft, and height of the view in radians.
+# Distance from the eye to the donut in the middle, in radii of a donut, and height of the view in radians.
 VIEWS = ((3.3, 0.36), (8.0, 0.36), (20.0, 0.36), (46.0, 0.38), (95.0, 0.42))
 SUPERSAMPLING = 2
-AZIMUTH = 0.80  # rad; the sun is then behind the camera, and no row of tufts lies along the view
+AZIMUTH = 0.80  # rad; the sun is then behind the camera
 SKY_TOP, SKY_BOTTOM = np.array([0.34, 0.55, 0.80]), np.array([0.86, 0.90, 0.91])
 
 
@@ -43,13 +43,18 @@ class Panel:
     gaussians_selected: int
     select_ms: float
     draw_ms: float
-    flip: float
+    flip: float | None  # None where it is not installed
     psnr: float
 
     @property
     def milliseconds(self) -> float:
         """Select and draw."""
         return self.select_ms + self.draw_ms
+
+    @property
+    def error(self) -> tuple[str, float]:
+        """What the pictures and the table show of the two measures, by its name."""
+        return ("PSNR", self.psnr) if self.flip is None else ("FLIP", self.flip)
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,7 @@ class DemoResult:
 
 
 def view_camera(distance: float, elevation: float, width: int, height: int) -> Camera:
-    """Look at the middle of the meadow, from near at toadstool height, from far at the whole hill."""
+    """Look at the middle of the field: from near at a donut, from far at the whole hill."""
     near = 1 / (1 + (distance / 12) ** 2)
     target = np.array([0.0, 0.0, 0.42 * near])
     direction = np.array(
@@ -119,7 +124,7 @@ def run_demo(
     progress: bool = True,
     device: str = "auto",
 ) -> DemoResult:
-    """Build the procedural asset, place it, draw and measure every distance, and write the picture.
+    """Make an asset, build and place it, draw and measure every distance, and write the picture.
 
     Args:
         num_gaussians: Of the asset.
@@ -136,7 +141,7 @@ def run_demo(
     width, height = size
     where = _device.resolve(device)
     start = time.perf_counter()
-    asset = make_asset(num_gaussians, seed=seed)
+    asset = make_donut(num_gaussians, seed=seed)
     built = time.perf_counter()
     bundle = build_bundle(asset, config=config or BuildConfig(), seed=seed, progress=progress, device=where)
     build_seconds = time.perf_counter() - built
@@ -164,7 +169,7 @@ def run_demo(
                     gaussians_selected=stats.gaussians_selected,
                     select_ms=stats.select_ms,
                     draw_ms=stats.draw_ms,
-                    flip=flip(truth, picture),
+                    flip=flip(truth, picture) if has_flip() else None,
                     psnr=psnr(truth, picture),
                 )
                 return panel, picture
@@ -216,16 +221,17 @@ def time_text(milliseconds: float) -> str:
 
 def table_text(result: DemoResult) -> str:
     """The numbers of the picture as a table."""
+    error = result.columns[0].full.error[0]
     lines = [
         f"{result.instances:,} instances of {result.asset_gaussians:,} gaussians, "
         f"{result.levels} levels built in {result.build_seconds:.1f} s, tolerance {result.tolerance:g} px²",
         "",
         f"{'':>9} {'full asset':-^34}  {'v3dg':-^34}",
-        f"{'distance':>9}" + f" {'gaussians':>10} {'select+draw':>12} {'FLIP':>10} " * 2,
+        f"{'distance':>9}" + f" {'gaussians':>10} {'select+draw':>12} {error:>10} " * 2,
     ]
     for column in result.columns:
         cells = (
-            f" {count_text(p.gaussians):>10} {time_text(p.milliseconds):>12} {p.flip:>10.4f} "
+            f" {count_text(p.gaussians):>10} {time_text(p.milliseconds):>12} {p.error[1]:>10.4f} "
             for p in (column.full, column.bundle)
         )
         lines.append(f"{column.distance:>9g}" + "".join(cells))
@@ -257,10 +263,10 @@ def _poster(result: DemoResult, pictures: list[tuple[Any, Any]]) -> NDArray[np.u
     right = sheet.width - _MARGIN
     placed = result.instances * result.asset_gaussians
     _text(draw, (_MARGIN, 34), "v3dg", 44, _INK)
-    motto = "a meadow from near to far: all gaussians, or just enough of them"
+    motto = "donuts from near to far: all gaussians, or just enough of them"
     _text(draw, (_MARGIN + 128, 38), motto, 21, _INK)
     line = (
-        f"{result.instances:,} tufts of {result.asset_gaussians:,} gaussians, {count_text(placed)} in all; "
+        f"{result.instances:,} donuts of {result.asset_gaussians:,} gaussians, {count_text(placed)} in all; "
         f"bundle of {result.levels} levels built in {result.build_seconds:.0f} s; "
         f"{result.device}; tolerance {result.tolerance:g} square px"
     )
@@ -284,10 +290,11 @@ def _poster(result: DemoResult, pictures: list[tuple[Any, Any]]) -> NDArray[np.u
                 _text(draw, (left + width, top + 11), label, 16, _ACCENT, anchor="ra")
             sheet.paste(Image.fromarray(to_8bit(picture)), (left, top + _TITLE))
             _caption(draw, left, top + _TITLE + height + 12, width, panel, _ACCENT if kind else _INK)
+    error = result.columns[0].full.error[0]
+    meaning = "mean difference seen, 67 pixels per degree, to" if error == "FLIP" else "dB, to"
     note = (
-        "gaussians: those in the view.  time: select + draw.  "
-        "FLIP: mean difference seen, 67 pixels per degree, to the full asset at twice the resolution, "
-        "box-averaged."
+        f"gaussians: those in the view.  time: select + draw.  {error}: {meaning} "
+        "the full asset at twice the resolution, box-averaged."
     )
     draw.line([(_MARGIN, sheet.height - _FOOT - 2), (right, sheet.height - _FOOT - 2)], fill=_RULE)
     _text(draw, (_MARGIN, sheet.height - _FOOT + 12), note, 15, _QUIET)
@@ -306,7 +313,7 @@ def _caption(
     cells = (
         ("gaussians", count_text(panel.gaussians)),
         ("time", time_text(panel.milliseconds)),
-        ("FLIP", f"{panel.flip:.3f}"),
+        (panel.error[0], f"{panel.error[1]:.3f}"),
     )
     size = min(24, max(9, width // 15))
     for place, (name, value) in zip((0.0, 0.42, 0.76), cells, strict=True):

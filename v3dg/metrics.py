@@ -1,4 +1,4 @@
-"""How far apart two pictures are: PSNR, SSIM and FLIP.
+"""How far apart two pictures are: PSNR, SSIM and FLIP; FLIP wants the extra `flip`.
 
 All take a reference and a test picture (H,W,3), display values in [0,1] (sRGB as shown, not linear light), as
 NumPy arrays or torch tensors, and are means over the whole picture. Nothing is cropped.
@@ -6,15 +6,22 @@ NumPy arrays or torch tensors, and are means over the whole picture. Nothing is 
 
 from __future__ import annotations
 
+import importlib.util
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from v3dg.cameras import Camera
+from v3dg.pictures import Picture, to_8bit
+from v3dg.render import render
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 FLIP_PIXELS_PER_DEGREE = 67.0
 """A 0.7 m wide 4K display seen from 0.7 m: the viewing condition that FLIP's authors use."""
+
+FLIP_MISSING = "FLIP wants flip-evaluator, which is not installed; pip install 'v3dg[flip]'"
 
 _SSIM_SIGMA_PX = 1.5
 _SSIM_REACH_PX = 5  # an 11 px window: 3.5 sigma to either side, rounded
@@ -93,8 +100,16 @@ def ssim(reference: Any, test: Any) -> float:
     return float(np.mean(luminance * structure))
 
 
+def has_flip() -> bool:
+    """Whether the extra `flip` is installed, without which FLIP cannot be measured."""
+    return importlib.util.find_spec("flip_evaluator") is not None
+
+
 def _flip(reference: Any, test: Any, *, magma: bool) -> NDArray[np.float32]:
-    import flip_evaluator
+    try:
+        import flip_evaluator
+    except ImportError as missing:
+        raise ImportError(FLIP_MISSING) from missing
 
     # Fresh arrays: the evaluator is free to write into what it gets.
     a, b = (np.clip(x, 0, 1).astype(np.float32, order="C") for x in _pair(reference, test))
@@ -107,6 +122,9 @@ def flip_map(reference: Any, test: Any) -> NDArray[np.float32]:
     """Compute LDR-FLIP per pixel at 67 pixels per degree: (H,W), 0 where no difference is seen, at most 1.
 
     Pictures are clipped to [0,1] first.
+
+    Raises:
+        ImportError: The extra `flip` is not installed.
 
     Source: Andersson et al., FLIP: a difference evaluator for alternating images, HPG 2020; by its authors'
     package.
@@ -137,3 +155,12 @@ def box_downsample(image: Any, factor: int) -> Any:
         raise ValueError(f"image: expected a height and width divisible by {factor}, got {height} x {width}")
     blocks = image.reshape(height // factor, factor, width // factor, factor, *image.shape[2:])
     return blocks.mean((1, 3))
+
+
+def draw_truth(subject: Any, camera: Camera, device: str = "cpu", supersampling: int = 2) -> Picture:
+    """Draw what the others are compared with, in 8 bits: all gaussians, with so many samples a pixel's side.
+
+    Each sample is clipped to [0,1] as a screen does, before it is averaged over its pixel.
+    """
+    color = render(subject, camera.scaled(supersampling), tolerance=0.0, device=device).color
+    return to_8bit(box_downsample(color.clip(0, 1), supersampling))

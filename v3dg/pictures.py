@@ -1,26 +1,56 @@
-"""Picture files: float pictures to 8 bits, written whole or not at all."""
+"""Pictures of 8 bits: from colours, on contact sheets, in files that are written whole or not at all."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _files
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+Picture: TypeAlias = NDArray[np.uint8]
+"""(H, W, 3)"""
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
+_GAP_PX, _TEXT_PX = 6, 18
+_PAPER, _INK = (16, 18, 22), (238, 240, 243)
 
-def to_8bit(image: Any) -> NDArray[np.uint8]:
-    """Round display values in [0,1] to 0..255; what lies outside is clipped."""
+
+def to_8bit(image: Any) -> Picture:
+    """Round display values in [0,1] to 0..255, where the array is; what lies outside is clipped."""
+    if hasattr(image, "detach"):
+        import torch
+
+        tensor: Picture = (image.detach().clip(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+        return tensor
     clipped = np.clip(np.asarray(image, dtype=np.float32), 0, 1)
-    pixels: NDArray[np.uint8] = (clipped * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+    pixels: Picture = (clipped * np.float32(255) + np.float32(0.5)).astype(np.uint8)
     return pixels
+
+
+def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
+    """Lay rows of (text, picture) out as one picture, each text above its picture."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    heights = [max(picture.shape[0] for _, picture in row) for row in rows]
+    widths = [sum(picture.shape[1] + _GAP_PX for _, picture in row) for row in rows]
+    size = max(widths) + _GAP_PX, sum(h + _TEXT_PX + _GAP_PX for h in heights) + _GAP_PX
+    canvas = Image.new("RGB", size, _PAPER)
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(12)
+    top = _GAP_PX
+    for row, height in zip(rows, heights, strict=True):
+        left = _GAP_PX
+        for text, picture in row:
+            draw.text((left, top), text, font=font, fill=_INK)
+            canvas.paste(Image.fromarray(picture), (left, top + _TEXT_PX))
+            left += picture.shape[1] + _GAP_PX
+        top += height + _TEXT_PX + _GAP_PX
+    return np.asarray(canvas)
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:

@@ -39,7 +39,7 @@ def write_film(
         stream = film.add_stream("h264", rate=fps, options={"crf": str(quality)})
         stream.pix_fmt = "yuv420p"
         for picture in pictures:
-            pixels = to_8bit(picture.detach().cpu() if hasattr(picture, "detach") else picture)
+            pixels = to_8bit(picture)
             if size is None:
                 size = pixels.shape
                 stream.height, stream.width = size[:2]

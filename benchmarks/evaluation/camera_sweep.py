@@ -1,48 +1,49 @@
-"""Rows of tables in which each is a build, drawn over the line of views: the means over the distances."""
+"""Rows of tables in which each is a build, drawn over the camera sweep: the means over the distances."""
 
 from __future__ import annotations
 
-from v3dg.bench.measure import Row, mean_of, tolerance_for
-from v3dg.bench.stage import Stage
-from v3dg.bench.table import Column
+from benchmarks.evaluation.evaluation import Evaluation
+from benchmarks.evaluation.markdown import Column
+from benchmarks.evaluation.measure import Row, tolerance_for
+from v3dg._judges import mean_of
 from v3dg.build import BuildConfig
 
 
-def full_row(stage: Stage) -> Row:
+def full_row(evaluation: Evaluation) -> Row:
     """Every gaussian, one sample a pixel."""
-    return summary(stage, "full", 0.0, stage.line_rows(stage.full_line, "drawn"))
+    return sweep_row(evaluation, "full", 0.0, evaluation.sweep_rows(evaluation.full_sweep, "drawn"))
 
 
-def build_row(stage: Stage, name: str, config: BuildConfig, tolerance: float) -> Row:
+def build_row(evaluation: Evaluation, name: str, config: BuildConfig, tolerance: float) -> Row:
     """What this build gives at this tolerance, and what it took."""
-    built = stage.build(config)
-    shots = stage.shoot_line(stage.place(built.bundle), tolerance)
-    row = summary(stage, name, tolerance, stage.line_rows(shots, "drawn"))
+    built = evaluation.build(config)
+    shots = evaluation.shoot_sweep(evaluation.place(built.bundle), tolerance)
+    row = sweep_row(evaluation, name, tolerance, evaluation.sweep_rows(shots, "drawn"))
     return {**row, "steps": config.steps, "build_seconds": round(built.seconds, 3)}
 
 
-def as_many_row(stage: Stage, name: str, config: BuildConfig, rival: Row) -> Row:
+def as_many_row(evaluation: Evaluation, name: str, config: BuildConfig, rival: Row) -> Row:
     """What this build gives with at most as many gaussians as another row has, view by view."""
-    built = stage.build(config)
-    scene = stage.place(built.bundle)
+    built = evaluation.build(config)
+    scene = evaluation.place(built.bundle)
     shots = [
-        stage.shoot(scene, view, tolerance_for(scene, view.camera, of_rival["drawn_selected"]))
-        for view, of_rival in zip(stage.line, rival["line"], strict=True)
+        evaluation.shoot(scene, view, tolerance_for(scene, view.camera, of_rival["drawn_selected"]))
+        for view, of_rival in zip(evaluation.camera_sweep, rival["sweep"], strict=True)
     ]
-    row = summary(stage, name, None, stage.line_rows(shots, "drawn"))
+    row = sweep_row(evaluation, name, None, evaluation.sweep_rows(shots, "drawn"))
     return {**row, "steps": config.steps, "build_seconds": round(built.seconds, 3)}
 
 
-def summary(stage: Stage, name: str, tolerance: float | None, line: list[Row]) -> Row:
-    means = mean_of(line, "drawn_selected", "drawn_in_frustum", "drawn_ms", "drawn_flip", "drawn_psnr")
-    full = mean_of([shot.row("drawn") for shot in stage.full_line], "drawn_in_frustum", "drawn_ms")
+def sweep_row(evaluation: Evaluation, name: str, tolerance: float | None, sweep: list[Row]) -> Row:
+    means = mean_of(sweep, "drawn_selected", "drawn_in_frustum", "drawn_ms", "drawn_flip", "drawn_psnr")
+    full = mean_of([shot.row("drawn") for shot in evaluation.full_sweep], "drawn_in_frustum", "drawn_ms")
     return {
         "levels": name,
         "tolerance": tolerance,
         **means,
         "share": round(means["drawn_in_frustum"] / full["drawn_in_frustum"], 5),
         "acceleration": round(full["drawn_ms"] / means["drawn_ms"], 3),
-        "line": line,
+        "sweep": sweep,
     }
 
 

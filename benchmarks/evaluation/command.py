@@ -1,4 +1,4 @@
-"""`v3dg bench`."""
+"""`python -m benchmarks evaluate`."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from v3dg.cli._common import Flag, Threads, UsageError, option, print_result, re
 
 
 @dataclass
-class Bench:
+class Evaluate:
     """Measure speed against error, beside peers, and write JSON, tables and pictures (docs/results.md)."""
 
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("v3dg_bench")
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("evaluation")
     """Folder for the results; made if it is not there."""
     preset: Literal["small", "full"] = "small"
     """small takes minutes on two cores, full wants a GPU."""
     parts: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
     """Which parts of the evaluation; all if not given."""
     asset: Annotated[Path | None, option("PATH")] = None
-    """Trained asset, a .ply file, in place of the one that v3dg makes itself."""
+    """Trained asset, a .ply file, in place of the one that is made here."""
     layout: Annotated[Path | None, option("PATH")] = None
     """Published layout (.json) of the instances of that asset and of cameras."""
     peers: Annotated[Path | None, option("FOLDER")] = None
-    """What other tools made of that asset (v3dg/bench/parts/merging.py says how)."""
+    """What other tools made of that asset (benchmarks/evaluation/parts/merging.py says how)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to build and draw; auto is a CUDA device where there is one and torch can use it."""
     seed: int = 0
@@ -39,29 +39,35 @@ class Bench:
     """Show no progress."""
 
 
-def run(options: Bench) -> None:
+def run(options: Evaluate) -> None:
     for path, suffix in ((options.asset, ".ply"), (options.layout, ".json")):
         if path is not None:
             require_file(path, suffix)
     if options.layout is not None and options.asset is None:
         raise UsageError("--layout: expected --asset with it, the asset that it places")
-    from v3dg import _device, bench
+    from benchmarks import evaluation
+    from v3dg import _device
 
-    stage = bench.Stage(
-        bench.PRESETS[options.preset],
-        _device.resolve(options.device),
-        options.output,
-        seed=options.seed,
-        asset_path=options.asset,
-        layout_path=options.layout,
-        peers=options.peers,
+    results = evaluation.run(
+        evaluation.Evaluation(
+            evaluation.PRESETS[options.preset],
+            _device.resolve(options.device),
+            options.output,
+            seed=options.seed,
+            asset_path=options.asset,
+            layout_path=options.layout,
+            peers=options.peers,
+        ),
+        options.preset,
+        options.parts or evaluation.NAMES,
+        quiet=options.quiet,
     )
-    results = bench.run(stage, options.preset, options.parts or bench.NAMES, quiet=options.quiet)
 
     def text() -> str:
         sections = [
-            f"## {bench.part(name).TITLE}\n\n{bench.part(name).tables(r)}" for name, r in results.items()
+            f"## {evaluation.part(name).TITLE}\n\n{evaluation.part(name).tables(result)}"
+            for name, result in results.items()
         ]
-        return "\n\n".join([*sections, f"Plots and a page: python -m v3dg.bench.report {options.output}"])
+        return "\n\n".join([*sections, f"Plots and a page: python -m benchmarks report {options.output}"])
 
     print_result(options.json, results, text)

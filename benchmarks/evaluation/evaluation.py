@@ -13,16 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from v3dg import _device, worlds
-from v3dg.bench.measure import Judge, Picture, Row, Time, as_picture, draw_truth, time_ms
-from v3dg.bench.settings import Settings
+from benchmarks import worlds
+from benchmarks.evaluation.measure import Judge, Row, Time, time_ms
+from benchmarks.evaluation.settings import Settings
+from benchmarks.worlds.procedural import make_asset
+from v3dg import _device
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.gaussians import Gaussians
 from v3dg.io import load
-from v3dg.procedural import make_asset
+from v3dg.metrics import draw_truth
+from v3dg.pictures import Picture, to_8bit
 from v3dg.render import Stats, render
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene
@@ -121,7 +124,7 @@ class Shot:
 
 
 @dataclass
-class Stage:
+class Evaluation:
     """What one evaluation is run with."""
 
     settings: Settings
@@ -226,17 +229,17 @@ class Stage:
         return [view for line in lines.values() for view in every(line, self.settings.distances)]
 
     @cached_property
-    def line(self) -> list[View]:
+    def camera_sweep(self) -> list[View]:
         """The views of one direction and the middle elevation, from near to far."""
         middle = sorted(self.settings.elevations)[len(self.settings.elevations) // 2]
         first = self.all_views[0].azimuth
         line = [v for v in self.all_views if abs(v.azimuth - first) < 0.5 and abs(v.elevation - middle) < 0.5]
-        return every(line, self.settings.line_distances)
+        return every(line, self.settings.sweep_distances)
 
     def truth(self, index: int) -> Picture:
-        """The true picture of the line's view."""
+        """The true picture of the camera sweep's view."""
         if index not in self._truths:
-            self._truths[index] = draw_truth(self.full_scene, self.line[index].camera, self.device)
+            self._truths[index] = draw_truth(self.full_scene, self.camera_sweep[index].camera, self.device)
         return self._truths[index]
 
     def shoot(
@@ -247,32 +250,32 @@ class Stage:
         def draw() -> Any:
             return render(subject, view.camera, tolerance=tolerance, device=self.device)
 
-        picture = as_picture(draw().color)
+        picture = to_8bit(draw().color)
         if not picture.any():
             raise RuntimeError(f"picture at distance {view.distance:g}: expected something in it, got black")
         timed = time_ms(lambda: draw().stats, self.device, repeats or self.settings.repeats)
         last = draw()
-        if not np.array_equal(picture, as_picture(last.color)):
+        if not np.array_equal(picture, to_8bit(last.color)):
             raise RuntimeError(
                 f"picture at distance {view.distance:g}: expected the same on every run, got another"
             )
         return Shot(view, picture, last.stats, timed)
 
-    def shoot_line(self, scene: Scene, tolerance: float = DEFAULT_TOLERANCE) -> list[Shot]:
-        return [self.shoot(scene, view, tolerance) for view in self.line]
+    def shoot_sweep(self, scene: Scene, tolerance: float = DEFAULT_TOLERANCE) -> list[Shot]:
+        return [self.shoot(scene, view, tolerance) for view in self.camera_sweep]
 
     @cached_property
-    def full_line(self) -> list[Shot]:
-        """The line with all gaussians, one sample a pixel: what level of detail has to beat."""
-        return self.shoot_line(self.full_scene, 0.0)
+    def full_sweep(self) -> list[Shot]:
+        """The camera sweep with all gaussians, one sample a pixel: what level of detail has to beat."""
+        return self.shoot_sweep(self.full_scene, 0.0)
 
-    def judge_line(self, shots: Sequence[Shot]) -> list[Row]:
-        """FLIP and PSNR of pictures of the line, in its order."""
+    def judge_sweep(self, shots: Sequence[Shot]) -> list[Row]:
+        """FLIP and PSNR of pictures of the camera sweep, in its order."""
         return self.judge.errors((self.truth(i), shot.picture) for i, shot in enumerate(shots))
 
-    def line_rows(self, shots: Sequence[Shot], name: str) -> list[Row]:
+    def sweep_rows(self, shots: Sequence[Shot], name: str) -> list[Row]:
         """A row a view: where from, what was drawn, how long it took, how far off it is."""
-        errors = self.judge_line(shots)
+        errors = self.judge_sweep(shots)
         return [
             {**shot.view.row(), **shot.row(name), **{f"{name}_{key}": value for key, value in error.items()}}
             for shot, error in zip(shots, errors, strict=True)

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Any
 
 import v3dg
-from v3dg.bench.measure import Time, time_ms
+from benchmarks.evaluation.measure import Time, time_ms
 from v3dg.cameras import Camera
 from v3dg.scene import Scene
 

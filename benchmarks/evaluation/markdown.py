@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from v3dg.bench.measure import Row
+from benchmarks.evaluation.measure import Row
 
 
 @dataclass(frozen=True)

@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from v3dg import _device, metrics
+from v3dg._judges import Judges
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
-from v3dg.pictures import to_8bit
-from v3dg.render import render
+from v3dg.pictures import Picture
 from v3dg.scene import Scene
 from v3dg.select import select
 
 Row = dict[str, Any]
-Picture = npt.NDArray[np.uint8]
-
-SUPERSAMPLING = 2
-"""Truth has so many times the pixels a side, box-averaged: 4K for 1080p, as in the paper."""
 
 COARSEST = 1e9
 """Tolerance in px² of the coarsest cut that there is, as a number that JSON can hold."""
@@ -82,20 +74,11 @@ def _cuda_ms(call: Callable[[], Any]) -> float:
     return float(start.elapsed_time(end))
 
 
-def draw_truth(subject: Any, camera: Camera, device: str, supersampling: int = SUPERSAMPLING) -> Picture:
-    """All gaussians at so many times the resolution, clipped as a screen does, box-averaged."""
-    color = render(subject, camera.scaled(supersampling), tolerance=0.0, device=device).color
-    return as_picture(metrics.box_downsample(color.clip(0, 1), supersampling))
-
-
-def as_picture(color: Any) -> Picture:
-    """What a screen shows of a colour array from any device: 8 bits a channel, rounded where the array is."""
-    if isinstance(color, np.ndarray):
-        return to_8bit(color)
-    import torch
-
-    picture: Picture = (color.detach().clip(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
-    return picture
+def crop(picture: Picture, side: int) -> Picture:
+    """The middle of a picture, at most so many px wide and high."""
+    height, width = picture.shape[:2]
+    top, left = max(0, (height - side) // 2), max(0, (width - side) // 2)
+    return picture[top : top + side, left : left + side]
 
 
 def _flip_and_psnr(pair: tuple[Picture, Picture]) -> tuple[float, float]:
@@ -103,39 +86,15 @@ def _flip_and_psnr(pair: tuple[Picture, Picture]) -> tuple[float, float]:
     return metrics.flip(truth, picture), metrics.psnr(truth, picture)
 
 
-class Judge:
-    """FLIP and PSNR of many pairs of pictures, on all cores; never while something is timed.
-
-    Processes are started when they are first needed and stay until `close`.
-    """
-
-    def __init__(self) -> None:
-        self._pool: ProcessPoolExecutor | None = None
+class Judge(Judges):
+    """FLIP and PSNR of many pairs of pictures, on all cores; never while something is timed."""
 
     def errors(self, pairs: Iterable[tuple[Picture, Picture]]) -> list[Row]:
         """{"flip", "psnr"} of each (truth, picture); PSNR is None for equal pictures."""
-        if self._pool is None:
-            # A forked process would inherit CUDA and OpenMP in a state that neither survives.
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=context)
-        found = self._pool.map(_flip_and_psnr, pairs)
         return [
             {"flip": round(flip, 5), "psnr": round(psnr, 2) if math.isfinite(psnr) else None}
-            for flip, psnr in found
+            for _, (flip, psnr) in self.measured(pairs, _flip_and_psnr)
         ]
-
-    def close(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
-
-
-def mean_of(rows: Sequence[Row], *names: str) -> Row:
-    """Means of columns; None where every value is missing."""
-    means: Row = {}
-    for name in names:
-        values = [row[name] for row in rows if row.get(name) is not None]
-        means[name] = float(f"{statistics.fmean(values):.6g}") if values else None
-    return means
 
 
 def tolerance_for(scene: Scene, camera: Camera, count: int) -> float:

@@ -1,4 +1,4 @@
-"""From recorded results to a page with plots: python -m v3dg.bench.report FOLDER ... -o PAGE."""
+"""`python -m benchmarks report`: from recorded results to a page with plots."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ from typing import Annotated, Any
 
 import tyro
 
-from v3dg.bench.parts import NAMES, part
+from benchmarks.evaluation.parts import NAMES, part
+from v3dg.cli._common import Flag
 
 
 @dataclass
-class Options:
+class Report:
+    """Make a page with plots of what `evaluate` has recorded."""
+
     folders: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders with results of `v3dg bench`; the first one is what the page begins with."""
+    """Folders with results of `evaluate`; the first one is what the page begins with."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("results.md")
     """Page to write."""
-    plots: bool = True
-    """Draw the plots, into the folders; needs matplotlib."""
+    no_plots: Flag = False
+    """Leave the plots in the folders as they are; drawing them wants matplotlib."""
 
 
 def read_results(folder: Path) -> dict[str, dict[str, Any]]:
@@ -35,7 +38,9 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]]:
         name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.exists()
     }
     if not results:
-        raise ValueError(f"{folder}: expected results such as {NAMES[0]}.json; run `v3dg bench` first")
+        raise ValueError(
+            f"{folder}: expected results such as {NAMES[0]}.json; run `python -m benchmarks evaluate` first"
+        )
     return results
 
 
@@ -48,10 +53,10 @@ def page(folders: Sequence[Path], output: Path) -> str:
     home = place(next(iter(sections[0][1].values())))
     wins, losses = [], []
     for name, result in measured.items():
-        verdict = part(name).verdict(result)
+        summary = part(name).summary(result)
         where = "" if place(result) == home else f" (on {place(result)})"
-        wins.append([sentence + where for sentence in verdict.wins])
-        losses.append([sentence + where for sentence in verdict.losses])
+        wins.append([sentence + where for sentence in summary.wins])
+        losses.append([sentence + where for sentence in summary.losses])
     lines = [
         "# Results",
         "",
@@ -59,7 +64,7 @@ def page(folders: Sequence[Path], output: Path) -> str:
         "",
         f"**Where we do not**: {_heads(losses)} ([all](#where-we-do-not)).",
         "",
-        "Written by `python -m v3dg.bench.report` from recorded JSON, never by hand; here on "
+        "Written by `python -m benchmarks report` from recorded JSON, never by hand; here on "
         f"{'; what is not measured there, on '.join(machines)}.",
         "",
         "## Where we win",
@@ -74,8 +79,8 @@ def page(folders: Sequence[Path], output: Path) -> str:
         "",
         "Error is FLIP (67 pixels per degree) and PSNR to the full scene at twice the resolution, "
         "box-averaged. Times are medians of single frames after a warm-up, selection included, from an "
-        "idle device to an idle device; a picture is checked before its time counts. The JSON beside the "
-        "pictures has the spread and every view.",
+        "idle device to an idle device; a picture is checked before its time counts. The JSON that a "
+        "run writes has the spread and every view.",
     ]
     for folder, results in sections:
         lines += ["", f"## {heading(next(iter(results.values())))}"]
@@ -131,12 +136,8 @@ def draw_plots(folder: Path) -> None:
             figure.savefig(folder / f"{name}.png", dpi=90, metadata={"Software": None})
 
 
-def main(options: Options) -> None:
+def run(options: Report) -> None:
     for folder in options.folders:
-        if options.plots:
+        if not options.no_plots:
             draw_plots(folder)
     options.output.write_text(page(options.folders, options.output), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Options))

@@ -18,7 +18,7 @@ class Settings:
         elevations: Degrees above the horizon of the cameras of "composed"; other parts take the middle.
         directions: How many of the paper's four directions "composed" looks from.
         distances: Cameras a direction in "composed", and in "large".
-        line_distances: Cameras of the one line on which the other parts compare.
+        sweep_distances: Cameras of the one sweep on which the other parts compare.
         judged_directions: Of how many directions FLIP is taken, which needs a second a picture.
         repeats: Timed calls, of which the median counts ...
         composed_repeats: ... and in "composed", which has by far the most views.
@@ -43,7 +43,7 @@ class Settings:
     elevations: tuple[float, ...]
     directions: int
     distances: int
-    line_distances: int
+    sweep_distances: int
     judged_directions: int
     repeats: int
     composed_repeats: int
@@ -70,7 +70,7 @@ PRESETS = {
         elevations=(45.0,),
         directions=1,
         distances=4,
-        line_distances=3,
+        sweep_distances=3,
         judged_directions=1,
         repeats=3,
         composed_repeats=3,
@@ -95,7 +95,7 @@ PRESETS = {
         elevations=(15.0, 30.0, 45.0, 60.0, 75.0),
         directions=4,
         distances=20,
-        line_distances=10,
+        sweep_distances=10,
         judged_directions=1,
         repeats=5,
         composed_repeats=3,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass
-class Verdict:
+class Summary:
     """Sentences: where we win, by how much and at which error; and where we do not."""
 
     wins: list[str] = field(default_factory=list)

@@ -13,9 +13,9 @@ import torch
 import tyro
 
 import v3dg
-from v3dg.bench import gpu, record
-from v3dg.bench.assets import like_trained
-from v3dg.bench.measure import time_ms
+from benchmarks.evaluation import gpu, record
+from benchmarks.evaluation.assets import like_trained
+from benchmarks.evaluation.measure import time_ms
 from v3dg.cameras import Camera
 
 Draw: TypeAlias = Callable[[v3dg.Gaussians], tuple[Any, Any]]

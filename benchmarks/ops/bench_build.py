@@ -20,12 +20,12 @@ import tyro
 from PIL import Image
 
 import v3dg
+from benchmarks.evaluation import gpu, record
+from benchmarks.evaluation.assets import many_copies
+from benchmarks.worlds.procedural import make_asset
 from v3dg import _operations, metrics
-from v3dg.bench import gpu, record
-from v3dg.bench.assets import many_copies
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
-from v3dg.procedural import make_asset
 from v3dg.scene_file import read_scene
 
 # px², past which every instance is drawn from its last level.

@@ -12,8 +12,8 @@ import numpy as np
 import tyro
 
 import v3dg
+from benchmarks.evaluation import record
 from v3dg import _operations
-from v3dg.bench import record
 from v3dg.rasterize import rows_of
 from v3dg.scene import rotation_from_quaternion
 from v3dg.select import rotations_of_bands

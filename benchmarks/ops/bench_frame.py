@@ -17,12 +17,12 @@ import tyro
 from bench_rasterize import camera_that_fills
 
 import v3dg
-from v3dg.bench import gpu, record
-from v3dg.bench.assets import like_trained
-from v3dg.bench.measure import time_ms
+from benchmarks.evaluation import gpu, record
+from benchmarks.evaluation.assets import like_trained
+from benchmarks.evaluation.measure import time_ms
+from benchmarks.worlds.procedural import make_asset
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
-from v3dg.procedural import make_asset
 from v3dg.render import Renderer
 from v3dg.scene_file import read_scene
 

@@ -19,11 +19,14 @@ import torch
 import tyro
 
 import v3dg
-from v3dg.bench import gpu, record
-from v3dg.bench.measure import Judge, Picture, Row, as_picture, draw_truth, mean_of, time_ms
+from benchmarks.evaluation import gpu, record
+from benchmarks.evaluation.measure import Judge, Row, time_ms
+from benchmarks.worlds.procedural import make_asset
+from v3dg._judges import mean_of
 from v3dg.build import build_bundle
 from v3dg.cameras import Camera
-from v3dg.procedural import make_asset
+from v3dg.metrics import draw_truth
+from v3dg.pictures import Picture, to_8bit
 from v3dg.render import Renderer
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene
@@ -119,7 +122,7 @@ def frames(
             stats = [frame().stats for _ in range(repeats)]
             select_ms.append(statistics.median(s.select_ms for s in stats))
             counts.append(stats[-1].gaussians_in_frustum)
-            pictures.append(as_picture(frame().color))
+            pictures.append(to_8bit(frame().color))
     row = {
         **options,
         "frame_ms": round(statistics.fmean(ms), 3),
@@ -167,7 +170,7 @@ def gsplat(scene: Scene, cameras: Sequence[Camera], config: Config) -> tuple[lis
     with torch.no_grad():
         for camera in cameras:
             ms.append(gpu.time_gsplat(placed, camera, max(3, config.repeats // 3)).median)
-            pictures.append(as_picture(gpu.gsplat_picture(placed, camera, packed=True)[0]))
+            pictures.append(to_8bit(gpu.gsplat_picture(placed, camera, packed=True)[0]))
     return ms, pictures
 
 
@@ -197,7 +200,7 @@ def field(bundle: v3dg.Bundle, count: int, config: Config, judge: Judge) -> Row:
         truth = draw_truth(scene, crop, gpu.DEVICE, _CROP_SUPERSAMPLING)
         for kind, tolerance in ((pairs, DEFAULT_TOLERANCE), (full, 0.0)):
             color = v3dg.render(scene, crop, tolerance=tolerance, device=gpu.DEVICE).color
-            kind.append((truth, as_picture(color)))
+            kind.append((truth, to_8bit(color)))
     row |= {
         "instances": count,
         "gaussians": count * len(means),

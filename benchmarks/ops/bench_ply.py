@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 import statistics
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable
@@ -17,6 +14,7 @@ import numpy as np
 import tyro
 
 import v3dg
+from benchmarks.evaluation import record
 
 
 @dataclass
@@ -64,12 +62,8 @@ def seconds(repeats: int, run: Callable[[], object]) -> list[float]:
 
 def main(config: Config) -> None:
     gaussians = random_gaussians(config.num_gaussians, config.sh_degree, config.seed)
-    here = Path(__file__).parent
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True)
     report: dict[str, object] = {
-        "commit": commit.stdout.strip(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} threads",
-        "isa": v3dg._core.isa(),
+        **record.provenance(),
         "num_gaussians": config.num_gaussians,
         "sh_degree": config.sh_degree,
     }

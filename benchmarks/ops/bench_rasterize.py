@@ -11,10 +11,10 @@ import numpy as np
 import tyro
 
 import v3dg
+from benchmarks.evaluation import record
+from benchmarks.worlds.procedural import make_asset
 from v3dg import _core
-from v3dg.bench import record
 from v3dg.cameras import Camera
-from v3dg.procedural import make_asset
 from v3dg.rasterize import intrinsics, rows_of, view_of_world
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import tyro
 from PIL import Image
 
+from benchmarks.evaluation import record
 from v3dg import metrics
-from v3dg.bench import record
 from v3dg.bundle import Bundle
 from v3dg.render import render
 from v3dg.scene_file import read_scene

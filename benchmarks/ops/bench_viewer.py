@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from v3dg.bench import record
+from benchmarks.evaluation import record
 from v3dg.scene_file import read_scene
 from v3dg.viewer.frame import Stage
 from v3dg.viewer.page import Site
 from v3dg.viewer.view import View, look_at
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from viewer_client import Tab
 

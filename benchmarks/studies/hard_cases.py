@@ -1,8 +1,8 @@
 """How far float32 is from float64 in each of tests/hard_cases.py: histograms of errors, and docs/numerics.md.
 
-    python benchmarks/hard_cases.py --device cpu --output benchmarks/results/hard_cases_cpu.json
-    python benchmarks/hard_cases.py --device cuda --output benchmarks/results/hard_cases_h200.json
-    python benchmarks/hard_cases.py --docs    # write the table again, from those two
+    python -m benchmarks.studies.hard_cases --device cpu --output benchmarks/results/hard_cases_cpu.json
+    python -m benchmarks.studies.hard_cases --device cuda --output benchmarks/results/hard_cases_h200.json
+    python -m benchmarks.studies.hard_cases --docs    # write the table again, from those two
 
 The last one measures nothing.
 """
@@ -18,9 +18,9 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from v3dg.bench import record
+from benchmarks.evaluation import record
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests"))
 
 import hard_cases as cases  # noqa: E402  (of the tests)
@@ -28,7 +28,7 @@ import hard_cases as cases  # noqa: E402  (of the tests)
 DECADES = (1e-7, 1e-6, 1e-5, 1e-4)
 DOCS = ROOT / "docs" / "numerics.md"
 RESULTS = {"CPU": "hard_cases_cpu.json", "H200": "hard_cases_h200.json"}
-BEGIN, END = "<!-- hard cases: benchmarks/hard_cases.py -->\n", "<!-- end of hard cases -->\n"
+BEGIN, END = "<!-- hard cases: benchmarks/studies/hard_cases.py -->\n", "<!-- end of hard cases -->\n"
 
 
 @dataclass

@@ -17,8 +17,8 @@ import tyro
 from PIL import Image
 
 import v3dg
+from benchmarks.evaluation import record
 from v3dg import metrics
-from v3dg.bench import record
 
 CHANGES: dict[str, dict[str, Any]] = {
     "defaults": {},

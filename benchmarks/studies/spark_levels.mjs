@@ -1,4 +1,4 @@
-// What Spark's quality tree leaves of an asset at several counts, as .ply files for part "merging" of `v3dg bench`:
+// What Spark's quality tree leaves of an asset at several counts, as .ply files for part "merging" of the evaluation:
 //   npm install @sparkjsdev/spark@2.2.0 && node spark_levels.mjs donut.ply peers 50 25 12.5 6.25 1
 // Spark's worker and its compiled tree run in Node as they are, without a browser. It chooses nodes for a camera that
 // is far away, so that all of the asset counts alike. Merged nodes may have opacities above 1, which Spark draws with

@@ -30,7 +30,7 @@ from PIL import Image
 import v3dg
 from v3dg.metrics import flip, psnr, ssim
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 from reference import sh as reference_sh
 from reference.project import project
 

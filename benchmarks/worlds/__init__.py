@@ -21,17 +21,17 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.worlds.paper_cameras import trajectories
+from benchmarks.worlds.procedural import TREE_KINDS, make_donut, make_person, make_temple, make_tree
+from benchmarks.worlds.procedural.donut import RING, TUBE
+from benchmarks.worlds.rings import Pile
 from v3dg.build import BuildConfig, build_bundle, discard_levels, is_current
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.gaussians import Gaussians
 from v3dg.io import load, save
-from v3dg.pile import Pile
-from v3dg.procedural import TREE_KINDS, make_donut, make_person, make_temple, make_tree
-from v3dg.procedural.donut import RING, TUBE
 from v3dg.scene import Scene
 from v3dg.scene_file import write_scene
-from v3dg.trajectories import trajectories
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""`v3dg world`."""
+"""`python -m benchmarks world`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ class World:
 
 
 def run(options: World) -> None:
-    from v3dg import _device, worlds
+    from benchmarks import worlds
+    from v3dg import _device
 
     start = time.perf_counter()
     arguments = worlds.SMALL[options.name] if options.scale == "small" else {}

@@ -1,11 +1,12 @@
 """Make the figures of docs/how_it_works.md and docs/choosing.md; wants the extra `bench`, takes a minute.
 
-The pictures are drawn by v3dg of an asset that it makes itself, the curves are those of recorded results.
+The pictures are drawn by v3dg of an asset that is made here, the curves are those of recorded results.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import v3dg
-from v3dg.bench.sheet import sheet
-from v3dg.pictures import to_8bit, write_picture
-from v3dg.procedural import make_asset, place_field
+
+sys.path.append(str(Path(__file__).resolve().parents[2]))  # for benchmarks/ of this checkout
+from benchmarks.worlds.procedural import make_asset, place_field
+from v3dg.pictures import contact_sheet, to_8bit, write_picture
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent.parent / "benchmarks" / "results"
@@ -64,7 +66,7 @@ def levels(bundle: v3dg.Bundle) -> None:
             count = image.stats.gaussians_selected
             row.append((f"level {level}: {count:,} gaussians" if color_by == "appearance" else "", image))
         rows.append([(text, to_8bit(image.color)) for text, image in row])
-    write_picture(HERE / "how_levels.jpg", sheet(rows))
+    write_picture(HERE / "how_levels.jpg", contact_sheet(rows))
 
 
 def cut(bundle: v3dg.Bundle) -> None:
@@ -88,7 +90,7 @@ def cut(bundle: v3dg.Bundle) -> None:
                 to_8bit(image.color),
             )
         )
-    write_picture(HERE / "how_cut.jpg", sheet([row]))
+    write_picture(HERE / "how_cut.jpg", contact_sheet([row]))
 
 
 def tree() -> None:

@@ -1,7 +1,8 @@
-"""Make worlds.jpg: the assets and the worlds that v3dg makes itself, each from near."""
+"""Make worlds.jpg: the assets and the worlds of benchmarks/worlds, each from near."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,10 @@ import tyro
 from PIL import Image
 
 import v3dg
-from v3dg import procedural, worlds
+
+sys.path.append(str(Path(__file__).resolve().parents[2]))  # for benchmarks/ of this checkout
+from benchmarks import worlds
+from benchmarks.worlds import procedural
 from v3dg.metrics import box_downsample
 from v3dg.pictures import to_8bit
 

@@ -6,23 +6,13 @@ stdout.
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import io
-import operator
-import os
-import sys
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import Any
 
-import tyro
+from v3dg.cli import build, compare, completion, convert, demo, export, info, render, view
+from v3dg.cli._program import Commands, Program
 
-from v3dg._version import __version__
-from v3dg.cli import bench, build, compare, completion, convert, demo, export, info, render, view, world
-from v3dg.cli._common import FAILURES, UsageError, failure_text
-
-# Options and what runs on them, by the command's name, in the order of the help.
-COMMANDS: dict[str, tuple[type[Any], Callable[[Any], None]]] = {
+COMMANDS: Commands = {
     "build": (build.Build, build.run),
     "info": (info.Info, info.run),
     "render": (render.Render, render.run),
@@ -30,9 +20,7 @@ COMMANDS: dict[str, tuple[type[Any], Callable[[Any], None]]] = {
     "compare": (compare.Compare, compare.run),
     "convert": (convert.Convert, convert.run),
     "export": (export.Export, export.run),
-    "world": (world.World, world.run),
     "demo": (demo.Demo, demo.run),
-    "bench": (bench.Bench, bench.run),
     "completion": (completion.Completion, completion.run),
 }
 
@@ -43,80 +31,18 @@ Level of detail for 3D Gaussian Splatting, in four steps:
     v3dg view donut.v3dg               shows it in a web browser
     v3dg compare donut.ply donut.v3dg  says what that costs in quality
 
-No asset at hand? `v3dg demo` makes one, `v3dg world forest` a whole scene.
+No asset at hand? `v3dg demo` makes one.
 `v3dg COMMAND --help` has the options, `v3dg --version` prints the version.
 """
 
+_PROGRAM = Program("v3dg", _DESCRIPTION, COMMANDS)
+
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Parse the command line; tyro's boxed message becomes one line."""
-    subcommands: Any = [
-        Annotated[options, tyro.conf.subcommand(name)] for name, (options, _) in COMMANDS.items()
-    ]
-    caught = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(caught):
-            parsed = tyro.cli(
-                functools.reduce(operator.or_, subcommands),
-                prog="v3dg",
-                description=_DESCRIPTION,
-                args=arguments,
-                config=(tyro.conf.FlagCreatePairsOff,),
-            )
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise UsageError(_one_line(caught.getvalue())) from None
-    return parsed
-
-
-def _one_line(boxed: str) -> str:
-    """The text of the first box that tyro drew, without its rules and its title."""
-    lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
-    rule = next((i for i, line in enumerate(lines) if not line), len(lines))
-    rest = " ".join(line for line in lines[rule:] if line).replace("run:", "run")
-    help_at = rest.find("run v3dg")
-    hint = rest[help_at:].split("--help")[0] if help_at >= 0 else "run v3dg "
-    return " ".join(lines[:rule]).rstrip(".") + f"; {hint}--help"
-
-
-def _set_threads(threads: int | None) -> None:
-    """Start this process anew with that many threads: OpenMP reads the number once, when it is loaded."""
-    if threads is None:
-        return
-    if threads < 1:
-        raise UsageError(f"--threads: expected at least 1, got {threads}")
-    if os.environ.get("OMP_NUM_THREADS") != str(threads):
-        os.environ["OMP_NUM_THREADS"] = str(threads)
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    """Parse the arguments of `v3dg`."""
+    return _PROGRAM.parse(arguments)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command, by default the one this program was started with, and return its exit code."""
-    is_program = arguments is None
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if list(arguments) == ["--version"]:
-        print(f"v3dg {__version__}")
-        return 0
-    try:
-        options = parse(arguments)
-        if is_program:
-            _set_threads(getattr(options, "threads", None))
-        run = next(run for kind, run in COMMANDS.values() if isinstance(options, kind))
-        run(options)
-        sys.stdout.flush()
-    except UsageError as error:
-        return _fail(str(error), 2)
-    except KeyboardInterrupt as stop:
-        return _fail(str(stop) or "interrupted", 130)
-    except BrokenPipeError:  # the reader of our output has gone: nobody is left to tell
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except FAILURES as error:
-        return _fail(failure_text(error), 1)
-    return 0
-
-
-def _fail(message: str, code: int) -> int:
-    print(f"v3dg: error: {' '.join(message.split())}", file=sys.stderr)
-    return code
+    return _PROGRAM.main(arguments)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-import multiprocessing
-import os
-import signal
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -29,7 +25,7 @@ from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, pi
 from v3dg.pictures import SUFFIXES as PICTURE_SUFFIXES
 
 if TYPE_CHECKING:
-    from v3dg.bench.measure import Picture
+    from v3dg.pictures import Picture
 
 # Views from which on starting processes to measure them is quicker than doing without.
 _ENOUGH_TO_SHARE = 6
@@ -40,14 +36,17 @@ _LEAST_WIDTH = 300
 
 @dataclass
 class Compare:
-    """Draw two subjects from the same cameras, or take two pictures, and measure how far apart they look."""
+    """Draw two subjects from the same cameras, or take two pictures, and measure how far apart they look.
+
+    By PSNR and SSIM, and by FLIP where the extra `flip` is installed.
+    """
 
     reference: tyro.conf.Positional[Path]
     """An asset, a bundle (.v3dg) or a scene (.json), to be drawn with all gaussians; or a picture (.png)."""
     test: tyro.conf.Positional[Path]
     """What to compare with it: any of those, or a picture of the same size."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("compare.png")
-    """Picture to write, .png or .jpg: reference, test and a map of FLIP, side by side."""
+    """Picture to write, .png or .jpg: reference, test and a map of FLIP where that is there, side by side."""
     pictures: Literal["worst", "all"] = "worst"
     """Show the view that differs most, or write a picture of every view."""
     tolerance: Annotated[float | None, option("PX2")] = None
@@ -81,7 +80,8 @@ class _Pair:
 def run(options: Compare) -> None:
     from tqdm import tqdm
 
-    from v3dg.bench.measure import mean_of
+    from v3dg._judges import Judges, mean_of
+    from v3dg.metrics import FLIP_MISSING
     from v3dg.pictures import check_picture_path
 
     output = check_picture_path(options.output)
@@ -90,17 +90,22 @@ def run(options: Compare) -> None:
         raise UsageError("PATH: expected two pictures, or two subjects to draw, got one of each")
     count, pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
     rows, worst, is_finest = [], None, True
-    judged = _judged(pairs) if count >= _ENOUGH_TO_SHARE else ((pair, _errors(pair)) for pair in pairs)
-    for pair, errors in tqdm(judged, total=count, unit="view", leave=False, disable=options.quiet):
-        row = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
-        if options.pictures == "all":
-            path = picture_path(output, pair.name, count)
-            _write(options, path, pair, row["flip"])
-            row["picture"] = str(path)
-        if worst is None or row["flip"] > worst[1]["flip"]:
-            worst = (pair, row)
-        rows.append(row)
-        is_finest = is_finest and pair.is_finest
+    with contextlib.closing(Judges()) as judges:
+        judged = (
+            judges.measured(pairs, _errors)
+            if count >= _ENOUGH_TO_SHARE
+            else ((pair, _errors(pair)) for pair in pairs)
+        )
+        for pair, errors in tqdm(judged, total=count, unit="view", leave=False, disable=options.quiet):
+            row = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
+            if options.pictures == "all":
+                path = picture_path(output, pair.name, count)
+                _write(options, path, pair, row["flip"])
+                row["picture"] = str(path)
+            if worst is None or _difference(row) > _difference(worst[1]):
+                worst = (pair, row)
+            rows.append(row)
+            is_finest = is_finest and pair.is_finest
     assert worst is not None
     if options.pictures == "worst":
         _write(options, output, worst[0], worst[1]["flip"])
@@ -116,11 +121,14 @@ def run(options: Compare) -> None:
     table = [_cells(row) for row in rows]
     if count > 1:
         table.append(_cells({"camera": "mean", **mean}))
+    shown = "reference and test" if mean["flip"] is None else "reference, test and FLIP"
     lines = [
         *table_lines(("view", "FLIP", "PSNR", "SSIM", "gaussians"), table),
         "",
-        f"{worst[1]['picture']}: reference, test and FLIP of view {worst[1]['camera']}, which differs most",
+        f"{worst[1]['picture']}: {shown} of view {worst[1]['camera']}, which differs most",
     ]
+    if mean["flip"] is None:
+        lines.append(FLIP_MISSING)
     if is_finest:
         lines.append("every view needs the finest level; `--size 100 100` shows the test as from far away")
     print_result(options.json, result, lambda: "\n".join(lines))
@@ -152,8 +160,9 @@ def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
     if options.supersample < 1:
         raise UsageError(f"--supersample: expected at least 1, got {options.supersample}")
     from v3dg import _device
-    from v3dg.bench.measure import as_picture, draw_truth
     from v3dg.bundle import Bundle
+    from v3dg.metrics import draw_truth
+    from v3dg.pictures import to_8bit
     from v3dg.render import render
 
     device = _device.resolve(options.device)
@@ -171,38 +180,29 @@ def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
             truth = draw_truth(reference, camera, device, options.supersample)
             image = render(test, camera, tolerance=options.tolerance, budget=options.budget, device=device)
             count = image.stats.gaussians_selected
-            yield _Pair(name, truth, as_picture(image.color), count, count == finest)
+            yield _Pair(name, truth, to_8bit(image.color), count, count == finest)
 
     return len(cameras), pairs()
 
 
-def _judged(pairs: Iterator[_Pair]) -> Iterator[tuple[_Pair, dict[str, float | None]]]:
-    """Pairs with their errors, in order; a core each measures them, while the next ones are drawn."""
-    cores = len(os.sched_getaffinity(0))
-    waiting: deque[tuple[_Pair, Future[dict[str, float | None]]]] = deque()
-    # A forked process would inherit CUDA and OpenMP in a state that neither survives. Ctrl-C is for us.
-    context, ignore = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)
-    with ProcessPoolExecutor(cores, context, signal.signal, ignore) as pool:
-        for pair in pairs:
-            waiting.append((pair, pool.submit(_errors, pair)))
-            if len(waiting) > cores:
-                done, errors = waiting.popleft()
-                yield done, errors.result()
-        for done, errors in waiting:
-            yield done, errors.result()
-
-
 def _errors(pair: _Pair) -> dict[str, float | None]:
-    """FLIP, PSNR (None for equal pictures) and SSIM of what a screen shows."""
+    """FLIP (None without its extra), PSNR (None for equal pictures) and SSIM of what a screen shows."""
     from v3dg import metrics
 
     shown = _shown(pair)
     psnr = metrics.psnr(*shown)
     return {
-        "flip": metrics.flip(*shown),
+        "flip": metrics.flip(*shown) if metrics.has_flip() else None,
         "psnr": psnr if math.isfinite(psnr) else None,
         "ssim": metrics.ssim(*shown),
     }
+
+
+def _difference(row: dict[str, Any]) -> float:
+    """What orders views: FLIP, or PSNR where that is not there."""
+    if row["flip"] is not None:
+        return float(row["flip"])
+    return -math.inf if row["psnr"] is None else -float(row["psnr"])
 
 
 def _shown(pair: _Pair) -> list[Any]:
@@ -211,21 +211,16 @@ def _shown(pair: _Pair) -> list[Any]:
     return [picture.astype(np.float32) / np.float32(255) for picture in (pair.reference, pair.test)]
 
 
-def _write(options: Compare, path: Path, pair: _Pair, flip: float) -> None:
+def _write(options: Compare, path: Path, pair: _Pair, flip: float | None) -> None:
     from v3dg import metrics
-    from v3dg.bench.sheet import sheet
-    from v3dg.pictures import to_8bit, write_picture
+    from v3dg.pictures import contact_sheet, to_8bit, write_picture
 
+    pictures = [(options.reference.name, pair.reference), (options.test.name, pair.test)]
+    if flip is not None:
+        pictures.append((f"FLIP {flip:.4f}", to_8bit(metrics.error_image(*_shown(pair)))))
     zoom = max(1, _LEAST_WIDTH // pair.test.shape[1])
-    row = [
-        (text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1))
-        for text, picture in (
-            (options.reference.name, pair.reference),
-            (options.test.name, pair.test),
-            (f"FLIP {flip:.4f}", to_8bit(metrics.error_image(*_shown(pair)))),
-        )
-    ]
-    write_picture(path, sheet([row]))
+    row = [(text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1)) for text, picture in pictures]
+    write_picture(path, contact_sheet([row]))
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:

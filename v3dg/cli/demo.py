@@ -26,7 +26,7 @@ class Demo:
     tolerance: Annotated[float | None, option("PX2")] = None
     """Screen area in px² that one gaussian of a coarser cluster may stand for."""
     seed: int = 0
-    """Seed of the asset, of the meadow and of the build."""
+    """Seed of the asset, of the field and of the build."""
     threads: Threads = None
     """CPU threads; all if not given."""
     json: Flag = False

@@ -23,9 +23,9 @@ import numpy as np
 from v3dg.camera_file import write_cameras
 from v3dg.cameras import Camera, VectorLike
 from v3dg.false_color import LEVEL_COLORS
-from v3dg.films import write_film
 from v3dg.scene_file import write_scene
 from v3dg.select import DEFAULT_TOLERANCE
+from v3dg.video import write_film
 from v3dg.viewer.frame import MOST_COUNTED, Frame, Settings, Shows, Stage, ramp
 from v3dg.viewer.pacing import Painter, Request
 from v3dg.viewer.path import CameraPath

@@ -1,9 +1,9 @@
 """The parts of the evaluation, a module each.
 
-A part has a TITLE, a sentence or two ABOUT what it asks, and three functions: run(stage) measures and returns
-what JSON can hold, or yields it again each time that it knows more; tables(result) gives that as Markdown;
-verdict(result) says in a sentence or two where we win and where we do not. Where there is something to plot,
-plot(result, figure) draws it.
+A part has a TITLE, a sentence or two ABOUT what it asks, and three functions: run(evaluation) measures and
+returns what JSON can hold, or yields it again each time that it knows more; tables(result) gives that as
+Markdown; summary(result) says in a sentence or two where we win and where we do not. Where there is something
+to plot, plot(result, figure) draws it.
 """
 
 from __future__ import annotations
@@ -37,4 +37,4 @@ def part(name: str) -> Any:
     """
     if name not in NAMES:
         raise ValueError(f"parts: expected some of {', '.join(NAMES)}, got {name}")
-    return importlib.import_module(f"v3dg.bench.parts.{name}")
+    return importlib.import_module(f"benchmarks.evaluation.parts.{name}")

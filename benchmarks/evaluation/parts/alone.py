@@ -11,17 +11,18 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.evaluation import gpu
+from benchmarks.evaluation.assets import like_trained, many_copies
+from benchmarks.evaluation.evaluation import Evaluation
+from benchmarks.evaluation.markdown import Column, count_text, markdown
+from benchmarks.evaluation.measure import Row, time_ms
+from benchmarks.evaluation.summary import Summary
 from v3dg import _core, _device, _operations
-from v3dg.bench import gpu
-from v3dg.bench.assets import like_trained, many_copies
-from v3dg.bench.measure import Row, as_picture, time_ms
-from v3dg.bench.stage import Stage
-from v3dg.bench.table import Column, count_text, markdown
-from v3dg.bench.verdict import Verdict
 from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.metrics import psnr
+from v3dg.pictures import to_8bit
 from v3dg.rasterize import intrinsics, rows_of, view_of_world
 from v3dg.render import Renderer, render
 from v3dg.scene import Scene
@@ -41,17 +42,17 @@ _MOST_DRAWN = {"cpu": 1_000_000, "cuda": 100_000_000}
 _LEAST_PSNR = 40.0
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    bandwidth = copy_bandwidth(stage.device)
-    counts = stage.settings.counts
-    most_drawn, most_built = _MOST_DRAWN[stage.device], _MOST_BUILT[stage.device]
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    bandwidth = copy_bandwidth(evaluation.device)
+    counts = evaluation.settings.counts
+    most_drawn, most_built = _MOST_DRAWN[evaluation.device], _MOST_BUILT[evaluation.device]
     return {
         "copy_gigabytes_a_second": round(bandwidth / 1e9, 2),
-        "rasterize": [rasterize_row(stage, n, bandwidth) for n in counts if n <= most_drawn],
-        "split": [split_row(stage, n, bandwidth) for n in counts],
-        "select": [select_row(stage, n) for n in counts],
-        "build": [build_row(stage, n) for n in counts if n <= most_built],
-        "threads": threads_rows(stage) if stage.device == "cpu" else [],
+        "rasterize": [rasterize_row(evaluation, n, bandwidth) for n in counts if n <= most_drawn],
+        "split": [split_row(evaluation, n, bandwidth) for n in counts],
+        "select": [select_row(evaluation, n) for n in counts],
+        "build": [build_row(evaluation, n) for n in counts if n <= most_built],
+        "threads": threads_rows(evaluation) if evaluation.device == "cpu" else [],
     }
 
 
@@ -70,25 +71,28 @@ def copy_bandwidth(device: str) -> float:
     return 2 * _COPIED_BYTES / (copied.median / 1e3)
 
 
-def rasterize_row(stage: Stage, count: int, bandwidth: float) -> Row:
-    width, height = stage.settings.size
+def rasterize_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
+    width, height = evaluation.settings.size
     camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=width, height=height)
-    gaussians = like_trained(count, camera, stage.device, seed=stage.seed)
+    gaussians = like_trained(count, camera, evaluation.device, seed=evaluation.seed)
 
     def draw() -> Any:
-        return render(gaussians, camera, device=stage.device)
+        return render(gaussians, camera, device=evaluation.device)
 
     picture = draw()
     row: Row = {"gaussians": count, "gaussians_in_frustum": picture.stats.gaussians_in_frustum}
-    if stage.device == "cuda" and gpu.has_gsplat():
-        row |= gsplat_peer(stage, gaussians, camera, picture.color)
-    elif stage.device == "cpu":
+    if evaluation.device == "cuda" and gpu.has_gsplat():
+        row |= gsplat_peer(evaluation, gaussians, camera, picture.color)
+    elif evaluation.device == "cpu":
         row["psnr_to_float64"] = psnr_to_float64(gaussians, camera, picture.color)
-    renderer = _renderer(gaussians, stage.device)
-    timed = time_ms(lambda: renderer(camera), stage.device, stage.settings.repeats)
+    renderer = _renderer(gaussians, evaluation.device)
+    timed = time_ms(lambda: renderer(camera), evaluation.device, evaluation.settings.repeats)
     row |= timed.row("frame")
     num_bytes = 4 * (
-        sum(array[:1].size if stage.device == "cpu" else array[:1].numel() for array in rows_of(gaussians))
+        sum(
+            array[:1].size if evaluation.device == "cpu" else array[:1].numel()
+            for array in rows_of(gaussians)
+        )
         * count
         + 5 * width * height
     )
@@ -112,46 +116,48 @@ def psnr_to_float64(gaussians: Gaussians, camera: Camera, color: Any) -> float:
 
 
 def _checked_psnr(expected: Any, color: Any) -> float:
-    found = psnr(*(as_picture(c).astype(np.float32) / 255 for c in (expected, color)))
+    found = psnr(*(to_8bit(c).astype(np.float32) / 255 for c in (expected, color)))
     if not found >= _LEAST_PSNR:
         raise RuntimeError(f"picture: expected at least {_LEAST_PSNR:g} dB to the reference, got {found:.1f}")
     return round(min(found, 99.0), 2)
 
 
-def gsplat_peer(stage: Stage, gaussians: Gaussians, camera: Camera, color: Any) -> Row:
+def gsplat_peer(evaluation: Evaluation, gaussians: Gaussians, camera: Camera, color: Any) -> Row:
     import torch
 
     with torch.no_grad():
         expected = gpu.gsplat_picture(gaussians, camera, packed=True)[0]
     row: Row = {"psnr_to_gsplat": _checked_psnr(expected, color)}
-    row |= gpu.time_gsplat(gaussians, camera, stage.settings.repeats).row("gsplat")
+    row |= gpu.time_gsplat(gaussians, camera, evaluation.settings.repeats).row("gsplat")
     torch.cuda.empty_cache()
     return row
 
 
-def split_row(stage: Stage, count: int, bandwidth: float) -> Row:
-    means: Any = np.random.default_rng(stage.seed).standard_normal((count, 3), np.float32)
+def split_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
+    means: Any = np.random.default_rng(evaluation.seed).standard_normal((count, 3), np.float32)
     on_device = means
     size = BuildConfig().cluster_size
-    if stage.device == "cuda":
+    if evaluation.device == "cuda":
         import torch
 
-        on_device = torch.from_numpy(means).to(stage.device)
+        on_device = torch.from_numpy(means).to(evaluation.device)
         if count <= 1_000_000:
             order, _ = _operations.median_split(on_device, size)
             if not np.array_equal(_device.to_host(order), _operations.median_split(means, size)[0]):
                 raise RuntimeError("median_split: expected the same order on both devices, got another")
-    timed = time_ms(lambda: _operations.median_split(on_device, size), stage.device, stage.settings.repeats)
+    timed = time_ms(
+        lambda: _operations.median_split(on_device, size), evaluation.device, evaluation.settings.repeats
+    )
     num_bytes = (12 + 8) * count
     share = num_bytes / (timed.median / 1e3) / bandwidth
     return {"points": count, **timed.row("split"), "bytes": num_bytes, "share": round(share, 4)}
 
 
-def select_row(stage: Stage, count: int) -> Row:
+def select_row(evaluation: Evaluation, count: int) -> Row:
     """A scene of so many gaussians, of instances of the asset, from where about half is coarse."""
-    bundle = stage.build().bundle
-    instances = max(1, count // len(stage.asset))
-    rng = np.random.default_rng(stage.seed)
+    bundle = evaluation.build().bundle
+    instances = max(1, count // len(evaluation.asset))
+    rng = np.random.default_rng(evaluation.seed)
     side = 2.0 * instances**0.5
     positions = np.column_stack([rng.uniform(-side, side, (instances, 2)), np.zeros(instances)])
     scene = Scene()
@@ -159,13 +165,13 @@ def select_row(stage: Stage, count: int) -> Row:
     camera = Camera.look_at((0, -2.0 * side, side), (0, 0, 0), width=1920, height=1080)
 
     def choose() -> Any:
-        return select(scene, camera, tolerance=DEFAULT_TOLERANCE, device=stage.device)
+        return select(scene, camera, tolerance=DEFAULT_TOLERANCE, device=evaluation.device)
 
     chosen = choose()
-    timed = time_ms(choose, stage.device, stage.settings.repeats)
+    timed = time_ms(choose, evaluation.device, evaluation.settings.repeats)
     clusters = instances * len(bundle.clusters)
     return {
-        "gaussians": instances * len(stage.asset),
+        "gaussians": instances * len(evaluation.asset),
         "instances": instances,
         "clusters": clusters,
         "clusters_selected": len(chosen),
@@ -174,15 +180,15 @@ def select_row(stage: Stage, count: int) -> Row:
     }
 
 
-def build_row(stage: Stage, count: int) -> Row:
-    copies = -(-count // len(stage.asset))
-    asset = many_copies(stage.asset, copies, seed=stage.seed).subset(slice(count))
+def build_row(evaluation: Evaluation, count: int) -> Row:
+    copies = -(-count // len(evaluation.asset))
+    asset = many_copies(evaluation.asset, copies, seed=evaluation.seed).subset(slice(count))
     start = time.perf_counter()
-    bundle = stage.build(BuildConfig(steps=stage.settings.large_steps), asset).bundle
+    bundle = evaluation.build(BuildConfig(steps=evaluation.settings.large_steps), asset).bundle
     seconds = time.perf_counter() - start
     return {
         "gaussians": count,
-        "steps": stage.settings.large_steps,
+        "steps": evaluation.settings.large_steps,
         "levels": bundle.num_levels,
         "seconds": round(seconds, 3),
         "gaussians_a_second": round(count / seconds),
@@ -196,8 +202,8 @@ _SCRIPT = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
 from v3dg import _operations
-from v3dg.bench.assets import like_trained
-from v3dg.bench.measure import time_ms
+from benchmarks.evaluation.assets import like_trained
+from benchmarks.evaluation.measure import time_ms
 from v3dg.cameras import Camera
 from v3dg.render import render
 count, width, height = map(int, sys.argv[2:])
@@ -211,16 +217,16 @@ print(json.dumps(times))
 """
 
 
-def threads_rows(stage: Stage) -> list[Row]:
+def threads_rows(evaluation: Evaluation) -> list[Row]:
     cores = len(os.sched_getaffinity(0))
     numbers = sorted({1, *(2**k for k in range(1, 9) if 2**k <= cores), cores})
-    count = min(max(stage.settings.counts), 100_000)
+    count = min(max(evaluation.settings.counts), 100_000)
     rows = []
     for number in numbers:
         done = subprocess.run(
             [
                 *(sys.executable, "-c", _SCRIPT, json.dumps(sys.path)),
-                *map(str, (count, *stage.settings.size)),
+                *map(str, (count, *evaluation.settings.size)),
             ],
             env={**os.environ, "OMP_NUM_THREADS": str(number)},
             stdout=subprocess.PIPE,
@@ -282,8 +288,8 @@ def tables(result: dict[str, Any]) -> str:
     return "\n\n".join(text)
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
-    out = Verdict()
+def summary(result: dict[str, Any]) -> Summary:
+    out = Summary()
     for row in result["rasterize"]:
         if "gsplat_ms" in row:
             out.judge(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from v3dg.bench.measure import Picture, Row, as_picture, clip_radius_for, screen_radii
-from v3dg.bench.sheet import crop, sheet
-from v3dg.bench.stage import Stage, View
-from v3dg.bench.table import Column, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.evaluation import Evaluation, View
+from benchmarks.evaluation.markdown import Column, markdown
+from benchmarks.evaluation.measure import Row, clip_radius_for, crop, screen_radii
+from benchmarks.evaluation.summary import Summary
+from v3dg.pictures import Picture, contact_sheet, to_8bit
 from v3dg.rasterize import rasterize
 from v3dg.select import select
 
@@ -21,16 +21,16 @@ ABOUT = (
 _TOLERANCES = (3.0, 8.0, 16.0)
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    scene = stage.place(stage.build().bundle)
-    views = [len(stage.line) // 2, len(stage.line) - 1]
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    scene = evaluation.place(evaluation.build().bundle)
+    views = [len(evaluation.camera_sweep) // 2, len(evaluation.camera_sweep) - 1]
     rows: list[Row] = []
     pictures: list[tuple[Picture, Picture]] = []
     for index in views:
-        view = stage.line[index]
+        view = evaluation.camera_sweep[index]
         for tolerance in _TOLERANCES:
-            ours = stage.shoot(scene, view, tolerance)
-            clip, count, picture = clipped(stage, view, ours.stats.gaussians_in_frustum)
+            ours = evaluation.shoot(scene, view, tolerance)
+            clip, count, picture = clipped(evaluation, view, ours.stats.gaussians_in_frustum)
             rows.append(
                 {
                     **view.row(),
@@ -42,18 +42,20 @@ def run(stage: Stage) -> dict[str, Any]:
                 | ours.row("ours")
             )
             pictures.append((ours.picture, picture))
-    pairs = [(stage.truth(row["view"]), p) for row, both in zip(rows, pictures, strict=True) for p in both]
-    errors = iter(stage.judge.errors(pairs))
+    pairs = [
+        (evaluation.truth(row["view"]), p) for row, both in zip(rows, pictures, strict=True) for p in both
+    ]
+    errors = iter(evaluation.judge.errors(pairs))
     for row in rows:
         for name in ("ours", "clipped"):
             row |= {f"{name}_{key}": value for key, value in next(errors).items()}
-    side = stage.settings.panel
-    stage.save(
+    side = evaluation.settings.panel
+    evaluation.save(
         "clipping",
-        sheet(
+        contact_sheet(
             [
                 [
-                    ("truth", crop(stage.truth(row["view"]), side)),
+                    ("truth", crop(evaluation.truth(row["view"]), side)),
                     (f"ours, FLIP {row['ours_flip']:.4f}", crop(ours_picture, side)),
                     (
                         f"clipped below {row['clip_px']:.2g} px, FLIP {row['clipped_flip']:.4f}",
@@ -68,14 +70,14 @@ def run(stage: Stage) -> dict[str, Any]:
     return {"rows": rows}
 
 
-def clipped(stage: Stage, view: View, count: int) -> tuple[float, int, Picture]:
+def clipped(evaluation: Evaluation, view: View, count: int) -> tuple[float, int, Picture]:
     """The clip that leaves at most so many of the full scene's gaussians in the picture, and the picture."""
-    everything = select(stage.full_scene, view.camera, tolerance=0.0).gaussians(device=stage.device)
+    everything = select(evaluation.full_scene, view.camera, tolerance=0.0).gaussians(device=evaluation.device)
     radii = screen_radii(everything, view.camera)
     clip = clip_radius_for(radii, count)
     kept = radii > clip
-    left = everything.subset(kept.nonzero()[0] if stage.device == "cpu" else kept.nonzero()[:, 0])
-    return clip, int(kept.sum()), as_picture(rasterize(left, view.camera).color)
+    left = everything.subset(kept.nonzero()[0] if evaluation.device == "cpu" else kept.nonzero()[:, 0])
+    return clip, int(kept.sum()), to_8bit(rasterize(left, view.camera).color)
 
 
 _TABLE = (
@@ -95,8 +97,8 @@ def tables(result: dict[str, Any]) -> str:
     return markdown(_TABLE, result["rows"])
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
-    out = Verdict()
+def summary(result: dict[str, Any]) -> Summary:
+    out = Summary()
     row = max(result["rows"], key=lambda row: (row["distance"], row["tolerance"]))
     out.judge(
         row["ours_flip"] < row["clipped_flip"],

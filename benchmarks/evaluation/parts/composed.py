@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from v3dg.bench.measure import Picture, Row, draw_truth, mean_of
-from v3dg.bench.sheet import crop, sheet
-from v3dg.bench.stage import Stage, View
-from v3dg.bench.table import Column, count_text, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.evaluation import Evaluation, View
+from benchmarks.evaluation.markdown import Column, count_text, markdown
+from benchmarks.evaluation.measure import Row, crop
+from benchmarks.evaluation.summary import Summary
+from v3dg._judges import mean_of
+from v3dg.metrics import draw_truth
+from v3dg.pictures import Picture, contact_sheet
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
@@ -21,12 +23,12 @@ ABOUT = (
 )
 
 
-def run(stage: Stage) -> Iterator[dict[str, Any]]:
+def run(evaluation: Evaluation) -> Iterator[dict[str, Any]]:
     """What is known after each scene."""
     scenes: list[Row] = []
-    for name, scene, views in stage.composed_scenes():
-        rows, pictures = measure(stage, scene, views)
-        stage.save(f"composed_{name}", pictures)
+    for name, scene, views in evaluation.composed_scenes():
+        rows, pictures = measure(evaluation, scene, views)
+        evaluation.save(f"composed_{name}", pictures)
         gaussians = sum(
             len(bundle.level_gaussians(0)) * int((scene.instance_bundle == b).sum())
             for b, bundle in enumerate(scene.bundles)
@@ -35,25 +37,25 @@ def run(stage: Stage) -> Iterator[dict[str, Any]]:
         yield {"tolerance": DEFAULT_TOLERANCE, "scenes": scenes}
 
 
-def measure(stage: Stage, scene: Scene, views: list[View]) -> tuple[list[Row], Picture]:
-    azimuths = sorted({round(view.azimuth, 1) for view in views})[: stage.settings.judged_directions]
+def measure(evaluation: Evaluation, scene: Scene, views: list[View]) -> tuple[list[Row], Picture]:
+    azimuths = sorted({round(view.azimuth, 1) for view in views})[: evaluation.settings.judged_directions]
     rows: list[Row] = []
     judged: list[tuple[int, Picture, Picture, Picture]] = []
     for view in views:
         full, ours = (
-            stage.shoot(scene, view, tolerance, stage.settings.composed_repeats)
+            evaluation.shoot(scene, view, tolerance, evaluation.settings.composed_repeats)
             for tolerance in (0.0, DEFAULT_TOLERANCE)
         )
         if round(view.azimuth, 1) in azimuths:
-            truth = draw_truth(scene, view.camera, stage.device)
+            truth = draw_truth(scene, view.camera, evaluation.device)
             judged.append((len(rows), truth, full.picture, ours.picture))
         rows.append({**view.row(), **full.row("full"), **ours.row("ours")})
     pairs = [(truth, picture) for _, truth, *both in judged for picture in both]
-    errors = iter(stage.judge.errors(pairs))
+    errors = iter(evaluation.judge.errors(pairs))
     for index, *_ in judged:
         for name in ("full", "ours"):
             rows[index] |= {f"{name}_{key}": value for key, value in next(errors).items()}
-    return rows, strips(rows, judged, stage.settings.panel)
+    return rows, strips(rows, judged, evaluation.settings.panel)
 
 
 def strips(rows: list[Row], judged: list[tuple[int, Picture, Picture, Picture]], side: int) -> Picture:
@@ -65,7 +67,7 @@ def strips(rows: list[Row], judged: list[tuple[int, Picture, Picture, Picture]],
         key=lambda entry: rows[entry[0]]["distance"],
     )
     chosen = [line[len(line) // 4], line[len(line) // 2], line[-1]]
-    return sheet(
+    return contact_sheet(
         [
             [
                 (f"truth, distance {row['distance']:.3g}", crop(truth, side)),
@@ -117,8 +119,8 @@ def tables(result: dict[str, Any]) -> str:
     )
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
-    out = Verdict()
+def summary(result: dict[str, Any]) -> Summary:
+    out = Summary()
     for scene in result["scenes"]:
         rows = by_distance(scene)
         far = rows[-1]

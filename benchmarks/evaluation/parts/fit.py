@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from v3dg.bench.line import COLUMNS, build_row, full_row
-from v3dg.bench.stage import PAPER_TOLERANCE, Stage
-from v3dg.bench.table import Column, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.camera_sweep import COLUMNS, build_row, full_row
+from benchmarks.evaluation.evaluation import PAPER_TOLERANCE, Evaluation
+from benchmarks.evaluation.markdown import Column, markdown
+from benchmarks.evaluation.summary import Summary
 from v3dg.build import BuildConfig
 from v3dg.select import DEFAULT_TOLERANCE
 
@@ -18,15 +18,15 @@ ABOUT = (
 )
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    steps = stage.settings.steps
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    steps = evaluation.settings.steps
     rows = [
-        full_row(stage),
-        build_row(stage, "paper, *0", BuildConfig.paper(steps=0, prune_growth=1.0), PAPER_TOLERANCE),
+        full_row(evaluation),
+        build_row(evaluation, "paper, *0", BuildConfig.paper(steps=0, prune_growth=1.0), PAPER_TOLERANCE),
     ]
-    rows += [build_row(stage, "paper", BuildConfig.paper(steps=n), PAPER_TOLERANCE) for n in steps]
+    rows += [build_row(evaluation, "paper", BuildConfig.paper(steps=n), PAPER_TOLERANCE) for n in steps]
     ours = (*steps, BuildConfig().steps)
-    rows += [build_row(stage, "ours", BuildConfig(steps=n), DEFAULT_TOLERANCE) for n in ours]
+    rows += [build_row(evaluation, "ours", BuildConfig(steps=n), DEFAULT_TOLERANCE) for n in ours]
     return {"rows": rows}
 
 
@@ -39,10 +39,10 @@ def tables(result: dict[str, Any]) -> str:
     return markdown((*columns, *COLUMNS[2:]), result["rows"])
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
+def summary(result: dict[str, Any]) -> Summary:
     ours = [row for row in result["rows"] if row["levels"] == "ours"]
     unfitted, fitted = ours[0], ours[-1]
-    out = Verdict()
+    out = Summary()
     out.judge(
         fitted["drawn_flip"] < unfitted["drawn_flip"],
         f"fitting our levels takes {fitted['build_seconds']:.1f} s of build instead of "

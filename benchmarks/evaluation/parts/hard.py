@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from v3dg.bench.assets import hair_lines, sky_dome
-from v3dg.bench.measure import Picture, Row, as_picture, draw_truth, tolerance_for
-from v3dg.bench.sheet import sheet
-from v3dg.bench.stage import FOV_X, Stage, close_distance
-from v3dg.bench.table import Column, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.assets import hair_lines, sky_dome
+from benchmarks.evaluation.evaluation import FOV_X, Evaluation, close_distance
+from benchmarks.evaluation.markdown import Column, markdown
+from benchmarks.evaluation.measure import Row, tolerance_for
+from benchmarks.evaluation.summary import Summary
+from benchmarks.worlds.procedural import make_tree
 from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
-from v3dg.procedural import make_tree
+from v3dg.metrics import draw_truth
+from v3dg.pictures import Picture, contact_sheet, to_8bit
 from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
@@ -36,25 +37,25 @@ _SUPERSAMPLING = 8  # hair is far thinner than half a pixel
 _NOTICED_FLIP = 1e-3
 
 
-def assets(stage: Stage) -> Iterator[tuple[str, Gaussians, dict[str, Camera]]]:
-    count = stage.settings.hard_gaussians
-    lines = hair_lines(count, seed=stage.seed)
-    yield "hair-thin lines", lines, cameras_around(stage, lines)
-    side = stage.settings.panel
+def assets(evaluation: Evaluation) -> Iterator[tuple[str, Gaussians, dict[str, Camera]]]:
+    count = evaluation.settings.hard_gaussians
+    lines = hair_lines(count, seed=evaluation.seed)
+    yield "hair-thin lines", lines, cameras_around(evaluation, lines)
+    side = evaluation.settings.panel
     within = Camera.look_at((0, 0, 0.1), (1, 0, 0.5), fov_x=1.2, width=side, height=side, near=1e-3)
-    yield "sky dome", sky_dome(count, seed=stage.seed), {"within": within}
-    tree = make_tree(count, seed=stage.seed)
-    yield "dense tree", tree, cameras_around(stage, tree)
-    yield stage.asset_name, stage.asset, cameras_around(stage, stage.asset)
+    yield "sky dome", sky_dome(count, seed=evaluation.seed), {"within": within}
+    tree = make_tree(count, seed=evaluation.seed)
+    yield "dense tree", tree, cameras_around(evaluation, tree)
+    yield evaluation.asset_name, evaluation.asset, cameras_around(evaluation, evaluation.asset)
 
 
-def cameras_around(stage: Stage, asset: Gaussians) -> dict[str, Camera]:
+def cameras_around(evaluation: Evaluation, asset: Gaussians) -> dict[str, Camera]:
     center, distance = close_distance(asset)
     direction = np.array([0.2, -0.8, 0.55])
 
     def camera(factor: float) -> Camera:
         # As many px² a gaussian as from so far away, without the empty rest of the picture.
-        side = max(_LEAST_PX, round(stage.settings.panel / factor))
+        side = max(_LEAST_PX, round(evaluation.settings.panel / factor))
         eye = center + factor * distance * direction
         return Camera.look_at(
             eye,
@@ -68,20 +69,20 @@ def cameras_around(stage: Stage, asset: Gaussians) -> dict[str, Camera]:
     return {"near": camera(1.0), "far": camera(_FAR)}
 
 
-def run(stage: Stage) -> dict[str, Any]:
+def run(evaluation: Evaluation) -> dict[str, Any]:
     rows: list[Row] = []
     strips: list[list[tuple[str, Picture]]] = []
     jobs: list[tuple[Picture, Picture]] = []
-    for name, asset, cameras in assets(stage):
-        own = None if asset is stage.asset else asset
-        fitted = Scene.of(stage.build(asset=own).bundle)
-        merged = Scene.of(stage.build(BuildConfig(steps=0), own).bundle)
+    for name, asset, cameras in assets(evaluation):
+        own = None if asset is evaluation.asset else asset
+        fitted = Scene.of(evaluation.build(asset=own).bundle)
+        merged = Scene.of(evaluation.build(BuildConfig(steps=0), own).bundle)
         for where, camera in cameras.items():
-            truth = draw_truth(fitted, camera, stage.device, _SUPERSAMPLING)
+            truth = draw_truth(fitted, camera, evaluation.device, _SUPERSAMPLING)
 
             def draw(scene: Scene, tolerance: float, camera: Camera = camera) -> tuple[Picture, int]:
-                image = render(scene, camera, tolerance=tolerance, device=stage.device)
-                return as_picture(image.color), image.stats.gaussians_in_frustum
+                image = render(scene, camera, tolerance=tolerance, device=evaluation.device)
+                return to_8bit(image.color), image.stats.gaussians_in_frustum
 
             full, count = draw(fitted, 0.0)
             strip = [("truth", truth), ("full", full)]
@@ -98,12 +99,12 @@ def run(stage: Stage) -> dict[str, Any]:
                 if ours_count > wanted:  # as coarse as it gets: the eye is inside the balls of what is left
                     break
             strip[0] = f"{name}, {where}: truth", truth
-            strips.append([(text, enlarged(picture, stage.settings.panel)) for text, picture in strip])
-    errors = iter(stage.judge.errors(jobs))
+            strips.append([(text, enlarged(picture, evaluation.settings.panel)) for text, picture in strip])
+    errors = iter(evaluation.judge.errors(jobs))
     for row in rows:
         for who in ("full", "ours", "merged"):
             row |= {f"{who}_{key}": value for key, value in next(errors).items()}
-    stage.save("hard", sheet(strips))
+    evaluation.save("hard", contact_sheet(strips))
     return {"rows": rows}
 
 
@@ -132,8 +133,8 @@ def tables(result: dict[str, Any]) -> str:
     return markdown(_COLUMNS, result["rows"])
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
-    out = Verdict()
+def summary(result: dict[str, Any]) -> Summary:
+    out = Summary()
     for row in result["rows"]:
         count = f"{row['ours_in_frustum']:,} of {row['full_in_frustum']:,}"
         what = f"{row['asset']} ({row['view']}), {count} gaussians"

@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from v3dg.bench.hierarchy import HierarchyScene, build_hierarchy
-from v3dg.bench.measure import Picture, Row, as_picture, draw_truth, time_ms, tolerance_for
-from v3dg.bench.sheet import crop, sheet
-from v3dg.bench.stage import Stage
-from v3dg.bench.table import Column, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.evaluation import Evaluation
+from benchmarks.evaluation.hierarchy import HierarchyScene, build_hierarchy
+from benchmarks.evaluation.markdown import Column, markdown
+from benchmarks.evaluation.measure import Row, crop, time_ms, tolerance_for
+from benchmarks.evaluation.summary import Summary
+from v3dg.metrics import draw_truth
+from v3dg.pictures import Picture, contact_sheet, to_8bit
 from v3dg.rasterize import rasterize
 
 TITLE = "Against a hierarchy of single gaussians"
@@ -24,27 +25,27 @@ ABOUT = (
 _TARGETS_PX = (1.0, 2.0, 4.0, 8.0, 16.0)
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    built = stage.build()
-    scene = stage.place(built.bundle, stage.settings.hierarchy_instances)
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    built = evaluation.build()
+    scene = evaluation.place(built.bundle, evaluation.settings.hierarchy_instances)
     start = time.perf_counter()
-    hierarchy = build_hierarchy(stage.asset)
+    hierarchy = build_hierarchy(evaluation.asset)
     build_seconds = time.perf_counter() - start
-    theirs = HierarchyScene(hierarchy, scene, stage.device)
-    view = stage.line[len(stage.line) // 2]
-    truth = draw_truth(scene, view.camera, stage.device)
+    theirs = HierarchyScene(hierarchy, scene, evaluation.device)
+    view = evaluation.camera_sweep[len(evaluation.camera_sweep) // 2]
+    truth = draw_truth(scene, view.camera, evaluation.device)
     rows: list[Row] = []
     pictures: list[tuple[Picture, Picture]] = []
-    repeats = stage.settings.repeats
+    repeats = evaluation.settings.repeats
     for target_px in _TARGETS_PX:
         chosen = theirs.gaussians(theirs.cut(view.camera, target_px))
         tolerance = tolerance_for(scene, view.camera, len(chosen))
-        ours = stage.shoot(scene, view, tolerance)
-        picture = as_picture(rasterize(chosen, view.camera).color)
-        raster = time_ms(lambda: rasterize(chosen, view.camera), stage.device, repeats)  # noqa: B023
+        ours = evaluation.shoot(scene, view, tolerance)
+        picture = to_8bit(rasterize(chosen, view.camera).color)
+        raster = time_ms(lambda: rasterize(chosen, view.camera), evaluation.device, repeats)  # noqa: B023
         whole = time_ms(
             lambda: rasterize(theirs.gaussians(theirs.cut(view.camera, target_px)), view.camera),  # noqa: B023
-            stage.device,
+            evaluation.device,
             repeats,
         )
         rows.append(
@@ -55,14 +56,14 @@ def run(stage: Stage) -> dict[str, Any]:
             | ours.row("ours")
         )
         pictures.append((picture, ours.picture))
-    errors = iter(stage.judge.errors((truth, p) for both in pictures for p in both))
+    errors = iter(evaluation.judge.errors((truth, p) for both in pictures for p in both))
     for row in rows:
         for name in ("theirs", "ours"):
             row |= {f"{name}_{key}": value for key, value in next(errors).items()}
-    side = stage.settings.panel
-    stage.save(
+    side = evaluation.settings.panel
+    evaluation.save(
         "hierarchy",
-        sheet(
+        contact_sheet(
             [
                 [
                     ("truth", crop(truth, side)),
@@ -106,8 +107,8 @@ def tables(result: dict[str, Any]) -> str:
     return builds + "\n\n" + markdown(_COLUMNS, result["rows"])
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
-    out = Verdict()
+def summary(result: dict[str, Any]) -> Summary:
+    out = Summary()
     row = result["rows"][2]
     out.judge(
         row["ours_flip"] < row["theirs_flip"],

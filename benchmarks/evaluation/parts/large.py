@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from v3dg.bench.assets import many_copies
-from v3dg.bench.measure import draw_truth
-from v3dg.bench.parts import composed
-from v3dg.bench.sheet import crop, sheet
-from v3dg.bench.stage import Stage, View, close_distance
-from v3dg.bench.table import count_text, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.assets import many_copies
+from benchmarks.evaluation.evaluation import Evaluation, View, close_distance
+from benchmarks.evaluation.markdown import count_text, markdown
+from benchmarks.evaluation.measure import crop
+from benchmarks.evaluation.parts import composed
+from benchmarks.evaluation.summary import Summary
 from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
+from v3dg.metrics import draw_truth
+from v3dg.pictures import contact_sheet
 from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "One large asset"
@@ -25,27 +26,27 @@ ABOUT = (
 _ELEVATION = 45.0
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    asset = many_copies(stage.asset, stage.settings.large_copies, seed=stage.seed)
-    built = stage.build(BuildConfig(steps=stage.settings.large_steps), asset)
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    asset = many_copies(evaluation.asset, evaluation.settings.large_copies, seed=evaluation.seed)
+    built = evaluation.build(BuildConfig(steps=evaluation.settings.large_steps), asset)
     center, distance = close_distance(asset)
-    width, height = stage.settings.size
+    width, height = evaluation.settings.size
     rows, pairs, strips = [], [], []
-    for d in range(stage.settings.distances):
-        away = 2 * distance * (d + 1) / stage.settings.distances
+    for d in range(evaluation.settings.distances):
+        away = 2 * distance * (d + 1) / evaluation.settings.distances
         e = math.radians(_ELEVATION)
         eye = center + away * _direction(e)
         camera = Camera.look_at(eye, center, width=width, height=height, near=1e-3 * away)
         view = View(270.0, _ELEVATION, away, camera)
-        full, ours = (stage.shoot(built.bundle, view, t) for t in (0.0, DEFAULT_TOLERANCE))
-        truth = draw_truth(built.bundle, camera, stage.device)
+        full, ours = (evaluation.shoot(built.bundle, view, t) for t in (0.0, DEFAULT_TOLERANCE))
+        truth = draw_truth(built.bundle, camera, evaluation.device)
         pairs += [(truth, full.picture), (truth, ours.picture)]
         rows.append({**view.row(), **full.row("full"), **ours.row("ours")})
-    errors = iter(stage.judge.errors(pairs))
+    errors = iter(evaluation.judge.errors(pairs))
     for row in rows:
         for name in ("full", "ours"):
             row |= {f"{name}_{key}": value for key, value in next(errors).items()}
-    side = stage.settings.panel
+    side = evaluation.settings.panel
     for k in sorted({len(rows) // 4, len(rows) // 2, len(rows) - 1}):
         truth, full_picture, ours_picture = pairs[2 * k][0], pairs[2 * k][1], pairs[2 * k + 1][1]
         strips.append(
@@ -55,11 +56,11 @@ def run(stage: Stage) -> dict[str, Any]:
                 (f"ours, FLIP {rows[k]['ours_flip']:.4f}", crop(ours_picture, side)),
             ]
         )
-    stage.save("large", sheet(strips))
+    evaluation.save("large", contact_sheet(strips))
     return {
         "tolerance": DEFAULT_TOLERANCE,
         "gaussians": len(asset),
-        "steps": stage.settings.large_steps,
+        "steps": evaluation.settings.large_steps,
         "build_seconds": round(built.seconds, 2),
         "scenes": [{"scene": "one large asset", "views": rows}],
     }
@@ -79,8 +80,8 @@ def tables(result: dict[str, Any]) -> str:
     )
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
-    return composed.verdict(result)
+def summary(result: dict[str, Any]) -> Summary:
+    return composed.summary(result)
 
 
 plot = composed.plot

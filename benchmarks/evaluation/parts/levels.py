@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from v3dg.bench.measure import Row, as_picture
-from v3dg.bench.sheet import sheet
-from v3dg.bench.stage import Stage, close_view, every
-from v3dg.bench.table import Column, count_text, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.evaluation import Evaluation, close_view, every
+from benchmarks.evaluation.markdown import Column, count_text, markdown
+from benchmarks.evaluation.measure import Row
+from benchmarks.evaluation.summary import Summary
 from v3dg.build import BuildConfig
+from v3dg.pictures import contact_sheet, to_8bit
 from v3dg.rasterize import rasterize
 
 TITLE = "Levels side by side"
@@ -21,17 +21,19 @@ ABOUT = (
 _MOST_LEVELS = 7
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    side = stage.settings.panel // 2
-    camera = close_view(stage.asset, (side, side))
-    truth = as_picture(rasterize(stage.asset, camera).color)
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    side = evaluation.settings.panel // 2
+    camera = close_view(evaluation.asset, (side, side))
+    truth = to_8bit(rasterize(evaluation.asset, camera).color)
     builds = [("paper, *0", BuildConfig.paper(steps=0, prune_growth=1.0))]
-    builds += [(f"paper, {n}", BuildConfig.paper(steps=n)) for n in stage.settings.steps]
-    builds += [(f"ours, {n}", BuildConfig(steps=n)) for n in (*stage.settings.steps, BuildConfig().steps)]
+    builds += [(f"paper, {n}", BuildConfig.paper(steps=n)) for n in evaluation.settings.steps]
+    builds += [
+        (f"ours, {n}", BuildConfig(steps=n)) for n in (*evaluation.settings.steps, BuildConfig().steps)
+    ]
     rows: list[Row] = []
     strips = []
     for name, config in builds:
-        bundle = stage.build(config).bundle
+        bundle = evaluation.build(config).bundle
         strip = []
         for level in every(range(bundle.num_levels), _MOST_LEVELS):
             gaussians = bundle.level_gaussians(level)
@@ -42,13 +44,13 @@ def run(stage: Stage) -> dict[str, Any]:
                 filter_px2=float(bundle.clusters.filter_px2[first]),
                 antialiased=bool(bundle.clusters.antialiased[first]),
             )
-            strip.append((f"{name}: {count_text(len(gaussians))}", as_picture(raster.color)))
+            strip.append((f"{name}: {count_text(len(gaussians))}", to_8bit(raster.color)))
             rows.append({"levels": name, "level": level, "gaussians": len(gaussians)})
         strips.append(strip)
-    errors = stage.judge.errors((truth, picture) for strip in strips for _, picture in strip)
+    errors = evaluation.judge.errors((truth, picture) for strip in strips for _, picture in strip)
     for row, error in zip(rows, errors, strict=True):
         row |= error
-    stage.save("levels", sheet(strips))
+    evaluation.save("levels", contact_sheet(strips))
     return {"rows": rows}
 
 
@@ -65,5 +67,5 @@ def tables(result: dict[str, Any]) -> str:
     return markdown(_COLUMNS, result["rows"])
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
-    return Verdict()
+def summary(result: dict[str, Any]) -> Summary:
+    return Summary()

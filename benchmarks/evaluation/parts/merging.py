@@ -5,7 +5,7 @@ of peers, as <asset>_<tool>_<percent>.ply:
 
     splat-transform -g cpu -w donut.ply -d 50% peers/donut_splat-transform_50.ply
     splat-transform -g cpu -w donut.ply --decimate-adaptive 50% peers/donut_adaptive_50.ply
-    node benchmarks/spark_levels.mjs donut.ply peers 50 25 12.5 6.25 1
+    node benchmarks/studies/spark_levels.mjs donut.ply peers 50 25 12.5 6.25 1
 
 and seconds.json there has what each took, {"splat-transform": {"50": 1.0}}.
 """
@@ -19,16 +19,18 @@ from typing import Any
 
 import numpy as np
 
-from v3dg.bench.line import build_row, full_row
-from v3dg.bench.measure import Picture, Row, as_picture, draw_truth, mean_of, tolerance_for
-from v3dg.bench.stage import Stage
-from v3dg.bench.table import Column, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.camera_sweep import build_row, full_row
+from benchmarks.evaluation.evaluation import Evaluation
+from benchmarks.evaluation.markdown import Column, markdown
+from benchmarks.evaluation.measure import Row, tolerance_for
+from benchmarks.evaluation.summary import Summary
+from v3dg._judges import mean_of
 from v3dg.build import BuildConfig
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.io import load
-from v3dg.metrics import psnr
+from v3dg.metrics import draw_truth, psnr
+from v3dg.pictures import Picture, to_8bit
 from v3dg.rasterize import rasterize
 from v3dg.render import render
 from v3dg.scene import Scene
@@ -47,24 +49,24 @@ _FOV = math.radians(50)
 _LARGE_PX = 400
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    rows = [full_row(stage)]
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    rows = [full_row(evaluation)]
     for tolerance in _TOLERANCES:
-        rows.append(build_row(stage, "merged", BuildConfig(steps=0), tolerance))
-        rows.append(build_row(stage, "ours", BuildConfig(), tolerance))
-    return {"rows": rows, "peers": [] if stage.peers is None else peer_rows(stage)}
+        rows.append(build_row(evaluation, "merged", BuildConfig(steps=0), tolerance))
+        rows.append(build_row(evaluation, "ours", BuildConfig(), tolerance))
+    return {"rows": rows, "peers": [] if evaluation.peers is None else peer_rows(evaluation)}
 
 
-def peer_rows(stage: Stage) -> list[Row]:
-    assert stage.peers is not None
-    seconds_path = stage.peers / "seconds.json"
+def peer_rows(evaluation: Evaluation) -> list[Row]:
+    assert evaluation.peers is not None
+    seconds_path = evaluation.peers / "seconds.json"
     seconds = json.loads(seconds_path.read_text(encoding="utf-8")) if seconds_path.exists() else {}
-    bundle = stage.build().bundle
+    bundle = evaluation.build().bundle
     rows = []
-    for path in sorted(stage.peers.glob(f"{stage.asset_name}_*.ply")):
-        found = re.fullmatch(rf"{re.escape(stage.asset_name)}_(.+)_([0-9.]+)", path.stem)
+    for path in sorted(evaluation.peers.glob(f"{evaluation.asset_name}_*.ply")):
+        found = re.fullmatch(rf"{re.escape(evaluation.asset_name)}_(.+)_([0-9.]+)", path.stem)
         if found is None:
-            raise ValueError(f"{path}: expected a name like {stage.asset_name}_TOOL_50.ply")
+            raise ValueError(f"{path}: expected a name like {evaluation.asset_name}_TOOL_50.ply")
         tool, percent = found.groups()
         theirs = load(path)
         footprint = footprint_of_cut(bundle, len(theirs))
@@ -75,7 +77,7 @@ def peer_rows(stage: Stage) -> list[Row]:
             "theirs_gaussians": len(theirs),
         }
         for where, px2 in (("cut", footprint), ("large", None)):
-            errors = compare(stage, bundle, theirs, px2)
+            errors = compare(evaluation, bundle, theirs, px2)
             row |= {f"{where}_{name}": value for name, value in errors.items()}
         rows.append(row)
     return sorted(rows, key=lambda row: (row["tool"], -row["percent"]))
@@ -114,7 +116,7 @@ def footprint_of_cut(bundle: Bundle, count: int) -> float:
     return low
 
 
-def compare(stage: Stage, bundle: Bundle, theirs: Any, footprint_px2: float | None) -> Row:
+def compare(evaluation: Evaluation, bundle: Bundle, theirs: Any, footprint_px2: float | None) -> Row:
     """Means over the views of FLIP and PSNR, of all gaussians, theirs, and our cut with at most as many."""
     scene = Scene.of(bundle)
     coarser = bundle.level_range(1)[0] if bundle.num_levels > 1 else 0
@@ -128,13 +130,13 @@ def compare(stage: Stage, bundle: Bundle, theirs: Any, footprint_px2: float | No
         counts.append(ours.stats.gaussians_selected)
         # Theirs as the asset is drawn, or with our filter where that suits it better.
         drawn = [
-            as_picture(rasterize(theirs, camera, filter_px2=px2, antialiased=compensated).color)
+            to_8bit(rasterize(theirs, camera, filter_px2=px2, antialiased=compensated).color)
             for px2, compensated in ((0.0, False), own_filter)
         ]
         their_best = max(drawn, key=lambda p: psnr(truth / np.float32(255), p / np.float32(255)))
-        full = as_picture(render(bundle, camera, tolerance=0.0).color)
-        pairs += [(truth, full), (truth, their_best), (truth, as_picture(ours.color))]
-    errors = stage.judge.errors(pairs)
+        full = to_8bit(render(bundle, camera, tolerance=0.0).color)
+        pairs += [(truth, full), (truth, their_best), (truth, to_8bit(ours.color))]
+    errors = evaluation.judge.errors(pairs)
     row: Row = {"size_px": camera.width, "ours_gaussians": float(np.mean(counts))}
     for k, who in enumerate(("full", "theirs", "ours")):
         row |= {f"{who}_{key}": value for key, value in mean_of(errors[k::3], "flip", "psnr").items()}
@@ -176,8 +178,8 @@ def tables(result: dict[str, Any]) -> str:
     return text
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
-    out = Verdict()
+def summary(result: dict[str, Any]) -> Summary:
+    out = Summary()
     merged, ours = (
         next(r for r in result["rows"] if r["levels"] == name and r["tolerance"] == 8.0)
         for name in ("merged", "ours")

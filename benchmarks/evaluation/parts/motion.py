@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from v3dg.bench.measure import Picture, Row, as_picture, draw_truth
-from v3dg.bench.sheet import crop, sheet
-from v3dg.bench.stage import Stage, orbit_view
-from v3dg.bench.table import Column, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.evaluation import Evaluation, orbit_view
+from benchmarks.evaluation.markdown import Column, markdown
+from benchmarks.evaluation.measure import Row, crop
+from benchmarks.evaluation.summary import Summary
+from v3dg.metrics import draw_truth
+from v3dg.pictures import Picture, contact_sheet, to_8bit
 from v3dg.render import render
 from v3dg.select import DEFAULT_TOLERANCE
 
@@ -26,30 +27,31 @@ ABOUT = (
 _NEARER = 0.995
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    scene = stage.place(stage.build().bundle)
-    start = stage.line[-1]
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    scene = evaluation.place(evaluation.build().bundle)
+    start = evaluation.camera_sweep[-1]
     views = [
-        orbit_view(start.azimuth, start.elevation, start.distance * _NEARER**k, stage.settings.size)
-        for k in range(stage.settings.motion_frames)
+        orbit_view(start.azimuth, start.elevation, start.distance * _NEARER**k, evaluation.settings.size)
+        for k in range(evaluation.settings.motion_frames)
     ]
     frames: dict[str, list[Picture]] = {
-        "truth": [draw_truth(scene, view.camera, stage.device) for view in views]
+        "truth": [draw_truth(scene, view.camera, evaluation.device) for view in views]
     }
     for name, tolerance in (("full", 0.0), ("ours", DEFAULT_TOLERANCE)):
         frames[name] = [
-            as_picture(render(scene, view.camera, tolerance=tolerance, device=stage.device).color)
+            to_8bit(render(scene, view.camera, tolerance=tolerance, device=evaluation.device).color)
             for view in views
         ]
     steps = {
-        name: [e["flip"] for e in stage.judge.errors(itertools.pairwise(p))] for name, p in frames.items()
+        name: [e["flip"] for e in evaluation.judge.errors(itertools.pairwise(p))]
+        for name, p in frames.items()
     }
-    rows = [summary(name, steps[name], steps["truth"], steps["full"]) for name in ("truth", "full", "ours")]
+    rows = [steps_row(name, steps[name], steps["truth"], steps["full"]) for name in ("truth", "full", "ours")]
     worst = int(np.argmax(np.array(steps["ours"]) - np.array(steps["truth"])))
-    side = stage.settings.panel
-    stage.save(
+    side = evaluation.settings.panel
+    evaluation.save(
         "motion_worst",
-        sheet(
+        contact_sheet(
             [
                 [
                     (f"{name}, frame {worst}", crop(p[worst], side)),
@@ -68,7 +70,7 @@ def difference(a: Picture, b: Picture) -> Picture:
     return picture
 
 
-def summary(name: str, steps: list[float], truth: list[float], full: list[float]) -> Row:
+def steps_row(name: str, steps: list[float], truth: list[float], full: list[float]) -> Row:
     above = [step - own for step, own in zip(steps, truth, strict=True)]
     return {
         "frames": name,
@@ -92,9 +94,9 @@ def tables(result: dict[str, Any]) -> str:
     return markdown(_COLUMNS, result["rows"])
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
+def summary(result: dict[str, Any]) -> Summary:
     _, full, ours = result["rows"]
-    out = Verdict()
+    out = Summary()
     out.judge(
         ours["above_truth"] <= full["above_truth"],
         f"in a zoom, consecutive frames of ours differ by FLIP {ours['above_truth']:+.4f} more than the "

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from v3dg.bench import gpu
-from v3dg.bench.line import COLUMNS, build_row, full_row, summary
-from v3dg.bench.measure import Row, as_picture
-from v3dg.bench.stage import Stage, paper_tolerance
-from v3dg.bench.table import markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation import gpu
+from benchmarks.evaluation.camera_sweep import COLUMNS, build_row, full_row, sweep_row
+from benchmarks.evaluation.evaluation import Evaluation, paper_tolerance
+from benchmarks.evaluation.markdown import markdown
+from benchmarks.evaluation.measure import Row
+from benchmarks.evaluation.summary import Summary
 from v3dg.build import BuildConfig
+from v3dg.pictures import to_8bit
 from v3dg.select import select
 
 TITLE = "Tolerance: time against error"
@@ -24,50 +25,50 @@ _PAPER_TAUS = (512, 1024, 2048, 4096, 8192)
 _TOLERANCES = (0.5, 1.0, 2.0, 3.0, 4.4, 8.0, 16.0)
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    rows = [full_row(stage)]
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    rows = [full_row(evaluation)]
     sweeps = (
         ("paper", BuildConfig.paper(), [paper_tolerance(tau) for tau in _PAPER_TAUS]),
         ("ours", BuildConfig(), _TOLERANCES),
     )
     for name, config, tolerances in sweeps:
-        rows += [build_row(stage, name, config, tolerance) for tolerance in tolerances]
-    if stage.device == "cuda" and gpu.has_gsplat():
-        rows.append(gsplat_row(stage))
+        rows += [build_row(evaluation, name, config, tolerance) for tolerance in tolerances]
+    if evaluation.device == "cuda" and gpu.has_gsplat():
+        rows.append(gsplat_row(evaluation))
     return {"rows": rows}
 
 
-def gsplat_row(stage: Stage) -> Row:
+def gsplat_row(evaluation: Evaluation) -> Row:
     """gsplat draws every gaussian of the scene, which it is given in the world."""
     import torch
 
-    every_one = select(stage.full_scene, stage.line[0].camera, tolerance=0.0, cull=False)
+    every_one = select(evaluation.full_scene, evaluation.camera_sweep[0].camera, tolerance=0.0, cull=False)
     placed = every_one.gaussians(device="cuda")
     pictures, rows = [], []
-    for view, ours in zip(stage.line, stage.full_line, strict=True):
+    for view, ours in zip(evaluation.camera_sweep, evaluation.full_sweep, strict=True):
         with torch.no_grad():
-            pictures.append(as_picture(gpu.gsplat_picture(placed, view.camera, packed=True)[0]))
-        timed = gpu.time_gsplat(placed, view.camera, stage.settings.repeats)
+            pictures.append(to_8bit(gpu.gsplat_picture(placed, view.camera, packed=True)[0]))
+        timed = gpu.time_gsplat(placed, view.camera, evaluation.settings.repeats)
         rows.append({**ours.row("drawn"), **view.row(), **timed.row("drawn")})
-    truths = (stage.truth(i) for i in range(len(rows)))
-    errors = stage.judge.errors(zip(truths, pictures, strict=True))
+    truths = (evaluation.truth(i) for i in range(len(rows)))
+    errors = evaluation.judge.errors(zip(truths, pictures, strict=True))
     for row, error in zip(rows, errors, strict=True):
         row |= {f"drawn_{key}": value for key, value in error.items()}
     torch.cuda.empty_cache()
-    return summary(stage, "gsplat, full", 0.0, rows)
+    return sweep_row(evaluation, "gsplat, full", 0.0, rows)
 
 
 def tables(result: dict[str, Any]) -> str:
     return markdown(COLUMNS, result["rows"])
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
+def summary(result: dict[str, Any]) -> Summary:
     by_name: dict[str, list[Row]] = {}
     for row in result["rows"]:
         by_name.setdefault(row["levels"], []).append(row)
     full = by_name["full"][0]
     good = [row for row in by_name["ours"] if row["drawn_flip"] <= full["drawn_flip"]]
-    out = Verdict()
+    out = Summary()
     if good:
         best = max(good, key=lambda row: row["acceleration"])
         out.judge(

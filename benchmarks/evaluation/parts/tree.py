@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from v3dg.bench.line import COLUMNS, as_many_row, build_row, full_row
-from v3dg.bench.stage import PAPER_TOLERANCE, Stage
-from v3dg.bench.table import Column, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.camera_sweep import COLUMNS, as_many_row, build_row, full_row
+from benchmarks.evaluation.evaluation import PAPER_TOLERANCE, Evaluation
+from benchmarks.evaluation.markdown import Column, markdown
+from benchmarks.evaluation.summary import Summary
 from v3dg.build import BuildConfig
 from v3dg.select import DEFAULT_TOLERANCE
 
@@ -20,20 +20,20 @@ ABOUT = (
 _SHAPES = ((256, 32), (512, 16), (1024, 8), (2048, 4), (4096, 2))
 
 
-def run(stage: Stage) -> dict[str, Any]:
-    rows = [full_row(stage)]
+def run(evaluation: Evaluation) -> dict[str, Any]:
+    rows = [full_row(evaluation)]
     for cluster_size, group_size in _SHAPES:
         config = BuildConfig.paper(
             cluster_size=cluster_size,
             group_size=group_size,
             min_clusters=group_size,
-            steps=stage.settings.tree_steps,
+            steps=evaluation.settings.tree_steps,
         )
-        rows.append(build_row(stage, f"{cluster_size} x {group_size}", config, PAPER_TOLERANCE))
+        rows.append(build_row(evaluation, f"{cluster_size} x {group_size}", config, PAPER_TOLERANCE))
     ours = BuildConfig()
     name = f"ours, {ours.cluster_size} x {ours.group_size}"
-    rows.append(build_row(stage, name, ours, DEFAULT_TOLERANCE))
-    rows.append(as_many_row(stage, "ours, as many as 4096 x 2", ours, rows[len(_SHAPES)]))
+    rows.append(build_row(evaluation, name, ours, DEFAULT_TOLERANCE))
+    rows.append(as_many_row(evaluation, "ours, as many as 4096 x 2", ours, rows[len(_SHAPES)]))
     return {"rows": rows}
 
 
@@ -42,11 +42,11 @@ def tables(result: dict[str, Any]) -> str:
     return markdown((*columns, *COLUMNS[2:]), result["rows"])
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
+def summary(result: dict[str, Any]) -> Summary:
     shapes = [row for row in result["rows"][1:] if not row["levels"].startswith("ours")]
     ours, rival = result["rows"][-1], shapes[-1]
     flips = [row["drawn_flip"] for row in shapes]
-    out = Verdict()
+    out = Summary()
     out.judge(
         ours["drawn_flip"] < rival["drawn_flip"],
         f"tree or DAG makes little difference to the paper's settings (FLIP {min(flips):.4f} to "

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from v3dg.bench.measure import Row, draw_truth, mean_of
-from v3dg.bench.stage import Stage, View, close_distance
-from v3dg.bench.table import Column, markdown
-from v3dg.bench.verdict import Verdict
+from benchmarks.evaluation.evaluation import Evaluation, View, close_distance
+from benchmarks.evaluation.markdown import Column, markdown
+from benchmarks.evaluation.measure import Row
+from benchmarks.evaluation.summary import Summary
+from v3dg._judges import mean_of
 from v3dg.bundle import Bundle
 from v3dg.cameras import turntable
+from v3dg.metrics import draw_truth
 from v3dg.select import DEFAULT_TOLERANCE
 
 TITLE = "Original views"
@@ -24,21 +26,21 @@ _ELEVATION = 30.0
 _NOTICED_DB = 0.01
 
 
-def run(stage: Stage) -> dict[str, Any]:
+def run(evaluation: Evaluation) -> dict[str, Any]:
     return {
         "tolerance": DEFAULT_TOLERANCE,
-        "rows": [row_of(stage, name, bundle) for name, bundle in stage.close_bundles()],
+        "rows": [row_of(evaluation, name, bundle) for name, bundle in evaluation.close_bundles()],
     }
 
 
-def row_of(stage: Stage, name: str, bundle: Bundle) -> Row:
+def row_of(evaluation: Evaluation, name: str, bundle: Bundle) -> Row:
     asset = bundle.level_gaussians(0)
     center, distance = close_distance(asset)
-    side = stage.settings.close_px
+    side = evaluation.settings.close_px
     cameras = turntable(
         center,
         distance,
-        stage.settings.close_views,
+        evaluation.settings.close_views,
         math.radians(_ELEVATION),
         width=side,
         height=side,
@@ -47,9 +49,9 @@ def row_of(stage: Stage, name: str, bundle: Bundle) -> Row:
     rows = []
     for camera in cameras:
         view = View(0.0, _ELEVATION, distance, camera)
-        full, ours = (stage.shoot(bundle, view, tolerance) for tolerance in (0.0, DEFAULT_TOLERANCE))
-        truth = draw_truth(bundle, camera, stage.device)
-        same, of_full, of_ours = stage.judge.errors(
+        full, ours = (evaluation.shoot(bundle, view, tolerance) for tolerance in (0.0, DEFAULT_TOLERANCE))
+        truth = draw_truth(bundle, camera, evaluation.device)
+        same, of_full, of_ours = evaluation.judge.errors(
             ((full.picture, ours.picture), (truth, full.picture), (truth, ours.picture))
         )
         row = {**full.row("full"), **ours.row("ours"), "psnr_to_full": same["psnr"]}
@@ -95,8 +97,8 @@ def tables(result: dict[str, Any]) -> str:
     return markdown(_COLUMNS, result["rows"])
 
 
-def verdict(result: dict[str, Any]) -> Verdict:
-    out = Verdict()
+def summary(result: dict[str, Any]) -> Summary:
+    out = Summary()
     worst = max(result["rows"], key=_drop)
     out.judge(
         _drop(worst) <= _NOTICED_DB,

@@ -4,11 +4,11 @@ Gaussians are spread as training spreads them: flat ones that cover surfaces, ne
 wide range of sizes and opacities, colour that depends on the view where something shines or light passes.
 """
 
-from v3dg.procedural.donut import make_donut
-from v3dg.procedural.person import make_person
-from v3dg.procedural.temple import make_temple
-from v3dg.procedural.toadstools import make_asset, place_field
-from v3dg.procedural.tree import TREE_KINDS, make_tree
+from benchmarks.worlds.procedural.donut import make_donut
+from benchmarks.worlds.procedural.person import make_person
+from benchmarks.worlds.procedural.temple import make_temple
+from benchmarks.worlds.procedural.toadstools import make_asset, place_field
+from benchmarks.worlds.procedural.tree import TREE_KINDS, make_tree
 
 __all__ = [
     "TREE_KINDS",

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from v3dg.procedural._parts import UP, Array, unit
+from benchmarks.worlds.procedural._parts import UP, Array, unit
 
 _HIPS, _WAIST, _CHEST, _NECK, _HEAD = 0.93, 1.08, 1.29, 1.47, 1.64  # heights
 _SIDES = (-1.0, 1.0)

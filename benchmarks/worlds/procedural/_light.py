@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.worlds.procedural._parts import UP, Array, Part, quaternions, unit
 from v3dg.gaussians import Gaussians
-from v3dg.procedural._parts import UP, Array, Part, quaternions, unit
 
 SH_C0 = 0.28209479177387814  # the constant basis function of spherical harmonics
 SH_C1 = 0.4886025119029199  # the factor of the linear ones

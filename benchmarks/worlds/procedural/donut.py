@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from v3dg.gaussians import Gaussians
-from v3dg.procedural._light import gaussians_of
-from v3dg.procedural._parts import (
+from benchmarks.worlds.procedural._light import gaussians_of
+from benchmarks.worlds.procedural._parts import (
     Array,
     Noise,
     Part,
@@ -18,6 +17,7 @@ from v3dg.procedural._parts import (
     smoothstep,
     unit,
 )
+from v3dg.gaussians import Gaussians
 
 RING = 0.068  # radius of the tube's axis
 TUBE = 0.040  # of the tube, icing included

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from benchmarks.worlds.procedural._body import Figure, Shape, random_figure
+from benchmarks.worlds.procedural._light import gaussians_of
+from benchmarks.worlds.procedural._parts import UP, Array, Noise, Part, cover, mix, smoothstep, unit
 from v3dg.gaussians import Gaussians
-from v3dg.procedural._body import Figure, Shape, random_figure
-from v3dg.procedural._light import gaussians_of
-from v3dg.procedural._parts import UP, Array, Noise, Part, cover, mix, smoothstep, unit
 
 _SKINS = np.array(
     [[0.62, 0.36, 0.24], [0.48, 0.26, 0.16], [0.30, 0.15, 0.085], [0.14, 0.065, 0.038], [0.70, 0.44, 0.32]]

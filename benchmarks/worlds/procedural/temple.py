@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v3dg.gaussians import Gaussians
-from v3dg.procedural._light import gaussians_of
-from v3dg.procedural._parts import (
+from benchmarks.worlds.procedural._light import gaussians_of
+from benchmarks.worlds.procedural._parts import (
     UP,
     Array,
     Noise,
@@ -26,6 +25,7 @@ from v3dg.procedural._parts import (
     surface_area,
     unit,
 )
+from v3dg.gaussians import Gaussians
 
 # Lengths in metres. Columns stand on a rectangle of 6 x 11; x is across the front, which looks along -y.
 _COLUMNS_X, _COLUMNS_Y, _PITCH = 6, 11, 2.35

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v3dg.gaussians import Gaussians
-from v3dg.procedural._light import SH_C0, SH_C1, SKY, SUN, TO_SUN, display
-from v3dg.procedural._parts import (
+from benchmarks.worlds.procedural._light import SH_C0, SH_C1, SKY, SUN, TO_SUN, display
+from benchmarks.worlds.procedural._parts import (
     GOLDEN_ANGLE,
     UP,
     Array,
@@ -31,6 +30,7 @@ from v3dg.procedural._parts import (
     strips,
     unit,
 )
+from v3dg.gaussians import Gaussians
 
 
 def _discs(

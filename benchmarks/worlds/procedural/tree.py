@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.gaussians import Gaussians
-from v3dg.procedural._light import gaussians_of
-from v3dg.procedural._parts import (
+from benchmarks.worlds.procedural._light import gaussians_of
+from benchmarks.worlds.procedural._parts import (
     GOLDEN_ANGLE,
     UP,
     Array,
@@ -22,6 +21,7 @@ from v3dg.procedural._parts import (
     strips,
     unit,
 )
+from v3dg.gaussians import Gaussians
 
 _STEPS = 10  # segments of a branch
 _CLEARANCE = 0.3  # m: no branch comes nearer to the ground
