@@ -22,7 +22,7 @@ from v3dg.viewer.frame import SceneView
 from v3dg.viewer.server import Site
 from v3dg.viewer.view import View, look_at
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from viewer_client import Tab
 
