@@ -106,6 +106,11 @@ def test_an_environment_is_loaded_with_the_rest(tmp_path, bundle):
     assert len(v3dg.load(path)) == len(bundle.level_gaussians(0)) + len(bundle.level_gaussians(3))
 
 
+def test_an_environment_that_is_null_is_none(tmp_path, bundle):
+    path = edited(tmp_path, bundle, environment=None)
+    assert len(v3dg.load(path)) == len(bundle.level_gaussians(0))
+
+
 def test_a_leaf_without_its_finest_level_has_the_next(tmp_path, bundle):
     path = edited(tmp_path, bundle)
     index = json.loads(path.read_text())
@@ -135,6 +140,18 @@ def test_hostile_indices_are_refused(tmp_path, bundle, changes, message):
     with pytest.raises(ValueError, match=r"lod-meta\.json") as error:
         v3dg.load(path)
     assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"environment": "../meta.json"}, {"environment": 5}, {"tree": {}}, {"file": 99}], ids=str
+)
+def test_a_wrong_index_is_refused_before_a_chunk_is_decoded(tmp_path, bundle, changes, monkeypatch):
+    path = edited(tmp_path, bundle, **changes)
+    decoded = []
+    monkeypatch.setattr(v3dg.formats.sog, "read", decoded.append)
+    with pytest.raises(ValueError, match=r"lod-meta\.json"):
+        v3dg.load(path)
+    assert decoded == []
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -410,14 +410,6 @@ def test_hostile_spz_of_version_4_is_refused(tmp_path, place, value, message):
     assert_refused_cheaply(tmp_path / "a.spz", message)
 
 
-def test_zstandard_is_asked_for_where_it_is_missing(monkeypatch):
-    monkeypatch.setitem(sys.modules, "zstandard", None)
-    with pytest.raises(
-        ImportError, match=r"sh0_v4\.spz: .* needs the package zstandard; pip install 'v3dg\[formats\]'"
-    ):
-        load(FIXTURES / "sh0_v4.spz")
-
-
 def sog_with(tmp_path, edit=None, files=None, compression=zipfile.ZIP_STORED):
     """The fixture with `edit` of the text of its meta.json, and other contents of some files."""
     path = tmp_path / "a.sog"

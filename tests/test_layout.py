@@ -49,7 +49,7 @@ SOURCES = sorted(str(p.relative_to(ROOT)) for p in CSRC.rglob("*") if p.suffix i
 MODULES = sorted((ROOT / "v3dg").rglob("*.py"))
 MEASURING = sorted(p for part in ("evaluation", "worlds") for p in (ROOT / "benchmarks" / part).rglob("*.py"))
 MOST_LINES, MOST_LINES_A_FILE = 10_000, 400
-TOO_LONG = {"v3dg/build.py", "v3dg/bundle.py", "v3dg/viewer/page.py"}
+TOO_LONG = {"v3dg/build.py", "v3dg/bundle.py"}
 
 
 def module_name(path):
@@ -139,21 +139,56 @@ def test_kernels_are_started_by_launch_alone():
     assert [str(p) for p in sources if "<<<" in p.read_text(encoding="utf-8")] == []
 
 
-def imports_when_loaded(path):
-    """Modules that a Python file imports as it is loaded, not inside functions or for type checkers."""
-    names, statements = set(), list(ast.parse(path.read_text(encoding="utf-8")).body)
-    while statements:
-        statement = statements.pop()
-        if isinstance(statement, ast.Import):
-            names |= {alias.name for alias in statement.names}
-        elif isinstance(statement, ast.ImportFrom):
-            names.add(statement.module)
-            names |= {f"{statement.module}.{alias.name}" for alias in statement.names}
-        elif isinstance(statement, ast.If) and "TYPE_CHECKING" in ast.unparse(statement.test):
-            statements += statement.orelse
-        elif not isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            statements += [child for child in ast.iter_child_nodes(statement) if isinstance(child, ast.stmt)]
+def imports_of(path, *, inside_functions):
+    """Modules that a Python file imports, except for type checkers; and the names that it takes from them."""
+    names, todo = set(), [ast.parse(path.read_text(encoding="utf-8"))]
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {node.module} - {"v3dg"}  # whose modules are taken from it, too
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            todo += node.orelse
+        elif inside_functions or not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            todo += ast.iter_child_nodes(node)
     return names
+
+
+def imports_when_loaded(path):
+    """Modules that a Python file imports as it is loaded."""
+    return imports_of(path, inside_functions=False)
+
+
+def room_of(name):
+    """The module or package right in v3dg/ that a module is, or is in."""
+    return f"{name}.__init__".split(".")[1]
+
+
+def rooms_imported(path, rooms):
+    """Modules and packages right in v3dg/ that a file imports."""
+    for name in imports_of(path, inside_functions=True):
+        if name.split(".")[0] == "v3dg":
+            room = room_of(name)
+            yield room if room in rooms else "__init__"  # which has the public names
+
+
+def order_of_v3dg():
+    """Each after what it imports, as CONTRIBUTING.md promises."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    return re.search(r"imports only what stands before it.*?```text\n(.*?)```", text, re.DOTALL)[1].split()
+
+
+def test_every_module_of_v3dg_has_its_place_in_the_order():
+    assert sorted(order_of_v3dg()) == sorted({room_of(module_name(path)) for path in MODULES} | {"_core"})
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
+def test_module_imports_only_what_stands_before_it(path):
+    order, room = order_of_v3dg(), room_of(module_name(path))
+    below = {room, *order[: order.index(room)]}
+    assert sorted(set(rooms_imported(path, order)) - below) == []
 
 
 def test_modules_do_not_import_in_a_circle():

@@ -1,6 +1,5 @@
 import hashlib
 import math
-import os
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ from hypothesis import strategies as st
 
 import scenes
 import v3dg
+from command_line import TESTS_ENVIRONMENT
 from compare import (
     BACKGROUND_GRADIENT,
     FINITE_DIFFERENCE,
@@ -720,12 +720,9 @@ np.savez(sys.argv[1], *out[0])
 
 def run_elsewhere(path, what, **environment):
     """Arrays that RUN makes in a process of its own, or None where the processor lacks the instructions."""
-    here = os.path.dirname(os.path.abspath(__file__))
-    root = os.path.dirname(os.path.dirname(os.path.abspath(v3dg.__file__)))
-    paths = os.pathsep.join([here, root, os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "-c", RUN, str(path), what],
-        env={**os.environ, "PYTHONPATH": paths, **environment},
+        env=TESTS_ENVIRONMENT | environment,
         capture_output=True,
         text=True,
         check=False,

@@ -1,15 +1,13 @@
-import json
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.studies import exact_cut
+import exact_cut
+from command_line import TESTS_ENVIRONMENT
 from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, covariances, lod_bundle, random_camera, random_scene, rotation_matrices, turned
@@ -52,9 +50,8 @@ def tolerances_of(draw, scene, camera):
     return draw(st.sampled_from([0.0, exact, np.inf, 1e-3, 0.5, 1e4]))
 
 
-def test_many_random_trials_have_no_violation(capsys):
-    assert exact_cut.main(["--trials", "200000", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["violations"] == 0
+def test_many_random_trials_have_no_violation():
+    assert exact_cut.run_trials(200_000)["violations"] == 0
 
 
 @settings(max_examples=300)
@@ -385,11 +382,10 @@ print(hashlib.sha256(selection.instance_ids.tobytes() + selection.cluster_ids.to
 
 
 def test_number_of_threads_changes_nothing():
-    folder = str(Path(__file__).parent)
     digests = [
         subprocess.run(
-            [sys.executable, "-c", f"import sys; sys.path.insert(0, {folder!r})\n{DIGEST}"],
-            env={**os.environ, "OMP_NUM_THREADS": threads},
+            [sys.executable, "-c", DIGEST],
+            env=TESTS_ENVIRONMENT | {"OMP_NUM_THREADS": threads},
             check=True,
             capture_output=True,
             text=True,

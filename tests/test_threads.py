@@ -1,7 +1,6 @@
 """Several threads, forked processes, torch beside us: the same results, and no deadlock."""
 
 import hashlib
-import os
 import subprocess
 import sys
 import threading
@@ -16,6 +15,7 @@ import pytest
 import scenes
 import scenes_lod
 import v3dg
+from command_line import TESTS_ENVIRONMENT
 from devices import host
 
 CAMERA = scenes.camera(131, 97, fx=90.0, cx=60.0, cy=55.0, pose=scenes.pose(8))
@@ -181,11 +181,9 @@ def test_other_threads_go_on_while_the_core_is_at_work(tmp_path, monkeypatch):
 
 def run(script, **environment):
     """What a script of its own prints, which may not hang."""
-    here = Path(__file__).parent
-    paths = [str(here), str(Path(v3dg.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
         [sys.executable, "-W", "ignore::DeprecationWarning", "-c", script],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), **environment},
+        env=TESTS_ENVIRONMENT | environment,
         capture_output=True,
         text=True,
         check=False,

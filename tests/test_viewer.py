@@ -1,4 +1,4 @@
-"""The viewer without a browser; test_viewer_page.py opens it in one."""
+"""The viewer without a browser; test_viewer_tab.py and test_viewer_browser.py open it in one."""
 
 import contextlib
 import math
@@ -14,8 +14,8 @@ import scenes_lod
 import v3dg
 from v3dg import Camera, Gaussians, Scene, _core
 from v3dg.pictures import to_8bit
-from v3dg.viewer.frame import MOST_COUNTED, Frame, Settings, Stage, Stopped, ramp
-from v3dg.viewer.pacing import Draft, Pacer, Painter, Request, finer_sizes
+from v3dg.viewer.frame import MOST_COUNTED, Frame, SceneView, Settings, Stopped, ramp
+from v3dg.viewer.pacing import Draft, Pacer, RenderLoop, Request, finer_sizes
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View, look_at
 
@@ -88,54 +88,54 @@ def view():
 
 
 @pytest.fixture
-def stage(crowd, device):
-    return Stage(crowd, device=device)
+def scene_view(crowd, device):
+    return SceneView(crowd, device=device)
 
 
-def drawn(stage, view, device, **options):
+def drawn(scene_view, view, device, **options):
     """What `v3dg.render` draws there, and its figures."""
-    image = v3dg.render(stage.scene, view.camera(*SIZE, stage.near), device=device, **options)
+    image = v3dg.render(scene_view.scene, view.camera(*SIZE, scene_view.near), device=device, **options)
     color = image.color if device == "cpu" else image.color.cpu().numpy()
     return to_8bit(color), image.stats
 
 
 @pytest.mark.parametrize("shows", ["appearance", "level", "cluster"])
-def test_frame_is_the_picture_of_render(stage, view, device, shows):
-    frame = stage.frame(view, SIZE, Settings(shows=shows, tolerance=20.0))
-    picture, stats = drawn(stage, view, device, tolerance=20.0, color_by=shows)
+def test_frame_is_the_picture_of_render(scene_view, view, device, shows):
+    frame = scene_view.frame(view, SIZE, Settings(shows=shows, tolerance=20.0))
+    picture, stats = drawn(scene_view, view, device, tolerance=20.0, color_by=shows)
     np.testing.assert_array_equal(frame.pixels, picture)
     assert frame.figures.gaussians_selected == stats.gaussians_selected
     assert frame.figures.gaussians_in_view == stats.gaussians_in_frustum
     assert frame.size == SIZE
 
 
-def test_figures_count_gaussians_by_level(stage, view):
-    figures = stage.frame(view, SIZE, Settings(tolerance=20.0)).figures
+def test_figures_count_gaussians_by_level(scene_view, view):
+    figures = scene_view.frame(view, SIZE, Settings(tolerance=20.0)).figures
     assert figures.levels.sum() == figures.gaussians_selected
     assert np.count_nonzero(figures.levels) > 2
-    finest = stage.frame(view, SIZE, Settings(tolerance=0.0)).figures
+    finest = scene_view.frame(view, SIZE, Settings(tolerance=0.0)).figures
     assert finest.levels[0] == finest.gaussians_selected > figures.gaussians_selected
-    coarse = stage.frame(view, SIZE, Settings(tolerance=0.0, min_level=2)).figures
+    coarse = scene_view.frame(view, SIZE, Settings(tolerance=0.0, min_level=2)).figures
     assert (coarse.levels[:2] == 0).all()
     assert coarse.levels[2] == coarse.gaussians_selected
     assert figures.memory_bytes > 10 << 20
 
 
-def test_budget_is_kept_and_one_too_small_is_an_error(stage, view):
+def test_budget_is_kept_and_one_too_small_is_an_error(scene_view, view):
     budget = 3000
-    figures = stage.frame(view, SIZE, Settings(tolerance=0.0, budget=budget)).figures
+    figures = scene_view.frame(view, SIZE, Settings(tolerance=0.0, budget=budget)).figures
     assert 0 < figures.gaussians_selected <= budget
     assert figures.tolerance > 0
     with pytest.raises(ValueError, match="budget: expected at least"):
-        stage.frame(view, SIZE, Settings(tolerance=0.0, budget=1))
+        scene_view.frame(view, SIZE, Settings(tolerance=0.0, budget=1))
 
 
-def test_alpha_and_depth_are_shown(stage, view, device):
-    image = v3dg.render(stage.scene, view.camera(*SIZE, stage.near), tolerance=0.0, device=device)
+def test_alpha_and_depth_are_shown(scene_view, view, device):
+    image = v3dg.render(scene_view.scene, view.camera(*SIZE, scene_view.near), tolerance=0.0, device=device)
     alpha, depth = (np.asarray(p if device == "cpu" else p.cpu()) for p in (image.alpha, image.depth))
-    shown = stage.frame(view, SIZE, Settings(shows="alpha", tolerance=0.0))
+    shown = scene_view.frame(view, SIZE, Settings(shows="alpha", tolerance=0.0))
     np.testing.assert_array_equal(shown.pixels, np.repeat(to_8bit(alpha)[..., None], 3, axis=2))
-    shown = stage.frame(view, SIZE, Settings(shows="depth", tolerance=0.0))
+    shown = scene_view.frame(view, SIZE, Settings(shows="depth", tolerance=0.0))
     far, near = shown.value_range
     inside = (alpha > 0.99) & (depth > near) & (depth < far)
     assert inside.sum() > 100
@@ -145,10 +145,10 @@ def test_alpha_and_depth_are_shown(stage, view, device):
     assert (shown.pixels[alpha == 0] == 0).all()
 
 
-def test_an_empty_picture_is_black_in_every_mode(stage):
+def test_an_empty_picture_is_black_in_every_mode(scene_view):
     away = look_at((0, -60, 0), (0, -70, 0), (0, 0, 1), 0.5, 1.5)
     for shows in ("appearance", "level", "depth", "alpha", "count", "difference"):
-        frame = stage.frame(away, SIZE, Settings(shows=shows, split=0.0))
+        frame = scene_view.frame(away, SIZE, Settings(shows=shows, split=0.0))
         assert not frame.pixels.any()
         assert frame.figures.gaussians_in_view == 0
 
@@ -159,57 +159,61 @@ def test_an_empty_picture_is_black_in_every_mode(stage):
 )
 def test_count_is_of_the_gaussians_that_a_pixel_is_blended_of(opacities, count):
     """A gaussian that would take the transmittance to 1e-4 or below is not blended, nor what is behind it."""
-    stage = Stage(stack(opacities))
+    scene_view = SceneView(stack(opacities))
     camera = AXIS.camera(33, 33, 0.01)
-    cut = v3dg.select(stage.scene, camera)
+    cut = v3dg.select(scene_view.scene, camera)
     window = (0, 0, 33, 33)
-    counts, in_view = stage._count(cut, camera, window, None)
+    counts, in_view = scene_view._count(cut, camera, window, None)
     assert counts[16, 16] == count
     assert in_view == len(opacities)
-    alpha = v3dg.render(stage.scene, camera).alpha
+    alpha = v3dg.render(scene_view.scene, camera).alpha
     np.testing.assert_array_equal(counts > 0, alpha > 0)
 
 
 def test_count_is_shown_on_a_scale_of_octaves(device):
     pixels = {}
     for number in (2, 16):
-        frame = Stage(stack([0.01] * number), device=device).frame(AXIS, (33, 33), Settings(shows="count"))
+        frame = SceneView(stack([0.01] * number), device=device).frame(
+            AXIS, (33, 33), Settings(shows="count")
+        )
         pixels[number] = frame.pixels[16, 16]
         assert frame.value_range == (1.0, MOST_COUNTED)
     for number, pixel in pixels.items():
         np.testing.assert_array_equal(pixel, to_8bit(ramp(np.array(math.log2(number) / 8))))
 
 
-def test_difference_is_to_all_gaussians_and_amplified(stage, view):
-    none = stage.frame(view, SIZE, Settings(shows="difference", tolerance=0.0))
+def test_difference_is_to_all_gaussians_and_amplified(scene_view, view):
+    none = scene_view.frame(view, SIZE, Settings(shows="difference", tolerance=0.0))
     assert not none.pixels.any()
     one, ten = (
-        stage.frame(view, SIZE, Settings(shows="difference", tolerance=20.0, gain=gain)).pixels.astype(int)
+        scene_view.frame(view, SIZE, Settings(shows="difference", tolerance=20.0, gain=gain)).pixels.astype(
+            int
+        )
         for gain in (1, 10)
     )
     assert one.max() > 10
     assert abs(np.minimum(10 * one, 255) - ten).max() <= 5
 
 
-def test_split_shows_all_gaussians_on_the_left(stage, view, device):
+def test_split_shows_all_gaussians_on_the_left(scene_view, view, device):
     settings = Settings(tolerance=20.0, split=0.25)
-    pixels = stage.frame(view, SIZE, settings).pixels
-    fine, _ = drawn(stage, view, device, tolerance=0.0)
-    coarse, _ = drawn(stage, view, device, tolerance=20.0)
+    pixels = scene_view.frame(view, SIZE, settings).pixels
+    fine, _ = drawn(scene_view, view, device, tolerance=0.0)
+    coarse, _ = drawn(scene_view, view, device, tolerance=20.0)
     np.testing.assert_array_equal(pixels[:, :23], fine[:, :23])
     np.testing.assert_array_equal(pixels[:, 25:], coarse[:, 25:])
     assert (pixels[:, 23:25] == 255).all()
     assert not np.array_equal(fine[:, :23], coarse[:, :23])
     np.testing.assert_array_equal(
-        stage.frame(view, SIZE, replace(settings, split=1.0)).pixels[:, :-1], fine[:, :-1]
+        scene_view.frame(view, SIZE, replace(settings, split=1.0)).pixels[:, :-1], fine[:, :-1]
     )
 
 
-def test_frozen_cut_stays_while_the_camera_moves(stage, view):
+def test_frozen_cut_stays_while_the_camera_moves(scene_view, view):
     far = look_at((0, -30, 1), (0, 0, 0), (0, 0, 1), 0.7, 1.5)
-    there = stage.frame(far, SIZE, Settings())
-    here = stage.frame(view, SIZE, Settings())
-    frozen = stage.frame(view, SIZE, Settings(frozen=far))
+    there = scene_view.frame(far, SIZE, Settings())
+    here = scene_view.frame(view, SIZE, Settings())
+    frozen = scene_view.frame(view, SIZE, Settings(frozen=far))
     np.testing.assert_array_equal(frozen.figures.levels, there.figures.levels)
     assert frozen.figures.gaussians_selected < here.figures.gaussians_selected
     assert not np.array_equal(frozen.pixels, here.pixels)
@@ -218,26 +222,26 @@ def test_frozen_cut_stays_while_the_camera_moves(stage, view):
 
 def test_asset_is_drawn_whole_and_has_one_level(view):
     asset = scenes_lod.blob(np.random.default_rng(1), 500)
-    stage = Stage(asset)
-    assert stage.num_levels == 1
-    assert stage.num_gaussians == 500
-    frame = stage.frame(view, SIZE, Settings())
-    whole = to_8bit(v3dg.render(asset, view.camera(*SIZE, stage.near)).color)
+    scene_view = SceneView(asset)
+    assert scene_view.num_levels == 1
+    assert scene_view.num_gaussians == 500
+    frame = scene_view.frame(view, SIZE, Settings())
+    whole = to_8bit(v3dg.render(asset, view.camera(*SIZE, scene_view.near)).color)
     assert abs(frame.pixels.astype(int) - whole).max() <= 1
     assert whole.any()
 
 
 def test_scene_of_nothing_is_drawn():
-    frame = Stage(Scene()).frame(AXIS, SIZE, Settings())
+    frame = SceneView(Scene()).frame(AXIS, SIZE, Settings())
     assert not frame.pixels.any()
 
 
 def test_a_picture_that_is_stopped_is_given_up(crowd, view):
-    stage, stop = Stage(crowd), _core.Stop()
+    scene_view, stop = SceneView(crowd), _core.Stop()
     stop.request()
     for shows in ("appearance", "count", "difference"):
         with pytest.raises(Stopped):
-            stage.frame(view, SIZE, Settings(shows=shows), stop)
+            scene_view.frame(view, SIZE, Settings(shows=shows), stop)
 
 
 def test_a_stop_ends_a_long_picture_early():
@@ -247,12 +251,12 @@ def test_a_stop_ends_a_long_picture_early():
         scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 4000, size=0.2), 256),
         positions=rng.normal(size=(2000, 3)),
     )
-    stage, settings = Stage(scene), Settings(tolerance=0.0)
+    scene_view, settings = SceneView(scene), Settings(tolerance=0.0)
     view = look_at((0, -9, 0), (0, 0, 0), (0, 0, 1), 0.7, 1.5)
     start = time.monotonic()
-    undisturbed = stage.frame(view, (800, 600), settings).pixels
+    undisturbed = scene_view.frame(view, (800, 600), settings).pixels
     whole = time.monotonic() - start
-    in_bands = stage.frame(view, (800, 600), settings, _core.Stop()).pixels
+    in_bands = scene_view.frame(view, (800, 600), settings, _core.Stop()).pixels
     np.testing.assert_array_equal(in_bands, undisturbed)
     shortest = whole
     for part in range(4, 14):  # the machine may be busy, now or then
@@ -261,7 +265,7 @@ def test_a_stop_ends_a_long_picture_early():
         start = time.monotonic()
         timer.start()
         with contextlib.suppress(Stopped):
-            stage.frame(view, (800, 600), settings, stop)
+            scene_view.frame(view, (800, 600), settings, stop)
             continue
         shortest = min(shortest, time.monotonic() - start)
     assert shortest < 0.6 * whole
@@ -322,10 +326,10 @@ def test_sizes_double_up_to_the_full_one():
     assert finer_sizes((800, 400), (800, 400)) == []
 
 
-# The painter.
+# The render loop.
 
 
-class FakeStage:
+class FakeSceneView:
     """Notes what is drawn; `hold` makes larger pictures wait until they are stopped."""
 
     draws_all_while_moving = False
@@ -357,9 +361,9 @@ class NoPacer:
 
 
 @pytest.fixture
-def painting(request):
-    """A painter, its stage, and what it sent: (view, size, is it final)."""
-    stage, sent, errors, is_final = FakeStage(), [], [], threading.Event()
+def rendering(request):
+    """A render loop, what it draws of, and what it sent: (view, size, is it final)."""
+    scene_view, sent, errors, is_final = FakeSceneView(), [], [], threading.Event()
 
     def send(frame, final):
         sent.append((frame.pixels[0, 0, 0], frame.size, final))
@@ -370,9 +374,9 @@ def painting(request):
         errors.append(error)
         is_final.set()
 
-    painter = Painter(stage, send, fail, getattr(request, "param", None))
-    yield SimpleNamespace(painter=painter, stage=stage, sent=sent, errors=errors, is_final=is_final)
-    painter.close()
+    loop = RenderLoop(scene_view, send, fail, getattr(request, "param", None))
+    yield SimpleNamespace(loop=loop, scene_view=scene_view, sent=sent, errors=errors, is_final=is_final)
+    loop.close()
 
 
 def wait(event):
@@ -380,83 +384,83 @@ def wait(event):
     event.clear()
 
 
-def test_a_request_is_answered_small_and_then_in_full(painting):
-    painting.painter.ask(Request(7, (160, 80), Settings()))
-    wait(painting.is_final)
-    assert painting.sent == [(7, (40, 20), False), (7, (80, 40), False), (7, (160, 80), True)]
+def test_a_request_is_answered_small_and_then_in_full(rendering):
+    rendering.loop.ask(Request(7, (160, 80), Settings()))
+    wait(rendering.is_final)
+    assert rendering.sent == [(7, (40, 20), False), (7, (80, 40), False), (7, (160, 80), True)]
 
 
-def test_a_new_request_ends_a_large_picture(painting):
-    painting.stage.hold = True
-    painting.painter.ask(Request(1, (160, 80), Settings()))
-    wait(painting.stage.is_held)
-    painting.stage.hold = False
-    painting.painter.ask(Request(2, (160, 80), Settings()))
-    wait(painting.is_final)
-    assert (1, (160, 80), True) not in painting.sent
-    assert painting.sent[-1] == (2, (160, 80), True)
+def test_a_new_request_ends_a_large_picture(rendering):
+    rendering.scene_view.hold = True
+    rendering.loop.ask(Request(1, (160, 80), Settings()))
+    wait(rendering.scene_view.is_held)
+    rendering.scene_view.hold = False
+    rendering.loop.ask(Request(2, (160, 80), Settings()))
+    wait(rendering.is_final)
+    assert (1, (160, 80), True) not in rendering.sent
+    assert rendering.sent[-1] == (2, (160, 80), True)
 
 
-def test_of_many_requests_the_last_is_drawn(painting):
+def test_of_many_requests_the_last_is_drawn(rendering):
     for view in range(200):
-        painting.painter.ask(Request(view, (160, 80), Settings()))
-    wait(painting.is_final)
-    assert painting.sent[-1] == (199, (160, 80), True)
-    assert len(painting.sent) < 200
+        rendering.loop.ask(Request(view, (160, 80), Settings()))
+    wait(rendering.is_final)
+    assert rendering.sent[-1] == (199, (160, 80), True)
+    assert len(rendering.sent) < 200
 
 
-def test_a_comparison_of_too_many_gaussians_waits_for_the_rest(painting):
+def test_a_comparison_of_too_many_gaussians_waits_for_the_rest(rendering):
     settings = Settings(shows="difference", split=0.5, tolerance=0.0)
-    painting.painter.ask(Request(3, (160, 80), settings))
-    wait(painting.is_final)
-    first, *others = painting.stage.drawn
+    rendering.loop.ask(Request(3, (160, 80), settings))
+    wait(rendering.is_final)
+    first, *others = rendering.scene_view.drawn
     assert not first[2].compares
     assert first[2].tolerance > 0
     assert all(other[2] == settings for other in others)
 
 
-def test_few_gaussians_are_compared_while_moving(painting):
+def test_few_gaussians_are_compared_while_moving(rendering):
     settings = Settings(shows="difference", tolerance=0.0)
-    painting.stage.draws_all_while_moving = True
-    painting.painter.ask(Request(3, (160, 80), settings))
-    wait(painting.is_final)
-    assert all(drawn[2] == settings for drawn in painting.stage.drawn)
+    rendering.scene_view.draws_all_while_moving = True
+    rendering.loop.ask(Request(3, (160, 80), settings))
+    wait(rendering.is_final)
+    assert all(drawn[2] == settings for drawn in rendering.scene_view.drawn)
 
 
-@pytest.mark.parametrize("painting", [NoPacer()], indirect=True)
-def test_a_coarser_cut_is_replaced_at_rest_though_the_size_is_the_same(painting):
+@pytest.mark.parametrize("rendering", [NoPacer()], indirect=True)
+def test_a_coarser_cut_is_replaced_at_rest_though_the_size_is_the_same(rendering):
     settings = Settings(tolerance=0.5)
-    painting.painter.ask(Request(1, (16, 8), settings))
-    wait(painting.is_final)
+    rendering.loop.ask(Request(1, (16, 8), settings))
+    wait(rendering.is_final)
     coarser = replace(settings, tolerance=v3dg.DEFAULT_TOLERANCE)
-    assert painting.stage.drawn == [(1, (16, 8), coarser), (1, (16, 8), settings)]
-    assert [final for *_, final in painting.sent] == [False, True]
+    assert rendering.scene_view.drawn == [(1, (16, 8), coarser), (1, (16, 8), settings)]
+    assert [final for *_, final in rendering.sent] == [False, True]
 
 
-@pytest.mark.parametrize("painting", [NoPacer()], indirect=True)
-def test_what_is_drawn_in_full_at_once_is_not_drawn_again(painting):
-    painting.painter.ask(Request(1, (16, 8), Settings()))
-    wait(painting.is_final)
-    painting.painter.ask(Request(2, (16, 8), Settings()))
-    wait(painting.is_final)
-    assert painting.sent == [(1, (16, 8), True), (2, (16, 8), True)]
+@pytest.mark.parametrize("rendering", [NoPacer()], indirect=True)
+def test_what_is_drawn_in_full_at_once_is_not_drawn_again(rendering):
+    rendering.loop.ask(Request(1, (16, 8), Settings()))
+    wait(rendering.is_final)
+    rendering.loop.ask(Request(2, (16, 8), Settings()))
+    wait(rendering.is_final)
+    assert rendering.sent == [(1, (16, 8), True), (2, (16, 8), True)]
 
 
-def test_an_error_is_told_and_the_next_request_is_drawn(painting):
-    painting.painter.ask(Request(ValueError("no such cut"), (160, 80), Settings()))
-    wait(painting.is_final)
-    assert [str(error) for error in painting.errors] == ["no such cut"]
-    painting.painter.ask(Request(5, (160, 80), Settings()))
-    wait(painting.is_final)
-    assert painting.sent[-1] == (5, (160, 80), True)
+def test_an_error_is_told_and_the_next_request_is_drawn(rendering):
+    rendering.loop.ask(Request(ValueError("no such cut"), (160, 80), Settings()))
+    wait(rendering.is_final)
+    assert [str(error) for error in rendering.errors] == ["no such cut"]
+    rendering.loop.ask(Request(5, (160, 80), Settings()))
+    wait(rendering.is_final)
+    assert rendering.sent[-1] == (5, (160, 80), True)
 
 
-def test_closing_ends_the_thread_in_the_middle_of_a_picture(painting):
-    painting.stage.hold = True
-    painting.painter.ask(Request(1, (160, 80), Settings()))
-    wait(painting.stage.is_held)
-    painting.painter.close()
-    assert not any(thread.name == "v3dg painter" for thread in threading.enumerate())
+def test_closing_ends_the_thread_in_the_middle_of_a_picture(rendering):
+    rendering.scene_view.hold = True
+    rendering.loop.ask(Request(1, (160, 80), Settings()))
+    wait(rendering.scene_view.is_held)
+    rendering.loop.close()
+    assert not any(thread.name == "v3dg render loop" for thread in threading.enumerate())
 
 
 # Paths.

@@ -1,4 +1,4 @@
-"""The viewer's page in Chromium, as a person uses it. Wants playwright, and Chromium where PATH finds it."""
+"""The viewer in Chromium, as a person uses it. Wants playwright, and Chromium where PATH finds it."""
 
 import io
 import itertools
@@ -13,8 +13,8 @@ from PIL import Image
 import chromium
 import scenes_lod
 import v3dg
-from v3dg.viewer.frame import Stage
-from v3dg.viewer.page import Site
+from v3dg.viewer.frame import SceneView
+from v3dg.viewer.server import Site
 
 pytest.importorskip("viser")
 pytest.importorskip("playwright.sync_api")
@@ -35,15 +35,15 @@ def site(tmp_path_factory):
     bundle.save(path)
     scene = v3dg.Scene()
     scene.add(v3dg.Bundle.open(path), positions=rng.normal(size=(200, 3)), scales=np.full(200, 0.3))
-    stage = Stage(scene)
+    scene_view = SceneView(scene)
     cameras = {"from the side": v3dg.Camera.look_at((6, 0, 0), (0, 0, 0), width=640, height=480)}
-    site = Site(stage, name="blobs", cameras=cameras, port=0)
+    site = Site(scene_view, name="blobs", cameras=cameras, port=0)
     yield site
     site.close()
 
 
 class Tab:
-    """A page and what can be seen and done there."""
+    """A tab and what can be seen and done there."""
 
     def __init__(self, browser, site):
         self.errors = []
@@ -60,7 +60,7 @@ class Tab:
         """The picture, 8 bit, once it is drawn in full."""
         canvas = self.page.locator("canvas").first
         end = time.monotonic() + SECONDS
-        self.page.wait_for_timeout(600)  # until what was done before has come to the page
+        self.page.wait_for_timeout(600)  # until what was done before has come to the tab
         while abs((self.figure("picture") or 0) - canvas.bounding_box()["width"]) > 1:
             assert time.monotonic() < end, self.page.inner_text("body")
             self.page.wait_for_timeout(200)
@@ -69,7 +69,7 @@ class Tab:
 
     def seen(self):
         box = self.page.locator("canvas").first.bounding_box()
-        # Below the notices that the page begins with.
+        # Below the notices that the tab begins with.
         png = self.page.screenshot(clip=box | {"y": 200, "height": box["height"] - 200})
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
 

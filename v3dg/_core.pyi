@@ -88,8 +88,8 @@ class ClusterTable:
         offset: NDArray[Any],
     ) -> None: ...
 
-# Instances are (bundle, positions, quaternions, scales, importance), a camera (viewmat, eye, K, width,
-# height, near, window or None), a rule (tolerance, budget or None, min_level, footprint, cull).
+# Instances are (bundle, positions, quaternions, scales, importance), a camera (viewmat, K, width, height,
+# near, window or None), a rule (tolerance, budget or None, min_level, footprint, cull).
 SelectedPairs: TypeAlias = tuple[NDArray[np.int32], NDArray[np.int32], int, float, bool]
 
 def eye_of(viewmat: NDArray[np.float64]) -> NDArray[np.float64]: ...
@@ -263,7 +263,7 @@ class ModelFrame:
         stream: int,
     ) -> Drawing: ...
 
-# simplify_init
+# simplify
 def prune(
     means: NDArray[Any],
     scales: NDArray[Any],

@@ -18,11 +18,11 @@ import tyro
 
 from benchmarks.evaluation import record
 from v3dg.scene_file import read_scene
-from v3dg.viewer.frame import Stage
-from v3dg.viewer.page import Site
+from v3dg.viewer.frame import SceneView
+from v3dg.viewer.server import Site
 from v3dg.viewer.view import View, look_at
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
 
 from viewer_client import Tab
 
@@ -47,8 +47,8 @@ class Config:
 
 def main(config: Config) -> None:
     scene, cameras = read_scene(config.scene)
-    stage = Stage(scene, device=config.device)
-    site = Site(stage, port=0)
+    scene_view = SceneView(scene, device=config.device)
+    site = Site(scene_view, port=0)
     rng = np.random.default_rng(0)
     rows = []
     try:
@@ -56,7 +56,7 @@ def main(config: Config) -> None:
             for place in config.cameras:
                 name, camera = list(cameras.items())[place]
                 view = View.of_camera(camera)
-                rows.append({"camera": name, **drag_around(browser, view, stage.center, config, rng)})
+                rows.append({"camera": name, **drag_around(browser, view, scene_view.center, config, rng)})
                 print(rows[-1], flush=True)
     finally:
         site.close()

@@ -1,4 +1,4 @@
-"""How far float32 is from float64 in each of tests/hard_cases.py: histograms of errors, and docs/numerics.md.
+"""How far float32 is from float64 in tests/support/hard_cases.py: histograms of errors, and docs/numerics.md.
 
     python -m benchmarks.studies.hard_cases --device cpu --output benchmarks/results/hard_cases_cpu.json
     python -m benchmarks.studies.hard_cases --device cuda --output benchmarks/results/hard_cases_h200.json
@@ -22,6 +22,7 @@ from benchmarks.evaluation import record
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT / "tests" / "support"))
 
 import hard_cases as cases  # noqa: E402  (of the tests)
 

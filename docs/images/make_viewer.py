@@ -1,4 +1,4 @@
-"""Make viewer_*.jpg: the viewer's page in Chromium, in each of its modes. Wants playwright.
+"""Make viewer_*.jpg: a tab of the viewer in Chromium, in each of its modes. Wants playwright.
 
 python docs/images/make_viewer.py donutsea.json 048_camera_8
 """
@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from playwright.sync_api import Page, sync_playwright
 
 import v3dg
-from v3dg.viewer.frame import Stage
-from v3dg.viewer.page import Site
+from v3dg.viewer.frame import SceneView
+from v3dg.viewer.server import Site
 
 FOLDER = Path(__file__).parent
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
@@ -24,7 +24,7 @@ MODES = ("Colour", "Level", "Cluster", "Depth", "Alpha", "Gaussians per pixel", 
 
 def main(scene_path: str, camera: str) -> None:
     scene, cameras = v3dg.read_scene(scene_path)
-    site = Site(Stage(scene), name="DonutSea", cameras=cameras, port=0)
+    site = Site(SceneView(scene), name="DonutSea", cameras=cameras, port=0)
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
         page = browser.new_page(viewport={"width": 1120, "height": 640})
@@ -37,7 +37,7 @@ def main(scene_path: str, camera: str) -> None:
         page.keyboard.type(camera)
         page.get_by_role("option", name=camera, exact=True).click()
         page.get_by_text("Camera", exact=True).click()
-        save("page", shot(page))
+        save("tab", shot(page))
         modes = {MODES[0]: shot(page, canvas_only=True)}
         for before, after in itertools.pairwise(MODES):
             choose(page, before, after)

@@ -11,6 +11,7 @@ from pathlib import Path
 import atheris
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
 
 with atheris.instrument_imports(include=["v3dg"]):
     from fuzz.targets import parts_of, read_bundle

@@ -10,6 +10,7 @@ from pathlib import Path
 import atheris
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
 
 with atheris.instrument_imports(include=["v3dg"]):
     from fuzz.targets import FORMATS, META_IN_SOG, read_format

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
 
 from fuzz.targets import META_IN_SOG, SOG, zipped
 from random_bundle import random_bundle, random_gaussians

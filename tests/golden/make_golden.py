@@ -14,6 +14,7 @@ import numpy as np
 
 PATH = Path(__file__).parent / "gsplat_projection.npz"
 sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
 
 import scenes  # noqa: E402
 

@@ -42,8 +42,8 @@ def run(options: View) -> None:
         raise UsageError(f"--port: expected 0 to 65535, got {options.port}")
     from v3dg.gaussians import Gaussians
     from v3dg.select import DEFAULT_TOLERANCE, rule_of
-    from v3dg.viewer.frame import Stage
-    from v3dg.viewer.page import Site
+    from v3dg.viewer.frame import SceneView
+    from v3dg.viewer.server import Site
 
     tolerance = options.tolerance
     if tolerance is None:
@@ -54,9 +54,9 @@ def run(options: View) -> None:
     subject, cameras = load_subject(options.subject)
     if isinstance(subject, Gaussians) and options.budget is not None:
         raise UsageError(f"--budget: {options.subject} has no levels to choose from; build a bundle of it")
-    stage = Stage(subject, device=options.device)
+    scene_view = SceneView(subject, device=options.device)
     site = Site(
-        stage,
+        scene_view,
         name=options.subject.stem,
         cameras=cameras,
         host=options.host,

@@ -51,7 +51,6 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
     Raises:
         ValueError: It is none, incomplete, or of a higher version or SH degree.
-        ImportError: It is of version 4 and the package zstandard is missing.
         OSError: It cannot be read.
     """
     content = read_bytes(path)
@@ -236,12 +235,8 @@ def _sections_of_zstd(path: str | os.PathLike[str], content: bytes) -> tuple[int
 
 
 def _expand(path: str | os.PathLike[str], packed: bytes, size: int) -> memoryview:
-    try:
-        import zstandard
-    except ImportError:
-        raise ImportError(
-            f"{os.fspath(path)}: .spz of version 4 needs the package zstandard; pip install 'v3dg[formats]'"
-        ) from None
+    import zstandard
+
     try:
         with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
             body = reader.read(size + 1)

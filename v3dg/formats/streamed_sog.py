@@ -33,17 +33,20 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     if "version" in fields and fields["version"].value != 1:
         raise fields["version"].error("streamed SOG version 1")
     names = [_inside(item) for item in fields["filenames"].items()]
+    finest = _finest(fields["tree"], len(names))
+    has_environment = "environment" in fields and fields["environment"].value is not None
+    environment = _inside(fields["environment"]) if has_environment else None
+    if not finest and environment is None:
+        raise problem(path, "expected gaussians in the tree, got none")
     parts = []
-    for file, rows in sorted(_finest(fields["tree"], len(names)).items()):
+    for file, rows in sorted(finest.items()):
         gaussians = sog.read(path.parent / names[file])
         # No more than it has: else a small file could ask for any number.
         if sum(len(r) for r in rows) > len(gaussians) or max(r.stop for r in rows) > len(gaussians):
             raise problem(path, f"expected at most {len(gaussians)} gaussians of {names[file]!a}, got more")
         parts.append(gaussians.subset(np.concatenate([np.arange(r.start, r.stop) for r in rows])))
-    if "environment" in fields:
-        parts.append(sog.read(path.parent / _inside(fields["environment"])))
-    if not parts:
-        raise problem(path, "expected gaussians in the tree, got none")
+    if environment is not None:
+        parts.append(sog.read(path.parent / environment))
     degrees = sorted({part.sh_degree for part in parts})
     if len(degrees) > 1:
         raise problem(path, f"expected one SH degree in all folders, got {degrees}")

@@ -1,5 +1,6 @@
-"""The viewer of `v3dg view`: a web page drawn by the renderer. Wants the extra `viewer`.
+"""The viewer of `v3dg view`: a web server whose pictures the renderer draws. Wants the extra `viewer`.
 
-`view` says from where a page looks, `frame` draws what it shows, `pacing` decides how large and when, `path`
-flies the camera, and `page` is the page itself; all but the last work without a browser.
+`view` says from where a tab looks, `frame` draws what it shows, `pacing` decides how large and when, `path`
+flies the camera: these know no browser. `figures`, `controls`, `exports` and `path_controls` are the parts of
+a browser's `tab`, and `server` gives each browser that connects one.
 """

@@ -124,7 +124,7 @@ class Stopped(Exception):
     """A picture was given up because another one is wanted."""
 
 
-class Stage:
+class SceneView:
     """Draws pictures of one scene, for any number of threads.
 
     Args:

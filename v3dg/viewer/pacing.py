@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from v3dg import _core
 from v3dg.select import DEFAULT_TOLERANCE
-from v3dg.viewer.frame import Frame, Settings, Stage, Stopped
+from v3dg.viewer.frame import Frame, SceneView, Settings, Stopped
 from v3dg.viewer.view import View
 
 Size = tuple[int, int]
@@ -84,38 +84,38 @@ def finer_sizes(drawn: Size, full: Size) -> list[Size]:
 
 @dataclass(frozen=True)
 class Request:
-    """What a page wants to see: full size in px, a view, settings."""
+    """What a tab wants to see: full size in px, a view, settings."""
 
     view: View
     size: Size
     settings: Settings
 
 
-class Painter:
-    """Draws what one page asked for last, in a thread of its own, as often and as large as time allows.
+class RenderLoop:
+    """Draws what one tab asked for last, in a thread of its own, as often and as large as time allows.
 
     A request is answered by a small picture; after a rest larger ones follow, up to the full size. A new
     request ends a larger picture at once.
 
     Args:
-        send: Called with each picture and whether it is the final one; in the painter's thread.
-        fail: Called with what could not be drawn; in the painter's thread.
+        send: Called with each picture and whether it is the final one; in the loop's thread.
+        fail: Called with what could not be drawn; in the loop's thread.
     """
 
     def __init__(
         self,
-        stage: Stage,
+        scene_view: SceneView,
         send: Callable[[Frame, bool], None],
         fail: Callable[[Exception], None],
         pacer: Pacer | None = None,
     ) -> None:
-        self._stage, self._send, self._fail = stage, send, fail
+        self._scene_view, self._send, self._fail = scene_view, send, fail
         self._pacer = pacer or Pacer()
         self._changed = threading.Condition()
         self._request: Request | None = None
         self._is_closed = False
         self._stop = _core.Stop()
-        self._thread = threading.Thread(target=self._run, name="v3dg painter", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="v3dg render loop", daemon=True)
         self._thread.start()
 
     def ask(self, request: Request) -> None:
@@ -141,17 +141,17 @@ class Painter:
             if self._is_closed or request is None:
                 return
             try:
-                self._paint(request)
+                self._draw(request)
             except Stopped:
                 pass
-            except Exception as error:  # a page that shows the reason is better than one that stands still
+            except Exception as error:  # a tab that shows the reason is better than one that stands still
                 self._fail(error)
 
-    def _paint(self, request: Request) -> None:
+    def _draw(self, request: Request) -> None:
         draft = self._pacer.draft(request.size)
         settings = self._while_moving(request.settings, draft)
         start = time.perf_counter()
-        frame = self._stage.frame(request.view, draft.size, settings)
+        frame = self._scene_view.frame(request.view, draft.size, settings)
         self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
         sizes = finer_sizes(draft.size, request.size)
         if settings != request.settings and not sizes:
@@ -162,11 +162,11 @@ class Painter:
             if stop is None:
                 return
             is_final = place == len(sizes) - 1
-            self._send(self._stage.frame(request.view, finer, request.settings, stop), is_final)
+            self._send(self._scene_view.frame(request.view, finer, request.settings, stop), is_final)
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
         """What of the settings there is time for."""
-        if self._stage.draws_all_while_moving:
+        if self._scene_view.draws_all_while_moving:
             least = 0.0 if draft.coarser == 1 else DEFAULT_TOLERANCE
         else:
             least = DEFAULT_TOLERANCE

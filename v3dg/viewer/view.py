@@ -1,4 +1,4 @@
-"""From where a page looks: what a browser knows of its camera, and the pinhole camera that it makes."""
+"""From where a tab looks: what a browser knows of its camera, and the pinhole camera that it makes."""
 
 from __future__ import annotations
 

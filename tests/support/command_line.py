@@ -1,13 +1,22 @@
-"""The command line as a user starts it."""
+"""The command line as a user starts it, and other Pythons that tests start."""
 
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import v3dg
 
+PACKAGE = str(Path(v3dg.__file__).parents[1])
 # The package under test, wherever the command starts.
-ENVIRONMENT = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
+ENVIRONMENT = os.environ | {"PYTHONPATH": PACKAGE}
+# And what tests import, for a Python that runs a part of one.
+SUPPORT = Path(__file__).parent
+TESTS_ENVIRONMENT = os.environ | {
+    "PYTHONPATH": os.pathsep.join(
+        [str(SUPPORT.parent), str(SUPPORT), PACKAGE, os.environ.get("PYTHONPATH", "")]
+    )
+}
 COMMAND = [sys.executable, "-m", "v3dg"]
 
 
