@@ -6,7 +6,7 @@ import pytest
 import v3dg
 from v3dg import worlds
 from v3dg.cli import main
-from v3dg.scene import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
 
 
 @pytest.fixture(scope="module")
