@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from v3dg.donut import make_donut, place_field
-from v3dg.scene import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from benchmarks.worlds.rings import Pile, _near_pairs
-from v3dg.scene import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
 
 RING, TUBE = 0.07, 0.04
 FLAT = [1.0, 0.0, 0.0, 0.0]

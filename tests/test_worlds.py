@@ -6,7 +6,7 @@ import pytest
 import v3dg
 from benchmarks import worlds
 from benchmarks.__main__ import PROGRAM
-from v3dg.scene import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
 
 
 @pytest.fixture(scope="module")

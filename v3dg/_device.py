@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
-from typing import Any, Literal, TypeVar
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,23 +17,59 @@ _T = TypeVar("_T")
 _MUCH_MEMORY = 1 << 30
 
 
-def resolve(device: str) -> Literal["cpu", "cuda"]:
-    """The device that "auto", "cpu" or "cuda" stands for; "auto" is CUDA where nothing is missing for it.
+@dataclass(frozen=True)
+class Device:
+    """Where work runs: the CPU, or a CUDA device by its number."""
+
+    number: int = -1
+
+    @property
+    def is_cuda(self) -> bool:
+        return self.number >= 0
+
+    def __str__(self) -> str:
+        return f"cuda:{self.number}" if self.is_cuda else "cpu"
+
+    @contextmanager
+    def current(self) -> Iterator[None]:
+        """Make it torch's current device meanwhile; the CPU always is one."""
+        if not self.is_cuda:
+            yield
+            return
+        import torch
+
+        with torch.cuda.device(self.number):
+            yield
+
+
+CPU = Device()
+
+
+def resolve(device: str | Device) -> Device:
+    """The device that "auto", "cpu", "cuda" or "cuda:1" stands for.
+
+    "cuda" is torch's current device, "auto" the same where nothing is missing for it, else the CPU.
 
     Raises:
-        ValueError: It is none of the three.
-        RuntimeError: It is "cuda", and something is missing; never another device in its place.
+        ValueError: It is none of these.
+        RuntimeError: It is a CUDA device, and something is missing; never another device in its place.
     """
-    if device not in ("auto", "cpu", "cuda"):
-        raise ValueError(f"device: expected 'auto', 'cpu' or 'cuda', got {device!r}")
-    if device == "cpu":
-        return "cpu"
+    name = str(device)
+    kind, _, number = name.partition(":")
+    if kind not in ("auto", "cpu", "cuda") or (name != kind and (kind != "cuda" or not number.isdecimal())):
+        raise ValueError(f"device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got {name!r}")
+    if kind == "cpu":
+        return CPU
     missing = missing_for_cuda()
     if missing is None:
-        return "cuda"
-    if device == "cuda":
+        if int(number or 0) >= _core.num_cuda_devices():
+            raise RuntimeError(
+                f"device: expected one of {_core.num_cuda_devices()} CUDA devices, got {name!r}"
+            )
+        return Device(int(number)) if number else Device(current_device())
+    if kind == "cuda":
         raise RuntimeError(f"device: {missing}; or use 'cpu'")
-    return "cpu"
+    return CPU
 
 
 def missing_for_cuda() -> str | None:
@@ -53,29 +89,27 @@ def missing_for_cuda() -> str | None:
     return None
 
 
-def describe(device: Literal["cpu", "cuda"]) -> str:
+def describe(device: Device) -> str:
     """What of a device the last bits of results depend on."""
-    if device == "cpu":
+    if not device.is_cuda:
         return _core.isa()
     import torch
 
-    return str(torch.cuda.get_device_name())
+    return str(torch.cuda.get_device_name(device.number))
 
 
-def of(array: Array) -> Any:
-    """Where an array is: "cpu" for NumPy's, else its torch device."""
-    return "cpu" if isinstance(array, np.ndarray) else array.device
+def of(array: Array) -> Device:
+    """Where an array is; torch's tensors on the host count as the CPU's."""
+    if isinstance(array, np.ndarray) or not array.is_cuda:
+        return CPU
+    return Device(array.device.index)
 
 
-def place(gaussians: Gaussians, device: Any) -> Gaussians:
-    """The gaussians as NumPy arrays ("cpu") or as tensors on a CUDA device, without gradients.
-
-    "cuda" is the device that they are on, if it is one, else the current one.
-    """
-    if device == "cpu":
+def place(gaussians: Gaussians, device: Device) -> Gaussians:
+    """The gaussians as NumPy arrays (on the CPU) or as tensors on a CUDA device, without gradients."""
+    if not device.is_cuda:
         return gaussians.numpy()
-    is_there = device == "cuda" and str(of(gaussians.means)).startswith("cuda")
-    there = gaussians.torch(None if is_there else device)
+    there = gaussians.torch(str(device))
     return Gaussians(*(getattr(there, field.name).detach() for field in fields(there)))
 
 
@@ -86,24 +120,11 @@ def current_device() -> int:
     return int(torch.cuda.current_device())
 
 
-def current_stream() -> int:
-    """The stream of that device that torch's work, and so ours, is enqueued on."""
-    import torch
-
-    return int(torch.cuda.current_stream().cuda_stream)
-
-
 def is_capturing() -> bool:
-    """Whether a CUDA graph is being captured on that stream."""
+    """Whether a CUDA graph is being captured on torch's current stream."""
     import torch
 
     return bool(torch.cuda.is_current_stream_capturing())
-
-
-def aligned(tensor: Any) -> Any:
-    """The tensor, contiguous, where the core can read it in words of 16 bytes."""
-    tensor = tensor.contiguous()
-    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
 
 
 def library_of(array: Array) -> Any:
@@ -151,13 +172,13 @@ def memory_errors() -> Iterator[None]:
         raise MemoryError(str(error)) from error
 
 
-def with_this_stream(work: Callable[[_T], None], device: Any) -> Callable[[_T], None]:
+def with_this_stream(work: Callable[[_T], None], device: Device) -> Callable[[_T], None]:
     """The same work on this thread's stream, whatever thread it will run on."""
-    if device == "cpu":
+    if not device.is_cuda:
         return work
     import torch
 
-    stream = torch.cuda.current_stream(device)
+    stream = torch.cuda.current_stream(device.number)
 
     def on_stream(argument: _T) -> None:
         with torch.cuda.stream(stream):
@@ -166,11 +187,11 @@ def with_this_stream(work: Callable[[_T], None], device: Any) -> Callable[[_T], 
     return on_stream
 
 
-def spare_memory(device: Any) -> None:
+def spare_memory(device: Device) -> None:
     """Have torch give back what it keeps for later, where that is much: the core cannot use it."""
-    if device == "cpu":
+    if not device.is_cuda:
         return
     import torch
 
-    if torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device) > _MUCH_MEMORY:
+    if torch.cuda.memory_reserved(device.number) - torch.cuda.memory_allocated(device.number) > _MUCH_MEMORY:
         torch.cuda.empty_cache()

@@ -20,17 +20,18 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core, _device, _files, _operations, cleaning
-from v3dg._operations import Offsets
+from v3dg import _core, _device, _files, cleaning
+from v3dg._device import Device
 from v3dg._version import __version__
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.gaussians import Array, Gaussians
-from v3dg.rasterize import rows_of
+
+Offsets: TypeAlias = npt.NDArray[np.int64]
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -202,7 +203,7 @@ def build_bundle(
     config: BuildConfig | None = None,
     seed: int = 0,
     progress: bool = True,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
+    device: str | Device = "auto",
     resume_path: str | os.PathLike[str] | None = None,
     unusable: Literal["drop", "refuse"] = "drop",
 ) -> Bundle:
@@ -235,6 +236,8 @@ def build_bundle(
     """
     config = config or BuildConfig()
     where = _device.resolve(device)
+    if where.is_cuda and str(device) in ("auto", "cuda") and _device.of(asset.means).is_cuda:
+        where = _device.of(asset.means)
     if not isinstance(progress, bool):
         raise TypeError(f"progress: expected True or False, got {progress!r}")
     seed = operator.index(seed)
@@ -303,7 +306,9 @@ class _Build:
         self.config, self.seed = config, seed
         self.where = _device.of(asset.means)
         self.levels: list[_Level] = []
-        order, offset = _operations.median_split(asset.means, config.cluster_size)
+        count = len(asset)
+        depth = _core.num_halvings(count, config.cluster_size)
+        order, offset = _core.median_split(asset.means, np.array([0, count]), depth)
         sizes = np.diff(offset)
         self.pile = _Pile(len(asset) + sum(_sizes_ahead(sizes, config)), asset)
         leaves = asset.subset(order)
@@ -314,21 +319,23 @@ class _Build:
                 offset,
                 np.arange(len(sizes), dtype=np.int32),
                 np.stack([offset[:-1], offset[1:]], axis=1),
-                _device.to_host(_operations.bound_by_boxes(leaves, offset)),
-                _device.to_host(_operations.bound_spheres(self._spheres, offset)),
+                _device.to_host(_core.bound_by_boxes(leaves.rows, offset)),
+                _device.to_host(_core.bound_spheres(self._spheres, offset)),
                 np.zeros(len(sizes), np.float32),
                 np.zeros((len(sizes), 2), np.float32),
             )
         )
         self.leaves = self.last
-        self.target_leaves = _operations.fit_target(self.leaves) if config.targets == "leaves" else None
+        self.target_leaves = _core.FitTarget(
+            self.leaves.rows, config.asset_filter_px2, config.asset_antialiased
+        )
         self._ball_of_leaves = np.zeros((0, 2), np.int64), np.zeros((0, 4), np.float32)
 
     def append(self, level: _Level) -> None:
         """Add a finished level, whose gaussians are on any device."""
         copy = self.pile.add(level.gaussians)
         self.levels.append(replace(level, gaussians=copy))
-        self.last = copy if self.where == "cpu" else _device.place(level.gaussians, self.where)
+        self.last = copy if not self.where.is_cuda else _device.place(level.gaussians, self.where)
 
     def balls_of_leaves(self, leaf_range: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
         """Balls around the gaussians of level 0 under each group, which are what the fit looks at."""
@@ -336,7 +343,7 @@ class _Build:
         # Past the root, every level stands for all leaves.
         if not np.array_equal(known_range, leaf_range):
             offset = np.append(leaf_range[:, 0], leaf_range[-1, 1])
-            ball = _device.to_host(_operations.bound_spheres(self._spheres, offset))
+            ball = _device.to_host(_core.bound_spheres(self._spheres, offset))
             self._ball_of_leaves = leaf_range, ball
         return ball
 
@@ -389,31 +396,35 @@ def _simplify(build: _Build, shape: tuple[int, int], bar: _Bar) -> None:
 
     from_leaves = config.targets == "leaves"
     own_filter = from_leaves or number == 1
-    error = np.zeros((num_groups, 2), np.float32)
     bar.start_level(number, num_groups, int(out_offset[-1]))
     ball = build.balls_of_leaves(leaf_range)
-    target = build.target_leaves if from_leaves else _operations.fit_target(build.last)
+    target = build.target_leaves
+    if not from_leaves:
+        own = config.asset_filter_px2, config.asset_antialiased
+        target = _core.FitTarget(build.last.rows, *(own if own_filter else (config.filter_px2, True)))
     _device.spare_memory(build.where)
-    _run_fit(
-        bar,
-        build.where,
-        lambda progress: _operations.fit_level(
-            _fit_config(config, build.seed, number),
-            target,
-            config.asset_filter_px2 if own_filter else config.filter_px2,
-            config.asset_antialiased if own_filter else True,
-            leaf_range if from_leaves else np.stack([offset[:-1], offset[1:]], axis=1),
-            np.stack([out_offset[:-1], out_offset[1:]], axis=1),
-            ball,
-            gaussians,
-            error,
-            progress,
-        ),
-    )
+    errors = []
+    rows = gaussians.rows
+
+    def fit(progress: _core.FitProgress) -> None:
+        errors.append(
+            _core.fit_level(
+                _fit_config(config, build.seed, number),
+                target,
+                leaf_range if from_leaves else np.stack([offset[:-1], offset[1:]], axis=1),
+                rows,
+                np.stack([out_offset[:-1], out_offset[1:]], axis=1),
+                ball,
+                np.arange(num_groups),
+                progress,
+            )
+        )
+
+    _run_fit(bar, build.where, fit)
     cluster_offset = out_offset
     if clusters_made > 1:
         depth = clusters_made.bit_length() - 1
-        order, cluster_offset = _operations.split_segments(gaussians.means, out_offset, depth)
+        order, cluster_offset = _core.median_split(gaussians.means, out_offset, depth)
         gaussians = gaussians.subset(order)
     build.append(
         _Level(
@@ -421,10 +432,10 @@ def _simplify(build: _Build, shape: tuple[int, int], bar: _Bar) -> None:
             cluster_offset,
             np.repeat(np.arange(num_groups, dtype=np.int32), clusters_made),
             leaf_range,
-            _device.to_host(_operations.bound_by_boxes(gaussians, cluster_offset)),
-            _operations.bound_spheres(below.ball, child_offset),
+            _device.to_host(_core.bound_by_boxes(gaussians.rows, cluster_offset)),
+            _core.bound_spheres(below.ball, child_offset),
             weight,
-            error,
+            errors[0],
         )
     )
 
@@ -439,16 +450,22 @@ def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: B
         part = gaussians.subset(slice(cuts[0], cuts[-1]))
         cuts, out_cuts = cuts - cuts[0], out_cuts - out_cuts[0]
         if config.init == "merge":
-            parts.append(_operations.merge(part, cuts, out_cuts))
+            parts.append(Gaussians(*_core.merge(part.rows, cuts, out_cuts)))
         else:
-            kept = part.subset(_operations.prune(part, cuts, out_cuts))
+            kept = part.subset(_core.prune(part.rows, cuts, out_cuts))
             parts.append(replace(kept, scales=kept.scales * np.float32(config.prune_growth)))
     return parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)
 
 
 def _fit_config(config: BuildConfig, seed: int, level: int) -> Any:
-    fit = _core.FitConfig()
-    for name in (
+    names = (field.name for field in fields(config))
+    settings = {name: getattr(config, name) for name in names if name in _FIT_SETTINGS}
+    # Every level has views of its own.
+    return _core.FitConfig(**settings, antialiased=True, seed=seed * 64 + level)
+
+
+_FIT_SETTINGS = frozenset(
+    (
         *(
             "steps",
             "views_per_step",
@@ -458,18 +475,21 @@ def _fit_config(config: BuildConfig, seed: int, level: int) -> Any:
             "px2_per_gaussian",
             "distance",
         ),
-        *("filter_px2", "step_position", "position_in_world", "step_log_scale", "step_quat", "step_logit"),
-        *("step_sh0", "step_sh_rest", "final_step"),
-    ):
-        setattr(fit, name, getattr(config, name))
-    fit.loss = _core.LossWeights(config.loss_l1, config.loss_dssim, config.loss_alpha)
-    fit.compensate = True
-    # Every level has views of its own.
-    fit.seed = seed * 64 + level
-    return fit
+        *(
+            "filter_px2",
+            "loss_l1",
+            "loss_dssim",
+            "loss_alpha",
+            "step_position",
+            "step_log_scale",
+            "step_quat",
+        ),
+        *("step_logit", "step_sh0", "step_sh_rest", "position_in_world", "final_step"),
+    )
+)
 
 
-def _run_fit(bar: _Bar, where: Any, fit: Callable[[_core.FitProgress], None]) -> None:
+def _run_fit(bar: _Bar, where: Device, fit: Callable[[_core.FitProgress], None]) -> None:
     """Run `fit` on a thread of its own, so that Ctrl-C and the bar stay alive while it computes."""
     state = _core.FitProgress()
     fit = _device.with_this_stream(fit, where)
@@ -568,14 +588,14 @@ class _Checkpoint:
         asset: Gaussians,
         config: BuildConfig,
         seed: int,
-        device: Literal["cpu", "cuda"],
+        device: Device,
     ) -> None:
         self._path = None if path is None else Path(path)
         if self._path is None:
             return
         what = [asdict(config), seed, _device.describe(device), __version__, len(asset), asset.sh_degree]
         text = json.dumps(what, sort_keys=True).encode()
-        self._head = b"v3dg levels 2\n" + _digest(text, rows_of(asset.numpy()))
+        self._head = b"v3dg levels 2\n" + _digest(text, _arrays_of(asset.numpy()))
         self._num_sh = asset.sh.shape[1]
         self._num_bytes = 0  # of the file that are good
 
@@ -635,7 +655,7 @@ class _Checkpoint:
         """Add a level that is on the host; what a full disk cuts off is removed again."""
         if self._path is None:
             return
-        arrays = [*rows_of(level.gaussians), *(getattr(level, field.name) for field in fields(_Level)[1:])]
+        arrays = [*_arrays_of(level.gaussians), *(getattr(level, field.name) for field in fields(_Level)[1:])]
         counts = self._COUNTS.pack(len(level.gaussians), len(level.group_of_cluster), len(level.ball))
         descriptor = self._file.fileno()
         os.ftruncate(descriptor, self._num_bytes)
@@ -719,6 +739,10 @@ def _lock(file: FileIO) -> None:
         # Some network file systems have no locks; there, two builds of one output are the user's to avoid.
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
             raise
+
+
+def _arrays_of(g: Gaussians) -> tuple[Any, ...]:
+    return g.means, g.quats, g.scales, g.opacities, g.sh
 
 
 def _write_all(descriptor: int, data: bytes | memoryview) -> None:

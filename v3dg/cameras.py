@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -135,7 +136,17 @@ class Camera:
     @property
     def position(self) -> Floats:
         """(3,) the eye in the world."""
-        return _core.eye_of(self.viewmat)
+        return self.core.position
+
+    @cached_property
+    def core(self) -> _core.Camera:
+        """The same camera as the compiled operations take it."""
+        return _core.Camera(
+            viewmat=self.viewmat, K=self.K, width=self.width, height=self.height, near=self.near
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Camera, (self.viewmat, self.K, self.width, self.height, self.near)
 
     @property
     def fx(self) -> float:

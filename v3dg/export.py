@@ -21,15 +21,14 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _files, _operations
+from v3dg import _core, _device, _files
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
 from v3dg.cleaning import ball_of_most
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable, morton_order
 from v3dg.gaussians import Gaussians
-from v3dg.scene import rotation_from_quaternion
-from v3dg.select import rotations_of_bands
+from v3dg.rotations import rotation_from_quaternion
 
 Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
@@ -171,20 +170,21 @@ class _Turn:
         self._rotation = rotation_from_quaternion(self._quaternion)
 
     def gaussians(self, gaussians: Gaussians) -> Gaussians:
-        num_bases = gaussians.sh.shape[1]
-        return _operations.gather(
-            [gaussians],
-            num_bases,
-            bundle=np.zeros(1, np.int32),
-            positions=np.zeros((1, 3)),
-            rotations=self._rotation,
-            quaternions=self._quaternion,
-            scales=np.ones(1),
-            bands=rotations_of_bands(self._rotation, num_bases),
+        turned = _core.gather(
+            bundles=[gaussians.rows],
+            instances=_core.Instances(
+                bundle=np.zeros(1, np.int32),
+                positions=np.zeros((1, 3)),
+                quaternions=self._quaternion,
+                scales=np.ones(1),
+                importance=np.ones(1, np.float32),
+            ),
             instance=np.zeros(1, np.int32),
             first_row=np.zeros(1, np.int64),
             offset=np.array([0, len(gaussians)]),
+            device=_device.of(gaussians.means).number,
         )
+        return Gaussians(*turned)
 
     def boxes(self, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
         """(N, 2, 3) lower and upper corners, of boxes that stay along the axes."""

@@ -9,6 +9,8 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 
+from v3dg import _core
+
 Array: TypeAlias = Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
 
 _NAMES = ("means", "quats", "scales", "opacities", "sh")
@@ -79,6 +81,21 @@ class Gaussians:
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
         return _NUM_SH[int(self.sh.shape[1])]
+
+    @property
+    def rows(self) -> _core.Rows:
+        """The arrays as the compiled operations take them, without gradients; they share memory.
+
+        Tensors on a CUDA device that do not begin where it can be read in words of 16 bytes are copied.
+        """
+        arrays = [getattr(self, name) for name in _NAMES]
+        if _is_tensor(self.means):
+            arrays = [tensor.detach() for tensor in arrays]
+            if self.means.is_cuda:
+                arrays = [tensor if tensor.data_ptr() % 16 == 0 else tensor.clone() for tensor in arrays]
+            else:
+                arrays = [tensor.numpy() for tensor in arrays]
+        return _core.Rows(*arrays)
 
     def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
         """Take the gaussians that a slice, an array of M indices or a mask of N booleans names, in its order.

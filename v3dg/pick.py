@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from v3dg import _core, _resident
+from v3dg import _core
+from v3dg._device import CPU
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
-from v3dg.render import cluster_tables
+from v3dg.residency import residency
 from v3dg.scene import Scene
-from v3dg.select import camera_of, rule_of, select
+from v3dg.select import rule_of, select
 
 
 @dataclass(frozen=True)
@@ -65,14 +66,16 @@ def pick(
     if budget is not None:  # which is for the whole picture
         tolerance = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level).tolerance
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
-    pixel = camera_of(camera, (x, y, x + 1, y + 1))
-    instances = _resident.instances_on_host(scene)
-    instance_ids, cluster_ids, *_ = _core.select(scene.tables, instances, pixel, rule)
-    found = _core.pick_selection(cluster_tables(scene), instances, pixel, instance_ids, cluster_ids)
+    pixel = camera.core.window(x, y, x + 1, y + 1)
+    resident = residency.scene(scene_or_bundle, CPU)
+    cut = resident.core.select(pixel, rule)
+    frame = _core.SceneFrame(CPU.number)
+    frame.set_models([residency.model(bundle, CPU, "appearance") for bundle in resident.bundles])
+    found = frame.pick_cut(resident.core, pixel, cut.instance_ids, cut.cluster_ids)
     if found is None:
         return None
     place, weight, depth = found
-    instance, cluster = int(instance_ids[place]), int(cluster_ids[place])
+    instance, cluster = int(cut.instance_ids[place]), int(cut.cluster_ids[place])
     level = int(scene.bundles[scene.instance_bundle[instance]].clusters.level[cluster])
     ray = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
     position = camera.position + depth * ray @ camera.viewmat[:3, :3]

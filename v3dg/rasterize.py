@@ -67,122 +67,61 @@ def rasterize(
         raise ValueError(f"filter_px2: expected a variance of at least 0 px², got {filter_px2}")
     if len(background) != 3:
         raise ValueError(f"background: expected three numbers, got {len(background)}")
-    options = (float(filter_px2), bool(antialiased), intrinsics(camera), camera.width, camera.height)
+    options = {"filter_px2": float(filter_px2), "antialiased": bool(antialiased), "with_depth": True}
     if isinstance(gaussians.means, np.ndarray):
-        model = _core.Model(*rows_of(gaussians))
+        shade = [float(b) for b in background]
         color, alpha, depth, _, _ = _core.rasterize(
-            model, view_of_world(camera), *options, [float(b) for b in background], True, False
+            gaussians.rows, camera.core, background=shade, keep_tape=False, **options
         )
         return Raster(color, alpha, depth)
     return _rasterize_torch(gaussians, camera, options, background)
 
 
-def rows_of(gaussians: Gaussians) -> tuple[Any, Any, Any, Any, Any]:
-    """The five arrays, in the order in which the core takes them."""
-    g = gaussians
-    return g.means, g.quats, g.scales, g.opacities, g.sh
-
-
-def intrinsics(camera: Camera) -> list[float]:
-    """Focal lengths, principal point and near depth, in the order in which the core takes them."""
-    k = camera.K
-    return [float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]), float(camera.near)]
-
-
-def view_of_world(camera: Camera) -> Any:
-    """(15,) world to view for the core: linear part, translation, the eye in the world."""
-    v = np.asarray(camera.viewmat, np.float64)
-    return np.concatenate([v[:3, :3].ravel(), v[:3, 3], -v[:3, :3].T @ v[:3, 3]])
-
-
 def _rasterize_torch(
-    gaussians: Gaussians, camera: Camera, options: tuple[float, bool, list[float], int, int], background: Any
+    gaussians: Gaussians, camera: Camera, options: dict[str, Any], background: Any
 ) -> Raster:
     import torch
 
-    rows = rows_of(gaussians)
-    bg = torch.as_tensor(background, dtype=rows[0].dtype)
-    draw = _draw_on_cuda if rows[0].is_cuda else _draw_on_cpu
-    needs_tape = torch.is_grad_enabled() and any(t.requires_grad for t in (*rows, bg))
-    return Raster(*draw(rows, bg, view_of_world(camera), options, needs_tape))
-
-
-def _draw_on_cpu(
-    rows: tuple[Any, ...], bg: Any, view: Any, options: tuple[float, bool, list[float], int, int], tape: bool
-) -> Any:
-    import torch
-
-    model_type = _core.ModelDouble if rows[0].dtype == torch.float64 else _core.Model
-
-    class Rasterize(torch.autograd.Function):
-        @staticmethod
-        def forward(ctx: Any, *tensors: Any) -> Any:
-            arrays = [np.ascontiguousarray(t.detach().numpy()) for t in tensors[:5]]
-            *out, _, ctx.tape = _core.rasterize(
-                model_type(*arrays), view, *options, tensors[5].tolist(), True, tape
-            )
-            return tuple(torch.from_numpy(o) for o in out)
-
-        @staticmethod
-        def backward(ctx: Any, *gradients: Any) -> Any:
-            arrays = [np.ascontiguousarray(g.detach().numpy()) for g in gradients]
-            return tuple(torch.from_numpy(g) for g in _core.rasterize_backward(ctx.tape, *arrays))
-
-    apply: Any = Rasterize.apply
-    return apply(*rows, bg)
-
-
-def _draw_on_cuda(
-    rows: tuple[Any, ...], bg: Any, view: Any, options: tuple[float, bool, list[float], int, int], tape: bool
-) -> Any:
-    import torch
-
-    if not _core.has_cuda:
+    means = gaussians.means
+    if means.is_cuda and not _core.has_cuda:
         raise RuntimeError(f"gaussians: {_device.missing_for_cuda()}; or call gaussians.torch('cpu')")
-    if rows[0].dtype == torch.float64:
+    if means.is_cuda and means.dtype == torch.float64:
         raise ValueError(
             "gaussians: float64 is computed on the CPU only; call gaussians.torch('cpu'), or use float32"
         )
-    with torch.cuda.device(rows[0].device):
-        return _cuda_function().apply(view, options, tape, *rows, bg)
+    arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    shade = torch.as_tensor(background, dtype=means.dtype)
+    keep_tape = torch.is_grad_enabled() and any(t.requires_grad for t in (*arrays, shade))
+    return Raster(*_function().apply(camera.core, {**options, "keep_tape": keep_tape}, *arrays, shade))
 
 
 @functools.cache
-def _cuda_function() -> Any:
+def _function() -> Any:
+    """The operation and its gradient, for torch's tensors on any device."""
     import torch
+
+    def to_core(gradient: Any) -> Any:
+        gradient = gradient.detach().contiguous()
+        return gradient if gradient.is_cuda else gradient.numpy()
 
     class Rasterize(torch.autograd.Function):
         @staticmethod
-        def forward(ctx: Any, view: Any, options: Any, tape: bool, *tensors: Any) -> Any:
+        def forward(ctx: Any, camera: Any, options: dict[str, Any], *tensors: Any) -> Any:
             ctx.set_materialize_grads(False)
-            filter_px2, antialiased, k, width, height = options
-            inputs = tuple(_device.aligned(t.detach()) for t in tensors[:5])
-            new = inputs[0].new_empty
-            picture = new((height, width, 3)), new((height, width)), new((height, width))
-            stream = _device.current_stream()
-            bg = tensors[5].tolist()
-            kept = _core.rasterize_cuda(inputs, view, filter_px2, antialiased, k, bg, picture, stream)
-            if tape:
-                ctx.tape, ctx.inputs, ctx.background_device = kept, inputs, tensors[5].device
+            rows = Gaussians(*(t.detach() for t in tensors[:5])).rows
+            *planes, _, tape = _core.rasterize(rows, camera, background=tensors[5].tolist(), **options)
+            picture = tuple(torch.as_tensor(plane) for plane in planes)
+            ctx.tape, ctx.background_device = tape, tensors[5].device
+            if tensors[0].is_cuda:  # backward reads them again, and so has to know of what is written to
                 ctx.save_for_backward(*tensors[:5], *picture)
             return picture
 
         @staticmethod
         def backward(ctx: Any, *gradients: Any) -> Any:
-            # Reading them complains of what was written to since.
-            pictures = ctx.saved_tensors[5:]
-            d_color, d_alpha = (
-                torch.zeros_like(p) if g is None else g.contiguous()
-                for p, g in zip(pictures[:2], gradients[:2], strict=True)
-            )
-            d_depth = None if gradients[2] is None else gradients[2].contiguous()
-            out = tuple(torch.empty_like(t) for t in ctx.inputs)
-            d_background = d_color.new_empty(3)
-            with torch.cuda.device(d_color.device):
-                stream = _device.current_stream()
-                _core.rasterize_backward_cuda(ctx.tape, d_color, d_alpha, d_depth, out, d_background, stream)
-            if ctx.needs_input_grad[8]:
-                return None, None, None, *out, d_background.to(ctx.background_device)
-            return None, None, None, *out, None
+            _ = ctx.saved_tensors  # complains of what was written to since
+            d_color, d_alpha, d_depth = (None if g is None else to_core(g) for g in gradients)
+            *out, d_background = _core.rasterize_backward(ctx.tape, d_color, d_alpha, d_depth)
+            background = torch.as_tensor(d_background).to(ctx.background_device)
+            return None, None, *(torch.as_tensor(d) for d in out), background
 
     return Rasterize

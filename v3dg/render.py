@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import atexit
-import time
-import weakref
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, overload
 
-from v3dg import _core, _device, _resident
+from v3dg import _core, _device
+from v3dg._device import Device
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
-from v3dg.false_color import ColorBy, false_color
+from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
-from v3dg.rasterize import intrinsics, rows_of, view_of_world
+from v3dg.residency import residency
 from v3dg.scene import Scene
-from v3dg.select import Selection, camera_of, over_budget, rule_of, select
+from v3dg.select import Selection, over_budget, rule_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -55,23 +53,23 @@ class Image:
         stats: What it cost.
     """
 
-    def __init__(self, color: Any, alpha: Any, depth: Any, finish: Callable[[], Stats]) -> None:
-        self._picture, self._finish = (color, alpha, depth), finish
+    def __init__(self, drawing: _core.Drawing, finish: Callable[[], Stats]) -> None:
+        self._drawing, self._finish = drawing, finish
 
     @property
     def color(self) -> Any:
         self._finish()
-        return self._picture[0]
+        return self._drawing.color
 
     @property
     def alpha(self) -> Any:
         self._finish()
-        return self._picture[1]
+        return self._drawing.alpha
 
     @property
     def depth(self) -> Any:
         self._finish()
-        return self._picture[2]
+        return self._drawing.depth
 
     @property
     def stats(self) -> Stats:
@@ -141,82 +139,42 @@ def render(
             CUDA that is raised where the picture is looked at.
         RuntimeError: `device` is "cuda" and something is missing for it.
     """
-    drawer = _drawer_of(subject, color_by) if _device.resolve(device) == "cuda" else None
+    frame = _frame_of(subject, color_by, _device.resolve(device))
 
     def one(view: Camera) -> Image:
-        options = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
-        if drawer is not None:
-            return drawer.draw(subject, view, background, **options)
-        return _render_on_cpu(subject, view, background, color_by, **options)
+        return frame.draw(
+            subject, view, background, tolerance=tolerance, budget=budget, min_level=min_level, cut=cut
+        )
 
     return one(camera) if isinstance(camera, Camera) else [one(view) for view in camera]
 
 
-def _render_on_cpu(
-    subject: Scene | Bundle | Gaussians,
-    camera: Camera,
-    background: Sequence[float],
-    color_by: ColorBy,
-    **options: Any,
-) -> Image:
-    shade = _three(background)
-    if isinstance(subject, Gaussians):
-        _check_asset(color_by, **options)
-        start = time.perf_counter()
-        lens = (intrinsics(camera), camera.width, camera.height, shade, True)
-        model = _core.Model(*rows_of(subject.numpy()))
-        color, alpha, depth, counts, _ = _core.rasterize(
-            model, view_of_world(camera), 0.0, False, *lens, False
-        )
-        milliseconds = 1e3 * (time.perf_counter() - start)
-        asset_stats = Stats(len(subject), counts["in_frustum"], 0.0, 0.0, milliseconds)
-        return Image(color, alpha, depth, lambda: asset_stats)
-
-    scene = Scene.of(subject)
-    tables = cluster_tables(scene, color_by)
-    start = time.perf_counter()
-    cut = options.pop("cut")
-    selection = select(scene, camera, **options) if cut is None else _checked(cut, subject, **options)
-    selected = time.perf_counter()
-    color, alpha, depth, counts = _core.render_selection(
-        tables,
-        _resident.instances_on_host(scene),
-        camera_of(camera),
-        selection.instance_ids,
-        selection.cluster_ids,
-        shade,
-        True,
-    )
-    drawn = time.perf_counter()
-    stats = Stats(
-        gaussians_selected=selection.num_gaussians,
-        gaussians_in_frustum=counts["in_frustum"],
-        tolerance=selection.tolerance,
-        select_ms=1e3 * (selected - start),
-        draw_ms=1e3 * (drawn - selected),
-    )
-    return Image(color, alpha, depth, lambda: stats)
-
-
 class Renderer:
-    """Draws one scene, bundle or asset on torch's current CUDA device, with what that needs.
+    """Draws one scene, bundle or asset on one device, with buffers of its own.
 
-    Enqueuing a picture waits for nothing, so pictures can be drawn ahead, and captured in a CUDA graph: draw
-    once what the graph will meet, so that it is all on the device, then capture `render`; what was not drawn
-    before is a RuntimeError. Keep the renderer as long as the graph, and capture again when the scene has
-    changed. A picture that is under way when its scene is changed is finished first.
+    On a CUDA device, enqueuing a picture on torch's current stream there waits for nothing, so pictures can
+    be drawn ahead, and captured in a CUDA graph: draw once what the graph will meet, so that it is all on the
+    device, then capture `render`; what was not drawn before is a RuntimeError. Keep the renderer as long as
+    the graph, and capture again when the scene has changed. A picture that is under way when its scene is
+    changed is finished first.
 
     Args:
         color_by: As in `v3dg.render`.
+        device: As in `v3dg.render`. The renderer stays on it, whichever device is torch's current one later.
 
     Raises:
-        RuntimeError: Something is missing for CUDA.
+        RuntimeError: Something is missing for the device.
     """
 
-    def __init__(self, subject: Scene | Bundle | Gaussians, *, color_by: ColorBy = "appearance") -> None:
-        _device.resolve("cuda")
+    def __init__(
+        self,
+        subject: Scene | Bundle | Gaussians,
+        *,
+        color_by: ColorBy = "appearance",
+        device: str | Device = "auto",
+    ) -> None:
         self._subject = subject
-        self._drawer = _Drawer(subject, color_by)
+        self._frame = _Frame(subject, color_by, _device.resolve(device))
 
     def render(
         self,
@@ -228,71 +186,83 @@ class Renderer:
         cut: Selection | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> Image:
-        """Draw on torch's current stream, as `v3dg.render` does."""
-        options = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
-        return self._drawer.draw(self._subject, camera, background, **options)
+        """Draw as `v3dg.render` does."""
+        return self._frame.draw(
+            self._subject,
+            camera,
+            background,
+            tolerance=tolerance,
+            budget=budget,
+            min_level=min_level,
+            cut=cut,
+        )
 
 
-class _Drawer:
-    """What of a renderer does not keep its subject alive."""
+class _Frame:
+    """Buffers that pictures of one subject are drawn with; it does not keep the subject alive."""
 
-    def __init__(self, subject: Scene | Bundle | Gaussians, color_by: ColorBy) -> None:
-        self.device = _device.current_device()
-        self._color_by = color_by
-        self._num_bundles = 0
+    def __init__(self, subject: Scene | Bundle | Gaussians, color_by: ColorBy, device: Device) -> None:
+        self._device, self._color_by = device, color_by
+        self._bundles: tuple[Bundle, ...] | None = None
         if isinstance(subject, Gaussians):
             _check_asset(color_by)
-            self._frame: Any = _core.ModelFrame(_rows_on_device(subject), _device.current_stream())
+            self._asset = _core.AssetFrame(_core.Model(_device.place(subject, device).rows))
         else:
-            self._take_bundles(Scene.of(subject).bundles)
-
-    def _take_bundles(self, bundles: Sequence[Bundle]) -> None:
-        rows = [_rows_of_bundle(bundle, self._color_by) for bundle in bundles]
-        self._frame = _core.SceneFrame(rows, _device.current_stream())
-        self._num_bundles = len(bundles)
+            self._frame = _core.SceneFrame(device.number)
 
     def draw(
-        self, subject: Scene | Bundle | Gaussians, camera: Camera, background: Sequence[float], **options: Any
+        self,
+        subject: Scene | Bundle | Gaussians,
+        camera: Camera,
+        background: Sequence[float],
+        *,
+        cut: Selection | None,
+        **options: Any,
     ) -> Image:
-        shape = (camera.height, camera.width)
-        shade, stream = _three(background), _device.current_stream()
+        shade = _three(background)
         if isinstance(subject, Gaussians):
-            _check_asset(self._color_by, **options)
-            picture = (_empty((*shape, 3)), _empty(shape), _empty(shape))
-            drawing = self._frame.draw(
-                view_of_world(camera), 0.0, False, intrinsics(camera), shade, picture, stream
-            )
-            return Image(*picture, lambda: _stats(drawing.finish(), 0.0))
-
-        cut, budget = options.pop("cut"), options["budget"]
+            _check_asset(self._color_by, cut=cut, **options)
+            drawing = self._asset.draw(camera.core, shade)
+            return Image(drawing, lambda: _stats(drawing.finish(), 0.0))
         rule = rule_of(**options, footprint="solid_angle", cull=True)
-        if isinstance(subject, Scene) and self._num_bundles != len(subject.bundles):
-            self._take_bundles(subject.bundles)
-        resident = _resident.resident_of(subject)
-        scene = resident.core
-        picture = (_empty((*shape, 3)), _empty(shape), _empty(shape))
+        resident = residency.scene(subject, self._device)
+        self._take_models(resident.bundles)
         if cut is None:
-            drawing = self._frame.draw(scene, camera_of(camera), rule, shade, picture, stream)
+            drawing = self._frame.draw(resident.core, camera.core, rule, shade)
         else:
             selection = _checked(cut, subject, **options)
-            pairs = (_uploaded(selection.instance_ids), _uploaded(selection.cluster_ids))
-            drawing = self._frame.draw_cut(scene, camera_of(camera), *pairs, shade, picture, stream)
+            pairs = self._here(selection.instance_ids), self._here(selection.cluster_ids)
+            drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade)
         resident.add_drawing(drawing)
+        budget = options["budget"]
 
         def finish() -> Stats:
-            counts = drawing.finish()
-            if budget is not None and counts["exceeds_budget"]:
-                raise over_budget(budget, counts["least"])
-            used = (
-                cut.tolerance if cut is not None else counts["tolerance"] if budget is not None else rule[0]
-            )
-            return _stats(counts, used)
+            stats = drawing.finish()
+            if budget is not None and stats.exceeds_budget:
+                raise over_budget(budget, stats.gaussians)
+            chosen = stats.tolerance_px2 if budget is not None else rule.tolerance_px2
+            return _stats(stats, chosen if cut is None else cut.tolerance)
 
-        return Image(*picture, finish)
+        if not self._device.is_cuda:
+            finish()
+        return Image(drawing, finish)
+
+    def _take_models(self, bundles: tuple[Bundle, ...]) -> None:
+        if self._bundles != bundles:
+            models = [residency.model(bundle, self._device, self._color_by) for bundle in bundles]
+            self._frame.set_models(models)
+            self._bundles = bundles
+
+    def _here(self, ids: Any) -> Any:
+        if not self._device.is_cuda:
+            return ids
+        import torch
+
+        return torch.from_numpy(ids).to(str(self._device))
 
 
-def _stats(counts: dict[str, Any], tolerance: float) -> Stats:
-    return Stats(counts["gaussians"], counts["in_frustum"], tolerance, counts["select_ms"], counts["draw_ms"])
+def _stats(stats: _core.FrameStats, tolerance: float) -> Stats:
+    return Stats(stats.gaussians, stats.in_frustum, tolerance, stats.select_ms, stats.draw_ms)
 
 
 def _three(background: Sequence[float]) -> list[float]:
@@ -318,7 +288,7 @@ def _checked(cut: Selection, subject: Scene | Bundle, **options: Any) -> Selecti
     for name, value in options.items():
         if value:
             raise ValueError(f"{name}: expected nothing beside a cut, which has been chosen, got {value}")
-    mine = cut.scene is subject or (isinstance(subject, Bundle) and cut.scene.bundles == [subject])
+    mine = cut.scene is subject or (isinstance(subject, Bundle) and cut.scene.bundles == (subject,))
     if not mine:
         raise ValueError("cut: expected a selection from this scene, got one from another")
     if (cut.instance_ids >= len(cut.scene)).any():
@@ -326,61 +296,7 @@ def _checked(cut: Selection, subject: Scene | Bundle, **options: Any) -> Selecti
     return cut
 
 
-# Drawers of scenes and bundles, and bundles' gaussians, as long as those live.
-_drawers: weakref.WeakKeyDictionary[Scene | Bundle, dict[str, _Drawer]] = weakref.WeakKeyDictionary()
-_rows: weakref.WeakKeyDictionary[Bundle, dict[str, tuple[int, tuple[Any, ...]]]] = weakref.WeakKeyDictionary()
-
-atexit.register(_drawers.clear)  # while the driver is there
-
-
-def _drawer_of(subject: Scene | Bundle | Gaussians, color_by: ColorBy) -> _Drawer:
+def _frame_of(subject: Scene | Bundle | Gaussians, color_by: ColorBy, device: Device) -> _Frame:
     if isinstance(subject, Gaussians):
-        return _Drawer(subject, color_by)
-    known = _drawers.setdefault(subject, {})
-    if color_by not in known or known[color_by].device != _device.current_device():
-        known[color_by] = _Drawer(subject, color_by)
-    return known[color_by]
-
-
-def _rows_of_bundle(bundle: Bundle, color_by: ColorBy) -> tuple[Any, ...]:
-    device, known = _device.current_device(), _rows.setdefault(bundle, {})
-    if color_by not in known or known[color_by][0] != device:
-        known[color_by] = (device, _rows_on_device(false_color(bundle, color_by)))
-    return known[color_by][1]
-
-
-def _rows_on_device(gaussians: Gaussians) -> tuple[Any, ...]:
-    """The five arrays as the core wants them on torch's current CUDA device."""
-    import torch
-
-    return tuple(_device.aligned(row.detach().to(torch.float32)) for row in rows_of(gaussians.torch("cuda")))
-
-
-def _empty(shape: tuple[int, ...]) -> Any:
-    """A float32 tensor on torch's current CUDA device, not initialised."""
-    import torch
-
-    return torch.empty(shape, dtype=torch.float32, device="cuda")
-
-
-def _uploaded(array: Any) -> Any:
-    import torch
-
-    return torch.from_numpy(array).to("cuda")
-
-
-# A bundle's gaussians as the core lays them out, made when it is first drawn.
-_models: weakref.WeakKeyDictionary[Bundle, dict[str, Any]] = weakref.WeakKeyDictionary()
-
-
-def cluster_tables(scene: Scene, color_by: ColorBy = "appearance") -> list[tuple[Any, ...]]:
-    """Gaussians and clusters of the scene's bundles as the CPU's half takes them."""
-    return [_table(bundle, color_by) for bundle in scene.bundles]
-
-
-def _table(bundle: Bundle, color_by: ColorBy) -> tuple[Any, ...]:
-    known = _models.setdefault(bundle, {})
-    if color_by not in known:
-        known[color_by] = _core.Model(*rows_of(false_color(bundle, color_by)))
-    clusters = bundle.clusters
-    return known[color_by], clusters.offset, clusters.filter_px2, clusters.antialiased
+        return _Frame(subject, color_by, device)
+    return residency.frame(subject, (color_by, device), lambda: _Frame(subject, color_by, device))

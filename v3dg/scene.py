@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import weakref
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core
 from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
+from v3dg.rotations import rotation_from_quaternion
 
 _NO_ROTATION = (1.0, 0.0, 0.0, 0.0)
 
@@ -24,14 +23,10 @@ class Scene:
     Poses may be given as NumPy arrays, or as torch tensors on the host or on a CUDA device. Those of a device
     stay there, without a look at their values: an instance whose pose is not finite, or of no size, is not
     drawn.
-
-    Attributes:
-        bundles: The bundles, in the order in which they were first added.
     """
 
     def __init__(self) -> None:
-        self.bundles: list[Bundle] = []
-        self.tables: list[_core.ClusterTable] = []
+        self._bundles: list[Bundle] = []
         self._bundle: npt.NDArray[np.int32] = np.zeros(0, np.int32)
         self._importance: npt.NDArray[np.float32] = np.zeros(0, np.float32)
         # NumPy arrays or tensors on a CUDA device.
@@ -40,8 +35,7 @@ class Scene:
             "quaternions": np.zeros((0, 4)),
             "scales": np.zeros(0),
         }
-        # Counted up at each change, so that whoever keeps a copy knows when to look again.
-        self.num_changes = self.num_moves = 0
+        self._num_changes = self._num_moves = 0
 
     @classmethod
     def of(cls, scene_or_bundle: Scene | Bundle) -> Scene:
@@ -91,14 +85,13 @@ class Scene:
 
         index = next((b for b, known in enumerate(self.bundles) if known is bundle), len(self.bundles))
         if index == len(self.bundles):
-            self.tables.append(_table_of(bundle))
-            self.bundles.append(bundle)
+            self._bundles.append(bundle)
         first = len(self)
         self._bundle = np.concatenate([self._bundle, np.full(count, index, np.int32)])
         self._importance = np.concatenate([self._importance, weights])
         for name, rows in new.items():
             self._poses[name] = _joined(self._poses[name], rows)
-        self.num_changes += 1
+        self._num_changes += 1
         return range(first, first + count)
 
     def remove(self, ids: Any) -> None:
@@ -108,7 +101,7 @@ class Scene:
         self._bundle, self._importance = self._bundle[keep], self._importance[keep]
         for name, rows in self._poses.items():
             self._poses[name] = rows[keep if isinstance(rows, np.ndarray) else _like(rows, keep)]
-        self.num_changes += 1
+        self._num_changes += 1
 
     def move(
         self, ids: Any = None, *, positions: Any = None, quaternions: Any = None, scales: Any = None
@@ -142,7 +135,7 @@ class Scene:
                 here = _like(there, here).clone()
                 here[_like(there, rows)] = _like(there, values)
             self._poses[name] = here
-        self.num_moves += 1
+        self._num_moves += 1
 
     def set_importance(self, importance: npt.ArrayLike, ids: Any = None) -> None:
         """Give instances another importance, as in `add`; all of them if ``ids`` is None."""
@@ -150,7 +143,20 @@ class Scene:
         changed = self._importance.copy()
         changed[rows] = _importances(importance, len(rows))
         self._importance = changed
-        self.num_changes += 1
+        self._num_changes += 1
+
+    @property
+    def bundles(self) -> tuple[Bundle, ...]:
+        """The bundles, in the order in which they were first added."""
+        return tuple(self._bundles)
+
+    @property
+    def revision(self) -> tuple[int, int]:
+        """Counted up when instances come, go or get another importance, and when they move.
+
+        Whoever keeps a copy of the scene knows by it when to look again.
+        """
+        return self._num_changes, self._num_moves
 
     @property
     def instance_bundle(self) -> npt.NDArray[np.int32]:
@@ -186,7 +192,8 @@ class Scene:
         """(I, 3, 3) float64, of the quaternions."""
         return rotation_from_quaternion(self.quaternions)
 
-    def poses_anywhere(self) -> tuple[Any, Any, Any]:
+    @property
+    def poses(self) -> tuple[Any, Any, Any]:
         """Positions, quaternions and scales where they are: NumPy arrays, or tensors on a CUDA device."""
         return self._poses["positions"], self._poses["quaternions"], self._poses["scales"]
 
@@ -212,37 +219,6 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"Scene({len(self)} instances of {len(self.bundles)} bundles)"
-
-
-def rotation_from_quaternion(quaternions: Floats) -> Floats:
-    """Rotation matrices (I, 3, 3) of unit quaternions (I, 4) w x y z."""
-    w, x, y, z = np.moveaxis(quaternions, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
-
-
-# Of bundles, as long as those live: a bundle is made a scene for every picture of it.
-_tables: weakref.WeakKeyDictionary[Bundle, _core.ClusterTable] = weakref.WeakKeyDictionary()
-
-
-def _table_of(bundle: Bundle) -> _core.ClusterTable:
-    if bundle not in _tables:
-        clusters, groups = bundle.clusters, bundle.groups
-        _tables[bundle] = _core.ClusterTable(
-            groups.ball,
-            groups.weight,
-            groups.level,
-            clusters.own_group,
-            clusters.parent_group,
-            clusters.box,
-            clusters.filter_px2,
-            clusters.offset,
-        )
-    return _tables[bundle]
 
 
 _ROW = {"positions": (3,), "quaternions": (4,), "scales": ()}

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, overload
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core, _device, _operations, _resident
+from v3dg import _core, _device
+from v3dg._device import Device
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera, Floats, VectorLike
+from v3dg.cameras import Camera, VectorLike
 from v3dg.gaussians import Gaussians
+from v3dg.residency import residency
 from v3dg.scene import Scene
 
 if TYPE_CHECKING:
@@ -61,31 +63,31 @@ class Selection:
             device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there, ``"auto"`` for the better
                 of the two that works. Both hold the same numbers.
         """
-        device = _device.resolve(device)
+        where = _device.resolve(device)
         shift = np.asarray(origin, np.float64)
         if shift.shape != (3,):
             raise ValueError(f"origin: expected shape (3,), got {shift.shape}")
         scene = self.scene
-        instances, instance = np.unique(self.instance_ids, return_inverse=True)
-        used, bundle = np.unique(scene.instance_bundle[instances], return_inverse=True)
-        num_bases = max((scene.bundles[b].sh_degree + 1 for b in used), default=1) ** 2
-        sources = [scene.bundles[b].gaussians for b in used]
-        world = _operations.gather(
-            [source.torch("cuda") for source in sources] if device == "cuda" else sources,
-            num_bases,
-            bundle=bundle.astype(np.int32),
-            positions=scene.positions[instances] - shift,
-            rotations=scene.rotations[instances],
-            quaternions=scene.quaternions[instances],
-            scales=scene.scales[instances],
-            bands=rotations_of_bands(scene.rotations[instances], num_bases),
-            instance=instance.astype(np.int32),
-            first_row=self._per_pair([table.clusters.offset[:-1] for table in scene.bundles]).astype(
-                np.int64
-            ),
-            offset=self._first(),
-        )
-        return world.torch("cuda") if device == "cuda" else world
+        ids, instance = np.unique(self.instance_ids, return_inverse=True)
+        used, bundle = np.unique(scene.instance_bundle[ids], return_inverse=True)
+        with where.current():
+            world = _core.gather(
+                bundles=[residency.gaussians(scene.bundles[b], where).rows for b in used],
+                instances=_core.Instances(
+                    bundle=bundle.astype(np.int32),
+                    positions=scene.positions[ids] - shift,
+                    quaternions=scene.quaternions[ids],
+                    scales=scene.scales[ids],
+                    importance=scene.importance[ids],
+                ),
+                instance=instance.astype(np.int32),
+                first_row=self._per_pair([table.clusters.offset[:-1] for table in scene.bundles]).astype(
+                    np.int64
+                ),
+                offset=self._first(),
+                device=where.number,
+            )
+        return Gaussians(*world)
 
     @property
     def filters_px2(self) -> npt.NDArray[np.float32]:
@@ -180,24 +182,24 @@ def select(
     Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the budget is ours.
     """
     rule = rule_of(tolerance, budget, min_level, footprint, cull)
-    on_cuda = _device.resolve(device) == "cuda"
+    where = _device.resolve(device)
     if not isinstance(camera, Camera):
-        return [_select(scene_or_bundle, view, rule, on_cuda) for view in camera]
-    return _select(scene_or_bundle, camera, rule, on_cuda)
+        return [_select(scene_or_bundle, view, rule, budget, where) for view in camera]
+    return _select(scene_or_bundle, camera, rule, budget, where)
 
 
-def _select(subject: Scene | Bundle, camera: Camera, rule: tuple[Any, ...], on_cuda: bool) -> Selection:
-    scene = Scene.of(subject)
+def _select(
+    subject: Scene | Bundle, camera: Camera, rule: _core.Rule, budget: int | None, device: Device
+) -> Selection:
     start = time.perf_counter()
-    if on_cuda:
-        resident = _resident.resident_of(subject)
-        found = resident.core.select(camera_of(camera), rule, _device.current_stream())
-    else:
-        found = _core.select(scene.tables, _resident.instances_on_host(scene), camera_of(camera), rule)
-    instance_ids, cluster_ids, count, tolerance, fits_budget = found
-    if not fits_budget:
-        raise over_budget(rule[1], count)
-    return Selection(scene, instance_ids, cluster_ids, count, tolerance, time.perf_counter() - start)
+    cut = residency.scene(subject, device).core.select(camera.core, rule)
+    if not cut.fits_budget:
+        assert budget is not None
+        raise over_budget(budget, cut.num_gaussians)
+    seconds = time.perf_counter() - start
+    return Selection(
+        Scene.of(subject), cut.instance_ids, cut.cluster_ids, cut.num_gaussians, cut.tolerance_px2, seconds
+    )
 
 
 def group_metrics(
@@ -205,12 +207,16 @@ def group_metrics(
 ) -> list[npt.NDArray[np.float32]]:
     """Return for each instance what tolerance is compared with: its groups' metrics, (G,) in px²."""
     scene = Scene.of(scene_or_bundle)
-    metric, offset = _core.group_metrics(
-        scene.tables,
-        _resident.instances_on_host(scene),
-        camera_of(camera),
-        rule_of(0.0, None, 0, footprint, False),
+    instances = _core.Instances(
+        bundle=scene.instance_bundle,
+        positions=scene.positions,
+        quaternions=scene.quaternions,
+        scales=scene.scales,
+        importance=scene.importance,
     )
+    rule = rule_of(0.0, None, 0, footprint, False)
+    tables = [residency.table(bundle) for bundle in scene.bundles]
+    metric, offset = _core.group_metrics(tables, instances, camera.core, rule)
     return np.split(metric, offset[1:-1]) if len(scene) else []
 
 
@@ -219,7 +225,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 def rule_of(
     tolerance: float | None, budget: int | None, min_level: int, footprint: Footprint, cull: bool
-) -> tuple[Any, ...]:
+) -> _core.Rule:
     """What to choose, as the core takes it.
 
     Raises:
@@ -235,7 +241,9 @@ def rule_of(
     if not 0 <= operator.index(min_level) < 1 << 31:
         raise ValueError(f"min_level: expected a level, 0 or more, got {min_level}")
     tolerance = min(tolerance, _LARGEST) if math.isfinite(tolerance) else tolerance
-    return (tolerance, budget, min_level, footprint, cull)
+    return _core.Rule(
+        tolerance_px2=tolerance, budget=budget, min_level=min_level, footprint=footprint, culls=cull
+    )
 
 
 def over_budget(budget: int, least: int) -> ValueError:
@@ -243,54 +251,3 @@ def over_budget(budget: int, least: int) -> ValueError:
     return ValueError(
         f"budget: expected at least {least} gaussians, which the coarsest cut of this view has, got {budget}"
     )
-
-
-def camera_of(camera: Camera, window: tuple[int, int, int, int] | None = None) -> tuple[Any, ...]:
-    """The camera as the core takes it, and the pixels [x0, x1) x [y0, y1) of its image that are wanted."""
-    return (camera.viewmat, camera.K, camera.width, camera.height, camera.near, window)
-
-
-def _basis_of_band(degree: int, directions: Floats) -> Floats:
-    """Real spherical harmonics (..., 2 degree + 1) of a band at directions (..., 3), signs as in 3DGS."""
-    x, y, z = np.moveaxis(directions, -1, 0)
-    xx, yy, zz = x * x, y * y, z * z
-    if degree == 1:
-        factor = math.sqrt(3 / (4 * math.pi))
-        terms = [-y, z, -x]
-    elif degree == 2:
-        factor = math.sqrt(15 / (4 * math.pi))
-        terms = [x * y, -y * z, (2 * zz - xx - yy) / math.sqrt(12), -x * z, (xx - yy) / 2]
-    else:
-        factor = math.sqrt(35 / (32 * math.pi))
-        terms = [
-            -y * (3 * xx - yy),
-            math.sqrt(24) * x * y * z,
-            -math.sqrt(0.6) * y * (4 * zz - xx - yy),
-            math.sqrt(0.4) * z * (2 * zz - 3 * xx - 3 * yy),
-            -math.sqrt(0.6) * x * (4 * zz - xx - yy),
-            math.sqrt(6) * z * (xx - yy),
-            -x * (xx - 3 * yy),
-        ]
-    return factor * np.stack(terms, axis=-1)
-
-
-def rotations_of_bands(rotations: Floats, num_bases: int) -> Floats:
-    """(I, 83): matrices of bands 1, 2, ..., one after another, that take coefficients into the world.
-
-    A band is closed under rotation, so the matrix follows from the basis at enough directions: the colour
-    towards d in the world is the asset's colour towards the direction rotated back.
-    """
-    flat = np.zeros((len(rotations), sum((2 * degree + 1) ** 2 for degree in (1, 2, 3))))
-    # Points on a spiral: many more than the 7 that the largest band needs, for a well-posed solution.
-    count = 32
-    z = 1 - (2 * np.arange(count) + 1) / count
-    turn = np.arange(count) * math.pi * (3 - math.sqrt(5))
-    directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
-    in_asset = directions @ rotations  # rows: rotation transposed times direction
-    first = 0
-    for degree in range(1, math.isqrt(num_bases)):
-        size = (2 * degree + 1) ** 2
-        band = np.linalg.pinv(_basis_of_band(degree, directions)) @ _basis_of_band(degree, in_asset)
-        flat[:, first : first + size] = band.reshape(-1, size)
-        first += size
-    return flat

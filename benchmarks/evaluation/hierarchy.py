@@ -18,7 +18,8 @@ import numpy.typing as npt
 from v3dg import _device, _operations
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
-from v3dg.scene import Scene, rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
+from v3dg.scene import Scene
 from v3dg.select import rotations_of_bands
 
 Ids = npt.NDArray[np.int64]

@@ -15,7 +15,7 @@ import v3dg
 from benchmarks.evaluation import record
 from v3dg import _operations
 from v3dg.rasterize import rows_of
-from v3dg.scene import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
 from v3dg.select import rotations_of_bands
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from v3dg.scene import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

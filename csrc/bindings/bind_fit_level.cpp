@@ -1,21 +1,44 @@
+#include <algorithm>
 #include <memory>
 
-#include "bindings/args.h"
-#include "bindings/device_args.h"
-#include "bindings/render_args.h"
+#include "bindings/operations.h"
+#include "bindings/types.h"
+#include "fit_group/dssim.h"
 #include "pipeline/fit_level.h"
 #include "pipeline/fit_level_cuda.h"
 #include "pipeline/model.h"
 
 namespace v3dg {
 
-using namespace py::literals;
-
 namespace {
+
+// What groups should look like, as its device reads it.
+class BoundTarget {
+  public:
+    BoundTarget(const Rows& rows, float filter_px2, bool antialiased)
+        : rows_(rows), filter_px2_(filter_px2), antialiased_(antialiased) {
+        const GaussianRows<const float> read = rows.read<float>();
+        if (!rows.device().is_host()) return;
+        const py::gil_scoped_release unlocked;
+        model_ = std::make_unique<Model<float>>(read);
+    }
+
+    Device device() const { return rows_.device(); }
+    size_t size() const { return rows_.size(); }
+    int sh_degree() const { return rows_.sh_degree(); }
+    FitTarget on_host() const { return {&model_->planes(), filter_px2_, antialiased_}; }
+    cuda::DeviceFitTarget on_device() const { return {rows_.read<float>(), filter_px2_, antialiased_}; }
+
+  private:
+    Rows rows_;
+    float filter_px2_;
+    bool antialiased_;
+    std::unique_ptr<Model<float>> model_;  // on the host
+};
 
 // The groups that index `num_targets` and `num_rows` gaussians.
 std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& range, const py::array& ball,
-                                const py::array& stream, py::ssize_t num_targets, py::ssize_t num_rows) {
+                                const py::array& stream, size_t num_targets, size_t num_rows) {
     const py::ssize_t num_groups = range.ndim() == 2 ? range.shape(0) : 0;
     const Span<const int64_t> targets = span_of<const int64_t>(target_range, "target_range", {num_groups, 2});
     const Span<const int64_t> own = span_of<const int64_t>(range, "range", {num_groups, 2});
@@ -24,8 +47,8 @@ std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& 
     std::vector<FitGroup> groups;
     for (py::ssize_t g = 0; g < num_groups; ++g) {
         const int64_t bounds[4] = {targets[2 * g], targets[2 * g + 1], own[2 * g], own[2 * g + 1]};
-        if (bounds[0] < 0 || bounds[1] < bounds[0] || bounds[1] > num_targets || bounds[2] < 0 ||
-            bounds[3] < bounds[2] || bounds[3] > num_rows)
+        if (bounds[0] < 0 || bounds[1] < bounds[0] || bounds[1] > static_cast<int64_t>(num_targets) ||
+            bounds[2] < 0 || bounds[3] < bounds[2] || bounds[3] > static_cast<int64_t>(num_rows))
             throw py::value_error("range: expected [first, last) within the gaussians, group " +
                                   std::to_string(g) + " is not");
         FitGroup group{static_cast<uint64_t>(bounds[0]),
@@ -43,115 +66,98 @@ std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& 
     return groups;
 }
 
-float* errors_of(py::array& error, size_t num_groups) {
-    return span_of<float>(error, "error", {static_cast<py::ssize_t>(num_groups), 2}).data;
+py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, const py::array& target_range,
+                            const Rows& gaussians, const py::array& range, const py::array& ball,
+                            const py::array& stream, FitProgress& progress) {
+    if (gaussians.device() != target.device() || gaussians.sh_degree() != target.sh_degree())
+        throw py::value_error("gaussians: expected the device and the SH degree of the target, got others");
+    const std::vector<FitGroup> groups =
+        groups_of(target_range, range, ball, stream, target.size(), gaussians.size());
+    const GaussianRows<float> rows = gaussians.write();
+    const NewArray<float> error({}, {static_cast<py::ssize_t>(groups.size()), 2});
+    std::fill(error.span.begin(), error.span.end(), 0.0f);
+    const Span<const FitGroup> all{groups.data(), groups.size()};
+    const Work work(gaussians.device());
+    if constexpr (V3DG_WITH_CUDA != 0)
+        if (!work.device().is_host()) {
+            const cuda::DeviceFitTarget on_device = target.on_device();
+            {
+                const py::gil_scoped_release unlocked;
+                cuda::fit_level(config, all, on_device, rows, error.span.data, progress, work.stream());
+            }
+            return error.object;
+        }
+    {
+        const py::gil_scoped_release unlocked;
+        fit_level(config, all, target.on_host(), rows, error.span.data, progress);
+    }
+    return error.object;
 }
 
-void fit_level_arrays(const FitConfig& config, const std::shared_ptr<Model<float>>& target,
-                      float target_filter_px2, bool target_compensate, const py::array& target_range,
-                      const py::array& range, const py::array& ball, const py::array& stream,
-                      py::array& means, py::array& quats, py::array& scales, py::array& opacities,
-                      py::array& sh, py::array& error, FitProgress& progress) {
-    const py::ssize_t n = opacities.ndim() == 1 ? opacities.shape(0) : 0;
-    const int degree = target->planes().sh_degree;
-    const std::vector<FitGroup> groups =
-        groups_of(target_range, range, ball, stream, static_cast<py::ssize_t>(target->size()), n);
-    const GaussianRows<float> rows{span_of<float>(means, "means", {n, 3}).data,
-                                   span_of<float>(quats, "quats", {n, 4}).data,
-                                   span_of<float>(scales, "scales", {n, 3}).data,
-                                   span_of<float>(opacities, "opacities", {n}).data,
-                                   span_of<float>(sh, "sh", {n, num_sh_bases(degree), 3}).data,
-                                   static_cast<size_t>(n),
-                                   degree};
-    float* errors = errors_of(error, groups.size());
-    py::gil_scoped_release unlocked;
-    fit_level(config, {groups.data(), groups.size()},
-              {&target->planes(), target_filter_px2, target_compensate}, rows, errors, progress);
+FitConfig make_config(int steps, int views_per_step, int num_views, int supersample, int image_size,
+                      float px2_per_gaussian, float distance, float filter_px2, bool antialiased,
+                      float loss_l1, float loss_dssim, float loss_alpha, float step_position,
+                      float step_log_scale, float step_quat, float step_logit, float step_sh0,
+                      float step_sh_rest, bool position_in_world, float final_step, uint64_t seed) {
+    FitConfig config{};
+    config.steps = steps;
+    config.views_per_step = views_per_step;
+    config.num_views = num_views;
+    config.supersample = supersample;
+    config.image_size = image_size;
+    config.px2_per_gaussian = px2_per_gaussian;
+    config.distance = distance;
+    config.filter_px2 = filter_px2;
+    config.compensate = antialiased;
+    config.loss = {loss_l1, loss_dssim, loss_alpha};
+    config.step_position = step_position;
+    config.step_log_scale = step_log_scale;
+    config.step_quat = step_quat;
+    config.step_logit = step_logit;
+    config.step_sh0 = step_sh0;
+    config.step_sh_rest = step_sh_rest;
+    config.position_in_world = position_in_world;
+    config.final_step = final_step;
+    config.seed = seed;
+    return config;
+}
+
+py::tuple dssim_of(const py::array& picture, const py::array& target) {
+    const Span<const float> p = span_of<const float>(picture, "picture", {-1, -1});
+    const py::ssize_t height = picture.shape(0), width = picture.shape(1);
+    const Span<const float> t = span_of<const float>(target, "target", {height, width});
+    if (p.size == 0) throw py::value_error("picture: expected at least one pixel, got none");
+    const NewArray<float> gradient({}, {height, width});
+    std::fill(gradient.span.begin(), gradient.span.end(), 0.0f);
+    SsimScratch scratch;
+    const float value = dssim(p.data, t.data, static_cast<int>(width), static_cast<int>(height), 1.0f,
+                              gradient.span.data, scratch);
+    return py::make_tuple(value, gradient.object);
 }
 
 }  // namespace
 
 void bind_fit_level(py::module_& m) {
-    py::class_<LossWeights>(m, "LossWeights")
-        .def(py::init([](float l1, float dssim, float alpha) { return LossWeights{l1, dssim, alpha}; }),
-             "l1"_a, "dssim"_a, "alpha"_a);
-    py::class_<FitConfig>(m, "FitConfig")
-        .def(py::init<>([] { return FitConfig{}; }))
-        .def_readwrite("steps", &FitConfig::steps)
-        .def_readwrite("views_per_step", &FitConfig::views_per_step)
-        .def_readwrite("num_views", &FitConfig::num_views)
-        .def_readwrite("supersample", &FitConfig::supersample)
-        .def_readwrite("image_size", &FitConfig::image_size)
-        .def_readwrite("px2_per_gaussian", &FitConfig::px2_per_gaussian)
-        .def_readwrite("distance", &FitConfig::distance)
-        .def_readwrite("filter_px2", &FitConfig::filter_px2)
-        .def_readwrite("compensate", &FitConfig::compensate)
-        .def_readwrite("loss", &FitConfig::loss)
-        .def_readwrite("step_position", &FitConfig::step_position)
-        .def_readwrite("step_log_scale", &FitConfig::step_log_scale)
-        .def_readwrite("step_quat", &FitConfig::step_quat)
-        .def_readwrite("step_logit", &FitConfig::step_logit)
-        .def_readwrite("step_sh0", &FitConfig::step_sh0)
-        .def_readwrite("step_sh_rest", &FitConfig::step_sh_rest)
-        .def_readwrite("position_in_world", &FitConfig::position_in_world)
-        .def_readwrite("final_step", &FitConfig::final_step)
-        .def_readwrite("seed", &FitConfig::seed);
-    py::class_<FitProgress>(m, "FitProgress")
+    py::class_<FitConfig>(m, "FitConfig", "How groups are fitted; a setting that is left out is an error.")
+        .def(py::init(&make_config), py::kw_only(), "steps"_a, "views_per_step"_a, "num_views"_a,
+             "supersample"_a, "image_size"_a, "px2_per_gaussian"_a, "distance"_a, "filter_px2"_a,
+             "antialiased"_a, "loss_l1"_a, "loss_dssim"_a, "loss_alpha"_a, "step_position"_a,
+             "step_log_scale"_a, "step_quat"_a, "step_logit"_a, "step_sh0"_a, "step_sh_rest"_a,
+             "position_in_world"_a, "final_step"_a, "seed"_a);
+    py::class_<FitProgress>(m, "FitProgress",
+                            "How far a fit is, to be looked at and cancelled from any thread.")
         .def(py::init<>())
         .def_property_readonly("groups_done", [](const FitProgress& p) { return p.groups_done.load(); })
         .def_property_readonly("loss_sum", [](const FitProgress& p) { return p.loss_sum.load(); })
         .def("cancel", [](FitProgress& p) { p.cancel = true; });
-    m.def("fit_level", &fit_level_arrays, "config"_a, "target"_a, "target_filter_px2"_a,
-          "target_compensate"_a, "target_range"_a, "range"_a, "ball"_a, "stream"_a, "means"_a, "quats"_a,
-          "scales"_a, "opacities"_a, "sh"_a, "error"_a, "progress"_a);
-    if constexpr (V3DG_WITH_CUDA) {
-        m.def(
-            "fit_level_cuda",
-            [](const FitConfig& config, const py::object& target_means, const py::object& target_quats,
-               const py::object& target_scales, const py::object& target_opacities,
-               const py::object& target_sh, float target_filter_px2, bool target_compensate,
-               const py::array& target_range, const py::array& range, const py::array& ball,
-               const py::array& stream, const py::object& means, const py::object& quats,
-               const py::object& scales, const py::object& opacities, const py::object& sh, py::array& error,
-               FitProgress& progress, uintptr_t cuda_stream) {
-                const Span<const float> target_opacity =
-                    device_span_of<const float>(target_opacities, "target_opacities", {-1});
-                const Span<float> opacity = device_span_of<float>(opacities, "opacities", {-1});
-                const auto num_targets = static_cast<py::ssize_t>(target_opacity.size);
-                const auto n = static_cast<py::ssize_t>(opacity.size);
-                const Span<const float> target_coefficients =
-                    device_span_of<const float>(target_sh, "target_sh", {num_targets, -1, 3});
-                const py::ssize_t bases =
-                    num_targets > 0 ? static_cast<py::ssize_t>(target_coefficients.size) / num_targets / 3
-                                    : 1;
-                const int degree = degree_of_bases(bases, "(N, " + std::to_string(bases) + ", 3)");
-                const cuda::DeviceFitTarget target{
-                    {device_span_of<const float>(target_means, "target_means", {num_targets, 3}).data,
-                     device_span_of<const float>(target_quats, "target_quats", {num_targets, 4}).data,
-                     device_span_of<const float>(target_scales, "target_scales", {num_targets, 3}).data,
-                     target_opacity.data, target_coefficients.data, target_opacity.size, degree},
-                    target_filter_px2,
-                    target_compensate};
-                const GaussianRows<float> rows{device_span_of<float>(means, "means", {n, 3}).data,
-                                               device_span_of<float>(quats, "quats", {n, 4}).data,
-                                               device_span_of<float>(scales, "scales", {n, 3}).data,
-                                               opacity.data,
-                                               device_span_of<float>(sh, "sh", {n, bases, 3}).data,
-                                               static_cast<size_t>(n),
-                                               degree};
-                const std::vector<FitGroup> groups =
-                    groups_of(target_range, range, ball, stream, num_targets, n);
-                float* errors = errors_of(error, groups.size());
-                py::gil_scoped_release unlocked;
-                cuda::fit_level(config, {groups.data(), groups.size()}, target, rows, errors, progress,
-                                reinterpret_cast<cuda::Stream>(cuda_stream));
-            },
-            "config"_a, "target_means"_a, "target_quats"_a, "target_scales"_a, "target_opacities"_a,
-            "target_sh"_a, "target_filter_px2"_a, "target_compensate"_a, "target_range"_a, "range"_a,
-            "ball"_a, "stream"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a, "error"_a,
-            "progress"_a, "cuda_stream"_a,
-            "The same on a device, where all gaussians are; the other arrays are on the host.");
-    }
+    py::class_<BoundTarget>(m, "FitTarget", "The gaussians that groups should look like.")
+        .def(py::init<const Rows&, float, bool>(), "gaussians"_a, "filter_px2"_a, "antialiased"_a);
+    m.def("fit_level", &fit_level_arrays, "config"_a, "target"_a, "target_range"_a, "gaussians"_a, "range"_a,
+          "ball"_a, "stream"_a, "progress"_a,
+          "Fits groups of gaussians, in place, to look like groups of the target inside their balls (G, 4). "
+          "Returns the residuals (G, 2) in colour and alpha.");
+    m.def("dssim", &dssim_of, "picture"_a, "target"_a,
+          "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
 }
 
 }  // namespace v3dg

@@ -1,7 +1,8 @@
 #include <cerrno>
 #include <system_error>
 
-#include "bindings/args.h"
+#include "bindings/operations.h"
+#include "bindings/types.h"
 #include "io/ply.h"
 
 namespace v3dg {
@@ -42,14 +43,11 @@ py::tuple ply_read(const py::object& path_object) {
     const PlyFile ply = with_path(path, open_ply);
     const auto n = static_cast<py::ssize_t>(ply.num_gaussians());
     const auto k = static_cast<py::ssize_t>(ply.num_sh);
-    ArrayOf<float> means({n, py::ssize_t(3)}), quats({n, py::ssize_t(4)}), scales({n, py::ssize_t(3)}),
-        opacities(n), sh({n, k, py::ssize_t(3)});
-    const PlyGaussians<float> out = {
-        span_of<float>(means, "means", {n, 3}), span_of<float>(quats, "quats", {n, 4}),
-        span_of<float>(scales, "scales", {n, 3}), span_of<float>(opacities, "opacities", {n}),
-        span_of<float>(sh, "sh", {n, k, 3})};
+    const NewArray<float> means({}, {n, 3}), quats({}, {n, 4}), scales({}, {n, 3}), opacities({}, {n}),
+        sh({}, {n, k, 3});
+    const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span, sh.span};
     with_path(path, [&](const char*) { read_ply(ply, out); });
-    return py::make_tuple(means, quats, scales, opacities, sh);
+    return py::make_tuple(means.object, quats.object, scales.object, opacities.object, sh.object);
 }
 
 PlyEncoding encoding_of(const std::string& name) {
@@ -78,7 +76,6 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
 }  // namespace
 
 void bind_ply(py::module_& m) {
-    using namespace py::literals;
     m.def("ply_read", ply_read, "path"_a);
     m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
           "encoding"_a);

@@ -6,8 +6,9 @@
 #include <new>
 
 #include "base/isa.h"
-#include "bindings/args.h"
+#include "bindings/operations.h"
 #include "math/gaussian.h"
+#include "select/select.h"
 
 // A child of fork() has none of the threads that GNU's OpenMP keeps for the next loop, but would wait for
 // them without end. So the thread that forks lets its own go first; they come back, on either side, with the
@@ -20,24 +21,29 @@ static bool must_let_threads_go() {
            std::strstr(found.dli_fname, "libgomp") != nullptr;
 }
 
+static int num_cuda_devices() {
+    if constexpr (V3DG_WITH_CUDA != 0) return v3dg::cuda::num_devices();
+    return 0;
+}
+
 PYBIND11_MODULE(_core, m) {
     if (must_let_threads_go() && pthread_atfork(&let_threads_go, nullptr, nullptr) != 0)
         throw std::bad_alloc();
     m.doc() = "Compiled operations of v3dg; the public interface is the package v3dg.";
-    m.attr("reach_sigmas") = v3dg::kReachSigmas;
+    m.attr("min_alpha") = v3dg::kMinAlpha;
+    m.attr("sh_base0") = v3dg::kShBase0;
     m.attr("has_cuda") = V3DG_WITH_CUDA != 0;
     m.def(
         "isa", [] { return v3dg::isa_name(v3dg::active_isa()); },
         "Instruction set that the CPU half runs on.");
-    v3dg::bind_box(m);
+    m.def("num_cuda_devices", &num_cuda_devices, "CUDA devices to run on; 0 without CUDA or a driver.");
+    v3dg::bind_types(m);
+    v3dg::bind_ply(m);
     v3dg::bind_cluster(m);
+    v3dg::bind_simplify(m);
     v3dg::bind_gather(m);
     v3dg::bind_select(m);
-    v3dg::bind_simplify(m);
-    v3dg::bind_ply(m);
-    v3dg::bind_render(m);
-    v3dg::bind_rasterize_cuda(m);
+    v3dg::bind_rasterize(m);
+    v3dg::bind_scene(m);
     v3dg::bind_fit_level(m);
-    v3dg::bind_loss(m);
-    v3dg::bind_frame(m);
 }

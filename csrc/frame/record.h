@@ -34,8 +34,8 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, int x0, int x1, int y0
     r.y1 = static_cast<uint16_t>(y1);
 }
 
-// An entry of a tile's list on the CPU holds a record's place in its low half and the bits of its float32 depth,
-// which order the list, in its high half.
+// An entry of a tile's list on the CPU holds a record's place in its low half and the bits of its float32
+// depth, which order the list, in its high half.
 inline uint32_t record_of(uint64_t entry) { return static_cast<uint32_t>(entry); }
 
 // Gradients of the ellipse and colour of one record.

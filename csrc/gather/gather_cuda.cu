@@ -26,7 +26,7 @@ __device__ size_t cluster_at(const Span<const int64_t>& offset, size_t low, size
 
 // One thread a row of the result, or one a row and basis: num_items a row.
 __global__ void __launch_bounds__(kBlockSize)
-    gather_kernel(GatherInput in, GaussianRows<float> out, int num_items) {
+    gather_kernel(GatherInput in, Rotations rotations, GaussianRows<float> out, int num_items) {
     const int64_t num = in.offset[in.instance.size] * num_items;
     const int64_t first = blockIdx.x * int64_t(kBlockSize);
     const int64_t last = (first + kBlockSize < num ? first + kBlockSize : num) - 1;
@@ -40,8 +40,8 @@ __global__ void __launch_bounds__(kBlockSize)
     const int64_t row = item / num_items;
     const size_t s = cluster_at(in.offset, cluster[0], cluster[1], row);
     const int basis = static_cast<int>(item % num_items);
-    gather_sh(in, s, row - in.offset[s], basis, out);
-    if (basis == 0) gather_shape(in, s, row - in.offset[s], out);
+    gather_sh(in, rotations, s, row - in.offset[s], basis, out);
+    if (basis == 0) gather_shape(in, rotations, s, row - in.offset[s], out);
 }
 
 // A host array on the device, for as long as this lives.
@@ -61,10 +61,14 @@ void gather(const GatherInput& host, const GaussianRows<float>& out, Stream stre
     const int64_t num_items = host.offset[host.instance.size] * num_sh_bases(out.sh_degree);
     const Copy<GaussianRows<const float>> bundles(in.bundles, stream);
     const Copy<int32_t> bundle(in.bundle, stream), instance(in.instance, stream);
-    const Copy<double> position(in.position, stream), rotation(in.rotation, stream),
-        quaternion(in.quaternion, stream), scale(in.scale, stream), bands(in.bands, stream);
+    const Copy<double> position(in.position, stream), quaternion(in.quaternion, stream),
+        scale(in.scale, stream);
+    const RotationTables tables(host, out.sh_degree);
+    const DeviceBuffer<double> rotation({tables.rotation.data(), tables.rotation.size()}, stream),
+        bands({tables.bands.data(), tables.bands.size()}, stream);
+    const Rotations rotations{rotation.data(), bands.data()};
     const Copy<int64_t> first_row(in.first_row, stream), offset(in.offset, stream);
-    launch("gather", gather_kernel, blocks_for(num_items, kBlockSize), kBlockSize, 0, stream, in, out,
+    launch("gather", gather_kernel, blocks_for(num_items, kBlockSize), kBlockSize, 0, stream, in, rotations, out,
            num_sh_bases(out.sh_degree));
 }
 

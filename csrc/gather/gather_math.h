@@ -1,17 +1,33 @@
 #pragma once
 
+#include <vector>
+
 #include "base/host_device.h"
 #include "gather/gather.h"
+#include "gather/sh_rotation.h"
 
 namespace v3dg {
 
+// How instances are turned.
+struct Rotations {
+    const double* rotation;  // [I * 9] rows
+    const double* bands;     // [I * kBandsSize]; none where the result has SH degree 0
+};
+
+// The memory of these, on the host.
+struct RotationTables {
+    std::vector<double> rotation, bands;
+
+    RotationTables(const GatherInput& in, int sh_degree);
+};
+
 // Writes all but the SH coefficients of the gaussian `within` cluster s.
-V3DG_HD inline void gather_shape(const GatherInput& in, size_t s, int64_t within,
+V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotations, size_t s, int64_t within,
                                  const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
     const size_t i = in.instance[s];
     const GaussianRows<const float>& rows = in.bundles[in.bundle[i]];
-    const double *r = in.rotation.data + 9 * i, *q = in.quaternion.data + 4 * i, scale = in.scale[i];
+    const double *r = rotations.rotation + 9 * i, *q = in.quaternion.data + 4 * i, scale = in.scale[i];
     const double x = rows.means[3 * from], y = rows.means[3 * from + 1], z = rows.means[3 * from + 2];
     for (int k = 0; k < 3; ++k) {
         const double rotated = r[3 * k] * x + r[3 * k + 1] * y + r[3 * k + 2] * z;
@@ -28,7 +44,7 @@ V3DG_HD inline void gather_shape(const GatherInput& in, size_t s, int64_t within
 }
 
 // Writes the three coefficients of one SH basis of that gaussian, rotated into the world with its band.
-V3DG_HD inline void gather_sh(const GatherInput& in, size_t s, int64_t within, int basis,
+V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations, size_t s, int64_t within, int basis,
                               const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
     const size_t i = in.instance[s];
@@ -40,7 +56,7 @@ V3DG_HD inline void gather_sh(const GatherInput& in, size_t s, int64_t within, i
         return;
     }
     const int degree = basis < 4 ? 1 : basis < 9 ? 2 : 3, first = degree * degree, size = 2 * degree + 1;
-    const double* band = in.bands.data + kBandsSize * i + (degree == 1 ? 0 : degree == 2 ? 9 : 9 + 25);
+    const double* band = rotations.bands + kBandsSize * i + (degree == 1 ? 0 : degree == 2 ? 9 : 9 + 25);
     for (int c = 0; c < 3; ++c) {
         double sum = 0;
         for (int k = 0; k < size; ++k)

@@ -39,7 +39,8 @@ V3DG_HD V3DG_INLINE SlopeLimits<T> slope_limits(const Pinhole<T>& cam) {
 
 // A pinhole camera in the world, in double precision.
 struct Camera {
-    double rotation[9];  // world to camera, rows
+    double rotation[9];     // world to camera, rows
+    double translation[3];  // of world to camera
     double eye[3];
     double fx, fy, cx, cy, width, height, near;  // px; near in world units
     double x0, y0, x1, y1;                       // the part of the image that is wanted, px
@@ -62,6 +63,22 @@ V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {
         }
     }
     for (int a = 0; a < 3; ++a) eye[a] /= determinant;
+}
+
+// The image side of a camera in the world.
+template <class T>
+V3DG_HD inline Pinhole<T> pinhole_of(const Camera& c) {
+    return {T(c.fx), T(c.fy), T(c.cx), T(c.cy), T(c.width), T(c.height), T(c.near)};
+}
+
+// What projection needs of gaussians in the world itself.
+template <class T>
+V3DG_HD inline ModelView<T> view_of_world(const Camera& c) {
+    ModelView<T> view;
+    for (int k = 0; k < 9; ++k) view.linear[k] = T(c.rotation[k]);
+    for (int k = 0; k < 3; ++k) view.translation[k] = T(c.translation[k]);
+    for (int k = 0; k < 3; ++k) view.eye[k] = T(c.eye[k]);
+    return view;
 }
 
 }  // namespace v3dg

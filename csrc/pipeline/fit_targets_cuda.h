@@ -2,7 +2,7 @@
 
 #include "fit_group/fit_group_cuda.h"
 #include "pipeline/fit_level_cuda.h"
-#include "pipeline/frame.h"
+#include "pipeline/frame_cuda.h"
 
 namespace v3dg {
 namespace cuda {

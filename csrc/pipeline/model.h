@@ -30,6 +30,7 @@ class Model {
     }
     const GaussianPlanes<T>& planes() const { return planes_; }
     size_t size() const { return size_; }
+    size_t bytes() const { return storage_.capacity() * sizeof(T); }
 
   private:
     size_t size_;

@@ -1,77 +1,62 @@
 #pragma once
 
-#include "pipeline/frame.h"
-#include "select/select_cuda.h"
+#include <atomic>
+#include <vector>
+
+#include "pipeline/render.h"
+#include "select/select.h"
 
 namespace v3dg {
-namespace cuda {
 
-// The only picture of a frame; `first_tile` and the tiles are filled in.
-FrameImage frame_image(const Pinhole<float>& camera, int width, int height, const float background[3],
-                       float* color, float* alpha, float* depth);
-
-// Gaussians that stay as they are, and packed.
-class PackedModel {
-  public:
-    PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream);
-    const GaussianRows<const float>& rows() const { return rows_; }
-    const PackedPlanes& packed() const { return packed_; }
-
-  private:
-    GaussianRows<const float> rows_;
-    DeviceBuffer<float> planes_;
-    PackedPlanes packed_;
+// How the clusters of one bundle are drawn, and its gaussians, on the host.
+struct SceneModel {
+    const GaussianPlanes<float>* planes;
+    size_t size;                     // gaussians
+    Span<const float> filter_px2;    // [C]
+    Span<const uint8_t> compensate;  // [C]
 };
 
-// Draws a scene that stays on the device: selects, then draws the cut.
-class SceneFrame {
-  public:
-    // `models` are the gaussians of each bundle of the tables, which stay where they are.
-    SceneFrame(std::vector<PackedModel> models, cudaStream_t stream);
-
-    // The tables stay as they are until the drawing is finished.
-    std::unique_ptr<Drawing> draw(SceneTables& tables, const Camera& camera, const SelectRule& rule,
-                                  const FrameImage& image, cudaStream_t stream);
-    // Draws pairs that were selected before; they are on the device and stay, too.
-    std::unique_ptr<Drawing> draw_cut(SceneTables& tables, const Camera& camera, Span<const int32_t> instance,
-                                      Span<const int32_t> cluster, const FrameImage& image,
-                                      cudaStream_t stream);
-
-  private:
-    std::unique_ptr<Drawing> draw(const SceneTables& tables, const FrameImage& image, Frame::Prepare prepare,
-                                  cudaStream_t stream);
-
-    std::vector<PackedModel> models_;
-    DeviceBuffer<GaussianRows<const float>> rows_;
-    DeviceBuffer<PackedPlanes> packed_;
-    DeviceBuffer<Placement> placements_;
-    DeviceBuffer<FrameImage> images_;
-    Frame frame_;
+// A scene on the host: what selection reads of its bundles, their gaussians, and its instances.
+struct HostScene {
+    Span<const ClusterTable> tables;
+    Span<const SceneModel> models;  // of the same bundles
+    InstanceTable instances;
 };
 
-// One model in front of one camera.
-struct ModelTables {
-    GaussianRows<const float> rows;
-    PackedPlanes packed;
-    Placement placement;
-    FrameImage image;
+// What one frame came to.
+struct SceneFrameCounts {
+    int64_t gaussians;    // that were selected; where the budget is exceeded, what the coarsest cut has
+    float tolerance_px2;  // that was used
+    bool exceeds_budget;  // nothing was drawn then
+    double select_seconds, draw_seconds;
+    RenderCounts render;
 };
 
-// Draws all gaussians of one model.
-class ModelFrame {
-  public:
-    explicit ModelFrame(Frame::Keeps keeps = Frame::Keeps::nothing) : frame_(keeps) {}
-
-    // The rows, and what is packed of them, stay where they are until the drawing is finished.
-    std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
-                                  float filter_px2, bool compensate, const FrameImage& image,
-                                  cudaStream_t stream, const PackedPlanes* packed = nullptr);
-    FrameTape tape() const { return frame_.tape(); }
-
-  private:
-    DeviceBuffer<ModelTables> tables_;
-    Frame frame_;
+// Where a pixel's gaussian comes from.
+struct ScenePick {
+    size_t pair;  // place in the cut
+    float weight, depth;
 };
 
-}  // namespace cuda
+namespace cpu {
+
+// Selects what the window of the camera needs, and draws it. Once `stop` is true, returns soon and leaves the
+// picture unfinished.
+SceneFrameCounts draw_scene(const HostScene& scene, const Camera& camera, const SelectRule& rule,
+                            const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
+
+// Draws pairs that were selected before. Throws std::out_of_range where one is not of the scene.
+SceneFrameCounts draw_cut(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
+                          Span<const int32_t> cluster, const Picture<float>& picture,
+                          const std::atomic<bool>* stop = nullptr);
+
+// Draws all gaussians of one model, in the world, without a filter.
+SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,
+                            const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
+
+// The gaussian that the first pixel of the camera's window shows most of. Returns whether there is any.
+bool pick_cut(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
+              Span<const int32_t> cluster, ScenePick& picked);
+
+}  // namespace cpu
 }  // namespace v3dg

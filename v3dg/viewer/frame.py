@@ -10,7 +10,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core, _device, _resident
+from v3dg import _core, _device
+from v3dg._device import CPU
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
@@ -18,9 +19,10 @@ from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.pictures import to_8bit
-from v3dg.render import cluster_tables, render
+from v3dg.render import render
+from v3dg.residency import residency
 from v3dg.scene import Scene
-from v3dg.select import DEFAULT_TOLERANCE, Selection, camera_of, rule_of, select
+from v3dg.select import DEFAULT_TOLERANCE, Selection, rule_of, select
 from v3dg.viewer.view import View
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
@@ -155,7 +157,7 @@ class SceneView:
     @property
     def draws_all_while_moving(self) -> bool:
         """Whether all gaussians are few enough to be drawn in every picture."""
-        return self.device == "cuda" or self.num_gaussians <= _FEW_GAUSSIANS
+        return self.device.is_cuda or self.num_gaussians <= _FEW_GAUSSIANS
 
     def frame(
         self, view: View, size: tuple[int, int], settings: Settings, stop: _core.Stop | None = None
@@ -226,13 +228,12 @@ class SceneView:
     def _all_gaussians(
         self, camera: Camera, window: Window, stop: _core.Stop | None
     ) -> npt.NDArray[np.float32]:
-        if self.device == "cuda":
-            cut = select(self.scene, camera, tolerance=0.0, device="cuda")
+        if self.device.is_cuda:
+            cut = select(self.scene, camera, tolerance=0.0, device=self.device)
         else:  # which leaves out what is beside the window
-            instances = _resident.instances_on_host(self.scene)
             rule = rule_of(0.0, None, 0, "solid_angle", True)
-            found = _core.select(self.scene.tables, instances, camera_of(camera, window), rule)
-            cut = Selection(self.scene, found[0], found[1], found[2], 0.0, 0.0)
+            found = residency.scene(self.scene, CPU).core.select(camera.core.window(*window), rule)
+            cut = Selection(self.scene, found.instance_ids, found.cluster_ids, found.num_gaussians, 0.0, 0.0)
         color: npt.NDArray[np.float32] = self._draw(cut, camera, window, "appearance", stop)[0]
         return color
 
@@ -240,39 +241,32 @@ class SceneView:
         self, cut: Selection, camera: Camera, window: Window, color_by: ColorBy, stop: _core.Stop | None
     ) -> tuple[Any, Any, Any, int]:
         """Colour, alpha and depth of the window, and the gaussians in view of the whole picture."""
-        if self.device == "cuda":
-            image = render(self.scene, camera, cut=cut, color_by=color_by, device="cuda")
+        if self.device.is_cuda:
+            image = render(self.scene, camera, cut=cut, color_by=color_by, device=self.device)
             x0, y0, x1, y1 = window
             planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
             color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
             return color, alpha, depth, image.stats.gaussians_in_frustum
-        color, alpha, depth, counts = _core.render_selection(
-            cluster_tables(self.scene, color_by),
-            _resident.instances_on_host(self.scene),
-            camera_of(camera, window),
-            cut.instance_ids,
-            cut.cluster_ids,
-            (0.0, 0.0, 0.0),
-            True,
-            stop,
+        frame, scene = self._frame(color_by), residency.scene(self.scene, CPU).core
+        drawing = frame.draw_cut(
+            scene, camera.core.window(*window), cut.instance_ids, cut.cluster_ids, (0.0, 0.0, 0.0), stop
         )
         _check(stop)
-        return color, alpha, depth, counts["in_frustum"]
+        return drawing.color, drawing.alpha, drawing.depth, drawing.finish().in_frustum
 
     def _count(
         self, cut: Selection, camera: Camera, window: Window, stop: _core.Stop | None
     ) -> tuple[npt.NDArray[np.float32], int]:
         """(H, W) gaussians that each pixel is blended of; drawn on the CPU on any device."""
-        count, counts = _core.count_selection(
-            cluster_tables(self.scene),
-            _resident.instances_on_host(self.scene),
-            camera_of(camera, window),
-            cut.instance_ids,
-            cut.cluster_ids,
-            stop,
-        )
+        frame, scene = self._frame("appearance"), residency.scene(self.scene, CPU).core
+        drawing = frame.count_cut(scene, camera.core.window(*window), cut.instance_ids, cut.cluster_ids, stop)
         _check(stop)
-        return count, counts["in_frustum"]
+        return drawing.depth, drawing.finish().in_frustum
+
+    def _frame(self, color_by: ColorBy) -> _core.SceneFrame:
+        frame = _core.SceneFrame(CPU.number)
+        frame.set_models([residency.model(bundle, CPU, color_by) for bundle in self.scene.bundles])
+        return frame
 
     def _levels(self, cut: Selection) -> npt.NDArray[np.int64]:
         """(L,) selected gaussians by level."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from v3dg.cameras import Camera, Floats, VectorLike
-from v3dg.scene import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
 
 
 @dataclass(frozen=True)

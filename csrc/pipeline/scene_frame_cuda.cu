@@ -1,4 +1,4 @@
-#include "pipeline/scene_frame.h"
+#include "pipeline/scene_frame_cuda.h"
 
 #include <algorithm>
 
@@ -28,23 +28,23 @@ static uint32_t num_tiles(const FrameImage& image) {
 PackedModel::PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream)
     : rows_(rows), planes_(16 * rows.size, stream), packed_(pack(rows, planes_.data(), stream)) {}
 
-SceneFrame::SceneFrame(std::vector<PackedModel> models, cudaStream_t stream)
-    : models_(std::move(models)), images_(1, stream) {
+void SceneFrame::set_models(std::vector<std::shared_ptr<const PackedModel>> models, cudaStream_t stream) {
     std::vector<GaussianRows<const float>> rows;
     std::vector<PackedPlanes> packed;
-    for (const PackedModel& model : models_) {
-        rows.push_back(model.rows());
-        packed.push_back(model.packed());
+    for (const auto& model : models) {
+        rows.push_back(model->rows());
+        packed.push_back(model->packed());
     }
     rows_.copy_from({rows.data(), rows.size()}, stream);
     packed_.copy_from({packed.data(), packed.size()}, stream);
+    models_ = std::move(models);
 }
 
 std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& tables, const FrameImage& image,
                                           Frame::Prepare prepare, cudaStream_t stream) {
     const FrameBatch batch{rows_.data(),
                            placements_.reserve(tables.num_instances(), stream),
-                           images_.data(),
+                           images_.reserve(1, stream),
                            1,
                            num_tiles(image),
                            packed_.data(),

@@ -6,8 +6,8 @@
 
 #include "base/isa.h"
 #include "base/parallel_for.h"
-#include "frame/image.h"
 #include "fit_group/fit_group_math.h"
+#include "frame/image.h"
 
 namespace v3dg {
 

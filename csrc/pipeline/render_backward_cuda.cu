@@ -1,4 +1,4 @@
-#include "pipeline/frame_backward.h"
+#include "pipeline/render_backward_cuda.h"
 
 #include <map>
 #include <mutex>

@@ -1,4 +1,4 @@
-#include "pipeline/frame.h"
+#include "pipeline/frame_cuda.h"
 
 #include <algorithm>
 #include <stdexcept>

@@ -1,0 +1,224 @@
+#include <algorithm>
+
+#include "bindings/operations.h"
+#include "bindings/picture.h"
+#include "pipeline/model.h"
+#include "pipeline/render.h"
+
+#if V3DG_WITH_CUDA
+#include "pipeline/render_backward_cuda.h"
+#endif
+
+namespace v3dg {
+
+namespace {
+
+// What one picture is drawn with, beside gaussians and camera.
+struct Look {
+    double filter_px2;
+    bool antialiased;
+    std::array<double, 3> background;
+};
+
+// What rasterize leaves for rasterize_backward.
+class Tape {
+  public:
+    virtual ~Tape() = default;
+    // Gradients of means, quats, scales, opacities, sh and background.
+    virtual py::tuple backward(const py::object& d_color, const py::object& d_alpha,
+                               const py::object& d_depth) = 0;
+};
+
+// The gradient of a plane of the picture; where none is given, zeros.
+template <class T>
+struct Plane {
+    py::object object;
+    Span<const T> span;
+
+    Plane(const py::object& given, const char* name, Device device, const std::vector<py::ssize_t>& shape)
+        : object(given.is_none() ? zeros(device, shape) : given) {
+        span = shape.size() == 3 ? span_on<const T>(device, object, name, {shape[0], shape[1], shape[2]})
+                                 : span_on<const T>(device, object, name, {shape[0], shape[1]});
+    }
+
+  private:
+    static py::object zeros(Device device, const std::vector<py::ssize_t>& shape) {
+        const py::object array = new_array(device, py::dtype::of<T>(), shape);
+        if (device.is_host())
+            array.attr("fill")(0);
+        else
+            array.attr("zero_")();
+        return array;
+    }
+};
+
+py::tuple with_background(const NewRows& gradients, const py::object& background) {
+    return py::make_tuple(gradients.means.object, gradients.quats.object, gradients.scales.object,
+                          gradients.opacities.object, gradients.sh.object, background);
+}
+
+template <class T>
+class HostTape final : public Tape {
+  public:
+    HostTape(const GaussianRows<const T>& rows, const BoundCamera& camera, const Look& look)
+        : model_(rows),
+          draw_{&model_.planes(), 0, model_.size(), view_of_world<T>(camera.camera), T(look.filter_px2),
+                look.antialiased},
+          camera_(pinhole_of<T>(camera.camera)),
+          height_(camera.height()),
+          width_(camera.width()),
+          background_(look.background) {}
+
+    RenderCounts draw(const Picture<T>& picture, bool keeps_tape) {
+        return render<T>({draw_}, camera_, picture, keeps_tape, workspace_);
+    }
+
+    py::tuple backward(const py::object& d_color, const py::object& d_alpha,
+                       const py::object& d_depth) override {
+        const py::ssize_t h = height_, w = width_;
+        const Plane<T> color(d_color, "d_color", {}, {h, w, 3}), alpha(d_alpha, "d_alpha", {}, {h, w});
+        const PictureGradient<T> d_picture{
+            color.span.data, alpha.span.data,
+            d_depth.is_none() ? nullptr : span_of<const T>(d_depth, "d_depth", {h, w}).data};
+        const auto n = static_cast<py::ssize_t>(model_.size());
+        const int degree = model_.planes().sh_degree;
+        const NewArray<T> means({}, {n, 3}), quats({}, {n, 4}), scales({}, {n, 3}), opacities({}, {n}),
+            sh({}, {n, num_sh_bases(degree), 3}), background({}, {3});
+        for (const Span<T>& span :
+             {means.span, quats.span, scales.span, opacities.span, sh.span, background.span})
+            std::fill(span.begin(), span.end(), T(0));
+        const GaussianRows<T> out{
+            means.span.data, quats.span.data, scales.span.data, opacities.span.data, sh.span.data,
+            model_.size(),   degree};
+        {
+            const py::gil_scoped_release unlocked;
+            const Picture<T> picture{{0, 0, width_, height_},
+                                     {T(background_[0]), T(background_[1]), T(background_[2])},
+                                     nullptr,
+                                     nullptr,
+                                     nullptr};
+            render_backward<T>(draw_, camera_, picture, d_picture, workspace_, out, background.span.data);
+        }
+        return py::make_tuple(means.object, quats.object, scales.object, opacities.object, sh.object,
+                              background.object);
+    }
+
+  private:
+    Model<T> model_;
+    Draw<T> draw_;
+    Pinhole<T> camera_;
+    int height_, width_;
+    std::array<double, 3> background_;
+    Workspace<T> workspace_;
+};
+
+py::dict dict_of(const RenderCounts& c) {
+    return py::dict("in_frustum"_a = c.in_frustum, "records"_a = c.records, "entries"_a = c.entries,
+                    "project_seconds"_a = c.project_seconds, "bin_seconds"_a = c.bin_seconds,
+                    "rasterize_seconds"_a = c.rasterize_seconds);
+}
+
+template <class T>
+py::tuple rasterize_on_host(const Rows& gaussians, const BoundCamera& camera, const Look& look,
+                            bool with_depth, bool keep_tape) {
+    NewPicture out{camera.height(), camera.width(), {}, {}, py::none(), with_depth};
+    const Picture<T> picture = out.on_host<T>({0, 0, camera.width(), camera.height()}, look.background);
+    const GaussianRows<const T> rows = gaussians.read<T>();
+    std::unique_ptr<HostTape<T>> tape;
+    RenderCounts counts;
+    {
+        const py::gil_scoped_release unlocked;
+        tape = std::make_unique<HostTape<T>>(rows, camera, look);
+        counts = tape->draw(picture, keep_tape);
+    }
+    return py::make_tuple(
+        out.color, out.alpha, out.depth, dict_of(counts),
+        keep_tape ? py::cast(std::unique_ptr<Tape>(std::move(tape))) : py::object(py::none()));
+}
+
+#if V3DG_WITH_CUDA
+
+class DeviceTape final : public Tape {
+  public:
+    // Keeps the arrays, which backward() reads again.
+    DeviceTape(const Rows& gaussians, std::unique_ptr<cuda::DifferentiableFrame> frame, py::ssize_t height,
+               py::ssize_t width)
+        : gaussians_(gaussians), frame_(std::move(frame)), height_(height), width_(width) {}
+    ~DeviceTape() override { cuda::give_back(std::move(frame_)); }
+
+    py::tuple backward(const py::object& d_color, const py::object& d_alpha,
+                       const py::object& d_depth) override {
+        const py::ssize_t h = height_, w = width_;
+        const Device device = gaussians_.device();
+        const Work work(device);
+        const Plane<float> color(d_color, "d_color", device, {h, w, 3}), alpha(d_alpha, "d_alpha", device, {h, w});
+        const PictureGradient<float> d_picture{
+            color.span.data, alpha.span.data,
+            d_depth.is_none() ? nullptr : device_span_of<const float>(d_depth, "d_depth", {h, w}).data};
+        const NewRows gradients(device, gaussians_.size(), gaussians_.sh_degree());
+        const NewArray<float> background(device, {3});
+        {
+            const py::gil_scoped_release unlocked;
+            frame_->backward(d_picture, gradients.rows(), background.span.data, work.stream());
+        }
+        return with_background(gradients, background.object);
+    }
+
+  private:
+    Rows gaussians_;
+    std::unique_ptr<cuda::DifferentiableFrame> frame_;
+    py::ssize_t height_, width_;
+};
+
+py::tuple rasterize_on_device(const Rows& gaussians, const BoundCamera& camera, const Look& look,
+                              bool with_depth, bool keep_tape) {
+    const Device device = gaussians.device();
+    const Work work(device);
+    NewPicture out{camera.height(), camera.width(), {}, {}, py::none(), with_depth};
+    const cuda::ModelPicture in{gaussians.read<float>(), view_of_world<float>(camera.camera),
+                                static_cast<float>(look.filter_px2), look.antialiased,
+                                out.on_device(device, camera.camera, look.background)};
+    std::unique_ptr<cuda::DifferentiableFrame> frame;
+    {
+        const py::gil_scoped_release unlocked;
+        frame = cuda::take_frame();
+        frame->draw(in, work.stream());
+    }
+    auto tape = std::make_unique<DeviceTape>(gaussians, std::move(frame), out.height, out.width);
+    return py::make_tuple(
+        out.color, out.alpha, out.depth, py::none(),
+        keep_tape ? py::cast(std::unique_ptr<Tape>(std::move(tape))) : py::object(py::none()));
+}
+
+#endif
+
+py::tuple rasterize(const Rows& gaussians, const BoundCamera& camera, double filter_px2, bool antialiased,
+                    const std::array<double, 3>& background, bool with_depth, bool keep_tape) {
+    const Look look{filter_px2, antialiased, background};
+#if V3DG_WITH_CUDA
+    if (!gaussians.device().is_host())
+        return rasterize_on_device(gaussians, camera, look, with_depth, keep_tape);
+#endif
+    return gaussians.is_double() ? rasterize_on_host<double>(gaussians, camera, look, with_depth, keep_tape)
+                                 : rasterize_on_host<float>(gaussians, camera, look, with_depth, keep_tape);
+}
+
+}  // namespace
+
+void bind_rasterize(py::module_& m) {
+    py::class_<Tape>(m, "Tape", "What rasterize leaves for rasterize_backward; it keeps the gaussians.");
+    m.def("rasterize", &rasterize, "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a, "antialiased"_a,
+          "background"_a, "with_depth"_a, "keep_tape"_a,
+          "Draws gaussians where they are and in the precision that they have: (color, alpha, depth or None, "
+          "on "
+          "the host counts and times, the tape or None).");
+    m.def(
+        "rasterize_backward",
+        [](Tape& tape, const py::object& d_color, const py::object& d_alpha, const py::object& d_depth) {
+            return tape.backward(d_color, d_alpha, d_depth);
+        },
+        "tape"_a, "d_color"_a, "d_alpha"_a, "d_depth"_a,
+        "Gradients of means, quats, scales, opacities, sh and background.");
+}
+
+}  // namespace v3dg

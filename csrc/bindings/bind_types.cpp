@@ -1,0 +1,177 @@
+#include <algorithm>
+#include <cmath>
+
+#include "bindings/operations.h"
+#include "bindings/types.h"
+
+namespace v3dg {
+
+namespace {
+
+using Corners = std::array<int, 4>;
+
+void set_window(const Corners& w, Camera& camera) {
+    const int width = static_cast<int>(camera.width), height = static_cast<int>(camera.height);
+    if (!(0 <= w[0] && w[0] < w[2] && w[2] <= width && 0 <= w[1] && w[1] < w[3] && w[3] <= height))
+        throw py::value_error("window: expected x0 < x1 and y0 < y1 within " + std::to_string(width) + " x " +
+                              std::to_string(height) + " px, got " +
+                              py::str(py::tuple(py::cast(w))).cast<std::string>());
+    camera.x0 = w[0];
+    camera.y0 = w[1];
+    camera.x1 = w[2];
+    camera.y1 = w[3];
+}
+
+BoundCamera make_camera(const py::array& viewmat, const py::array& K, int width, int height, double near) {
+    if (width < 1 || height < 1 || width > UINT16_MAX || height > UINT16_MAX)
+        throw py::value_error("width, height: expected 1 to 65535 px, got " + std::to_string(width) + " x " +
+                              std::to_string(height));
+    const Span<const double> view = span_of<const double>(viewmat, "viewmat", {4, 4});
+    const Span<const double> k = span_of<const double>(K, "K", {3, 3});
+    BoundCamera out;
+    std::copy(view.begin(), view.end(), out.viewmat.begin());
+    Camera& camera = out.camera;
+    for (int row = 0; row < 3; ++row) {
+        for (int a = 0; a < 3; ++a) camera.rotation[3 * row + a] = view[4 * row + a];
+        camera.translation[row] = view[4 * row + 3];
+    }
+    eye_of(view.data, camera.eye);
+    camera.fx = k[0];
+    camera.fy = k[4];
+    camera.cx = k[2];
+    camera.cy = k[5];
+    camera.width = width;
+    camera.height = height;
+    camera.near = near;
+    set_window({0, 0, width, height}, camera);
+    return out;
+}
+
+BoundCamera window_of_camera(const BoundCamera& camera, int x0, int y0, int x1, int y1) {
+    BoundCamera part = camera;
+    set_window({x0, y0, x1, y1}, part.camera);
+    return part;
+}
+
+py::array_t<double> position_of(const BoundCamera& camera) {
+    return py::array_t<double>(3, camera.camera.eye);
+}
+
+Footprint footprint_of(const std::string& name) {
+    if (name == "solid_angle") return Footprint::solid_angle;
+    if (name == "paper") return Footprint::paper;
+    throw py::value_error("footprint: expected solid_angle or paper, got " + name);
+}
+
+SelectRule make_rule(double tolerance_px2, std::optional<uint64_t> budget, int32_t min_level,
+                     const std::string& footprint, bool culls) {
+    SelectRule rule;
+    rule.tolerance_px2 = static_cast<float>(tolerance_px2);
+    rule.budget = budget.value_or(kNoBudget);
+    rule.min_level = min_level;
+    rule.footprint = footprint_of(footprint);
+    rule.culls = culls;
+    return rule;
+}
+
+}  // namespace
+
+int degree_of_bases(py::ssize_t bases, const std::string& shape) {
+    int degree = 0;
+    while (degree <= 3 && num_sh_bases(degree) != bases) ++degree;
+    if (degree > 3)
+        throw py::value_error("sh: expected shape (N, K, 3) with K of 1, 4, 9 or 16, got " + shape);
+    return degree;
+}
+
+Rows::Rows(py::object means, py::object quats, py::object scales, py::object opacities, py::object sh)
+    : arrays_{std::move(means), std::move(quats), std::move(scales), std::move(opacities), std::move(sh)},
+      device_(device_of(arrays_[0], "means")) {
+    const std::vector<py::ssize_t> shape = shape_of(arrays_[4], "sh");
+    sh_degree_ = degree_of_bases(shape.size() == 3 ? shape[1] : -1, shape_text(arrays_[4]));
+    const std::vector<py::ssize_t> centers = shape_of(arrays_[0], "means");
+    if (centers.size() != 2)
+        throw py::value_error("means: expected shape (N, 3), got " + shape_text(arrays_[0]));
+    size_ = static_cast<size_t>(centers[0]);
+    is_double_ = device_.is_host() && py::isinstance<py::array_t<double>>(arrays_[0]);
+    if (is_double_) {
+        read<double>();
+        return;
+    }
+    const GaussianRows<const float> rows = read<float>();
+    if (device_.is_host()) return;
+    for (const float* start : {rows.quats, rows.sh})
+        if (reinterpret_cast<uintptr_t>(start) % 16 != 0)
+            throw py::value_error("quats, sh: expected memory that begins at a multiple of 16 bytes");
+}
+
+NewRows::NewRows(Device device, size_t size, int sh_degree)
+    : means(device, {static_cast<py::ssize_t>(size), 3}),
+      quats(device, {static_cast<py::ssize_t>(size), 4}),
+      scales(device, {static_cast<py::ssize_t>(size), 3}),
+      opacities(device, {static_cast<py::ssize_t>(size)}),
+      sh(device, {static_cast<py::ssize_t>(size), num_sh_bases(sh_degree), 3}),
+      size(size),
+      sh_degree(sh_degree) {}
+
+Instances::Instances(py::array bundle, py::array positions, py::array quaternions, py::array scales,
+                     py::array importance)
+    : arrays_{bundle, positions, quaternions, scales, importance} {
+    table_.bundle = span_of<const int32_t>(bundle, "bundle", {-1});
+    const auto count = static_cast<py::ssize_t>(table_.bundle.size);
+    table_.position = span_of<const double>(positions, "positions", {count, 3});
+    table_.quaternion = span_of<const double>(quaternions, "quaternions", {count, 4});
+    table_.scale = span_of<const double>(scales, "scales", {count});
+    table_.importance = span_of<const float>(importance, "importance", {count});
+}
+
+void Instances::check_bundles(size_t num_bundles) const {
+    check_instance_bundles(table_.bundle, num_bundles);
+}
+
+void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles) {
+    for (const int32_t b : bundle)
+        if (b < 0 || static_cast<size_t>(b) >= num_bundles)
+            throw py::value_error("bundle: expected a bundle below " + std::to_string(num_bundles) +
+                                  ", got " + std::to_string(b));
+}
+
+Span<const int64_t> offsets_of(const py::handle& offset, size_t last) {
+    const Span<const int64_t> values = span_of<const int64_t>(offset, "offset", {-1});
+    bool good = values.size > 0 && values[0] == 0 && values[values.size - 1] == static_cast<int64_t>(last);
+    for (size_t i = 1; good && i < values.size; ++i) good = values[i - 1] <= values[i];
+    if (!good)
+        throw py::value_error("offset: expected ascending boundaries from 0 to " + std::to_string(last) +
+                              ", got others");
+    return values;
+}
+
+Window window_of(const Camera& c) {
+    return {static_cast<int>(c.x0), static_cast<int>(c.y0), static_cast<int>(c.x1), static_cast<int>(c.y1)};
+}
+
+void bind_types(py::module_& m) {
+    py::class_<BoundCamera>(m, "Camera",
+                            "A pinhole camera, or a window of its image, as every operation takes it.")
+        .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a, "near"_a)
+        .def("window", &window_of_camera, "x0"_a, "y0"_a, "x1"_a, "y1"_a,
+             "The same camera, of whose image only the pixels [x0, x1) x [y0, y1) are wanted.")
+        .def_property_readonly("position", &position_of, "Where it is in the world: (3,).");
+    py::class_<SelectRule>(m, "Rule", "What a selection chooses.")
+        .def(py::init(&make_rule), py::kw_only(), "tolerance_px2"_a, "budget"_a, "min_level"_a, "footprint"_a,
+             "culls"_a)
+        .def_readonly("tolerance_px2", &SelectRule::tolerance_px2);
+    py::class_<Instances>(m, "Instances", "Instances of bundles; borrows the arrays, which are on the host.")
+        .def(py::init<py::array, py::array, py::array, py::array, py::array>(), py::kw_only(), "bundle"_a,
+             "positions"_a, "quaternions"_a, "scales"_a, "importance"_a);
+    py::class_<Rows>(m, "Rows", "The arrays of gaussians, on the host or on a CUDA device.")
+        .def(py::init<py::object, py::object, py::object, py::object, py::object>(), "means"_a, "quats"_a,
+             "scales"_a, "opacities"_a, "sh"_a)
+        .def("__len__", &Rows::size)
+        .def_property_readonly(
+            "device", [](const Rows& rows) { return rows.device().number; },
+            "Number of the CUDA device; -1 on the host.")
+        .def_property_readonly("sh_degree", &Rows::sh_degree);
+}
+
+}  // namespace v3dg

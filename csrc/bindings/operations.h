@@ -1,0 +1,19 @@
+#pragma once
+
+#include <pybind11/pybind11.h>
+
+// One function a file of bindings, in the order in which module.cpp calls them.
+
+namespace v3dg {
+
+void bind_types(pybind11::module_& m);
+void bind_ply(pybind11::module_& m);
+void bind_cluster(pybind11::module_& m);
+void bind_simplify(pybind11::module_& m);
+void bind_gather(pybind11::module_& m);
+void bind_select(pybind11::module_& m);
+void bind_rasterize(pybind11::module_& m);
+void bind_scene(pybind11::module_& m);
+void bind_fit_level(pybind11::module_& m);
+
+}  // namespace v3dg

@@ -1,0 +1,55 @@
+#pragma once
+
+#include "bindings/types.h"
+#include "frame/image.h"
+
+#if V3DG_WITH_CUDA
+#include "pipeline/scene_frame_cuda.h"
+#endif
+
+namespace v3dg {
+
+// The planes of a new picture, to be filled in: colour (H, W, 3), alpha and, where it is wanted, depth (H,
+// W).
+struct NewPicture {
+    py::ssize_t height, width;
+    py::object color, alpha, depth;
+    bool with_depth;
+
+    template <class T>
+    Picture<T> on_host(const Window& window, const std::array<double, 3>& background) {
+        const NewArray<T> color_plane({}, {height, width, 3}), alpha_plane({}, {height, width});
+        color = color_plane.object;
+        alpha = alpha_plane.object;
+        Picture<T> picture{window,
+                           {T(background[0]), T(background[1]), T(background[2])},
+                           color_plane.span.data,
+                           alpha_plane.span.data,
+                           nullptr};
+        if (with_depth) {
+            const NewArray<T> depth_plane({}, {height, width});
+            depth = depth_plane.object;
+            picture.depth = depth_plane.span.data;
+        }
+        return picture;
+    }
+
+#if V3DG_WITH_CUDA
+    cuda::FrameImage on_device(Device device, const Camera& camera, const std::array<double, 3>& background) {
+        const NewArray<float> color_plane(device, {height, width, 3}), alpha_plane(device, {height, width});
+        color = color_plane.object;
+        alpha = alpha_plane.object;
+        float* depth_data = nullptr;
+        if (with_depth) {
+            const NewArray<float> depth_plane(device, {height, width});
+            depth = depth_plane.object;
+            depth_data = depth_plane.span.data;
+        }
+        const float b[3] = {float(background[0]), float(background[1]), float(background[2])};
+        return cuda::frame_image(pinhole_of<float>(camera), static_cast<int>(width), static_cast<int>(height),
+                                 b, color_plane.span.data, alpha_plane.span.data, depth_data);
+    }
+#endif
+};
+
+}  // namespace v3dg

@@ -1,0 +1,105 @@
+#pragma once
+
+// Value types that cross between Python and the core. All of them are immutable; those that hold arrays keep
+// them alive.
+
+#include <array>
+
+#include "bindings/array.h"
+#include "frame/image.h"
+#include "math/camera.h"
+#include "math/gaussian.h"
+#include "select/select.h"
+
+namespace v3dg {
+
+// A camera that is wanted as a whole or in part, and what it was made of.
+struct BoundCamera {
+    std::array<double, 16> viewmat;
+    Camera camera;
+
+    int width() const { return static_cast<int>(camera.width); }
+    int height() const { return static_cast<int>(camera.height); }
+};
+
+// The arrays of gaussians, all on the host or all on one CUDA device, float32 or, on the host, float64.
+class Rows {
+  public:
+    Rows(py::object means, py::object quats, py::object scales, py::object opacities, py::object sh);
+
+    Device device() const { return device_; }
+    size_t size() const { return size_; }
+    int sh_degree() const { return sh_degree_; }
+    bool is_double() const { return is_double_; }
+    const std::array<py::object, 5>& arrays() const { return arrays_; }
+
+    // Borrowed, in the precision that they have.
+    template <class T>
+    GaussianRows<const T> read() const {
+        return spans<const T>();
+    }
+    // Borrowed to be written to, float32.
+    GaussianRows<float> write() const { return spans<float>(); }
+
+  private:
+    template <class T>
+    GaussianRows<T> spans() const {
+        const auto n = static_cast<py::ssize_t>(size_),
+                   bases = static_cast<py::ssize_t>(num_sh_bases(sh_degree_));
+        return {span_on<T>(device_, arrays_[0], "means", {n, 3}).data,
+                span_on<T>(device_, arrays_[1], "quats", {n, 4}).data,
+                span_on<T>(device_, arrays_[2], "scales", {n, 3}).data,
+                span_on<T>(device_, arrays_[3], "opacities", {n}).data,
+                span_on<T>(device_, arrays_[4], "sh", {n, bases, 3}).data,
+                size_,
+                sh_degree_};
+    }
+
+    std::array<py::object, 5> arrays_;
+    Device device_;
+    size_t size_ = 0;
+    int sh_degree_ = 0;
+    bool is_double_ = false;
+};
+
+// New rows of `size` gaussians, to be filled in.
+struct NewRows {
+    NewArray<float> means, quats, scales, opacities, sh;
+    size_t size;
+    int sh_degree;
+
+    NewRows(Device device, size_t size, int sh_degree);
+    GaussianRows<float> rows() const {
+        return {means.span.data, quats.span.data, scales.span.data, opacities.span.data, sh.span.data, size,
+                sh_degree};
+    }
+    py::tuple arrays() const {
+        return py::make_tuple(means.object, quats.object, scales.object, opacities.object, sh.object);
+    }
+};
+
+// Degree of coefficients of shape (N, K, 3).
+int degree_of_bases(py::ssize_t bases, const std::string& shape);
+
+// Instances on the host.
+class Instances {
+  public:
+    Instances(py::array bundle, py::array positions, py::array quaternions, py::array scales,
+              py::array importance);
+    const InstanceTable& table() const { return table_; }
+    // Throws unless every instance shows one of so many bundles.
+    void check_bundles(size_t num_bundles) const;
+
+  private:
+    std::array<py::array, 5> arrays_;
+    InstanceTable table_;
+};
+void check_instance_bundles(Span<const int32_t> bundle, size_t num_bundles);
+
+// Boundaries of segments: ascending from 0 to `last`.
+Span<const int64_t> offsets_of(const py::handle& offset, size_t last);
+
+// The part of the camera's image that is wanted.
+Window window_of(const Camera& camera);
+
+}  // namespace v3dg

@@ -1,0 +1,160 @@
+#include "pipeline/scene_frame.h"
+
+#include <algorithm>
+#include <chrono>
+#include <memory>
+#include <stdexcept>
+#include <string>
+
+namespace v3dg {
+
+namespace {
+
+double now() {
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+// A workspace lent to one caller at a time, kept from frame to frame; a second caller gets one of its own.
+// Without a lock, which a fork() in the middle would leave closed.
+class SharedWorkspace {
+  public:
+    ~SharedWorkspace() { delete kept_.load(); }
+    std::unique_ptr<Workspace<float>> take() {
+        std::unique_ptr<Workspace<float>> kept(kept_.exchange(nullptr));
+        return kept ? std::move(kept) : std::make_unique<Workspace<float>>();
+    }
+    // Keeps what the next frame is likely to need, but does not sit on the memory of an exceptional one.
+    void give_back(std::unique_ptr<Workspace<float>> workspace) {
+        constexpr size_t kMostRecords = size_t(16) << 20;
+        if (workspace->records.capacity() <= kMostRecords)
+            workspace.reset(kept_.exchange(workspace.release()));
+    }
+
+  private:
+    std::atomic<Workspace<float>*> kept_{nullptr};
+};
+
+SharedWorkspace& shared_workspace() {
+    static SharedWorkspace shared;
+    return shared;
+}
+
+SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& camera,
+                          const Picture<float>& picture, const std::atomic<bool>* stop) {
+    SceneFrameCounts counts{};
+    std::unique_ptr<Workspace<float>> workspace = shared_workspace().take();
+    counts.render = render<float>(draws, pinhole_of<float>(camera), picture, false, *workspace, stop);
+    shared_workspace().give_back(std::move(workspace));
+    return counts;
+}
+
+// The clusters of a cut as draws. Neighbouring clusters of one instance are neighbours in memory: one draw.
+class CutDraws {
+  public:
+    CutDraws(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
+             Span<const int32_t> cluster)
+        : scene_(scene), camera_(camera) {
+        for (size_t s = 0; s < instance.size; ++s) add(instance[s], cluster[s]);
+    }
+
+    const std::vector<Draw<float>>& draws() const { return draws_; }
+    int64_t num_gaussians() const { return static_cast<int64_t>(num_gaussians_); }
+    // The pair that a gaussian belongs to, counted through all draws.
+    size_t pair_of(uint64_t gaussian) const {
+        return std::upper_bound(end_of_pair_.begin(), end_of_pair_.end(), gaussian) - end_of_pair_.begin();
+    }
+
+  private:
+    void add(int32_t i, int32_t c) {
+        if (i < 0 || static_cast<size_t>(i) >= scene_.instances.bundle.size)
+            throw std::out_of_range("instance_ids: expected ids of the scene's instances, got " +
+                                    std::to_string(i));
+        const int32_t bundle = scene_.instances.bundle[i];
+        const SceneModel& model = scene_.models[bundle];
+        const ClusterTable& table = scene_.tables[bundle];
+        if (c < 0 || static_cast<size_t>(c) >= model.filter_px2.size)
+            throw std::out_of_range("cluster_ids: expected ids of the bundle's clusters, got " +
+                                    std::to_string(c));
+        const uint64_t first = table.offset[c], count = table.offset[c + 1] - first;
+        end_of_pair_.push_back(num_gaussians_);
+        if (i != last_instance_) {
+            const Pose pose = scene_.instances.pose(i);
+            if (!is_placed(pose)) return;
+            view_ = model_view_from_instance(axes_of_instance(camera_, pose), pose);
+        }
+        end_of_pair_.back() = num_gaussians_ += count;
+        const Draw<float> next{
+            model.planes, first, count, view_, model.filter_px2[c], model.compensate[c] != 0};
+        if (i == last_instance_ && joins(draws_.back(), next))
+            draws_.back().count += count;
+        else
+            draws_.push_back(next);
+        last_instance_ = i;
+    }
+
+    // Whether the second, of the same instance, goes on where the first ends and is drawn alike.
+    static bool joins(const Draw<float>& a, const Draw<float>& b) {
+        return a.first + a.count == b.first && a.filter_px2 == b.filter_px2 && a.compensate == b.compensate;
+    }
+
+    const HostScene& scene_;
+    const Camera& camera_;
+    std::vector<Draw<float>> draws_;
+    std::vector<uint64_t> end_of_pair_;  // among the gaussians of all draws
+    uint64_t num_gaussians_ = 0;
+    int32_t last_instance_ = -1;
+    ModelView<float> view_{};
+};
+
+}  // namespace
+
+SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Camera& camera, const SelectRule& rule,
+                                 const Picture<float>& picture, const std::atomic<bool>* stop) {
+    const double start = now();
+    SelectOutput cut;
+    select({scene.tables, scene.instances, camera, rule}, cut);
+    const double select_seconds = now() - start;
+    SceneFrameCounts counts{};
+    if (cut.fits_budget)
+        counts = draw_cut(scene, camera, {cut.instance.data(), cut.instance.size()},
+                          {cut.cluster.data(), cut.cluster.size()}, picture, stop);
+    counts.gaussians = cut.num_gaussians;
+    counts.tolerance_px2 = cut.tolerance_px2;
+    counts.exceeds_budget = !cut.fits_budget;
+    counts.select_seconds = select_seconds;
+    return counts;
+}
+
+SceneFrameCounts cpu::draw_cut(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
+                               Span<const int32_t> cluster, const Picture<float>& picture,
+                               const std::atomic<bool>* stop) {
+    const double start = now();
+    const CutDraws cut(scene, camera, instance, cluster);
+    SceneFrameCounts counts = draw_all(cut.draws(), camera, picture, stop);
+    counts.gaussians = cut.num_gaussians();
+    counts.draw_seconds = now() - start;
+    return counts;
+}
+
+SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,
+                                 const Picture<float>& picture, const std::atomic<bool>* stop) {
+    const double start = now();
+    SceneFrameCounts counts =
+        draw_all({{&model, 0, count, view_of_world<float>(camera), 0.0f, false}}, camera, picture, stop);
+    counts.gaussians = static_cast<int64_t>(count);
+    counts.draw_seconds = now() - start;
+    return counts;
+}
+
+bool cpu::pick_cut(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
+                   Span<const int32_t> cluster, ScenePick& picked) {
+    const CutDraws cut(scene, camera, instance, cluster);
+    Pick found{};
+    if (!pick(cut.draws(), pinhole_of<float>(camera), static_cast<int>(camera.x0),
+              static_cast<int>(camera.y0), found))
+        return false;
+    picked = {cut.pair_of(found.gaussian), found.weight, found.depth};
+    return true;
+}
+
+}  // namespace v3dg

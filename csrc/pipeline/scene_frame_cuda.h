@@ -1,0 +1,79 @@
+#pragma once
+
+#include "pipeline/frame_cuda.h"
+#include "select/select_cuda.h"
+
+namespace v3dg {
+namespace cuda {
+
+// The only picture of a frame; `first_tile` and the tiles are filled in.
+FrameImage frame_image(const Pinhole<float>& camera, int width, int height, const float background[3],
+                       float* color, float* alpha, float* depth);
+
+// Gaussians that stay as they are, and packed.
+class PackedModel {
+  public:
+    PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream);
+    const GaussianRows<const float>& rows() const { return rows_; }
+    const PackedPlanes& packed() const { return packed_; }
+    size_t bytes() const { return planes_.capacity() * sizeof(float); }
+
+  private:
+    GaussianRows<const float> rows_;
+    DeviceBuffer<float> planes_;
+    PackedPlanes packed_;
+};
+
+// Draws a scene that stays on the device: selects, then draws the cut.
+class SceneFrame {
+  public:
+    // The gaussians of each bundle of the tables that are drawn next. The host's array may be reused on
+    // return.
+    void set_models(std::vector<std::shared_ptr<const PackedModel>> models, cudaStream_t stream);
+
+    // The tables stay as they are until the drawing is finished.
+    std::unique_ptr<Drawing> draw(SceneTables& tables, const Camera& camera, const SelectRule& rule,
+                                  const FrameImage& image, cudaStream_t stream);
+    // Draws pairs that were selected before; they are on the device and stay, too.
+    std::unique_ptr<Drawing> draw_cut(SceneTables& tables, const Camera& camera, Span<const int32_t> instance,
+                                      Span<const int32_t> cluster, const FrameImage& image,
+                                      cudaStream_t stream);
+
+  private:
+    std::unique_ptr<Drawing> draw(const SceneTables& tables, const FrameImage& image, Frame::Prepare prepare,
+                                  cudaStream_t stream);
+
+    std::vector<std::shared_ptr<const PackedModel>> models_;
+    DeviceBuffer<GaussianRows<const float>> rows_;
+    DeviceBuffer<PackedPlanes> packed_;
+    DeviceBuffer<Placement> placements_;
+    DeviceBuffer<FrameImage> images_;
+    Frame frame_;
+};
+
+// One model in front of one camera.
+struct ModelTables {
+    GaussianRows<const float> rows;
+    PackedPlanes packed;
+    Placement placement;
+    FrameImage image;
+};
+
+// Draws all gaussians of one model.
+class ModelFrame {
+  public:
+    explicit ModelFrame(Frame::Keeps keeps = Frame::Keeps::nothing) : frame_(keeps) {}
+
+    // The rows, and what is packed of them, stay where they are until the drawing is finished.
+    std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
+                                  float filter_px2, bool compensate, const FrameImage& image,
+                                  cudaStream_t stream, const PackedPlanes* packed = nullptr);
+    FrameTape tape() const { return frame_.tape(); }
+
+  private:
+    DeviceBuffer<ModelTables> tables_;
+    Frame frame_;
+};
+
+}  // namespace cuda
+}  // namespace v3dg

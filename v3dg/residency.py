@@ -1,0 +1,197 @@
+"""Residency: what of which bundle and scene is on which device. The only cache of the package."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import threading
+import weakref
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar
+
+from v3dg import _core, _device
+from v3dg._device import Device
+from v3dg.bundle import Bundle
+from v3dg.false_color import ColorBy, false_color
+from v3dg.gaussians import Gaussians
+from v3dg.scene import Scene
+
+_Frame = TypeVar("_Frame")
+
+
+class ResidentScene:
+    """What selection and frames read of a scene on one device, as the scene is now.
+
+    Attributes:
+        core: The compiled module's part.
+        bundles: The bundles whose tables are there.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.core = _core.ResidentScene(device.number)
+        self.bundles: tuple[Bundle, ...] = ()
+        self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()  # that may be under way
+        self._lock = threading.Lock()  # of that set
+        self._seen: tuple[int, int] | None = None
+
+    def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
+        """Take over what has changed since the last time: nothing, the poses, or all instances.
+
+        Frames under way are finished first: one that found a buffer too small will be drawn again.
+
+        Raises:
+            RuntimeError: Something has changed, and a CUDA graph is being captured.
+        """
+        revision = scene.revision
+        if self._seen == revision:
+            return
+        if self.device.is_cuda and _device.is_capturing():
+            raise RuntimeError(
+                "scene: expected no change while a CUDA graph is captured, got a new or changed scene; "
+                "draw as much once before"
+            )
+        self.finish_drawings()
+        if self.bundles != scene.bundles:
+            self.core.set_bundles(tables)
+            self.bundles = scene.bundles
+        poses = [self._here(rows) for rows in self._poses_of(scene)]
+        if self._seen is not None and self._seen[0] == revision[0]:
+            self.core.set_poses(*poses)
+        else:
+            self.core.set_instances(scene.instance_bundle, scene.importance, *poses)
+        self._seen = revision
+
+    def add_drawing(self, drawing: _core.Drawing) -> None:
+        """Remember a frame that may be under way."""
+        if self.device.is_cuda:
+            with self._lock:
+                self._drawings.add(drawing)
+
+    def finish_drawings(self) -> None:
+        """Wait for the frames that are under way."""
+        with self._lock:
+            under_way = list(self._drawings)
+            self._drawings.clear()
+        for drawing in under_way:
+            drawing.finish()
+
+    def _poses_of(self, scene: Scene) -> tuple[Any, Any, Any]:
+        return scene.poses if self.device.is_cuda else (scene.positions, scene.quaternions, scene.scales)
+
+    def _here(self, rows: Any) -> Any:
+        is_elsewhere = getattr(rows, "is_cuda", False) and rows.device.index != self.device.number
+        return rows.to(str(self.device)) if is_elsewhere else rows
+
+
+class Residency:
+    """What is on which device, as long as its bundle or scene lives.
+
+    Whatever is asked for and is not there is made; several devices may hold the same bundle at once. Adding a
+    bundle to a scene leaves the gaussians of the others where they are.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._tables: weakref.WeakKeyDictionary[Bundle, _core.ClusterTable] = weakref.WeakKeyDictionary()
+        self._gaussians: weakref.WeakKeyDictionary[Bundle, dict[Device, Gaussians]] = (
+            weakref.WeakKeyDictionary()
+        )
+        self._models: weakref.WeakKeyDictionary[Bundle, dict[tuple[Device, ColorBy], _core.Model]] = (
+            weakref.WeakKeyDictionary()
+        )
+        self._scenes: weakref.WeakKeyDictionary[Scene | Bundle, dict[Device, ResidentScene]] = (
+            weakref.WeakKeyDictionary()
+        )
+        self._frames: weakref.WeakKeyDictionary[Scene | Bundle, dict[Hashable, Any]] = (
+            weakref.WeakKeyDictionary()
+        )
+        os.register_at_fork(after_in_child=self._renew_lock)
+
+    def table(self, bundle: Bundle) -> _core.ClusterTable:
+        """What selection and drawing read of the bundle's clusters, on the host."""
+        with self._lock:
+            if bundle not in self._tables:
+                clusters, groups = bundle.clusters, bundle.groups
+                self._tables[bundle] = _core.ClusterTable(
+                    ball=groups.ball,
+                    weight=groups.weight,
+                    level=groups.level,
+                    own_group=clusters.own_group,
+                    parent_group=clusters.parent_group,
+                    box=clusters.box,
+                    filter_px2=clusters.filter_px2,
+                    antialiased=clusters.antialiased,
+                    offset=clusters.offset,
+                )
+            return self._tables[bundle]
+
+    def scene(self, subject: Scene | Bundle, device: Device) -> ResidentScene:
+        """The scene on a device as it is now; a bundle as a scene of one."""
+        with self._lock:
+            known = self._scenes.setdefault(subject, {})
+            resident = known.get(device)
+            if resident is not None and isinstance(subject, Bundle):
+                return resident  # a bundle stays as it is
+            if resident is None:
+                resident = ResidentScene(device)
+            scene = Scene.of(subject)
+            resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
+            known[device] = resident
+            return resident
+
+    def gaussians(self, bundle: Bundle, device: Device) -> Gaussians:
+        """All gaussians of the bundle on a device."""
+        if not device.is_cuda:
+            return bundle.gaussians
+        with self._lock:
+            known = self._gaussians.setdefault(bundle, {})
+            if device not in known:
+                known[device] = bundle.gaussians.torch(str(device))
+            return known[device]
+
+    def model(self, bundle: Bundle, device: Device, color_by: ColorBy) -> _core.Model:
+        """The bundle's gaussians as frames of a device read them."""
+        with self._lock:
+            known = self._models.setdefault(bundle, {})
+            if (device, color_by) not in known:
+                here = false_color(bundle, color_by)
+                if color_by == "appearance":
+                    here = self.gaussians(bundle, device)
+                elif device.is_cuda:
+                    here = here.torch(str(device))
+                known[device, color_by] = _core.Model(here.rows)
+            return known[device, color_by]
+
+    def frame(self, subject: Scene | Bundle, key: Hashable, make: Callable[[], _Frame]) -> _Frame:
+        """The buffers that pictures of a subject are drawn with, of which each key has its own."""
+        with self._lock:
+            known = self._frames.setdefault(subject, {})
+            if key not in known:
+                known[key] = make()
+            frame: _Frame = known[key]
+            return frame
+
+    def num_bytes(self, device: Device) -> int:
+        """Memory that the models of all bundles take on a device."""
+        with self._lock:
+            return sum(
+                model.bytes
+                for models in self._models.values()
+                for (d, _), model in models.items()
+                if d == device
+            )
+
+    def clear(self) -> None:
+        """Give everything back; what is asked for later is made again."""
+        with self._lock:
+            for known in (self._frames, self._scenes, self._models, self._gaussians, self._tables):
+                known.clear()
+
+    def _renew_lock(self) -> None:
+        # Another thread of the parent may have held it when the child was made.
+        self._lock = threading.RLock()
+
+
+residency = Residency()
+atexit.register(residency.clear)  # while the driver is there
