@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v3dg import _device
+from v3dg._device import Device
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.donut import make_donut, place_field
 from v3dg.metrics import box_downsample, flip, has_flip, psnr
-from v3dg.pictures import check_picture_path, write_picture
+from v3dg.pictures import Picture, check_picture_path, contact_sheet, to_8bit, write_picture
 from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from PIL.ImageDraw import ImageDraw
 
 # Distance from the eye to the donut in the middle, in radii of a donut, and height of the view in radians.
 VIEWS = ((3.3, 0.36), (8.0, 0.36), (20.0, 0.36), (46.0, 0.38), (95.0, 0.42))
@@ -138,7 +138,6 @@ def run_demo(
     from tqdm import tqdm
 
     path = check_picture_path(output)
-    width, height = size
     where = _device.resolve(device)
     start = time.perf_counter()
     asset = make_donut(num_gaussians, seed=seed)
@@ -150,34 +149,15 @@ def run_demo(
     scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
 
     columns, pictures = [], []
-    with tqdm(total=3 * len(views), desc="draw", unit="picture", leave=False, disable=not progress) as bar:
+    with tqdm(total=len(views), desc="draw", unit="distance", leave=False, disable=not progress) as bar:
         for distance, elevation in views:
-            camera = view_camera(distance, elevation, width, height)
-            sharp = render(scene, camera.scaled(SUPERSAMPLING), tolerance=0.0, device=where)
-            pixels = (_device.to_host(x) for x in (sharp.color, sharp.alpha))
-            truth = _over_sky(*(box_downsample(x, SUPERSAMPLING) for x in pixels))
-            del sharp
-            bar.update()
-
-            def measure(allowed: float, camera: Camera = camera, truth: Any = truth) -> tuple[Panel, Any]:
-                image = render(scene, camera, tolerance=allowed, device=where)
-                picture = _over_sky(_device.to_host(image.color), _device.to_host(image.alpha))
-                stats = image.stats
-                bar.update()
-                panel = Panel(
-                    gaussians=stats.gaussians_in_frustum,
-                    gaussians_selected=stats.gaussians_selected,
-                    select_ms=stats.select_ms,
-                    draw_ms=stats.draw_ms,
-                    flip=flip(truth, picture) if has_flip() else None,
-                    psnr=psnr(truth, picture),
-                )
-                return panel, picture
-
-            full, full_picture = measure(0.0)
-            ours, our_picture = measure(tolerance)
+            camera = view_camera(distance, elevation, *size)
+            truth = _truth(scene, camera, where)
+            full, full_picture = _measure(scene, camera, 0.0, truth, where)
+            ours, our_picture = _measure(scene, camera, tolerance, truth, where)
             columns.append(Column(distance, full, ours))
             pictures.append((full_picture, our_picture))
+            bar.update()
 
     result = DemoResult(
         picture=str(path),
@@ -186,13 +166,37 @@ def run_demo(
         levels=bundle.num_levels,
         bundle_gaussians=bundle.num_gaussians,
         tolerance=tolerance,
-        device=f"{_num_threads()} CPU threads" if where == "cpu" else _device.describe(where),
+        device=f"{_num_threads()} CPU threads" if not where.is_cuda else _device.describe(where),
         build_seconds=build_seconds,
         seconds=time.perf_counter() - start,
         columns=tuple(columns),
     )
-    write_picture(path, _poster(result, pictures))
+    write_picture(path, _sheet(columns, pictures))
     return result
+
+
+def _truth(scene: Scene, camera: Camera, device: Device) -> NDArray[np.float32]:
+    """The full asset at twice the resolution, box-averaged."""
+    sharp = render(scene, camera.scaled(SUPERSAMPLING), tolerance=0.0, device=device)
+    planes = (_device.to_host(plane) for plane in (sharp.color, sharp.alpha))
+    return _over_sky(*(box_downsample(plane, SUPERSAMPLING) for plane in planes))
+
+
+def _measure(
+    scene: Scene, camera: Camera, tolerance: float, truth: NDArray[np.float32], device: Device
+) -> tuple[Panel, NDArray[np.float32]]:
+    image = render(scene, camera, tolerance=tolerance, device=device)
+    picture = _over_sky(_device.to_host(image.color), _device.to_host(image.alpha))
+    stats = image.stats
+    panel = Panel(
+        gaussians=stats.gaussians_in_frustum,
+        gaussians_selected=stats.gaussians_selected,
+        select_ms=stats.select_ms,
+        draw_ms=stats.draw_ms,
+        flip=flip(truth, picture) if has_flip() else None,
+        psnr=psnr(truth, picture),
+    )
+    return panel, picture
 
 
 def _num_threads() -> int:
@@ -238,98 +242,19 @@ def table_text(result: DemoResult) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-_PAPER, _INK, _QUIET, _RULE = (16, 18, 22), (238, 240, 243), (140, 147, 158), (44, 48, 56)
-_ACCENT = (126, 211, 153)
-_MARGIN, _GAP, _HEAD, _TITLE, _CAPTION, _FOOT = 44, 14, 118, 40, 84, 52
+def _sheet(columns: list[Column], pictures: list[tuple[Any, Any]]) -> Picture:
+    """The full asset in the upper row, the bundle in the lower one, each picture below its numbers."""
 
+    def text(name: str, column: Column, panel: Panel) -> str:
+        error, value = panel.error
+        cost = (
+            f"{count_text(panel.gaussians)} gaussians, {time_text(panel.milliseconds)}, {error} {value:.3f}"
+        )
+        return f"{name}, distance {column.distance:g}: {cost}"
 
-def _poster(result: DemoResult, pictures: list[tuple[Any, Any]]) -> NDArray[np.uint8]:
-    """Lay the pictures out with their numbers, as 8-bit RGB."""
-    from PIL import Image, ImageDraw
-
-    from v3dg.pictures import to_8bit
-
-    height, width = pictures[0][0].shape[:2]
-    row = _TITLE + height + _CAPTION
-    sheet = Image.new(
-        "RGB",
-        (
-            2 * _MARGIN + len(pictures) * width + (len(pictures) - 1) * _GAP,
-            _HEAD + 2 * row + _FOOT,
-        ),
-        _PAPER,
-    )
-    draw = ImageDraw.Draw(sheet)
-    right = sheet.width - _MARGIN
-    placed = result.instances * result.asset_gaussians
-    _text(draw, (_MARGIN, 34), "v3dg", 44, _INK)
-    motto = "donuts from near to far: all gaussians, or just enough of them"
-    _text(draw, (_MARGIN + 128, 38), motto, 21, _INK)
-    line = (
-        f"{result.instances:,} donuts of {result.asset_gaussians:,} gaussians, {count_text(placed)} in all; "
-        f"bundle of {result.levels} levels built in {result.build_seconds:.0f} s; "
-        f"{result.device}; tolerance {result.tolerance:g} square px"
-    )
-    _text(draw, (_MARGIN + 128, 66), line, 17, _QUIET)
-
-    for index, (column, pair) in enumerate(zip(result.columns, pictures, strict=True)):
-        left = _MARGIN + index * (width + _GAP)
-        for kind, picture in enumerate(pair):
-            top = _HEAD + kind * row
-            panel = column.bundle if kind else column.full
-            if index == 0:
-                name = ("Full asset, every gaussian", "v3dg, just detailed enough")[kind]
-                _text(draw, (left, top + 9), name, 19, _ACCENT if kind else _INK)
-            if kind == 0:
-                label = f"distance {column.distance:g}"
-                _text(draw, (left + width, top + 11), label, 16, _QUIET, anchor="ra")
-            elif index:
-                fewer = _factor_text(column.full.gaussians, column.bundle.gaussians)
-                faster = _factor_text(column.full.milliseconds, column.bundle.milliseconds)
-                label = f"{fewer} fewer, {faster} faster"
-                _text(draw, (left + width, top + 11), label, 16, _ACCENT, anchor="ra")
-            sheet.paste(Image.fromarray(to_8bit(picture)), (left, top + _TITLE))
-            _caption(draw, left, top + _TITLE + height + 12, width, panel, _ACCENT if kind else _INK)
-    error = result.columns[0].full.error[0]
-    meaning = "mean difference seen, 67 pixels per degree, to" if error == "FLIP" else "dB, to"
-    note = (
-        f"gaussians: those in the view.  time: select + draw.  {error}: {meaning} "
-        "the full asset at twice the resolution, box-averaged."
-    )
-    draw.line([(_MARGIN, sheet.height - _FOOT - 2), (right, sheet.height - _FOOT - 2)], fill=_RULE)
-    _text(draw, (_MARGIN, sheet.height - _FOOT + 12), note, 15, _QUIET)
-    return np.asarray(sheet)
-
-
-def _factor_text(more: float, less: float) -> str:
-    factor = more / max(less, 1e-6)
-    return f"{factor:,.{0 if factor >= 10 else 1}f}x"
-
-
-def _caption(
-    draw: ImageDraw, left: int, top: int, width: int, panel: Panel, colour: tuple[int, int, int]
-) -> None:
-    """Three numbers with their names below a picture."""
-    cells = (
-        ("gaussians", count_text(panel.gaussians)),
-        ("time", time_text(panel.milliseconds)),
-        (panel.error[0], f"{panel.error[1]:.3f}"),
-    )
-    size = min(24, max(9, width // 15))
-    for place, (name, value) in zip((0.0, 0.42, 0.76), cells, strict=True):
-        x = left + round(place * width)
-        _text(draw, (x, top), value, size, colour)
-        _text(draw, (x, top + size + 6), name, max(8, size * 5 // 8), _QUIET)
-
-
-def _text(
-    draw: ImageDraw,
-    at: tuple[int, int],
-    text: str,
-    size: int,
-    colour: tuple[int, int, int],
-    anchor: str = "la",
-) -> None:
-    from PIL import ImageFont
-
-    draw.text(at, text, font=ImageFont.load_default(size), fill=colour, anchor=anchor)
+    rows = zip(columns, pictures, strict=True)
+    cells = [
+        ((text("full", c, c.full), to_8bit(full)), (text("v3dg", c, c.bundle), to_8bit(ours)))
+        for c, (full, ours) in rows
+    ]
+    return contact_sheet([[upper for upper, _ in cells], [lower for _, lower in cells]])

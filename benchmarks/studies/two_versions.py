@@ -1,0 +1,210 @@
+"""What one version of v3dg computes, as digests, and how long that takes, to be compared with another version.
+
+Run it once or more with each version in turn, on one machine, then compare what they wrote:
+
+    PYTHONPATH=old python -m benchmarks.studies.two_versions --output old.json ...
+    PYTHONPATH=new python -m benchmarks.studies.two_versions --output new.json ...
+    python -m benchmarks.studies.two_versions --compare old.json new.json
+
+It calls nothing but the public interface, so that a version that lays its modules out otherwise runs it, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import v3dg
+
+
+def host(array: Any) -> np.ndarray[Any, Any]:
+    return array if isinstance(array, np.ndarray) else array.detach().cpu().numpy()
+
+
+def digest(*arrays: Any) -> str:
+    """Of the arrays' bytes."""
+    found = hashlib.blake2b(digest_size=8)
+    for array in arrays:
+        found.update(np.ascontiguousarray(host(array)).tobytes())
+    return found.hexdigest()
+
+
+def random_gaussians(count: int, sh_degree: int, seed: int = 0) -> v3dg.Gaussians:
+    """Gaussians in a ball, of sizes as a training leaves them."""
+    rng = np.random.default_rng(seed)
+    means = rng.normal(size=(count, 3))
+    means *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(means, axis=1, keepdims=True)
+    scales = np.exp(rng.normal(np.log(0.7 * count ** (-1 / 3)), 0.5, (count, 3)))
+    return v3dg.Gaussians(
+        means.astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        scales.astype(np.float32),
+        rng.uniform(0.05, 1, count).astype(np.float32),
+        (0.4 * rng.normal(size=(count, (sh_degree + 1) ** 2, 3))).astype(np.float32),
+    )
+
+
+class Run:
+    """Digests and times of one version on one device."""
+
+    def __init__(self, device: str, repeats: int) -> None:
+        self.device, self.repeats = device, repeats
+        self.digests: dict[str, str] = {}
+        self.ms: dict[str, list[float]] = {}
+
+    def wait(self) -> None:
+        if self.device == "cuda":
+            import torch
+
+            torch.cuda.synchronize()
+
+    def time(self, name: str, call: Any, repeats: int | None = None) -> Any:
+        result = call()
+        self.wait()
+        for _ in range(repeats or self.repeats):
+            start = time.perf_counter()
+            result = call()
+            self.wait()
+            self.ms.setdefault(name, []).append(1e3 * (time.perf_counter() - start))
+        return result
+
+    def builds(self) -> v3dg.Bundle:
+        for sh_degree, config in (
+            (0, v3dg.BuildConfig(steps=40)),
+            (2, v3dg.BuildConfig(steps=20, init="prune", targets="previous")),
+            (3, v3dg.BuildConfig.paper(cluster_size=512, steps=10)),
+        ):
+            asset = random_gaussians(6000, sh_degree, seed=sh_degree)
+            bundle = v3dg.build_bundle(asset, config=config, seed=5, device=self.device, progress=False)
+            self.digests[f"build sh {sh_degree}"] = self.digest_of(bundle)
+        asset = random_gaussians(40_000, 1)
+        config = v3dg.BuildConfig(steps=100 if self.device == "cpu" else 800)
+        build = lambda: v3dg.build_bundle(asset, config=config, device=self.device, progress=False)  # noqa: E731
+        bundle = self.time("build 40 k", build, 1 if self.device == "cpu" else 5)
+        self.digests["build 40 k"] = self.digest_of(bundle)
+        return bundle
+
+    @staticmethod
+    def digest_of(bundle: v3dg.Bundle) -> str:
+        g, c, p = bundle.gaussians, bundle.clusters, bundle.groups
+        tables = c.offset, c.own_group, c.parent_group, c.box, p.ball, p.weight, p.error
+        return digest(g.means, g.quats, g.scales, g.opacities, g.sh, *tables)
+
+    def frames(self, name: str, scene: Any, cameras: dict[str, v3dg.Camera]) -> None:
+        for key, camera in cameras.items():
+            for tolerance in (0.0, 3.0, 9.4):
+                label = f"{name} {key} tolerance {tolerance:g}"
+                cut = self.time(
+                    f"select, {label}", lambda: v3dg.select(scene, camera, tolerance=tolerance, device=self.device)
+                )
+                self.digests[f"cut, {label}"] = digest(cut.instance_ids, cut.cluster_ids)
+                if tolerance == 0.0 and self.device == "cpu":
+                    continue
+                draw = lambda: v3dg.render(scene, camera, tolerance=tolerance, device=self.device)  # noqa: E731
+                image = self.time(f"frame, {label}", draw)
+                self.digests[f"picture, {label}"] = digest(image.color, image.alpha, image.depth)
+            budget = v3dg.select(scene, camera, tolerance=3.0, device=self.device).num_gaussians // 2
+            cut = v3dg.select(scene, camera, budget=budget, device=self.device)
+            self.digests[f"budget, {name} {key}"] = digest(cut.instance_ids, cut.cluster_ids)
+            world = cut.gaussians(origin=camera.position, device=self.device)
+            self.digests[f"world, {name} {key}"] = digest(world.means, world.quats, world.scales, world.opacities)
+        if self.device == "cuda":
+            self.host_part(name, scene, next(iter(cameras.values())))
+
+    def host_part(self, name: str, scene: Any, camera: v3dg.Camera) -> None:
+        """Time until a frame is enqueued, which the device does not wait for."""
+        renderer = v3dg.Renderer(scene)
+        for _ in range(20):
+            renderer.render(camera, tolerance=9.4).stats  # noqa: B018
+        found = []
+        for _ in range(200):
+            self.wait()
+            start = time.perf_counter()
+            image = renderer.render(camera, tolerance=9.4)
+            found.append(1e3 * (time.perf_counter() - start))
+            image.stats  # noqa: B018
+        self.ms[f"host, {name}"] = found
+
+    def rasterize(self, count: int, sh_degree: int, width: int, height: int) -> None:
+        import torch
+
+        camera = v3dg.Camera.look_at((0.2, -2.5, 0.3), (0, 0, 0), width=width, height=height)
+        asset = random_gaussians(count, sh_degree, seed=1)
+        tensors = asset.torch(self.device)
+        names = ("means", "quats", "scales", "opacities", "sh")
+        leaves = [getattr(tensors, name).clone().requires_grad_() for name in names]
+        forward = lambda: v3dg.rasterize(tensors, camera, filter_px2=0.3, antialiased=True)  # noqa: E731
+        image = self.time(f"forward {count}", forward)
+        self.digests[f"forward {count}"] = digest(image.color, image.alpha, image.depth)
+        weights = torch.linspace(0.1, 1.0, 3, device=self.device)
+
+        def both() -> Any:
+            for leaf in leaves:
+                leaf.grad = None
+            picture = v3dg.rasterize(v3dg.Gaussians(*leaves), camera, filter_px2=0.3, antialiased=True)
+            ((picture.color * weights).mean() + 0.1 * picture.alpha.mean()).backward()
+            return leaves
+
+        self.time(f"forward + backward {count}", both)
+        self.digests[f"gradients {count}"] = digest(*(leaf.grad for leaf in leaves))
+
+
+def compare(old_path: Path, new_path: Path) -> int:
+    old, new = (json.loads(path.read_text()) for path in (old_path, new_path))
+    names = sorted(old["digests"].keys() | new["digests"].keys())
+    differ = [name for name in names if old["digests"].get(name) != new["digests"].get(name)]
+    print(f"{len(names) - len(differ)} of {len(names)} digests are the same; others: {differ or 'none'}")
+    print(f"{'':58} {'old ms':>9} {'new ms':>9} {'ratio':>6} {'least':>6}")
+    for name, before in old["ms"].items():
+        after = new["ms"].get(name)
+        if after is None:
+            continue
+        middle = statistics.median(before), statistics.median(after)
+        print(
+            f"{name:58} {middle[0]:9.3f} {middle[1]:9.3f} {middle[1] / middle[0]:6.3f} {min(after) / min(before):6.3f}"
+        )
+    return len(differ)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--layout", type=Path, help="a layout of instances, for frames of a whole scene")
+    parser.add_argument("--cameras", type=int, nargs="*", default=[40, 46, 50, 59])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--count", type=int, default=100_000, help="gaussians that are rasterized")
+    parser.add_argument("--output", type=Path, help="written, or added to where it is there")
+    parser.add_argument("--compare", type=Path, nargs=2, metavar=("OLD", "NEW"))
+    arguments = parser.parse_args()
+    if arguments.compare:
+        raise SystemExit(compare(*arguments.compare) != 0)
+    run = Run(arguments.device, arguments.repeats)
+    if arguments.output and arguments.output.is_file():
+        run.ms = json.loads(arguments.output.read_text())["ms"]
+    bundle = run.builds()
+    ring = {f"ring {k}": c for k, c in enumerate(v3dg.cameras.turntable((0, 0, 0), 4.0, 2, width=640, height=480))}
+    run.frames("random", bundle, ring)
+    if arguments.layout:
+        from v3dg.scene_file import read_scene
+
+        asset = v3dg.load(arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"])
+        config = v3dg.BuildConfig(steps=20)
+        name = json.loads(arguments.layout.read_text())["asset"]
+        donut = v3dg.build_bundle(asset, config=config, device=arguments.device, progress=False)
+        scene, cameras = read_scene(arguments.layout, bundles={name: donut})
+        some = [list(cameras.items())[k] for k in arguments.cameras]
+        run.frames("layout", scene, {f"camera {k}": c for k, (_, c) in zip(arguments.cameras, some, strict=True)})
+    run.rasterize(arguments.count, 3 if arguments.device == "cuda" else 1, 1280, 720)
+    if arguments.output:
+        arguments.output.write_text(json.dumps({"digests": run.digests, "ms": run.ms}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
