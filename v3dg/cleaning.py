@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _device
+from v3dg import _core, _device
 from v3dg.gaussians import Array, Gaussians
 
 LARGEST = 1e18
 """Of a coordinate or a scale, in world units: squares of more are no float32 numbers."""
-SMALLEST_OPACITY = float(np.float32(1 / 255))
+SMALLEST_OPACITY = float(np.float32(_core.min_alpha))
 """A gaussian is drawn where its alpha is this or more, so one whose opacity is below is never drawn."""
 OUTLIER_DISTANCE = 20.0
 """From the median of the positions, in median distances; sky and floaters lie there, and slips."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from v3dg import _core
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -22,10 +23,7 @@ _SPRINKLE_COLORS = np.array(
     [[0.95, 0.95, 0.9], [0.9, 0.6, 0.03], [0.05, 0.3, 0.8], [0.02, 0.5, 0.3], [0.8, 0.05, 0.04]]
 )
 _TO_SUN = np.array([0.42, -0.50, 0.76])
-_SH_C0, _SH_C1 = (
-    0.28209479177387814,
-    0.4886025119029199,
-)  # factors of the constant and the linear basis functions
+_SH_C0, _SH_C1 = _core.sh_base0, 0.4886025119029199  # of the constant and the linear basis functions
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 

@@ -8,12 +8,12 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 import numpy.typing as npt
 
+from v3dg import _core
 from v3dg.bundle import Bundle
 from v3dg.gaussians import Gaussians
 
 ColorBy: TypeAlias = Literal["appearance", "level", "cluster"]
 
-_SH_BASE = 0.28209479177387814  # of degree 0
 # From fine to coarse, and around again: neighbours differ in hue and in lightness.
 LEVEL_COLORS = np.array(
     [
@@ -49,7 +49,7 @@ def false_color(bundle: Bundle, by: ColorBy) -> Gaussians:
         colors = _scattered_colors(len(clusters.level))
     per_gaussian = np.repeat(colors, np.diff(clusters.offset), axis=0)
     return replace(
-        gaussians, sh=np.ascontiguousarray((per_gaussian[:, None, :] - 0.5) / _SH_BASE, np.float32)
+        gaussians, sh=np.ascontiguousarray((per_gaussian[:, None, :] - 0.5) / _core.sh_base0, np.float32)
     )
 
 

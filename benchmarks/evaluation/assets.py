@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import v3dg
+from v3dg import _core
 from v3dg.rotations import rotation_from_quaternion
 
 
@@ -152,5 +153,5 @@ def _quats_from_x(x: Any) -> Any:
 
 
 def _gaussians(means: Any, quats: Any, scales: Any, opacities: Any, color: Any) -> v3dg.Gaussians:
-    sh = (color[:, None] - 0.5) / 0.28209479177387814
+    sh = (color[:, None] - 0.5) / _core.sh_base0
     return v3dg.Gaussians(*(np.asarray(a, np.float32) for a in (means, quats, scales, opacities, sh)))

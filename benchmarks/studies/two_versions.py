@@ -102,7 +102,8 @@ class Run:
             for tolerance in (0.0, 3.0, 9.4):
                 label = f"{name} {key} tolerance {tolerance:g}"
                 cut = self.time(
-                    f"select, {label}", lambda: v3dg.select(scene, camera, tolerance=tolerance, device=self.device)
+                    f"select, {label}",
+                    lambda: v3dg.select(scene, camera, tolerance=tolerance, device=self.device),
                 )
                 self.digests[f"cut, {label}"] = digest(cut.instance_ids, cut.cluster_ids)
                 if tolerance == 0.0 and self.device == "cpu":
@@ -114,7 +115,9 @@ class Run:
             cut = v3dg.select(scene, camera, budget=budget, device=self.device)
             self.digests[f"budget, {name} {key}"] = digest(cut.instance_ids, cut.cluster_ids)
             world = cut.gaussians(origin=camera.position, device=self.device)
-            self.digests[f"world, {name} {key}"] = digest(world.means, world.quats, world.scales, world.opacities)
+            self.digests[f"world, {name} {key}"] = digest(
+                world.means, world.quats, world.scales, world.opacities
+            )
         if self.device == "cuda":
             self.host_part(name, scene, next(iter(cameras.values())))
 
@@ -174,7 +177,9 @@ def compare(old_path: Path, new_path: Path) -> int:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--layout", type=Path, help="a layout of instances, for frames of a whole scene")
     parser.add_argument("--cameras", type=int, nargs="*", default=[40, 46, 50, 59])
@@ -189,7 +194,9 @@ def main() -> None:
     if arguments.output and arguments.output.is_file():
         run.ms = json.loads(arguments.output.read_text())["ms"]
     bundle = run.builds()
-    ring = {f"ring {k}": c for k, c in enumerate(v3dg.cameras.turntable((0, 0, 0), 4.0, 2, width=640, height=480))}
+    ring = {
+        f"ring {k}": c for k, c in enumerate(v3dg.cameras.turntable((0, 0, 0), 4.0, 2, width=640, height=480))
+    }
     run.frames("random", bundle, ring)
     if arguments.layout:
         from v3dg.scene_file import read_scene
@@ -200,7 +207,9 @@ def main() -> None:
         donut = v3dg.build_bundle(asset, config=config, device=arguments.device, progress=False)
         scene, cameras = read_scene(arguments.layout, bundles={name: donut})
         some = [list(cameras.items())[k] for k in arguments.cameras]
-        run.frames("layout", scene, {f"camera {k}": c for k, (_, c) in zip(arguments.cameras, some, strict=True)})
+        run.frames(
+            "layout", scene, {f"camera {k}": c for k, (_, c) in zip(arguments.cameras, some, strict=True)}
+        )
     run.rasterize(arguments.count, 3 if arguments.device == "cuda" else 1, 1280, 720)
     if arguments.output:
         arguments.output.write_text(json.dumps({"digests": run.digests, "ms": run.ms}, indent=1))

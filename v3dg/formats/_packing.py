@@ -9,12 +9,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _files
+from v3dg import _core, _files
 from v3dg.gaussians import Gaussians
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 
-SH_C0 = 0.28209479177387814
+SH_C0 = _core.sh_base0
 """The basis function of degree 0: colour is SH_C0 times its coefficient, plus ½."""
 
 DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
@@ -23,7 +23,7 @@ DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 _BLOCK = 1 << 16  # gaussians decoded at once: the double precision of a block stays in the cache's reach
 _MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
 _MORTON_BITS = 21
-_LEAST_SEEN = np.float32(1 / 255)
+_LEAST_SEEN = np.float32(_core.min_alpha)
 
 # The components that stay when one is left out, in ascending order.
 _KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.worlds.procedural._parts import UP, Array, Part, quaternions, unit
+from v3dg import _core
 from v3dg.gaussians import Gaussians
 
-SH_C0 = 0.28209479177387814  # the constant basis function of spherical harmonics
+SH_C0 = _core.sh_base0  # the constant basis function of spherical harmonics
 SH_C1 = 0.4886025119029199  # the factor of the linear ones
 TO_SUN = np.array([0.42, -0.50, 0.76]) / np.linalg.norm([0.42, -0.50, 0.76])
 SUN = np.array([1.55, 1.42, 1.18])
