@@ -15,8 +15,8 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from random_bundle import random_bundle, random_gaussians
-from v3dg import bundle_file
 from v3dg.bundle import Bundle, Clusters, Groups
+from v3dg.bundle import file as bundle_file
 from v3dg.gaussians import Gaussians
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh")
@@ -210,7 +210,7 @@ def test_opened_arrays_can_be_written(saved):
 
 
 def test_threads_read_large_bundles(tmp_path, monkeypatch):
-    monkeypatch.setattr("v3dg.bundle._BYTES_PER_TASK", 4096)
+    monkeypatch.setattr("v3dg.bundle.bundle._BYTES_PER_TASK", 4096)
     bundle = random_bundle(1, num_levels=6, sh_degree=1, max_cluster=100)
     path = tmp_path / "a.v3dg"
     bundle.save(path)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from v3dg import bundle_file
 from v3dg._json import parse_json
-from v3dg.bundle_file import BundleFile
+from v3dg.bundle import file as bundle_file
+from v3dg.bundle.file import BundleFile
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:

@@ -1,0 +1,5 @@
+"""Bundle: all clusters of all levels of one asset, with the tables that selection reads; save and open."""
+
+from v3dg.bundle.bundle import NESTING_MARGIN, Bundle, Clusters, Groups
+
+__all__ = ["NESTING_MARGIN", "Bundle", "Clusters", "Groups"]
