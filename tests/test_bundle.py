@@ -17,6 +17,7 @@ from safetensors.numpy import save_file
 from random_bundle import random_bundle, random_gaussians
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.bundle import file as bundle_file
+from v3dg.bundle.format import TABLE_NAMES
 from v3dg.gaussians import Gaussians
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh")
@@ -87,7 +88,7 @@ def join_file(header, tensors):
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
     text += b" " * (-(8 + len(text)) % 4096)
     head = len(text).to_bytes(8, "little") + text
-    tables = b"".join(tensors[name].tobytes() for name in bundle_file.TABLE_NAMES)
+    tables = b"".join(tensors[name].tobytes() for name in TABLE_NAMES)
     digest = hashlib.blake2b(head + tables, digest_size=16).digest()
     return head + tensors["pages"].tobytes() + tables + digest
 
@@ -210,7 +211,7 @@ def test_opened_arrays_can_be_written(saved):
 
 
 def test_threads_read_large_bundles(tmp_path, monkeypatch):
-    monkeypatch.setattr("v3dg.bundle.bundle._BYTES_PER_TASK", 4096)
+    monkeypatch.setattr("v3dg.bundle.pages._BYTES_PER_TASK", 4096)
     bundle = random_bundle(1, num_levels=6, sh_degree=1, max_cluster=100)
     path = tmp_path / "a.v3dg"
     bundle.save(path)
@@ -304,7 +305,7 @@ def test_a_sparse_file_of_ten_gigabytes_opens(tmp_path, reads):
     }
     names = {np.dtype(dtype): name for name, dtype in DTYPES.items()}
     tensors["hash"] = np.zeros(16, np.uint8)
-    for name in (*bundle_file.TABLE_NAMES, "hash"):
+    for name in (*TABLE_NAMES, "hash"):
         array = tensors[name]
         offsets = [end, end + array.nbytes]
         header[name] = {"dtype": names[array.dtype], "shape": list(array.shape), "data_offsets": offsets}
@@ -559,7 +560,7 @@ def test_random_tables_open_or_are_refused(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("fuzz") / "small.v3dg"
     random_bundle(3).save(path)
     header, tensors = split_file(path.read_bytes())
-    name = data.draw(st.sampled_from([name for name in bundle_file.TABLE_NAMES if name != "pages.hash"]))
+    name = data.draw(st.sampled_from([name for name in TABLE_NAMES if name != "pages.hash"]))
     values = tensors[name].reshape(-1)
     limits = (-(2.0**60), 2.0**60) if values.dtype.kind == "f" else np.iinfo(values.dtype)
     number = (

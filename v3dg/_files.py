@@ -10,12 +10,16 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+_PIECE_BYTES = 16 << 20
+
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
-    """Give a new name beside `path` to write to; at the end it replaces `path`, on failure it is removed.
+def replacing(path: str | os.PathLike[str], mark: str | None = None) -> Iterator[str]:
+    """Give a name beside `path` to write to; at the end it replaces `path`, on failure it is removed.
 
-    What is written is on the disk before it gets its name. A link stays a link, to the new file.
+    What is written is on the disk before it gets its name. A link stays a link, to the new file. The name has
+    a `mark` that no other has; with a given one, what a killed program left there is removed, and no two may
+    write at once.
 
     Raises:
         IsADirectoryError: `path` is a folder.
@@ -29,8 +33,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
         raise ValueError(f"{os.fspath(path)}: expected the path of a file, got a device or a pipe")
     folder, name = os.path.split(target)
     # The start of the name only: a name may have 255 bytes, and a character up to four.
-    temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
+    temporary = os.path.join(folder, f".{name[:40]}.{mark or secrets.token_hex(8)}.tmp")
     with naming_errors(path, temporary):
+        if mark is not None:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(temporary)
         try:
             yield temporary
             _flush(temporary)
@@ -58,6 +65,14 @@ def _flush(path: str) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int) -> None:
+    """Write all of the data to one place of a file; signals are heard now and then."""
+    view = memoryview(data)
+    while view:
+        count = os.pwrite(descriptor, view[:_PIECE_BYTES], offset)
+        view, offset = view[count:], offset + count
 
 
 def check_folder(path: Path) -> None:

@@ -1,5 +1,6 @@
 """Bundle: all clusters of all levels of one asset, with the tables that selection reads; save and open."""
 
-from v3dg.bundle.bundle import NESTING_MARGIN, Bundle, Clusters, Groups
+from v3dg.bundle.bundle import Bundle
+from v3dg.bundle.tables import NESTING_MARGIN, Clusters, Groups
 
 __all__ = ["NESTING_MARGIN", "Bundle", "Clusters", "Groups"]

@@ -1,188 +1,138 @@
 """The file of a bundle: a safetensors container with aligned, hashed pages in front of the tables.
 
 docs/format.md says what is in the file and why. This module moves bytes and trusts none of them; what the
-tables mean is checked by `v3dg.bundle`.
+tables mean is checked by `v3dg.bundle.tables`.
 """
 
 from __future__ import annotations
 
 import errno
 import hashlib
-import json
 import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
 from v3dg import _files
 from v3dg._json import parse_json
+from v3dg.bundle.format import (
+    ALIGNMENT_BYTES,
+    DTYPES,
+    FORMAT,
+    HASH_BYTES,
+    MAX_HEADER_BYTES,
+    SCHEMA,
+    VERSION,
+    entries_of,
+    entries_of_layout,
+    header_of,
+    padding_bytes,
+    page_hash,
+    page_tables,
+)
+from v3dg.bundle.pages import Float32Codec
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    Tables = Mapping[str, NDArray[Any]]
+    from v3dg.bundle.pages import PageLayout
+    from v3dg.bundle.tables import Clusters, Groups
+    from v3dg.gaussians import Gaussians
 
-FORMAT = "v3dg"
-VERSION = 1
-ALIGNMENT_BYTES = 4096  # of a page in the file: the memory page, so that a page maps or loads directly
-HASH_BYTES = 16
-
-_MAX_HEADER_BYTES = 1 << 20  # the header holds 20 entries and the config; more is damage or an attack
 _THREADS = 8
-_RUN_BYTES = 64 << 20
 _READ_BYTES = 1 << 30  # one read call moves at most 2 GiB - 4 KiB
-_DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
-_SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
-    # name, safetensors dtype, rows (C clusters, C+1, G groups, P pages), rest of the shape. In file order:
-    # wide types first, so that every table is aligned to its own type.
-    ("clusters.offset", "I64", "C+1", ()),
-    ("pages.offset", "I64", "P", ()),
-    ("pages.bytes", "I64", "P", ()),
-    ("clusters.level", "I32", "C", ()),
-    ("clusters.own_group", "I32", "C", ()),
-    ("clusters.parent_group", "I32", "C", ()),
-    ("clusters.box", "F32", "C", (2, 3)),
-    ("clusters.filter_px2", "F32", "C", ()),
-    ("groups.ball", "F32", "G", (4,)),
-    ("groups.weight", "F32", "G", ()),
-    ("groups.parent", "I32", "G", ()),
-    ("groups.level", "I32", "G", ()),
-    ("groups.error", "F32", "G", (2,)),
-    ("pages.first_cluster", "I32", "P", ()),
-    ("pages.num_clusters", "I32", "P", ()),
-    ("clusters.antialiased", "U8", "C", ()),
-    ("pages.hash", "U8", "P", (HASH_BYTES,)),
-)
-TABLE_NAMES = tuple(name for name, _, _, _ in _SCHEMA)
 
 
-def floats_per_gaussian(sh_degree: int) -> int:
-    """Count the float32 values of one gaussian: 3 mean, 4 quaternion, 3 scale, 1 opacity, 3 (d+1)² SH."""
-    return 11 + 3 * (sh_degree + 1) ** 2
+class BundleWriter:
+    """A bundle's file in the making: takes pages as they are finished, in any order, then the tables.
+
+    What goes where is known before the first page: the layout says how many clusters, groups and gaussians
+    there will be. `writing` makes one.
+    """
+
+    def __init__(
+        self,
+        descriptor: int,
+        pool: ThreadPoolExecutor,
+        layout: PageLayout,
+        codec: Float32Codec,
+        config_json: str,
+    ) -> None:
+        self._fd = descriptor
+        self._pool = pool
+        self._layout = layout
+        self._codec = codec
+        self._entries = entries_of_layout(layout, codec)
+        self._header = header_of(self._entries, codec.sh_degree, config_json)
+        self._page_tables = page_tables(layout, codec)
+        self._hashes = np.zeros((layout.num_pages, HASH_BYTES), np.uint8)
+        self._is_written = np.zeros(layout.num_pages, bool)
+        self.is_finished = False
+
+    def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
+        """Write the gaussians of a run of pages, on any device, to their place."""
+        assert len(gaussians) == len(self._layout.rows(first_page, last_page))
+        host = gaussians.numpy()
+        start = len(self._header) + self._page_tables["pages.offset"]
+
+        def write(page: int) -> None:
+            pieces = self._codec.encode(host, self._layout.slice_in(page, first_page))
+            padding = np.zeros(padding_bytes(sum(piece.nbytes for piece in pieces)), np.uint8)
+            data = np.concatenate([piece.reshape(-1).view(np.uint8) for piece in (*pieces, padding)])
+            self._hashes[page] = np.frombuffer(page_hash((data,)), np.uint8)
+            _files.write_at(self._fd, data.data, int(start[page]))
+
+        for _ in self._pool.map(write, range(first_page, last_page)):
+            pass
+        self._is_written[first_page:last_page] = True
+
+    def finish(self, clusters: Clusters, groups: Groups) -> None:
+        """Write the header and the tables; all pages have been written."""
+        assert self._is_written.all()
+        tables = self._page_tables | {"pages.hash": self._hashes}
+        for prefix, part in (("clusters", clusters), ("groups", groups)):
+            tables |= {f"{prefix}.{field.name}": getattr(part, field.name) for field in fields(part)}
+        digest = hashlib.blake2b(self._header, digest_size=HASH_BYTES)
+        end = bytearray()
+        for name, dtype, _, _ in SCHEMA:
+            end += tables[name].astype(DTYPES[dtype], copy=False).tobytes()
+        digest.update(end)
+        end += digest.digest()
+        _files.write_at(self._fd, self._header, 0)
+        start, last = (self._entries[name]["data_offsets"][1] for name in ("pages", "hash"))
+        assert start + len(end) == last
+        _files.write_at(self._fd, end, len(self._header) + start)
+        self.is_finished = True
 
 
-def padding_bytes(num_bytes: int) -> int:
-    """Count the bytes from here to the next multiple of the alignment."""
-    return -num_bytes % ALIGNMENT_BYTES
-
-
-def page_file_bytes(page_bytes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Round the sizes of pages up to the alignment: what they take in the file."""
-    return page_bytes + -page_bytes % ALIGNMENT_BYTES
-
-
-def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
-    """BLAKE2b-128 of the bytes of the pieces, one after another."""
-    digest = hashlib.blake2b(digest_size=HASH_BYTES)
-    for piece in pieces:
-        digest.update(piece.reshape(-1).view(np.uint8).data)
-    return digest.digest()
-
-
-def _page_in_file(pieces: Sequence[NDArray[Any]]) -> tuple[NDArray[np.uint8], bytes]:
-    """A page's bytes with their padding, and their hash."""
-    padding = np.zeros(padding_bytes(sum(piece.nbytes for piece in pieces)), np.uint8)
-    data = np.concatenate([piece.reshape(-1).view(np.uint8) for piece in (*pieces, padding)])
-    return data, page_hash((data,))
-
-
-def _runs(pages: Iterable[Sequence[NDArray[Any]]]) -> Iterator[list[Sequence[NDArray[Any]]]]:
-    """Cut pages into runs that are enough work for all threads and little memory."""
-    run, num_bytes = [], 0
-    for pieces in pages:
-        run.append(pieces)
-        num_bytes += sum(piece.nbytes for piece in pieces)
-        if num_bytes > _RUN_BYTES:
-            yield run
-            run, num_bytes = [], 0
-    yield run
-
-
-def _entries(num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int) -> dict[str, Any]:
-    """Every tensor of the file, in file order, as the header describes it."""
-    rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
-    entries: dict[str, Any] = {}
-    end = 0
-
-    def append(name: str, dtype: str, shape: list[int]) -> None:
-        nonlocal end
-        num_bytes = np.dtype(_DTYPES[dtype]).itemsize
-        for side in shape:
-            num_bytes *= side
-        entries[name] = {"dtype": dtype, "shape": shape, "data_offsets": [end, end + num_bytes]}
-        end += num_bytes
-
-    append("pages", "U8", [pages_bytes])
-    for name, dtype, count, rest in _SCHEMA:
-        append(name, dtype, [rows[count], *rest])
-    append("hash", "U8", [HASH_BYTES])
-    return entries
-
-
-def _header(entries: dict[str, Any], sh_degree: int, config_json: str) -> bytes:
-    """The length and the JSON, filled up with spaces so that the data starts aligned."""
-    metadata = {"format": FORMAT, "version": str(VERSION), "sh_degree": str(sh_degree), "config": config_json}
-    text = json.dumps({"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")).encode()
-    text += b" " * padding_bytes(8 + len(text))
-    if len(text) > _MAX_HEADER_BYTES:
-        raise ValueError(
-            f"config: expected at most {_MAX_HEADER_BYTES} bytes of JSON, got {len(config_json)}; shorten it"
-        )
-    return len(text).to_bytes(8, "little") + text
-
-
-def file_bytes(tables: Tables, sh_degree: int, config_json: str) -> int:
-    """Size of the file that `write` makes of this."""
-    entries = _table_entries(tables)
-    return len(_header(entries, sh_degree, config_json)) + int(entries["hash"]["data_offsets"][1])
-
-
-def _table_entries(tables: Tables) -> dict[str, Any]:
-    return _entries(
-        len(tables["clusters.level"]),
-        len(tables["groups.parent"]),
-        len(tables["pages.bytes"]),
-        int(page_file_bytes(tables["pages.bytes"]).sum()),
-    )
-
-
-def write(
+@contextmanager
+def writing(
     path: str | os.PathLike[str],
-    tables: Tables,
-    pages: Iterable[Sequence[NDArray[Any]]],
-    *,
-    sh_degree: int,
+    layout: PageLayout,
+    codec: Float32Codec,
     config_json: str,
-) -> None:
-    """Write a bundle to a temporary file beside ``path``, then rename it; a failure leaves nothing behind.
+    *,
+    mark: str | None = None,
+) -> Iterator[BundleWriter]:
+    """Write a bundle's file, which appears at ``path`` when all is done; a failure leaves nothing behind.
 
     Args:
-        tables: Every name of TABLE_NAMES but ``pages.hash``, which is computed.
-        pages: The arrays of each page, in order; their bytes follow one another in the file.
+        mark: Of the file's name until then, as `replacing` says.
     """
-    with _files.replacing(path) as temporary, open(temporary, "xb", buffering=1 << 20) as file:
-        entries = _table_entries(tables)
-        header = _header(entries, sh_degree, config_json)
-        file.write(header)
-        digest = hashlib.blake2b(header, digest_size=HASH_BYTES)
-        hashes = bytearray()
-        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
-            for run in _runs(pages):
-                for page, page_digest in pool.map(_page_in_file, run):
-                    file.write(page.data)
-                    hashes += page_digest
-        hash_table = np.frombuffer(hashes, np.uint8).reshape(-1, HASH_BYTES)
-        for name, dtype, _, _ in _SCHEMA:
-            table = hash_table if name == "pages.hash" else tables[name]
-            data = table.astype(_DTYPES[dtype], copy=False).tobytes()
-            file.write(data)
-            digest.update(data)
-        file.write(digest.digest())
-        assert file.tell() == len(header) + entries["hash"]["data_offsets"][1]
+    with (
+        _files.replacing(path, mark) as temporary,
+        open(temporary, "xb", buffering=0) as file,
+        ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool,
+    ):
+        writer = BundleWriter(file.fileno(), pool, layout, codec, config_json)
+        yield writer
+        assert writer.is_finished
 
 
 def _short(value: object) -> str:
@@ -197,7 +147,7 @@ class BundleFile:
         path: As given.
         num_bytes: Size of the file.
         pages_bytes: Size of all pages with their padding.
-        sh_degree: 0 to 3.
+        codec: What the bytes of its pages are.
         config: The JSON object that was saved.
         tables: One array for every name in TABLE_NAMES, with the shapes of docs/format.md.
 
@@ -228,7 +178,7 @@ class BundleFile:
         length = np.empty(8, np.uint8)
         self._read([length], 0)
         header_bytes = int.from_bytes(length.tobytes(), "little")
-        if header_bytes > min(self.num_bytes - 8, _MAX_HEADER_BYTES):
+        if header_bytes > min(self.num_bytes - 8, MAX_HEADER_BYTES):
             self._fail(
                 f"header: expected a bundle (safetensors), got a header length of {header_bytes} in a file "
                 f"of {self.num_bytes} bytes; it is another kind of file or it is truncated"
@@ -266,7 +216,7 @@ class BundleFile:
             self._fail(f"version: expected 1 or more, got {_short(version)}")
         if metadata.get("sh_degree") not in ("0", "1", "2", "3"):
             self._fail(f"sh_degree: expected '0' to '3', got {_short(metadata.get('sh_degree'))}")
-        self.sh_degree = int(metadata["sh_degree"])
+        self.codec = Float32Codec(int(metadata["sh_degree"]))
         config = metadata.get("config")
         if not isinstance(config, str):
             self._fail(f"config: expected a string of JSON, got {_short(config)}")
@@ -291,7 +241,7 @@ class BundleFile:
                 f"size: expected more than {_short(max(counts))} bytes for tensors, got {self.num_bytes}; "
                 "the file is truncated"
             )
-        expected = _entries(*counts)
+        expected = entries_of(*counts)
         for name, entry in expected.items():
             if header.get(name) != entry:
                 self._fail(f"{name}: expected {entry}, got {_short(header.get(name))}")
@@ -319,9 +269,9 @@ class BundleFile:
                 "hash: the header and tables do not match it; the file is damaged, copy or build it again"
             )
         self.tables: dict[str, NDArray[Any]] = {}
-        for name, dtype, _, _ in _SCHEMA:
+        for name, dtype, _, _ in SCHEMA:
             first, last = (offset - start for offset in entries[name]["data_offsets"])
-            self.tables[name] = data[first:last].view(_DTYPES[dtype]).reshape(entries[name]["shape"])
+            self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 
     def _read(self, buffers: Sequence[NDArray[Any]], offset: int) -> None:
         """Fill all buffers from one place of the file."""
@@ -339,12 +289,15 @@ class BundleFile:
             if num_read:
                 remaining[0] = remaining[0][num_read:]
 
-    def read_page(self, page: int, arrays: Sequence[NDArray[Any]]) -> None:
-        """Read a page into arrays that together have its size, and verify its hash.
+    def read_page(self, page: int, out: Gaussians, rows: slice) -> None:
+        """Read a page's gaussians into the rows, and verify its hash.
 
         Raises:
             ValueError: The page is damaged, or the file was truncated after it was opened.
         """
+        self.codec.decode(lambda arrays: self._read_page(page, arrays), out, rows)
+
+    def _read_page(self, page: int, arrays: Sequence[NDArray[Any]]) -> None:
         num_bytes = int(self.tables["pages.bytes"][page])
         padding = np.empty(padding_bytes(num_bytes), np.uint8)
         first = int(self.tables["pages.first_cluster"][page])

@@ -1,0 +1,122 @@
+"""What a bundle file is made of: its tables, its header, its hashes. docs/format.md says why."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from v3dg.bundle.pages import Float32Codec, PageLayout
+
+FORMAT = "v3dg"
+VERSION = 1
+ALIGNMENT_BYTES = 4096  # of a page in the file: the memory page, so that a page maps or loads directly
+HASH_BYTES = 16
+MAX_HEADER_BYTES = 1 << 20  # the header holds 20 entries and the config; more is damage or an attack
+
+DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
+SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
+    # name, safetensors dtype, rows (C clusters, C+1, G groups, P pages), rest of the shape. In file order:
+    # wide types first, so that every table is aligned to its own type.
+    ("clusters.offset", "I64", "C+1", ()),
+    ("pages.offset", "I64", "P", ()),
+    ("pages.bytes", "I64", "P", ()),
+    ("clusters.level", "I32", "C", ()),
+    ("clusters.own_group", "I32", "C", ()),
+    ("clusters.parent_group", "I32", "C", ()),
+    ("clusters.box", "F32", "C", (2, 3)),
+    ("clusters.filter_px2", "F32", "C", ()),
+    ("groups.ball", "F32", "G", (4,)),
+    ("groups.weight", "F32", "G", ()),
+    ("groups.parent", "I32", "G", ()),
+    ("groups.level", "I32", "G", ()),
+    ("groups.error", "F32", "G", (2,)),
+    ("pages.first_cluster", "I32", "P", ()),
+    ("pages.num_clusters", "I32", "P", ()),
+    ("clusters.antialiased", "U8", "C", ()),
+    ("pages.hash", "U8", "P", (HASH_BYTES,)),
+)
+TABLE_NAMES = tuple(name for name, _, _, _ in SCHEMA)
+
+
+def padding_bytes(num_bytes: int) -> int:
+    """Count the bytes from here to the next multiple of the alignment."""
+    return -num_bytes % ALIGNMENT_BYTES
+
+
+def page_file_bytes(page_bytes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Round the sizes of pages up to the alignment: what they take in the file."""
+    return page_bytes + -page_bytes % ALIGNMENT_BYTES
+
+
+def page_tables(layout: PageLayout, codec: Float32Codec) -> dict[str, NDArray[Any]]:
+    """The tables of the pages except the hashes; all follow from what is in each page."""
+    num_bytes = codec.page_bytes(layout.num_gaussians)
+    ends = np.cumsum(page_file_bytes(num_bytes))
+    return {
+        "pages.offset": np.concatenate([np.zeros(1, np.int64), ends])[:-1],
+        "pages.bytes": num_bytes,
+        "pages.first_cluster": layout.first_cluster[:-1].astype(np.int32),
+        "pages.num_clusters": np.diff(layout.first_cluster).astype(np.int32),
+    }
+
+
+def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
+    """BLAKE2b-128 of the bytes of the pieces, one after another."""
+    digest = hashlib.blake2b(digest_size=HASH_BYTES)
+    for piece in pieces:
+        digest.update(piece.reshape(-1).view(np.uint8).data)
+    return digest.digest()
+
+
+def entries_of(num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int) -> dict[str, Any]:
+    """Every tensor of the file, in file order, as the header describes it."""
+    rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
+    entries: dict[str, Any] = {}
+    end = 0
+
+    def append(name: str, dtype: str, shape: list[int]) -> None:
+        nonlocal end
+        num_bytes = np.dtype(DTYPES[dtype]).itemsize
+        for side in shape:
+            num_bytes *= side
+        entries[name] = {"dtype": dtype, "shape": shape, "data_offsets": [end, end + num_bytes]}
+        end += num_bytes
+
+    append("pages", "U8", [pages_bytes])
+    for name, dtype, count, rest in SCHEMA:
+        append(name, dtype, [rows[count], *rest])
+    append("hash", "U8", [HASH_BYTES])
+    return entries
+
+
+def entries_of_layout(layout: PageLayout, codec: Float32Codec) -> dict[str, Any]:
+    """The same from what is in each page: a group for each but the last."""
+    pages_bytes = int(page_file_bytes(codec.page_bytes(layout.num_gaussians)).sum())
+    return entries_of(layout.num_clusters, max(layout.num_pages - 1, 0), layout.num_pages, pages_bytes)
+
+
+def header_of(entries: dict[str, Any], sh_degree: int, config_json: str) -> bytes:
+    """The length and the JSON, filled up with spaces so that the data starts aligned."""
+    metadata = {"format": FORMAT, "version": str(VERSION), "sh_degree": str(sh_degree), "config": config_json}
+    text = json.dumps({"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")).encode()
+    text += b" " * padding_bytes(8 + len(text))
+    if len(text) > MAX_HEADER_BYTES:
+        raise ValueError(
+            f"config: expected at most {MAX_HEADER_BYTES} bytes of JSON, got {len(config_json)}; shorten it"
+        )
+    return len(text).to_bytes(8, "little") + text
+
+
+def file_bytes(layout: PageLayout, codec: Float32Codec, config_json: str) -> int:
+    """Size of the file that this makes."""
+    entries = entries_of_layout(layout, codec)
+    header = header_of(entries, codec.sh_degree, config_json)
+    return len(header) + int(entries["hash"]["data_offsets"][1])

@@ -1,0 +1,170 @@
+"""Pages: which clusters lie together, what the bytes of a page are, and where its gaussians come from."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from v3dg import _device
+from v3dg.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from v3dg.bundle.file import BundleFile
+    from v3dg.bundle.tables import Clusters
+
+_READ_THREADS = 8
+_BYTES_PER_TASK = 16 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class PageLayout:
+    """P pages in file order: page g is the clusters that group g replaces, the last page is the last level.
+
+    Attributes:
+        first_cluster: (P+1,) int64. First cluster of each page, and the number of clusters.
+        first_gaussian: (P+1,) int64. First gaussian of each page, and the number of gaussians.
+    """
+
+    first_cluster: NDArray[np.int64]
+    first_gaussian: NDArray[np.int64]
+
+    @staticmethod
+    def of(clusters: Clusters) -> PageLayout:
+        """The pages of clusters: those that share a parent group are neighbours."""
+        parent = clusters.parent_group
+        starts = np.flatnonzero(parent[1:] != parent[:-1]) + 1
+        count = len(clusters)
+        first = np.concatenate([np.zeros(min(count, 1), np.int64), starts, [count]]).astype(np.int64)
+        return PageLayout(first, clusters.offset[first])
+
+    @property
+    def num_pages(self) -> int:
+        return len(self.first_cluster) - 1
+
+    @property
+    def num_clusters(self) -> int:
+        return int(self.first_cluster[-1])
+
+    @property
+    def num_gaussians(self) -> NDArray[np.int64]:
+        """(P,) of each page."""
+        return np.diff(self.first_gaussian)
+
+    def rows(self, first_page: int, last_page: int) -> range:
+        """The gaussians of a run of pages."""
+        return range(int(self.first_gaussian[first_page]), int(self.first_gaussian[last_page]))
+
+    def slice_in(self, page: int, first_page: int) -> slice:
+        """Where a page's gaussians are among those that begin with the first page's."""
+        rows, before = self.rows(page, page + 1), int(self.first_gaussian[first_page])
+        return slice(rows.start - before, rows.stop - before)
+
+
+class Float32Codec:
+    """What the bytes of a page are: the arrays of its gaussians, float32, one whole array after another."""
+
+    def __init__(self, sh_degree: int) -> None:
+        self.sh_degree = sh_degree
+
+    @property
+    def floats_per_gaussian(self) -> int:
+        """3 mean, 4 quaternion, 3 scale, 1 opacity, 3 (d+1)² SH."""
+        return 11 + 3 * (self.sh_degree + 1) ** 2
+
+    def page_bytes(self, num_gaussians: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Sizes of pages of so many gaussians, without what they are filled up with."""
+        return num_gaussians * (4 * self.floats_per_gaussian)
+
+    def most_gaussians(self, num_bytes: int) -> int:
+        """How many gaussians so many bytes can hold."""
+        return num_bytes // (4 * self.floats_per_gaussian)
+
+    def encode(self, gaussians: Gaussians, rows: slice) -> list[NDArray[Any]]:
+        """Arrays whose bytes, one array after another, are those of the page that has these rows."""
+        return [getattr(gaussians, field.name)[rows] for field in fields(Gaussians)]
+
+    def decode(self, read: Callable[[Sequence[NDArray[Any]]], None], out: Gaussians, rows: slice) -> None:
+        """Fill the rows with a page, whose bytes `read` reads into the arrays that it is given."""
+        read(self.encode(out, rows))
+
+    def empty(self, count: int) -> Gaussians:
+        """Gaussians on the host to decode to, with any values."""
+        shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (self.sh_degree + 1) ** 2, 3)]
+        return Gaussians(*(np.empty(shape, np.float32) for shape in shapes))
+
+
+class PageSource(Protocol):
+    """Where the gaussians of pages come from."""
+
+    def read(self, first_page: int, last_page: int) -> Gaussians:
+        """Gaussians of a run of pages, on the host; those of a file are verified."""
+
+
+class MemoryPages:
+    """Pages whose gaussians are all in memory, on the host."""
+
+    def __init__(self, layout: PageLayout, gaussians: Gaussians) -> None:
+        self._layout = layout
+        self.gaussians = gaussians
+
+    def read(self, first_page: int, last_page: int) -> Gaussians:
+        """Shares memory with `gaussians`."""
+        rows = self._layout.rows(first_page, last_page)
+        return self.gaussians.subset(slice(rows.start, rows.stop))
+
+    def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
+        """Copy the gaussians of a run of pages, on any device, to their place."""
+        place = self.read(first_page, last_page)
+        for field in fields(Gaussians):
+            _device.copy_to_host(getattr(gaussians, field.name), getattr(place, field.name))
+
+
+class FilePages:
+    """Pages that are read from a file when they are asked for; a single one is kept until the next."""
+
+    def __init__(self, layout: PageLayout, file: BundleFile) -> None:
+        self._layout = layout
+        self._file = file
+        self._last_page: tuple[int, Gaussians] | None = None
+
+    def read(self, first_page: int, last_page: int) -> Gaussians:
+        if last_page - first_page != 1:
+            return self._read(first_page, last_page)
+        kept = self._last_page
+        if kept is None or kept[0] != first_page:
+            self._last_page = kept = (first_page, self._read(first_page, last_page))
+        return kept[1]
+
+    def _read(self, first_page: int, last_page: int) -> Gaussians:
+        """Read pages straight into the arrays of the result."""
+        result = self._file.codec.empty(len(self._layout.rows(first_page, last_page)))
+
+        def read(pages: range) -> None:
+            for page in pages:
+                self._file.read_page(page, result, self._layout.slice_in(page, first_page))
+
+        tasks = list(runs_of_pages(first_page, last_page, self._file.tables["pages.bytes"], _BYTES_PER_TASK))
+        if len(tasks) == 1:
+            read(tasks[0])
+        else:
+            with ThreadPoolExecutor(min(_READ_THREADS, os.cpu_count() or 1)) as pool:
+                list(pool.map(read, tasks))
+        return result
+
+
+def runs_of_pages(
+    first_page: int, last_page: int, page_bytes: NDArray[np.int64], num_bytes: int
+) -> Iterator[range]:
+    """Cut a run of pages into runs of about so many bytes: enough work, and little memory."""
+    ends = np.cumsum(page_bytes[first_page:last_page]) // num_bytes
+    cuts = (np.flatnonzero(np.diff(ends)) + first_page + 1).tolist()
+    for start, stop in zip([first_page, *cuts], [*cuts, last_page], strict=True):
+        yield range(start, stop)
