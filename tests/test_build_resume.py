@@ -144,7 +144,7 @@ def checkpoint(asset, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(v3dg.build, "_assemble", interrupt)
+        patch.setattr("v3dg.build.whole.assemble", interrupt)
         with pytest.raises(KeyboardInterrupt):
             build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "levels")
     return tmp_path / "levels"
@@ -154,7 +154,7 @@ def test_finished_levels_are_not_built_again(asset, checkpoint, monkeypatch):
     def fail(*_):
         raise AssertionError("built a level again")
 
-    monkeypatch.setattr(v3dg.build, "_simplify", fail)
+    monkeypatch.setattr("v3dg.build.simplify._simplify", fail)
     assert build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint).num_levels > 3
 
 
@@ -179,9 +179,9 @@ def test_checkpoint_of_another_build_is_refused(asset, checkpoint, changed, monk
     elif changed == "seed":
         seed = 1
     elif changed == "device":
-        monkeypatch.setattr(v3dg.build._device, "describe", lambda _: "another")
+        monkeypatch.setattr("v3dg._device.describe", lambda _: "another")
     else:
-        monkeypatch.setattr(v3dg.build, "__version__", "0.0.0")
+        monkeypatch.setattr("v3dg.build.checkpoint.__version__", "0.0.0")
     with pytest.raises(ValueError, match="another asset, config, seed, device or version; remove it"):
         build_bundle(asset, config=config, seed=seed, progress=False, resume_path=checkpoint)
     assert checkpoint.read_bytes() == before

@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import resource
@@ -348,12 +349,25 @@ def test_main_returns_the_exit_code(capsys):
     assert "nowhere.v3dg" in capsys.readouterr().err
 
 
-def test_levels_are_kept_when_the_bundle_cannot_be_saved(folder, tmp_path):
-    (tmp_path / "tuft.v3dg").mkdir()  # where the bundle should go
+def test_a_place_where_no_bundle_can_go_is_refused_before_anything_is_built(folder, tmp_path):
+    (tmp_path / "tuft.v3dg").mkdir()
     done = run("build", folder / "tuft.ply", "-o", "tuft.v3dg", "--quiet", cwd=tmp_path)
     assert done.returncode == 1
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert (tmp_path / "tuft.v3dg.partial").exists()
-    (tmp_path / "tuft.v3dg").rmdir()
-    assert run("build", folder / "tuft.ply", "--resume", "-o", "tuft.v3dg", cwd=tmp_path).returncode == 0
-    assert sorted(os.listdir(tmp_path)) == ["tuft.v3dg"]
+    assert done.stderr == "v3dg: error: tuft.v3dg: Is a directory\n"
+    assert os.listdir(tmp_path) == ["tuft.v3dg"]
+
+
+def test_levels_are_kept_when_the_bundle_cannot_be_saved(folder, tmp_path, monkeypatch, capsys):
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    command = ["build", str(folder / "tuft.ply"), "-o", str(tmp_path / "tuft.v3dg"), "--quiet"]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        assert cli.main(command) == 1
+    levels = tmp_path / "tuft.v3dg.partial"
+    message = f"tuft.v3dg: No space left on device; `--resume` continues from {levels}\n"
+    assert capsys.readouterr().err.endswith(message)
+    assert list(tmp_path.iterdir()) == [levels]
+    assert cli.main([*command, "--resume"]) == 0
+    assert os.listdir(tmp_path) == ["tuft.v3dg"]

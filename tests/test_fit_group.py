@@ -10,7 +10,7 @@ import scenes
 from compare import DSSIM_FLOAT, FIT_FLOAT, assert_close
 from devices import host, on
 from v3dg import BuildConfig, Camera, Gaussians, _core, rasterize
-from v3dg.build import _fit_config
+from v3dg.build.fit import fit_config
 from v3dg.rasterize import rows_of
 
 torch = pytest.importorskip("torch")
@@ -42,11 +42,11 @@ def fit_groups(
         error,
         progress or _core.FitProgress(),
     ]
-    fit_config = _fit_config(config, seed, 0)
+    settings = fit_config(config, seed, 0)
     if device == "cpu":
-        _core.fit_level(fit_config, _core.Model(*rows_of(target)), *arguments)
+        _core.fit_level(settings, _core.Model(*rows_of(target)), *arguments)
     else:
-        _core.fit_level_cuda(fit_config, *rows_of(on(device, target)), *arguments, 0)
+        _core.fit_level_cuda(settings, *rows_of(on(device, target)), *arguments, 0)
     return Gaussians(*host(rows)), error
 
 
@@ -407,7 +407,7 @@ def test_no_groups_are_legal(device):
 def test_wrong_groups_are_named(place, value, message):
     rows = [np.array(row) for row in rows_of(in_ball(15, 10))]
     arguments = [
-        *(_fit_config(PLAIN, 0, 0), _core.Model(*rows), 0.0, False),
+        *(fit_config(PLAIN, 0, 0), _core.Model(*rows), 0.0, False),
         *(np.array([[0, 10]]), np.array([[0, 10]]), np.array([[0, 0, 0, 1]], np.float32), np.array([0])),
         *(*rows, np.zeros((1, 2), np.float32), _core.FitProgress()),
     ]
@@ -420,7 +420,7 @@ def test_group_without_extent_is_named():
     rows = [np.array(row) for row in rows_of(in_ball(15, 10))]
     with pytest.raises(ValueError, match="ball: expected a positive radius, group 0 has none"):
         _core.fit_level(
-            *(_fit_config(PLAIN, 0, 0), _core.Model(*rows), 0.0, False),
+            *(fit_config(PLAIN, 0, 0), _core.Model(*rows), 0.0, False),
             *(np.array([[0, 10]]), np.array([[0, 10]]), np.zeros((1, 4), np.float32), np.array([0])),
             *(*rows, np.zeros((1, 2), np.float32), _core.FitProgress()),
         )

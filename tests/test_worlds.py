@@ -6,7 +6,8 @@ import pytest
 import v3dg
 from benchmarks import worlds
 from benchmarks.__main__ import PROGRAM
-from v3dg.rotations import rotation_from_quaternion
+from v3dg.build import build_file
+from v3dg.scene import rotation_from_quaternion
 
 
 @pytest.fixture(scope="module")
@@ -174,17 +175,17 @@ def test_an_interrupted_world_goes_on(tmp_path, monkeypatch):
     whole = worlds.write_world(world, tmp_path / "whole", **options).parent
     built = []
 
-    def build(asset, **rest):
+    def build(*paths, **rest):
         if len(built) == 1:
             raise KeyboardInterrupt
-        built.append(asset)
-        return v3dg.build_bundle(asset, **rest)
+        built.append(paths)
+        return build_file(*paths, **rest)
 
-    monkeypatch.setattr(worlds, "build_bundle", build)
+    monkeypatch.setattr(worlds, "build_file", build)
     with pytest.raises(KeyboardInterrupt):
         worlds.write_world(world, tmp_path / "cut", **options)
     first = (tmp_path / "cut" / "person_00.v3dg").stat().st_mtime_ns
-    monkeypatch.setattr(worlds, "build_bundle", v3dg.build_bundle)
+    monkeypatch.setattr(worlds, "build_file", build_file)
     path = worlds.write_world(world, tmp_path / "cut", resume=True, **options)
     assert (path.parent / "person_00.v3dg").stat().st_mtime_ns == first
     names = sorted(p.name for p in whole.iterdir())

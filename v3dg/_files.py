@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import os
 import secrets
 import stat
@@ -14,12 +15,12 @@ _PIECE_BYTES = 16 << 20
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str], mark: str | None = None) -> Iterator[str]:
+def replacing(path: str | os.PathLike[str], *, is_locked: bool = False) -> Iterator[str]:
     """Give a name beside `path` to write to; at the end it replaces `path`, on failure it is removed.
 
-    What is written is on the disk before it gets its name. A link stays a link, to the new file. The name has
-    a `mark` that no other has; with a given one, what a killed program left there is removed, and no two may
-    write at once.
+    What is written is on the disk before it gets its name. A link stays a link, to the new file. Where the
+    caller sees to it that no other writes to `path` meanwhile, the name is always the same, and what a killed
+    program left there is removed.
 
     Raises:
         IsADirectoryError: `path` is a folder.
@@ -32,10 +33,11 @@ def replacing(path: str | os.PathLike[str], mark: str | None = None) -> Iterator
     if os.path.exists(target) and not os.path.isfile(target):
         raise ValueError(f"{os.fspath(path)}: expected the path of a file, got a device or a pipe")
     folder, name = os.path.split(target)
+    own = hashlib.blake2b(os.fsencode(os.path.abspath(path)), digest_size=8).hexdigest()
     # The start of the name only: a name may have 255 bytes, and a character up to four.
-    temporary = os.path.join(folder, f".{name[:40]}.{mark or secrets.token_hex(8)}.tmp")
+    temporary = os.path.join(folder, f".{name[:40]}.{own if is_locked else secrets.token_hex(8)}.tmp")
     with naming_errors(path, temporary):
-        if mark is not None:
+        if is_locked:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(temporary)
         try:

@@ -25,7 +25,7 @@ from benchmarks.worlds.paper_cameras import trajectories
 from benchmarks.worlds.procedural import TREE_KINDS, make_donut, make_person, make_temple, make_tree
 from benchmarks.worlds.procedural.donut import RING, TUBE
 from benchmarks.worlds.rings import Pile
-from v3dg.build import BuildConfig, build_bundle, discard_levels, is_current
+from v3dg.build import BuildConfig, build_file
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.gaussians import Gaussians
@@ -319,17 +319,16 @@ def write_world(
         asset_path, bundle_path = folder / f"{name}.ply", folder / f"{name}.v3dg"
         if not (resume and asset_path.is_file() and _is_same(load(asset_path), gaussians)):
             save(asset_path, gaussians)
-        if resume and is_current(bundle_path, asset_path, config, seed):
-            bundles[name] = Bundle.open(bundle_path)
-            continue
-        levels = folder / f"{name}.v3dg.partial"
-        if not resume:
-            discard_levels(levels)
-        bundles[name] = build_bundle(
-            gaussians, config=config, seed=seed, device=device, resume_path=levels, progress=progress
+        bundles[name], _ = build_file(
+            asset_path,
+            bundle_path,
+            asset=gaussians,
+            config=config,
+            seed=seed,
+            device=device,
+            resume=resume,
+            progress=progress,
         )
-        bundles[name].save(bundle_path)
-        levels.unlink(missing_ok=True)
     path = folder / f"{world.name}.json"
     paths = [f"{name}.v3dg" for name in world.placements]
     write_scene(path, scene_of(world, bundles), paths, world.cameras())

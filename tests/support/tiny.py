@@ -32,14 +32,18 @@ def shrink(set_attribute=setattr, set_item=dict.__setitem__):
         set_attribute(worlds, name, make)
         set_item(worlds.WORLDS, name, make)
 
-    build_whole = build.build_bundle
+    def quickly(build_whole):
+        def build_quickly(*what, config=None, **options):
+            quick = replace(config or build.BuildConfig(), steps=0)
+            return build_whole(*what, config=quick, **{"progress": False, **options})
 
-    def build_quickly(asset, *, config=None, **options):
-        quick = replace(config or build.BuildConfig(), steps=0)
-        return build_whole(asset, config=quick, **{"progress": False, **options})
+        return build_quickly
 
-    for module in (v3dg, build, demo, worlds):
-        set_attribute(module, "build_bundle", build_quickly)
+    bundle_quickly, file_quickly = quickly(build.build_bundle), quickly(build.build_file)
+    for module in (v3dg, build, demo):
+        set_attribute(module, "build_bundle", bundle_quickly)
+    for module in (build, worlds):
+        set_attribute(module, "build_file", file_quickly)
 
 
 if __name__ == "__main__":

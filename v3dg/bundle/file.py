@@ -35,6 +35,7 @@ from v3dg.bundle.format import (
     page_tables,
 )
 from v3dg.bundle.pages import Float32Codec
+from v3dg.bundle.tables import check_tables
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -93,8 +94,16 @@ class BundleWriter:
         self._is_written[first_page:last_page] = True
 
     def finish(self, clusters: Clusters, groups: Groups) -> None:
-        """Write the header and the tables; all pages have been written."""
-        assert self._is_written.all()
+        """Write the header and the tables; all pages have been written, which are those of the clusters.
+
+        Raises:
+            ValueError: The tables do not guarantee an exact cut.
+            RuntimeError: Pages are missing.
+        """
+        if not self._is_written.all():
+            missing = np.flatnonzero(~self._is_written)
+            raise RuntimeError(f"expected all pages, got none of {len(missing)}; the first is {missing[0]}")
+        check_tables(clusters, groups, int(self._layout.first_gaussian[-1]))
         tables = self._page_tables | {"pages.hash": self._hashes}
         for prefix, part in (("clusters", clusters), ("groups", groups)):
             tables |= {f"{prefix}.{field.name}": getattr(part, field.name) for field in fields(part)}
@@ -118,21 +127,22 @@ def writing(
     codec: Float32Codec,
     config_json: str,
     *,
-    mark: str | None = None,
+    is_locked: bool = False,
 ) -> Iterator[BundleWriter]:
     """Write a bundle's file, which appears at ``path`` when all is done; a failure leaves nothing behind.
 
     Args:
-        mark: Of the file's name until then, as `replacing` says.
+        is_locked: No other writes to ``path`` meanwhile, as `replacing` wants to know.
     """
     with (
-        _files.replacing(path, mark) as temporary,
+        _files.replacing(path, is_locked=is_locked) as temporary,
         open(temporary, "xb", buffering=0) as file,
         ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool,
     ):
         writer = BundleWriter(file.fileno(), pool, layout, codec, config_json)
         yield writer
-        assert writer.is_finished
+        if not writer.is_finished:
+            raise RuntimeError(f"{os.fspath(path)}: expected the tables after the pages, got none")
 
 
 def _short(value: object) -> str:

@@ -145,46 +145,30 @@ def _outputs(options: Build) -> dict[Path, Path]:
 def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
     """Build and save one bundle; what was done, as JSON values."""
     require_file(asset_path, *SUFFIXES)
-    from v3dg import _device, _files
-    from v3dg.build import build_bundle, discard_levels, is_current
-    from v3dg.bundle import Bundle
+    from v3dg.build import build_file
     from v3dg.cleaning import AssetWarning
-    from v3dg.io import load
 
     if output.suffix != ".v3dg":
         raise ValueError(f"{output}: expected a file name ending in .v3dg")
-    _files.check_folder(output)
-    config = _config(options)
-    partial = output.with_name(output.name + ".partial")
-    device = _device.resolve(options.device)
     start = time.perf_counter()
-    if options.resume and is_current(output, asset_path, config, options.seed):
-        return _result(asset_path, output, Bundle.open(output), "kept", start)
-    if not options.resume:
-        discard_levels(partial)
-    asset = load(asset_path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AssetWarning)  # the result says it
-            bundle = build_bundle(
-                asset,
-                config=config,
+            bundle, is_built = build_file(
+                asset_path,
+                output,
+                config=_config(options),
                 seed=options.seed,
                 progress=not options.quiet,
-                device=device,
-                resume_path=partial,
+                device=options.device,
+                resume=options.resume,
                 unusable="refuse" if options.strict else "drop",
             )
-        bundle.save(output)
-    except ValueError as error:
-        place = f"{asset_path}: " if str(error).startswith("asset: ") else ""
-        raise ValueError(f"{place}{error}") from None
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted{_to_resume(partial)}") from None
+        raise KeyboardInterrupt(f"interrupted{_to_resume(output)}") from None
     except OSError as error:  # a full disk, say
-        raise OSError(error.errno, f"{error.strerror}{_to_resume(partial)}", error.filename) from None
-    partial.unlink(missing_ok=True)
-    return _result(asset_path, output, bundle, "built", start)
+        raise OSError(error.errno, f"{error.strerror}{_to_resume(output)}", error.filename) from None
+    return _result(asset_path, output, bundle, "built" if is_built else "kept", start)
 
 
 def _result(asset: Path, output: Path, bundle: Bundle, status: str, start: float) -> dict[str, Any]:
@@ -209,7 +193,10 @@ def _config(options: Build) -> BuildConfig:
     return config if options.cluster_size is None else replace(config, cluster_size=options.cluster_size)
 
 
-def _to_resume(partial: Path) -> str:
+def _to_resume(output: Path) -> str:
+    from v3dg.build import levels_path
+
+    partial = levels_path(output)
     return f"; `--resume` continues from {partial}" if partial.exists() else ""
 
 

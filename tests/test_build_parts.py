@@ -1,0 +1,259 @@
+"""Builds in parts: plans from counts, subtrees alone and in any order, files that take what is finished."""
+
+from dataclasses import asdict, fields, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import scenes
+import v3dg
+from benchmarks.worlds.procedural import make_asset
+from v3dg import BuildConfig, Gaussians, _core, build_bundle
+from v3dg._files import replacing
+from v3dg.build import build_file, levels_path
+from v3dg.build.assemble import assemble
+from v3dg.build.fit import fit_config
+from v3dg.build.plan import Plan
+from v3dg.build.simplify import Level, LevelTables, build_levels
+from v3dg.build.whole import _in_split_order
+from v3dg.bundle.bundle import config_to_json
+from v3dg.bundle.file import writing
+from v3dg.bundle.pages import Float32Codec, PageLayout
+
+SMALL = BuildConfig(cluster_size=32, steps=4, num_views=4, supersample=2)
+CONFIGS = {
+    "ours": SMALL,
+    "paper": BuildConfig.paper(cluster_size=32, steps=3, image_size=24),
+    "prune": replace(SMALL, init="prune"),
+    "previous": replace(SMALL, targets="previous"),
+    "fresh_views": replace(SMALL, num_views=0),
+    "groups_of_4": replace(SMALL, group_size=4, asset_filter_px2=0.3),
+    "groups_of_8": replace(SMALL, group_size=8, loss_dssim=0.2),
+}
+SEED = 11
+
+
+@pytest.fixture(scope="module")
+def asset():
+    return make_asset(num_gaussians=1100, seed=2)
+
+
+def arrays_of(level):
+    """All of a level by name."""
+    rows = {name: getattr(level.gaussians, name) for name in scenes.NAMES}
+    return rows | {field.name: getattr(level.tables, field.name) for field in fields(LevelTables)}
+
+
+def part_of(level, plan, part):
+    """What a level has of some of its groups."""
+    groups = slice(part.first_group, part.first_group + part.num_groups)
+    made = plan.num_clusters // plan.num_groups
+    clusters = slice(groups.start * made, groups.stop * made)
+    tables = level.tables
+    return Level(
+        level.gaussians.subset(slice(plan.offset[clusters.start], plan.offset[clusters.stop])),
+        LevelTables(tables.box[clusters], tables.ball[groups], tables.error[groups]),
+    )
+
+
+def build_subtree(leaves, plan, config, level, first_group, last_group):
+    """The levels above the leaves under a run of groups, made from those leaves alone; and their plan."""
+    part = plan.subtree(level, first_group, last_group)
+    bottom = part.levels[0].first_group
+    rows = plan.levels[0].offset[[bottom, bottom + part.levels[0].num_groups]]
+    own = Gaussians(*(np.array(getattr(leaves, name)[slice(*rows)]) for name in scenes.NAMES))
+    return list(build_levels(own, part, config, SEED)), part
+
+
+def joined(levels):
+    """One level of the parts of it, in order."""
+    tables = (
+        np.concatenate([getattr(level.tables, field.name) for level in levels])
+        for field in fields(LevelTables)
+    )
+    return Level(Gaussians.concatenate([level.gaussians for level in levels]), LevelTables(*tables))
+
+
+# ---- plans
+
+
+@pytest.mark.parametrize("num_gaussians", [1, 2, 3, 7, 33, 1000, 1023, 1025])
+@pytest.mark.parametrize("group_size", [2, 8])
+def test_plan_has_the_shape_of_the_bundle(asset, num_gaussians, group_size):
+    config = BuildConfig(cluster_size=16, steps=0, num_views=1, group_size=group_size, min_gaussians=1)
+    bundle = build_bundle(
+        asset.subset(slice(num_gaussians)), config=config, progress=False, device="cpu", unusable="refuse"
+    )
+    plan = Plan.of(num_gaussians, config)
+    assert len(plan.levels) == bundle.num_levels
+    for number, level in enumerate(plan.levels):
+        clusters = bundle.level_range(number)
+        offset = bundle.clusters.offset[clusters.start : clusters.stop + 1]
+        np.testing.assert_array_equal(level.offset, offset - offset[0])
+        if number > 0:
+            np.testing.assert_array_equal(level.weight, bundle.groups.weight[bundle.groups.level == number])
+    pages = PageLayout.of(bundle.clusters)
+    np.testing.assert_array_equal(plan.layout.first_cluster, pages.first_cluster)
+    np.testing.assert_array_equal(plan.layout.first_gaussian, pages.first_gaussian)
+    assert plan.first_page[-1] == bundle.num_pages
+
+
+def test_plan_of_a_subtree_is_a_part_of_the_plan():
+    plan = Plan.of(1_000_003, BuildConfig(group_size=4))
+    level, first, last = 5, 3, 7
+    part = plan.subtree(level, first, last)
+    assert len(part.levels) == level + 1
+    for here, whole in zip(part.levels, plan.levels, strict=False):
+        assert here.first_group * plan.levels[level].num_groups == first * whole.num_groups
+        groups = slice(here.first_group, here.first_group + here.num_groups)
+        np.testing.assert_array_equal(here.weight, whole.weight[groups])
+        np.testing.assert_array_equal(np.diff(here.leaf_offset), np.diff(whole.leaf_offset)[groups])
+        assert here.leaf_offset[-1] == part.levels[0].num_gaussians
+
+
+# ---- subtrees
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_subtree_alone_is_that_of_the_whole(asset, name):
+    """Whatever is built beside it, below which level, and in which order."""
+    config = CONFIGS[name]
+    leaves, plan = _in_split_order(asset, config), Plan.of(len(asset), config)
+    whole = list(build_levels(leaves, plan, config, SEED))
+    num_compared = 0
+    for level in (3, 1, 2):
+        num_groups = plan.levels[level].num_groups
+        for group in np.random.default_rng(level).permutation(num_groups)[:3]:
+            levels, part = build_subtree(leaves, plan, config, level, group, group + 1)
+            for built, of_whole, here, there in zip(levels, whole, part.levels, plan.levels, strict=False):
+                expected = arrays_of(part_of(of_whole, there, here))
+                for key, array in arrays_of(built).items():
+                    assert array.tobytes() == expected[key].tobytes(), (level, group, key)
+                num_compared += here.num_groups
+    assert num_compared > 20
+
+
+@pytest.mark.parametrize("name", ["ours", "groups_of_4"])
+def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
+    """Their pages go to the file as they are finished; what is above is built from what they became."""
+    config = CONFIGS[name]
+    build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu").save(tmp_path / "whole.v3dg")
+    made_with = v3dg.Bundle.open(tmp_path / "whole.v3dg").config
+    leaves, plan = _in_split_order(asset, config), Plan.of(len(asset), config)
+    level = 2
+    num_groups = plan.levels[level].num_groups
+    subtrees = {}
+    layout, codec, first_page = plan.layout, Float32Codec(asset.sh_degree), plan.first_page
+    with writing(tmp_path / "parts.v3dg", layout, codec, config_to_json(made_with)) as writer:
+        for group in np.random.default_rng(0).permutation(num_groups):
+            levels, part = build_subtree(leaves, plan, config, level, group, group + 1)
+            for number, above in enumerate(part.levels[1:]):
+                page = first_page[number] + above.first_group
+                writer.write(page, page + above.num_groups, levels[number].gaussians)
+            subtrees[group] = levels
+        in_order = zip(*(subtrees[group] for group in range(num_groups)), strict=True)
+        finished = [joined(levels) for levels in in_order][1:]
+        whole = list(build_levels(leaves, plan, config, SEED, finished=finished))
+        for number in range(level, len(whole)):
+            writer.write(first_page[number], first_page[number + 1], whole[number].gaussians)
+        writer.finish(*assemble(plan, [level.tables for level in whole], config))
+    assert (tmp_path / "parts.v3dg").read_bytes() == (tmp_path / "whole.v3dg").read_bytes()
+
+
+# ---- files
+
+
+def test_a_file_is_built_as_a_bundle_is(asset, tmp_path):
+    v3dg.save(tmp_path / "asset.ply", asset)
+    options = {"config": SMALL, "seed": SEED, "progress": False, "device": "cpu"}
+    bundle, is_built = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
+    assert is_built
+    assert bundle.path == str(tmp_path / "out.v3dg")
+    build_bundle(v3dg.load(tmp_path / "asset.ply"), **options).save(tmp_path / "memory.v3dg")
+    assert (tmp_path / "out.v3dg").read_bytes() == (tmp_path / "memory.v3dg").read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == {"asset.ply", "out.v3dg", "memory.v3dg"}
+    again = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
+    assert not again[1]
+
+
+def test_what_a_killed_build_left_of_a_file_is_written_over(asset, tmp_path):
+    """And not of another file, whose name begins alike."""
+    v3dg.save(tmp_path / "asset.ply", asset)
+    names = [f"{'long' * 20}_{end}.v3dg" for end in "ab"]
+    left = []
+    for name in names:
+        with replacing(tmp_path / name, is_locked=True) as temporary:
+            Path(temporary).touch()
+        left.append(Path(temporary))
+        (tmp_path / name).unlink()
+    for path in left:
+        path.write_bytes(bytes(10_000_000))
+    options = {"config": SMALL, "progress": False, "device": "cpu"}
+    bundle, _ = build_file(tmp_path / "asset.ply", tmp_path / names[0], **options)
+    assert bundle.info()["bytes"] == (tmp_path / names[0]).stat().st_size
+    assert {path.name for path in tmp_path.iterdir()} == {"asset.ply", names[0], left[1].name}
+
+
+def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatch):
+    v3dg.save(tmp_path / "asset.ply", asset)
+    options = {"config": SMALL, "progress": False, "device": "cpu"}
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("v3dg.build.whole.assemble", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
+    assert {p.name for p in tmp_path.iterdir()} == {"asset.ply", levels_path("out.v3dg").name}
+    monkeypatch.setattr("v3dg.build.simplify._simplify", interrupt)
+    bundle, is_built = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
+    assert is_built
+    assert bundle.num_levels == len(Plan.of(len(asset), SMALL).levels)
+
+
+def test_an_unfinished_file_never_gets_its_name(asset, tmp_path):
+    bundle = build_bundle(asset, config=replace(SMALL, steps=0), progress=False, device="cpu")
+    layout, codec = PageLayout.of(bundle.clusters), Float32Codec(bundle.sh_degree)
+
+    def write(first_page, finish):
+        with writing(tmp_path / "out.v3dg", layout, codec, config_to_json({})) as writer:
+            rest = bundle.gaussians.subset(slice(layout.first_gaussian[first_page], None))
+            writer.write(first_page, layout.num_pages, rest)
+            if finish:
+                writer.finish(bundle.clusters, bundle.groups)
+
+    with pytest.raises(RuntimeError, match="expected all pages, got none of 1; the first is 0"):
+        write(1, finish=True)
+    with pytest.raises(RuntimeError, match="expected the tables after the pages"):
+        write(0, finish=False)
+    assert list(tmp_path.iterdir()) == []
+    write(0, finish=True)
+    assert v3dg.Bundle.open(tmp_path / "out.v3dg").info()["levels"] == bundle.info()["levels"]
+
+
+# ---- settings
+
+
+# Those of the build itself.
+OF_THE_BUILD = {
+    *("cluster_size", "group_size", "min_clusters", "min_gaussians", "init", "prune_growth", "targets"),
+    *("asset_filter_px2", "asset_antialiased"),
+}
+
+
+def test_every_setting_of_the_fit_reaches_it(monkeypatch):
+    config = BuildConfig.paper(num_views=7, px2_per_gaussian=1.5)
+    monkeypatch.setattr(_core, "FitConfig", dict)
+    expected = {name: value for name, value in asdict(config).items() if name not in OF_THE_BUILD}
+    assert fit_config(config, 3, 2) == expected | {"antialiased": True, "seed": 3 * 64 + 2}
+
+
+def test_a_forgotten_setting_of_the_fit_is_an_error(monkeypatch):
+    monkeypatch.setattr(_core, "FitConfig", partial(_core.FitConfig, unknown=1))
+    with pytest.raises(TypeError):
+        fit_config(BuildConfig(), 0, 0)
+    with pytest.raises(TypeError):
+        _core.FitConfig(steps=1)

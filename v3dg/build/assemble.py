@@ -1,0 +1,54 @@
+"""The tables of a bundle, from the plan and what was measured of each level."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg.build.config import BuildConfig
+from v3dg.build.plan import Plan
+from v3dg.build.simplify import LevelTables
+from v3dg.bundle import Clusters, Groups
+
+
+def assemble(plan: Plan, tables: Sequence[LevelTables], config: BuildConfig) -> tuple[Clusters, Groups]:
+    """The tables of all levels, in order."""
+    levels = plan.levels
+    num_clusters = [level.num_clusters for level in levels]
+    num_groups = [0, *(level.num_groups for level in levels[1:])]  # of level 0 there are none in a bundle
+    is_fine = np.arange(sum(num_clusters)) < num_clusters[0]
+    clusters = Clusters(
+        offset=np.concatenate([[0], np.cumsum(np.concatenate([np.diff(level.offset) for level in levels]))]),
+        level=np.repeat(np.arange(len(levels), dtype=np.int32), num_clusters),
+        own_group=_groups_from(num_clusters, num_groups, 0),
+        parent_group=_groups_from(num_clusters, num_groups, 1),
+        box=np.concatenate([table.box for table in tables]),
+        filter_px2=np.where(is_fine, config.asset_filter_px2, config.filter_px2).astype(np.float32),
+        antialiased=np.where(is_fine, config.asset_antialiased, True).astype(np.uint8),
+    )
+    none = LevelTables(*(np.zeros((0, *shape), np.float32) for shape in ((2, 3), (4,), (2,))))
+    coarse = [none, *tables[1:]]
+    groups = Groups(
+        ball=np.concatenate([table.ball for table in coarse]),
+        weight=np.concatenate([np.zeros(0, np.float32), *(level.weight for level in levels[1:])]),
+        parent=_groups_from(num_groups, num_groups, 1),
+        level=np.repeat(np.arange(len(levels), dtype=np.int32), num_groups),
+        error=np.concatenate([table.error for table in coarse]),
+    )
+    return clusters, groups
+
+
+def _groups_from(counts: Sequence[int], num_groups: Sequence[int], above: int) -> npt.NDArray[np.int32]:
+    """The group, `above` levels up, that each of a level's rows belongs to; all have as many. -1 for none."""
+    first = np.cumsum([0, *num_groups])
+    parts: list[Any] = []
+    for number, count in enumerate(counts):
+        level = number + above
+        if level >= len(num_groups) or num_groups[level] == 0:
+            parts.append(np.full(count, -1))
+        else:
+            parts.append(first[level] + np.repeat(np.arange(num_groups[level]), count // num_groups[level]))
+    return np.concatenate(parts).astype(np.int32)

@@ -1,0 +1,211 @@
+"""Finished levels of a build, kept in a file so that it can be gone on with."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import math
+import os
+import stat
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, fields
+from io import FileIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _device, _files
+from v3dg._device import Device
+from v3dg._version import __version__
+from v3dg.build.config import BuildConfig
+from v3dg.build.plan import LevelPlan, Plan
+from v3dg.build.simplify import Level, LevelTables
+from v3dg.gaussians import Gaussians
+
+_DIGEST_BYTES = 16
+_PIECE_BYTES = 16 << 20
+
+
+class Checkpoint:
+    """Finished levels in a file that grows by one after each; the first, the leaves, is quicker to make anew.
+
+    A level whose writing was cut off does not count; one that is whole but damaged is an error. The file is
+    locked while a build uses it, and is gone after one that finished no level.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str] | None,
+        asset: Gaussians,
+        plan: Plan,
+        config: BuildConfig,
+        seed: int,
+        device: Device,
+    ) -> None:
+        self.num_levels = 0  # that are in the file, beside the leaves
+        self._path = None if path is None else Path(path)
+        if self._path is None:
+            return
+        self._levels = plan.levels
+        what = [asdict(config), seed, _device.describe(device), __version__, len(asset), asset.sh_degree]
+        text = json.dumps(what, sort_keys=True).encode()
+        self._head = b"v3dg levels 3\n" + _digest(text, _arrays_of(asset.numpy()))
+        self._num_bases = asset.sh.shape[1]
+        self._num_bytes = 0  # of the file that are good
+
+    def __enter__(self) -> Checkpoint:
+        if self._path is not None:
+            if not self._path.parent.is_dir():
+                raise ValueError(f"resume_path: expected a file in an existing folder, got {self._path}")
+            self._file = _open_locked(self._path)
+            try:
+                self._check_head()
+            except BaseException:
+                self._file.close()
+                raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._path is not None:
+            if os.fstat(self._file.fileno()).st_size == 0:
+                self._path.unlink(missing_ok=True)
+            self._file.close()
+
+    def load(self) -> Iterator[Level]:
+        """The finished levels but the leaves, one after another."""
+        if self._path is None:
+            return
+        for plan in self._levels[1:]:
+            with self._reading():
+                level = self._read(plan)
+            if level is None:
+                return
+            self._num_bytes = self._file.tell()
+            self.num_levels += 1
+            yield level
+
+    def _check_head(self) -> None:
+        with self._reading():
+            head = self._file.read(len(self._head))
+        if not self._head.startswith(head):
+            raise ValueError(
+                f"{self._path}: holds something else, or levels of another asset, config, seed, device or "
+                "version; remove it to start again"
+            )
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError) as error:
+            raise ValueError(
+                f"{self._path}: expected levels of an interrupted build, could not read them "
+                f"({error}); remove it to start again"
+            ) from error
+
+    def _read(self, plan: LevelPlan) -> Level | None:
+        """The next level; None where the file ends before it does."""
+        shapes = self._shapes(plan)
+        left = os.fstat(self._file.fileno()).st_size - self._file.tell()
+        if _DIGEST_BYTES + 4 * sum(map(math.prod, shapes)) > left:
+            return None
+        digest = self._file.read(_DIGEST_BYTES)
+        arrays = [np.fromfile(self._file, np.float32, math.prod(shape)).reshape(shape) for shape in shapes]
+        if _digest(b"", arrays) != digest:
+            raise ValueError("a level is damaged")
+        return Level(Gaussians(*arrays[:5]), LevelTables(*arrays[5:]))
+
+    def save(self, level: Level) -> None:
+        """Add a level that is on the host; what a full disk cuts off is removed again."""
+        if self._path is None:
+            return
+        arrays = [*_arrays_of(level.gaussians), *_arrays_of(level.tables)]
+        descriptor, end = self._file.fileno(), self._num_bytes
+        os.ftruncate(descriptor, end)
+        with _files.naming_errors(self._path):
+            try:
+                head = self._head if end == 0 else b""
+                pieces: list[bytes | memoryview] = [head, _digest(b"", arrays), *map(_bytes_of, arrays)]
+                for data in pieces:
+                    _files.write_at(descriptor, data, end)
+                    end += len(data)
+            except OSError:
+                os.ftruncate(descriptor, self._num_bytes)
+                raise
+        self._num_bytes = end
+        self.num_levels += 1
+
+    def _shapes(self, plan: LevelPlan) -> list[tuple[int, ...]]:
+        """Of the arrays of a level, in order; all are float32."""
+        n, clusters, groups = plan.num_gaussians, plan.num_clusters, plan.num_groups
+        rows: list[tuple[int, ...]] = [(n, 3), (n, 4), (n, 3), (n,), (n, self._num_bases, 3)]
+        return [*rows, (clusters, 2, 3), (groups, 4), (groups, 2)]
+
+
+def discard_levels(resume_path: str | os.PathLike[str]) -> None:
+    """Remove what an interrupted build left there, if anything.
+
+    Raises:
+        RuntimeError: A build is using it.
+    """
+    if os.path.lexists(resume_path):
+        with _open_locked(resume_path):
+            os.unlink(resume_path)
+
+
+def _open_locked(path: str | os.PathLike[str]) -> FileIO:
+    """Open or make a file to read and write; other builds are kept out until it is closed."""
+    # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
+    file = FileIO(path, "r+", opener=lambda name, _: os.open(name, flags, 0o666))
+    try:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a device or a pipe")
+        _lock(file)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _lock(file: FileIO) -> None:
+    try:
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RuntimeError(
+            f"{os.fspath(file.name)}: another build is using it; wait for it, or write to another place"
+        ) from None
+    except OSError as error:
+        # Some network file systems have no locks; there, two builds of one output are the user's to avoid.
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+            raise
+
+
+def _arrays_of(parts: Gaussians | LevelTables) -> list[npt.NDArray[np.float32]]:
+    return [getattr(parts, field.name) for field in fields(parts)]
+
+
+def _bytes_of(array: npt.NDArray[np.float32]) -> memoryview:
+    return memoryview(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+
+
+def _digest(head: bytes, arrays: Sequence[npt.NDArray[Any]]) -> bytes:
+    """Of the head and the arrays' bytes; in pieces, so that all cores share the work."""
+    pieces: list[Any] = [head]
+    for array in arrays:
+        data = _bytes_of(array)
+        pieces += [data[i : i + _PIECE_BYTES] for i in range(0, len(data), _PIECE_BYTES)]
+
+    def digest(piece: Any) -> bytes:
+        return hashlib.blake2b(piece, digest_size=_DIGEST_BYTES).digest()
+
+    if sum(array.nbytes for array in arrays) < _PIECE_BYTES:  # less work than starting threads
+        return digest(b"".join(map(digest, pieces)))
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
+        return digest(b"".join(pool.map(digest, pieces)))

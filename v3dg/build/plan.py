@@ -1,0 +1,146 @@
+"""The shape of every level, from counts alone: what a group is made of is known before anything is built."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _core
+from v3dg.build.config import BuildConfig
+from v3dg.bundle.pages import PageLayout
+
+Offsets = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class LevelPlan:
+    """One level, or a run of its groups: C clusters made by G groups, each of as many clusters.
+
+    At level 0 every cluster is a group of its own.
+
+    Attributes:
+        first_group: Number of the first group in the level of the whole asset.
+        offset: (C + 1,) gaussians of each cluster.
+        group_offset: (G + 1,) gaussians that each group is simplified to.
+        leaf_offset: (G + 1,) gaussians of level 0 under each group.
+        weight: (G,) float32, of the footprint.
+    """
+
+    first_group: int
+    offset: Offsets
+    group_offset: Offsets
+    leaf_offset: Offsets
+    weight: npt.NDArray[np.float32]
+
+    @property
+    def num_clusters(self) -> int:
+        return len(self.offset) - 1
+
+    @property
+    def num_groups(self) -> int:
+        return len(self.group_offset) - 1
+
+    @property
+    def num_gaussians(self) -> int:
+        return int(self.offset[-1])
+
+    def groups(self, first: int, last: int) -> LevelPlan:
+        """A run of the groups, their gaussians counted from 0."""
+        made = self.num_clusters // self.num_groups
+        return LevelPlan(
+            self.first_group + first,
+            _from_zero(self.offset[first * made : last * made + 1]),
+            _from_zero(self.group_offset[first : last + 1]),
+            _from_zero(self.leaf_offset[first : last + 1]),
+            self.weight[first:last],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The levels of a whole asset, or those of a subtree of it.
+
+    All counts of clusters and groups are powers of two, so groups nest evenly: those under a run of groups
+    are a run of whole groups of every level below.
+    """
+
+    levels: tuple[LevelPlan, ...]
+
+    @staticmethod
+    def of(num_gaussians: int, config: BuildConfig) -> Plan:
+        """The plan of an asset with so many gaussians."""
+        sizes = np.array([num_gaussians], np.int64)
+        for _ in range(_core.num_halvings(num_gaussians, config.cluster_size)):
+            sizes = _halved(sizes)
+        offset = _offset_of(sizes)
+        levels = [LevelPlan(0, offset, offset, offset, np.zeros(len(sizes), np.float32))]
+        while (shape := _next_shape(levels[-1], config)) is not None:
+            levels.append(_level_above(levels[-1], *shape))
+        return Plan(tuple(levels))
+
+    def subtree(self, level: int, first_group: int, last_group: int) -> Plan:
+        """What is under a run of groups of one level, up to that level."""
+        top = self.levels[level].num_groups
+        each = [below.num_groups // top for below in self.levels[: level + 1]]
+        return Plan(
+            tuple(
+                below.groups(first_group * count, last_group * count)
+                for below, count in zip(self.levels, each, strict=False)
+            )
+        )
+
+    @property
+    def first_page(self) -> list[int]:
+        """Of each level, and the number of pages: a group's page is that of the clusters that it replaces."""
+        return list(itertools.accumulate(self._num_pages, initial=0))
+
+    @property
+    def _num_pages(self) -> list[int]:
+        return [*(level.num_groups for level in self.levels[1:]), 1]
+
+    @property
+    def layout(self) -> PageLayout:
+        """The pages of the bundle."""
+        clusters, gaussians = [], []
+        for level, count in zip(self.levels, self._num_pages, strict=True):
+            each = level.num_clusters // count
+            clusters.append(np.full(count, each, np.int64))
+            gaussians.append(np.diff(level.offset[::each]))
+        return PageLayout(_offset_of(np.concatenate(clusters)), _offset_of(np.concatenate(gaussians)))
+
+
+def _next_shape(below: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:
+    """Groups that a level's clusters form, and clusters each makes; None after the last level."""
+    num_groups = max(1, below.num_clusters // config.group_size)
+    made = max(1, below.num_clusters // num_groups // 2)
+    if num_groups * made < config.min_clusters or below.num_gaussians // 2 < config.min_gaussians:
+        return None
+    return num_groups, made
+
+
+def _level_above(below: LevelPlan, num_groups: int, clusters_made: int) -> LevelPlan:
+    into = np.diff(below.offset[:: below.num_clusters // num_groups])
+    sizes = (into + 1) // 2
+    group_offset = _offset_of(sizes)
+    weight = np.maximum((1 / sizes).astype(np.float32), below.weight.reshape(num_groups, -1).max(axis=1))
+    while len(sizes) < num_groups * clusters_made:
+        sizes = _halved(sizes)
+    leaf_offset = np.ascontiguousarray(below.leaf_offset[:: below.num_groups // num_groups])
+    return LevelPlan(0, _offset_of(sizes), group_offset, leaf_offset, weight)
+
+
+def _halved(sizes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Sizes of the parts when each is split in two, as the median split does it."""
+    return np.stack([(sizes + 1) // 2, sizes // 2], axis=1).ravel()
+
+
+def _offset_of(sizes: npt.NDArray[np.int64]) -> Offsets:
+    return np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
+
+
+def _from_zero(offset: Offsets) -> Offsets:
+    moved: Offsets = offset - offset[0]
+    return moved
