@@ -53,10 +53,4 @@ void select(const SelectInput& in, SelectOutput& out);
 void group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric);
 }  // namespace cpu
 
-namespace cuda {
-// How many devices there are; 0 without a driver.
-int num_devices();
-
-}  // namespace cuda
-
 }  // namespace v3dg

@@ -746,14 +746,5 @@ void SceneTables::select(const Camera& camera, const SelectRule& rule, SelectOut
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
-int num_devices() {
-    int count = 0;
-    if (cudaGetDeviceCount(&count) != cudaSuccess) {
-        cudaGetLastError();
-        return 0;
-    }
-    return count;
-}
-
 }  // namespace cuda
 }  // namespace v3dg
