@@ -30,20 +30,43 @@ struct Arguments {
     }
 };
 
+// Where the values of each instance begin, if its bundle has counts[b] of them; at the end, how many there
+// are.
+NewArray<int64_t> offset_of_instances(Span<const int32_t> bundle, const std::vector<size_t>& counts) {
+    NewArray<int64_t> offset({}, {static_cast<py::ssize_t>(bundle.size + 1)});
+    offset.span[0] = 0;
+    for (size_t i = 0; i < bundle.size; ++i)
+        offset.span[i + 1] = offset.span[i] + static_cast<int64_t>(counts[bundle[i]]);
+    return offset;
+}
+
 py::tuple group_metrics(const std::vector<const BoundTable*>& tables, const Instances& instances,
                         const BoundCamera& camera, const SelectRule& rule) {
     const Arguments arguments(tables, instances, camera, rule);
+    std::vector<size_t> counts;
+    for (const ClusterTable& table : arguments.tables) counts.push_back(table.ball.size);
     const Span<const int32_t> bundle = arguments.input.instances.bundle;
-    const NewArray<int64_t> offset({}, {static_cast<py::ssize_t>(bundle.size + 1)});
-    offset.span[0] = 0;
-    for (size_t i = 0; i < bundle.size; ++i)
-        offset.span[i + 1] = offset.span[i] + static_cast<int64_t>(arguments.tables[bundle[i]].ball.size);
+    const NewArray<int64_t> offset = offset_of_instances(bundle, counts);
     const NewArray<float> metric({}, {static_cast<py::ssize_t>(offset.span[bundle.size])});
     {
         const py::gil_scoped_release unlocked;
         cpu::group_metrics(arguments.input, offset.span, metric.span);
     }
     return py::make_tuple(metric.object, offset.object);
+}
+
+py::tuple bounds_may_draw(const std::vector<const BoundTable*>& tables, const Instances& instances,
+                          const BoundCamera& camera, const SelectRule& rule, bool and_coarser) {
+    const Arguments arguments(tables, instances, camera, rule);
+    std::vector<size_t> counts;
+    for (const ClusterTable& table : arguments.tables)
+        counts.push_back((table.num_clusters() + kClustersOfBounds - 1) / kClustersOfBounds);
+    const Span<const int32_t> bundle = arguments.input.instances.bundle;
+    const NewArray<int64_t> offset = offset_of_instances(bundle, counts);
+    const NewArray<uint8_t> may_draw({}, {static_cast<py::ssize_t>(offset.span[bundle.size])});
+    cpu::bounds_may_draw(arguments.input, and_coarser ? Tolerances::from_this_on : Tolerances::this_one,
+                         offset.span, may_draw.span);
+    return py::make_tuple(may_draw.object, offset.object);
 }
 
 }  // namespace
@@ -106,6 +129,10 @@ void bind_select(py::module_& m) {
         .def_readonly("fits_budget", &BoundCut::fits_budget);
     m.def("group_metrics", &group_metrics, "tables"_a, "instances"_a, "camera"_a, "rule"_a,
           "Metric of every group of every instance, px2, and where each instance's metrics begin.");
+    m.def(
+        "bounds_may_draw", &bounds_may_draw, "tables"_a, "instances"_a, "camera"_a, "rule"_a, "and_coarser"_a,
+        "For each eight neighbouring clusters of every instance, 0 if their bounds tell that none is drawn; "
+        "and where each instance's values begin.");
 }
 
 }  // namespace v3dg

@@ -167,4 +167,16 @@ void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset
     });
 }
 
+void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<const int64_t> first,
+                          Span<uint8_t> may_draw) {
+    std::vector<std::vector<ClusterBounds>> bounds;
+    for (const ClusterTable& table : in.bundles) bounds.push_back(bounds_of_clusters(table));
+    parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
+        const SeenInstance seen(in, i);
+        uint8_t* out = may_draw.data + first[i];
+        for (const ClusterBounds& b : bounds[in.instances.bundle[i]])
+            *out++ = seen.is_placed && v3dg::may_draw(b, seen.view, in.rule, tolerances);
+    });
+}
+
 }  // namespace v3dg
