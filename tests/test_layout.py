@@ -22,12 +22,23 @@ MAY_INCLUDE = {
     "cluster": {"base", "math"},
     "simplify": {"base", "math", "cluster"},
     "gather": {"base", "math"},
-    "select": {"base", "math", "frame"},
+    "residency": {"base", "math", "frame"},
+    "select": {"base", "math", "frame", "residency"},
     "project": {"base", "math", "frame"},
     "tile_bin": {"base", "math", "frame"},
     "rasterize": {"base", "math", "frame"},
     "fit_group": {"base", "math", "frame", "project", "tile_bin", "rasterize"},
-    "pipeline": {"base", "math", "frame", "select", "project", "tile_bin", "rasterize", "fit_group"},
+    "pipeline": {
+        "base",
+        "math",
+        "frame",
+        "residency",
+        "select",
+        "project",
+        "tile_bin",
+        "rasterize",
+        "fit_group",
+    },
     "bindings": {
         "base",
         "math",
@@ -36,12 +47,13 @@ MAY_INCLUDE = {
         "cluster",
         "simplify",
         "gather",
+        "residency",
         "select",
         "fit_group",
         "pipeline",
     },
 }
-NOT_OPERATIONS = {"base", "math", "io", "frame", "pipeline", "bindings"}
+NOT_OPERATIONS = {"base", "math", "io", "frame", "residency", "pipeline", "bindings"}
 TESTED_WITH = {"tile_bin": "rasterize"}
 
 OPERATIONS = sorted(p.name for p in CSRC.iterdir() if p.is_dir() and p.name not in NOT_OPERATIONS)

@@ -99,6 +99,9 @@ def select(
 def group_metrics(
     tables: list[ClusterTable], instances: tuple[Any, ...], camera: tuple[Any, ...], rule: tuple[Any, ...]
 ) -> tuple[Float32, NDArray[np.int64]]: ...
+def bounds_may_draw(
+    tables: list[ClusterTable], instances: Instances, camera: Camera, rule: Rule, and_coarser: bool
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]: ...
 
 # render
 class Model:

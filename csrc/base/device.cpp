@@ -13,10 +13,25 @@ void check(cudaError_t error, const char* what) {
     throw std::runtime_error(std::string("cuda: ") + what + " failed: " + cudaGetErrorString(error));
 }
 
-unsigned num_multiprocessors() {
-    int device = 0, count = 0;
+int num_devices() {
+    int count = 0;
+    if (cudaGetDeviceCount(&count) != cudaSuccess) {
+        cudaGetLastError();
+        return 0;
+    }
+    return count;
+}
+
+int current_device() {
+    int device = 0;
     check(cudaGetDevice(&device), "cudaGetDevice");
-    check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device), "cudaDeviceGetAttribute");
+    return device;
+}
+
+unsigned num_multiprocessors() {
+    int count = 0;
+    check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, current_device()),
+          "cudaDeviceGetAttribute");
     return static_cast<unsigned>(count);
 }
 
@@ -24,8 +39,7 @@ unsigned num_multiprocessors() {
 static cudaMemPool_t pool_of_current_device() {
     static std::mutex mutex;
     static std::vector<cudaMemPool_t> pools;
-    int device = 0;
-    check(cudaGetDevice(&device), "cudaGetDevice");
+    const int device = current_device();
     const std::lock_guard<std::mutex> lock(mutex);
     if (pools.size() <= static_cast<size_t>(device)) pools.resize(device + 1, nullptr);
     if (pools[device] == nullptr) {
@@ -69,9 +83,14 @@ void* allocate(size_t bytes, cudaStream_t stream) {
     return pointer;
 }
 
-void release(void* pointer, cudaStream_t stream) noexcept {
+void release(void* pointer, int device, cudaStream_t stream) noexcept {
+    if (pointer == nullptr) return;
+    int current = device;
+    const bool is_elsewhere =
+        cudaGetDevice(&current) == cudaSuccess && current != device && cudaSetDevice(device) == cudaSuccess;
     // At exit the driver may be gone before us, and then so is the memory.
-    if (pointer != nullptr && cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
+    if (cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
+    if (is_elsewhere && cudaSetDevice(current) != cudaSuccess) cudaGetLastError();
 }
 
 bool is_capturing(cudaStream_t stream) {

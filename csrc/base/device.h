@@ -29,13 +29,17 @@ class OutOfMemory : public std::bad_alloc {
 // Throws std::runtime_error with CUDA's own words unless the call succeeded; `what` names it.
 void check(cudaError_t error, const char* what);
 
-// Of the current device.
+// How many devices there are; 0 without a driver.
+int num_devices();
+int current_device();
+// How many the current device has.
 unsigned num_multiprocessors();
 
 // Stream-ordered memory of the current device, from a pool that keeps what is given back for the next caller.
 // Throws OutOfMemory.
 void* allocate(size_t bytes, cudaStream_t stream);
-void release(void* pointer, cudaStream_t stream) noexcept;
+// Of memory and a stream of `device`, whichever is current.
+void release(void* pointer, int device, cudaStream_t stream) noexcept;
 // Waits for the stream, and returns to the driver what the pool keeps.
 void trim_pool(cudaStream_t stream);
 
@@ -74,8 +78,8 @@ class Turn {
     bool is_captured_;
 };
 
-// Owned elements of a plain type on the device, not initialised. Grows by forgetting what it held. Whoever
-// uses it on several streams orders them.
+// Owned elements of a plain type, not initialised, on the device that is current when it grows. Grows by
+// forgetting what it held. Whoever uses it on several streams orders them.
 template <class T>
 class DeviceBuffer {
   public:
@@ -87,15 +91,16 @@ class DeviceBuffer {
         swap(other);
         return *this;
     }
-    ~DeviceBuffer() { release(data_, stream_); }
+    ~DeviceBuffer() { release(data_, device_, stream_); }
 
     // Room for `size` elements, allocated and given back in the order of `stream`.
     T* reserve(size_t size, cudaStream_t stream) {
         if (size > capacity_) {
             refuse_capture(stream);
-            release(data_, stream_);
+            release(data_, device_, stream_);
             data_ = nullptr;
             capacity_ = 0;
+            device_ = current_device();
             data_ = static_cast<T*>(allocate(size * sizeof(T), stream));
             capacity_ = size;
         }
@@ -112,16 +117,19 @@ class DeviceBuffer {
     }
     T* data() const { return data_; }
     size_t capacity() const { return capacity_; }
+    size_t bytes() const { return capacity_ * sizeof(T); }
 
   private:
     void swap(DeviceBuffer& other) noexcept {
         std::swap(data_, other.data_);
         std::swap(capacity_, other.capacity_);
+        std::swap(device_, other.device_);
         std::swap(stream_, other.stream_);
     }
 
     T* data_ = nullptr;
     size_t capacity_ = 0;
+    int device_ = 0;
     cudaStream_t stream_ = nullptr;
 };
 

@@ -5,23 +5,21 @@
 namespace v3dg {
 namespace cuda {
 
-// Makes a device the current one while it lives.
+// Makes a device the current one of this thread for as long as it lives. Streams that are used meanwhile
+// belong to that device.
 class DeviceGuard {
   public:
-    explicit DeviceGuard(int device) {
-        check(cudaGetDevice(&before_), "cudaGetDevice");
-        if (device != before_) check(cudaSetDevice(device), "cudaSetDevice");
-        is_changed_ = device != before_;
+    explicit DeviceGuard(int device) : device_(device), before_(current_device()) {
+        if (device_ != before_) check(cudaSetDevice(device_), "cudaSetDevice");
     }
     ~DeviceGuard() {
-        if (is_changed_) cudaSetDevice(before_);
+        if (device_ != before_ && cudaSetDevice(before_) != cudaSuccess) cudaGetLastError();
     }
     DeviceGuard(const DeviceGuard&) = delete;
     DeviceGuard& operator=(const DeviceGuard&) = delete;
 
   private:
-    int before_ = 0;
-    bool is_changed_ = false;
+    const int device_, before_;
 };
 
 }  // namespace cuda

@@ -94,12 +94,20 @@ struct SceneState {
 // What selection reads of a scene, on one device.
 class BoundScene {
   public:
-    explicit BoundScene(int device) : device_{device}, state_(std::make_shared<SceneState>()) {}
+    explicit BoundScene(int device) : device_{device}, state_(std::make_shared<SceneState>()) {
+#if V3DG_WITH_CUDA
+        const Work work(device_);
+        if (!device_.is_host()) {
+            on_device_ = std::make_unique<cuda::SceneTables>();
+            cut_ = std::make_unique<cuda::Cut>();
+        }
+#endif
+    }
 
     Device device() const { return device_; }
     std::shared_ptr<const SceneState> state() const { return state_; }
 #if V3DG_WITH_CUDA
-    cuda::SceneTables& on_device() { return *on_device_; }
+    const cuda::SceneTables& on_device() const { return *on_device_; }
 #endif
 
     // Takes the place of all bundles; instances come next.
@@ -113,13 +121,11 @@ class BoundScene {
         }
 #if V3DG_WITH_CUDA
         if (!device_.is_host()) {
-            std::vector<cuda::ClusterFilters> filters;
-            for (size_t b = 0; b < state->tables.size(); ++b)
-                filters.push_back({state->bundle(b).filter_px2(), state->bundle(b).antialiased()});
             const Work work(device_);
-            on_device_ = std::make_unique<cuda::SceneTables>(
-                Span<const ClusterTable>{state->tables.data(), state->tables.size()},
-                Span<const cuda::ClusterFilters>{filters.data(), filters.size()}, work.stream());
+            std::vector<std::shared_ptr<const cuda::BundleTables>> tables;
+            for (size_t b = 0; b < state->tables.size(); ++b)
+                tables.push_back(state->bundle(b).on_device(work));
+            on_device_->set_bundles(std::move(tables), work.stream());
         }
 #endif
         state_ = std::move(state);
@@ -180,7 +186,7 @@ class BoundScene {
                     out);
 #if V3DG_WITH_CUDA
             else
-                on_device_->select(camera.camera, rule, out, work.stream());
+                cut_->select(*on_device_, camera.camera, rule, out, work.stream());
 #endif
         }
         return BoundCut(out);
@@ -195,6 +201,7 @@ class BoundScene {
                 !is_host};
     }
     std::unique_ptr<cuda::SceneTables> on_device_;
+    std::unique_ptr<cuda::Cut> cut_;
 #endif
 
     Device device_;
@@ -278,7 +285,7 @@ class BoundSceneFrame {
             if (model.device() != device_)
                 throw py::value_error("models: expected gaussians on the frame's device, got others");
             num_gaussians_.push_back(model.size());
-            if (device_.is_host()) host.push_back({&model.host().planes(), model.size(), {}, {}});
+            if (device_.is_host()) host.push_back({&model.host().planes(), {}, {}});
 #if V3DG_WITH_CUDA
             else
                 packed.push_back(model.packed());
@@ -394,8 +401,8 @@ class BoundSceneFrame {
     std::vector<SceneModel> models_of(const SceneState& scene) const {
         std::vector<SceneModel> models = host_;
         for (size_t b = 0; b < models.size(); ++b) {
-            models[b].filter_px2 = scene.bundle(b).filter_px2();
-            models[b].compensate = scene.bundle(b).antialiased();
+            models[b].pages = whole_bundle(scene.tables[b]);
+            models[b].filters = scene.bundle(b).filters();
         }
         return models;
     }
@@ -454,7 +461,7 @@ class BoundAssetFrame {
         const cuda::FrameImage image = picture.on_device(device, camera.camera, background);
         const cuda::PackedModel& packed = *model.packed();
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
-                                   work.stream(), &packed.packed());
+                                    work.stream(), &packed.packed());
         return std::make_unique<BoundDrawing>(std::move(picture), model_, device, std::move(drawing));
 #else
         return nullptr;

@@ -1,6 +1,3 @@
-#include <algorithm>
-#include <cmath>
-
 #include "bindings/operations.h"
 #include "bindings/tables.h"
 
@@ -33,20 +30,43 @@ struct Arguments {
     }
 };
 
+// Where the values of each instance begin, if its bundle has counts[b] of them; at the end, how many there
+// are.
+NewArray<int64_t> offset_of_instances(Span<const int32_t> bundle, const std::vector<size_t>& counts) {
+    NewArray<int64_t> offset({}, {static_cast<py::ssize_t>(bundle.size + 1)});
+    offset.span[0] = 0;
+    for (size_t i = 0; i < bundle.size; ++i)
+        offset.span[i + 1] = offset.span[i] + static_cast<int64_t>(counts[bundle[i]]);
+    return offset;
+}
+
 py::tuple group_metrics(const std::vector<const BoundTable*>& tables, const Instances& instances,
                         const BoundCamera& camera, const SelectRule& rule) {
     const Arguments arguments(tables, instances, camera, rule);
+    std::vector<size_t> counts;
+    for (const ClusterTable& table : arguments.tables) counts.push_back(table.ball.size);
     const Span<const int32_t> bundle = arguments.input.instances.bundle;
-    const NewArray<int64_t> offset({}, {static_cast<py::ssize_t>(bundle.size + 1)});
-    offset.span[0] = 0;
-    for (size_t i = 0; i < bundle.size; ++i)
-        offset.span[i + 1] = offset.span[i] + static_cast<int64_t>(arguments.tables[bundle[i]].ball.size);
+    const NewArray<int64_t> offset = offset_of_instances(bundle, counts);
     const NewArray<float> metric({}, {static_cast<py::ssize_t>(offset.span[bundle.size])});
     {
         const py::gil_scoped_release unlocked;
         cpu::group_metrics(arguments.input, offset.span, metric.span);
     }
     return py::make_tuple(metric.object, offset.object);
+}
+
+py::tuple bounds_may_draw(const std::vector<const BoundTable*>& tables, const Instances& instances,
+                          const BoundCamera& camera, const SelectRule& rule, bool and_coarser) {
+    const Arguments arguments(tables, instances, camera, rule);
+    std::vector<size_t> counts;
+    for (const ClusterTable& table : arguments.tables)
+        counts.push_back((table.num_clusters() + kClustersOfBounds - 1) / kClustersOfBounds);
+    const Span<const int32_t> bundle = arguments.input.instances.bundle;
+    const NewArray<int64_t> offset = offset_of_instances(bundle, counts);
+    const NewArray<uint8_t> may_draw({}, {static_cast<py::ssize_t>(offset.span[bundle.size])});
+    cpu::bounds_may_draw(arguments.input, and_coarser ? Tolerances::from_this_on : Tolerances::this_one,
+                         offset.span, may_draw.span);
+    return py::make_tuple(may_draw.object, offset.object);
 }
 
 }  // namespace
@@ -58,44 +78,35 @@ BoundTable::BoundTable(py::array ball, py::array weight, py::array level, py::ar
     const Span<const float> balls = span_of<const float>(ball, "ball", {-1, 4});
     const size_t num_groups = balls.size / 4;
     const auto groups = static_cast<py::ssize_t>(num_groups);
-    table_.ball = {reinterpret_cast<const Ball*>(balls.data), num_groups};
-    table_.weight = span_of<const float>(weight, "weight", {groups});
-    table_.level = span_of<const int32_t>(level, "level", {groups});
-    table_.own_group = span_of<const int32_t>(own_group, "own_group", {-1});
-    const auto clusters = static_cast<py::ssize_t>(table_.own_group.size);
-    table_.parent_group = span_of<const int32_t>(parent_group, "parent_group", {clusters});
+    ClusterTable given{};
+    given.ball = {reinterpret_cast<const Ball*>(balls.data), num_groups};
+    given.weight = span_of<const float>(weight, "weight", {groups});
+    given.level = span_of<const int32_t>(level, "level", {groups});
+    given.own_group = span_of<const int32_t>(own_group, "own_group", {-1});
+    const auto clusters = static_cast<py::ssize_t>(given.num_clusters());
+    given.parent_group = span_of<const int32_t>(parent_group, "parent_group", {clusters});
     const Span<const float> boxes = span_of<const float>(box, "box", {clusters, 2, 3});
-    table_.box = {reinterpret_cast<const Box*>(boxes.data), table_.own_group.size};
-    filter_px2_ = span_of<const float>(filter_px2, "filter_px2", {clusters});
-    antialiased_ = span_of<const uint8_t>(antialiased, "antialiased", {clusters});
-    table_.offset = span_of<const int64_t>(offset, "offset", {clusters + 1});
-    check_groups(table_.own_group, "own_group", num_groups);
-    check_groups(table_.parent_group, "parent_group", num_groups);
-    offsets_of(offset, num_gaussians());
-    find_top();
-    find_bounds();
-    float filter = 0.0f;
-    for (const float value : filter_px2_) filter = std::max(filter, value);
-    table_.pad_px = static_cast<float>(kReachSigmas) * std::sqrt(filter) + 1.0f;
+    given.box = {reinterpret_cast<const Box*>(boxes.data), given.num_clusters()};
+    const ClusterFilters filters{span_of<const float>(filter_px2, "filter_px2", {clusters}),
+                                 span_of<const uint8_t>(antialiased, "antialiased", {clusters})};
+    given.offset = span_of<const int64_t>(offset, "offset", {clusters + 1});
+    check_groups(given.own_group, "own_group", num_groups);
+    check_groups(given.parent_group, "parent_group", num_groups);
+    offsets_of(offset, static_cast<size_t>(given.offset[clusters]));
+    host_ = std::make_unique<HostTable>(given, filters);
 }
 
-void BoundTable::find_top() {
-    std::vector<uint8_t> is_top(table_.ball.size, 0);
-    for (size_t c = 0; c < table_.parent_group.size; ++c) {
-        if (table_.parent_group[c] >= 0) continue;
-        top_cluster_.push_back(static_cast<int32_t>(c));
-        if (table_.own_group[c] >= 0) is_top[table_.own_group[c]] = 1;
+#if V3DG_WITH_CUDA
+std::shared_ptr<const cuda::BundleTables> BoundTable::on_device(const Work& work) const {
+    std::weak_ptr<const cuda::BundleTables>& known = on_device_[work.device().number];
+    std::shared_ptr<const cuda::BundleTables> tables = known.lock();
+    if (tables == nullptr) {
+        tables = std::make_shared<cuda::BundleTables>(table(), filters(), work.stream());
+        known = tables;
     }
-    for (size_t g = 0; g < is_top.size(); ++g)
-        if (is_top[g]) top_group_.push_back(static_cast<int32_t>(g));
-    table_.top_group = {top_group_.data(), top_group_.size()};
-    table_.top_cluster = {top_cluster_.data(), top_cluster_.size()};
+    return tables;
 }
-
-void BoundTable::find_bounds() {
-    table_.bounds = no_box();
-    for (const Box& box : table_.box) grow(table_.bounds, box);
-}
+#endif
 
 BoundCut::BoundCut(const SelectOutput& out)
     : instance_ids(array_of(out.instance)),
@@ -118,6 +129,10 @@ void bind_select(py::module_& m) {
         .def_readonly("fits_budget", &BoundCut::fits_budget);
     m.def("group_metrics", &group_metrics, "tables"_a, "instances"_a, "camera"_a, "rule"_a,
           "Metric of every group of every instance, px2, and where each instance's metrics begin.");
+    m.def(
+        "bounds_may_draw", &bounds_may_draw, "tables"_a, "instances"_a, "camera"_a, "rule"_a, "and_coarser"_a,
+        "For each eight neighbouring clusters of every instance, 0 if their bounds tell that none is drawn; "
+        "and where each instance's values begin.");
 }
 
 }  // namespace v3dg

@@ -8,7 +8,10 @@
 #include "base/isa.h"
 #include "bindings/operations.h"
 #include "math/gaussian.h"
-#include "select/select.h"
+
+#if V3DG_WITH_CUDA
+#include "base/device.h"
+#endif
 
 // A child of fork() has none of the threads that GNU's OpenMP keeps for the next loop, but would wait for
 // them without end. So the thread that forks lets its own go first; they come back, on either side, with the
@@ -22,8 +25,11 @@ static bool must_let_threads_go() {
 }
 
 static int num_cuda_devices() {
-    if constexpr (V3DG_WITH_CUDA != 0) return v3dg::cuda::num_devices();
+#if V3DG_WITH_CUDA
+    return v3dg::cuda::num_devices();
+#else
     return 0;
+#endif
 }
 
 PYBIND11_MODULE(_core, m) {

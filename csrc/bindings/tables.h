@@ -1,32 +1,40 @@
 #pragma once
 
+#include <map>
+#include <memory>
 #include <vector>
 
 #include "bindings/types.h"
+#include "residency/cluster_table.h"
+
+#if V3DG_WITH_CUDA
+#include "residency/bundle_tables.h"
+#endif
 
 namespace v3dg {
 
-// The tables of one bundle on the host, with the arrays that they borrow from.
+// The tables of one bundle with the arrays that they borrow from.
 class BoundTable {
   public:
     BoundTable(py::array ball, py::array weight, py::array level, py::array own_group, py::array parent_group,
                py::array box, py::array filter_px2, py::array antialiased, py::array offset);
     BoundTable(const BoundTable&) = delete;
 
-    const ClusterTable& table() const { return table_; }
-    Span<const float> filter_px2() const { return filter_px2_; }
-    Span<const uint8_t> antialiased() const { return antialiased_; }
-    size_t num_gaussians() const { return static_cast<size_t>(table_.offset[table_.offset.size - 1]); }
+    const ClusterTable& table() const { return host_->table(); }
+    const ClusterFilters& filters() const { return host_->filters(); }
+    size_t num_gaussians() const { return static_cast<size_t>(table().offset[table().offset.size - 1]); }
+
+#if V3DG_WITH_CUDA
+    // The tables on a device, which all scenes there share; uploaded if no scene has them.
+    std::shared_ptr<const cuda::BundleTables> on_device(const Work& work) const;
+#endif
 
   private:
-    void find_top();
-    void find_bounds();
-
     std::vector<py::array> arrays_;
-    std::vector<int32_t> top_group_, top_cluster_;
-    ClusterTable table_;
-    Span<const float> filter_px2_;
-    Span<const uint8_t> antialiased_;
+    std::unique_ptr<HostTable> host_;
+#if V3DG_WITH_CUDA
+    mutable std::map<int, std::weak_ptr<const cuda::BundleTables>> on_device_;
+#endif
 };
 
 // The pairs (instance, cluster) of a selection, and what it came to.

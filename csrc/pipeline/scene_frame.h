@@ -4,16 +4,16 @@
 #include <vector>
 
 #include "pipeline/render.h"
+#include "residency/page_table.h"
 #include "select/select.h"
 
 namespace v3dg {
 
-// How the clusters of one bundle are drawn, and its gaussians, on the host.
+// The gaussians of one bundle on the host, where its clusters lie among them and how they are drawn.
 struct SceneModel {
     const GaussianPlanes<float>* planes;
-    size_t size;                     // gaussians
-    Span<const float> filter_px2;    // [C]
-    Span<const uint8_t> compensate;  // [C]
+    PageTable pages;
+    ClusterFilters filters;
 };
 
 // A scene on the host: what selection reads of its bundles, their gaussians, and its instances.

@@ -48,7 +48,8 @@ SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& c
     return counts;
 }
 
-// The clusters of a cut as draws. Neighbouring clusters of one instance are neighbours in memory: one draw.
+// The clusters of a cut as draws. Clusters of one instance whose rows follow on each other make one draw if
+// they are drawn alike.
 class CutDraws {
   public:
     CutDraws(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
@@ -72,10 +73,10 @@ class CutDraws {
         const int32_t bundle = scene_.instances.bundle[i];
         const SceneModel& model = scene_.models[bundle];
         const ClusterTable& table = scene_.tables[bundle];
-        if (c < 0 || static_cast<size_t>(c) >= model.filter_px2.size)
+        if (c < 0 || static_cast<size_t>(c) >= table.num_clusters())
             throw std::out_of_range("cluster_ids: expected ids of the bundle's clusters, got " +
                                     std::to_string(c));
-        const uint64_t first = table.offset[c], count = table.offset[c + 1] - first;
+        const uint64_t first = model.pages.first_row[c], count = table.num_gaussians(c);
         end_of_pair_.push_back(num_gaussians_);
         if (i != last_instance_) {
             const Pose pose = scene_.instances.pose(i);
@@ -84,7 +85,7 @@ class CutDraws {
         }
         end_of_pair_.back() = num_gaussians_ += count;
         const Draw<float> next{
-            model.planes, first, count, view_, model.filter_px2[c], model.compensate[c] != 0};
+            model.planes, first, count, view_, model.filters.filter_px2[c], model.filters.compensate[c] != 0};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else
@@ -92,7 +93,7 @@ class CutDraws {
         last_instance_ = i;
     }
 
-    // Whether the second, of the same instance, goes on where the first ends and is drawn alike.
+    // Whether the second, of the same instance, begins where the first ends and is drawn alike.
     static bool joins(const Draw<float>& a, const Draw<float>& b) {
         return a.first + a.count == b.first && a.filter_px2 == b.filter_px2 && a.compensate == b.compensate;
     }

@@ -40,36 +40,37 @@ void SceneFrame::set_models(std::vector<std::shared_ptr<const PackedModel>> mode
     models_ = std::move(models);
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& tables, const FrameImage& image,
+std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const FrameImage& image,
                                           Frame::Prepare prepare, cudaStream_t stream) {
     const FrameBatch batch{rows_.data(),
-                           placements_.reserve(tables.num_instances(), stream),
+                           placements_.reserve(scene.num_instances(), stream),
                            images_.reserve(1, stream),
                            1,
                            num_tiles(image),
                            packed_.data(),
-                           tables.num_instances() > 1};
+                           scene.num_instances() > 1};
     return frame_.draw(batch, std::move(prepare), stream);
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw(SceneTables& tables, const Camera& camera, const SelectRule& rule,
-                                          const FrameImage& image, cudaStream_t stream) {
+std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Camera& camera,
+                                          const SelectRule& rule, const FrameImage& image,
+                                          cudaStream_t stream) {
     return draw(
-        tables, image,
-        [=, &tables](const ItemList& items, cudaStream_t on) {
-            tables.cut_items(camera, rule, image, images_.data(), placements_.data(), items, on);
+        scene, image,
+        [=, &scene](const ItemList& items, cudaStream_t on) {
+            cut_.cut_items(scene, camera, rule, image, images_.data(), placements_.data(), items, on);
         },
         stream);
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw_cut(SceneTables& tables, const Camera& camera,
+std::unique_ptr<Drawing> SceneFrame::draw_cut(const SceneTables& scene, const Camera& camera,
                                               Span<const int32_t> instance, Span<const int32_t> cluster,
                                               const FrameImage& image, cudaStream_t stream) {
     return draw(
-        tables, image,
-        [=, &tables](const ItemList& items, cudaStream_t on) {
-            tables.given_items(camera, instance, cluster, image, images_.data(), placements_.data(), items,
-                               on);
+        scene, image,
+        [=, &scene](const ItemList& items, cudaStream_t on) {
+            cut_.given_items(scene, camera, instance, cluster, image, images_.data(), placements_.data(),
+                             items, on);
         },
         stream);
 }

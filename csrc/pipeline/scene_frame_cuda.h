@@ -27,20 +27,20 @@ class PackedModel {
 // Draws a scene that stays on the device: selects, then draws the cut.
 class SceneFrame {
   public:
-    // The gaussians of each bundle of the tables that are drawn next. The host's array may be reused on
+    // The gaussians of each bundle of the scenes that are drawn next. The host's array may be reused on
     // return.
     void set_models(std::vector<std::shared_ptr<const PackedModel>> models, cudaStream_t stream);
 
-    // The tables stay as they are until the drawing is finished.
-    std::unique_ptr<Drawing> draw(SceneTables& tables, const Camera& camera, const SelectRule& rule,
+    // The scene stays as it is until the drawing is finished.
+    std::unique_ptr<Drawing> draw(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
                                   const FrameImage& image, cudaStream_t stream);
     // Draws pairs that were selected before; they are on the device and stay, too.
-    std::unique_ptr<Drawing> draw_cut(SceneTables& tables, const Camera& camera, Span<const int32_t> instance,
-                                      Span<const int32_t> cluster, const FrameImage& image,
-                                      cudaStream_t stream);
+    std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera,
+                                      Span<const int32_t> instance, Span<const int32_t> cluster,
+                                      const FrameImage& image, cudaStream_t stream);
 
   private:
-    std::unique_ptr<Drawing> draw(const SceneTables& tables, const FrameImage& image, Frame::Prepare prepare,
+    std::unique_ptr<Drawing> draw(const SceneTables& scene, const FrameImage& image, Frame::Prepare prepare,
                                   cudaStream_t stream);
 
     std::vector<std::shared_ptr<const PackedModel>> models_;
@@ -48,6 +48,7 @@ class SceneFrame {
     DeviceBuffer<PackedPlanes> packed_;
     DeviceBuffer<Placement> placements_;
     DeviceBuffer<FrameImage> images_;
+    Cut cut_;
     Frame frame_;
 };
 

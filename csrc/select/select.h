@@ -3,21 +3,10 @@
 #include <cstdint>
 #include <vector>
 
+#include "residency/instance_table.h"
 #include "select/view_math.h"
 
 namespace v3dg {
-
-// Similarity transforms p -> scale * rotation p + position. An instance whose pose is not finite, or has no
-// size, is not drawn.
-struct InstanceTable {
-    Span<const int32_t> bundle;     // [I] which ClusterTable
-    Span<const double> position;    // [I * 3]
-    Span<const double> quaternion;  // [I * 4] w x y z
-    Span<const double> scale;       // [I]
-    Span<const float> importance;   // [I] metrics are multiplied by it
-
-    V3DG_HD Pose pose(size_t i) const { return {position.data + 3 * i, quaternion.data + 4 * i, scale[i]}; }
-};
 
 // Chooses the clusters of all instances that are just detailed enough for one view: exactly one on every path
 // from a leaf to its root, when balls nest and weights never decrease towards the root.
@@ -27,8 +16,8 @@ struct InstanceTable {
 //
 // With a budget, the tolerance is the least of those that a budget chooses from (select_math.h) from which on
 // no cut has more gaussians: a coarser cut can have more than a finer one where the frustum cuts through it.
-// There may be none: then `fits_budget` is false, nothing is selected and `num_gaussians`
-// is what the coarsest cut has.
+// There may be none: then `fits_budget` is false, nothing is selected and `num_gaussians` is what the
+// coarsest cut has.
 //
 // Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the footprint and the
 // nesting balls are ours.
@@ -51,12 +40,11 @@ void select(const SelectInput& in, SelectOutput& out);
 
 // Metric of every group of every instance, px2. The bundle of instance i has its metrics at metric_offset[i].
 void group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric);
+
+// What bounds tell without asking a cluster: for each kClustersOfBounds neighbours of the table of every
+// instance, 0 if none of them is drawn at these tolerances, else 1. Those of instance i begin at first[i].
+void bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<const int64_t> first,
+                     Span<uint8_t> may_draw);
 }  // namespace cpu
-
-namespace cuda {
-// How many devices there are; 0 without a driver.
-int num_devices();
-
-}  // namespace cuda
 
 }  // namespace v3dg

@@ -1,4 +1,4 @@
-// A chunk of instances to a thread. Metrics are evaluated once a group; a cluster then reads what was found.
+// Threads work on chunks of instances. The metric of a group is computed once; its clusters then look it up.
 
 #include "select/select.h"
 
@@ -12,54 +12,66 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kChunk = 16;
-constexpr size_t kBudgetShares = 16;
+constexpr size_t kBudgetParts = 16;
 
+// Metrics of the groups of one instance, computed before.
+struct KnownMetrics {
+    const float* metric;
+
+    float operator()(int32_t g) const { return metric[g]; }
+};
+
+// An instance in front of the camera. One without a pose is hidden.
 struct SeenInstance {
     const ClusterTable& table;
     InstanceView view;
-    bool is_hidden, culls;
+    bool is_placed;
 
     SeenInstance(const SelectInput& in, size_t i)
-        : table(in.bundles[in.instances.bundle[i]]), view(), is_hidden(true), culls(false) {
+        : table(in.bundles[in.instances.bundle[i]]),
+          view(),
+          is_placed(v3dg::is_placed(in.instances.pose(i))) {
+        if (!is_placed) return;
         const Pose pose = in.instances.pose(i);
-        if (!is_placed(pose)) return;
         view = view_from_instance(in.camera, axes_of_instance(in.camera, pose), pose,
                                   in.instances.importance[i], table.pad_px);
-        is_hidden = in.rule.culls && is_outside(table.bounds, view);
-        culls = in.rule.culls && !is_inside(table.bounds, view);
     }
 
-    bool draws(size_t c) const { return !culls || !is_outside(table.box[c], view); }
-    int64_t size(size_t c) const { return table.offset[c + 1] - table.offset[c]; }
+    CutSource source(const SelectRule& rule) const {
+        return is_placed ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
+    }
+
+    // With the metrics that `metrics` has room for.
+    InstanceCut<KnownMetrics> cut(const SelectRule& rule, const std::vector<float>& metrics) const {
+        return {table, view, rule, {metrics.data()}, rule.culls && !is_inside(table.bounds, view)};
+    }
+
+    void find_metrics(const SelectRule& rule, float* metrics) const {
+        for (size_t g = 0; g < table.ball.size; ++g)
+            metrics[g] = metric_px2(table, static_cast<int32_t>(g), view, rule);
+    }
 };
 
-// Appends what instance i draws. fits_group: scratch for as many groups as any bundle has.
-void select_instance(const SelectInput& in, const SelectRule& rule, size_t i,
-                     std::vector<uint8_t>& fits_group, SelectOutput& out) {
+// Appends what instance i draws. metrics: scratch for as many groups as any bundle has.
+void select_instance(const SelectInput& in, const SelectRule& rule, size_t i, std::vector<float>& metrics,
+                     SelectOutput& out) {
     const SeenInstance seen(in, i);
-    if (seen.is_hidden) return;
-    const ClusterTable& table = seen.table;
-    const auto draw = [&](int32_t c) {
-        if (!seen.draws(c)) return;
+    const CutSource source = seen.source(rule);
+    if (source == CutSource::nowhere) return;
+    const InstanceCut<KnownMetrics> cut = seen.cut(rule, metrics);
+    const auto add = [&](size_t c) {
         out.instance.push_back(static_cast<int32_t>(i));
-        out.cluster.push_back(c);
-        out.num_gaussians += seen.size(c);
+        out.cluster.push_back(static_cast<int32_t>(c));
+        out.num_gaussians += seen.table.num_gaussians(c);
     };
-    if (top_fits(table, seen.view, rule)) {
-        for (const int32_t c : table.top_cluster) draw(c);
+    if (source == CutSource::tops) {
+        for (const int32_t c : seen.table.top_cluster)
+            if (!cut.is_culled(c)) add(c);
         return;
     }
-    // Group -1 stands at both ends: below the leaves everything fits, above the roots nothing does.
-    const size_t num_groups = table.ball.size;
-    for (size_t g = 0; g < num_groups; ++g)
-        fits_group[g] = fits(table, static_cast<int32_t>(g), seen.view, rule);
-    const size_t num_clusters = table.own_group.size;
-    for (size_t c = 0; c < num_clusters; ++c) {
-        const int32_t own = table.own_group[c], parent = table.parent_group[c];
-        const bool own_fits = own < 0 || fits_group[own];
-        const bool parent_fits = parent >= 0 && fits_group[parent];
-        if (own_fits && !parent_fits) draw(static_cast<int32_t>(c));
-    }
+    seen.find_metrics(rule, metrics.data());
+    for (size_t c = 0; c < seen.table.num_clusters(); ++c)
+        if (cut.draws(c)) add(c);
 }
 
 size_t most_groups(const SelectInput& in) {
@@ -69,25 +81,24 @@ size_t most_groups(const SelectInput& in) {
 }
 
 // Adds to `change`, for each tolerance that a budget chooses from, by how many gaussians the cut of instance
-// i differs from that of the tolerance before.
-void count_instance(const SelectInput& in, size_t i, std::vector<uint32_t>& bins,
+// i differs from that of the tolerance before. metrics: as above.
+void count_instance(const SelectInput& in, size_t i, std::vector<float>& metrics,
                     std::vector<int64_t>& change) {
     const SeenInstance seen(in, i);
-    if (seen.is_hidden) return;
-    const ClusterTable& table = seen.table;
-    if (top_fits(table, seen.view, in.rule)) {
-        for (const int32_t c : table.top_cluster)
-            if (seen.draws(c)) change[0] += seen.size(c);
+    const CutSource source = seen.source(in.rule);
+    if (source == CutSource::nowhere) return;
+    const InstanceCut<KnownMetrics> cut = seen.cut(in.rule, metrics);
+    if (source == CutSource::tops) {
+        for (const int32_t c : seen.table.top_cluster)
+            if (!cut.is_culled(c)) change[0] += seen.table.num_gaussians(c);
         return;
     }
-    for (size_t g = 0; g < table.ball.size; ++g)
-        bins[g] = bin_of_group(table, static_cast<int32_t>(g), seen.view, in.rule);
-    for (size_t c = 0; c < table.own_group.size; ++c) {
-        const int32_t own = table.own_group[c], parent = table.parent_group[c];
-        const uint32_t first = own < 0 ? 0 : bins[own], last = parent < 0 ? kNumBudgetBins : bins[parent];
-        if (first >= last || !seen.draws(c)) continue;
-        change[first] += seen.size(c);
-        change[last] -= seen.size(c);
+    seen.find_metrics(in.rule, metrics.data());
+    for (size_t c = 0; c < seen.table.num_clusters(); ++c) {
+        const BinRange bins = cut.bins(c);
+        if (bins.is_empty()) continue;
+        change[bins.first] += seen.table.num_gaussians(c);
+        change[bins.end] -= seen.table.num_gaussians(c);
     }
 }
 
@@ -95,13 +106,13 @@ void count_instance(const SelectInput& in, size_t i, std::vector<uint32_t>& bins
 // fits.
 int64_t meet_budget(const SelectInput& in, SelectRule& rule) {
     const size_t num_instances = in.instances.bundle.size, num_groups = most_groups(in);
-    // Shares of the instances, dealt out in turn, since neighbours cost alike.
-    std::vector<std::vector<int64_t>> changes(std::min(kBudgetShares, num_instances));
-    parallel_for(changes.size(), 1, [&](size_t share) {
-        changes[share].assign(kNumBudgetBins + 1, 0);
-        std::vector<uint32_t> bins(num_groups);
-        for (size_t i = share; i < num_instances; i += changes.size())
-            count_instance(in, i, bins, changes[share]);
+    // Each part takes every kBudgetParts-th instance, because neighbours cost about the same.
+    std::vector<std::vector<int64_t>> changes(std::min(kBudgetParts, num_instances));
+    parallel_for(changes.size(), 1, [&](size_t part) {
+        changes[part].assign(kNumBudgetBins + 1, 0);
+        std::vector<float> metrics(num_groups);
+        for (size_t i = part; i < num_instances; i += changes.size())
+            count_instance(in, i, metrics, changes[part]);
     });
     int64_t count = 0, chosen_count = 0;
     uint32_t chosen = 0;
@@ -133,9 +144,9 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
     const size_t num_groups = most_groups(in);
     std::vector<SelectOutput> chunks(num_chunks);
     parallel_for(num_chunks, 1, [&](size_t k) {
-        std::vector<uint8_t> fits_group(num_groups);
+        std::vector<float> metrics(num_groups);
         for (size_t i = k * kChunk; i < std::min(num_instances, (k + 1) * kChunk); ++i)
-            select_instance(in, rule, i, fits_group, chunks[k]);
+            select_instance(in, rule, i, metrics, chunks[k]);
     });
     std::vector<size_t> first(num_chunks + 1, 0);
     for (size_t k = 0; k < num_chunks; ++k) {
@@ -152,10 +163,19 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
 
 void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric) {
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
+        SeenInstance(in, i).find_metrics(in.rule, metric.data + metric_offset[i]);
+    });
+}
+
+void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<const int64_t> first,
+                          Span<uint8_t> may_draw) {
+    std::vector<std::vector<ClusterBounds>> bounds;
+    for (const ClusterTable& table : in.bundles) bounds.push_back(bounds_of_clusters(table));
+    parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
         const SeenInstance seen(in, i);
-        for (size_t g = 0; g < seen.table.ball.size; ++g)
-            metric[metric_offset[i] + g] =
-                metric_px2(seen.table, static_cast<int32_t>(g), seen.view, in.rule);
+        uint8_t* out = may_draw.data + first[i];
+        for (const ClusterBounds& b : bounds[in.instances.bundle[i]])
+            *out++ = seen.is_placed && v3dg::may_draw(b, seen.view, in.rule, tolerances);
     });
 }
 

@@ -1,6 +1,6 @@
 #pragma once
 
-// Formulas of selection, compiled without contraction on both halves so that they give the same bits.
+// The decisions of selection, compiled without contraction on both halves so that they give the same bits.
 //
 // Every comparison of a metric with the tolerance goes through fits(), and a cluster is drawn when its own
 // group fits and the group above does not: what one test accepts, the other refuses.
@@ -10,9 +10,9 @@
 #include <cstdint>
 #include <cstring>
 
-#include "base/span.h"
-#include "math/bounds.h"
 #include "math/solid_angle.h"
+#include "residency/cluster_bounds.h"
+#include "residency/cluster_table.h"
 
 namespace v3dg {
 
@@ -39,21 +39,6 @@ struct InstanceView {
     Plane plane[kNumPlanes];
 };
 
-// What selection reads of a bundle: G groups, C clusters. Group -1 is none.
-struct ClusterTable {
-    Span<const Ball> ball;             // [G] contains the balls of the groups below it
-    Span<const float> weight;          // [G] per px2, never decreasing towards the root
-    Span<const int32_t> level;         // [G] of the clusters that the group makes, ascending towards the root
-    Span<const int32_t> own_group;     // [C] group that made the cluster; -1: always fits
-    Span<const int32_t> parent_group;  // [C] group that replaces the cluster; -1: nothing does
-    Span<const Box> box;               // [C] what the cluster draws, without the filter
-    Span<const int64_t> offset;        // [C + 1] gaussians of each cluster
-    Span<const int32_t> top_group;     // groups that no other group replaces
-    Span<const int32_t> top_cluster;   // clusters that no group replaces
-    Box bounds;                        // of all boxes
-    float pad_px;                      // how far the filter reaches, and a pixel
-};
-
 constexpr uint64_t kNoBudget = ~uint64_t(0);
 
 struct SelectRule {
@@ -69,7 +54,7 @@ V3DG_HD inline float distance2_to(const Ball& ball, const InstanceView& view) {
     return dx * dx + dy * dy + dz * dz;
 }
 
-// Of a ball so far away, squared, from the eye.
+// Screen area, px2, of a ball whose centre is this far from the eye, squared.
 V3DG_HD inline float footprint_at(float radius, float distance2, const InstanceView& view) {
     const float x2 = radius * radius / distance2;
     if (!(x2 < 1.0f)) return INFINITY;
@@ -85,17 +70,16 @@ V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view, F
     return area >= 0.0f ? area : INFINITY;
 }
 
-// Screen area, px2, that one gaussian of the clusters made by group g stands for; none where nothing finer
-// may be drawn.
+// Screen area, px2, that one gaussian of the clusters made by group g stands for. 0 where nothing finer may
+// be drawn, so that the group always fits.
 V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
                                 const SelectRule& rule) {
     if (table.level[g] <= rule.min_level) return 0.0f;
     return footprint_px2(table.ball[g], view, rule.footprint) * table.weight[g];
 }
 
-V3DG_HD inline bool fits(const ClusterTable& table, int32_t g, const InstanceView& view,
-                         const SelectRule& rule) {
-    return metric_px2(table, g, view, rule) <= rule.tolerance_px2;
+V3DG_HD inline bool fits(float metric_px2, const SelectRule& rule) {
+    return metric_px2 <= rule.tolerance_px2;
 }
 
 // Where a box lies as seen from one plane, in units of the plane's normal.
@@ -161,18 +145,114 @@ V3DG_HD inline float tolerance_of_bin(uint32_t bin, float tolerance) {
     return value;
 }
 
-V3DG_HD inline uint32_t bin_of_group(const ClusterTable& table, int32_t g, const InstanceView& view,
-                                     const SelectRule& rule) {
-    return bin_of_metric(metric_px2(table, g, view, rule), rule.tolerance_px2);
-}
-
 // Whether the clusters that nothing replaces are the cut. The paper's footprint does not grow towards the
 // root, so that a group may fail to fit below one that does.
-V3DG_HD inline bool top_fits(const ClusterTable& table, const InstanceView& view, const SelectRule& rule) {
+V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view, const SelectRule& rule) {
     if (rule.footprint == Footprint::paper) return false;
     for (size_t i = 0; i < table.top_group.size; ++i)
-        if (!fits(table, table.top_group[i], view, rule)) return false;
+        if (!fits(metric_px2(table, table.top_group[i], view, rule), rule)) return false;
     return true;
+}
+
+// Where the cut of an instance is found.
+enum class CutSource {
+    nowhere,  // the instance is hidden
+    tops,     // among the clusters that nothing replaces
+    table,    // by asking every cluster
+};
+
+V3DG_HD inline bool is_hidden(const ClusterTable& table, const InstanceView& view, const SelectRule& rule) {
+    return rule.culls && is_outside(table.bounds, view);
+}
+
+// The tops are asked only where there are at most `most_tops` of them.
+V3DG_HD inline CutSource source_of_cut(const ClusterTable& table, const InstanceView& view,
+                                       const SelectRule& rule, size_t most_tops) {
+    if (is_hidden(table, view, rule)) return CutSource::nowhere;
+    const bool has_few_tops = table.top_cluster.size <= most_tops;
+    return has_few_tops && tops_fit(table, view, rule) ? CutSource::tops : CutSource::table;
+}
+
+// The tolerances, among those that a budget chooses from, whose cuts have a cluster.
+struct BinRange {
+    uint32_t first, end;
+
+    V3DG_HD bool is_empty() const { return first >= end; }
+};
+
+// Computes the metrics of an instance's groups when a cluster asks for them.
+struct GroupMetrics {
+    const ClusterTable& table;
+    const InstanceView& view;
+    const SelectRule& rule;
+
+    V3DG_HD float operator()(int32_t g) const { return metric_px2(table, g, view, rule); }
+};
+
+// The decision, cluster by cluster of an instance's table. `Metric` gives the metric of a group:
+// GroupMetrics, or what was computed before.
+template <class Metric>
+struct InstanceCut {
+    const ClusterTable& table;
+    const InstanceView& view;
+    const SelectRule& rule;
+    Metric metric_of_group;
+    bool culls;  // whether some of the clusters may lie outside
+
+    V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
+
+    // Below the leaves everything fits, above the roots nothing does.
+    V3DG_HD bool draws(size_t c) const {
+        const int32_t own = table.own_group[c], parent = table.parent_group[c];
+        const bool own_fits = own < 0 || fits(metric_of_group(own), rule);
+        const bool parent_fits = parent >= 0 && fits(metric_of_group(parent), rule);
+        return own_fits && !parent_fits && !is_culled(c);
+    }
+
+    // The tolerances from the rule's own on at which draws(c) holds.
+    V3DG_HD BinRange bins(size_t c) const {
+        const int32_t own = table.own_group[c], parent = table.parent_group[c];
+        const BinRange range{own < 0 ? 0 : bin_of_group(own),
+                             parent < 0 ? kNumBudgetBins : bin_of_group(parent)};
+        return range.is_empty() || is_culled(c) ? BinRange{0, 0} : range;
+    }
+
+  private:
+    V3DG_HD uint32_t bin_of_group(int32_t g) const {
+        return bin_of_metric(metric_of_group(g), rule.tolerance_px2);
+    }
+};
+
+// More than rounding can do to a metric, which is compared with what bounds it.
+constexpr float kBoundMargin = 1e-3f;
+
+// Whether all the groups above the clusters fit, so that none of the clusters is drawn.
+V3DG_HD inline bool parents_fit(const ClusterBounds& bounds, const InstanceView& view,
+                                const SelectRule& rule) {
+    if (bounds.has_root || rule.footprint == Footprint::paper) return false;
+    const float distance = sqrtf(distance2_to(bounds.parents, view)) - bounds.parents.radius;
+    return distance > 0.0f &&
+           footprint_at(bounds.most_parent_radius, distance * distance, view) * bounds.most_parent_weight <=
+               (1.0f - kBoundMargin) * rule.tolerance_px2;
+}
+
+// Whether none of the clusters has a group of its own that fits.
+V3DG_HD inline bool owns_do_not_fit(const ClusterBounds& bounds, const InstanceView& view,
+                                    const SelectRule& rule) {
+    if (bounds.has_leaf || bounds.least_own_level <= rule.min_level || rule.footprint == Footprint::paper)
+        return false;
+    const float distance = sqrtf(distance2_to(bounds.owns, view)) + bounds.owns.radius;
+    return footprint_at(bounds.least_own_radius, distance * distance, view) * bounds.least_own_weight >
+           (1.0f + kBoundMargin) * rule.tolerance_px2;
+}
+
+enum class Tolerances { this_one, from_this_on };
+
+// False only if none of the clusters is drawn at these tolerances.
+V3DG_HD inline bool may_draw(const ClusterBounds& bounds, const InstanceView& view, const SelectRule& rule,
+                             Tolerances tolerances) {
+    return !(rule.culls && is_outside(bounds.box, view)) && !parents_fit(bounds, view, rule) &&
+           (tolerances == Tolerances::from_this_on || !owns_do_not_fit(bounds, view, rule));
 }
 
 }  // namespace v3dg

@@ -1,0 +1,59 @@
+#include "residency/cluster_bounds.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace v3dg {
+
+namespace {
+
+// Contains the centres of the balls. At the origin where there are none.
+Ball ball_of_centers(const std::vector<Ball>& balls) {
+    double middle[3] = {0, 0, 0}, radius2 = 0;
+    for (const Ball& b : balls) {
+        const float center[3] = {b.x, b.y, b.z};
+        for (int a = 0; a < 3; ++a) middle[a] += center[a] / static_cast<double>(balls.size());
+    }
+    const float m[3] = {float(middle[0]), float(middle[1]), float(middle[2])};
+    for (const Ball& b : balls) {
+        const double d[3] = {double(b.x) - m[0], double(b.y) - m[1], double(b.z) - m[2]};
+        radius2 = std::max(radius2, d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+    }
+    return {m[0], m[1], m[2], static_cast<float>(std::sqrt(radius2) * (1 + 1e-6))};
+}
+
+ClusterBounds bounds_of(const ClusterTable& table, size_t first, size_t last) {
+    ClusterBounds bounds{no_box(), {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false};
+    std::vector<Ball> parents, owns;
+    for (size_t c = first; c < last; ++c) {
+        grow(bounds.box, table.box[c]);
+        const int32_t own = table.own_group[c], parent = table.parent_group[c];
+        bounds.has_leaf |= own < 0;
+        bounds.has_root |= parent < 0;
+        if (own >= 0) {
+            owns.push_back(table.ball[own]);
+            bounds.least_own_radius = std::min(bounds.least_own_radius, table.ball[own].radius);
+            bounds.least_own_weight = std::min(bounds.least_own_weight, table.weight[own]);
+            bounds.least_own_level = std::min(bounds.least_own_level, table.level[own]);
+        }
+        if (parent >= 0) {
+            parents.push_back(table.ball[parent]);
+            bounds.most_parent_radius = std::max(bounds.most_parent_radius, table.ball[parent].radius);
+            bounds.most_parent_weight = std::max(bounds.most_parent_weight, table.weight[parent]);
+        }
+    }
+    bounds.parents = ball_of_centers(parents);
+    bounds.owns = ball_of_centers(owns);
+    return bounds;
+}
+
+}  // namespace
+
+std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table) {
+    std::vector<ClusterBounds> bounds;
+    for (size_t first = 0; first < table.num_clusters(); first += kClustersOfBounds)
+        bounds.push_back(bounds_of(table, first, std::min(first + kClustersOfBounds, table.num_clusters())));
+    return bounds;
+}
+
+}  // namespace v3dg

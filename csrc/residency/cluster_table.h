@@ -1,0 +1,60 @@
+#pragma once
+
+// What selection reads of a bundle.
+
+#include <cstdint>
+#include <vector>
+
+#include "base/span.h"
+#include "math/bounds.h"
+
+namespace v3dg {
+
+// G groups, C clusters. Group -1 is none.
+struct ClusterTable {
+    Span<const Ball> ball;             // [G] contains the balls of the groups below it
+    Span<const float> weight;          // [G] per px2, never decreasing towards the root
+    Span<const int32_t> level;         // [G] of the clusters that the group makes, ascending towards the root
+    Span<const int32_t> own_group;     // [C] group that made the cluster; -1: always fits
+    Span<const int32_t> parent_group;  // [C] group that replaces the cluster; -1: nothing does
+    Span<const Box> box;               // [C] what the cluster draws, without the filter
+    Span<const int64_t> offset;        // [C + 1] how many gaussians the clusters before each have
+    Span<const int32_t> top_group;     // groups that no other group replaces
+    Span<const int32_t> top_cluster;   // clusters that no group replaces
+    Box bounds;                        // of all boxes
+    float pad_px;                      // how far the filter reaches, and a pixel
+
+    V3DG_HD size_t num_clusters() const { return own_group.size; }
+    V3DG_HD int64_t num_gaussians(size_t c) const { return offset[c + 1] - offset[c]; }
+};
+
+// How the clusters of a bundle are drawn.
+struct ClusterFilters {
+    Span<const float> filter_px2;    // [C]
+    Span<const uint8_t> compensate;  // [C] opacity for what the filter adds
+
+    V3DG_HD bool are_same(size_t a, size_t b) const {
+        return filter_px2[a] == filter_px2[b] && compensate[a] == compensate[b];
+    }
+};
+
+// The tables of a bundle on the host. Borrows the arrays that it is given and owns what it derives from them.
+class HostTable {
+  public:
+    // `given` has the arrays from `ball` to `offset`.
+    HostTable(const ClusterTable& given, const ClusterFilters& filters);
+    HostTable(const HostTable&) = delete;
+    HostTable& operator=(const HostTable&) = delete;
+
+    const ClusterTable& table() const { return table_; }
+    const ClusterFilters& filters() const { return filters_; }
+
+  private:
+    void find_tops();
+
+    std::vector<int32_t> top_group_, top_cluster_;
+    ClusterTable table_;
+    ClusterFilters filters_;
+};
+
+}  // namespace v3dg

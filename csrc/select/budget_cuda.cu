@@ -1,0 +1,115 @@
+// A budget: change_kernel adds up by how much each tolerance changes the number of gaussians, choose_kernel
+// takes the least from which on no cut has too many.
+//
+// Both run for two rounds. The first takes no tolerance below half of what was chosen last time, which spares
+// it the tables of what is far away. The second does nothing unless that was too much.
+
+#include "select/cut_parts.cuh"
+
+namespace v3dg {
+namespace cuda {
+
+namespace {
+
+constexpr unsigned kChooseThreads = 1024;
+// Bins of a warp of choose_kernel.
+constexpr uint32_t kWarpBins = (kNumBudgetBins + kChooseThreads - 1) / kChooseThreads * 32;
+constexpr float kMostGuess = 1 << 20;
+
+// Adds the numbers of gaussians by which the cut of each tolerance differs from that of the tolerance before.
+__global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound round,
+                              const unsigned* num_parts, Count* change) {
+    if (round.is_over()) return;
+    rule.tolerance_px2 = round.least_tolerance(rule);
+    __shared__ Count at_first;
+    if (threadIdx.x == 0) at_first = 0;
+    __syncthreads();
+    for (unsigned p = blockIdx.x * kCutWarps + threadIdx.x / 32; p < *num_parts; p += gridDim.x * kCutWarps) {
+        const LaneClusters mine = clusters_of_lane(scene, scene.parts[p]);
+        Count kept = 0;
+        if (mine.are_tops) {
+            for (unsigned k = 0; k < kLaneClusters; ++k)
+                if (mine.drawn >> k & 1) kept += mine.size(k);
+        } else {
+            const ClusterTable& table = mine.bundle->table;
+            const InstanceView view = scene.views[mine.instance];
+            const InstanceCut<GroupMetrics> cut{table, view, rule, {table, view, rule}, rule.culls};
+            ask_clusters(mine, view, rule, Tolerances::from_this_on, [&](int32_t c) {
+                const BinRange bins = cut.bins(c);
+                if (bins.is_empty()) return false;
+                const Count size = static_cast<Count>(table.num_gaussians(c));
+                if (bins.first == 0)
+                    kept += size;
+                else
+                    atomicAdd(&change[bins.first], size);
+                if (bins.end < kNumBudgetBins) atomicAdd(&change[bins.end], ~size + 1);
+                return true;
+            });
+        }
+        kept = warp_sum(kept);
+        if (threadIdx.x % 32 == 0 && kept > 0) atomicAdd(&at_first, kept);
+    }
+    __syncthreads();
+    if (threadIdx.x == 0 && at_first > 0) atomicAdd(&change[0], at_first);
+}
+
+// One block. Chooses the tolerance after the last one whose cut exceeds the budget. Where there is none, no
+// parts are left to cut.
+__global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change, CutChoice* choice,
+                              BudgetState* state, unsigned* num_parts) {
+    if (round.is_over()) return;
+    const float least_tolerance = round.least_tolerance(rule);
+    __shared__ uint32_t chosen;
+    __shared__ Count before_warp[kChooseThreads / 32 + 1];
+    const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    const uint32_t first = kWarpBins * warp, last = min(first + kWarpBins, kNumBudgetBins);
+    Count sum = 0;
+    for (uint32_t bin = first + lane; bin < last; bin += 32) sum += change[bin];
+    sum = warp_sum(sum);
+    if (lane == 0) before_warp[warp + 1] = sum;
+    if (threadIdx.x == 0) {
+        before_warp[0] = 0;
+        chosen = 0;
+    }
+    __syncthreads();
+    if (threadIdx.x == 0)
+        for (unsigned w = 0; w < kChooseThreads / 32; ++w) before_warp[w + 1] += before_warp[w];
+    __syncthreads();
+    Count count = before_warp[warp];
+    for (uint32_t from = first; from < last; from += 32) {
+        const uint32_t bin = from + lane;
+        Count here = bin < last ? change[bin] : 0;
+#pragma unroll
+        for (unsigned offset = 1; offset < 32; offset *= 2) {
+            const Count below = __shfl_up_sync(kAllLanes, here, offset);
+            if (lane >= offset) here += below;
+        }
+        const unsigned beyond = __ballot_sync(kAllLanes, bin < last && count + here > rule.budget);
+        if (lane == 0 && beyond != 0) atomicMax(&chosen, from + 32 - __clz(static_cast<int>(beyond)));
+        count += __shfl_sync(kAllLanes, here, 31);
+    }
+    __syncthreads();
+    const bool is_first_in_vain = chosen == 0 && least_tolerance > rule.tolerance_px2;
+    if (is_first_in_vain)
+        for (uint32_t bin = threadIdx.x; bin < kNumBudgetBins; bin += kChooseThreads) change[bin] = 0;
+    if (threadIdx.x != 0) return;
+    const bool fits_budget = chosen < kNumBudgetBins;
+    const float tolerance = fits_budget ? tolerance_of_bin(chosen, least_tolerance) : INFINITY;
+    *choice = {tolerance, !fits_budget, before_warp[kChooseThreads / 32]};
+    *state = {fminf(0.5f * tolerance, kMostGuess), is_first_in_vain || round.is_second};
+    if (!fits_budget) *num_parts = 0;
+}
+
+}  // namespace
+
+void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const BudgetRound& round,
+                      unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
+                      BudgetState* state, cudaStream_t stream) {
+    launch("change_kernel", change_kernel, num_blocks, kCutThreads, 0, stream, scene, rule, round, num_parts,
+           change);
+    launch("choose_kernel", choose_kernel, 1, kChooseThreads, 0, stream, rule, round, change, choice, state,
+           num_parts);
+}
+
+}  // namespace cuda
+}  // namespace v3dg

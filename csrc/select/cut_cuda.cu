@@ -1,0 +1,314 @@
+// A cut takes two kernels. place_kernel, a thread an instance: the camera in its frame, and where its cut is
+// found: nowhere, among its tops, or in its table. That is dealt out as parts: 256 clusters of a table, or
+// the tops of up to 32 neighbouring instances. cut_kernel, a warp a part: which clusters are drawn, and their
+// places in the list by a prefix sum over parts.
+//
+// For a budget, the kernels of budget_cuda.cu run in between, for two rounds with place_kernel before each.
+
+#include "select/select_cuda.h"
+
+#include <algorithm>
+
+#include "base/device_guard.h"
+#include "base/scan.cuh"
+#include "select/cut_parts.cuh"
+#include "select/draw_items.cuh"
+
+namespace v3dg {
+namespace cuda {
+
+// Where the choice of a budget goes, and what a frame wants besides: nulls where there is none.
+struct Cut::Target {
+    FrameImage image;
+    FrameImage* images;
+    Placement* placements;
+    CutChoice* choice;
+};
+
+namespace {
+
+constexpr unsigned kCutBlocks = 4;      // on a multiprocessor
+constexpr unsigned kPlaceThreads = 64;  // few, so that a few thousand instances spread over the device
+
+// Scratch of one cut, cleared before it; the states of the cut are cleared by place_kernel.
+struct Scratch {
+    unsigned *place_ticket, *cut_ticket;
+    unsigned* num_parts;
+    Count* place_state;               // a word a block of place_kernel
+    Count *unit_state, *count_state;  // a word a ticket of cut_kernel
+};
+
+// Where the cut of instance i is found. Writes what the kernels after this one need of it.
+__device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Camera& camera,
+                                    const SelectRule& rule, Placement* placements) {
+    const Pose pose = scene.instances.pose(i);
+    if (!is_placed(pose)) return CutSource::nowhere;
+    const int32_t b = scene.instances.bundle[i];
+    const ClusterTable& table = scene.bundles[b].table;
+    const InstanceAxes axes = axes_of_instance(camera, pose);
+    const InstanceView view =
+        view_from_instance(camera, axes, pose, scene.instances.importance[i], table.pad_px);
+    const CutSource source = source_of_cut(table, view, rule, kLaneClusters);
+    if (source == CutSource::nowhere) return source;
+    if (placements != nullptr)
+        placements[i] = {model_view_from_instance(axes, pose), static_cast<uint32_t>(b), 0};
+    if (source == CutSource::table) {
+        scene.views[i] = view;
+        return source;
+    }
+    const InstanceCut<GroupMetrics> cut{table, view, rule, {table, view, rule}, rule.culls};
+    unsigned drawn = 0;
+    for (unsigned k = 0; k < table.top_cluster.size; ++k)
+        if (!cut.is_culled(table.top_cluster[k])) drawn |= 1u << k;
+    scene.tops[i] = static_cast<uint8_t>(drawn);
+    return drawn != 0 ? source : CutSource::nowhere;
+}
+
+__global__ void place_kernel(PlacedScene scene, Camera camera, SelectRule rule, FrameImage image,
+                             FrameImage* images, Placement* placements, BudgetRound round, Scratch scratch) {
+    if (round.is_over()) return;
+    rule.tolerance_px2 = round.least_tolerance(rule);
+    const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
+    if (i == 0 && images != nullptr) images[0] = image;
+    const size_t num_instances = scene.instances.scale.size;
+    const CutSource source =
+        i < num_instances ? place_instance(scene, i, camera, rule, placements) : CutSource::nowhere;
+
+    // Tops of neighbours with no table in between make one part, which the first of them writes.
+    const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
+    const unsigned tops = __ballot_sync(kAllLanes, source == CutSource::tops);
+    const unsigned tables = __ballot_sync(kAllLanes, source == CutSource::table);
+    const unsigned table_below = tables & below, table_above = tables & ~below;
+    const unsigned from = table_below != 0 ? 32 - __clz(static_cast<int>(table_below)) : 0;
+    const unsigned to = table_above != 0 ? __ffs(table_above) - 1 : 32;
+    const bool begins = source == CutSource::tops && (tops & below) >> from == 0;
+    unsigned parts = begins ? 1 : 0;
+    if (source == CutSource::table)
+        parts = blocks_for(scene.bundles[scene.instances.bundle[i]].table.num_clusters(), kPartSize);
+
+    unsigned total;
+    const unsigned before_in_block = block_prefix(parts, total);
+    __shared__ unsigned before_block;
+    if (threadIdx.x < 32) {
+        const unsigned before = static_cast<unsigned>(prefix_of_part(scratch.place_state, block, total));
+        if (threadIdx.x == 0) before_block = before;
+    }
+    __syncthreads();
+    const unsigned before = before_block;
+    CutPart* part = scene.parts + before + before_in_block;
+    if (begins) {
+        const unsigned until = to < 32 ? (1u << to) - 1 : kAllLanes;
+        *part = {static_cast<uint32_t>(i), 0, (tops & until) >> lane};
+    } else {
+        for (unsigned p = 0; p < parts; ++p) part[p] = {static_cast<uint32_t>(i), p * kPartSize, 0};
+    }
+    // The block clears the tickets whose first part is one of its own.
+    for (unsigned t = blocks_for(before, kCutWarps) + threadIdx.x; t < blocks_for(before + total, kCutWarps);
+         t += kPlaceThreads)
+        scratch.unit_state[t] = scratch.count_state[t] = 0;
+    if (block + 1 == gridDim.x && threadIdx.x == 0) *scratch.num_parts = before + total;
+}
+
+// Writes what a block adds to a list: each thread the clusters that it draws. The blocks' parts of the list
+// are in the order of their tickets.
+template <class Output>
+__device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool is_last, Count* unit_state,
+                               Count* count_state, const Output& output) {
+    __shared__ Count before_units, before_gaussians;
+    const WriteCount count = output.count(mine);
+    unsigned num_units, num_gaussians;
+    const unsigned units_before = block_prefix(count.units, num_units),
+                   gaussians_before = block_prefix(count.gaussians, num_gaussians);
+    if (threadIdx.x < 64) {  // a warp each
+        const bool is_units = threadIdx.x < 32;
+        const Count before =
+            prefix_of_part(is_units ? unit_state : count_state, ticket, is_units ? num_units : num_gaussians);
+        if (threadIdx.x % 32 == 0) (is_units ? before_units : before_gaussians) = before;
+    }
+    __syncthreads();
+    output.write(mine, before_units + units_before, before_gaussians + gaussians_before);
+    if (is_last && threadIdx.x == 0)
+        output.finish(before_units + num_units, before_gaussians + num_gaussians);
+}
+
+template <class Output>
+__global__ void __launch_bounds__(kCutThreads, kCutBlocks)
+    cut_kernel(PlacedScene scene, SelectRule rule, const CutChoice* choice, const BudgetState* state,
+               Scratch scratch, Scratch second_scratch, Output output) {
+    if (state != nullptr && state->again != 0) scratch = second_scratch;
+    const unsigned num_parts = *scratch.num_parts, num_tickets = blocks_for(num_parts, kCutWarps);
+    if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
+    if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
+    for (unsigned ticket = take_ticket(scratch.cut_ticket); ticket < num_tickets;
+         ticket = take_ticket(scratch.cut_ticket)) {
+        const unsigned p = ticket * kCutWarps + threadIdx.x / 32;
+        LaneClusters mine{};
+        if (p < num_parts) {
+            mine = clusters_of_lane(scene, scene.parts[p]);
+            if (!mine.are_tops) {
+                const ClusterTable& table = mine.bundle->table;
+                const InstanceView view = scene.views[mine.instance];
+                const InstanceCut<GroupMetrics> cut{table, view, rule, {table, view, rule}, rule.culls};
+                mine.drawn = ask_clusters(mine, view, rule, Tolerances::this_one,
+                                          [&](int32_t c) { return cut.draws(c); });
+            }
+        }
+        write_clusters(mine, ticket, ticket + 1 == num_tickets, scratch.unit_state, scratch.count_state,
+                       output);
+    }
+}
+
+// A thread an instance.
+__global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage image, FrameImage* images,
+                                 Placement* placements) {
+    const size_t i = size_t(blockIdx.x) * blockDim.x + threadIdx.x;
+    if (i == 0) images[0] = image;
+    if (i >= scene.instances.scale.size) return;
+    const Pose pose = scene.instances.pose(i);
+    placements[i] = {model_view_from_instance(axes_of_instance(camera, pose), pose),
+                     static_cast<uint32_t>(scene.instances.bundle[i]), 0};
+}
+
+// A thread kLaneClusters pairs. The pairs of instances without a pose are left out.
+__global__ void __launch_bounds__(kCutThreads)
+    given_kernel(PlacedScene scene, Span<const int32_t> instance, Span<const int32_t> cluster,
+                 Scratch scratch, ItemOutput output) {
+    const unsigned ticket = take_ticket(scratch.cut_ticket);
+    const size_t p = size_t(ticket) * kCutThreads + threadIdx.x;
+    LaneClusters mine{};
+    if (p < instance.size && is_placed(scene.instances.pose(instance[p])))
+        mine = {&scene.bundles[scene.instances.bundle[instance[p]]], static_cast<uint32_t>(instance[p]),
+                static_cast<uint32_t>(cluster[p]), false, 1};
+    write_clusters(mine, ticket, ticket + 1 == gridDim.x, scratch.unit_state, scratch.count_state, output);
+}
+
+// At least one: an empty scene has a picture, too.
+unsigned place_blocks(size_t num_instances) { return std::max(1u, blocks_for(num_instances, kPlaceThreads)); }
+
+// Words of Scratch before the states of the cut: three counters and the states of place_kernel's blocks.
+size_t cleared_words(size_t num_instances) { return 2 + place_blocks(num_instances); }
+
+size_t scratch_words(size_t num_instances, size_t num_tickets) {
+    return cleared_words(num_instances) + 2 * num_tickets;
+}
+
+Scratch scratch_in(Count* words, size_t num_instances, size_t num_tickets) {
+    auto* counters = reinterpret_cast<unsigned*>(words);
+    Count* states = words + cleared_words(num_instances);
+    return {counters, counters + 1, counters + 2, words + 2, states, states + num_tickets};
+}
+
+// Parts of all tables together, if every one is asked.
+size_t most_parts(const SceneTables& scene) {
+    size_t parts = 0;
+    for (size_t b = 0; b < scene.num_bundles(); ++b)
+        parts +=
+            scene.num_instances_of(b) * std::max(1u, blocks_for(scene.bundle(b).num_clusters(), kPartSize));
+    return parts;
+}
+
+template <class T>
+void copy_to_host(T* to, const T* from, size_t count, cudaStream_t stream) {
+    if (count > 0)
+        check(cudaMemcpyAsync(to, from, count * sizeof(T), cudaMemcpyDeviceToHost, stream),
+              "cudaMemcpyAsync to the host");
+}
+
+}  // namespace
+
+template <class Output>
+void Cut::cut(const SceneTables& scene, const Camera& camera, const SelectRule& rule, const Target& target,
+              const Output& output, cudaStream_t stream) {
+    const size_t count = scene.num_instances(), parts = most_parts(scene);
+    const size_t num_tickets = blocks_for(parts, kCutWarps), words = scratch_words(count, num_tickets);
+    Count* scratch_of_rounds = scratch_.reserve(2 * words, stream);
+    const Scratch scratches[2] = {scratch_in(scratch_of_rounds, count, num_tickets),
+                                  scratch_in(scratch_of_rounds + words, count, num_tickets)};
+    const SceneOnDevice on_device = scene.on_device();
+    const PlacedScene placed{on_device.bundles, on_device.instances, views_.reserve(count, stream),
+                             tops_.reserve(count, stream), parts_.reserve(parts, stream)};
+    const unsigned blocks = static_cast<unsigned>(
+        std::clamp<size_t>(num_tickets, 1, (2048 / kCutThreads) * num_multiprocessors()));
+    const bool has_budget = rule.budget != kNoBudget;
+    Count* change = has_budget ? change_.reserve(kNumBudgetBins, stream) : nullptr;
+    if (has_budget) {
+        check(cudaMemsetAsync(change, 0, kNumBudgetBins * sizeof(Count), stream), "cudaMemsetAsync");
+        const BudgetState none{};
+        if (budget_.data() == nullptr) budget_.copy_from({&none, 1}, stream);
+    }
+    BudgetState* state = has_budget ? budget_.data() : nullptr;
+    for (const bool is_second : {false, true}) {
+        const Scratch& scratch = scratches[is_second];
+        const BudgetRound round{state, is_second};
+        check(cudaMemsetAsync(scratch.place_ticket, 0, cleared_words(count) * sizeof(Count), stream),
+              "cudaMemsetAsync");
+        launch("place_kernel", place_kernel, place_blocks(count), kPlaceThreads, 0, stream, placed, camera,
+               rule, target.image, target.images, target.placements, round, scratch);
+        if (!has_budget) break;
+        choose_tolerance(placed, rule, round, blocks, scratch.num_parts, change, target.choice, state,
+                         stream);
+    }
+    launch("cut_kernel", cut_kernel<Output>, blocks, kCutThreads, 0, stream, placed, rule, target.choice,
+           state, scratches[0], scratches[1], output);
+}
+
+void Cut::cut_items(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
+                    const FrameImage& image, FrameImage* images, Placement* placements, const ItemList& items,
+                    cudaStream_t stream) {
+    const DeviceGuard guard(device_);
+    const Turn turn = scene.turn(stream);
+    cut(scene, camera, rule, {image, images, placements, &items.counters->choice}, ItemOutput{items}, stream);
+}
+
+void Cut::given_items(const SceneTables& scene, const Camera& camera, Span<const int32_t> instance,
+                      Span<const int32_t> cluster, const FrameImage& image, FrameImage* images,
+                      Placement* placements, const ItemList& items, cudaStream_t stream) {
+    const DeviceGuard guard(device_);
+    const Turn turn = scene.turn(stream);
+    const SceneOnDevice on_device = scene.on_device();
+    const PlacedScene placed{on_device.bundles, on_device.instances, nullptr, nullptr, nullptr};
+    const unsigned blocks = std::max(1u, blocks_for(instance.size, kCutThreads));
+    const size_t words = scratch_words(0, blocks);
+    const Scratch scratch = scratch_in(scratch_.reserve(words, stream), 0, blocks);
+    check(cudaMemsetAsync(scratch_.data(), 0, words * sizeof(Count), stream), "cudaMemsetAsync");
+    launch("place_all_kernel", place_all_kernel, place_blocks(scene.num_instances()), kPlaceThreads, 0,
+           stream, placed, camera, image, images, placements);
+    launch("given_kernel", given_kernel, blocks, kCutThreads, 0, stream, placed, instance, cluster, scratch,
+           ItemOutput{items});
+}
+
+void Cut::select(const SceneTables& scene, const Camera& camera, const SelectRule& rule, SelectOutput& out,
+                 cudaStream_t stream) {
+    const DeviceGuard guard(device_);
+    const Turn turn = scene.turn(stream);
+    Pairs* on_device = pairs_.reserve(1, stream);
+    Pairs counts{};
+    // Most cuts of most scenes fit at once.
+    for (Count capacity = std::max<Count>(1u << 16, pair_instance_.capacity());; capacity = counts.pairs) {
+        const PairOutput output{pair_instance_.reserve(capacity, stream),
+                                pair_cluster_.reserve(capacity, stream), capacity, &on_device->pairs,
+                                &on_device->gaussians};
+        check(cudaMemsetAsync(on_device, 0, sizeof *on_device, stream), "cudaMemsetAsync");
+        cut(scene, camera, rule, {{}, nullptr, nullptr, &on_device->choice}, output, stream);
+        copy_to_host(&counts, on_device, 1, stream);
+        check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+        if (counts.pairs <= capacity) break;
+    }
+    const bool has_budget = rule.budget != kNoBudget;
+    out.fits_budget = !has_budget || !counts.choice.exceeds_budget;
+    out.tolerance_px2 = has_budget ? counts.choice.tolerance_px2 : rule.tolerance_px2;
+    out.num_gaussians = static_cast<int64_t>(out.fits_budget ? counts.gaussians : counts.choice.least);
+    out.instance.resize(counts.pairs);
+    out.cluster.resize(counts.pairs);
+    copy_to_host(out.instance.data(), pair_instance_.data(), counts.pairs, stream);
+    copy_to_host(out.cluster.data(), pair_cluster_.data(), counts.pairs, stream);
+    check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+}
+
+size_t Cut::bytes() const {
+    return views_.bytes() + tops_.bytes() + parts_.bytes() + scratch_.bytes() + change_.bytes() +
+           budget_.bytes() + pair_instance_.bytes() + pair_cluster_.bytes() + pairs_.bytes();
+}
+
+}  // namespace cuda
+}  // namespace v3dg

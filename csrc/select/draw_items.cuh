@@ -1,0 +1,127 @@
+#pragma once
+
+// Where a cut is written: as pairs, or as the items of a frame. A lane first counts what it will write of its
+// clusters, and writes that once it knows what is before it.
+
+#include "select/cut_parts.cuh"
+
+namespace v3dg {
+namespace cuda {
+
+struct WriteCount {
+    unsigned units, gaussians;  // units: elements of the list
+};
+
+// Selected clusters as (instance, cluster).
+struct PairOutput {
+    int32_t *instance, *cluster;
+    Count capacity;
+    Count *pairs, *gaussians;
+
+    __device__ WriteCount count(const LaneClusters& mine) const {
+        WriteCount count{0, 0};
+        for (unsigned k = 0; k < kLaneClusters; ++k)
+            if (mine.drawn >> k & 1) {
+                ++count.units;
+                count.gaussians += mine.size(k);
+            }
+        return count;
+    }
+    __device__ void write(const LaneClusters& mine, Count first, Count) const {
+        for (unsigned k = 0; k < kLaneClusters; ++k)
+            if (mine.drawn >> k & 1) {
+                if (first >= capacity) return;
+                instance[first] = static_cast<int32_t>(mine.instance);
+                cluster[first++] = mine.cluster(k);
+            }
+    }
+    __device__ void finish(Count units, Count gaussians_drawn) const {
+        *pairs = units;
+        *gaussians = gaussians_drawn;
+    }
+};
+
+// Neighbouring clusters that are drawn together, for the lane's instance; or one that is drawn for all
+// instances of `sharers`, bits above the first of the part.
+struct DrawnRun {
+    unsigned k, num_clusters;
+    uint32_t sharers;
+    unsigned num_instances;
+
+    __device__ unsigned gaussians_an_item() const { return kItemSize / num_instances; }
+};
+
+// Whether a warp is quicker when it goes through a cluster's gaussians one by one, each for all instances at
+// once, than when it goes through the instances one by one. An item costs as much as two more rounds.
+__device__ inline bool is_worth_sharing(unsigned num_gaussians, unsigned num_instances) {
+    return num_instances > 1 && num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
+}
+
+// Calls visit(DrawnRun) in the lane that writes the run; for whole warps.
+template <class Visit>
+__device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
+    if (!mine.are_tops) {
+        if (mine.drawn == 0) return;
+        const unsigned joins = mine.bundle->joins[mine.first / kLaneClusters];
+        for (unsigned k = 0, end; k < kLaneClusters; k = end) {
+            end = k + 1;
+            if ((mine.drawn >> k & 1) == 0) continue;
+            while ((mine.drawn & joins) >> end & 1) ++end;
+            visit(DrawnRun{k, end - k, 0, 1});
+        }
+        return;
+    }
+    const unsigned same_bundle =
+        __match_any_sync(kAllLanes, reinterpret_cast<unsigned long long>(mine.bundle));
+    for (unsigned k = 0; __any_sync(kAllLanes, mine.drawn >> k != 0); ++k) {
+        const bool is_drawn = (mine.drawn >> k & 1) != 0;
+        const unsigned sharers = __ballot_sync(kAllLanes, is_drawn) & same_bundle, count = __popc(sharers);
+        if (!is_drawn) continue;
+        if (!is_worth_sharing(mine.size(k), count))
+            visit(DrawnRun{k, 1, 0, 1});
+        else if (threadIdx.x % 32 + 1 == static_cast<unsigned>(__ffs(sharers)))
+            visit(DrawnRun{k, 1, sharers, count});
+    }
+}
+
+// Selected clusters as items. Neighbouring clusters are drawn by the same items, and so are the tops that
+// neighbouring instances have in common.
+struct ItemOutput {
+    ItemList items;
+
+    __device__ WriteCount count(const LaneClusters& mine) const {
+        WriteCount count{0, 0};
+        for_each_drawn(mine, [&](const DrawnRun& run) {
+            const unsigned size = mine.size(run.k, run.num_clusters);
+            count.units += blocks_for(size, run.gaussians_an_item());
+            count.gaussians += run.num_instances * size;
+        });
+        return count;
+    }
+    __device__ void write(const LaneClusters& mine, Count first, Count record) const {
+        for_each_drawn(mine, [&](const DrawnRun& run) {
+            const int32_t cluster = mine.cluster(run.k);
+            const unsigned size = mine.size(run.k, run.num_clusters), step = run.gaussians_an_item();
+            const uint32_t placement = run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
+            const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->pages.first_row[cluster]);
+            const float filter_px2 = mine.bundle->filters.filter_px2[cluster];
+            const uint32_t compensate = mine.bundle->filters.compensate[cluster];
+            for (unsigned skip = 0; skip < size; skip += step, ++first) {
+                const unsigned count = min(step, size - skip);
+                if (first < items.item_capacity &&
+                    record + run.num_instances * count <= items.record_capacity)
+                    items.items[first] = {
+                        placement,  gaussian + skip, count,      static_cast<uint32_t>(record),
+                        filter_px2, compensate,      run.sharers};
+                record += run.num_instances * count;
+            }
+        });
+    }
+    __device__ void finish(Count units, Count gaussians) const {
+        items.counters->items = units;
+        items.counters->gaussians = gaussians;
+    }
+};
+
+}  // namespace cuda
+}  // namespace v3dg
