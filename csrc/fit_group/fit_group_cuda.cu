@@ -17,7 +17,7 @@
 #include <stdexcept>
 #include <type_traits>
 
-#include "base/launch.cuh"
+#include "base/scan.cuh"
 #include "rasterize/rasterize_math.h"
 
 namespace v3dg {
@@ -496,11 +496,7 @@ struct Fit {
         const uint32_t end = min(count, begin + each);
         uint32_t own = 0;
         for (uint32_t t = begin; t < end; ++t) own += __popcll(mask_at(t));
-        uint32_t upto = own;
-        for (int offset = 1; offset < 32; offset *= 2) {
-            const uint32_t left = __shfl_up_sync(kAllLanes, upto, offset);
-            if (threadIdx.x % 32 >= static_cast<unsigned>(offset)) upto += left;
-        }
+        const uint32_t upto = warp_prefix(own);
         if (threadIdx.x % 32 == 31) s.warp_total[threadIdx.x / 32] = upto;
         __syncthreads();
         uint32_t before = upto - own, total = 0;

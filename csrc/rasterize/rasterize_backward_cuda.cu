@@ -7,7 +7,7 @@
 
 #include <cmath>
 
-#include "base/launch.cuh"
+#include "base/scan.cuh"
 #include "rasterize/rasterize_backward.h"
 #include "rasterize/rasterize_math.h"
 
@@ -284,11 +284,7 @@ __global__ void __launch_bounds__(kThreads, 2)
             }
             s.warps[i] = warps;
             batch.took_part[i] = 0;
-            end_pair = __popc(warps);
-            for (int offset = 1; offset < 32; offset *= 2) {
-                const uint32_t other = __shfl_up_sync(kAllLanes, end_pair, offset);
-                if (lane >= offset) end_pair += other;
-            }
+            end_pair = warp_prefix<32, uint32_t>(__popc(warps));
             if (lane == 31) s.pairs_of_warp[warp] = end_pair;
         }
         if (!goes_on) break;

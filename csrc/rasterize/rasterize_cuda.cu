@@ -11,7 +11,7 @@
 
 #include <algorithm>
 
-#include "base/launch.cuh"
+#include "base/scan.cuh"
 #include "rasterize/rasterize_cuda.h"
 #include "rasterize/rasterize_math.h"
 
@@ -111,11 +111,7 @@ __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
         count[i] = own[i];
         sum += count[i];
     }
-    uint32_t inclusive = sum;
-    for (int offset = 1; offset < 32; offset *= 2) {
-        const uint32_t below = __shfl_up_sync(kAllLanes, inclusive, offset);
-        if (lane >= offset) inclusive += below;
-    }
+    const uint32_t inclusive = warp_prefix(sum);
     if (lane == 31) warp_sum[warp] = inclusive;
     __syncthreads();
     uint32_t first = inclusive - sum;

@@ -102,12 +102,7 @@ __device__ LargeRows rows_of(const LargeBatch& batch, int first, int count) {
     LargeRows rows{batch.top + first,       min(count, batch.all_rows - first) * batch.columns,
                    begin - first,           max(end - begin, 0),
                    begin - batch.first_row, 0};
-    rows.rows_after = rows.rows;
-#pragma unroll
-    for (unsigned offset = 1; offset < kLargeAtOnce; offset *= 2) {
-        const int below = __shfl_up_sync(kAllLanes, rows.rows_after, offset, kLargeAtOnce);
-        if (threadIdx.x % kLargeAtOnce >= offset) rows.rows_after += below;
-    }
+    rows.rows_after = warp_prefix<kLargeAtOnce>(rows.rows);
     return rows;
 }
 
