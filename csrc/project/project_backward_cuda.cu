@@ -59,8 +59,8 @@ __device__ bool sum_of_slots(const GradientSlots& slots, uint32_t first, uint32_
 
 __global__ void place_slots_kernel(ItemList items, const uint32_t* item_records, const Record<float>* records,
                                    uint32_t* first_slot) {
+    if (!items.is_complete()) return;
     const unsigned long long num_items = items.counters->items;
-    if (num_items > items.item_capacity || items.counters->gaussians > items.record_capacity) return;
     __shared__ uint32_t sum_of_warp[kThreads / 32];
     __shared__ uint32_t first_of_item;
     const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;

@@ -260,12 +260,13 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
 
 // The item's large records, in whole batches.
 template <class Model>
-__device__ void write_large(const WarpSpace<Model>& space, const ProjectOutput& out) {
+__device__ void write_large(const WarpSpace<Model>& space, FrameCounters& counters,
+                            const ProjectOutput& out) {
     const unsigned num_large = space.num_large;
     if (num_large == 0) return;
     const unsigned lane = threadIdx.x % 32, count = blocks_for(num_large, kLargeAtOnce) * kLargeAtOnce;
     unsigned long long place = 0;
-    if (lane == 0) place = atomicAdd(out.tiles.num_large, static_cast<unsigned long long>(count));
+    if (lane == 0) place = atomicAdd(&counters.large, static_cast<unsigned long long>(count));
     place = __shfl_sync(kAllLanes, place, 0);
     for (unsigned k = lane; k < count && place + k < out.large_capacity; k += 32)
         out.large[place + k] = {k < num_large ? space.tables.item.record + space.large[k] : kNoRecord,
@@ -300,7 +301,8 @@ __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint
 // The item whose tables are there. Returns how many records it has.
 template <class Source, bool kIsShared>
 __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
-                                 const ProjectOutput& out, unsigned& num_in_frustum) {
+                                 FrameCounters& counters, const ProjectOutput& out,
+                                 unsigned& num_in_frustum) {
     constexpr unsigned kRound = kIsShared ? 1 : 32;  // gaussians
     const auto& tables = space.tables;
     const unsigned lane = threadIdx.x % 32, count = tables.item.count;
@@ -350,7 +352,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         waiting -= taken;
         __syncwarp();  // before the queue and the records are written again
     }
-    write_large(space, out);
+    write_large(space, counters, out);
     return written;
 }
 
@@ -370,14 +372,10 @@ __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum, 
     atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));
 }
 
-__device__ bool have_room(const ItemList& items) {
-    return items.counters->items <= items.item_capacity && items.counters->gaussians <= items.record_capacity;
-}
-
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out) {
-    if (!have_room(in.items)) return;
+    if (!in.items.is_complete()) return;
     __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
     WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
     const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
@@ -401,7 +399,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         __syncwarp();
         store_tables(space.tables, this_item_word, this_placement_word, in, models, loaded);
         if (space.tables.item.sharers != 0) continue;
-        const unsigned written = project_item<Source, false>(space, nullptr, out, num_in_frustum);
+        const unsigned written =
+            project_item<Source, false>(space, nullptr, *in.items.counters, out, num_in_frustum);
         num_records += written;
         report_item(space.tables, i, written, out);
     }
@@ -412,7 +411,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_shared_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out) {
-    if (!have_room(in.items)) return;
+    if (!in.items.is_complete()) return;
     __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
     WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
     const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
@@ -428,7 +427,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
             __syncwarp();
             store_tables(space.tables, load_word(item), load_word(sharers[__ffs(item.sharers) - 1]), in,
                          models, loaded);
-            const unsigned written = project_item<Source, true>(space, sharers, out, num_in_frustum);
+            const unsigned written =
+                project_item<Source, true>(space, sharers, *in.items.counters, out, num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
         }

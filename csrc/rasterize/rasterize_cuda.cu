@@ -597,10 +597,6 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
     });
 }
 
-__device__ bool is_complete(const FrameLists& lists) {
-    return lists.counters->gaussians <= lists.record_capacity &&
-           lists.counters->entries <= lists.entry_capacity;
-}
 __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
 }
@@ -610,7 +606,7 @@ __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists) {
     constexpr int kClasses = 64;
     __shared__ uint32_t place[kClasses];
-    if (!is_complete(lists)) return;
+    if (!lists.capacity.holds(*lists.counters)) return;
     const auto class_of = [&](uint32_t tile) {
         const uint32_t count = count_of(lists, tile);
         if (count < 2) return kClasses - 1 - static_cast<int>(count);
@@ -655,7 +651,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists) {
 // Spreads the long lists, a block one after another.
 __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists lists) {
     __shared__ SpreadShared<kLog2Spread> s;
-    if (!is_complete(lists)) return;
+    if (!lists.capacity.holds(*lists.counters)) return;
     for (uint32_t i = blockIdx.x; i < lists.num_tiles; i += gridDim.x) {
         TilePlan& plan = lists.plans[i];
         const uint32_t count = count_of(lists, plan.tile);
@@ -673,7 +669,7 @@ __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists list
 }
 
 __global__ void __launch_bounds__(kThreads, kBlocks) rasterize_kernel(FrameLists lists, RasterTape tape) {
-    if (!is_complete(lists)) return;
+    if (!lists.capacity.holds(*lists.counters)) return;
     Shared& s = *reinterpret_cast<Shared*>(shared_memory());
     const TilePlan plan = lists.plans[blockIdx.x];
     const Buckets buckets{plan.lowest, plan.last_bucket, plan.shift, false};

@@ -18,11 +18,6 @@ constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
 constexpr unsigned kBlocks = 5;    // on a multiprocessor
 constexpr uint32_t kNoItem = ~0u;  // in place of a number of records
 
-__device__ bool is_complete(const TileBinInput& in) {
-    return in.counters->items <= in.item_capacity && in.counters->gaussians <= in.record_capacity &&
-           *in.counts.num_large <= in.large_capacity;
-}
-
 // In whole words, and of those what is used; without its colour.
 __device__ Record<float> load_record(const Record<float>* record) {
     const uint4* words = reinterpret_cast<const uint4*>(record);
@@ -137,7 +132,7 @@ template <class Visit>
 __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     constexpr int kLog2MostParts = 2;
     const unsigned num_warps = gridDim.x * kWarps;
-    const unsigned num_batches = static_cast<unsigned>(*in.counts.num_large / kLargeAtOnce);
+    const unsigned num_batches = static_cast<unsigned>(in.counters->large / kLargeAtOnce);
     const unsigned warps_each = num_batches == 0 ? 0 : 8 * num_warps / num_batches;
     const int log2_parts = min(max(31 - __clz(static_cast<int>(warps_each)), 0), kLog2MostParts);
     for (unsigned at = blockIdx.x * kWarps + threadIdx.x / 32; at < num_batches << log2_parts;
@@ -210,7 +205,7 @@ __device__ uint32_t records_of_tile(const LargeBatch& batch, const LargeRows& wi
 }
 
 __global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinInput in) {
-    if (!is_complete(in)) return;
+    if (!in.capacity.holds(*in.counters)) return;
     __shared__ WindowRuns all_runs[kWarps];
     WindowRuns& runs = all_runs[threadIdx.x / 32];
     for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
@@ -262,10 +257,7 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
         out.image_of_tile[tile] = image_of(in, static_cast<uint32_t>(tile));
     }
     if (block + 1 == gridDim.x && threadIdx.x == 0) {
-        const unsigned long long entries = before_block + total;
-        out.tile_first[in.num_tiles] = entries;
-        const bool lacks_large = *in.counts.num_large > in.large_capacity;
-        in.counters->entries = lacks_large && entries <= in.entry_capacity ? in.entry_capacity + 1 : entries;
+        out.tile_first[in.num_tiles] = in.counters->entries = before_block + total;
     }
 }
 
@@ -355,7 +347,7 @@ __device__ void scatter_windows(const TileBinInput& in, const Scatter& to, const
 // Blocks take items, a thread a record, and then the records over many tiles. An item's table is fetched two
 // items before its turn, its records one.
 __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput in, TileBinOutput out) {
-    if (!is_complete(in) || in.counters->entries > in.entry_capacity) return;
+    if (!in.capacity.holds(*in.counters)) return;
     const Scatter to{out.tile_first, in.counts.count, out.entries};
     const unsigned num_items = static_cast<unsigned>(in.counters->items);
     ItemTiles now{0, 0, 0, 0}, next = now;
