@@ -10,6 +10,7 @@
 
 #include "base/launch.cuh"
 #include "frame/count_tile.cuh"
+#include "frame/record.cuh"
 #include "project/project_math.h"
 
 namespace v3dg {
@@ -42,9 +43,9 @@ template <class Model>
 struct WarpSpace {
     ItemTables<Model> tables;
     alignas(16) Queued queue[kQueue];
-    uint4 records[3 * 32];     // on their way out: written by lane, read in a row
-    unsigned num_large;        // of the item's records so far,
-    uint8_t large[kItemSize];  // and which they are
+    float4 records[kRecordVectors * 32];  // on their way out: written by lane, read in a row
+    unsigned num_large;                   // of the item's records so far,
+    uint8_t large[kItemSize];             // and which they are
 };
 
 __device__ float4 load4(const float* rows, uint32_t row) {
@@ -194,15 +195,6 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
-__device__ void put_record(const Record<float>& r, uint4* to) {
-    to[0] = {__float_as_uint(r.u), __float_as_uint(r.v), __float_as_uint(r.l11), __float_as_uint(r.l12)};
-    to[1] = {__float_as_uint(r.l22), __float_as_uint(r.log2_opacity), __float_as_uint(r.color[0]),
-             __float_as_uint(r.color[1])};
-    to[2] = {__float_as_uint(r.color[2]), __float_as_uint(r.depth), r.x0 | uint32_t(r.x1) << 16,
-             r.y0 | uint32_t(r.y1) << 16};
-}
-static_assert(sizeof(Record<float>) == 3 * sizeof(uint4), "written as whole words");
-
 // Writes the records of up to 32 queued gaussians, in their order, and counts them into tiles. Returns how
 // many there are. `sharers` are the placements of a shared item.
 template <class Source, bool kIsShared>
@@ -226,7 +218,7 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
     TileBox tiles{0, 0, 1, 0};
     bool is_large = false;
     if (reaches_pixel) {
-        put_record(r, space.records + 3 * rank);
+        store_record(r, space.records + kRecordVectors * rank);
         const EntryBox box = entry_box(r);
         tiles = tile_box(box);
         is_large = tiles.count > kFewTiles;
@@ -245,11 +237,11 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
         if (lane == 0) space.num_large = before + __popc(large);
     }
     __syncwarp();
-    uint4* records = reinterpret_cast<uint4*>(out.records + first);
-    const unsigned num_words = 3 * __popc(kept);
+    float4* vectors = reinterpret_cast<float4*>(out.records + first);
+    const unsigned num_vectors = kRecordVectors * __popc(kept);
 #pragma unroll
-    for (unsigned w = lane; w < 96; w += 32)
-        if (w < num_words) records[w] = space.records[w];
+    for (unsigned w = lane; w < kRecordVectors * 32; w += 32)
+        if (w < num_vectors) vectors[w] = space.records[w];
     for (unsigned k = 0; __any_sync(kAllLanes, k < tiles.count); ++k)
         count_tile(out.tiles.count,
                    k < tiles.count

@@ -8,6 +8,7 @@
 
 #include "base/scan.cuh"
 #include "frame/count_tile.cuh"
+#include "frame/record.cuh"
 
 namespace v3dg {
 namespace cuda {
@@ -17,25 +18,6 @@ namespace {
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
 constexpr unsigned kBlocks = 5;    // on a multiprocessor
 constexpr uint32_t kNoItem = ~0u;  // in place of a number of records
-
-// In whole words, and of those what is used; without its colour.
-__device__ Record<float> load_record(const Record<float>* record) {
-    const uint4* words = reinterpret_cast<const uint4*>(record);
-    const uint4 a = words[0], b = words[1], c = words[2];
-    Record<float> r;
-    r.u = __uint_as_float(a.x);
-    r.v = __uint_as_float(a.y);
-    r.l11 = __uint_as_float(a.z);
-    r.l12 = __uint_as_float(a.w);
-    r.l22 = __uint_as_float(b.x);
-    r.log2_opacity = __uint_as_float(b.y);
-    r.depth = __uint_as_float(c.y);
-    r.x0 = static_cast<uint16_t>(c.z);
-    r.x1 = static_cast<uint16_t>(c.z >> 16);
-    r.y0 = static_cast<uint16_t>(c.w);
-    r.y1 = static_cast<uint16_t>(c.w >> 16);
-    return r;
-}
 
 // Large records that a warp takes together; lanes 16 apart have the same one. Neighbours cover the same
 // tiles, so a tile is looked at for all of them at once, in windows of so many tiles, unless they lie
