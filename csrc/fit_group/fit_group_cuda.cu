@@ -13,11 +13,11 @@
 
 #include <algorithm>
 #include <cfloat>
-#include <cstddef>
 #include <stdexcept>
 #include <type_traits>
 
 #include "base/scan.cuh"
+#include "frame/record.cuh"
 #include "rasterize/rasterize_math.h"
 
 namespace v3dg {
@@ -39,10 +39,6 @@ constexpr uint32_t kHiddenKey = 0xfffffffeu;  // after all depths
 constexpr uint32_t kSmallCount = 256;         // gaussians of a small group, whose picture is one region
 constexpr int kStepsPerPoll = 16;
 constexpr unsigned kLargestTeam = 16;
-
-static_assert(sizeof(Record<float>) == 48 && offsetof(Record<float>, l22) == 16 &&
-                  offsetof(Record<float>, color) == 24,
-              "loaded as whole words");
 
 // Where an array lies: in the block's shared memory, or in the team's part of the scratch.
 struct Place {
@@ -593,7 +589,7 @@ struct Fit {
             if (entry >= end) continue;
             const auto* from = reinterpret_cast<const float4*>(ranked() + list(i / kChunk)[entry]);
             auto* to = reinterpret_cast<float4*>(staged() + i);
-            for (int k = 0; k < 3; ++k) to[k] = from[k];
+            for (int k = 0; k < kRecordVectors; ++k) to[k] = from[k];
         }
         __syncwarp();
     }
@@ -625,11 +621,10 @@ struct Fit {
         Blended out;
 #pragma unroll
         for (int q = 0; q < kAtOnce; ++q) {
-            const Record<float>& r = *records.record[q];
-            const float4 a = *reinterpret_cast<const float4*>(&r.u);
-            const float4 b = *reinterpret_cast<const float4*>(&r.l22);
-            out.alpha[q] = alpha_of(falloff_at(p.center_x, p.center_y, a.x, a.y, a.z, a.w, b.x, b.y));
-            out.color[q] = make_float3(b.z, b.w, r.color[2]);
+            const Record<float> r = load_record(records.record[q]);
+            out.alpha[q] =
+                alpha_of(falloff_at(p.center_x, p.center_y, r.u, r.v, r.l11, r.l12, r.l22, r.log2_opacity));
+            out.color[q] = make_float3(r.color[0], r.color[1], r.color[2]);
         }
         blend_weights(out.alpha, transmittance, out.before, out.weight);
         return out;
@@ -749,9 +744,8 @@ struct Fit {
     }
 
     // Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk.
-    __device__ void add_up(const Pixel& p, uint32_t i, const Record<float>& r, float* slot) const {
-        const float4 e = *reinterpret_cast<const float4*>(&r.u);
-        const float l22 = r.l22;
+    __device__ void add_up(const Pixel& p, uint32_t i, const Record<float>& record, float* slot) const {
+        const Record<float> r = load_record(&record);
         const uint32_t half = threadIdx.x % 32 / kCellPixels;
         const float2* shares = fragments() + 33 * i + half * kCellPixels;
         const float4* d_colors = d_pixels() + half * kCellPixels;
@@ -761,28 +755,19 @@ struct Fit {
         float color[3] = {0, 0, 0};
 #pragma unroll
         for (int y = 0; y < kCell; ++y) {
-            float exponent = 0, t1 = 0, t1_dx = 0;
+            RowSums<float> row{};
             Falloff<float> f;
 #pragma unroll
             for (int x = 0; x < kCell; ++x) {
                 const float2 share = shares[y * kCell + x];
                 const float4 d_color = d_colors[y * kCell + x];
-                f = falloff_at(left + x, top + y, e.x, e.y, e.z, e.w, l22, 0.0f);
-                const float d_t1 = share.x * f.t1;
-                exponent += share.x;
-                t1 += d_t1;
-                t1_dx += d_t1 * f.dx;
+                f = falloff_at(left + x, top + y, r.u, r.v, r.l11, r.l12, r.l22, 0.0f);
+                row.add(f, share.x);
                 color[0] += share.y * d_color.x;
                 color[1] += share.y * d_color.y;
                 color[2] += share.y * d_color.z;
             }
-            // The exponent is less by t1² + t2².
-            sums.exponent += exponent;
-            sums.t1 -= 2 * t1;
-            sums.t1_dx -= 2 * t1_dx;
-            sums.t1_dy -= 2 * t1 * f.dy;
-            sums.t2 -= 2 * f.t2 * exponent;
-            sums.t2_dy -= 2 * f.t2 * exponent * f.dy;
+            sums += row.of_falloff(f);
         }
         slot[0] = sums.exponent;
         slot[1] = sums.t1;
