@@ -60,7 +60,8 @@ struct Shared {
 
 static_assert(sizeof(Shared) <= 99 * 1024, "the most that a block can have on every device");
 
-// Parts of the tile, one bit a warp, that the record may reach.
+// Parts of the tile, one bit a warp, that the record may reach. Compares without rounding to pixel centres: a
+// tile marks the slots of all records that it lists for a warp, and those decide which gaussians get zeros.
 __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
     const int x0 = max(g.x0 - left, 0) / kWarpWidth, x1 = min(g.x1 - left, kFrameTileWidth - 1) / kWarpWidth;
     const int y0 = max(g.y0 - top, 0) / kWarpHeight, y1 = min(g.y1 - top, kFrameTileHeight - 1) / kWarpHeight;
