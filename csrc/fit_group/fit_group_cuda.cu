@@ -343,14 +343,9 @@ struct Fit {
         float half_x, half_y;
         if (!(e.depth >= camera.near_depth) || !extent_of(g.opacity, e, p, half_x, half_y)) return false;
         if (!meets_image(e.u, half_x, camera.width) || !meets_image(e.v, half_y, camera.height)) return false;
-        float low_x, high_x, low_y, high_y;
-        pixel_span(e.u, half_x, camera.width, low_x, high_x);
-        pixel_span(e.v, half_y, camera.height, low_y, high_y);
-        const int x0 = max(0, static_cast<int>(ceilf(low_x))), y0 = max(0, static_cast<int>(ceilf(low_y)));
-        const int x1 = min(job.size - 1, static_cast<int>(floorf(high_x)));
-        const int y1 = min(job.size - 1, static_cast<int>(floorf(high_y)));
-        if (x0 > x1 || y0 > y1) return false;
-        set_ellipse(e, x0, x1, y0, y1, r);
+        const PixelBox<int> box = pixel_box(e, half_x, half_y, camera, job.size, job.size);
+        if (!box.holds_pixels()) return false;
+        set_ellipse(e, box, r);
         const float* sh = at(layout.value) + 11 * n + num_sh * i;
         with_degree(in.rows.sh_degree, [&](auto degree) {
             color_of_sh<float>(decltype(degree)::value, g.mean, view, sh, r.color);
@@ -369,20 +364,21 @@ struct Fit {
         }
     }
 
-    // Cells of the region at (left, top) that the record may reach, a bit each, row by row.
+    // Cells of the region at (left, top) that the record may reach, a bit each, row by row. Rounded to pixel
+    // centres, because each cell costs a slot and a place in a list.
     __device__ static CellMask cells_of(const Record<float>& r, int left, int top) {
-        const int x0 = max(r.x0 - left, 0), x1 = min(r.x1 - left, kRegion - 1);
-        const int y0 = max(r.y0 - top, 0), y1 = min(r.y1 - top, kRegion - 1);
-        if (x0 > x1 || y0 > y1) return 0;
+        const PixelBox<int> box{max(r.x0 - left, 0), min(r.x1 - left, kRegion - 1), max(r.y0 - top, 0),
+                                min(r.y1 - top, kRegion - 1)};
+        if (!box.holds_pixels()) return 0;
         const EllipseRows<float> ellipse = ellipse_rows(r.l11, r.l12, r.l22, r.log2_opacity);
         const float u = r.u - static_cast<float>(left) - 0.5f, v = r.v - static_cast<float>(top) - 0.5f;
         CellMask reached = 0;
-        for (int row = y0 / kCell; row <= y1 / kCell; ++row) {
+        for (int row = box.y0 / kCell; row <= box.y1 / kCell; ++row) {
             const float low = static_cast<float>(kCell * row) - v;
             float from, to;
             row_extent(ellipse, low, low + static_cast<float>(kCell - 1), from, to);
-            const int first = max(x0, static_cast<int>(ceilf(max_of(u + from, -1.0f))));
-            const int last = min(x1, static_cast<int>(floorf(min_of(u + to, static_cast<float>(kRegion)))));
+            const int first = max(box.x0, ceil_to_int(max_of(u + from, -1.0f)));
+            const int last = min(box.x1, floor_to_int(min_of(u + to, static_cast<float>(kRegion))));
             if (first > last) continue;
             const uint32_t columns = (2u << last / kCell) - (1u << first / kCell);
             reached |= static_cast<CellMask>(columns) << (kRegionCells * row);

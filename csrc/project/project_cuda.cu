@@ -162,14 +162,10 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in, const 
     if (!extent_of(1.0f, e, s, half_x, half_y)) return false;
     if (!(meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height))) return false;
     ++num_in_frustum;
-    float low_x, high_x, low_y, high_y;
-    pixel_span(e.u, half_x, cam.width, low_x, high_x);
-    pixel_span(e.v, half_y, cam.height, low_y, high_y);
-    const int x0 = max(0, __float2int_ru(low_x)), x1 = min(in.image.width - 1, __float2int_rd(high_x));
-    const int y0 = max(0, __float2int_ru(low_y)), y1 = min(in.image.height - 1, __float2int_rd(high_y));
-    if (x0 > x1 || y0 > y1) return false;
+    const PixelBox<int> box = pixel_box(e, half_x, half_y, cam, in.image.width, in.image.height);
+    if (!box.holds_pixels()) return false;
 
-    set_ellipse(e, x0, x1, y0, y1, r);
+    set_ellipse(e, box, r);
     if (in.model.sh_degree > 0) {
         const float4 sphere = Source::load_sphere(in.model, g);
         const float mean[3] = {sphere.x, sphere.y, sphere.z};
