@@ -1,7 +1,9 @@
 #include "base/device.h"
 
+#include <map>
 #include <mutex>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace v3dg {
@@ -33,6 +35,19 @@ unsigned num_multiprocessors() {
     check(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, current_device()),
           "cudaDeviceGetAttribute");
     return static_cast<unsigned>(count);
+}
+
+void allow_shared_memory(const void* kernel, size_t bytes, const char* name) {
+    static std::mutex mutex;
+    static std::map<std::pair<int, const void*>, size_t> allowed_bytes;
+    int device = 0;
+    check(cudaGetDevice(&device), "cudaGetDevice");
+    const std::lock_guard<std::mutex> lock(mutex);
+    size_t& allowed = allowed_bytes[{device, kernel}];
+    if (bytes <= allowed) return;
+    check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)),
+          name);
+    allowed = bytes;
 }
 
 // A pool of our own, so that how long we keep memory is nobody else's affair.

@@ -35,6 +35,12 @@ int current_device();
 // How many the current device has.
 unsigned num_multiprocessors();
 
+// Lets the kernel have `bytes` of dynamic shared memory on the current device, which has to be asked for
+// where it is more than 48 KiB with what the kernel declares. The driver's limit is one for all threads, so
+// it is only ever raised: a lower one could come between another thread's asking and its launch. `name` goes
+// into errors.
+void allow_shared_memory(const void* kernel, size_t bytes, const char* name);
+
 // Stream-ordered memory of the current device, from a pool that keeps what is given back for the next caller.
 // Throws OutOfMemory.
 void* allocate(size_t bytes, cudaStream_t stream);

@@ -2,8 +2,6 @@
 
 // Starting kernels, and what kernels need of a block and a warp.
 
-#include <mutex>
-
 #include "base/device.h"
 
 namespace v3dg {
@@ -11,20 +9,12 @@ namespace cuda {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
 
-inline std::mutex launching;
-
 // Starts `kernel` and checks that it started; `name` goes into the error. A grid of no blocks does nothing.
 template <class... P, class... A>
 void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_t shared_bytes,
             cudaStream_t stream, A&&... arguments) {
     if (grid.x == 0 || grid.y == 0 || grid.z == 0) return;
-    // More than 48 KiB has to be asked for. That holds for the kernel until somebody asks for less.
-    const std::lock_guard<std::mutex> lock(launching);
-    if (shared_bytes > 48 * 1024)
-        check(
-            cudaFuncSetAttribute(reinterpret_cast<const void*>(kernel),
-                                 cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(shared_bytes)),
-            name);
+    if (shared_bytes > 0) allow_shared_memory(reinterpret_cast<const void*>(kernel), shared_bytes, name);
     kernel<<<grid, block, shared_bytes, stream>>>(static_cast<P>(arguments)...);
     check(cudaGetLastError(), name);
 }

@@ -1,11 +1,23 @@
 #pragma once
 
-// Prefix sums: of a block's threads, and of parts that any number of blocks take in turn.
+// Prefix sums: over the lanes of a warp, over a block's threads, and over parts that any number of blocks
+// take in turn.
 
 #include "base/launch.cuh"
 
 namespace v3dg {
 namespace cuda {
+
+// Sum of x over the lanes up to and including this one, in each part of kWidth lanes; for a whole warp.
+template <unsigned kWidth = 32, class T>
+__device__ inline T warp_prefix(T x) {
+#pragma unroll
+    for (unsigned offset = 1; offset < kWidth; offset *= 2) {
+        const T below = __shfl_up_sync(kAllLanes, x, offset, kWidth);
+        if (threadIdx.x % kWidth >= offset) x += below;
+    }
+    return x;
+}
 
 // Sum of x over the threads before this one; `total` is that of all. For every thread of a block of whole
 // warps.
@@ -13,12 +25,7 @@ template <class T>
 __device__ inline T block_prefix(T x, T& total) {
     __shared__ T warp_total[32];
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    T sum = x;
-#pragma unroll
-    for (unsigned offset = 1; offset < 32; offset *= 2) {
-        const T below = __shfl_up_sync(kAllLanes, sum, offset);
-        if (lane >= offset) sum += below;
-    }
+    const T sum = warp_prefix(x);
     if (lane == 31) warp_total[warp] = sum;
     __syncthreads();
     T before = 0;

@@ -13,11 +13,11 @@
 
 #include <algorithm>
 #include <cfloat>
-#include <cstddef>
 #include <stdexcept>
 #include <type_traits>
 
-#include "base/launch.cuh"
+#include "base/scan.cuh"
+#include "frame/record.cuh"
 #include "rasterize/rasterize_math.h"
 
 namespace v3dg {
@@ -39,10 +39,6 @@ constexpr uint32_t kHiddenKey = 0xfffffffeu;  // after all depths
 constexpr uint32_t kSmallCount = 256;         // gaussians of a small group, whose picture is one region
 constexpr int kStepsPerPoll = 16;
 constexpr unsigned kLargestTeam = 16;
-
-static_assert(sizeof(Record<float>) == 48 && offsetof(Record<float>, l22) == 16 &&
-                  offsetof(Record<float>, color) == 24,
-              "loaded as whole words");
 
 // Where an array lies: in the block's shared memory, or in the team's part of the scratch.
 struct Place {
@@ -347,14 +343,9 @@ struct Fit {
         float half_x, half_y;
         if (!(e.depth >= camera.near_depth) || !extent_of(g.opacity, e, p, half_x, half_y)) return false;
         if (!meets_image(e.u, half_x, camera.width) || !meets_image(e.v, half_y, camera.height)) return false;
-        float low_x, high_x, low_y, high_y;
-        pixel_span(e.u, half_x, camera.width, low_x, high_x);
-        pixel_span(e.v, half_y, camera.height, low_y, high_y);
-        const int x0 = max(0, static_cast<int>(ceilf(low_x))), y0 = max(0, static_cast<int>(ceilf(low_y)));
-        const int x1 = min(job.size - 1, static_cast<int>(floorf(high_x)));
-        const int y1 = min(job.size - 1, static_cast<int>(floorf(high_y)));
-        if (x0 > x1 || y0 > y1) return false;
-        set_ellipse(e, x0, x1, y0, y1, r);
+        const PixelBox<int> box = pixel_box(e, half_x, half_y, camera, job.size, job.size);
+        if (!box.holds_pixels()) return false;
+        set_ellipse(e, box, r);
         const float* sh = at(layout.value) + 11 * n + num_sh * i;
         with_degree(in.rows.sh_degree, [&](auto degree) {
             color_of_sh<float>(decltype(degree)::value, g.mean, view, sh, r.color);
@@ -373,20 +364,21 @@ struct Fit {
         }
     }
 
-    // Cells of the region at (left, top) that the record may reach, a bit each, row by row.
+    // Cells of the region at (left, top) that the record may reach, a bit each, row by row. Rounded to pixel
+    // centres, because each cell costs a slot and a place in a list.
     __device__ static CellMask cells_of(const Record<float>& r, int left, int top) {
-        const int x0 = max(r.x0 - left, 0), x1 = min(r.x1 - left, kRegion - 1);
-        const int y0 = max(r.y0 - top, 0), y1 = min(r.y1 - top, kRegion - 1);
-        if (x0 > x1 || y0 > y1) return 0;
+        const PixelBox<int> box{max(r.x0 - left, 0), min(r.x1 - left, kRegion - 1), max(r.y0 - top, 0),
+                                min(r.y1 - top, kRegion - 1)};
+        if (!box.holds_pixels()) return 0;
         const EllipseRows<float> ellipse = ellipse_rows(r.l11, r.l12, r.l22, r.log2_opacity);
         const float u = r.u - static_cast<float>(left) - 0.5f, v = r.v - static_cast<float>(top) - 0.5f;
         CellMask reached = 0;
-        for (int row = y0 / kCell; row <= y1 / kCell; ++row) {
+        for (int row = box.y0 / kCell; row <= box.y1 / kCell; ++row) {
             const float low = static_cast<float>(kCell * row) - v;
             float from, to;
             row_extent(ellipse, low, low + static_cast<float>(kCell - 1), from, to);
-            const int first = max(x0, static_cast<int>(ceilf(max_of(u + from, -1.0f))));
-            const int last = min(x1, static_cast<int>(floorf(min_of(u + to, static_cast<float>(kRegion)))));
+            const int first = max(box.x0, ceil_to_int(max_of(u + from, -1.0f)));
+            const int last = min(box.x1, floor_to_int(min_of(u + to, static_cast<float>(kRegion))));
             if (first > last) continue;
             const uint32_t columns = (2u << last / kCell) - (1u << first / kCell);
             reached |= static_cast<CellMask>(columns) << (kRegionCells * row);
@@ -496,11 +488,7 @@ struct Fit {
         const uint32_t end = min(count, begin + each);
         uint32_t own = 0;
         for (uint32_t t = begin; t < end; ++t) own += __popcll(mask_at(t));
-        uint32_t upto = own;
-        for (int offset = 1; offset < 32; offset *= 2) {
-            const uint32_t left = __shfl_up_sync(kAllLanes, upto, offset);
-            if (threadIdx.x % 32 >= static_cast<unsigned>(offset)) upto += left;
-        }
+        const uint32_t upto = warp_prefix(own);
         if (threadIdx.x % 32 == 31) s.warp_total[threadIdx.x / 32] = upto;
         __syncthreads();
         uint32_t before = upto - own, total = 0;
@@ -597,7 +585,7 @@ struct Fit {
             if (entry >= end) continue;
             const auto* from = reinterpret_cast<const float4*>(ranked() + list(i / kChunk)[entry]);
             auto* to = reinterpret_cast<float4*>(staged() + i);
-            for (int k = 0; k < 3; ++k) to[k] = from[k];
+            for (int k = 0; k < kRecordVectors; ++k) to[k] = from[k];
         }
         __syncwarp();
     }
@@ -629,11 +617,10 @@ struct Fit {
         Blended out;
 #pragma unroll
         for (int q = 0; q < kAtOnce; ++q) {
-            const Record<float>& r = *records.record[q];
-            const float4 a = *reinterpret_cast<const float4*>(&r.u);
-            const float4 b = *reinterpret_cast<const float4*>(&r.l22);
-            out.alpha[q] = alpha_of(falloff_at(p.center_x, p.center_y, a.x, a.y, a.z, a.w, b.x, b.y));
-            out.color[q] = make_float3(b.z, b.w, r.color[2]);
+            const Record<float> r = load_record(records.record[q]);
+            out.alpha[q] =
+                alpha_of(falloff_at(p.center_x, p.center_y, r.u, r.v, r.l11, r.l12, r.l22, r.log2_opacity));
+            out.color[q] = make_float3(r.color[0], r.color[1], r.color[2]);
         }
         blend_weights(out.alpha, transmittance, out.before, out.weight);
         return out;
@@ -753,9 +740,8 @@ struct Fit {
     }
 
     // Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk.
-    __device__ void add_up(const Pixel& p, uint32_t i, const Record<float>& r, float* slot) const {
-        const float4 e = *reinterpret_cast<const float4*>(&r.u);
-        const float l22 = r.l22;
+    __device__ void add_up(const Pixel& p, uint32_t i, const Record<float>& record, float* slot) const {
+        const Record<float> r = load_record(&record);
         const uint32_t half = threadIdx.x % 32 / kCellPixels;
         const float2* shares = fragments() + 33 * i + half * kCellPixels;
         const float4* d_colors = d_pixels() + half * kCellPixels;
@@ -765,28 +751,19 @@ struct Fit {
         float color[3] = {0, 0, 0};
 #pragma unroll
         for (int y = 0; y < kCell; ++y) {
-            float exponent = 0, t1 = 0, t1_dx = 0;
+            RowSums<float> row{};
             Falloff<float> f;
 #pragma unroll
             for (int x = 0; x < kCell; ++x) {
                 const float2 share = shares[y * kCell + x];
                 const float4 d_color = d_colors[y * kCell + x];
-                f = falloff_at(left + x, top + y, e.x, e.y, e.z, e.w, l22, 0.0f);
-                const float d_t1 = share.x * f.t1;
-                exponent += share.x;
-                t1 += d_t1;
-                t1_dx += d_t1 * f.dx;
+                f = falloff_at(left + x, top + y, r.u, r.v, r.l11, r.l12, r.l22, 0.0f);
+                row.add(f, share.x);
                 color[0] += share.y * d_color.x;
                 color[1] += share.y * d_color.y;
                 color[2] += share.y * d_color.z;
             }
-            // The exponent is less by t1² + t2².
-            sums.exponent += exponent;
-            sums.t1 -= 2 * t1;
-            sums.t1_dx -= 2 * t1_dx;
-            sums.t1_dy -= 2 * t1 * f.dy;
-            sums.t2 -= 2 * f.t2 * exponent;
-            sums.t2_dy -= 2 * f.t2 * exponent * f.dy;
+            sums += row.of_falloff(f);
         }
         slot[0] = sums.exponent;
         slot[1] = sums.t1;

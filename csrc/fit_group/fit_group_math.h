@@ -32,15 +32,8 @@ V3DG_HD V3DG_INLINE void multiply(const double a[9], const double b[9], double o
 V3DG_HD V3DG_INLINE void random_rotation(double u0, double u1, double u2, double r[9]) {
     const double a = sqrt_of(1 - u0), b = sqrt_of(u0), s = 2 * kPi * u1, t = 2 * kPi * u2;
     const double x = a * ::sin(s), y = a * ::cos(s), z = b * ::sin(t), w = b * ::cos(t);
-    r[0] = 1 - 2 * (y * y + z * z);
-    r[1] = 2 * (x * y - w * z);
-    r[2] = 2 * (x * z + w * y);
-    r[3] = 2 * (x * y + w * z);
-    r[4] = 1 - 2 * (x * x + z * z);
-    r[5] = 2 * (y * z - w * x);
-    r[6] = 2 * (x * z - w * y);
-    r[7] = 2 * (y * z + w * x);
-    r[8] = 1 - 2 * (x * x + y * y);
+    const double quat[4] = {w, x, y, z};
+    rotation_of_quat(quat, 2.0, r);  // its length is 1
 }
 
 // View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random, and those held out,

@@ -49,6 +49,12 @@ struct ItemList {
     DrawItem* items;
     FrameCounters* counters;
     unsigned long long item_capacity, record_capacity;
+
+    V3DG_HD bool has_room_for(unsigned long long num_items, unsigned long long num_gaussians) const {
+        return Capacity{item_capacity, record_capacity, 0, 0}.holds_items(num_items, num_gaussians);
+    }
+    // For all that its writer has counted.
+    V3DG_HD bool is_complete() const { return has_room_for(counters->items, counters->gaussians); }
 };
 
 }  // namespace cuda

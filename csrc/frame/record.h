@@ -20,7 +20,7 @@ struct Record {
 
 // Sets all of a record but its colour.
 template <class T>
-V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, int x0, int x1, int y0, int y1, Record<T>& r) {
+V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& box, Record<T>& r) {
     r.u = e.u;
     r.v = e.v;
     r.l11 = e.l11;
@@ -28,10 +28,10 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, int x0, int x1, int y0
     r.l22 = e.l22;
     r.log2_opacity = e.log2_opacity;
     r.depth = e.depth;
-    r.x0 = static_cast<uint16_t>(x0);
-    r.x1 = static_cast<uint16_t>(x1);
-    r.y0 = static_cast<uint16_t>(y0);
-    r.y1 = static_cast<uint16_t>(y1);
+    r.x0 = static_cast<uint16_t>(box.x0);
+    r.x1 = static_cast<uint16_t>(box.x1);
+    r.y0 = static_cast<uint16_t>(box.y0);
+    r.y1 = static_cast<uint16_t>(box.y1);
 }
 
 // An entry of a tile's list on the CPU holds a record's place in its low half and the bits of its float32

@@ -78,8 +78,8 @@ struct FrameLists {
     const unsigned long long* tile_first;  // [num_tiles + 1] into entries
     TileEntry *entries, *scratch;          // each tile's in any order
     const FrameCounters* counters;
-    unsigned long long record_capacity, entry_capacity;  // records: at most kMostFrameRecords
-    TilePlan* plans;                                     // [num_tiles] scratch
+    Capacity capacity;  // at most kMostFrameRecords records
+    TilePlan* plans;    // [num_tiles] scratch
 };
 
 // A record over more tiles than this is looked at row by row of tiles.
@@ -137,7 +137,6 @@ struct ItemTiles {
 // What project() has found out of the tiles, and scratch of tile_bin(). Cleared before project().
 struct TileCounts {
     uint32_t* count;  // [num_tiles] of the records over at most kFewTiles; zero after tile_bin()
-    unsigned long long* num_large;  // whole batches
     unsigned* ticket;
     unsigned long long* state;  // [tile_bin_parts(num_tiles)]
 };

@@ -15,6 +15,14 @@ struct Ellipse {
     V depth;
 };
 
+// The first and the last pixel in x and in y that something covers; none where a first lies after its last.
+template <class I>
+struct PixelBox {
+    I x0, x1, y0, y1;
+
+    V3DG_HD V3DG_INLINE auto holds_pixels() const { return (x0 <= x1) & (y0 <= y1); }
+};
+
 // An ellipse |L d|² = reach as a row of pixels meets it.
 template <class V>
 struct EllipseRows {
@@ -37,16 +45,19 @@ V3DG_HD V3DG_INLINE EllipseRows<V> ellipse_rows(V l11, V l12, V l22, V log2_opac
     return e;
 }
 
-// Where the ellipse may lie between the heights y0 <= y1: from x0 to x1, all from its centre. A hair more, so
-// that the blend step alone decides. Means nothing where the ellipse's box does not meet the heights.
+// Where the ellipse may lie between the heights y0 <= y1: from x0 to x1, all from its centre, with a margin,
+// so that the blend step alone decides. Means nothing where the ellipse's box does not meet the heights.
+//
+// From this, four places find the cells of a grid that a gaussian may reach. They round differently on
+// purpose: each says why.
 template <class V>
 V3DG_HD V3DG_INLINE void row_extent(const EllipseRows<V>& e, V y0, V y1, V& x0, V& x1) {
     const V a = min_of(max_of(e.rightmost, y0), y1), b = min_of(max_of(-e.rightmost, y0), y1);
     const V half_a = sqrt_of(max_of(e.reach - e.l22 * e.l22 * a * a, V{})) * e.inverse;
     const V half_b = sqrt_of(max_of(e.reach - e.l22 * e.l22 * b * b, V{})) * e.inverse;
-    const V hair = Lane<V>(1e-2) + Lane<V>(1e-3) * (half_a + half_b);
-    x0 = e.slope * b - half_b - hair;
-    x1 = e.slope * a + half_a + hair;
+    const V margin = Lane<V>(1e-2) + Lane<V>(1e-3) * (half_a + half_b);
+    x0 = e.slope * b - half_b - margin;
+    x1 = e.slope * a + half_a + margin;
 }
 
 }  // namespace v3dg

@@ -29,7 +29,22 @@ V3DG_HD inline float abs_of(float x) { return ::fabsf(x); }
 V3DG_HD inline double abs_of(double x) { return ::fabs(x); }
 V3DG_HD inline float round_of(float x) { return ::rintf(x); }
 V3DG_HD inline double round_of(double x) { return ::rint(x); }
-// As many bits as a hair of margin needs, for normal x: relative error below 1e-6.
+// Rounded up or down to an integer.
+V3DG_HD inline int ceil_to_int(float x) {
+#ifdef __CUDA_ARCH__
+    return __float2int_ru(x);
+#else
+    return static_cast<int>(::ceilf(x));
+#endif
+}
+V3DG_HD inline int floor_to_int(float x) {
+#ifdef __CUDA_ARCH__
+    return __float2int_rd(x);
+#else
+    return static_cast<int>(::floorf(x));
+#endif
+}
+// Exact enough to find a margin by, for normal x: relative error below 1e-6.
 V3DG_HD inline float rough_reciprocal(float x) {
 #ifdef __CUDA_ARCH__
     return __fdividef(1.0f, x);
@@ -189,6 +204,21 @@ V3DG_INLINE Vec<float> log2_of(Vec<float> x) {
 V3DG_INLINE Vec<double> log2_of(Vec<double> x) {
     for (int i = 0; i < kLanes<double>; ++i) x[i] = ::log2(x[i]);
     return x;
+}
+
+template <class V>
+V3DG_INLINE auto to_int(V x) {
+    return __builtin_convertvector(x, decltype(x < x));
+}
+template <class V>
+V3DG_INLINE auto floor_to_int(V x) {
+    const auto i = to_int(x);
+    return i + (x < __builtin_convertvector(i, V));  // a comparison that holds is -1
+}
+template <class V>
+V3DG_INLINE auto ceil_to_int(V x) {
+    const auto i = to_int(x);
+    return i - (x > __builtin_convertvector(i, V));
 }
 
 V3DG_INLINE float sum_of(Vec<float> x) {

@@ -6,11 +6,9 @@
 
 namespace v3dg {
 
-// Rotation matrix, row major, of the normalised quaternion. A zero quaternion gives the identity.
+// Rotation matrix, row major, of a quaternion of which 2 over its squared length is `s`.
 template <class V>
-V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
-    const V n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-    const V s = n2 > V{} ? 2 / n2 : V{};
+V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V s, V r[9]) {
     const V w = q[0], x = q[1], y = q[2], z = q[3];
     r[0] = 1 - s * (y * y + z * z);
     r[1] = s * (x * y - w * z);
@@ -21,6 +19,14 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
     r[6] = s * (x * z - w * y);
     r[7] = s * (y * z + w * x);
     r[8] = 1 - s * (x * x + y * y);
+}
+
+// That of the normalised quaternion. A zero quaternion gives the identity.
+template <class V>
+V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
+    const V n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+    const V s = n2 > V{} ? 2 / n2 : V{};
+    rotation_of_quat(q, s, r);
 }
 
 // Gradient of the quaternion, through its normalisation, from that of the rotation matrix.

@@ -45,7 +45,8 @@ void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTa
             V3DG_DISPATCH_ISA(fit_group, config, groups[g], target, images.data() + i * num_pictures, rows,
                               error + 2 * g, progress.cancel);
             double sum = progress.loss_sum.load();
-            const double loss = config.loss.l1 * error[2 * g] + config.loss.alpha * error[2 * g + 1];
+            const double own_error[2] = {error[2 * g], error[2 * g + 1]};
+            const double loss = residual_loss(config.loss, own_error);
             while (!progress.loss_sum.compare_exchange_weak(sum, sum + loss)) {
             }
             ++progress.groups_done;

@@ -66,7 +66,7 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items, un
         t.images[blockIdx.x] = image;
         t.placements[blockIdx.x] = {view_of_world(t.config, job.group, view), 0, blockIdx.x};
     }
-    if (num_items > items.item_capacity || num_records > items.record_capacity) return;
+    if (!items.has_room_for(num_items, num_records)) return;
     const uint32_t count = static_cast<uint32_t>(job.group.target_count);
     for (uint32_t i = threadIdx.x; i * kItemSize < count; i += blockDim.x) {
         const uint32_t first = i * kItemSize;

@@ -12,7 +12,6 @@ namespace cuda {
 // What a frame counts, cleared before it and copied to the host after it.
 struct Frame::State {
     FrameCounters counters;
-    unsigned long long num_large;
     unsigned long long ticket;
 };
 
@@ -75,16 +74,16 @@ void Frame::enlarge(const State& s) {
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(s.counters.gaussians));
     // Some more, so that a camera on its way does not need a little more every frame.
-    const auto grow = [](size_t& capacity, unsigned long long count) {
-        if (count > capacity) capacity = static_cast<size_t>(count + count / 8);
+    const auto grow = [](unsigned long long& capacity, unsigned long long count) {
+        if (count > capacity) capacity = count + count / 8;
     };
     // What was not projected has no entries yet; most scenes have one or two a gaussian.
     if (s.counters.gaussians > capacity_.records) grow(capacity_.entries, s.counters.gaussians);
     grow(capacity_.items, s.counters.items);
     grow(capacity_.records, s.counters.gaussians);
-    grow(capacity_.large, s.num_large);
+    grow(capacity_.large, s.counters.large);
     grow(capacity_.entries, s.counters.entries);
-    capacity_.records = std::min<size_t>(capacity_.records, kMostFrameRecords);
+    capacity_.records = std::min(capacity_.records, kMostFrameRecords);
     if (was_captured_) return;
     // The largest buffers go before larger ones come, and not into the pool: pieces of the old size are of no
     // use.
@@ -124,7 +123,7 @@ void Frame::enqueue(Drawing& drawing) {
     unsigned char* cleared = room(cleared_, cleared_bytes, drawing);
     State* state = reinterpret_cast<State*>(cleared);
     auto* scan_state = reinterpret_cast<unsigned long long*>(cleared + sizeof(State));
-    const TileCounts tiles{reinterpret_cast<uint32_t*>(scan_state + parts), &state->num_large,
+    const TileCounts tiles{reinterpret_cast<uint32_t*>(scan_state + parts),
                            reinterpret_cast<unsigned*>(&state->ticket), scan_state};
     const ItemList items{room(items_, capacity.items, drawing), &state->counters, capacity.items,
                          capacity.records};
@@ -147,20 +146,14 @@ void Frame::enqueue(Drawing& drawing) {
     if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
     project({batch.models, batch.packed, batch.placements, batch.images, items, batch.has_shared_items},
             {records, few, item_records, item_tiles, source, tiles, large, capacity.large}, stream);
-    tile_bin({item_tiles, few, records, batch.images, batch.num_images, batch.num_tiles, capacity.items,
-              capacity.records, capacity.large, capacity.entries, large, tiles, &state->counters},
+    tile_bin({item_tiles, few, records, batch.images, batch.num_images, batch.num_tiles, capacity, large,
+              tiles, &state->counters},
              bins, stream);
-    const FrameLists lists{batch.images,
-                           bins.image_of_tile,
-                           batch.num_tiles,
-                           records,
-                           bins.tile_first,
-                           entries,
-                           scratch,
-                           &state->counters,
-                           capacity.records,
-                           capacity.entries,
-                           room(plans_, batch.num_tiles, drawing)};
+    const FrameLists lists{batch.images,    bins.image_of_tile,
+                           batch.num_tiles, records,
+                           bins.tile_first, entries,
+                           scratch,         &state->counters,
+                           capacity,        room(plans_, batch.num_tiles, drawing)};
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
     const auto report = [&] {
@@ -189,8 +182,7 @@ FrameTape Frame::tape() const {
                            entries_.data(),
                            nullptr,
                            &reinterpret_cast<const State*>(cleared_.data())->counters,
-                           capacity_.records,
-                           capacity_.entries,
+                           capacity_,
                            plans_.data()};
     return {lists,
             {order_.data(), blended_.data()},
@@ -211,11 +203,7 @@ Drawing::~Drawing() {
     if (slot_ != nullptr && !is_captured_) frame_.free_slots_.push_back(slot_);
 }
 
-bool Drawing::was_drawn() const {
-    const Frame::State& s = *slot_->state;
-    return s.counters.items <= capacity_.items && s.counters.gaussians <= capacity_.records &&
-           s.num_large <= capacity_.large && s.counters.entries <= capacity_.entries;
-}
+bool Drawing::was_drawn() const { return capacity_.holds(slot_->state->counters); }
 
 void Drawing::wait() const {
     if (!is_captured_) check(cudaEventSynchronize(slot_->done), "a frame");

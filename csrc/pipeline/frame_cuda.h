@@ -71,11 +71,6 @@ class Frame {
     friend class Drawing;
     struct Slot;
     struct State;
-    // Elements that the buffers have room for.
-    struct Capacity {
-        size_t items = 64, records = 4096, large = 4096, entries = 4096;
-    };
-
     void enqueue(Drawing& drawing);
     void enlarge(const State& state);
     Slot* take_slot(bool capturing);
@@ -83,7 +78,7 @@ class Frame {
     T* room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing);
 
     const Keeps keeps_;
-    Capacity capacity_;
+    Capacity capacity_{64, 4096, 4096, 4096};
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
     DeviceBuffer<Record<float>> records_;
@@ -135,7 +130,7 @@ class Drawing {
     Frame::Prepare prepare_;
     cudaStream_t stream_;
     Frame::Slot* slot_ = nullptr;
-    Frame::Capacity capacity_;  // that it was drawn with
+    Capacity capacity_{};  // that it was drawn with
     bool is_captured_ = false, is_settled_ = false;
 };
 

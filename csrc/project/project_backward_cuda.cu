@@ -3,7 +3,7 @@
 
 #include <type_traits>
 
-#include "base/launch.cuh"
+#include "base/scan.cuh"
 #include "project/project_backward.h"
 #include "project/project_math.h"
 
@@ -59,8 +59,8 @@ __device__ bool sum_of_slots(const GradientSlots& slots, uint32_t first, uint32_
 
 __global__ void place_slots_kernel(ItemList items, const uint32_t* item_records, const Record<float>* records,
                                    uint32_t* first_slot) {
+    if (!items.is_complete()) return;
     const unsigned long long num_items = items.counters->items;
-    if (num_items > items.item_capacity || items.counters->gaussians > items.record_capacity) return;
     __shared__ uint32_t sum_of_warp[kThreads / 32];
     __shared__ uint32_t first_of_item;
     const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
@@ -68,11 +68,7 @@ __global__ void place_slots_kernel(ItemList items, const uint32_t* item_records,
         const uint32_t record = items.items[i].record + threadIdx.x;
         const bool is_record = threadIdx.x < item_records[i];
         const uint32_t num = is_record ? num_slots_of(records[record]) : 0;
-        uint32_t end = num;
-        for (int offset = 1; offset < 32; offset *= 2) {
-            const uint32_t before = __shfl_up_sync(kAllLanes, end, offset);
-            if (lane >= offset) end += before;
-        }
+        const uint32_t end = warp_prefix(num);
         if (lane == 31) sum_of_warp[warp] = end;
         __syncthreads();
         if (threadIdx.x == 0) {

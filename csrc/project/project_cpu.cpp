@@ -15,21 +15,6 @@ static V3DG_INLINE Gaussian3d<Vec<T>> load_gaussians(const GaussianPlanes<T>& m,
     return g;
 }
 
-template <class V>
-static V3DG_INLINE auto to_int(V x) {
-    return __builtin_convertvector(x, decltype(x < x));
-}
-template <class V>
-static V3DG_INLINE auto floor_to_int(V x) {
-    const auto i = to_int(x);
-    return i + (x < __builtin_convertvector(i, V));  // a comparison that holds is -1
-}
-template <class V>
-static V3DG_INLINE auto ceil_to_int(V x) {
-    const auto i = to_int(x);
-    return i - (x > __builtin_convertvector(i, V));
-}
-
 // Tiles that the pixels from `first` to `last` lie in, along one axis.
 template <class I>
 static V3DG_INLINE I tiles_of(I first, I last) {
@@ -44,7 +29,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
     using I = decltype(V{} < V{});
     constexpr int kWidth = kLanes<T>;
     const GaussianPlanes<T>& model = *draw.model;
-    const int last_x = static_cast<int>(camera.width) - 1, last_y = static_cast<int>(camera.height) - 1;
+    const int width = static_cast<int>(camera.width), height = static_cast<int>(camera.height);
     I top = I{} + INT_MAX, bottom = I{} - 1, pairs = I{};
     size_t num_records = 0;
     for (uint64_t done = 0; done < count; done += kWidth) {
@@ -67,23 +52,20 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         reach.in_frustum += __builtin_popcount(meets_bits);
         if (meets_bits == 0) continue;
 
-        V low_x, high_x, low_y, high_y;
-        pixel_span(e.u, half_x, camera.width, low_x, high_x);
-        pixel_span(e.v, half_y, camera.height, low_y, high_y);
-        I x0 = max_of(ceil_to_int(low_x), I{}), x1 = min_of(floor_to_int(high_x), I{} + last_x);
-        I y0 = max_of(ceil_to_int(low_y), I{}), y1 = min_of(floor_to_int(high_y), I{} + last_y);
-        const auto drawn = meets & (x0 <= x1) & (y0 <= y1);
+        PixelBox<I> box = pixel_box(e, half_x, half_y, camera, width, height);
+        const auto drawn = meets & box.holds_pixels();
         const unsigned drawn_bits = bits_of(drawn) & lanes;
         reach.drawn += __builtin_popcount(drawn_bits);
-        top = min_of(top, drawn ? y0 : top);
-        bottom = max_of(bottom, drawn ? y1 : bottom);
-        // Of what is not drawn, the product could overflow.
-        const I columns = drawn ? tiles_of(x0, x1) : I{}, rows = drawn ? tiles_of(y0, y1) : I{};
+        top = min_of(top, drawn ? box.y0 : top);
+        bottom = max_of(bottom, drawn ? box.y1 : bottom);
+        // The boxes of gaussians that are not drawn may be so large that the product overflows.
+        const I columns = drawn ? tiles_of(box.x0, box.x1) : I{},
+                rows = drawn ? tiles_of(box.y0, box.y1) : I{};
         pairs += columns * rows;
 
-        x0 = max_of(x0, I{} + window.x0), x1 = min_of(x1, I{} + (window.x1 - 1));
-        y0 = max_of(y0, I{} + window.y0), y1 = min_of(y1, I{} + (window.y1 - 1));
-        unsigned kept = drawn_bits & bits_of((x0 <= x1) & (y0 <= y1));
+        box.x0 = max_of(box.x0, I{} + window.x0), box.x1 = min_of(box.x1, I{} + (window.x1 - 1));
+        box.y0 = max_of(box.y0, I{} + window.y0), box.y1 = min_of(box.y1, I{} + (window.y1 - 1));
+        unsigned kept = drawn_bits & bits_of(box.holds_pixels());
         if (kept == 0) continue;
 
         V sh[3 * kMaxShBases], color[3];
@@ -97,8 +79,10 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
             Record<T>& r = records[num_records];
             const Ellipse<T> mine{e.u[i],    e.v[i], e.l11[i], e.l12[i], e.l22[i], e.log2_opacity[i],
                                   e.depth[i]};
-            set_ellipse(mine, static_cast<int>(x0[i]), static_cast<int>(x1[i]), static_cast<int>(y0[i]),
-                        static_cast<int>(y1[i]), r);
+            set_ellipse(mine,
+                        PixelBox<int>{static_cast<int>(box.x0[i]), static_cast<int>(box.x1[i]),
+                                      static_cast<int>(box.y0[i]), static_cast<int>(box.y1[i])},
+                        r);
             for (int c = 0; c < 3; ++c) r.color[c] = color[c][i];
             if (source != nullptr) source[num_records] = source_base + static_cast<uint32_t>(done) + i;
             ++num_records;

@@ -10,6 +10,7 @@
 
 #include "base/launch.cuh"
 #include "frame/count_tile.cuh"
+#include "frame/record.cuh"
 #include "project/project_math.h"
 
 namespace v3dg {
@@ -42,9 +43,9 @@ template <class Model>
 struct WarpSpace {
     ItemTables<Model> tables;
     alignas(16) Queued queue[kQueue];
-    uint4 records[3 * 32];     // on their way out: written by lane, read in a row
-    unsigned num_large;        // of the item's records so far,
-    uint8_t large[kItemSize];  // and which they are
+    float4 records[kRecordVectors * 32];  // on their way out: written by lane, read in a row
+    unsigned num_large;                   // of the item's records so far,
+    uint8_t large[kItemSize];             // and which they are
 };
 
 __device__ float4 load4(const float* rows, uint32_t row) {
@@ -161,14 +162,10 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in, const 
     if (!extent_of(1.0f, e, s, half_x, half_y)) return false;
     if (!(meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height))) return false;
     ++num_in_frustum;
-    float low_x, high_x, low_y, high_y;
-    pixel_span(e.u, half_x, cam.width, low_x, high_x);
-    pixel_span(e.v, half_y, cam.height, low_y, high_y);
-    const int x0 = max(0, __float2int_ru(low_x)), x1 = min(in.image.width - 1, __float2int_rd(high_x));
-    const int y0 = max(0, __float2int_ru(low_y)), y1 = min(in.image.height - 1, __float2int_rd(high_y));
-    if (x0 > x1 || y0 > y1) return false;
+    const PixelBox<int> box = pixel_box(e, half_x, half_y, cam, in.image.width, in.image.height);
+    if (!box.holds_pixels()) return false;
 
-    set_ellipse(e, x0, x1, y0, y1, r);
+    set_ellipse(e, box, r);
     if (in.model.sh_degree > 0) {
         const float4 sphere = Source::load_sphere(in.model, g);
         const float mean[3] = {sphere.x, sphere.y, sphere.z};
@@ -194,15 +191,6 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
-__device__ void put_record(const Record<float>& r, uint4* to) {
-    to[0] = {__float_as_uint(r.u), __float_as_uint(r.v), __float_as_uint(r.l11), __float_as_uint(r.l12)};
-    to[1] = {__float_as_uint(r.l22), __float_as_uint(r.log2_opacity), __float_as_uint(r.color[0]),
-             __float_as_uint(r.color[1])};
-    to[2] = {__float_as_uint(r.color[2]), __float_as_uint(r.depth), r.x0 | uint32_t(r.x1) << 16,
-             r.y0 | uint32_t(r.y1) << 16};
-}
-static_assert(sizeof(Record<float>) == 3 * sizeof(uint4), "written as whole words");
-
 // Writes the records of up to 32 queued gaussians, in their order, and counts them into tiles. Returns how
 // many there are. `sharers` are the placements of a shared item.
 template <class Source, bool kIsShared>
@@ -226,7 +214,7 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
     TileBox tiles{0, 0, 1, 0};
     bool is_large = false;
     if (reaches_pixel) {
-        put_record(r, space.records + 3 * rank);
+        store_record(r, space.records + kRecordVectors * rank);
         const EntryBox box = entry_box(r);
         tiles = tile_box(box);
         is_large = tiles.count > kFewTiles;
@@ -245,11 +233,11 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
         if (lane == 0) space.num_large = before + __popc(large);
     }
     __syncwarp();
-    uint4* records = reinterpret_cast<uint4*>(out.records + first);
-    const unsigned num_words = 3 * __popc(kept);
+    float4* vectors = reinterpret_cast<float4*>(out.records + first);
+    const unsigned num_vectors = kRecordVectors * __popc(kept);
 #pragma unroll
-    for (unsigned w = lane; w < 96; w += 32)
-        if (w < num_words) records[w] = space.records[w];
+    for (unsigned w = lane; w < kRecordVectors * 32; w += 32)
+        if (w < num_vectors) vectors[w] = space.records[w];
     for (unsigned k = 0; __any_sync(kAllLanes, k < tiles.count); ++k)
         count_tile(out.tiles.count,
                    k < tiles.count
@@ -260,12 +248,13 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
 
 // The item's large records, in whole batches.
 template <class Model>
-__device__ void write_large(const WarpSpace<Model>& space, const ProjectOutput& out) {
+__device__ void write_large(const WarpSpace<Model>& space, FrameCounters& counters,
+                            const ProjectOutput& out) {
     const unsigned num_large = space.num_large;
     if (num_large == 0) return;
     const unsigned lane = threadIdx.x % 32, count = blocks_for(num_large, kLargeAtOnce) * kLargeAtOnce;
     unsigned long long place = 0;
-    if (lane == 0) place = atomicAdd(out.tiles.num_large, static_cast<unsigned long long>(count));
+    if (lane == 0) place = atomicAdd(&counters.large, static_cast<unsigned long long>(count));
     place = __shfl_sync(kAllLanes, place, 0);
     for (unsigned k = lane; k < count && place + k < out.large_capacity; k += 32)
         out.large[place + k] = {k < num_large ? space.tables.item.record + space.large[k] : kNoRecord,
@@ -300,7 +289,8 @@ __device__ void store_tables(ItemTables<Model>& tables, uint32_t item_word, uint
 // The item whose tables are there. Returns how many records it has.
 template <class Source, bool kIsShared>
 __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const Placement* sharers,
-                                 const ProjectOutput& out, unsigned& num_in_frustum) {
+                                 FrameCounters& counters, const ProjectOutput& out,
+                                 unsigned& num_in_frustum) {
     constexpr unsigned kRound = kIsShared ? 1 : 32;  // gaussians
     const auto& tables = space.tables;
     const unsigned lane = threadIdx.x % 32, count = tables.item.count;
@@ -350,7 +340,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         waiting -= taken;
         __syncwarp();  // before the queue and the records are written again
     }
-    write_large(space, out);
+    write_large(space, counters, out);
     return written;
 }
 
@@ -370,14 +360,10 @@ __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum, 
     atomicAdd(&counters.records, static_cast<unsigned long long>(num_records));
 }
 
-__device__ bool have_room(const ItemList& items) {
-    return items.counters->items <= items.item_capacity && items.counters->gaussians <= items.record_capacity;
-}
-
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out) {
-    if (!have_room(in.items)) return;
+    if (!in.items.is_complete()) return;
     __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
     WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
     const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
@@ -401,7 +387,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         __syncwarp();
         store_tables(space.tables, this_item_word, this_placement_word, in, models, loaded);
         if (space.tables.item.sharers != 0) continue;
-        const unsigned written = project_item<Source, false>(space, nullptr, out, num_in_frustum);
+        const unsigned written =
+            project_item<Source, false>(space, nullptr, *in.items.counters, out, num_in_frustum);
         num_records += written;
         report_item(space.tables, i, written, out);
     }
@@ -412,7 +399,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_shared_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out) {
-    if (!have_room(in.items)) return;
+    if (!in.items.is_complete()) return;
     __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
     WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
     const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
@@ -428,7 +415,8 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
             __syncwarp();
             store_tables(space.tables, load_word(item), load_word(sharers[__ffs(item.sharers) - 1]), in,
                          models, loaded);
-            const unsigned written = project_item<Source, true>(space, sharers, out, num_in_frustum);
+            const unsigned written =
+                project_item<Source, true>(space, sharers, *in.items.counters, out, num_in_frustum);
             num_records += written;
             report_item(space.tables, i, written, out);
         }

@@ -12,7 +12,7 @@ struct ProjectInput {
     const PackedPlanes* packed;  // read in place of `models` where it is not null
     const Placement* placements;
     const FrameImage* images;
-    ItemList items;         // in the counters: sets in_frustum and records, which start at 0
+    ItemList items;         // in the counters: sets in_frustum, records and large, which start at 0
     bool has_shared_items;  // whether there may be any
 };
 

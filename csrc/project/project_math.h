@@ -133,7 +133,7 @@ V3DG_HD V3DG_INLINE T sphere_of_image(T reach_px, T inv_z, T slope_x, T slope_y,
                    T(kReachSigmas * kReachSigmas) * filter_px2);
 }
 
-// Whether there is no pixel centre within `half` of `center` on one axis, with the hair of pixel_span().
+// Whether there is no pixel centre within `half` of `center` on one axis, with the margin of pixel_span().
 template <class T>
 V3DG_HD V3DG_INLINE bool misses_centers(T center, T half) {
     const T from_center = center - T(0.5);
@@ -146,14 +146,26 @@ V3DG_HD V3DG_INLINE auto meets_image(V center, V half, Lane<V> size) {
     return (center + half > V{}) & (center - half < all_lanes<V>(size));
 }
 
-// The pixels from ceil(low) to floor(high) have their centres within `half` of `center`, or a hair farther,
-// so that the blend step alone decides. From -1 or 0 to size - 1 or size.
+// The pixels from ceil(low) to floor(high) have their centres within `half` of `center`, or within a margin
+// of that, so that the blend step alone decides. From -1 or 0 to size - 1 or size.
 template <class V>
 V3DG_HD V3DG_INLINE void pixel_span(V center, V half, Lane<V> size, V& low, V& high) {
     using T = Lane<V>;
-    const V hair = half * T(1e-5) + T(2e-3);
-    low = max_of(all_lanes<V>(T(-1)), center - half - hair - T(0.5));
-    high = min_of(all_lanes<V>(size), center + half + hair - T(0.5));
+    const V margin = half * T(1e-5) + T(2e-3);
+    low = max_of(all_lanes<V>(T(-1)), center - half - margin - T(0.5));
+    high = min_of(all_lanes<V>(size), center + half + margin - T(0.5));
+}
+
+// The pixels of an image of width x height whose centres lie in the box of an ellipse of this extent.
+template <class V>
+V3DG_HD V3DG_INLINE auto pixel_box(const Ellipse<V>& e, V half_x, V half_y, const Pinhole<Lane<V>>& camera,
+                                   int width, int height) {
+    V low_x, high_x, low_y, high_y;
+    pixel_span(e.u, half_x, camera.width, low_x, high_x);
+    pixel_span(e.v, half_y, camera.height, low_y, high_y);
+    using I = decltype(ceil_to_int(low_x));
+    return PixelBox<I>{max_of(ceil_to_int(low_x), I{}), min_of(floor_to_int(high_x), I{} + (width - 1)),
+                       max_of(ceil_to_int(low_y), I{}), min_of(floor_to_int(high_y), I{} + (height - 1))};
 }
 
 // Gradients of the gaussian's mean, quaternion, scales and opacity from those of its ellipse.

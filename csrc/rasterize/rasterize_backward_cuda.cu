@@ -7,7 +7,7 @@
 
 #include <cmath>
 
-#include "base/launch.cuh"
+#include "base/scan.cuh"
 #include "rasterize/rasterize_backward.h"
 #include "rasterize/rasterize_math.h"
 
@@ -60,7 +60,8 @@ struct Shared {
 
 static_assert(sizeof(Shared) <= 99 * 1024, "the most that a block can have on every device");
 
-// Parts of the tile, one bit a warp, that the record may reach.
+// Parts of the tile, one bit a warp, that the record may reach. Compares without rounding to pixel centres: a
+// tile marks the slots of all records that it lists for a warp, and those decide which gaussians get zeros.
 __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
     const int x0 = max(g.x0 - left, 0) / kWarpWidth, x1 = min(g.x1 - left, kFrameTileWidth - 1) / kWarpWidth;
     const int y0 = max(g.y0 - top, 0) / kWarpHeight, y1 = min(g.y1 - top, kFrameTileHeight - 1) / kWarpHeight;
@@ -120,31 +121,21 @@ __device__ void add_up(Shared& s, Batch& batch, int warp, int held, int entry, f
     const float u = g.u - left, v = g.v - top, l11 = g.l11, l12 = g.l12, l22 = g.l22;
     const Share* shares = &s.share[warp][gaussian * kShareStride + kWarpWidth * row];
     const float4* d_colors = s.d_color[warp][row];
-    float sum = 0, sum_t1 = 0, sum_t1_dx = 0, color[3] = {0, 0, 0}, depth = 0;
+    RowSums<float> sums{};
+    float color[3] = {0, 0, 0}, depth = 0;
     Falloff<float> f;
 #pragma unroll
     for (int i = 0; i < kWarpWidth; ++i) {
         const Share share = shares[i];
         const float4 d_color = d_colors[i];
         f = falloff_at(float(i), float(row), u, v, l11, l12, l22, 0.0f);
-        const float d_t1 = share.d_exponent * f.t1;
-        sum += share.d_exponent;
-        sum_t1 += d_t1;
-        sum_t1_dx += d_t1 * f.dx;
+        sums.add(f, share.d_exponent);
         color[0] += d_color.x * share.weight;
         color[1] += d_color.y * share.weight;
         color[2] += d_color.z * share.weight;
         if (kWithDepth) depth += d_color.w * share.weight;
     }
-    // The exponent is less by t1² + t2².
-    FalloffSums<float> sums;
-    sums.exponent = sum;
-    sums.t1 = -2 * sum_t1;
-    sums.t1_dx = -2 * sum_t1_dx;
-    sums.t1_dy = sums.t1 * f.dy;
-    sums.t2 = -2 * f.t2 * sum;
-    sums.t2_dy = sums.t2 * f.dy;
-    const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums);
+    const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums.of_falloff(f));
 
     // Over the rows, in the place of the shares: lane l adds up the values l / kHeld, l / kHeld + 4, ...
     const float value[kValues] = {d.u,   d.v,      d.l11,    d.l12,   d.l22, d.log2_opacity,
@@ -284,11 +275,7 @@ __global__ void __launch_bounds__(kThreads, 2)
             }
             s.warps[i] = warps;
             batch.took_part[i] = 0;
-            end_pair = __popc(warps);
-            for (int offset = 1; offset < 32; offset *= 2) {
-                const uint32_t other = __shfl_up_sync(kAllLanes, end_pair, offset);
-                if (lane >= offset) end_pair += other;
-            }
+            end_pair = warp_prefix<32, uint32_t>(__popc(warps));
             if (lane == 31) s.pairs_of_warp[warp] = end_pair;
         }
         if (!goes_on) break;

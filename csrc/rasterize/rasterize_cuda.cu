@@ -11,7 +11,8 @@
 
 #include <algorithm>
 
-#include "base/launch.cuh"
+#include "base/scan.cuh"
+#include "frame/record.cuh"
 #include "rasterize/rasterize_cuda.h"
 #include "rasterize/rasterize_math.h"
 
@@ -42,7 +43,6 @@ constexpr int kPlanThreads = 1024;  // of the kernels before the blend
 constexpr int kSubWidth = 8, kSubHeight = 4, kSubColumns = kFrameTileWidth / kSubWidth;
 constexpr int kSubs = kSubColumns * kFrameTileHeight / kSubHeight;
 
-static_assert(sizeof(Record<float>) == 3 * sizeof(float4), "fetched as whole vectors");
 static_assert(kSubWidth == 8 && kSubHeight == 4, "the window of reached_pixels");
 static_assert(2 * kFewEntries <= kThreads, "two threads rank an entry");
 static_assert(kPiece % 3 == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0, "begins a class of plan_kernel");
@@ -111,11 +111,7 @@ __device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
         count[i] = own[i];
         sum += count[i];
     }
-    uint32_t inclusive = sum;
-    for (int offset = 1; offset < 32; offset *= 2) {
-        const uint32_t below = __shfl_up_sync(kAllLanes, inclusive, offset);
-        if (lane >= offset) inclusive += below;
-    }
+    const uint32_t inclusive = warp_prefix(sum);
     if (lane == 31) warp_sum[warp] = inclusive;
     __syncthreads();
     uint32_t first = inclusive - sum;
@@ -225,11 +221,11 @@ struct Shared {
             uint32_t warp_sum[kWarps];
             uint16_t by_bucket[kPiece];
         };
-        float4 record[3][kBatch];
+        float4 record[kRecordVectors][kBatch];
     };
     uint16_t sorted[kPiece];  // places in `key`
     uint32_t blocks[kBatch];  // live ones that the batch's records may reach
-    // Of the batch, those that may reach the sub-tile of a warp: where they begin in a third of `record`.
+    // Of the batch, those that may reach the sub-tile of a warp: where they begin in a vector of `record`.
     uint32_t list[kWarps][kBatch + 1];
     Pixels pixels;
     uint32_t alive_blocks;  // as blocks_of(TileEntry)
@@ -418,17 +414,21 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s)
     for (int c = 0; c < 3; ++c) p.color[c] = pixels.color[c][sub][lane];
     if (kWithDepth) p.depth = pixels.depth[sub][lane];
     bool alive = p.transmittance > 0;
-    const auto third = [&](int k, uint32_t offset) -> const float4& {
-        return *reinterpret_cast<const float4*>(reinterpret_cast<const unsigned char*>(s.record[k]) + offset);
+    const auto record_at = [&](uint32_t offset) {
+        const auto vector = [&](int k) -> const float4& {
+            return *reinterpret_cast<const float4*>(reinterpret_cast<const unsigned char*>(s.record[k]) +
+                                                    offset);
+        };
+        return record_of_vectors(vector(0), vector(1), vector(2));
     };
     for (int first = 0; first < listed; first += 32) {
         // The last lane takes the first record, which becomes the highest bit of a pixel.
         const uint32_t* last_of_group = list + first + 31;
         uint32_t bits = 0;
         if (first + 31 - lane < listed) {
-            const uint32_t own = last_of_group[-lane];
-            const float4 a = third(0, own), b = third(1, own);
-            bits = reached_pixels(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
+            const Record<float> own = record_at(last_of_group[-lane]);
+            bits = reached_pixels(own.u - corner_x, own.v - corner_y, own.l11, own.l12, own.l22,
+                                  own.log2_opacity);
         }
         bits = transpose_bits(bits);
         if (!alive) bits = 0;
@@ -436,17 +436,15 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Shared& s)
         int highest = 31 - __clz(static_cast<int>(bits));
         uint32_t next = last_of_group[-highest];
         while (bits != 0) {
-            const float4 a = third(0, next), b = third(1, next), c = third(2, next);
+            const Record<float> r = record_at(next);
             bits ^= __funnelshift_l(0u, 1u, highest);  // 1 << highest, without a register for the 1
             highest = 31 - __clz(static_cast<int>(bits));
             next = last_of_group[-highest];
-            const Falloff<float> f = falloff_at(p.x, p.y, a.x, a.y, a.z, a.w, b.x, b.y);
+            const Falloff<float> f = falloff_at(p.x, p.y, r.u, r.v, r.l11, r.l12, r.l22, r.log2_opacity);
             float weight;
             alive = blend_live(alpha_of(f), p.transmittance, weight);
-            p.color[0] += weight * b.z;
-            p.color[1] += weight * b.w;
-            p.color[2] += weight * c.x;
-            if (kWithDepth) p.depth += weight * c.y;
+            for (int c = 0; c < 3; ++c) p.color[c] += weight * r.color[c];
+            if (kWithDepth) p.depth += weight * r.depth;
             if (!alive) bits = 0;
         }
         __syncwarp();
@@ -470,7 +468,7 @@ __device__ void blend_piece(const Record<float>* records, uint32_t count, int le
                 blocks = blocks_of(entry) & s.alive_blocks;
                 const float4* from = reinterpret_cast<const float4*>(records + record_of(entry));
                 if (blocks != 0)
-                    for (int k = 0; k < 3; ++k) copy_async(&s.record[k][i], from + k);
+                    for (int k = 0; k < kRecordVectors; ++k) copy_async(&s.record[k][i], from + k);
             }
             s.blocks[i] = blocks;
             blocks = __reduce_or_sync(kAllLanes, blocks);
@@ -601,10 +599,6 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
     });
 }
 
-__device__ bool is_complete(const FrameLists& lists) {
-    return lists.counters->gaussians <= lists.record_capacity &&
-           lists.counters->entries <= lists.entry_capacity;
-}
 __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
 }
@@ -614,7 +608,7 @@ __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists) {
     constexpr int kClasses = 64;
     __shared__ uint32_t place[kClasses];
-    if (!is_complete(lists)) return;
+    if (!lists.capacity.holds(*lists.counters)) return;
     const auto class_of = [&](uint32_t tile) {
         const uint32_t count = count_of(lists, tile);
         if (count < 2) return kClasses - 1 - static_cast<int>(count);
@@ -659,7 +653,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists) {
 // Spreads the long lists, a block one after another.
 __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists lists) {
     __shared__ SpreadShared<kLog2Spread> s;
-    if (!is_complete(lists)) return;
+    if (!lists.capacity.holds(*lists.counters)) return;
     for (uint32_t i = blockIdx.x; i < lists.num_tiles; i += gridDim.x) {
         TilePlan& plan = lists.plans[i];
         const uint32_t count = count_of(lists, plan.tile);
@@ -677,7 +671,7 @@ __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists list
 }
 
 __global__ void __launch_bounds__(kThreads, kBlocks) rasterize_kernel(FrameLists lists, RasterTape tape) {
-    if (!is_complete(lists)) return;
+    if (!lists.capacity.holds(*lists.counters)) return;
     Shared& s = *reinterpret_cast<Shared*>(shared_memory());
     const TilePlan plan = lists.plans[blockIdx.x];
     const Buckets buckets{plan.lowest, plan.last_bucket, plan.shift, false};

@@ -86,6 +86,42 @@ template <class T>
 struct FalloffSums {
     T exponent, t1, t2;
     T t1_dx, t1_dy, t2_dy;  // gradient by t1 times dx, ...
+
+    V3DG_HD V3DG_INLINE FalloffSums& operator+=(const FalloffSums& d) {
+        exponent += d.exponent;
+        t1 += d.t1;
+        t2 += d.t2;
+        t1_dx += d.t1_dx;
+        t1_dy += d.t1_dy;
+        t2_dy += d.t2_dy;
+        return *this;
+    }
+};
+
+// The same over the pixels of one row, which have dy and t2 in common: of the gradient by the exponent, and
+// of it times t1 and t1 dx.
+template <class T>
+struct RowSums {
+    T exponent, t1, t1_dx;
+
+    V3DG_HD V3DG_INLINE void add(const Falloff<T>& f, T d_exponent) {
+        const T d_t1 = d_exponent * f.t1;
+        exponent += d_exponent;
+        t1 += d_t1;
+        t1_dx += d_t1 * f.dx;
+    }
+
+    // `f` is that of any pixel of the row. The exponent contains -(t1² + t2²), hence the factors -2.
+    V3DG_HD V3DG_INLINE FalloffSums<T> of_falloff(const Falloff<T>& f) const {
+        FalloffSums<T> sums;
+        sums.exponent = exponent;
+        sums.t1 = -2 * t1;
+        sums.t1_dx = -2 * t1_dx;
+        sums.t1_dy = sums.t1 * f.dy;
+        sums.t2 = -2 * f.t2 * exponent;
+        sums.t2_dy = sums.t2 * f.dy;
+        return sums;
+    }
 };
 
 // Gradient of the ellipse: t1 = l11 dx + l12 dy and t2 = l22 dy, with dx = x - u and dy = y - v.

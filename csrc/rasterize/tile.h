@@ -56,7 +56,8 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
 constexpr int kFewBlocks = 5;
 
 // Those of `blocks` that the ellipse itself reaches, not just its box: for each row of blocks, the ellipse's
-// extent in x over the row's pixel centres. Conservative by a hair, as the box is.
+// extent in x over the row's pixel centres, with the margin of row_extent(). Rounds by truncation, which is
+// one instruction for a vector on every instruction set.
 template <class T>
 V3DG_INLINE uint64_t blocks_of_ellipse(const Record<T>& g, int left, int top, uint64_t blocks) {
     if (__builtin_popcountll(blocks) < kFewBlocks) return blocks;

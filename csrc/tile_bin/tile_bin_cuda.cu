@@ -8,6 +8,7 @@
 
 #include "base/scan.cuh"
 #include "frame/count_tile.cuh"
+#include "frame/record.cuh"
 
 namespace v3dg {
 namespace cuda {
@@ -17,30 +18,6 @@ namespace {
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
 constexpr unsigned kBlocks = 5;    // on a multiprocessor
 constexpr uint32_t kNoItem = ~0u;  // in place of a number of records
-
-__device__ bool is_complete(const TileBinInput& in) {
-    return in.counters->items <= in.item_capacity && in.counters->gaussians <= in.record_capacity &&
-           *in.counts.num_large <= in.large_capacity;
-}
-
-// In whole words, and of those what is used; without its colour.
-__device__ Record<float> load_record(const Record<float>* record) {
-    const uint4* words = reinterpret_cast<const uint4*>(record);
-    const uint4 a = words[0], b = words[1], c = words[2];
-    Record<float> r;
-    r.u = __uint_as_float(a.x);
-    r.v = __uint_as_float(a.y);
-    r.l11 = __uint_as_float(a.z);
-    r.l12 = __uint_as_float(a.w);
-    r.l22 = __uint_as_float(b.x);
-    r.log2_opacity = __uint_as_float(b.y);
-    r.depth = __uint_as_float(c.y);
-    r.x0 = static_cast<uint16_t>(c.z);
-    r.x1 = static_cast<uint16_t>(c.z >> 16);
-    r.y0 = static_cast<uint16_t>(c.w);
-    r.y1 = static_cast<uint16_t>(c.w >> 16);
-    return r;
-}
 
 // Large records that a warp takes together; lanes 16 apart have the same one. Neighbours cover the same
 // tiles, so a tile is looked at for all of them at once, in windows of so many tiles, unless they lie
@@ -102,12 +79,7 @@ __device__ LargeRows rows_of(const LargeBatch& batch, int first, int count) {
     LargeRows rows{batch.top + first,       min(count, batch.all_rows - first) * batch.columns,
                    begin - first,           max(end - begin, 0),
                    begin - batch.first_row, 0};
-    rows.rows_after = rows.rows;
-#pragma unroll
-    for (unsigned offset = 1; offset < kLargeAtOnce; offset *= 2) {
-        const int below = __shfl_up_sync(kAllLanes, rows.rows_after, offset, kLargeAtOnce);
-        if (threadIdx.x % kLargeAtOnce >= offset) rows.rows_after += below;
-    }
+    rows.rows_after = warp_prefix<kLargeAtOnce>(rows.rows);
     return rows;
 }
 
@@ -142,7 +114,7 @@ template <class Visit>
 __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     constexpr int kLog2MostParts = 2;
     const unsigned num_warps = gridDim.x * kWarps;
-    const unsigned num_batches = static_cast<unsigned>(*in.counts.num_large / kLargeAtOnce);
+    const unsigned num_batches = static_cast<unsigned>(in.counters->large / kLargeAtOnce);
     const unsigned warps_each = num_batches == 0 ? 0 : 8 * num_warps / num_batches;
     const int log2_parts = min(max(31 - __clz(static_cast<int>(warps_each)), 0), kLog2MostParts);
     for (unsigned at = blockIdx.x * kWarps + threadIdx.x / 32; at < num_batches << log2_parts;
@@ -215,7 +187,7 @@ __device__ uint32_t records_of_tile(const LargeBatch& batch, const LargeRows& wi
 }
 
 __global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinInput in) {
-    if (!is_complete(in)) return;
+    if (!in.capacity.holds(*in.counters)) return;
     __shared__ WindowRuns all_runs[kWarps];
     WindowRuns& runs = all_runs[threadIdx.x / 32];
     for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
@@ -267,10 +239,7 @@ __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
         out.image_of_tile[tile] = image_of(in, static_cast<uint32_t>(tile));
     }
     if (block + 1 == gridDim.x && threadIdx.x == 0) {
-        const unsigned long long entries = before_block + total;
-        out.tile_first[in.num_tiles] = entries;
-        const bool lacks_large = *in.counts.num_large > in.large_capacity;
-        in.counters->entries = lacks_large && entries <= in.entry_capacity ? in.entry_capacity + 1 : entries;
+        out.tile_first[in.num_tiles] = in.counters->entries = before_block + total;
     }
 }
 
@@ -360,7 +329,7 @@ __device__ void scatter_windows(const TileBinInput& in, const Scatter& to, const
 // Blocks take items, a thread a record, and then the records over many tiles. An item's table is fetched two
 // items before its turn, its records one.
 __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput in, TileBinOutput out) {
-    if (!is_complete(in) || in.counters->entries > in.entry_capacity) return;
+    if (!in.capacity.holds(*in.counters)) return;
     const Scatter to{out.tile_first, in.counts.count, out.entries};
     const unsigned num_items = static_cast<unsigned>(in.counters->items);
     ItemTiles now{0, 0, 0, 0}, next = now;

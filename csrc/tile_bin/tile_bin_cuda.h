@@ -17,10 +17,10 @@ struct TileBinInput {
     const Record<float>* records;
     const FrameImage* images;
     uint32_t num_images, num_tiles;
-    unsigned long long item_capacity, record_capacity, large_capacity, entry_capacity;
+    Capacity capacity;
     const LargeRecord* large;
     TileCounts counts;
-    FrameCounters* counters;  // sets `entries`, past the capacity also where `large` had too little room
+    FrameCounters* counters;  // sets `entries`; without the large ones where they had too little room
 };
 
 struct TileBinOutput {
