@@ -1,8 +1,7 @@
-"""False colours: a bundle whose gaussians show the level or the cluster that they belong to."""
+"""False colours: palettes that show the level or the cluster that gaussians belong to."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -10,7 +9,6 @@ import numpy.typing as npt
 
 from v3dg import _core
 from v3dg.bundle import Bundle
-from v3dg.gaussians import Gaussians
 
 ColorBy: TypeAlias = Literal["appearance", "level", "cluster"]
 
@@ -31,26 +29,19 @@ LEVEL_COLORS = np.array(
 )
 
 
-def false_color(bundle: Bundle, by: ColorBy) -> Gaussians:
-    """Return the gaussians of all levels, coloured by level, by cluster, or as they appear.
+def palette_of(bundle: Bundle, by: ColorBy) -> npt.NDArray[np.float32] | None:
+    """Return the constant SH coefficients (C, 3) that clusters are drawn with; None for what they appear as.
 
     Raises:
         ValueError: ``by`` is none of these.
     """
     if by not in get_args(ColorBy):
         raise ValueError(f"color_by: expected {', '.join(map(repr, get_args(ColorBy)))}, got {by!r}")
-    gaussians = bundle.gaussians
     if by == "appearance":
-        return gaussians
-    clusters = bundle.clusters
-    if by == "level":
-        colors = LEVEL_COLORS[clusters.level % len(LEVEL_COLORS)]
-    else:
-        colors = _scattered_colors(len(clusters.level))
-    per_gaussian = np.repeat(colors, np.diff(clusters.offset), axis=0)
-    return replace(
-        gaussians, sh=np.ascontiguousarray((per_gaussian[:, None, :] - 0.5) / _core.sh_base0, np.float32)
-    )
+        return None
+    level = bundle.clusters.level
+    colors = LEVEL_COLORS[level % len(LEVEL_COLORS)] if by == "level" else _scattered_colors(len(level))
+    return np.ascontiguousarray((colors - 0.5) / _core.sh_base0, np.float32)
 
 
 def _scattered_colors(count: int) -> npt.NDArray[np.float32]:

@@ -70,7 +70,7 @@ def pick(
     resident = residency.scene(scene_or_bundle, CPU)
     cut = resident.core.select(pixel, rule)
     frame = _core.SceneFrame(CPU.number)
-    frame.set_models([residency.model(bundle, CPU, "appearance") for bundle in resident.bundles])
+    residency.set_models(frame, resident.bundles, CPU, "appearance")
     found = frame.pick_cut(resident.core, pixel, cut.instance_ids, cut.cluster_ids)
     if found is None:
         return None

@@ -249,8 +249,7 @@ class _Frame:
 
     def _take_models(self, bundles: tuple[Bundle, ...]) -> None:
         if self._bundles != bundles:
-            models = [residency.model(bundle, self._device, self._color_by) for bundle in bundles]
-            self._frame.set_models(models)
+            residency.set_models(self._frame, bundles, self._device, self._color_by)
             self._bundles = bundles
 
     def _here(self, ids: Any) -> Any:

@@ -6,13 +6,13 @@ import atexit
 import os
 import threading
 import weakref
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, TypeVar
 
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg.bundle import Bundle
-from v3dg.false_color import ColorBy, false_color
+from v3dg.false_color import ColorBy, palette_of
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene
 
@@ -97,7 +97,7 @@ class Residency:
         self._gaussians: weakref.WeakKeyDictionary[Bundle, dict[Device, Gaussians]] = (
             weakref.WeakKeyDictionary()
         )
-        self._models: weakref.WeakKeyDictionary[Bundle, dict[tuple[Device, ColorBy], _core.Model]] = (
+        self._models: weakref.WeakKeyDictionary[Bundle, dict[Device, _core.Model]] = (
             weakref.WeakKeyDictionary()
         )
         self._scenes: weakref.WeakKeyDictionary[Scene | Bundle, dict[Device, ResidentScene]] = (
@@ -150,18 +150,25 @@ class Residency:
                 known[device] = bundle.gaussians.torch(str(device))
             return known[device]
 
-    def model(self, bundle: Bundle, device: Device, color_by: ColorBy) -> _core.Model:
+    def model(self, bundle: Bundle, device: Device) -> _core.Model:
         """The bundle's gaussians as frames of a device read them."""
         with self._lock:
             known = self._models.setdefault(bundle, {})
-            if (device, color_by) not in known:
-                here = false_color(bundle, color_by)
-                if color_by == "appearance":
-                    here = self.gaussians(bundle, device)
-                elif device.is_cuda:
-                    here = here.torch(str(device))
-                known[device, color_by] = _core.Model(here.rows)
-            return known[device, color_by]
+            if device not in known:
+                known[device] = _core.Model(self.gaussians(bundle, device).rows)
+            return known[device]
+
+    def set_models(
+        self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy
+    ) -> None:
+        """Have a frame of a device draw these bundles, their gaussians or clusters in these colours."""
+        colors = [palette_of(bundle, color_by) for bundle in bundles]
+        palettes = [
+            _core.Palette(self.table(bundle), sh, device.number)
+            for bundle, sh in zip(bundles, colors, strict=True)
+            if sh is not None
+        ]
+        frame.set_models([self.model(bundle, device) for bundle in bundles], palettes)
 
     def frame(self, subject: Scene | Bundle, key: Hashable, make: Callable[[], _Frame]) -> _Frame:
         """The buffers that pictures of a subject are drawn with, of which each key has its own."""

@@ -151,7 +151,8 @@ class DeviceTape final : public Tape {
         const py::ssize_t h = height_, w = width_;
         const Device device = gaussians_.device();
         const Work work(device);
-        const Plane<float> color(d_color, "d_color", device, {h, w, 3}), alpha(d_alpha, "d_alpha", device, {h, w});
+        const Plane<float> color(d_color, "d_color", device, {h, w, 3}),
+            alpha(d_alpha, "d_alpha", device, {h, w});
         const PictureGradient<float> d_picture{
             color.span.data, alpha.span.data,
             d_depth.is_none() ? nullptr : device_span_of<const float>(d_depth, "d_depth", {h, w}).data};

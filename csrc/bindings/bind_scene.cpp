@@ -80,6 +80,38 @@ class BoundModel {
 #endif
 };
 
+// Colours of the clusters of one bundle on one device.
+class BoundPalette {
+  public:
+    BoundPalette(const py::object& table_object, const py::array& sh, int device)
+        : table_(table_object), sh_(sh), device_{device} {
+        const auto& table = table_object.cast<const BoundTable&>();
+        const auto clusters = static_cast<py::ssize_t>(table.table().num_clusters());
+        const Span<const float> colors = span_of<const float>(sh, "sh", {clusters, 3});
+        host_ = {colors.data, whole_bundle(table.table()).first_row.data, static_cast<uint32_t>(clusters)};
+#if V3DG_WITH_CUDA
+        if (device_.is_host()) return;
+        const Work work(device_);
+        on_device_ = std::make_shared<cuda::DevicePalette>(colors, table.on_device(work), work.stream());
+#endif
+    }
+
+    Device device() const { return device_; }
+    const Palette& host() const { return host_; }
+#if V3DG_WITH_CUDA
+    const std::shared_ptr<const cuda::DevicePalette>& on_device() const { return on_device_; }
+#endif
+
+  private:
+    py::object table_;
+    py::array sh_;
+    Device device_;
+    Palette host_;
+#if V3DG_WITH_CUDA
+    std::shared_ptr<const cuda::DevicePalette> on_device_;
+#endif
+};
+
 // A scene as the host knows it. It stays as it is: whoever draws it keeps it, and a change makes another.
 struct SceneState {
     py::list bundles;
@@ -274,31 +306,30 @@ class BoundSceneFrame {
 #endif
     }
 
-    void set_models(const py::list& models) {
+    // The gaussians of each bundle and, unless there are none, the colours of their clusters.
+    void set_models(const py::list& models, const py::list& palettes) {
+        if (!palettes.empty() && palettes.size() != models.size())
+            throw py::value_error("palettes: expected none, or one for each model");
         std::vector<SceneModel> host;
-        num_gaussians_.clear();
-#if V3DG_WITH_CUDA
-        std::vector<std::shared_ptr<const cuda::PackedModel>> packed;
-#endif
+        std::vector<size_t> num_gaussians;
         for (const py::handle& item : models) {
             const auto& model = item.cast<const BoundModel&>();
-            if (model.device() != device_)
-                throw py::value_error("models: expected gaussians on the frame's device, got others");
-            num_gaussians_.push_back(model.size());
-            if (device_.is_host()) host.push_back({&model.host().planes(), {}, {}});
-#if V3DG_WITH_CUDA
-            else
-                packed.push_back(model.packed());
-#endif
+            check_device(model.device(), "models");
+            num_gaussians.push_back(model.size());
+            if (device_.is_host()) host.push_back({&model.host().planes(), {}, {}, {}});
+        }
+        for (size_t b = 0; b < palettes.size(); ++b) {
+            const auto& palette = palettes[b].cast<const BoundPalette&>();
+            check_device(palette.device(), "palettes");
+            if (device_.is_host()) host[b].palette = palette.host();
         }
 #if V3DG_WITH_CUDA
-        if (!device_.is_host()) {
-            const Work work(device_);
-            frame_->set_models(std::move(packed), work.stream());
-        }
+        if (!device_.is_host()) set_models_on_device(models, palettes);
 #endif
         host_ = std::move(host);
+        num_gaussians_ = std::move(num_gaussians);
         models_ = models;
+        palettes_ = palettes;
     }
 
     std::unique_ptr<BoundDrawing> draw(const py::object& scene_object, const BoundCamera& camera,
@@ -392,6 +423,23 @@ class BoundSceneFrame {
         return scene;
     }
 
+    void check_device(Device device, const char* name) const {
+        if (device != device_)
+            throw py::value_error(std::string(name) + ": expected what is on the frame's device, got others");
+    }
+
+#if V3DG_WITH_CUDA
+    void set_models_on_device(const py::list& models, const py::list& palettes) {
+        std::vector<std::shared_ptr<const cuda::PackedModel>> packed;
+        for (const py::handle& model : models) packed.push_back(model.cast<const BoundModel&>().packed());
+        std::vector<std::shared_ptr<const cuda::DevicePalette>> colors;
+        for (const py::handle& palette : palettes)
+            colors.push_back(palette.cast<const BoundPalette&>().on_device());
+        const Work work(device_);
+        frame_->set_models(std::move(packed), std::move(colors), work.stream());
+    }
+#endif
+
     void require_host(const char* name) const {
         if (!device_.is_host())
             throw py::value_error(std::string(name) +
@@ -421,7 +469,7 @@ class BoundSceneFrame {
         const Picture<float> picture = out.on_host<float>(window, background);
         const std::shared_ptr<const SceneState> state = scene.state();
         const std::vector<SceneModel> models = models_of(*state);
-        const py::list gaussians = models_;  // which another thread may replace meanwhile
+        const py::list gaussians = models_, colors = palettes_;  // which another thread may replace meanwhile
         SceneFrameCounts counts;
         {
             const py::gil_scoped_release unlocked;
@@ -431,7 +479,7 @@ class BoundSceneFrame {
     }
 
     Device device_;
-    py::list models_;
+    py::list models_, palettes_;
     std::vector<size_t> num_gaussians_;  // of each bundle
     std::vector<SceneModel> host_;       // without what the scene knows of the clusters
 #if V3DG_WITH_CUDA
@@ -514,6 +562,8 @@ void bind_scene(py::module_& m) {
         .def(py::init<const Rows&>(), "gaussians"_a)
         .def("__len__", &BoundModel::size)
         .def_property_readonly("bytes", &BoundModel::bytes);
+    py::class_<BoundPalette>(m, "Palette", "Colours of a bundle's clusters, in which gaussians can be drawn.")
+        .def(py::init<py::object, py::array, int>(), "table"_a, "sh"_a, "device"_a);
     py::class_<BoundScene>(m, "ResidentScene", "What selection reads of a scene, on one device.")
         .def(py::init<int>(), "device"_a)
         .def("set_bundles", &BoundScene::set_bundles, "tables"_a)
@@ -523,7 +573,7 @@ void bind_scene(py::module_& m) {
         .def("select", &BoundScene::select, "camera"_a, "rule"_a);
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
         .def(py::init<int>(), "device"_a)
-        .def("set_models", &BoundSceneFrame::set_models, "models"_a)
+        .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "background"_a,
              "stop"_a = nullptr)
         .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,

@@ -18,6 +18,7 @@ struct Draw {
     ModelView<T> view;
     T filter_px2;
     bool compensate;  // opacity for what the filter adds
+    Palette palette{};
 };
 
 namespace cuda {

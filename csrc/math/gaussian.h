@@ -3,6 +3,7 @@
 // A gaussian, the layouts in which many of them are held, and how far one reaches.
 
 #include <cstddef>
+#include <cstdint>
 
 #include "math/quat.h"
 #include "math/sh.h"
@@ -53,12 +54,33 @@ struct GaussianPlanes {
     int sh_degree;
 };
 
+// Colours of a bundle's clusters that gaussians are drawn in, in place of their own.
+struct Palette {
+    const float* sh = nullptr;           // (C, 3) coefficients of the constant basis; null: no palette
+    const int64_t* first_row = nullptr;  // [C] where clusters begin among the gaussians, ascending
+    uint32_t num_clusters = 0;
+
+    // The cluster that a gaussian of the bundle belongs to.
+    V3DG_HD uint32_t cluster_of(uint64_t row) const {
+        uint32_t first = 0, last = num_clusters - 1;
+        while (first < last) {
+            const uint32_t middle = first + (last - first + 1) / 2;
+            if (static_cast<uint64_t>(first_row[middle]) <= row)
+                first = middle;
+            else
+                last = middle - 1;
+        }
+        return first;
+    }
+};
+
 // The same as a CUDA frame reads what stays on the device: four planes of (N, 4) that hold a PackedGaussian
 // each, and the SH coefficients as rows.
 struct PackedPlanes {
     const float* plane[4];
     const float* sh;
     int sh_degree;
+    Palette palette;
 };
 
 // How far from its mean a gaussian reaches at most, in its model's units: no less than extent_of() leads to.

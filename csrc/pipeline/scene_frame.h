@@ -14,6 +14,7 @@ struct SceneModel {
     const GaussianPlanes<float>* planes;
     PageTable pages;
     ClusterFilters filters;
+    Palette palette;
 };
 
 // A scene on the host: what selection reads of its bundles, their gaussians, and its instances.

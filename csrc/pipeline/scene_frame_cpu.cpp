@@ -85,7 +85,8 @@ class CutDraws {
         }
         end_of_pair_.back() = num_gaussians_ += count;
         const Draw<float> next{
-            model.planes, first, count, view_, model.filters.filter_px2[c], model.filters.compensate[c] != 0};
+            model.planes, first, count, view_, model.filters.filter_px2[c], model.filters.compensate[c] != 0,
+            model.palette};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else

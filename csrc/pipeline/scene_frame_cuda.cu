@@ -28,16 +28,28 @@ static uint32_t num_tiles(const FrameImage& image) {
 PackedModel::PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream)
     : rows_(rows), planes_(16 * rows.size, stream), packed_(pack(rows, planes_.data(), stream)) {}
 
-void SceneFrame::set_models(std::vector<std::shared_ptr<const PackedModel>> models, cudaStream_t stream) {
+DevicePalette::DevicePalette(Span<const float> sh, std::shared_ptr<const BundleTables> tables,
+                             cudaStream_t stream)
+    : tables_(std::move(tables)), sh_(sh, stream) {}
+
+Palette DevicePalette::palette() const {
+    return {sh_.data(), tables_->on_device().pages.first_row.data,
+            static_cast<uint32_t>(tables_->num_clusters())};
+}
+
+void SceneFrame::set_models(std::vector<std::shared_ptr<const PackedModel>> models,
+                            std::vector<std::shared_ptr<const DevicePalette>> palettes, cudaStream_t stream) {
     std::vector<GaussianRows<const float>> rows;
     std::vector<PackedPlanes> packed;
-    for (const auto& model : models) {
-        rows.push_back(model->rows());
-        packed.push_back(model->packed());
+    for (size_t b = 0; b < models.size(); ++b) {
+        rows.push_back(models[b]->rows());
+        packed.push_back(models[b]->packed());
+        if (!palettes.empty()) packed.back().palette = palettes[b]->palette();
     }
     rows_.copy_from({rows.data(), rows.size()}, stream);
     packed_.copy_from({packed.data(), packed.size()}, stream);
     models_ = std::move(models);
+    palettes_ = std::move(palettes);
 }
 
 std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const FrameImage& image,

@@ -24,12 +24,25 @@ class PackedModel {
     PackedPlanes packed_;
 };
 
+// Colours of the clusters of one bundle.
+class DevicePalette {
+  public:
+    // `sh` is (C, 3), coefficients of the constant basis; the host's memory may be reused on return.
+    DevicePalette(Span<const float> sh, std::shared_ptr<const BundleTables> tables, cudaStream_t stream);
+    Palette palette() const;
+
+  private:
+    std::shared_ptr<const BundleTables> tables_;
+    DeviceBuffer<float> sh_;
+};
+
 // Draws a scene that stays on the device: selects, then draws the cut.
 class SceneFrame {
   public:
-    // The gaussians of each bundle of the scenes that are drawn next. The host's array may be reused on
-    // return.
-    void set_models(std::vector<std::shared_ptr<const PackedModel>> models, cudaStream_t stream);
+    // The gaussians of each bundle of the scenes that are drawn next and, unless there are none, the colours
+    // of their clusters. The host's arrays may be reused on return.
+    void set_models(std::vector<std::shared_ptr<const PackedModel>> models,
+                    std::vector<std::shared_ptr<const DevicePalette>> palettes, cudaStream_t stream);
 
     // The scene stays as it is until the drawing is finished.
     std::unique_ptr<Drawing> draw(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
@@ -44,6 +57,7 @@ class SceneFrame {
                                   cudaStream_t stream);
 
     std::vector<std::shared_ptr<const PackedModel>> models_;
+    std::vector<std::shared_ptr<const DevicePalette>> palettes_;
     DeviceBuffer<GaussianRows<const float>> rows_;
     DeviceBuffer<PackedPlanes> packed_;
     DeviceBuffer<Placement> placements_;

@@ -21,6 +21,17 @@ static V3DG_INLINE I tiles_of(I first, I last) {
     return last / kTileSize - first / kTileSize + 1;
 }
 
+// The colours of the clusters of the gaussians from `at` on, in the lanes that `kept` has bits for.
+template <class V>
+static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsigned kept, V sh[3]) {
+    for (int k = 0; k < 3; ++k) sh[k] = V{};
+    for (; kept != 0; kept &= kept - 1) {
+        const int i = __builtin_ctz(kept);
+        const float* color = palette.sh + 3 * static_cast<uint64_t>(palette.cluster_of(at + i));
+        for (int k = 0; k < 3; ++k) sh[k][i] = static_cast<Lane<V>>(color[k]);
+    }
+}
+
 template <class T>
 size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
                const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base,
@@ -69,9 +80,14 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         if (kept == 0) continue;
 
         V sh[3 * kMaxShBases], color[3];
-        const int num_sh = 3 * num_sh_bases(model.sh_degree);
-        for (int k = 0; k < num_sh; ++k) sh[k] = load(model.sh[k] + at);
-        color_of_sh(model.sh_degree, g.mean, mv, sh, color);
+        if (draw.palette.sh != nullptr) {
+            load_palette(draw.palette, at, kept, sh);
+            color_of_sh(0, g.mean, mv, sh, color);
+        } else {
+            const int num_sh = 3 * num_sh_bases(model.sh_degree);
+            for (int k = 0; k < num_sh; ++k) sh[k] = load(model.sh[k] + at);
+            color_of_sh(model.sh_degree, g.mean, mv, sh, color);
+        }
 
         while (kept != 0) {
             const int i = __builtin_ctz(kept);

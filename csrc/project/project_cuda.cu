@@ -77,6 +77,7 @@ __device__ void color_of(const float* rows, uint32_t g, const float mean[3], con
 // Gaussians as users hold them.
 struct RowSource {
     using Model = GaussianRows<const float>;
+    static constexpr bool kHasPalette = false;
 
     // A gaussian's mean and reach, all that is read of most of those that reach no pixel centre.
     static __device__ float4 load_sphere(const GaussianRows<const float>& m, uint32_t g) {
@@ -109,6 +110,7 @@ struct RowSource {
 
 struct PackedSource {
     using Model = PackedPlanes;
+    static constexpr bool kHasPalette = true;
 
     static __device__ float4 load_sphere(const PackedPlanes& m, uint32_t g) { return load4(m.plane[0], g); }
 
@@ -166,6 +168,14 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in, const 
     if (!box.holds_pixels()) return false;
 
     set_ellipse(e, box, r);
+    if constexpr (Source::kHasPalette) {
+        const Palette& palette = in.model.palette;
+        if (palette.sh != nullptr) {
+            const float anywhere[3] = {0, 0, 0};
+            color_of<0>(palette.sh, palette.cluster_of(g), anywhere, view, r.color);
+            return true;
+        }
+    }
     if (in.model.sh_degree > 0) {
         const float4 sphere = Source::load_sphere(in.model, g);
         const float mean[3] = {sphere.x, sphere.y, sphere.z};
@@ -451,7 +461,8 @@ PackedPlanes pack(const GaussianRows<const float>& rows, float* planes, cudaStre
     constexpr unsigned kThreads = 256;
     launch("pack_kernel", pack_kernel, blocks_for(count, kThreads), kThreads, 0, stream, rows,
            reinterpret_cast<float4*>(planes));
-    return {{planes, planes + 4 * count, planes + 8 * count, planes + 12 * count}, rows.sh, rows.sh_degree};
+    return {
+        {planes, planes + 4 * count, planes + 8 * count, planes + 12 * count}, rows.sh, rows.sh_degree, {}};
 }
 
 template <class Source>

@@ -265,7 +265,7 @@ class SceneView:
 
     def _frame(self, color_by: ColorBy) -> _core.SceneFrame:
         frame = _core.SceneFrame(CPU.number)
-        frame.set_models([residency.model(bundle, CPU, color_by) for bundle in self.scene.bundles])
+        residency.set_models(frame, self.scene.bundles, CPU, color_by)
         return frame
 
     def _levels(self, cut: Selection) -> npt.NDArray[np.int64]:
