@@ -7,7 +7,7 @@
 #include "fit_group/fit_group_math.h"
 #include "project/project.h"
 #include "rasterize/rasterize.h"
-#include "rasterize/tile.h"
+#include "rasterize/simd_tile.h"
 #include "tile_bin/tile_bin.h"
 
 // One thread fits one group, start to end. The group's frame has its ball at the origin with radius 1, so
@@ -135,7 +135,7 @@ class Student {
                       const RecordGradient<float>* d_records, size_t count) {
         by_value_.resize(gradient_.size());
         float* g = by_value_.data();
-        const GaussianRows<float> out{g,           g + 3 * n_, g + 7 * n_,     g + 10 * n_,
+        const GaussianRows<float> out{g,           g + 3 * n_, g + 7 * n_,      g + 10 * n_,
                                       g + 11 * n_, n_,         model_.sh_degree};
         project_backward<float>(draw, source, d_records, count, camera, out);
         for (size_t i = 0; i < count; ++i) {
