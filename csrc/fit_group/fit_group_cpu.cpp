@@ -7,7 +7,7 @@
 #include "fit_group/fit_group_math.h"
 #include "project/project.h"
 #include "rasterize/rasterize.h"
-#include "rasterize/tile.h"
+#include "rasterize/simd_tile.h"
 #include "tile_bin/tile_bin.h"
 
 // One thread fits one group, start to end. The group's frame has its ball at the origin with radius 1, so

@@ -1,6 +1,6 @@
 #include "rasterize/rasterize.h"
 
-#include "rasterize/tile.h"
+#include "rasterize/simd_tile.h"
 
 namespace v3dg {
 namespace V3DG_ISA {

@@ -1,0 +1,148 @@
+#pragma once
+
+// Where the arrays of a fit on the device lie: in the shared memory of blocks, or in their scratch. The host
+// decides that, and knows nothing of CUDA here.
+
+#include <cstddef>
+#include <cstdint>
+#include <type_traits>
+
+#include "frame/record.h"
+
+namespace v3dg {
+namespace cuda {
+
+constexpr int kViewsAtOnce = 2;
+// A half-warp blends a cell. Masks have a bit for each cell of a region; a larger picture takes several
+// regions.
+constexpr int kCell = 4, kCellPixels = kCell * kCell;
+constexpr int kRegion = 32, kRegionCells = kRegion / kCell;
+static_assert(kRegionCells * kRegionCells == 64 && kCellPixels == 16, "a mask is a word, a cell half a warp");
+using CellMask = unsigned long long;
+constexpr int kAtOnce = 4;  // gaussians that a half-warp looks at together
+constexpr int kSums = 9;    // FalloffSums and colour
+constexpr int kSumStride = 12;
+
+// How a kernel was compiled: for small groups, which keep what is read again and again in shared memory, or
+// for large ones; and how many gaussians of a list a warp takes from pixels to sums at once.
+template <int kThreadsOfBlock, bool kIsSmall, int kChunkSize>
+struct FitShape {
+    static constexpr int kThreads = kThreadsOfBlock, kWarps = kThreads / 32, kChunk = kChunkSize;
+    static constexpr bool kSmall = kIsSmall;
+    using Index = std::conditional_t<kSmall, uint16_t, uint32_t>;  // of a gaussian in the views at once
+};
+
+// Where an array lies: in the block's shared memory, or in the team's part of the scratch.
+struct Place {
+    size_t offset;
+    bool is_shared;
+};
+
+struct FitLayout {
+    // Shared for small groups, in the scratch for large ones.
+    size_t records, sorted, keys, mask, slot_first, order, lists, errors;
+    size_t list_size;          // bytes, of a half-warp
+    size_t fragments, staged;  // shared
+    // Wherever there is room.
+    Place value, m, v, by_view, sum, sort_keys, sums, near_slots;
+    size_t far_slots, maps, exchange;  // scratch
+    uint32_t num_near_slots, num_far_slots;
+    size_t shared_bytes;   // of a block
+    size_t scratch_bytes;  // of a team
+};
+
+// Of a warp: a value of two floats a gaussian and pixel, in rows of 33, and one of four floats a pixel.
+V3DG_HD constexpr size_t fragments_bytes(int chunk) { return (chunk * 33 * 2 + 32 * 4) * sizeof(float); }
+
+// Deals out memory. Only small groups have arrays in shared memory that large ones have in the scratch.
+struct Arena {
+    bool is_small;
+    size_t shared_limit, shared = 0, scratch = 0;  // bytes
+
+    static size_t rounded(size_t bytes) { return (bytes + 15) / 16 * 16; }
+    size_t in_shared(size_t bytes) {
+        shared += rounded(bytes);
+        return shared - rounded(bytes);
+    }
+    size_t in_scratch(size_t bytes) {
+        scratch += rounded(bytes);
+        return scratch - rounded(bytes);
+    }
+    // For what a small group has to have in shared memory.
+    size_t hot(size_t bytes) { return is_small ? in_shared(bytes) : in_scratch(bytes); }
+    // For what a small group has there while there is room.
+    Place anywhere(size_t bytes) {
+        const bool fits = is_small && shared + rounded(bytes) <= shared_limit;
+        return {fits ? in_shared(bytes) : in_scratch(bytes), fits};
+    }
+};
+
+// What there is to lay out.
+struct FitSizes {
+    size_t most_gaussians, floats_per_gaussian;  // of a group
+    int largest_picture;                         // px a side
+    bool has_dssim;
+    size_t num_blocks;    // that fit a group together
+    size_t shared_limit;  // bytes of a block
+};
+
+// What only large groups, or only small ones, have is left at 0 for the others.
+template <class Shape>
+FitLayout layout_of(const FitSizes& sizes) {
+    constexpr bool kSmall = Shape::kSmall;
+    constexpr size_t kFloat = sizeof(float), kIndex = sizeof(typename Shape::Index), kWarps = Shape::kWarps;
+    constexpr size_t kFragments = kWarps * fragments_bytes(Shape::kChunk);
+    FitLayout l{};
+    Arena arena{kSmall, sizes.shared_limit};
+    const size_t largest = sizes.largest_picture, num_blocks = sizes.num_blocks;
+    const size_t padded = (sizes.most_gaussians + 31) / 32 * 32, places = kViewsAtOnce * padded;
+    const size_t values = sizes.most_gaussians * sizes.floats_per_gaussian;
+    const size_t regions_across = (largest + kRegion - 1) / kRegion;
+    const size_t regions = regions_across * regions_across;
+    const size_t cells_across = (largest + kCell - 1) / kCell, cells = cells_across * cells_across;
+    l.records = arena.hot((places + 1) * sizeof(Record<float>));
+    if (!kSmall) l.sorted = arena.hot((places + 1) * sizeof(Record<float>));
+    l.keys = arena.hot(places * sizeof(uint32_t));
+    l.mask = arena.hot(regions * places * sizeof(CellMask));
+    l.slot_first = arena.hot(regions * places * sizeof(uint32_t));
+    l.order = arena.hot(places * kIndex);
+    l.list_size = Arena::rounded((padded + kAtOnce) * kIndex);
+    l.lists = arena.hot(2 * kWarps * (kSmall ? 1 : num_blocks) * l.list_size);
+    l.errors = arena.hot(kViewsAtOnce * (cells + largest) * 2 * kFloat);
+    l.fragments = arena.in_shared(kFragments);
+    if (!kSmall) l.staged = arena.in_shared(kWarps * 2 * Shape::kChunk * sizeof(Record<float>));
+    // Fragments are done with when gradients come, and not begun when keys are sorted.
+    const auto over_fragments = [&](size_t bytes) {
+        return num_blocks == 1 && bytes <= kFragments ? Place{l.fragments, true} : arena.anywhere(bytes);
+    };
+    if (kSmall && num_blocks > 1)
+        l.exchange = arena.in_scratch(2 * kViewsAtOnce * values * kFloat);
+    else
+        l.by_view = over_fragments(kViewsAtOnce * values * kFloat);
+    if (!kSmall) {
+        size_t size = 32;
+        while (size < sizes.most_gaussians) size *= 2;
+        l.sort_keys = over_fragments(size * sizeof(unsigned long long));
+    }
+    static_assert(kSumStride * kFloat == sizeof(Record<float>), "sums take the place of the records");
+    l.sums = {l.records, kSmall};
+    l.value = arena.anywhere(values * kFloat);
+    l.m = arena.anywhere(values * kFloat);
+    l.v = arena.anywhere(values * kFloat);
+    l.sum = {arena.in_scratch(values * kFloat), false};
+    // At least what one region can take.
+    l.num_far_slots = static_cast<uint32_t>(places * kRegionCells * kRegionCells);
+    l.far_slots = arena.in_scratch(l.num_far_slots * kSums * kFloat);
+    if (sizes.has_dssim) l.maps = arena.in_scratch(10 * 3 * kViewsAtOnce * largest * largest * kFloat);
+    if (kSmall && arena.shared < sizes.shared_limit) {
+        // The rest of the shared memory takes slots.
+        l.num_near_slots = static_cast<uint32_t>((sizes.shared_limit - arena.shared) / (kSums * kFloat));
+        l.near_slots = {arena.in_shared(l.num_near_slots * kSums * kFloat), true};
+    }
+    l.shared_bytes = arena.shared;
+    l.scratch_bytes = (arena.scratch + 127) / 128 * 128;
+    return l;
+}
+
+}  // namespace cuda
+}  // namespace v3dg

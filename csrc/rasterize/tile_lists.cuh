@@ -1,0 +1,143 @@
+#pragma once
+
+// The list of a tile, spread over buckets of depth.
+
+#include "base/scan.cuh"
+#include "frame/tile_list.h"
+
+namespace v3dg {
+namespace cuda {
+
+using EntryKey = unsigned long long;  // of a TileEntry
+
+constexpr int kEntriesAtOnce = 4;  // that a thread has in flight
+
+constexpr int kDepthShift = kEntryRecordBits + kEntryBoxBits;
+__device__ inline uint32_t depth_of_key(EntryKey key) { return static_cast<uint32_t>(key >> kDepthShift); }
+
+// Buckets of entries, of equal width in the bits of their depths, which are logarithmic over octaves and linear
+// within one; or, where all depths are equal, of equal width in the record.
+struct Buckets {
+    uint32_t lowest, last;  // `last` is the number of the last bucket
+    int shift;
+    bool by_record;
+
+    __device__ uint32_t part_of(EntryKey key) const {
+        return by_record ? record_of(TileEntry{key}) : depth_of_key(key);
+    }
+    // Keys outside the range that the buckets were made for belong to the first or the last.
+    __device__ uint32_t of(EntryKey key) const { return min((max(part_of(key), lowest) - lowest) >> shift, last); }
+    // The part of a key where a bucket begins; nothing lies before the first.
+    __device__ uint32_t begin_of(uint32_t bucket) const {
+        return bucket == 0 ? 0 : lowest + (bucket << shift);
+    }
+};
+
+__device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int log2_buckets, bool by_record) {
+    const int bits = 32 - __clz(static_cast<int>(highest - lowest));
+    return {lowest, (1u << log2_buckets) - 1, max(bits - log2_buckets, 0), by_record};
+}
+
+// Shared memory of a block that spreads a list.
+template <int kLog2Buckets>
+struct SpreadShared {
+    uint32_t bucket[1 << kLog2Buckets];
+    uint32_t range[4];
+    uint32_t warp_sum[32];
+};
+
+// Turns counts into the place of each bucket's first.
+template <int kCount, int kBlock>
+__device__ void scan_buckets(uint32_t* bucket, uint32_t* warp_sum) {
+    constexpr int kEach = kCount / kBlock;
+    const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    uint32_t* own = bucket + kEach * threadIdx.x;
+    uint32_t count[kEach], sum = 0;
+#pragma unroll
+    for (int i = 0; i < kEach; ++i) {
+        count[i] = own[i];
+        sum += count[i];
+    }
+    const uint32_t inclusive = warp_prefix(sum);
+    if (lane == 31) warp_sum[warp] = inclusive;
+    __syncthreads();
+    uint32_t first = inclusive - sum;
+    for (int w = 0; w < warp; ++w) first += warp_sum[w];
+#pragma unroll
+    for (int i = 0; i < kEach; ++i) {
+        own[i] = first;
+        first += count[i];
+    }
+    __syncthreads();
+}
+
+// Calls visit(entry) for entries [first, last), a thread's share of them.
+template <int kBlock, class Visit>
+__device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_t last, const Visit& visit) {
+    for (; first < last; first += kEntriesAtOnce * kBlock) {
+        TileEntry entry[kEntriesAtOnce];
+#pragma unroll
+        for (int k = 0; k < kEntriesAtOnce; ++k) {
+            const uint32_t i = first + k * kBlock + threadIdx.x;
+            if (i < last) entry[k] = entries[i];
+        }
+#pragma unroll
+        for (int k = 0; k < kEntriesAtOnce; ++k)
+            if (first + k * kBlock + threadIdx.x < last) visit(entry[k]);
+    }
+}
+
+// Buckets for entries [first, last): for the range of all of them, or of a sample when `roughly`.
+template <int kBlock, int kLog2Buckets>
+__device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last, bool roughly,
+                                SpreadShared<kLog2Buckets>& s) {
+    if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
+    uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // of depths and records
+    const auto widen = [&](TileEntry e) {
+        const uint32_t part[2] = {depth_of_key(e.key), record_of(e)};
+        for (int i = 0; i < 2; ++i) {
+            low[i] = min(low[i], part[i]);
+            high[i] = max(high[i], part[i]);
+        }
+    };
+    if (roughly) {
+        // A list that is spread has an entry for each thread.
+        widen(entries[first + static_cast<uint32_t>(static_cast<unsigned long long>(last - first) *
+                                                    threadIdx.x / kBlock)]);
+    } else {
+        for_each_entry<kBlock>(entries, first, last, widen);
+    }
+    __syncthreads();
+    for (int i = 0; i < 2; ++i) {
+        low[i] = __reduce_min_sync(kAllLanes, low[i]);
+        high[i] = __reduce_max_sync(kAllLanes, high[i]);
+        if (threadIdx.x % 32 == 0) {
+            atomicMin(&s.range[2 * i], low[i]);
+            atomicMax(&s.range[2 * i + 1], high[i]);
+        }
+    }
+    __syncthreads();
+    // Some 64 entries a bucket; the fewer, the more of what is written together stays together in the cache.
+    const int log2_buckets = min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
+    const bool by_record = !roughly && s.range[0] == s.range[1];
+    const uint32_t* range = s.range + (by_record ? 2 : 0);
+    return buckets_over(range[0], range[1], log2_buckets, by_record);
+}
+
+// Spreads entries [first, last) into bucket order, from one place to another.
+template <int kBlock, int kLog2Buckets>
+__device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
+                       const Buckets& buckets, SpreadShared<kLog2Buckets>& s) {
+    for (int i = threadIdx.x; i < 1 << kLog2Buckets; i += kBlock) s.bucket[i] = 0;
+    __syncthreads();
+    for_each_entry<kBlock>(from, first, last,
+                           [&](TileEntry e) { atomicAdd(&s.bucket[buckets.of(e.key)], 1u); });
+    __syncthreads();
+    scan_buckets<1 << kLog2Buckets, kBlock>(s.bucket, s.warp_sum);
+    for_each_entry<kBlock>(from, first, last,
+                           [&](TileEntry e) { to[first + atomicAdd(&s.bucket[buckets.of(e.key)], 1u)] = e; });
+    __syncthreads();
+}
+
+}  // namespace cuda
+}  // namespace v3dg
