@@ -186,7 +186,7 @@ def run_demo(
         levels=bundle.num_levels,
         bundle_gaussians=bundle.num_gaussians,
         tolerance=tolerance,
-        device=f"{_num_threads()} CPU threads" if where == "cpu" else _device.describe(where),
+        device=_device.describe(where) if where.is_cuda else f"{_num_threads()} CPU threads",
         build_seconds=build_seconds,
         seconds=time.perf_counter() - start,
         columns=tuple(columns),

@@ -14,9 +14,9 @@ from PIL import Image
 
 from v3dg.camera_file import write_cameras
 from v3dg.cameras import Camera
-from v3dg.video import write_film
 from v3dg.scene import Scene
 from v3dg.scene_file import write_scene
+from v3dg.video import write_film
 from v3dg.viewer.frame import Pixels
 
 if TYPE_CHECKING:
