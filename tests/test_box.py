@@ -11,12 +11,7 @@ from v3dg import _core
 
 
 def bound_by_boxes(device, g, offset):
-    rows = devices.on(device, (g.means, g.quats, g.scales))
-    if device == "cpu":
-        return _core.bound_by_boxes(*rows, offset)
-    box = devices.on(device, np.full((len(offset) - 1, 2, 3), np.nan, np.float32))
-    _core.bound_by_boxes_cuda(*rows, offset, box, 0)
-    return devices.host(box)
+    return devices.host(_core.bound_by_boxes(devices.on(device, g).rows, offset))
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])

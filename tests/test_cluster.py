@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from devices import host, on
 from reference import cluster as reference
-from v3dg import _core, _operations
+from v3dg import _core
 
 # Few distinct values, so that axes, coordinates and whole points tie.
 coarse_means = hnp.arrays(
@@ -24,12 +24,12 @@ any_means = hnp.arrays(np.float32, st.tuples(st.integers(0, 40), st.just(3)), el
 
 
 def median_split(device, means, cluster_size):
-    order, leaf_offset = _operations.median_split(on(device, means), cluster_size)
-    return host(order), leaf_offset
+    depth = _core.num_halvings(len(means), cluster_size)
+    return split_segments(device, means, np.array([0, len(means)]), depth)
 
 
 def split_segments(device, means, offset, depth):
-    order, leaf_offset = _operations.split_segments(on(device, means), offset, depth)
+    order, leaf_offset = _core.median_split(on(device, means), offset, depth)
     return host(order), leaf_offset
 
 
@@ -109,7 +109,7 @@ def test_large_splits_are_the_same_on_both_devices(decimals):
 )
 def test_split_refuses_bad_input(means, cluster_size, message):
     with pytest.raises(ValueError, match=message):
-        _operations.median_split(means, cluster_size)
+        median_split("cpu", means, cluster_size)
 
 
 @pytest.mark.parametrize("offset", [[0, 3], [1, 4], [0, 3, 2, 4], []])
@@ -124,7 +124,7 @@ def random_offset(rng, count, num_segments):
 
 
 def bound(device, spheres, offset):
-    return host(_operations.bound_spheres(on(device, np.asarray(spheres, np.float32)), np.array(offset)))
+    return host(_core.bound_spheres(on(device, np.asarray(spheres, np.float32)), np.array(offset)))
 
 
 def reaches(ball, spheres):
@@ -201,12 +201,12 @@ def test_balls_refuse_bad_boundaries(offset):
 
 DIGEST = """
 import hashlib, numpy as np
-from v3dg import _operations
+from v3dg import _core
 rng = np.random.default_rng(5)
 means = np.round(rng.normal(size=(200_000, 3)), 2).astype(np.float32)
-order, leaf_offset = _operations.median_split(means, 100)
+order, leaf_offset = _core.median_split(means, np.array([0, len(means)]), _core.num_halvings(len(means), 100))
 radii = rng.exponential(0.01, size=(len(means), 1)).astype(np.float32)
-ball = _operations.bound_spheres(np.concatenate([means[order], radii], axis=1), leaf_offset)
+ball = _core.bound_spheres(np.concatenate([means[order], radii], axis=1), leaf_offset)
 print(hashlib.sha256(order.tobytes() + leaf_offset.tobytes() + ball.tobytes()).hexdigest())
 """
 

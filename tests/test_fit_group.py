@@ -11,7 +11,6 @@ from compare import DSSIM_FLOAT, FIT_FLOAT, assert_close
 from devices import host, on
 from v3dg import BuildConfig, Camera, Gaussians, _core, rasterize
 from v3dg.build.fit import fit_config
-from v3dg.rasterize import rows_of
 
 torch = pytest.importorskip("torch")
 
@@ -30,24 +29,23 @@ def fit_groups(
 ):
     """Fit groups that are all in the ball (CENTER, RADIUS); the result and residuals."""
     num_groups = len(own_range)
-    start = on(device, start)
-    rows = [row.copy() if device == "cpu" else row.clone() for row in rows_of(start)]
-    error = np.full((num_groups, 2), -1, np.float32)
-    ranges = (np.array(r, np.int64).reshape(-1, 2) for r in (target_range, own_range))
-    arguments = [
-        *(0.0, False, *ranges),
+    fitted = on(device, copied(start))
+    target_range, own_range = (np.array(r, np.int64).reshape(-1, 2) for r in (target_range, own_range))
+    error = _core.fit_level(
+        fit_config(config, seed, 0),
+        _core.FitTarget(on(device, target).rows, 0.0, False),
+        target_range,
+        fitted.rows,
+        own_range,
         np.tile(np.float32([*CENTER, RADIUS]), (num_groups, 1)),
         np.arange(num_groups) if streams is None else np.array(streams),
-        *rows,
-        error,
         progress or _core.FitProgress(),
-    ]
-    settings = fit_config(config, seed, 0)
-    if device == "cpu":
-        _core.fit_level(settings, _core.Model(*rows_of(target)), *arguments)
-    else:
-        _core.fit_level_cuda(settings, *rows_of(on(device, target)), *arguments, 0)
-    return Gaussians(*host(rows)), error
+    )
+    return host(fitted), error
+
+
+def copied(gaussians):
+    return Gaussians(*(getattr(gaussians, name).copy() for name in scenes.NAMES))
 
 
 def fit(device, start, target, config, *, seed=0, stream=0, progress=None):
@@ -395,35 +393,59 @@ def test_no_groups_are_legal(device):
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "message"),
+    ("change", "message"),
     [
-        (4, [[0, 11]], "range: expected \\[first, last\\) within the gaussians, group 0 is not"),
-        (5, [[3, 2]], "range: expected \\[first, last\\) within the gaussians, group 0 is not"),
-        (5, [[-1, 2]], "range: expected \\[first, last\\) within the gaussians, group 0 is not"),
-        (4, [[0, 5], [5, 10]], "target_range: expected shape"),
-        (7, [0, 1], "stream: expected shape"),
+        ({"target_range": [[0, 11]]}, r"range: expected \[first, last\) within the gaussians, group 0 is not"),
+        ({"range": [[3, 2]]}, r"range: expected \[first, last\) within the gaussians, group 0 is not"),
+        ({"range": [[-1, 2]]}, r"range: expected \[first, last\) within the gaussians, group 0 is not"),
+        ({"target_range": [[0, 5], [5, 10]]}, "target_range: expected shape"),
+        ({"stream": [0, 1]}, "stream: expected shape"),
+        ({"ball": np.zeros((1, 4), np.float32)}, "ball: expected a positive radius, group 0 has none"),
     ],
 )
-def test_wrong_groups_are_named(place, value, message):
-    rows = [np.array(row) for row in rows_of(in_ball(15, 10))]
-    arguments = [
-        *(fit_config(PLAIN, 0, 0), _core.Model(*rows), 0.0, False),
-        *(np.array([[0, 10]]), np.array([[0, 10]]), np.array([[0, 0, 0, 1]], np.float32), np.array([0])),
-        *(*rows, np.zeros((1, 2), np.float32), _core.FitProgress()),
-    ]
-    arguments[place] = np.array(value)
+def test_wrong_groups_are_named(change, message):
     with pytest.raises(ValueError, match=message):
-        _core.fit_level(*arguments)
+        fit_one_group(in_ball(15, 10), in_ball(15, 10), change)
 
 
-def test_group_without_extent_is_named():
-    rows = [np.array(row) for row in rows_of(in_ball(15, 10))]
-    with pytest.raises(ValueError, match="ball: expected a positive radius, group 0 has none"):
-        _core.fit_level(
-            *(fit_config(PLAIN, 0, 0), _core.Model(*rows), 0.0, False),
-            *(np.array([[0, 10]]), np.array([[0, 10]]), np.zeros((1, 4), np.float32), np.array([0])),
-            *(*rows, np.zeros((1, 2), np.float32), _core.FitProgress()),
-        )
+def fit_one_group(start, target, change):
+    """Call the core, one argument or more being another."""
+    arguments = {
+        "config": fit_config(PLAIN, 0, 0),
+        "target": _core.FitTarget(target.rows, 0.0, False),
+        "target_range": [[0, 10]],
+        "gaussians": copied(start).rows,
+        "range": [[0, 10]],
+        "ball": np.float32([[0, 0, 0, 1]]),
+        "stream": [0],
+        "progress": _core.FitProgress(),
+    } | change
+    for name in ("target_range", "range", "stream"):
+        arguments[name] = np.array(arguments[name], np.int64)
+    return _core.fit_level(**arguments)
+
+
+def test_what_is_fitted_has_to_be_like_its_target():
+    message = "gaussians: expected the device and the SH degree of the target, got others"
+    with pytest.raises(ValueError, match=message):
+        fit_one_group(with_bases(in_ball(15, 10), 1), in_ball(15, 10), {})
+
+
+def test_what_is_fitted_has_to_be_writable():
+    start = copied(in_ball(15, 10))
+    start.means.flags.writeable = False
+    with pytest.raises(ValueError, match="means: expected an array that can be written to"):
+        fit_one_group(in_ball(15, 10), in_ball(15, 10), {"gaussians": start.rows})
+
+
+@pytest.mark.gpu
+def test_what_is_fitted_has_to_be_where_its_target_is():
+    message = "gaussians: expected the device and the SH degree of the target, got others"
+    there = on("cuda", in_ball(15, 10))
+    with pytest.raises(ValueError, match=message):
+        fit_one_group(in_ball(15, 10), there, {})
+    with pytest.raises(ValueError, match=message):
+        fit_one_group(in_ball(15, 10), in_ball(15, 10), {"gaussians": there.rows})
 
 
 # ---- both halves

@@ -133,5 +133,5 @@ def test_wrong_arguments_are_named():
     )
     with pytest.raises(ValueError, match=r"origin: expected shape \(3,\)"):
         selection.gaussians(origin=1.0)
-    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu' or 'cuda', got 'gpu'"):
+    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'gpu'"):
         selection.gaussians(device="gpu")

@@ -17,7 +17,7 @@ def test_instances_are_counted_and_composed():
     assert scene.add(BUNDLE, positions=np.zeros((0, 3))) == range(3, 3)
     assert scene.add(BUNDLE) == range(3, 4)
     assert len(scene) == 4
-    assert scene.bundles == [BUNDLE, OTHER]
+    assert scene.bundles == (BUNDLE, OTHER)
     np.testing.assert_array_equal(scene.instance_bundle, [0, 0, 1, 0])
     np.testing.assert_array_equal(scene.positions, [[1, 2, 3], [4, 5, 6], [7, 8, 9], [0, 0, 0]])
     np.testing.assert_array_equal(scene.scales, [1, 1, 3, 1])
@@ -26,11 +26,21 @@ def test_instances_are_counted_and_composed():
     assert repr(scene) == "Scene(4 instances of 2 bundles)"
 
 
-def test_table_of_a_bundle_is_made_once():
-    """Every picture of a bundle makes a scene of it, and the table has a row a cluster."""
-    table = Scene.of(BUNDLE).tables[0]
-    assert Scene.of(BUNDLE).tables[0] is table
-    assert Scene.of(OTHER).tables[0] is not table
+def test_revision_tells_what_has_changed():
+    scene = Scene()
+    seen = [scene.revision]
+    for change in (
+        lambda: scene.add(BUNDLE, positions=np.zeros((3, 3))),
+        lambda: scene.remove([0]),
+        lambda: scene.set_importance(2.0),
+    ):
+        change()
+        assert scene.revision[0] > seen[-1][0]
+        assert scene.revision[1] == seen[-1][1]
+        seen.append(scene.revision)
+    scene.move(positions=np.ones((2, 3)))
+    assert scene.revision[0] == seen[-1][0]
+    assert scene.revision[1] > seen[-1][1]
 
 
 @given(quaternion=st.tuples(*[st.floats(-1e150, 1e150)] * 4).filter(any))
@@ -70,7 +80,7 @@ def test_bad_instances_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         scene.add(BUNDLE, **arguments)
     assert len(scene) == 0
-    assert scene.bundles == []
+    assert scene.bundles == ()
 
 
 def test_add_refuses_what_is_not_a_bundle():

@@ -221,7 +221,7 @@ def published_layout():
 def test_published_layouts_are_read(tmp_path):
     path = put(tmp_path / "layout.json", published_layout())
     scene, cameras = read_scene(path, bundles={"oak": BUNDLE, "donut": OTHER})
-    assert scene.bundles == [BUNDLE, OTHER]
+    assert scene.bundles == (BUNDLE, OTHER)
     np.testing.assert_array_equal(scene.instance_bundle, [0, 0, 1])
     np.testing.assert_array_equal(scene.scales, [0.5, 2, 0.5])
     np.testing.assert_array_equal(scene.positions[1], [1, 2, 3])

@@ -320,7 +320,7 @@ def test_bad_arguments_are_refused():
         select(bundle, camera, tolerance=float("nan"))
     with pytest.raises(ValueError, match="footprint: expected solid_angle or paper, got ball"):
         select(bundle, camera, tolerance=1, footprint="ball")
-    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu' or 'cuda', got 'tpu'"):
+    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'tpu'"):
         select(bundle, camera, tolerance=1, device="tpu")
     with pytest.raises(TypeError, match="bundle: expected a Bundle, got str"):
         select("donut", camera, tolerance=1)
@@ -332,14 +332,15 @@ def test_table_refuses_groups_that_do_not_exist():
     wrong[-1] = len(groups)
     with pytest.raises(ValueError, match="own_group: expected -1 or a group below"):
         _core.ClusterTable(
-            groups.ball,
-            groups.weight,
-            groups.level,
-            wrong,
-            clusters.parent_group,
-            clusters.box,
-            clusters.filter_px2,
-            clusters.offset,
+            ball=groups.ball,
+            weight=groups.weight,
+            level=groups.level,
+            own_group=wrong,
+            parent_group=clusters.parent_group,
+            box=clusters.box,
+            filter_px2=clusters.filter_px2,
+            antialiased=clusters.antialiased,
+            offset=clusters.offset,
         )
 
 

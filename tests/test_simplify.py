@@ -11,7 +11,7 @@ import scenes
 from compare import MERGE_FLOAT, assert_close
 from devices import host, on
 from reference import simplify as reference
-from v3dg import Gaussians, _operations
+from v3dg import Gaussians, _core
 
 CAMERA = scenes.CAMERAS["plain"]
 
@@ -25,11 +25,12 @@ def segments(*lengths):
 
 
 def merge(device, gaussians, in_lengths, out_lengths):
-    return host(_operations.merge(on(device, gaussians), segments(*in_lengths), segments(*out_lengths)))
+    rows = on(device, gaussians).rows
+    return Gaussians(*host(_core.merge(rows, segments(*in_lengths), segments(*out_lengths))))
 
 
 def prune(device, gaussians, in_lengths, out_lengths):
-    kept = _operations.prune(on(device, gaussians), segments(*in_lengths), segments(*out_lengths))
+    kept = _core.prune(on(device, gaussians).rows, segments(*in_lengths), segments(*out_lengths))
     return gaussians.subset(host(kept))
 
 
@@ -211,7 +212,7 @@ def test_no_gaussians_give_none(device, method):
 def test_wrong_segments_are_named(method, in_offset, out_offset, message):
     offsets = (np.array(o, np.int64) for o in (in_offset, out_offset))
     with pytest.raises(ValueError, match=message):
-        getattr(_operations, method)(random_gaussians(9, 3), *offsets)
+        getattr(_core, method)(random_gaussians(9, 3).rows, *offsets)
 
 
 DEGENERATE = {

@@ -5,9 +5,8 @@ import pytest
 
 import scenes_lod
 from v3dg import Camera, Scene, _core, render, select
-from v3dg._resident import instances_on_host
-from v3dg.render import cluster_tables
-from v3dg.select import camera_of
+from v3dg._device import CPU
+from v3dg.residency import residency
 
 CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
 
@@ -22,27 +21,28 @@ def crowd(rng, count, num_gaussians=400):
 
 
 def draw_window(scene, camera, window):
-    """Colour, alpha, depth and counts of the pixels [x0, x1) x [y0, y1)."""
+    """Colour, alpha, depth and statistics of the pixels [x0, x1) x [y0, y1)."""
     selection = select(scene, camera, tolerance=0.0)
-    return _core.render_selection(
-        cluster_tables(scene),
-        instances_on_host(scene),
-        camera_of(camera, window),
+    frame = _core.SceneFrame(CPU.number)
+    frame.set_models([residency.model(bundle, CPU, "appearance") for bundle in scene.bundles])
+    drawing = frame.draw_cut(
+        residency.scene(scene, CPU).core,
+        camera.core.window(*window),
         selection.instance_ids,
         selection.cluster_ids,
         [0.1, 0.2, 0.3],
-        True,
     )
+    return drawing.color, drawing.alpha, drawing.depth, drawing.finish()
 
 
 def assert_windows_are_parts(scene, camera, windows):
     image = render(scene, camera, tolerance=0.0, background=(0.1, 0.2, 0.3))
     assert (image.alpha > 0.5).mean() > 0.1
     for x0, y0, x1, y1 in windows:
-        *part, counts = draw_window(scene, camera, (x0, y0, x1, y1))
+        *part, stats = draw_window(scene, camera, (x0, y0, x1, y1))
         for got, whole in zip(part, (image.color, image.alpha, image.depth), strict=True):
             np.testing.assert_array_equal(got, whole[y0:y1, x0:x1])
-        assert counts["in_frustum"] == image.stats.gaussians_in_frustum
+        assert stats.in_frustum == image.stats.gaussians_in_frustum
     return image
 
 

@@ -1,340 +1,305 @@
 """Types of the compiled module."""
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from os import PathLike
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+# NumPy's on the host, torch's on a CUDA device. It cannot be narrower: torch need not be installed, so its
+# tensor has no type here, and which of the two a result is follows from the device, which no type knows.
+Array: TypeAlias = Any
+
 Float32: TypeAlias = NDArray[np.float32]
+Float64: TypeAlias = NDArray[np.float64]
+Int32: TypeAlias = NDArray[np.int32]
+Int64: TypeAlias = NDArray[np.int64]
+Uint8: TypeAlias = NDArray[np.uint8]
 
 has_cuda: bool
-reach_sigmas: float
+min_alpha: float
+sh_base0: float
 
 def isa() -> str: ...
-def ply_read(path: str) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
+def num_cuda_devices() -> int: ...
+
+# types
+class Camera:
+    """A pinhole camera, or a window of its image, as every operation takes it."""
+
+    def __init__(self, *, viewmat: Float64, K: Float64, width: int, height: int, near: float) -> None: ...
+    def window(self, x0: int, y0: int, x1: int, y1: int) -> Camera: ...
+    @property
+    def position(self) -> Float64: ...
+
+class Rule:
+    """What a selection chooses."""
+
+    def __init__(
+        self,
+        *,
+        tolerance_px2: float,
+        budget: int | None,
+        min_level: int,
+        footprint: Literal["solid_angle", "paper"],
+        culls: bool,
+    ) -> None: ...
+    @property
+    def tolerance_px2(self) -> float: ...
+
+class Instances:
+    """Instances of bundles; borrows the arrays, which are on the host."""
+
+    def __init__(
+        self,
+        *,
+        bundle: Int32,
+        positions: Float64,
+        quaternions: Float64,
+        scales: Float64,
+        importance: Float32,
+    ) -> None: ...
+
+class Rows:
+    """The arrays of gaussians, on the host or on a CUDA device."""
+
+    def __init__(self, means: Array, quats: Array, scales: Array, opacities: Array, sh: Array) -> None: ...
+    def __len__(self) -> int: ...
+    @property
+    def device(self) -> int: ...
+    @property
+    def sh_degree(self) -> int: ...
+
+# Means, quats, scales, opacities and sh.
+Columns: TypeAlias = tuple[Array, Array, Array, Array, Array]
+
+# ply
+def ply_read(path: str | PathLike[str]) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
 def ply_write(
-    path: str,
-    means: NDArray[Any],
-    quats: NDArray[Any],
-    scales: NDArray[Any],
-    opacities: NDArray[Any],
-    sh: NDArray[Any],
+    path: str | PathLike[str],
+    means: Float32,
+    quats: Float32,
+    scales: Float32,
+    opacities: Float32,
+    sh: Float32,
     encoding: str,
 ) -> None: ...
 
-# box
-def bound_by_boxes(
-    means: NDArray[Any], quats: NDArray[Any], scales: NDArray[Any], offset: NDArray[Any]
-) -> Float32: ...
-def bound_by_boxes_cuda(
-    means: Any, quats: Any, scales: Any, offset: NDArray[Any], box: Any, stream: int
-) -> None: ...
-
 # cluster
+nesting_margin: float
+min_radius: float
+
 def num_halvings(count: int, cluster_size: int) -> int: ...
-def median_split(
-    means: NDArray[Any], offset: NDArray[Any], depth: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]: ...
-def median_split_cuda(
-    means: Any, offset: NDArray[Any], depth: int, order: Any, stream: int
-) -> NDArray[np.int64]: ...
-def bound_spheres(spheres: NDArray[Any], offset: NDArray[Any]) -> Float32: ...
-def bound_spheres_cuda(spheres: Any, offset: NDArray[Any], ball: Any, stream: int) -> None: ...
+def median_split(means: Array, offset: Int64, depth: int) -> tuple[Array, Int64]: ...
+def bound_spheres(spheres: Array, offset: Int64) -> Array: ...
+def bound_by_boxes(gaussians: Rows, offset: Int64) -> Array: ...
+
+# simplify
+def prune(gaussians: Rows, in_offset: Int64, out_offset: Int64) -> Array: ...
+def merge(gaussians: Rows, in_offset: Int64, out_offset: Int64) -> Columns: ...
 
 # gather
 def gather(
-    bundles: list[tuple[Any, Any, Any, Any, Any]],
-    bundle: NDArray[np.int32],
-    positions: NDArray[np.float64],
-    rotations: NDArray[np.float64],
-    quaternions: NDArray[np.float64],
-    scales: NDArray[np.float64],
-    bands: NDArray[np.float64],
-    instance: NDArray[np.int32],
-    first_row: NDArray[np.int64],
-    offset: NDArray[np.int64],
-    num_bases: int,
-) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
-def gather_cuda(
-    bundles: list[tuple[Any, Any, Any, Any, Any]],
-    bundle: NDArray[np.int32],
-    positions: NDArray[np.float64],
-    rotations: NDArray[np.float64],
-    quaternions: NDArray[np.float64],
-    scales: NDArray[np.float64],
-    bands: NDArray[np.float64],
-    instance: NDArray[np.int32],
-    first_row: NDArray[np.int64],
-    offset: NDArray[np.int64],
-    num_bases: int,
-    rows: tuple[Any, Any, Any, Any, Any],
-    stream: int,
-) -> None: ...
+    *,
+    bundles: Sequence[Rows],
+    instances: Instances,
+    instance: Int32,
+    first_row: Int64,
+    offset: Int64,
+    device: int,
+) -> Columns: ...
 
 # select
-def num_cuda_devices() -> int: ...
-
 class ClusterTable:
+    """What selection and drawing read of a bundle's clusters."""
+
     def __init__(
         self,
-        ball: NDArray[Any],
-        weight: NDArray[Any],
-        level: NDArray[Any],
-        own_group: NDArray[Any],
-        parent_group: NDArray[Any],
-        box: NDArray[Any],
-        filter_px2: NDArray[Any],
-        offset: NDArray[Any],
+        *,
+        ball: Float32,
+        weight: Float32,
+        level: Int32,
+        own_group: Int32,
+        parent_group: Int32,
+        box: Float32,
+        filter_px2: Float32,
+        antialiased: Uint8,
+        offset: Int64,
     ) -> None: ...
 
-# Instances are (bundle, positions, quaternions, scales, importance), a camera (viewmat, K, width, height,
-# near, window or None), a rule (tolerance, budget or None, min_level, footprint, cull).
-SelectedPairs: TypeAlias = tuple[NDArray[np.int32], NDArray[np.int32], int, float, bool]
+class Cut:
+    """The clusters that one view needs, and what their selection came to."""
 
-def eye_of(viewmat: NDArray[np.float64]) -> NDArray[np.float64]: ...
-def select(
-    tables: list[ClusterTable], instances: tuple[Any, ...], camera: tuple[Any, ...], rule: tuple[Any, ...]
-) -> SelectedPairs: ...
+    @property
+    def instance_ids(self) -> Int32: ...
+    @property
+    def cluster_ids(self) -> Int32: ...
+    @property
+    def num_gaussians(self) -> int: ...
+    @property
+    def tolerance_px2(self) -> float: ...
+    @property
+    def fits_budget(self) -> bool: ...
+
 def group_metrics(
-    tables: list[ClusterTable], instances: tuple[Any, ...], camera: tuple[Any, ...], rule: tuple[Any, ...]
-) -> tuple[Float32, NDArray[np.int64]]: ...
-def bounds_may_draw(
-    tables: list[ClusterTable], instances: Instances, camera: Camera, rule: Rule, and_coarser: bool
-) -> tuple[NDArray[np.uint8], NDArray[np.int64]]: ...
+    tables: Sequence[ClusterTable], instances: Instances, camera: Camera, rule: Rule
+) -> tuple[Float32, Int64]: ...
 
-# render
-class Model:
-    """Gaussians laid out for the rasterizer."""
-
-    def __init__(
-        self,
-        means: NDArray[Any],
-        quats: NDArray[Any],
-        scales: NDArray[Any],
-        opacities: NDArray[Any],
-        sh: NDArray[Any],
-    ) -> None: ...
-    def __len__(self) -> int: ...
-
-class ModelDouble:
-    """The same in double precision."""
-
-    def __init__(
-        self,
-        means: NDArray[Any],
-        quats: NDArray[Any],
-        scales: NDArray[Any],
-        opacities: NDArray[Any],
-        sh: NDArray[Any],
-    ) -> None: ...
-    def __len__(self) -> int: ...
-
+# rasterize
 class Tape:
-    """What rasterize leaves for rasterize_backward."""
+    """What rasterize leaves for rasterize_backward; it keeps the gaussians."""
 
-class TapeDouble: ...
-
-# The signature is the same in both precisions; arrays are of the model's.
+# Colour, alpha, depth where it is wanted, counts and times where it was the host that drew, the tape where it
+# is to be kept.
 def rasterize(
-    model: Model | ModelDouble,
-    view: Sequence[float] | NDArray[np.float64],
+    gaussians: Rows,
+    camera: Camera,
+    *,
     filter_px2: float,
-    compensate: bool,
-    intrinsics: Sequence[float],
-    width: int,
-    height: int,
+    antialiased: bool,
     background: Sequence[float],
     with_depth: bool,
     keep_tape: bool,
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any], Any]: ...
+) -> tuple[Array, Array, Array | None, dict[str, float] | None, Tape | None]: ...
+
+# Gradients of the columns and of the background.
 def rasterize_backward(
-    tape: Tape | TapeDouble, d_color: NDArray[Any], d_alpha: NDArray[Any], d_depth: NDArray[Any] | None
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]: ...
+    tape: Tape, d_color: Array | None, d_alpha: Array | None, d_depth: Array | None
+) -> tuple[Array, Array, Array, Array, Array, Array]: ...
 
-class TapeCuda:
-    """What rasterize_cuda leaves for rasterize_backward_cuda."""
-
-# The picture (color, alpha, depth) is filled; the way back reads it and the gaussians again.
-def rasterize_cuda(
-    gaussians: tuple[Any, ...],
-    view: Sequence[float] | NDArray[np.float64],
-    filter_px2: float,
-    compensate: bool,
-    intrinsics: Sequence[float],
-    background: Sequence[float],
-    picture: tuple[Any, Any, Any],
-    stream: int,
-) -> TapeCuda: ...
-
-# Fills d_gaussians, as (means, quats, scales, opacities, sh), and d_background.
-def rasterize_backward_cuda(
-    tape: TapeCuda,
-    d_color: Any,
-    d_alpha: Any,
-    d_depth: Any | None,
-    d_gaussians: tuple[Any, ...],
-    d_background: Any,
-    stream: int,
-) -> None: ...
-
+# scene
 class Stop:
     """Asks, from any thread, for a picture under way to be given up: it is then left unfinished."""
 
+    def request(self) -> None: ...
     @property
     def is_requested(self) -> bool: ...
-    def request(self) -> None: ...
 
-def render_selection(
-    bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
-    instances: tuple[Any, ...],
-    camera: tuple[Any, ...],
-    instance_ids: NDArray[np.int32],
-    cluster_ids: NDArray[np.int32],
-    background: Sequence[float],
-    with_depth: bool,
-    stop: Stop | None = None,
-) -> tuple[Float32, Float32, Float32, dict[str, Any]]: ...
-def count_selection(
-    bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
-    instances: tuple[Any, ...],
-    camera: tuple[Any, ...],
-    instance_ids: NDArray[np.int32],
-    cluster_ids: NDArray[np.int32],
-    stop: Stop | None = None,
-) -> tuple[Float32, dict[str, Any]]: ...
-def pick_selection(
-    bundles: list[tuple[Model, NDArray[np.int64], Float32, NDArray[np.uint8]]],
-    instances: tuple[Any, ...],
-    camera: tuple[Any, ...],
-    instance_ids: NDArray[np.int32],
-    cluster_ids: NDArray[np.int32],
-) -> tuple[int, float, float] | None: ...
+class FrameStats:
+    """What a frame came to; times in milliseconds."""
 
-# frame, with CUDA only; arrays on the device are whatever has __cuda_array_interface__
+    @property
+    def gaussians(self) -> int: ...
+    @property
+    def in_frustum(self) -> int: ...
+    @property
+    def records(self) -> int: ...
+    @property
+    def entries(self) -> int: ...
+    @property
+    def items(self) -> int: ...
+    @property
+    def tolerance_px2(self) -> float: ...
+    @property
+    def exceeds_budget(self) -> bool: ...
+    @property
+    def select_ms(self) -> float: ...
+    @property
+    def draw_ms(self) -> float: ...
+
 class Drawing:
-    """A frame that has been enqueued on a device."""
+    """A frame that has been drawn, or enqueued on a device."""
 
-    def finish(self) -> dict[str, Any]: ...
+    @property
+    def color(self) -> Array: ...
+    @property
+    def alpha(self) -> Array: ...
+    @property
+    def depth(self) -> Array: ...
+    def finish(self) -> FrameStats: ...
 
-class DeviceScene:
-    """What selection reads of a scene, on a device. A bundle is (table, filter_px2, antialiased)."""
+class Model:
+    """Gaussians as frames of their device read them."""
 
-    def __init__(
-        self, bundles: list[tuple[ClusterTable, Float32, NDArray[np.uint8]]], stream: int
+    def __init__(self, gaussians: Rows) -> None: ...
+    def __len__(self) -> int: ...
+    @property
+    def bytes(self) -> int: ...
+
+class ResidentScene:
+    """What selection reads of a scene, on one device."""
+
+    def __init__(self, device: int) -> None: ...
+    def set_bundles(self, tables: list[ClusterTable]) -> None: ...
+    def set_instances(
+        self, bundle: Int32, importance: Float32, positions: Array, quaternions: Array, scales: Array
     ) -> None: ...
-    def set_instances(self, bundle: NDArray[np.int32], importance: Float32, stream: int) -> None: ...
-    def set_poses(self, positions: Any, quaternions: Any, scales: Any, stream: int) -> None: ...
-    def select(self, camera: tuple[Any, ...], rule: tuple[Any, ...], stream: int) -> SelectedPairs: ...
+    def set_poses(self, positions: Array, quaternions: Array, scales: Array) -> None: ...
+    def select(self, camera: Camera, rule: Rule) -> Cut: ...
 
 class SceneFrame:
-    """Draws scenes of the same bundles; of each, its gaussians on the device."""
+    """Draws scenes of the same bundles on one device."""
 
-    def __init__(self, bundles: list[tuple[Any, ...]], stream: int) -> None: ...
+    def __init__(self, device: int) -> None: ...
+    def set_models(self, models: list[Model]) -> None: ...
     def draw(
         self,
-        scene: DeviceScene,
-        camera: tuple[Any, ...],
-        rule: tuple[Any, ...],
+        scene: ResidentScene,
+        camera: Camera,
+        rule: Rule,
         background: Sequence[float],
-        picture: tuple[Any, Any, Any],
-        stream: int,
+        stop: Stop | None = None,
     ) -> Drawing: ...
     def draw_cut(
         self,
-        scene: DeviceScene,
-        camera: tuple[Any, ...],
-        instance_ids: Any,
-        cluster_ids: Any,
+        scene: ResidentScene,
+        camera: Camera,
+        instance_ids: Array,
+        cluster_ids: Array,
         background: Sequence[float],
-        picture: tuple[Any, Any, Any],
-        stream: int,
+        stop: Stop | None = None,
     ) -> Drawing: ...
-
-class ModelFrame:
-    """Draws gaussians that stay on a device."""
-
-    def __init__(self, gaussians: tuple[Any, ...], stream: int) -> None: ...
-    def draw(
+    def count_cut(
         self,
-        view: Sequence[float] | NDArray[np.float64],
-        filter_px2: float,
-        compensate: bool,
-        intrinsics: Sequence[float],
-        background: Sequence[float],
-        picture: tuple[Any, Any, Any],
-        stream: int,
+        scene: ResidentScene,
+        camera: Camera,
+        instance_ids: Int32,
+        cluster_ids: Int32,
+        stop: Stop | None = None,
     ) -> Drawing: ...
+    def pick_cut(
+        self, scene: ResidentScene, camera: Camera, instance_ids: Int32, cluster_ids: Int32
+    ) -> tuple[int, float, float] | None: ...
 
-# simplify
-def prune(
-    means: NDArray[Any],
-    scales: NDArray[Any],
-    opacities: NDArray[Any],
-    in_offset: NDArray[np.int64],
-    out_offset: NDArray[np.int64],
-) -> NDArray[np.int64]: ...
-def merge(
-    means: NDArray[Any],
-    quats: NDArray[Any],
-    scales: NDArray[Any],
-    opacities: NDArray[Any],
-    sh: NDArray[Any],
-    in_offset: NDArray[np.int64],
-    out_offset: NDArray[np.int64],
-) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
-def prune_cuda(
-    means: Any,
-    scales: Any,
-    opacities: Any,
-    in_offset: NDArray[np.int64],
-    out_offset: NDArray[np.int64],
-    kept: Any,
-    stream: int,
-) -> None: ...
-def merge_cuda(
-    means: Any,
-    quats: Any,
-    scales: Any,
-    opacities: Any,
-    sh: Any,
-    in_offset: NDArray[np.int64],
-    out_offset: NDArray[np.int64],
-    out_means: Any,
-    out_quats: Any,
-    out_scales: Any,
-    out_opacities: Any,
-    out_sh: Any,
-    stream: int,
-) -> None: ...
+class AssetFrame:
+    """Draws gaussians without levels on the device that they are on."""
+
+    def __init__(self, model: Model) -> None: ...
+    def draw(self, camera: Camera, background: Sequence[float], stop: Stop | None = None) -> Drawing: ...
 
 # fit_level
-class LossWeights:
-    def __init__(self, l1: float, dssim: float, alpha: float) -> None: ...
-
 class FitConfig:
-    steps: int
-    views_per_step: int
-    num_views: int
-    supersample: int
-    image_size: int
-    px2_per_gaussian: float
-    distance: float
-    filter_px2: float
-    compensate: bool
-    loss: LossWeights
-    step_position: float
-    step_log_scale: float
-    step_quat: float
-    step_logit: float
-    step_sh0: float
-    step_sh_rest: float
-    position_in_world: bool
-    final_step: float
-    seed: int
+    """How groups are fitted; a setting that is left out is an error."""
+
+    def __init__(
+        self,
+        *,
+        steps: int,
+        views_per_step: int,
+        num_views: int,
+        supersample: int,
+        image_size: int,
+        px2_per_gaussian: float,
+        distance: float,
+        filter_px2: float,
+        antialiased: bool,
+        loss_l1: float,
+        loss_dssim: float,
+        loss_alpha: float,
+        step_position: float,
+        step_log_scale: float,
+        step_quat: float,
+        step_logit: float,
+        step_sh0: float,
+        step_sh_rest: float,
+        position_in_world: bool,
+        final_step: float,
+        seed: int,
+    ) -> None: ...
 
 class FitProgress:
-    """How far fit_level has come; shared with the thread that waits for it."""
+    """How far a fit is, to be looked at and cancelled from any thread."""
 
     @property
     def groups_done(self) -> int: ...
@@ -342,46 +307,20 @@ class FitProgress:
     def loss_sum(self) -> float: ...
     def cancel(self) -> None: ...
 
-# Writes the result over the start (means, ..., sh), and the residuals into `error`.
+class FitTarget:
+    """The gaussians that groups should look like."""
+
+    def __init__(self, gaussians: Rows, filter_px2: float, antialiased: bool) -> None: ...
+
+# Writes over `gaussians`; returns the residuals (G, 2).
 def fit_level(
     config: FitConfig,
-    target: Model,
-    target_filter_px2: float,
-    target_compensate: bool,
-    target_range: NDArray[np.int64],
-    range: NDArray[np.int64],
+    target: FitTarget,
+    target_range: Int64,
+    gaussians: Rows,
+    range: Int64,
     ball: Float32,
-    stream: NDArray[np.int64],
-    means: Float32,
-    quats: Float32,
-    scales: Float32,
-    opacities: Float32,
-    sh: Float32,
-    error: Float32,
+    stream: Int64,
     progress: FitProgress,
-) -> None: ...
-def fit_level_cuda(
-    config: FitConfig,
-    target_means: Any,
-    target_quats: Any,
-    target_scales: Any,
-    target_opacities: Any,
-    target_sh: Any,
-    target_filter_px2: float,
-    target_compensate: bool,
-    target_range: NDArray[Any],
-    range: NDArray[Any],
-    ball: NDArray[Any],
-    stream: NDArray[Any],
-    means: Any,
-    quats: Any,
-    scales: Any,
-    opacities: Any,
-    sh: Any,
-    error: NDArray[Any],
-    progress: FitProgress,
-    cuda_stream: int,
-) -> None: ...
-
-# loss
+) -> Float32: ...
 def dssim(picture: Float32, target: Float32) -> tuple[float, Float32]: ...

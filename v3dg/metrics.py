@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from v3dg._device import Device
 from v3dg.cameras import Camera
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
@@ -157,7 +158,7 @@ def box_downsample(image: Any, factor: int) -> Any:
     return blocks.mean((1, 3))
 
 
-def draw_truth(subject: Any, camera: Camera, device: str = "cpu", supersampling: int = 2) -> Picture:
+def draw_truth(subject: Any, camera: Camera, device: str | Device = "cpu", supersampling: int = 2) -> Picture:
     """Draw what the others are compared with, in 8 bits: all gaussians, with so many samples a pixel's side.
 
     Each sample is clipped to [0,1] as a screen does, before it is averaged over its pixel.

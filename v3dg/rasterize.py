@@ -67,7 +67,11 @@ def rasterize(
         raise ValueError(f"filter_px2: expected a variance of at least 0 px², got {filter_px2}")
     if len(background) != 3:
         raise ValueError(f"background: expected three numbers, got {len(background)}")
-    options = {"filter_px2": float(filter_px2), "antialiased": bool(antialiased), "with_depth": True}
+    options: dict[str, Any] = {
+        "filter_px2": float(filter_px2),
+        "antialiased": bool(antialiased),
+        "with_depth": True,
+    }
     if isinstance(gaussians.means, np.ndarray):
         shade = [float(b) for b in background]
         color, alpha, depth, _, _ = _core.rasterize(

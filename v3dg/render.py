@@ -87,7 +87,7 @@ def render(
     cut: Selection | None = ...,
     color_by: ColorBy = ...,
     background: Sequence[float] = ...,
-    device: str = ...,
+    device: str | Device = ...,
 ) -> Image: ...
 @overload
 def render(
@@ -100,7 +100,7 @@ def render(
     cut: Selection | None = ...,
     color_by: ColorBy = ...,
     background: Sequence[float] = ...,
-    device: str = ...,
+    device: str | Device = ...,
 ) -> list[Image]: ...
 def render(
     subject: Scene | Bundle | Gaussians,
@@ -112,7 +112,7 @@ def render(
     cut: Selection | None = None,
     color_by: ColorBy = "appearance",
     background: Sequence[float] = (0.0, 0.0, 0.0),
-    device: str = "cpu",
+    device: str | Device = "cpu",
 ) -> Image | list[Image]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 

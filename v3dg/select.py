@@ -51,7 +51,7 @@ class Selection:
     def __len__(self) -> int:
         return len(self.instance_ids)
 
-    def gaussians(self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str = "cpu") -> Gaussians:
+    def gaussians(self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str | Device = "cpu") -> Gaussians:
         """Return the selected gaussians in the world, N in the order of the selection, for any rasterizer.
 
         Spherical harmonics are rotated into the world's frame, which is exact. The degree is the highest of
@@ -131,7 +131,7 @@ def select(
     min_level: int = ...,
     footprint: Footprint = ...,
     cull: bool = ...,
-    device: str = ...,
+    device: str | Device = ...,
 ) -> Selection: ...
 @overload
 def select(
@@ -143,7 +143,7 @@ def select(
     min_level: int = ...,
     footprint: Footprint = ...,
     cull: bool = ...,
-    device: str = ...,
+    device: str | Device = ...,
 ) -> list[Selection]: ...
 def select(
     scene_or_bundle: Scene | Bundle,
@@ -154,7 +154,7 @@ def select(
     min_level: int = 0,
     footprint: Footprint = "solid_angle",
     cull: bool = True,
-    device: str = "cpu",
+    device: str | Device = "cpu",
 ) -> Selection | list[Selection]:
     """Choose the clusters that are just detailed enough for one view, or for each of several.
 

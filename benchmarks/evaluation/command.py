@@ -51,7 +51,7 @@ def run(options: Evaluate) -> None:
     results = evaluation.run(
         evaluation.Evaluation(
             evaluation.PRESETS[options.preset],
-            _device.resolve(options.device),
+            "cuda" if _device.resolve(options.device).is_cuda else "cpu",
             options.output,
             seed=options.seed,
             asset_path=options.asset,

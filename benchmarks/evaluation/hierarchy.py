@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _device, _operations
+from v3dg import _core, _device
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import rotation_from_quaternion
 from v3dg.scene import Scene
-from v3dg.select import rotations_of_bands
 
 Ids = npt.NDArray[np.int64]
 
@@ -50,11 +49,12 @@ class Hierarchy:
 
 def build_hierarchy(asset: Gaussians) -> Hierarchy:
     """Build the tree of one asset, given as NumPy arrays."""
-    order, offset = _operations.median_split(asset.means, 1)
+    count = len(asset)
+    order, offset = _core.median_split(asset.means, np.array([0, count]), _core.num_halvings(count, 1))
     depth = (len(offset) - 1).bit_length() - 1
     leaves = asset.subset(order)
     levels = [leaves]
-    boxes = [_operations.bound_by_boxes(leaves, np.arange(len(leaves) + 1))]
+    boxes = [_core.bound_by_boxes(leaves.rows, np.arange(len(leaves) + 1))]
     # Of the segments that the last split leaves, some are empty; above it, every node has two children.
     parents = [np.repeat(np.arange(len(offset) - 1), np.diff(offset)) // 2]
     for k in range(depth - 1, -1, -1):
@@ -77,7 +77,7 @@ def build_hierarchy(asset: Gaussians) -> Hierarchy:
 
 def _merge(children: Gaussians, first_child: Ids) -> Gaussians:
     """Join segments of one or two by their moments; opacity times surface is kept, also beyond 1."""
-    merged = _operations.merge(children, first_child, np.arange(len(first_child)))
+    merged = Gaussians(*_core.merge(children.rows, first_child, np.arange(len(first_child))))
     weight = np.add.reduceat(children.opacities * _surface(children.scales), first_child[:-1])
     opacities = weight / np.maximum(_surface(merged.scales), np.float32(1e-30))
     return Gaussians(merged.means, merged.quats, merged.scales, opacities, merged.sh)
@@ -131,16 +131,15 @@ class HierarchyScene:
     """One hierarchy at all instances of a scene, on a device."""
 
     def __init__(self, hierarchy: Hierarchy, scene: Scene, device: str) -> None:
-        self.scene = scene
-        self._bands = rotations_of_bands(scene.rotations, hierarchy.gaussians.sh.shape[1])
-        self._nodes = _device.place(hierarchy.gaussians, device)
+        self.scene, self._device = scene, _device.resolve(device)
+        self._nodes = _device.place(hierarchy.gaussians, self._device)
         self._library: Any = _device.library_of(self._nodes.means)
         self._box = self._place(hierarchy.box)
         self._extent = self._library.amax(self._box[:, 1] - self._box[:, 0], 1)
         self._siblings = self._place(hierarchy.num_siblings)
         self._parent = self._library.asarray(hierarchy.parent)
-        if device != "cpu":
-            self._parent = self._parent.to(device)
+        if self._device.is_cuda:
+            self._parent = self._parent.to(str(self._device))
         self._first_leaf = len(hierarchy.parent) - hierarchy.num_leaves
 
     def _place(self, values: Any) -> Any:
@@ -195,18 +194,19 @@ class HierarchyScene:
         )
 
     def _gather(self, instance: Any, rows: Any) -> Gaussians:
-        scene, count = self.scene, len(instance)
-        gathered = _operations.gather(
-            [self._nodes],
-            self._nodes.sh.shape[1],
-            bundle=np.zeros(len(scene), np.int32),
-            positions=scene.positions,
-            rotations=scene.rotations,
-            quaternions=scene.quaternions,
-            scales=scene.scales,
-            bands=self._bands,
+        scene = self.scene
+        gathered = _core.gather(
+            bundles=[self._nodes.rows],
+            instances=_core.Instances(
+                bundle=np.zeros(len(scene), np.int32),
+                positions=scene.positions,
+                quaternions=scene.quaternions,
+                scales=scene.scales,
+                importance=scene.importance,
+            ),
             instance=_device.to_host(instance).astype(np.int32),
             first_row=_device.to_host(rows).astype(np.int64),
-            offset=np.arange(count + 1),
+            offset=np.arange(len(instance) + 1),
+            device=self._device.number,
         )
-        return gathered
+        return Gaussians(*gathered)

@@ -23,7 +23,7 @@ import v3dg
 from benchmarks.evaluation import gpu, record
 from benchmarks.evaluation.assets import many_copies
 from benchmarks.worlds.procedural import make_asset
-from v3dg import _operations, metrics
+from v3dg import _core, metrics
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.scene_file import read_scene
@@ -95,16 +95,17 @@ def build(
 
 
 def split(means: Any, device: str, repeats: int) -> dict[str, Any]:
+    ends, depth = np.array([0, len(means)]), _core.num_halvings(len(means), BuildConfig().cluster_size)
     points = torch.from_numpy(means).to(gpu.DEVICE) if device == "cuda" else means
     seconds = []
     with gpu.PeakMemory() as peak:
         for _ in range(repeats + 1):
             torch.cuda.synchronize()
             start = time.perf_counter()
-            order, offset = _operations.median_split(points, BuildConfig().cluster_size)
+            order, offset = _core.median_split(points, ends, depth)
             torch.cuda.synchronize()
             seconds.append(time.perf_counter() - start)
-    expected, expected_offset = _operations.median_split(means, BuildConfig().cluster_size)
+    expected, expected_offset = _core.median_split(means, ends, depth)
     return {
         "points": len(means),
         "seconds": round(float(np.median(seconds[1:])), 4),

@@ -13,10 +13,7 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import record
-from v3dg import _operations
-from v3dg.rasterize import rows_of
-from v3dg.rotations import rotation_from_quaternion
-from v3dg.select import rotations_of_bands
+from v3dg import _core
 
 
 @dataclass
@@ -48,20 +45,20 @@ def random_gaussians(num: int, degree: int, seed: int) -> v3dg.Gaussians:
     )
 
 
-def placements(leaf_offset: np.ndarray, config: Config) -> dict[str, np.ndarray]:
+def placements(leaf_offset: np.ndarray, config: Config) -> dict[str, Any]:
     """Every cluster, in each of some instances."""
     rng = np.random.default_rng(config.seed)
     count, sizes = config.instances, np.tile(np.diff(leaf_offset), config.instances)
     quaternions = rng.standard_normal((count, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    rotations = rotation_from_quaternion(quaternions)
     return {
-        "bundle": np.zeros(count, np.int32),
-        "positions": rng.standard_normal((count, 3)),
-        "rotations": rotations,
-        "quaternions": quaternions,
-        "scales": np.ones(count),
-        "bands": rotations_of_bands(rotations, (config.sh_degree + 1) ** 2),
+        "instances": _core.Instances(
+            bundle=np.zeros(count, np.int32),
+            positions=rng.standard_normal((count, 3)),
+            quaternions=quaternions,
+            scales=np.ones(count),
+            importance=np.ones(count, np.float32),
+        ),
         "instance": np.repeat(np.arange(count, dtype=np.int32), len(leaf_offset) - 1),
         "first_row": np.tile(leaf_offset[:-1], count),
         "offset": np.concatenate([[0], np.cumsum(sizes)]),
@@ -73,7 +70,8 @@ def operations(
 ) -> dict[str, tuple[int, Callable[[], tuple[Any, ...]]]]:
     """What is timed, by name: how many gaussians go in, and a call that returns arrays."""
     num = len(gaussians)
-    order, leaf_offset = _operations.median_split(gaussians.means, config.cluster_size)
+    ends, depth = np.array([0, num]), _core.num_halvings(num, config.cluster_size)
+    order, leaf_offset = _core.median_split(gaussians.means, ends, depth)
     gaussians = gaussians.subset(order)
     offset = np.append(np.arange(0, num, config.group_size), num)
     halved = np.concatenate([[0], np.cumsum((np.diff(offset) + 1) // 2)])
@@ -85,18 +83,19 @@ def operations(
 
         spheres = torch.cat([gaussians.means, gaussians.scales.amax(dim=1, keepdim=True)], dim=1)
     tables = placements(leaf_offset, config)
+    rows, one_rows = gaussians.rows, one.rows
     one_offset, one_halved = np.array([0, len(one)]), np.array([0, (len(one) + 1) // 2])
     return {
-        "median_split": (num, lambda: _operations.median_split(gaussians.means, config.cluster_size)),
-        "split_segments": (num, lambda: _operations.split_segments(gaussians.means, offset, 3)),
-        "bound_clusters": (num, lambda: (_operations.bound_spheres(spheres, leaf_offset),)),
-        "bound_all": (num, lambda: (_operations.bound_spheres(spheres, np.array([0, num])),)),
-        "prune": (num, lambda: (_operations.prune(gaussians, offset, halved),)),
-        "merge": (num, lambda: rows_of(_operations.merge(gaussians, offset, halved))),
-        "merge_one_group": (len(one), lambda: rows_of(_operations.merge(one, one_offset, one_halved))),
+        "median_split": (num, lambda: _core.median_split(gaussians.means, ends, depth)),
+        "split_segments": (num, lambda: _core.median_split(gaussians.means, offset, 3)),
+        "bound_clusters": (num, lambda: (_core.bound_spheres(spheres, leaf_offset),)),
+        "bound_all": (num, lambda: (_core.bound_spheres(spheres, ends),)),
+        "prune": (num, lambda: (_core.prune(rows, offset, halved),)),
+        "merge": (num, lambda: _core.merge(rows, offset, halved)),
+        "merge_one_group": (len(one), lambda: _core.merge(one_rows, one_offset, one_halved)),
         "gather": (
             config.instances * num,
-            lambda: rows_of(_operations.gather([gaussians], (config.sh_degree + 1) ** 2, **tables)),
+            lambda: _core.gather(bundles=[rows], device=rows.device, **tables),
         ),
     }
 

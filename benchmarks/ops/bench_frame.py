@@ -51,7 +51,7 @@ def main(config: Config) -> None:
     def measure(
         name: str, subject: Any, gaussians: v3dg.Gaussians, camera: Camera, options: dict[str, Any]
     ) -> None:
-        renderer = Renderer(subject)
+        renderer = Renderer(subject, device=gpu.DEVICE)
 
         def ours() -> Any:
             frame = renderer.render(camera, **options)

@@ -110,7 +110,7 @@ def frames(
     """Every camera, near to far, with one renderer: as a flight through the scene finds it."""
     ms, select_ms, counts, pictures = [], [], [], []
     with gpu.PeakMemory() as peak:
-        renderer = Renderer(scene)
+        renderer = Renderer(scene, device=gpu.DEVICE)
         for camera in cameras:
 
             def frame(camera: Camera = camera) -> Any:
@@ -138,7 +138,7 @@ def frames(
 
 def movement(scene: Scene, camera: Camera, config: Config) -> Row:
     """What it costs that every instance has another place and rotation in every frame."""
-    renderer = Renderer(scene)
+    renderer = Renderer(scene, device=gpu.DEVICE)
     tolerance = config.tolerances[-1]
     host = tuple(np.array(a) for a in (scene.positions, scene.quaternions, scene.scales))
     device = tuple(torch.from_numpy(rows).to(gpu.DEVICE) for rows in host)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,6 @@ from benchmarks.evaluation import record
 from benchmarks.worlds.procedural import make_asset
 from v3dg import _core
 from v3dg.cameras import Camera
-from v3dg.rasterize import intrinsics, rows_of, view_of_world
 
 
 @dataclass
@@ -38,27 +37,17 @@ def camera_that_fills(gaussians: v3dg.Gaussians, width: int, height: int) -> Cam
 def main(config: Config) -> None:
     gaussians = make_asset() if config.asset is None else v3dg.load(config.asset)
     camera = camera_that_fills(gaussians, config.size, config.size)
-    options = (
-        view_of_world(camera),
-        0.0,
-        False,
-        intrinsics(camera),
-        camera.width,
-        camera.height,
-        [0.0] * 3,
-        False,
-        False,
-    )
-    model = _core.Model(*rows_of(gaussians))
+    look = {"filter_px2": 0.0, "antialiased": False, "background": [0.0] * 3}
+    options = {**look, "with_depth": False, "keep_tape": False}
+    rows = gaussians.rows
+    in_double = _core.Rows(*(getattr(gaussians, f.name).astype(np.float64) for f in fields(gaussians)))
     times, stages = [], []
     for _ in range(config.repeats + 3):
         start = time.perf_counter()
-        color, alpha, _, counts, _ = _core.rasterize(model, *options)
+        color, alpha, _, counts, _ = _core.rasterize(rows, camera.core, **options)
         times.append(time.perf_counter() - start)
         stages.append(counts)
-    exact = _core.rasterize(_core.ModelDouble(*(a.astype(np.float64) for a in rows_of(gaussians))), *options)[
-        0
-    ]
+    exact = _core.rasterize(in_double, camera.core, **options)[0]
     median = statistics.median(times[3:])
     result = {
         "gaussians": len(gaussians),

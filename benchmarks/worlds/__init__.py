@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +24,7 @@ from benchmarks.worlds.paper_cameras import trajectories
 from benchmarks.worlds.procedural import TREE_KINDS, make_donut, make_person, make_temple, make_tree
 from benchmarks.worlds.procedural.donut import RING, TUBE
 from benchmarks.worlds.rings import Pile
+from v3dg._device import Device
 from v3dg.build import BuildConfig, build_file
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
@@ -289,7 +289,7 @@ def write_world(
     *,
     config: BuildConfig | None = None,
     seed: int = 0,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
+    device: str | Device = "auto",
     resume: bool = False,
     progress: bool = True,
 ) -> Path:

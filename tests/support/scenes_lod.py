@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from v3dg import Bundle, Camera, Clusters, Gaussians, Groups, Scene, _operations
+from v3dg import Bundle, Camera, Clusters, Gaussians, Groups, Scene, _core
 
 REACH = 3.33  # standard deviations until an opaque gaussian falls below 1/255
 
@@ -55,7 +55,8 @@ def lod_bundle(rng, asset, cluster_size, *, group_size=2, past_root=2, filter_px
     A group of ``group_size`` clusters is thinned to half as many clusters, at least one; from one cluster on,
     ``past_root`` further levels halve it.
     """
-    order, leaf_offset = _operations.median_split(asset.means, cluster_size)
+    halvings = _core.num_halvings(len(asset), cluster_size)
+    order, leaf_offset = _core.median_split(asset.means, np.array([0, len(asset)]), halvings)
     level = [asset.subset(order[a:b]) for a, b in itertools.pairwise(leaf_offset)]
     # A unit: clusters made by one group, that group (-1: none), the ball that must be contained.
     units = [([cluster], -1, None) for cluster in level]
@@ -84,7 +85,7 @@ def lod_bundle(rng, asset, cluster_size, *, group_size=2, past_root=2, filter_px
             else:
                 radii = together.scales.max(axis=1, initial=0.0, keepdims=True)
                 spheres = np.concatenate([together.means, radii], axis=1)
-            ball = _operations.bound_spheres(spheres, np.array([0, len(spheres)]))[0]
+            ball = _core.bound_spheres(spheres, np.array([0, len(spheres)]))[0]
             keep = together.subset(np.sort(rng.permutation(len(together))[: max(1, len(together) // 2)]))
             num_made = max(1, len(below) // 2)
             parts = [keep.subset(part) for part in np.array_split(np.arange(len(keep)), num_made)]

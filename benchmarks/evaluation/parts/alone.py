@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
 import time
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -17,13 +19,12 @@ from benchmarks.evaluation.evaluation import Evaluation
 from benchmarks.evaluation.markdown import Column, count_text, markdown
 from benchmarks.evaluation.measure import Row, time_ms
 from benchmarks.evaluation.summary import Summary
-from v3dg import _core, _device, _operations
+from v3dg import _core, _device
 from v3dg.build import BuildConfig
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.metrics import psnr
 from v3dg.pictures import to_8bit
-from v3dg.rasterize import intrinsics, rows_of, view_of_world
 from v3dg.render import Renderer, render
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE, select
@@ -85,33 +86,27 @@ def rasterize_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
         row |= gsplat_peer(evaluation, gaussians, camera, picture.color)
     elif evaluation.device == "cpu":
         row["psnr_to_float64"] = psnr_to_float64(gaussians, camera, picture.color)
-    renderer = _renderer(gaussians, evaluation.device)
-    timed = time_ms(lambda: renderer(camera), evaluation.device, evaluation.settings.repeats)
+    renderer = Renderer(gaussians, device=evaluation.device)  # takes over the asset once
+    timed = time_ms(lambda: renderer.render(camera).stats, evaluation.device, evaluation.settings.repeats)
     row |= timed.row("frame")
     num_bytes = 4 * (
-        sum(
-            array[:1].size if evaluation.device == "cpu" else array[:1].numel()
-            for array in rows_of(gaussians)
-        )
-        * count
-        + 5 * width * height
+        sum(math.prod(getattr(gaussians, f.name).shape) for f in fields(gaussians)) + 5 * width * height
     )
     row |= {"bytes": num_bytes, "share": round(num_bytes / (timed.median / 1e3) / bandwidth, 4)}
     return row
 
 
-def _renderer(gaussians: Gaussians, device: str) -> Any:
-    """What draws an asset that is where it is drawn, without handing it over each time."""
-    if device == "cuda":
-        renderer = Renderer(gaussians)
-        return lambda camera: renderer.render(camera).stats
-    return lambda camera: render(gaussians, camera).stats
-
-
 def psnr_to_float64(gaussians: Gaussians, camera: Camera, color: Any) -> float:
-    model = _core.ModelDouble(*(array.astype(np.float64) for array in rows_of(gaussians)))
-    lens = (intrinsics(camera), camera.width, camera.height, [0.0] * 3, False, False)
-    exact = _core.rasterize(model, view_of_world(camera), 0.0, False, *lens)[0]
+    rows = _core.Rows(*(getattr(gaussians, f.name).astype(np.float64) for f in fields(gaussians)))
+    exact = _core.rasterize(
+        rows,
+        camera.core,
+        filter_px2=0.0,
+        antialiased=False,
+        background=[0.0] * 3,
+        with_depth=False,
+        keep_tape=False,
+    )[0]
     return _checked_psnr(exact.astype(np.float32), color)
 
 
@@ -136,17 +131,17 @@ def gsplat_peer(evaluation: Evaluation, gaussians: Gaussians, camera: Camera, co
 def split_row(evaluation: Evaluation, count: int, bandwidth: float) -> Row:
     means: Any = np.random.default_rng(evaluation.seed).standard_normal((count, 3), np.float32)
     on_device = means
-    size = BuildConfig().cluster_size
+    ends, depth = np.array([0, count]), _core.num_halvings(count, BuildConfig().cluster_size)
     if evaluation.device == "cuda":
         import torch
 
         on_device = torch.from_numpy(means).to(evaluation.device)
         if count <= 1_000_000:
-            order, _ = _operations.median_split(on_device, size)
-            if not np.array_equal(_device.to_host(order), _operations.median_split(means, size)[0]):
+            order, _ = _core.median_split(on_device, ends, depth)
+            if not np.array_equal(_device.to_host(order), _core.median_split(means, ends, depth)[0]):
                 raise RuntimeError("median_split: expected the same order on both devices, got another")
     timed = time_ms(
-        lambda: _operations.median_split(on_device, size), evaluation.device, evaluation.settings.repeats
+        lambda: _core.median_split(on_device, ends, depth), evaluation.device, evaluation.settings.repeats
     )
     num_bytes = (12 + 8) * count
     share = num_bytes / (timed.median / 1e3) / bandwidth
@@ -201,7 +196,8 @@ def build_row(evaluation: Evaluation, count: int) -> Row:
 _SCRIPT = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
-from v3dg import _operations
+import numpy as np
+from v3dg import _core
 from benchmarks.evaluation.assets import like_trained
 from benchmarks.evaluation.measure import time_ms
 from v3dg.cameras import Camera
@@ -209,9 +205,10 @@ from v3dg.render import render
 count, width, height = map(int, sys.argv[2:])
 camera = Camera.look_at((0, 0, 0), (0, 1, 0), width=width, height=height)
 gaussians = like_trained(count, camera, "cpu")
+ends, depth = np.array([0, count]), _core.num_halvings(count, 256)
 times = {
     "frame_ms": time_ms(lambda: render(gaussians, camera), "cpu", 5).median,
-    "split_ms": time_ms(lambda: _operations.median_split(gaussians.means, 256), "cpu", 5).median,
+    "split_ms": time_ms(lambda: _core.median_split(gaussians.means, ends, depth), "cpu", 5).median,
 }
 print(json.dumps(times))
 """
