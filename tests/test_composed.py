@@ -11,7 +11,7 @@ from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, lod_bundle, random_camera, random_scene
 from v3dg import Scene, render, select
-from v3dg.false_color import false_color
+from v3dg.false_color import palette_of
 
 # Of the tolerances that a budget chooses from, neighbours differ by this in their float32 bits.
 STEP_BITS = 1 << 12
@@ -302,27 +302,41 @@ def test_cut_of_another_scene_is_refused(device):
 
 
 @pytest.mark.parametrize("by", ["level", "cluster"])
+def test_palette_draws_what_a_recoloured_copy_does(device, by):
+    """Bit for bit, also where neighbouring clusters of several instances are drawn together."""
+    rng = np.random.default_rng(21)
+    bundle = lod_bundle(rng, blob(rng, 300, sh_degree=2), 16)
+    clusters = bundle.clusters
+    sh = np.repeat(palette_of(bundle, by), np.diff(clusters.offset), axis=0)[:, None]
+    recoloured = v3dg.Bundle(clusters, bundle.groups, replace(bundle.gaussians, sh=sh))
+    camera = v3dg.Camera.look_at((0, -6, 0), (0, 0, 0), width=64, height=48)
+    poses = rng.normal(size=(3, 3))
+    pictures = []
+    for subject, color_by in ((bundle, by), (recoloured, "appearance")):
+        scene = Scene()
+        scene.add(subject, positions=poses)
+        pictures.append(render(scene, camera, tolerance=5.0, color_by=color_by, device=device))
+    np.testing.assert_array_equal(host(pictures[0].color), host(pictures[1].color))
+
+
+@pytest.mark.parametrize("by", ["level", "cluster"])
 def test_false_colors_show_what_was_chosen(device, by):
     rng = np.random.default_rng(14)
     bundle = lod_bundle(rng, blob(rng, 200), 16)
     camera = v3dg.Camera.look_at((0, -6, 0), (0, 0, 0), width=48, height=40)
-    colored = false_color(bundle, by)
-    assert colored.sh_degree == 0
+    palette = palette_of(bundle, by)
     clusters = bundle.clusters
+    assert palette.shape == (len(clusters), 3)
     key = clusters.level if by == "level" else np.arange(len(clusters.level))
-    rgb = (0.28209479177387814 * colored.sh[:, 0] + 0.5).clip(0)
+    rgb = (0.28209479177387814 * palette + 0.5).clip(0)
     seen = {}
-    for c, name in enumerate(key):
-        here = rgb[clusters.offset[c] : clusters.offset[c + 1]]
-        assert (here == here[:1]).all()
-        if len(here):
-            seen.setdefault(int(name), here[0].tobytes())
-            assert seen[int(name)] == here[0].tobytes()
+    for name, color in zip(key.tolist(), rgb, strict=True):
+        assert seen.setdefault(name, color.tobytes()) == color.tobytes()
     assert len(set(list(seen.values())[:9])) == min(len(seen), 9)
     top = render(bundle, camera, tolerance=np.inf, color_by=by, device=device)
     color, alpha = host(top.color), host(top.alpha)
     shown = color[alpha > 0.5] / alpha[alpha > 0.5, None]
-    last = rgb[clusters.offset[-2] : clusters.offset[-1]][0]
+    last = rgb[-1]
     np.testing.assert_allclose(shown, np.broadcast_to(last, shown.shape), atol=2e-3)
     with pytest.raises(ValueError, match="color_by: expected 'appearance', 'level', 'cluster', got 'size'"):
         render(bundle, camera, color_by="size", device=device)

@@ -180,14 +180,10 @@ class Residency:
             return frame
 
     def num_bytes(self, device: Device) -> int:
-        """Memory that the models of all bundles take on a device."""
+        """Memory that gaussians and tables of all bundles take on a device beside the bundles themselves."""
         with self._lock:
-            return sum(
-                model.bytes
-                for models in self._models.values()
-                for (d, _), model in models.items()
-                if d == device
-            )
+            models = sum(known[device].bytes for known in self._models.values() if device in known)
+            return models + sum(table.bytes_on(device.number) for table in self._tables.values())
 
     def clear(self) -> None:
         """Give everything back; what is asked for later is made again."""

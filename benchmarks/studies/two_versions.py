@@ -1,4 +1,4 @@
-"""What one version of v3dg computes, as digests, and how long that takes, to be compared with another version.
+"""What one version of v3dg computes, as digests, and how long it takes, to be compared with another.
 
 Run it once or more with each version in turn, on one machine, then compare what they wrote:
 
@@ -16,6 +16,7 @@ import hashlib
 import json
 import statistics
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -101,15 +102,13 @@ class Run:
         for key, camera in cameras.items():
             for tolerance in (0.0, 3.0, 9.4):
                 label = f"{name} {key} tolerance {tolerance:g}"
-                cut = self.time(
-                    f"select, {label}",
-                    lambda: v3dg.select(scene, camera, tolerance=tolerance, device=self.device),
-                )
+                options = {"tolerance": tolerance, "device": self.device}
+                choose = partial(v3dg.select, scene, camera, **options)
+                cut = self.time(f"select, {label}", choose)
                 self.digests[f"cut, {label}"] = digest(cut.instance_ids, cut.cluster_ids)
                 if tolerance == 0.0 and self.device == "cpu":
                     continue
-                draw = lambda: v3dg.render(scene, camera, tolerance=tolerance, device=self.device)  # noqa: E731
-                image = self.time(f"frame, {label}", draw)
+                image = self.time(f"frame, {label}", partial(v3dg.render, scene, camera, **options))
                 self.digests[f"picture, {label}"] = digest(image.color, image.alpha, image.depth)
             budget = v3dg.select(scene, camera, tolerance=3.0, device=self.device).num_gaussians // 2
             cut = v3dg.select(scene, camera, budget=budget, device=self.device)
@@ -171,7 +170,8 @@ def compare(old_path: Path, new_path: Path) -> int:
             continue
         middle = statistics.median(before), statistics.median(after)
         print(
-            f"{name:58} {middle[0]:9.3f} {middle[1]:9.3f} {middle[1] / middle[0]:6.3f} {min(after) / min(before):6.3f}"
+            f"{name:58} {middle[0]:9.3f} {middle[1]:9.3f} {middle[1] / middle[0]:6.3f} "
+            f"{min(after) / min(before):6.3f}"
         )
     return len(differ)
 

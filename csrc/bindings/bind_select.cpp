@@ -108,6 +108,16 @@ std::shared_ptr<const cuda::BundleTables> BoundTable::on_device(const Work& work
 }
 #endif
 
+size_t BoundTable::bytes_on(int device) const {
+#if V3DG_WITH_CUDA
+    const auto found = on_device_.find(device);
+    const auto tables = found == on_device_.end() ? nullptr : found->second.lock();
+    if (tables != nullptr) return tables->bytes();
+#endif
+    static_cast<void>(device);
+    return 0;
+}
+
 BoundCut::BoundCut(const SelectOutput& out)
     : instance_ids(array_of(out.instance)),
       cluster_ids(array_of(out.cluster)),
@@ -120,7 +130,8 @@ void bind_select(py::module_& m) {
         .def(py::init<py::array, py::array, py::array, py::array, py::array, py::array, py::array, py::array,
                       py::array>(),
              py::kw_only(), "ball"_a, "weight"_a, "level"_a, "own_group"_a, "parent_group"_a, "box"_a,
-             "filter_px2"_a, "antialiased"_a, "offset"_a);
+             "filter_px2"_a, "antialiased"_a, "offset"_a)
+        .def("bytes_on", &BoundTable::bytes_on, "device"_a, "Memory that the tables take on a device.");
     py::class_<BoundCut>(m, "Cut", "The clusters that one view needs, and what their selection came to.")
         .def_readonly("instance_ids", &BoundCut::instance_ids)
         .def_readonly("cluster_ids", &BoundCut::cluster_ids)

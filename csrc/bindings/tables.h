@@ -24,6 +24,9 @@ class BoundTable {
     const ClusterFilters& filters() const { return host_->filters(); }
     size_t num_gaussians() const { return static_cast<size_t>(table().offset[table().offset.size - 1]); }
 
+    // Memory that the tables take on a device.
+    size_t bytes_on(int device) const;
+
 #if V3DG_WITH_CUDA
     // The tables on a device, which all scenes there share; uploaded if no scene has them.
     std::shared_ptr<const cuda::BundleTables> on_device(const Work& work) const;

@@ -49,7 +49,11 @@ def run_fit(
     """Run `fit` on a thread of its own, and `show` how far it is while it computes; what it returns."""
     state = _core.FitProgress()
     result: list[_T] = []
-    fit_there = _device.with_this_stream(lambda state: result.append(fit(state)), where)
+
+    def collect(progress: _core.FitProgress) -> None:
+        result.append(fit(progress))
+
+    fit_there = _device.with_this_stream(collect, where)
     failure: list[BaseException] = []
     done = threading.Event()
 
