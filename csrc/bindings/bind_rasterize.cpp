@@ -62,8 +62,11 @@ class HostTape final : public Tape {
   public:
     HostTape(const GaussianRows<const T>& rows, const BoundCamera& camera, const Look& look)
         : model_(rows),
-          draw_{&model_.planes(), 0, model_.size(), view_of_world<T>(camera.camera), T(look.filter_px2),
-                look.antialiased},
+          draw_{&model_.planes(),
+                0,
+                model_.size(),
+                view_of_world<T>(camera.camera),
+                {T(look.filter_px2), look.antialiased}},
           camera_(pinhole_of<T>(camera.camera)),
           height_(camera.height()),
           width_(camera.width()),

@@ -450,7 +450,7 @@ class BoundSceneFrame {
         std::vector<SceneModel> models = host_;
         for (size_t b = 0; b < models.size(); ++b) {
             models[b].pages = whole_bundle(scene.tables[b]);
-            models[b].filters = scene.bundle(b).filters();
+            models[b].appearance = scene.bundle(b).appearance();
         }
         return models;
     }

@@ -87,13 +87,13 @@ BoundTable::BoundTable(py::array ball, py::array weight, py::array level, py::ar
     given.parent_group = span_of<const int32_t>(parent_group, "parent_group", {clusters});
     const Span<const float> boxes = span_of<const float>(box, "box", {clusters, 2, 3});
     given.box = {reinterpret_cast<const Box*>(boxes.data), given.num_clusters()};
-    const ClusterFilters filters{span_of<const float>(filter_px2, "filter_px2", {clusters}),
-                                 span_of<const uint8_t>(antialiased, "antialiased", {clusters})};
+    const ClusterAppearance appearance{span_of<const float>(filter_px2, "filter_px2", {clusters}),
+                                       span_of<const uint8_t>(antialiased, "antialiased", {clusters})};
     given.offset = span_of<const int64_t>(offset, "offset", {clusters + 1});
     check_groups(given.own_group, "own_group", num_groups);
     check_groups(given.parent_group, "parent_group", num_groups);
     offsets_of(offset, static_cast<size_t>(given.offset[clusters]));
-    host_ = std::make_unique<HostTable>(given, filters);
+    host_ = std::make_unique<HostTable>(given, appearance);
 }
 
 #if V3DG_WITH_CUDA
@@ -101,7 +101,7 @@ std::shared_ptr<const cuda::BundleTables> BoundTable::on_device(const Work& work
     std::weak_ptr<const cuda::BundleTables>& known = on_device_[work.device().number];
     std::shared_ptr<const cuda::BundleTables> tables = known.lock();
     if (tables == nullptr) {
-        tables = std::make_shared<cuda::BundleTables>(table(), filters(), work.stream());
+        tables = std::make_shared<cuda::BundleTables>(table(), appearance(), work.stream());
         known = tables;
     }
     return tables;

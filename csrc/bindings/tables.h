@@ -21,7 +21,7 @@ class BoundTable {
     BoundTable(const BoundTable&) = delete;
 
     const ClusterTable& table() const { return host_->table(); }
-    const ClusterFilters& filters() const { return host_->filters(); }
+    const ClusterAppearance& appearance() const { return host_->appearance(); }
     size_t num_gaussians() const { return static_cast<size_t>(table().offset[table().offset.size - 1]); }
 
     // Memory that the tables take on a device.

@@ -10,14 +10,24 @@
 
 namespace v3dg {
 
+// How gaussians are drawn, apart from where. Neighbours in memory of the same appearance are drawn together.
+template <class T>
+struct Appearance {
+    T filter_px2;     // added to the variances on screen
+    bool compensate;  // opacity for what the filter adds
+
+    V3DG_HD bool operator==(const Appearance& other) const {
+        return filter_px2 == other.filter_px2 && compensate == other.compensate;
+    }
+};
+
 // A run of gaussians of one model, placed in front of the camera.
 template <class T>
 struct Draw {
     const GaussianPlanes<T>* model;
     uint64_t first, count;
     ModelView<T> view;
-    T filter_px2;
-    bool compensate;  // opacity for what the filter adds
+    Appearance<T> appearance;
     Palette palette{};
 };
 
@@ -38,8 +48,7 @@ struct Placement {
 // gaussian and then by placement.
 struct DrawItem {
     uint32_t placement, first, count, record;
-    float filter_px2;
-    uint32_t compensate;
+    Appearance<float> appearance;
     uint32_t sharers;
 };
 

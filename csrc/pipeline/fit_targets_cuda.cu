@@ -36,8 +36,7 @@ struct TargetTables {
     const FitJob* jobs;
     const FitView* views;
     const TargetPicture* pictures;
-    float filter_px2;
-    uint32_t compensate;
+    Appearance<float> appearance;
     float *color, *alpha;
     FrameImage* images;
     Placement* placements;
@@ -74,8 +73,7 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items, un
                                          static_cast<uint32_t>(job.group.target_first) + first,
                                          min(static_cast<uint32_t>(kItemSize), count - first),
                                          p.first_record + first,
-                                         t.filter_px2,
-                                         t.compensate,
+                                         t.appearance,
                                          0};
     }
 }
@@ -149,8 +147,7 @@ void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob
                             jobs_on_device,
                             views,
                             pictures_on_device.copy_from({pictures.data(), pictures.size()}, stream),
-                            target.filter_px2,
-                            target.compensate,
+                            {target.filter_px2, target.compensate},
                             color.reserve(3 * pixels, stream),
                             alpha.reserve(pixels, stream),
                             images.reserve(num_images, stream),

@@ -13,7 +13,7 @@ namespace v3dg {
 struct SceneModel {
     const GaussianPlanes<float>* planes;
     PageTable pages;
-    ClusterFilters filters;
+    ClusterAppearance appearance;
     Palette palette;
 };
 

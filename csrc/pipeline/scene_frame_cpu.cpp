@@ -84,9 +84,7 @@ class CutDraws {
             view_ = model_view_from_instance(axes_of_instance(camera_, pose), pose);
         }
         end_of_pair_.back() = num_gaussians_ += count;
-        const Draw<float> next{
-            model.planes, first, count, view_, model.filters.filter_px2[c], model.filters.compensate[c] != 0,
-            model.palette};
+        const Draw<float> next{model.planes, first, count, view_, model.appearance[c], model.palette};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else
@@ -96,7 +94,7 @@ class CutDraws {
 
     // Whether the second, of the same instance, begins where the first ends and is drawn alike.
     static bool joins(const Draw<float>& a, const Draw<float>& b) {
-        return a.first + a.count == b.first && a.filter_px2 == b.filter_px2 && a.compensate == b.compensate;
+        return a.first + a.count == b.first && a.appearance == b.appearance;
     }
 
     const HostScene& scene_;

@@ -90,8 +90,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_cut(const SceneTables& scene, const Ca
 constexpr unsigned kModelThreads = 128;
 
 // A thread an item.
-static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, float filter_px2,
-                                    bool compensate, ItemList items) {
+static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, Appearance<float> appearance,
+                                    ItemList items) {
     const unsigned long long i = blockIdx.x * static_cast<unsigned long long>(blockDim.x) + threadIdx.x;
     const unsigned long long first = i * kItemSize, count = tables.rows.size;
     if (i == 0) {
@@ -103,7 +103,7 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
     const uint32_t at = static_cast<uint32_t>(first);
     const uint32_t size =
         static_cast<uint32_t>(min(static_cast<unsigned long long>(kItemSize), count - first));
-    items.items[i] = {0, at, size, at, filter_px2, compensate, 0};
+    items.items[i] = {0, at, size, at, appearance, 0};
 }
 
 std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
@@ -119,8 +119,8 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
     return frame_.draw(
         batch,
         [=](const ItemList& items, cudaStream_t on) {
-            launch("model_kernel", model_kernel, blocks, kModelThreads, 0, on, tables, on_device, filter_px2,
-                   compensate, items);
+            launch("model_kernel", model_kernel, blocks, kModelThreads, 0, on, tables, on_device,
+                   Appearance<float>{filter_px2, compensate}, items);
         },
         stream);
 }

@@ -103,8 +103,8 @@ struct RowSource {
         gaussian.quat[2] = quat.z;
         gaussian.quat[3] = quat.w;
         if (m.sh_degree == 0) color_of<0>(m.sh, g, gaussian.mean, view, color);
-        return project_gaussian(gaussian, view, in.image.camera, in.item.filter_px2, in.item.compensate != 0,
-                                s);
+        return project_gaussian(gaussian, view, in.image.camera, in.item.appearance.filter_px2,
+                                in.item.appearance.compensate, s);
     }
 };
 
@@ -122,8 +122,8 @@ struct PackedSource {
         color[1] = c.z;
         color[2] = c.w;
         const PackedGaussian gaussian{{}, 0.0f, {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, c.x};
-        return project_packed(gaussian, view, in.image.camera, in.limits, in.item.filter_px2,
-                              in.item.compensate != 0, s);
+        return project_packed(gaussian, view, in.image.camera, in.limits, in.item.appearance.filter_px2,
+                              in.item.appearance.compensate, s);
     }
 };
 
@@ -140,13 +140,14 @@ __device__ Sphere look_at_sphere(const ItemTables<Model>& in, const float p[3], 
     const Pinhole<float>& cam = in.image.camera;
     const float inv_z = 1 / p[2], slope_x = p[0] * inv_z, slope_y = p[1] * inv_z;
     const float u = cam.fx * slope_x + cam.cx, v = cam.fy * slope_y + cam.cy;
-    const float half = sphere_of_image(reach_scale * reach, inv_z, slope_x, slope_y, in.item.filter_px2);
+    const float half =
+        sphere_of_image(reach_scale * reach, inv_z, slope_x, slope_y, in.item.appearance.filter_px2);
     const float middle_x = 0.5f * cam.width, middle_y = 0.5f * cam.height;
     const float from_x = fabsf(u - middle_x), from_y = fabsf(v - middle_y);
     const bool is_outside =
         !(p[2] >= cam.near_depth) | (reach < 0) | (from_x - half >= middle_x) | (from_y - half >= middle_y);
     // With its centre in the image it is in the frustum for certain, unless compensation makes it too faint.
-    const bool is_inside = (from_x < middle_x) & (from_y < middle_y) & (in.item.compensate == 0);
+    const bool is_inside = (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.compensate;
     const bool misses = is_inside & (misses_centers(u, half) | misses_centers(v, half));
     return {!(is_outside | misses), misses && !is_outside};
 }

@@ -36,11 +36,11 @@ class Upload {
 };
 
 std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const PageTable& pages,
-                                       const ClusterFilters& filters) {
+                                       const ClusterAppearance& appearance) {
     std::vector<uint8_t> joins((table.num_clusters() + kClustersOfBounds - 1) / kClustersOfBounds, 0);
     for (size_t c = 0; c < table.num_clusters(); ++c) {
         const size_t k = c % kClustersOfBounds;
-        if (k > 0 && pages.follows(table, c) && filters.are_same(c - 1, c))
+        if (k > 0 && pages.follows(table, c) && appearance[c - 1] == appearance[c])
             joins[c / kClustersOfBounds] |= 1 << k;
     }
     return joins;
@@ -48,11 +48,12 @@ std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const PageTabl
 
 }  // namespace
 
-BundleTables::BundleTables(const ClusterTable& table, const ClusterFilters& filters, cudaStream_t stream)
-    : on_device_{table, {}, filters, {}, nullptr} {
+BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
+                           cudaStream_t stream)
+    : on_device_{table, {}, appearance, {}, nullptr} {
     static_assert(kClustersOfBounds <= 8, "a byte says which of them are drawn together");
     const std::vector<ClusterBounds> bounds = bounds_of_clusters(table);
-    const std::vector<uint8_t> joins = joins_of_clusters(table, whole_bundle(table), filters);
+    const std::vector<uint8_t> joins = joins_of_clusters(table, whole_bundle(table), appearance);
     on_device_.bounds = {bounds.data(), bounds.size()};
     Span<const uint8_t> joins_on_device{joins.data(), joins.size()};
     ClusterTable& t = on_device_.table;
@@ -66,8 +67,8 @@ BundleTables::BundleTables(const ClusterTable& table, const ClusterFilters& filt
     upload.add(t.offset);
     upload.add(t.top_group);
     upload.add(t.top_cluster);
-    upload.add(on_device_.filters.filter_px2);
-    upload.add(on_device_.filters.compensate);
+    upload.add(on_device_.appearance.filter_px2);
+    upload.add(on_device_.appearance.compensate);
     upload.add(on_device_.bounds);
     upload.add(joins_on_device);
     upload.finish(storage_, stream);

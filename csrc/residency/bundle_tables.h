@@ -11,10 +11,10 @@ namespace cuda {
 struct BundleOnDevice {
     ClusterTable table;
     PageTable pages;
-    ClusterFilters filters;
+    ClusterAppearance appearance;
     Span<const ClusterBounds> bounds;
     // A byte for each of the bounds; bit k: its cluster k is drawn together with the one before, since its
-    // rows follow and its filter is the same.
+    // rows follow and it looks the same.
     const uint8_t* joins;
 };
 
@@ -23,7 +23,7 @@ struct BundleOnDevice {
 class BundleTables {
   public:
     // Returns when the tables are on the device; the host's memory may then be reused.
-    BundleTables(const ClusterTable& table, const ClusterFilters& filters, cudaStream_t stream);
+    BundleTables(const ClusterTable& table, const ClusterAppearance& appearance, cudaStream_t stream);
     BundleTables(const BundleTables&) = delete;
     BundleTables& operator=(const BundleTables&) = delete;
 

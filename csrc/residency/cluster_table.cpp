@@ -7,13 +7,13 @@
 
 namespace v3dg {
 
-HostTable::HostTable(const ClusterTable& given, const ClusterFilters& filters)
-    : table_(given), filters_(filters) {
+HostTable::HostTable(const ClusterTable& given, const ClusterAppearance& appearance)
+    : table_(given), appearance_(appearance) {
     find_tops();
     table_.bounds = no_box();
     for (const Box& box : table_.box) grow(table_.bounds, box);
     float most_filter_px2 = 0.0f;
-    for (const float value : filters.filter_px2) most_filter_px2 = std::max(most_filter_px2, value);
+    for (const float value : appearance.filter_px2) most_filter_px2 = std::max(most_filter_px2, value);
     table_.pad_px = static_cast<float>(kReachSigmas) * std::sqrt(most_filter_px2) + 1.0f;
 }
 

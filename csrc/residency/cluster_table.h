@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "base/span.h"
+#include "frame/draw_list.h"
 #include "math/bounds.h"
 
 namespace v3dg {
@@ -29,32 +30,30 @@ struct ClusterTable {
 };
 
 // How the clusters of a bundle are drawn.
-struct ClusterFilters {
+struct ClusterAppearance {
     Span<const float> filter_px2;    // [C]
-    Span<const uint8_t> compensate;  // [C] opacity for what the filter adds
+    Span<const uint8_t> compensate;  // [C]
 
-    V3DG_HD bool are_same(size_t a, size_t b) const {
-        return filter_px2[a] == filter_px2[b] && compensate[a] == compensate[b];
-    }
+    V3DG_HD Appearance<float> operator[](size_t c) const { return {filter_px2[c], compensate[c] != 0}; }
 };
 
 // The tables of a bundle on the host. Borrows the arrays that it is given and owns what it derives from them.
 class HostTable {
   public:
     // `given` has the arrays from `ball` to `offset`.
-    HostTable(const ClusterTable& given, const ClusterFilters& filters);
+    HostTable(const ClusterTable& given, const ClusterAppearance& appearance);
     HostTable(const HostTable&) = delete;
     HostTable& operator=(const HostTable&) = delete;
 
     const ClusterTable& table() const { return table_; }
-    const ClusterFilters& filters() const { return filters_; }
+    const ClusterAppearance& appearance() const { return appearance_; }
 
   private:
     void find_tops();
 
     std::vector<int32_t> top_group_, top_cluster_;
     ClusterTable table_;
-    ClusterFilters filters_;
+    ClusterAppearance appearance_;
 };
 
 }  // namespace v3dg

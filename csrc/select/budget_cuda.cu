@@ -1,9 +1,10 @@
-// A budget: change_kernel adds up by how much each tolerance changes the number of gaussians, choose_kernel
-// takes the least from which on no cut has too many.
+// Chooses the tolerance of a budget. change_kernel adds up by how many gaussians the cuts of neighbouring
+// tolerances differ; choose_kernel chooses the least tolerance from which on no cut has too many.
 //
-// Both run for two rounds. The first takes no tolerance below half of what was chosen last time, which spares
-// it the tables of what is far away. The second does nothing unless that was too much.
+// Both run for two rounds. The first looks at no tolerance below half of the last choice, so that it need not
+// look at the tables of what is far away. The second does nothing unless that was too much.
 
+#include "base/scan.cuh"
 #include "select/cut_parts.cuh"
 
 namespace v3dg {
@@ -78,12 +79,7 @@ __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change,
     Count count = before_warp[warp];
     for (uint32_t from = first; from < last; from += 32) {
         const uint32_t bin = from + lane;
-        Count here = bin < last ? change[bin] : 0;
-#pragma unroll
-        for (unsigned offset = 1; offset < 32; offset *= 2) {
-            const Count below = __shfl_up_sync(kAllLanes, here, offset);
-            if (lane >= offset) here += below;
-        }
+        const Count here = warp_prefix(bin < last ? change[bin] : 0);
         const unsigned beyond = __ballot_sync(kAllLanes, bin < last && count + here > rule.budget);
         if (lane == 0 && beyond != 0) atomicMax(&chosen, from + 32 - __clz(static_cast<int>(beyond)));
         count += __shfl_sync(kAllLanes, here, 31);

@@ -87,8 +87,8 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     return mine;
 }
 
-// Asks the clusters of a part of a table that may be drawn, a lane a cluster: those of four lanes at a time,
-// past the lanes whose bounds tell that none of theirs is. Returns to each lane a bit for each of its own for
+// Asks the clusters of a part of a table, a lane a cluster, for the lanes whose bounds do not tell that none
+// of theirs is drawn; four such lanes at a time. Returns to each lane a bit for each of its own clusters for
 // which ask(cluster) was true.
 template <class Ask>
 __device__ unsigned ask_clusters(const LaneClusters& mine, const InstanceView& view, const SelectRule& rule,

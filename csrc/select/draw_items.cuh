@@ -104,15 +104,13 @@ struct ItemOutput {
             const unsigned size = mine.size(run.k, run.num_clusters), step = run.gaussians_an_item();
             const uint32_t placement = run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
             const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->pages.first_row[cluster]);
-            const float filter_px2 = mine.bundle->filters.filter_px2[cluster];
-            const uint32_t compensate = mine.bundle->filters.compensate[cluster];
+            const Appearance<float> appearance = mine.bundle->appearance[cluster];
             for (unsigned skip = 0; skip < size; skip += step, ++first) {
                 const unsigned count = min(step, size - skip);
                 if (first < items.item_capacity &&
                     record + run.num_instances * count <= items.record_capacity)
-                    items.items[first] = {
-                        placement,  gaussian + skip, count,      static_cast<uint32_t>(record),
-                        filter_px2, compensate,      run.sharers};
+                    items.items[first] = {placement,  gaussian + skip, count, static_cast<uint32_t>(record),
+                                          appearance, run.sharers};
                 record += run.num_instances * count;
             }
         });
