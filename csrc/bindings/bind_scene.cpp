@@ -88,13 +88,16 @@ struct SceneState {
     std::vector<size_t> num_gaussians;  // of each bundle
     InstanceTable instances;
 
-    const BoundTable& bundle(size_t b) const { return bundles[b].cast<const BoundTable&>(); }
+    const BoundTable& bundle(size_t b) const { return held<BoundTable>(bundles[b], "tables"); }
 };
 
 // What selection reads of a scene, on one device.
 class BoundScene {
   public:
-    explicit BoundScene(int device) : device_{device}, state_(std::make_shared<SceneState>()) {}
+    explicit BoundScene(int device) : device_{device} {
+        const Work work(device_);
+        set_bundles(py::list());
+    }
 
     Device device() const { return device_; }
     std::shared_ptr<const SceneState> state() const { return state_; }
@@ -107,7 +110,7 @@ class BoundScene {
         auto state = std::make_shared<SceneState>();
         state->bundles = bundles;
         for (const py::handle& bundle : bundles) {
-            const auto& table = bundle.cast<const BoundTable&>();
+            const auto& table = held<BoundTable>(bundle, "tables");
             state->tables.push_back(table.table());
             state->num_gaussians.push_back(table.num_gaussians());
         }
@@ -261,8 +264,8 @@ NewPicture picture_of(const Window& window, bool with_depth) {
 class BoundSceneFrame {
   public:
     explicit BoundSceneFrame(int device) : device_{device} {
-#if V3DG_WITH_CUDA
         const Work work(device_);
+#if V3DG_WITH_CUDA
         if (!device_.is_host()) frame_ = std::make_unique<cuda::SceneFrame>();
 #endif
     }
@@ -274,7 +277,7 @@ class BoundSceneFrame {
         std::vector<std::shared_ptr<const cuda::PackedModel>> packed;
 #endif
         for (const py::handle& item : models) {
-            const auto& model = item.cast<const BoundModel&>();
+            const auto& model = held<BoundModel>(item, "models");
             if (model.device() != device_)
                 throw py::value_error("models: expected gaussians on the frame's device, got others");
             num_gaussians_.push_back(model.size());
@@ -378,7 +381,7 @@ class BoundSceneFrame {
 
   private:
     BoundScene& checked(const py::object& scene_object) const {
-        auto& scene = scene_object.cast<BoundScene&>();
+        auto& scene = held<BoundScene>(scene_object, "scene");
         if (scene.device() != device_) throw py::value_error("scene: expected one on the frame's device");
         if (scene.state()->num_gaussians != num_gaussians_)
             throw py::value_error("scene: expected one of the bundles that the frame has the gaussians of");
@@ -436,16 +439,15 @@ class BoundSceneFrame {
 class BoundAssetFrame {
   public:
     explicit BoundAssetFrame(const py::object& model) : model_(model) {
+        const Work work(held<BoundModel>(model, "model").device());
 #if V3DG_WITH_CUDA
-        const Device device = model.cast<const BoundModel&>().device();
-        const Work work(device);
-        if (!device.is_host()) frame_ = std::make_unique<cuda::ModelFrame>();
+        if (!work.device().is_host()) frame_ = std::make_unique<cuda::ModelFrame>();
 #endif
     }
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Background& background,
                                        const Stop* stop) {
-        const auto& model = model_.cast<const BoundModel&>();
+        const auto& model = held<BoundModel>(model_, "model");
         if (model.device().is_host()) return on_host(model.host(), camera, background, stop);
 #if V3DG_WITH_CUDA
         const Device device = model.device();
@@ -454,7 +456,7 @@ class BoundAssetFrame {
         const cuda::FrameImage image = picture.on_device(device, camera.camera, background);
         const cuda::PackedModel& packed = *model.packed();
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
-                                   work.stream(), &packed.packed());
+                                    work.stream(), &packed.packed());
         return std::make_unique<BoundDrawing>(std::move(picture), model_, device, std::move(drawing));
 #else
         return nullptr;

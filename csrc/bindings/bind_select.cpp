@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <functional>
 
 #include "bindings/operations.h"
 #include "bindings/tables.h"
@@ -20,21 +21,23 @@ py::array_t<T> array_of(const std::vector<T>& values) {
     return py::array_t<T>(static_cast<py::ssize_t>(values.size()), values.data());
 }
 
+using Tables = std::vector<std::reference_wrapper<const BoundTable>>;
+
 // Arguments of one selection on the host; `tables` and `input` borrow from them.
 struct Arguments {
     std::vector<ClusterTable> tables;
     SelectInput input;
 
-    Arguments(const std::vector<const BoundTable*>& tables_of_bundles, const Instances& instances,
-              const BoundCamera& camera, const SelectRule& rule) {
-        for (const BoundTable* table : tables_of_bundles) tables.push_back(table->table());
+    Arguments(const Tables& tables_of_bundles, const Instances& instances, const BoundCamera& camera,
+              const SelectRule& rule) {
+        for (const BoundTable& table : tables_of_bundles) tables.push_back(table.table());
         instances.check_bundles(tables.size());
         input = {{tables.data(), tables.size()}, instances.table(), camera.camera, rule};
     }
 };
 
-py::tuple group_metrics(const std::vector<const BoundTable*>& tables, const Instances& instances,
-                        const BoundCamera& camera, const SelectRule& rule) {
+py::tuple group_metrics(const Tables& tables, const Instances& instances, const BoundCamera& camera,
+                        const SelectRule& rule) {
     const Arguments arguments(tables, instances, camera, rule);
     const Span<const int32_t> bundle = arguments.input.instances.bundle;
     const NewArray<int64_t> offset({}, {static_cast<py::ssize_t>(bundle.size + 1)});
