@@ -1,4 +1,7 @@
+import copy
 import math
+import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +42,27 @@ def test_transposed_matrices_are_taken():
     assert camera.viewmat.flags.c_contiguous
     assert camera.K.flags.c_contiguous
     np.testing.assert_array_equal(camera.viewmat, turned.viewmat)
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))])
+def test_camera_is_copied_and_pickled_as_it_is(again):
+    """Also one that has been drawn with, which keeps what the core made of it."""
+    camera, drawn = (Camera.look_at((3, -4, 2), (0, 0, 0), width=64, height=48, near=0.5) for _ in range(2))
+    assert drawn.core is not None
+    for source in (camera, drawn):
+        other = again(source)
+        np.testing.assert_array_equal(other.viewmat, camera.viewmat)
+        np.testing.assert_array_equal(other.K, camera.K)
+        assert (other.width, other.height, other.near) == (64, 48, 0.5)
+        np.testing.assert_array_equal(other.position, drawn.position)
+
+
+def test_camera_of_the_core_is_made_once():
+    camera = Camera.look_at((3, -4, 2), (0, 0, 0), width=64, height=48)
+    assert camera.core is camera.core
+    wider = replace(camera, width=128)
+    assert wider.core is not camera.core
+    wider.core.window(64, 0, 128, 48)  # which the other has no room for
 
 
 def test_position_of_a_rounded_matrix_is_what_it_brings_to_zero():

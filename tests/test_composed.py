@@ -344,6 +344,31 @@ def test_false_colors_show_what_was_chosen(device, by):
         render(bundle.level_gaussians(0), camera, color_by=by, device=device)
 
 
+def test_asset_and_bundle_are_seen_from_the_same_place(device):
+    """Also with a rotation that is off by what float32 text loses, far from the origin."""
+    rng = np.random.default_rng(20)
+    center = np.array([300.0, -200.0, 50.0])
+    asset = blob(rng, 200, origin=center, sh_degree=3)
+    bundle = lod_bundle(rng, asset, 16)
+    exact = v3dg.Camera.look_at(center - [0, 6, 1], center, width=64, height=48)
+    viewmat = exact.viewmat.copy()
+    viewmat[:3, :3] += rng.uniform(-3e-5, 3e-5, (3, 3))
+    viewmat[:3, 3] = -viewmat[:3, :3] @ exact.position
+    camera = v3dg.Camera(viewmat, exact.K, 64, 48)
+    # Where the rotation is taken for one, the eye is elsewhere, and colours change with the direction.
+    np.testing.assert_allclose(camera.position, exact.position, atol=1e-9)
+    assert np.linalg.norm(-viewmat[:3, :3].T @ viewmat[:3, 3] - camera.position) > 5e-3
+    as_bundle = render(bundle, camera, tolerance=0.0, device=device)
+    as_asset = render(asset, camera, device=device)
+    raster = v3dg.rasterize(asset.torch("cuda") if device == "cuda" else asset, camera)
+    assert host(as_bundle.alpha).max() > 0.9
+    for picture in (as_asset, raster):
+        for name in ("color", "alpha", "depth"):
+            error = np.abs(host(getattr(picture, name)) - host(getattr(as_bundle, name)))
+            assert error.max() < 2e-4, name
+            assert error.mean() < 1e-6, name
+
+
 @pytest.mark.gpu
 def test_both_devices_choose_the_same():
     rng = np.random.default_rng(15)

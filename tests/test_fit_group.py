@@ -395,12 +395,10 @@ def test_no_groups_are_legal(device):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"target_range": [[0, 11]]},
-            r"range: expected \[first, last\) within the gaussians, group 0 is not",
+        *(
+            (change, r"range: expected \[first, last\) within the gaussians, group 0 is not")
+            for change in ({"target_range": [[0, 11]]}, {"range": [[3, 2]]}, {"range": [[-1, 2]]})
         ),
-        ({"range": [[3, 2]]}, r"range: expected \[first, last\) within the gaussians, group 0 is not"),
-        ({"range": [[-1, 2]]}, r"range: expected \[first, last\) within the gaussians, group 0 is not"),
         ({"target_range": [[0, 5], [5, 10]]}, "target_range: expected shape"),
         ({"stream": [0, 1]}, "stream: expected shape"),
         ({"ball": np.zeros((1, 4), np.float32)}, "ball: expected a positive radius, group 0 has none"),

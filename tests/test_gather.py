@@ -6,10 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import scenes
-from devices import host
+from devices import host, on
 from random_bundle import random_bundle
-from scenes_lod import blob, covariances, lod_bundle, random_camera, random_scene
-from v3dg import Camera, Scene, select
+from reference.sh import basis
+from scenes_lod import blob, covariances, lod_bundle, random_camera, random_scene, rotation_matrices
+from v3dg import Camera, Scene, _core, select
 
 
 def pairs(selection):
@@ -71,6 +72,55 @@ def test_gaussians_are_those_of_the_instances_in_the_world(device, seed, sh_degr
         filters = selection.filters_px2[rows]
         np.testing.assert_array_equal(filters, np.full(len(asset), bundle.clusters.filter_px2[c]))
         assert (selection.antialiased[rows] == bool(bundle.clusters.antialiased[c])).all()
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_harmonics_turn_as_the_bases_do(device, degree):
+    """To 1e-12, though results are float32: coefficients are such that all but one of a band nearly vanish.
+
+    What a row of the true rotation stands for in the asset is, but for its rounding, one basis in the world.
+    """
+    rng = np.random.default_rng(degree)
+    count, size, first = 50, 2 * degree + 1, degree * degree
+    quaternions = rng.normal(size=(count, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    directions = rng.normal(size=(200, 3))
+    bases = basis(directions, degree)[:, first:]
+    sh = np.zeros((count * size, (degree + 1) ** 2, 3), np.float32)
+    expected = np.zeros((count, size, size))
+    for i, rotation in enumerate(rotation_matrices(quaternions)):
+        in_asset = basis(directions @ rotation, degree)[:, first:]
+        band = np.linalg.lstsq(bases, in_asset, rcond=None)[0]
+        np.testing.assert_allclose(band @ band.T, np.eye(size), atol=1e-13)
+        mine = slice(i * size, (i + 1) * size)
+        sh[mine, first:] = band[:, :, None]
+        expected[i] = sh[mine, first:, 0].astype(np.float64) @ band.T
+    asset = scenes.gaussians(np.zeros((count * size, 3)), sh=sh)
+    instances = _core.Instances(
+        bundle=np.zeros(count, np.int32),
+        positions=np.zeros((count, 3)),
+        quaternions=quaternions,
+        scales=np.ones(count),
+        importance=np.ones(count, np.float32),
+    )
+    there = on(device, asset).rows
+    *_, turned = host(
+        _core.gather(
+            bundles=[there],
+            instances=instances,
+            instance=np.arange(count, dtype=np.int32),
+            first_row=size * np.arange(count),
+            offset=size * np.arange(count + 1),
+            device=there.device,
+        )
+    )
+    found = turned[:, first:].reshape(count, size, size, 3).astype(np.float64)
+    off_diagonal = ~np.eye(size, dtype=bool)
+    for channel in range(3):
+        error = np.abs(found[..., channel] - expected)
+        assert error[:, off_diagonal].max() < 1e-12
+        assert error[:, ~off_diagonal].max() < 1e-7  # a float32 next to one
+    assert (turned[:, :first] == 0).all()
 
 
 def mixed_selection():

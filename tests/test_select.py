@@ -322,8 +322,9 @@ def test_bad_arguments_are_refused():
         select(bundle, camera, tolerance=1, footprint="ball")
     with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'tpu'"):
         select(bundle, camera, tolerance=1, device="tpu")
-    with pytest.raises(TypeError, match="bundle: expected a Bundle, got str"):
-        select("donut", camera, tolerance=1)
+    for device in ("cpu", "auto"):
+        with pytest.raises(TypeError, match="bundle: expected a Bundle, got str"):
+            select("donut", camera, tolerance=1, device=device)
 
 
 def test_table_refuses_groups_that_do_not_exist():

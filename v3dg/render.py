@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, overload
 
@@ -203,12 +204,13 @@ class _Frame:
 
     def __init__(self, subject: Scene | Bundle | Gaussians, color_by: ColorBy, device: Device) -> None:
         self._device, self._color_by = device, color_by
-        self._bundles: tuple[Bundle, ...] | None = None
+        self._bundles: tuple[weakref.ref[Bundle], ...] | None = None  # that it has the gaussians of
         if isinstance(subject, Gaussians):
             _check_asset(color_by)
             self._asset = _core.AssetFrame(_core.Model(_device.place(subject, device).rows))
         else:
             self._frame = _core.SceneFrame(device.number)
+            self._take_models(Scene.of(subject).bundles)
 
     def draw(
         self,
@@ -248,9 +250,10 @@ class _Frame:
         return Image(drawing, finish)
 
     def _take_models(self, bundles: tuple[Bundle, ...]) -> None:
-        if self._bundles != bundles:
+        references = tuple(map(weakref.ref, bundles))
+        if self._bundles != references:
             residency.set_models(self._frame, bundles, self._device, self._color_by)
-            self._bundles = bundles
+            self._bundles = references
 
     def _here(self, ids: Any) -> Any:
         if not self._device.is_cuda:

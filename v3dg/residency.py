@@ -24,16 +24,21 @@ class ResidentScene:
 
     Attributes:
         core: The compiled module's part.
-        bundles: The bundles whose tables are there.
     """
 
     def __init__(self, device: Device) -> None:
         self.device = device
         self.core = _core.ResidentScene(device.number)
-        self.bundles: tuple[Bundle, ...] = ()
+        # Weak, for a bundle that is drawn by itself would else keep itself alive.
+        self._bundles: tuple[weakref.ref[Bundle], ...] = ()
         self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()  # that may be under way
         self._lock = threading.Lock()  # of that set
         self._seen: tuple[int, int] | None = None
+
+    @property
+    def bundles(self) -> tuple[Bundle, ...]:
+        """The bundles whose tables are there."""
+        return tuple(bundle for reference in self._bundles if (bundle := reference()) is not None)
 
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
         """Take over what has changed since the last time: nothing, the poses, or all instances.
@@ -54,7 +59,7 @@ class ResidentScene:
         self.finish_drawings()
         if self.bundles != scene.bundles:
             self.core.set_bundles(tables)
-            self.bundles = scene.bundles
+            self._bundles = tuple(map(weakref.ref, scene.bundles))
         poses = [self._here(rows) for rows in self._poses_of(scene)]
         if self._seen is not None and self._seen[0] == revision[0]:
             self.core.set_poses(*poses)
@@ -129,7 +134,7 @@ class Residency:
     def scene(self, subject: Scene | Bundle, device: Device) -> ResidentScene:
         """The scene on a device as it is now; a bundle as a scene of one."""
         with self._lock:
-            known = self._scenes.setdefault(subject, {})
+            known = self._scenes.setdefault(_checked(subject), {})
             resident = known.get(device)
             if resident is not None and isinstance(subject, Bundle):
                 return resident  # a bundle stays as it is
@@ -173,7 +178,7 @@ class Residency:
     def frame(self, subject: Scene | Bundle, key: Hashable, make: Callable[[], _Frame]) -> _Frame:
         """The buffers that pictures of a subject are drawn with, of which each key has its own."""
         with self._lock:
-            known = self._frames.setdefault(subject, {})
+            known = self._frames.setdefault(_checked(subject), {})
             if key not in known:
                 known[key] = make()
             frame: _Frame = known[key]
@@ -194,6 +199,11 @@ class Residency:
     def _renew_lock(self) -> None:
         # Another thread of the parent may have held it when the child was made.
         self._lock = threading.RLock()
+
+
+def _checked(subject: Scene | Bundle) -> Scene | Bundle:
+    """The subject, if it is one."""
+    return subject if isinstance(subject, Bundle) else Scene.of(subject)
 
 
 residency = Residency()

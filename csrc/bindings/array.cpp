@@ -9,16 +9,14 @@ namespace v3dg {
 namespace {
 
 constexpr const char* kInterface = "__cuda_array_interface__";
+#if !V3DG_WITH_CUDA
+constexpr const char* kWithoutCuda = "v3dg was built without CUDA; install it again where nvcc is found";
+#endif
 
 std::string text_of(const py::handle& value) { return py::str(value).cast<std::string>(); }
 
 [[noreturn]] void refuse(const char* name, const std::string& problem) {
     throw py::value_error(std::string(name) + ": " + problem);
-}
-
-[[noreturn]] void refuse_kind(const char* name, const char* expected, const py::handle& got) {
-    throw py::type_error(std::string(name) + ": expected " + expected + ", got " +
-                         text_of(py::type::handle_of(got)));
 }
 
 // The description of an array on a device; none where it is not one.
@@ -46,6 +44,11 @@ std::vector<py::ssize_t> lengths_of(const py::array& array) {
 
 }  // namespace
 
+void refuse_kind(const char* name, const std::string& expected, const py::handle& got) {
+    throw py::type_error(std::string(name) + ": expected " + expected + ", got " +
+                         text_of(py::type::handle_of(got)));
+}
+
 std::string shape_text(Shape shape) {
     std::string text;
     for (const py::ssize_t length : shape)
@@ -69,19 +72,21 @@ Device device_of(const py::handle& array, const char* name) {
 #if V3DG_WITH_CUDA
     const auto pointer = py::dict(face)["data"].cast<py::tuple>()[0].cast<uintptr_t>();
     cudaPointerAttributes attributes{};
-    // An array of no elements has no memory, which is as good as on the current device.
     if (pointer != 0 &&
         cudaPointerGetAttributes(&attributes, reinterpret_cast<const void*>(pointer)) == cudaSuccess &&
         attributes.type == cudaMemoryTypeDevice)
         return {attributes.device};
     cudaGetLastError();
+    // An array of no elements has no memory. Torch knows where it is all the same; any other is as good as on
+    // the current device.
+    const py::object index = py::getattr(py::getattr(array, "device", py::none()), "index", py::none());
+    if (py::isinstance<py::int_>(index)) return {index.cast<int>()};
     int current = 0;
     if (cudaGetDevice(&current) != cudaSuccess) cudaGetLastError();
     return {current};
 #else
-    throw std::runtime_error(std::string(name) +
-                             ": expected a NumPy array, got one on a CUDA device, and v3dg was built without "
-                             "CUDA; install it again where nvcc is found");
+    throw std::runtime_error(std::string(name) + ": expected a NumPy array, got one on a CUDA device, and " +
+                             kWithoutCuda);
 #endif
 }
 
@@ -117,6 +122,18 @@ void* device_memory(const py::handle& array, const char* name, const std::string
     return reinterpret_cast<void*>(face["data"].cast<py::tuple>()[0].cast<uintptr_t>());
 }
 
+void check_is_on([[maybe_unused]] Device device, [[maybe_unused]] const void* memory,
+                 [[maybe_unused]] const char* name) {
+#if V3DG_WITH_CUDA
+    cudaPointerAttributes attributes{};
+    if (cudaPointerGetAttributes(&attributes, memory) != cudaSuccess)
+        cudaGetLastError();
+    else if (attributes.type == cudaMemoryTypeDevice && attributes.device != device.number)
+        refuse(name, "expected an array on cuda:" + std::to_string(device.number) +
+                         " like the others, got one on cuda:" + std::to_string(attributes.device));
+#endif
+}
+
 py::object new_array(Device device, const py::dtype& dtype, const std::vector<py::ssize_t>& shape) {
     if (device.is_host()) return py::array(dtype, shape);
     const py::module_ torch = py::module_::import("torch");
@@ -149,7 +166,9 @@ Work::Work(Device device) : device_(device) {
 
 struct Work::Guard {};
 
-Work::Work(Device device) : device_(device) {}
+Work::Work(Device device) : device_(device) {
+    if (!device.is_host()) throw std::runtime_error(std::string("device: ") + kWithoutCuda);
+}
 
 #endif
 

@@ -25,6 +25,17 @@ using Shape = std::initializer_list<py::ssize_t>;
 std::string shape_text(Shape shape);
 std::string shape_text(const py::handle& array);
 
+// TypeError: the argument is another kind of object than is expected.
+[[noreturn]] void refuse_kind(const char* name, const std::string& expected, const py::handle& got);
+
+// What a Python object holds that is kept as such; TypeError where that is something else.
+template <class T>
+T& held(const py::handle& object, const char* name) {
+    if (!py::isinstance<T>(object))
+        refuse_kind(name, py::type::of<T>().attr("__name__").template cast<std::string>(), object);
+    return object.cast<T&>();
+}
+
 // The shape of an array on either side; TypeError where there is none.
 std::vector<py::ssize_t> shape_of(const py::handle& array, const char* name);
 
@@ -57,10 +68,16 @@ Span<T> device_span_of(const py::handle& array, const char* name, Shape shape) {
     return {static_cast<T*>(data), size};
 }
 
+// ValueError where memory is another CUDA device's.
+void check_is_on(Device device, const void* memory, const char* name);
+
 // Borrows an array that has to be where others are.
 template <class T>
 Span<T> span_on(Device device, const py::handle& array, const char* name, Shape shape) {
-    return device.is_host() ? span_of<T>(array, name, shape) : device_span_of<T>(array, name, shape);
+    if (device.is_host()) return span_of<T>(array, name, shape);
+    const Span<T> span = device_span_of<T>(array, name, shape);
+    check_is_on(device, span.data, name);
+    return span;
 }
 
 // A new array, not initialised: NumPy's on the host, a torch tensor on a device. Too little memory there is a
@@ -87,7 +104,8 @@ struct NewArray {
 };
 
 // Work on a device, on the stream that torch uses there; that device is the current one meanwhile. Made and
-// destroyed with Python's lock, which run() is called without.
+// destroyed with Python's lock, which the work itself is done without. RuntimeError where there is no such
+// device.
 class Work {
   public:
     explicit Work(Device device);

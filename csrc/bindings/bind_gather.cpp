@@ -1,4 +1,5 @@
 #include <algorithm>
+#include <functional>
 #include <vector>
 
 #include "bindings/operations.h"
@@ -25,15 +26,15 @@ void check_clusters(const GatherInput& in) {
     }
 }
 
-py::tuple gather(const std::vector<const Rows*>& bundles, const Instances& instances,
+py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles, const Instances& instances,
                  const py::array& instance, const py::array& first_row, const py::array& offset, int device) {
     std::vector<GaussianRows<const float>> rows;
     int sh_degree = 0;
-    for (const Rows* bundle : bundles) {
-        if (bundle->device() != Device{device})
+    for (const Rows& bundle : bundles) {
+        if (bundle.device() != Device{device})
             throw py::value_error("bundles: expected gaussians on the device that is asked for, got others");
-        rows.push_back(bundle->read<float>());
-        sh_degree = std::max(sh_degree, bundle->sh_degree());
+        rows.push_back(bundle.read<float>());
+        sh_degree = std::max(sh_degree, bundle.sh_degree());
     }
     instances.check_bundles(rows.size());
     const InstanceTable& placed = instances.table();

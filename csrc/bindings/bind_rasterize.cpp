@@ -52,11 +52,6 @@ struct Plane {
     }
 };
 
-py::tuple with_background(const NewRows& gradients, const py::object& background) {
-    return py::make_tuple(gradients.means.object, gradients.quats.object, gradients.scales.object,
-                          gradients.opacities.object, gradients.sh.object, background);
-}
-
 template <class T>
 class HostTape final : public Tape {
   public:
@@ -158,14 +153,14 @@ class DeviceTape final : public Tape {
             alpha(d_alpha, "d_alpha", device, {h, w});
         const PictureGradient<float> d_picture{
             color.span.data, alpha.span.data,
-            d_depth.is_none() ? nullptr : device_span_of<const float>(d_depth, "d_depth", {h, w}).data};
+            d_depth.is_none() ? nullptr : span_on<const float>(device, d_depth, "d_depth", {h, w}).data};
         const NewRows gradients(device, gaussians_.size(), gaussians_.sh_degree());
         const NewArray<float> background(device, {3});
         {
             const py::gil_scoped_release unlocked;
             frame_->backward(d_picture, gradients.rows(), background.span.data, work.stream());
         }
-        return with_background(gradients, background.object);
+        return py::tuple(gradients.arrays() + py::make_tuple(background.object));
     }
 
   private:

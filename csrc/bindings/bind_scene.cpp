@@ -120,7 +120,7 @@ struct SceneState {
     std::vector<size_t> num_gaussians;  // of each bundle
     InstanceTable instances;
 
-    const BoundTable& bundle(size_t b) const { return bundles[b].cast<const BoundTable&>(); }
+    const BoundTable& bundle(size_t b) const { return held<BoundTable>(bundles[b], "tables"); }
 };
 
 // What selection reads of a scene, on one device.
@@ -134,6 +134,7 @@ class BoundScene {
             cut_ = std::make_unique<cuda::Cut>();
         }
 #endif
+        set_bundles(py::list());
     }
 
     Device device() const { return device_; }
@@ -147,7 +148,7 @@ class BoundScene {
         auto state = std::make_shared<SceneState>();
         state->bundles = bundles;
         for (const py::handle& bundle : bundles) {
-            const auto& table = bundle.cast<const BoundTable&>();
+            const auto& table = held<BoundTable>(bundle, "tables");
             state->tables.push_back(table.table());
             state->num_gaussians.push_back(table.num_gaussians());
         }
@@ -300,8 +301,8 @@ NewPicture picture_of(const Window& window, bool with_depth) {
 class BoundSceneFrame {
   public:
     explicit BoundSceneFrame(int device) : device_{device} {
-#if V3DG_WITH_CUDA
         const Work work(device_);
+#if V3DG_WITH_CUDA
         if (!device_.is_host()) frame_ = std::make_unique<cuda::SceneFrame>();
 #endif
     }
@@ -313,13 +314,13 @@ class BoundSceneFrame {
         std::vector<SceneModel> host;
         std::vector<size_t> num_gaussians;
         for (const py::handle& item : models) {
-            const auto& model = item.cast<const BoundModel&>();
+            const auto& model = held<BoundModel>(item, "models");
             check_device(model.device(), "models");
             num_gaussians.push_back(model.size());
             if (device_.is_host()) host.push_back({&model.host().planes(), {}, {}, {}});
         }
         for (size_t b = 0; b < palettes.size(); ++b) {
-            const auto& palette = palettes[b].cast<const BoundPalette&>();
+            const auto& palette = held<BoundPalette>(palettes[b], "palettes");
             check_device(palette.device(), "palettes");
             if (device_.is_host()) host[b].palette = palette.host();
         }
@@ -416,7 +417,7 @@ class BoundSceneFrame {
 
   private:
     BoundScene& checked(const py::object& scene_object) const {
-        auto& scene = scene_object.cast<BoundScene&>();
+        auto& scene = held<BoundScene>(scene_object, "scene");
         if (scene.device() != device_) throw py::value_error("scene: expected one on the frame's device");
         if (scene.state()->num_gaussians != num_gaussians_)
             throw py::value_error("scene: expected one of the bundles that the frame has the gaussians of");
@@ -491,16 +492,15 @@ class BoundSceneFrame {
 class BoundAssetFrame {
   public:
     explicit BoundAssetFrame(const py::object& model) : model_(model) {
+        const Work work(held<BoundModel>(model, "model").device());
 #if V3DG_WITH_CUDA
-        const Device device = model.cast<const BoundModel&>().device();
-        const Work work(device);
-        if (!device.is_host()) frame_ = std::make_unique<cuda::ModelFrame>();
+        if (!work.device().is_host()) frame_ = std::make_unique<cuda::ModelFrame>();
 #endif
     }
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Background& background,
                                        const Stop* stop) {
-        const auto& model = model_.cast<const BoundModel&>();
+        const auto& model = held<BoundModel>(model_, "model");
         if (model.device().is_host()) return on_host(model.host(), camera, background, stop);
 #if V3DG_WITH_CUDA
         const Device device = model.device();

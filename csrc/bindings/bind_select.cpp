@@ -1,3 +1,5 @@
+#include <functional>
+
 #include "bindings/operations.h"
 #include "bindings/tables.h"
 
@@ -17,14 +19,16 @@ py::array_t<T> array_of(const std::vector<T>& values) {
     return py::array_t<T>(static_cast<py::ssize_t>(values.size()), values.data());
 }
 
+using Tables = std::vector<std::reference_wrapper<const BoundTable>>;
+
 // Arguments of one selection on the host; `tables` and `input` borrow from them.
 struct Arguments {
     std::vector<ClusterTable> tables;
     SelectInput input;
 
-    Arguments(const std::vector<const BoundTable*>& tables_of_bundles, const Instances& instances,
-              const BoundCamera& camera, const SelectRule& rule) {
-        for (const BoundTable* table : tables_of_bundles) tables.push_back(table->table());
+    Arguments(const Tables& tables_of_bundles, const Instances& instances, const BoundCamera& camera,
+              const SelectRule& rule) {
+        for (const BoundTable& table : tables_of_bundles) tables.push_back(table.table());
         instances.check_bundles(tables.size());
         input = {{tables.data(), tables.size()}, instances.table(), camera.camera, rule};
     }
@@ -40,8 +44,8 @@ NewArray<int64_t> offset_of_instances(Span<const int32_t> bundle, const std::vec
     return offset;
 }
 
-py::tuple group_metrics(const std::vector<const BoundTable*>& tables, const Instances& instances,
-                        const BoundCamera& camera, const SelectRule& rule) {
+py::tuple group_metrics(const Tables& tables, const Instances& instances, const BoundCamera& camera,
+                        const SelectRule& rule) {
     const Arguments arguments(tables, instances, camera, rule);
     std::vector<size_t> counts;
     for (const ClusterTable& table : arguments.tables) counts.push_back(table.ball.size);
@@ -55,8 +59,8 @@ py::tuple group_metrics(const std::vector<const BoundTable*>& tables, const Inst
     return py::make_tuple(metric.object, offset.object);
 }
 
-py::tuple bounds_may_draw(const std::vector<const BoundTable*>& tables, const Instances& instances,
-                          const BoundCamera& camera, const SelectRule& rule, bool and_coarser) {
+py::tuple bounds_may_draw(const Tables& tables, const Instances& instances, const BoundCamera& camera,
+                          const SelectRule& rule, bool and_coarser) {
     const Arguments arguments(tables, instances, camera, rule);
     std::vector<size_t> counts;
     for (const ClusterTable& table : arguments.tables)
