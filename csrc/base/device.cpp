@@ -120,23 +120,25 @@ void refuse_capture(cudaStream_t stream) {
             "cuda: no memory can be had while a graph is captured; draw as much once before");
 }
 
-Turns::Turns() { check(cudaEventCreateWithFlags(&done_, cudaEventDisableTiming), "cudaEventCreate"); }
+StreamMutex::StreamMutex() {
+    check(cudaEventCreateWithFlags(&done_, cudaEventDisableTiming), "cudaEventCreate");
+}
 
-Turns::~Turns() {
+StreamMutex::~StreamMutex() {
     if (cudaEventDestroy(done_) != cudaSuccess) cudaGetLastError();  // at exit the driver may be gone
 }
 
-Turn::Turn(Turns& turns, cudaStream_t stream)
-    : lock_(turns.busy_), turns_(turns), stream_(stream), is_captured_(is_capturing(stream)) {
-    if (!is_captured_ && stream != turns.last_)
-        check(cudaStreamWaitEvent(stream, turns.done_, 0), "cudaStreamWaitEvent");
+StreamLock::StreamLock(StreamMutex& mutex, cudaStream_t stream)
+    : lock_(mutex.busy_), mutex_(mutex), stream_(stream), is_captured_(is_capturing(stream)) {
+    if (!is_captured_ && stream != mutex.last_)
+        check(cudaStreamWaitEvent(stream, mutex.done_, 0), "cudaStreamWaitEvent");
 }
 
-Turn::~Turn() {
+StreamLock::~StreamLock() {
     if (is_captured_) return;
-    turns_.last_ = stream_;
-    if (cudaEventRecord(turns_.done_, stream_) != cudaSuccess)
-        cudaGetLastError();  // the next turn will see it
+    mutex_.last_ = stream_;
+    if (cudaEventRecord(mutex_.done_, stream_) != cudaSuccess)
+        cudaGetLastError();  // the next lock will see it
 }
 
 void trim_pool(cudaStream_t stream) {

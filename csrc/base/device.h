@@ -32,7 +32,7 @@ void check(cudaError_t error, const char* what);
 // How many devices there are; 0 without a driver.
 int num_devices();
 int current_device();
-// How many the current device has.
+// How many multiprocessors the current device has.
 unsigned num_multiprocessors();
 
 // Lets the kernel have `bytes` of dynamic shared memory on the current device, which has to be asked for
@@ -53,33 +53,34 @@ bool is_capturing(cudaStream_t stream);
 // Throws std::runtime_error while it is: memory from a graph is gone with the graph.
 void refuse_capture(cudaStream_t stream);
 
-// Memory that several threads and streams use, one after the other.
-class Turns {
+// Guards memory that several threads and streams use, one after the other.
+class StreamMutex {
   public:
-    Turns();
-    ~Turns();
-    Turns(const Turns&) = delete;
-    Turns& operator=(const Turns&) = delete;
+    StreamMutex();
+    ~StreamMutex();
+    StreamMutex(const StreamMutex&) = delete;
+    StreamMutex& operator=(const StreamMutex&) = delete;
 
   private:
-    friend class Turn;
+    friend class StreamLock;
     std::mutex busy_;
     cudaEvent_t done_ = nullptr;
     cudaStream_t last_ = nullptr;
 };
 
-// While it lives, the memory is one thread's, and what that enqueues on the stream runs after the turn
-// before. What a graph captures is not ordered so: whoever replays it does that.
-class Turn {
+// While it lives, the memory belongs to one thread, and what that enqueues on the stream runs after what was
+// enqueued under the lock before. It does not order what a graph captures: whoever replays the graph does
+// that.
+class StreamLock {
   public:
-    Turn(Turns& turns, cudaStream_t stream);
-    ~Turn();
-    Turn(const Turn&) = delete;
-    Turn& operator=(const Turn&) = delete;
+    StreamLock(StreamMutex& mutex, cudaStream_t stream);
+    ~StreamLock();
+    StreamLock(const StreamLock&) = delete;
+    StreamLock& operator=(const StreamLock&) = delete;
 
   private:
     const std::lock_guard<std::mutex> lock_;
-    Turns& turns_;
+    StreamMutex& mutex_;
     cudaStream_t stream_;
     bool is_captured_;
 };

@@ -115,7 +115,7 @@ void Frame::enqueue(Drawing& drawing) {
     const Slot& slot = *drawing.slot_;
     const bool capturing = drawing.is_captured_;
     const Capacity& capacity = drawing.capacity_ = capacity_;
-    const Turn turn(turns_, stream);
+    const StreamLock lock(busy_, stream);
 
     const size_t parts = tile_bin_parts(batch.num_tiles);
     const size_t cleared_bytes =

@@ -24,7 +24,7 @@ struct FrameBatch {
     bool has_shared_items = false;         // whether there may be any; a frame that keeps a tape has none
 };
 
-// What a frame leaves for the way back, valid until the next is drawn.
+// What a frame leaves for its backward pass, valid until the next frame is drawn.
 struct FrameTape {
     FrameLists lists;
     RasterTape raster;
@@ -97,7 +97,7 @@ class Frame {
     Drawing* last_ = nullptr;
     FrameBatch last_batch_{};
     cudaStream_t last_stream_ = nullptr;
-    Turns turns_;
+    StreamMutex busy_;
 };
 
 // A frame that has been enqueued. The Frame must outlive it.

@@ -18,7 +18,7 @@ void SceneTables::set_bundles(std::vector<std::shared_ptr<const BundleTables>> b
         on_device.push_back(bundle->on_device());
     }
     const DeviceGuard guard(device_);
-    const Turn turn(turns_, stream);
+    const StreamLock lock(busy_, stream);
     bundles_on_device_.copy_from({on_device.data(), on_device.size()}, stream);
     bundles_ = std::move(bundles);
     num_instances_of_.resize(bundles_.size(), 0);
@@ -27,7 +27,7 @@ void SceneTables::set_bundles(std::vector<std::shared_ptr<const BundleTables>> b
 void SceneTables::set_instances(Span<const int32_t> bundle, Span<const float> importance,
                                 cudaStream_t stream) {
     const DeviceGuard guard(device_);
-    const Turn turn(turns_, stream);
+    const StreamLock lock(busy_, stream);
     num_instances_ = bundle.size;
     num_instances_of_.assign(bundles_.size(), 0);
     for (const int32_t b : bundle) ++num_instances_of_[b];
@@ -38,7 +38,7 @@ void SceneTables::set_instances(Span<const int32_t> bundle, Span<const float> im
 void SceneTables::set_poses(const PoseSpan& position, const PoseSpan& quaternion, const PoseSpan& scale,
                             cudaStream_t stream) {
     const DeviceGuard guard(device_);
-    const Turn turn(turns_, stream);
+    const StreamLock lock(busy_, stream);
     const auto on_device = [&](const PoseSpan& from, int k) {
         return from.is_on_device ? from.values.data : uploaded_[k].copy_from(from.values, stream);
     };

@@ -48,11 +48,11 @@ class SceneTables {
     size_t num_instances_of(size_t b) const { return num_instances_of_[b]; }
 
     SceneOnDevice on_device() const;
-    Turn turn(cudaStream_t stream) const { return Turn(turns_, stream); }
+    StreamLock lock(cudaStream_t stream) const { return StreamLock(busy_, stream); }
 
   private:
     const int device_ = current_device();
-    mutable Turns turns_;
+    mutable StreamMutex busy_;
     std::vector<std::shared_ptr<const BundleTables>> bundles_;
     std::vector<size_t> num_instances_of_;  // each bundle
     size_t num_instances_ = 0;

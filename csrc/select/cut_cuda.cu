@@ -256,7 +256,7 @@ void Cut::cut_items(const SceneTables& scene, const Camera& camera, const Select
                     const FrameImage& image, FrameImage* images, Placement* placements, const ItemList& items,
                     cudaStream_t stream) {
     const DeviceGuard guard(device_);
-    const Turn turn = scene.turn(stream);
+    const StreamLock lock = scene.lock(stream);
     cut(scene, camera, rule, {image, images, placements, &items.counters->choice}, ItemOutput{items}, stream);
 }
 
@@ -264,7 +264,7 @@ void Cut::given_items(const SceneTables& scene, const Camera& camera, Span<const
                       Span<const int32_t> cluster, const FrameImage& image, FrameImage* images,
                       Placement* placements, const ItemList& items, cudaStream_t stream) {
     const DeviceGuard guard(device_);
-    const Turn turn = scene.turn(stream);
+    const StreamLock lock = scene.lock(stream);
     const SceneOnDevice on_device = scene.on_device();
     const PlacedScene placed{on_device.bundles, on_device.instances, nullptr, nullptr, nullptr};
     const unsigned blocks = std::max(1u, blocks_for(instance.size, kCutThreads));
@@ -280,7 +280,7 @@ void Cut::given_items(const SceneTables& scene, const Camera& camera, Span<const
 void Cut::select(const SceneTables& scene, const Camera& camera, const SelectRule& rule, SelectOutput& out,
                  cudaStream_t stream) {
     const DeviceGuard guard(device_);
-    const Turn turn = scene.turn(stream);
+    const StreamLock lock = scene.lock(stream);
     Pairs* on_device = pairs_.reserve(1, stream);
     Pairs counts{};
     // Most cuts of most scenes fit at once.
