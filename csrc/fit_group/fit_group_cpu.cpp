@@ -240,7 +240,7 @@ class Student {
     GaussianPlanes<float> model_{};
 };
 
-// Draws the student, compares it with its target and, on the way back, adds to its gradient.
+// Draws the student, compares it with its target, and adds to its gradient.
 class Comparison {
   public:
     Comparison(const FitConfig& config) : config_(config) {}

@@ -13,8 +13,6 @@
 
 namespace v3dg {
 
-// ---- views
-
 // The paper's code looks at a 64 px image with a focal length of 88.9 px.
 constexpr double kFocalPerSize = 88.9 / 64;
 // Room around the ball for what its gaussians draw beyond it.
@@ -138,8 +136,6 @@ V3DG_HD V3DG_INLINE Pinhole<float> camera_of(const FitView& view, float scale) {
     return {scale * view.focal, scale * view.focal, scale * view.cx, scale * view.cy, size, size, 1e-3f};
 }
 
-// ---- parameters
-
 constexpr float kLeastScale = 1e-5f;    // of the radius: far below what a pixel shows
 constexpr float kLeastOpacity = 1e-4f;  // keeps the logit finite and movable
 constexpr float kLog2e = 1.4426950408889634f;
@@ -170,8 +166,6 @@ V3DG_HD V3DG_INLINE V opacity_of_logit(V x) {
     constexpr float kMost = 13.287568f;  // log2 of 1 / kLeastOpacity - 1
     return 1 / (1 + exp2_in_range(min_of(all_lanes<V>(kMost), max_of(all_lanes<V>(-kMost), x * -kLog2e))));
 }
-
-// ---- steps
 
 // What one step of Adam takes.
 struct FitStep {

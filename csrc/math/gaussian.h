@@ -121,8 +121,8 @@ V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     double column[3][3];
     for (int k = 0; k < 3; ++k)
         for (int i = 0; i < 3; ++i) column[k][i] = r[3 * i + order[k]] * double(g.scale[order[k]]);
-    // Turning two columns into each other leaves F Fᵀ; a number becomes 0. The shorter two, whose lengths
-    // then differ least from before.
+    // Rotate columns 1 and 2 by a Givens rotation so that column 2 begins with 0; F Fᵀ does not change. They
+    // are the shortest columns, so their rounding is least.
     const double x = column[1][0], y = column[2][0], length = sqrt_of(x * x + y * y);
     const double cosine = length > 0 ? x / length : 1, sine = length > 0 ? y / length : 0;
     for (int i = 0; i < 3; ++i) {

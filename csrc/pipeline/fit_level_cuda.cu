@@ -70,10 +70,10 @@ size_t target_bytes(const FitConfig& config, const FitJob& job) {
 }
 
 // Fits jobs whose pictures fit into memory together.
-class Level {
+class LevelFit {
   public:
-    Level(const FitConfig& config, const DeviceFitTarget& target, const GaussianRows<float>& rows,
-          size_t num_groups, FitProgress& progress, cudaStream_t stream)
+    LevelFit(const FitConfig& config, const DeviceFitTarget& target, const GaussianRows<float>& rows,
+             size_t num_groups, FitProgress& progress, cudaStream_t stream)
         : config_(config),
           target_(target),
           rows_(rows),
@@ -139,7 +139,7 @@ void fit_level(const FitConfig& config, Span<const FitGroup> groups, const Devic
     size_t free_bytes = 0, total_bytes = 0;
     check(cudaMemGetInfo(&free_bytes, &total_bytes), "cudaMemGetInfo");
     size_t budget = std::min(kTargetBytes, free_bytes / 4);
-    Level level(config, target, rows, groups.size, progress, stream);
+    LevelFit level(config, target, rows, groups.size, progress, stream);
     for (size_t first = 0; first < jobs.size() && !progress.cancel;) {
         size_t last = first, bytes = 0;
         while (last < jobs.size() && (last == first || bytes + target_bytes(config, jobs[last]) <= budget))

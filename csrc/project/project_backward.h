@@ -1,6 +1,7 @@
 #pragma once
 
-// The way back from the records of a CUDA frame that shows one model to the gaussians of that model.
+// Backward pass of projection on CUDA: from the gradients of the records of a frame that shows one model to
+// those of the model's gaussians.
 
 #include "base/device.h"
 #include "frame/draw_list.h"

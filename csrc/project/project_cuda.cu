@@ -127,16 +127,16 @@ struct PackedSource {
     }
 };
 
-// What the sphere around a gaussian tells.
-struct Sphere {
+// What is known of a gaussian from the sphere around it.
+struct SphereTest {
     bool may_reach;       // a pixel centre; also where something is not a number
     bool misses_centers;  // but is in the frustum
 };
 
-// Of a gaussian at p in view space. Without branches: somebody else in the warp takes them all.
+// Of a gaussian at p in view space. Without branches, because some lane of the warp would take each of them.
 template <class Model>
-__device__ Sphere look_at_sphere(const ItemTables<Model>& in, const float p[3], float reach,
-                                 float reach_scale) {
+__device__ SphereTest test_sphere(const ItemTables<Model>& in, const float p[3], float reach,
+                                  float reach_scale) {
     const Pinhole<float>& cam = in.image.camera;
     const float inv_z = 1 / p[2], slope_x = p[0] * inv_z, slope_y = p[1] * inv_z;
     const float u = cam.fx * slope_x + cam.cx, v = cam.fy * slope_y + cam.cy;
@@ -332,7 +332,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             for (int k = 0; k < 3; ++k)
                 p[k] = view.linear[3 * k] * sphere.x + view.linear[3 * k + 1] * sphere.y +
                        view.linear[3 * k + 2] * sphere.z + view.translation[k];
-            const Sphere told = look_at_sphere(tables, p, sphere.w, reach_scale);
+            const SphereTest told = test_sphere(tables, p, sphere.w, reach_scale);
             may_reach = told.may_reach;
             num_in_frustum += told.misses_centers;
         }

@@ -1,6 +1,6 @@
 #pragma once
 
-// One gaussian, seen by one camera: its ellipse on the image, and the way back.
+// One gaussian, seen by one camera: its ellipse on the image, and the gradients of it.
 //
 // EWA projection (Zwicker et al. 2001) as 3D Gaussian Splatting uses it (Kerbl et al. 2023). The 2D
 // covariance is A Aᵀ + filter I with A = J W R S (2x3), so its determinant is |a1 x a2|² plus terms that are
@@ -14,7 +14,7 @@
 
 namespace v3dg {
 
-// What the way back needs again.
+// What the gradients need again.
 template <class V>
 struct Projection {
     V p[3];          // view space

@@ -1,6 +1,7 @@
 #pragma once
 
-// The way back through a CUDA frame of one picture: from the picture's gradients to those of its records.
+// Backward pass of rasterization on CUDA, of one picture: from the picture's gradients to those of its
+// records.
 
 #include "base/device.h"
 #include "frame/gradient_slots.h"

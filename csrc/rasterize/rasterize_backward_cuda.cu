@@ -78,8 +78,8 @@ __device__ uint32_t warps_of(const Record<float>& g, int left, int top) {
     return warps;
 }
 
-// What a pixel needs on the way back.
-struct Pixel {
+// What the backward pass needs of a pixel.
+struct PixelGradient {
     float x, y;
     float d_color[3], d_depth, d_weight;
     float total, running;  // sum over gaussians of weight * (gradient by that weight): all, and so far
@@ -87,8 +87,9 @@ struct Pixel {
 };
 
 // Reads the pixel at (column, row) of the picture; adds to `d_background`.
-__device__ Pixel read_pixel(const RasterizeBackwardInput& in, int column, int row, float d_background[3]) {
-    Pixel p{column + 0.5f, row + 0.5f, {0, 0, 0}, 0, 0, 0, 0, -1};
+__device__ PixelGradient read_pixel(const RasterizeBackwardInput& in, int column, int row,
+                                    float d_background[3]) {
+    PixelGradient p{column + 0.5f, row + 0.5f, {0, 0, 0}, 0, 0, 0, 0, -1};
     if (column >= in.image.width || row >= in.image.height) return p;
     const size_t at = static_cast<size_t>(row) * in.image.width + column;
     const float alpha = in.image.alpha[at], t = 1 - alpha;
@@ -160,7 +161,7 @@ __device__ void add_up(Shared& s, Batch& batch, int warp, int held, int entry, f
 
 // Blends one gaussian over the pixel.
 template <bool kWithDepth>
-__device__ Share blend_vjp(const Record<float>& g, Pixel& p) {
+__device__ Share blend_vjp(const Record<float>& g, PixelGradient& p) {
     const Falloff<float> f = falloff_at(p.x, p.y, g.u, g.v, g.l11, g.l12, g.l22, g.log2_opacity);
     const float alpha = alpha_of(f), before = p.transmittance;
     const float weight = blend_weight(alpha, p.transmittance);
@@ -173,7 +174,8 @@ __device__ Share blend_vjp(const Record<float>& g, Pixel& p) {
 
 // Takes this warp's pixels through the batch.
 template <bool kWithDepth>
-__device__ void blend_batch_vjp(Shared& s, Batch& batch, int warp, int num, Pixel& p, float left, float top) {
+__device__ void blend_batch_vjp(Shared& s, Batch& batch, int warp, int num, PixelGradient& p, float left,
+                                float top) {
     const int lane = threadIdx.x % 32;
     uint8_t* list = s.list[warp];
     int count = 0;
@@ -234,7 +236,8 @@ __global__ void __launch_bounds__(kThreads, 2)
               warp_top = top + warp / kWarpColumns * kWarpHeight;
 
     float d_background[3] = {0, 0, 0};
-    Pixel p = read_pixel(in, warp_left + lane % kWarpWidth, warp_top + lane / kWarpWidth, d_background);
+    PixelGradient p =
+        read_pixel(in, warp_left + lane % kWarpWidth, warp_top + lane / kWarpWidth, d_background);
     s.d_color[warp][lane / kWarpWidth][lane % kWarpWidth] =
         make_float4(p.d_color[0], p.d_color[1], p.d_color[2], p.d_depth);
     for (int c = 0; c < 3; ++c) {

@@ -6,7 +6,7 @@
 namespace v3dg {
 namespace cuda {
 
-// What the way back needs of the blend; every pointer is on the device.
+// What the backward pass needs of the forward pass; every pointer is on the device.
 struct RasterTape {
     // As long as the entries, each tile's at its tile_first: its records in the order they were blended,
     // without those that could change no pixel.

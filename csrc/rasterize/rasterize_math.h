@@ -1,6 +1,6 @@
 #pragma once
 
-// One gaussian over one pixel (or a vector of pixels): the blend step and the way back.
+// One gaussian over one pixel (or a vector of pixels): the blend step and its gradients.
 //
 // A pixel's transmittance is negative once it has stopped; its magnitude is then the final value.
 
@@ -49,8 +49,8 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t) {
     return weight;
 }
 
-// The same for several gaussians, one behind the other; `before` is the transmittance at each. Most pixels do
-// not stop among them, which the product of all tells.
+// blend_weight() for several gaussians, one behind the other; `before` is the transmittance at each. Most
+// pixels do not stop among them, and then the product of all tells that.
 template <int kCount, class T>
 V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&before)[kCount],
                                        T (&weight)[kCount]) {
@@ -138,7 +138,8 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
-// The same for a single pixel that has not stopped. Returns whether it goes on; if not, `t` stays as it was.
+// blend_weight() for a single pixel that has not stopped. Returns whether it goes on; if not, `t` stays as it
+// was.
 V3DG_HD inline bool blend_live(float alpha, float& t, float& weight) {
     const float next = t * (1 - alpha);
     const bool goes_on = next > static_cast<float>(kMinTransmittance);
@@ -148,24 +149,24 @@ V3DG_HD inline bool blend_live(float alpha, float& t, float& weight) {
 }
 
 // The pixels of an 8 x 4 window that a gaussian may reach, a bit each, row by row; (u, v) is its centre from
-// that of the first pixel. Some more, so that the blend step alone decides.
+// that of the first pixel. It has a margin, so that the blend step alone decides.
 V3DG_HD inline uint32_t reached_pixels(float u, float v, float l11, float l12, float l22,
                                        float log2_opacity) {
-    // Across in windows, so that saturating cuts off what lies outside.
-    constexpr float kEighth = 0.125f, kHair = 1e-2f;
+    // In x, 1 is the width of the window, so that saturation cuts off what lies outside.
+    constexpr float kEighth = 0.125f, kMargin = 1e-2f;
     const float reach = log2_opacity - static_cast<float>(kLog2MinAlpha);
     const float inverse = kEighth * rough_reciprocal(l11), slope = -l12 * inverse,
                 wider = inverse * (1 + 2e-3f);
-    // Half a pixel more, as the first pixel and the end are rounded to the nearest.
-    const float first_u = kEighth * u + kEighth * (0.5f - kHair),
-                end_u = kEighth * u + kEighth * (0.5f + kHair);
+    // Half a pixel is added, because both are rounded to the nearest integer.
+    const float first_u = kEighth * u + kEighth * (0.5f - kMargin),
+                end_u = kEighth * u + kEighth * (0.5f + kMargin);
     uint32_t pixels = 0;
     for (int row = 0; row < 4; ++row) {
         const float y = static_cast<float>(row) - v, t = l22 * y;
         const float half = rough_sqrt(max_of(reach - t * t, 0.0f)) * wider;
         const float first = saturated_fma(slope, y, first_u - half);
         const float end = max_of(saturated_fma(slope, y, end_u + half), first);
-        // Beyond the last row's last bit there is nothing, which is what it should be.
+        // In the last row an end of 1 shifts the bit out, which leaves the 0 that the subtraction needs.
         const uint32_t row_begin = 1u << (8 * row);
         pixels += shifted_by_eighths(row_begin, end) - shifted_by_eighths(row_begin, first);
     }

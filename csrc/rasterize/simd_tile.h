@@ -31,7 +31,7 @@ struct TilePlanes {
     alignas(64) T extra[kTilePixels];  // sum of weight * depth, or the number of gaussians
 };
 
-// What the way back reads of each pixel, and the sums it keeps.
+// What the backward pass reads of each pixel, and the sums it keeps.
 template <class T>
 struct TileGradient {
     alignas(64) T d_color[3][kTilePixels];
@@ -163,9 +163,9 @@ V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int
     }
 }
 
-// The way back through one record: the same steps on the same numbers, front to back, so that the same pixels
-// take part. `tile` is replayed (transmittance; color[0] holds the running sum); returns false where no pixel
-// of the tile took part.
+// Gradients of one record. Takes the same steps on the same numbers as blend_record(), front to back, so that
+// the same pixels take part: `tile` starts empty again, and its color[0] holds the running sum. Returns false
+// where no pixel of the tile took part.
 template <class T, bool kWithDepth>
 V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left, int top,
                                   const BlockPixels<T>& pixels, const TileGradient<T>& grad,
