@@ -132,9 +132,8 @@ void Frame::enqueue(Drawing& drawing) {
     ItemTiles* item_tiles = room(item_tiles_, capacity.items, drawing);
     LargeRecord* large = room(large_, capacity.large, drawing);
     TileEntry* entries = room(entries_, capacity.entries, drawing);
-    // Which tiles a record is in has been read when the blend stage begins.
+    // The blend stage overwrites the tiles of records over few tiles, which have all been read by then.
     FewTiles* few = room(scratch_, std::max(capacity.records, capacity.entries), drawing);
-    TileEntry* scratch = reinterpret_cast<TileEntry*>(few);
     const bool keeps_tape = keeps_ == Keeps::tape;
     uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
     const TileBinOutput bins{room(tile_first_, batch.num_tiles + 1, drawing),
@@ -149,11 +148,7 @@ void Frame::enqueue(Drawing& drawing) {
     tile_bin({item_tiles, few, records, batch.images, batch.num_images, batch.num_tiles, capacity, large,
               tiles, &state->counters},
              bins, stream);
-    const FrameLists lists{batch.images,    bins.image_of_tile,
-                           batch.num_tiles, records,
-                           bins.tile_first, entries,
-                           scratch,         &state->counters,
-                           capacity,        room(plans_, batch.num_tiles, drawing)};
+    room(plans_, batch.num_tiles, drawing);
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
     const auto report = [&] {
@@ -166,32 +161,31 @@ void Frame::enqueue(Drawing& drawing) {
         place_slots(items, item_records, records, room(first_slot_, capacity.records, drawing), stream);
         report();
     }
-    rasterize(lists, keeps_tape ? &tape : nullptr, stream);
+    rasterize(lists(batch), keeps_tape ? &tape : nullptr, stream);
     if (!keeps_tape) report();
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
 }
 
+FrameLists Frame::lists(const FrameBatch& batch) const {
+    return {batch.images,
+            image_of_tile_.data(),
+            batch.num_tiles,
+            records_.data(),
+            tile_first_.data(),
+            entries_.data(),
+            reinterpret_cast<TileEntry*>(scratch_.data()),
+            &reinterpret_cast<const State*>(cleared_.data())->counters,
+            capacity_,
+            plans_.data()};
+}
+
 FrameTape Frame::tape() const {
-    const FrameLists lists{last_batch_.images,
-                           image_of_tile_.data(),
-                           last_batch_.num_tiles,
-                           records_.data(),
-                           tile_first_.data(),
-                           entries_.data(),
-                           nullptr,
-                           &reinterpret_cast<const State*>(cleared_.data())->counters,
-                           capacity_,
-                           plans_.data()};
-    return {lists,
-            {order_.data(), blended_.data()},
-            last_batch_.models,
-            last_batch_.placements,
-            items_.data(),
-            item_records_.data(),
-            source_.data(),
-            first_slot_.data()};
+    return {lists(last_batch_), {order_.data(), blended_.data()},
+            last_batch_.models, last_batch_.placements,
+            items_.data(),      item_records_.data(),
+            source_.data(),     first_slot_.data()};
 }
 
 Drawing::Drawing(Frame& frame, const FrameBatch& batch, Frame::Prepare prepare, cudaStream_t stream)

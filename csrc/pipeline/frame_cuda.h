@@ -72,6 +72,8 @@ class Frame {
     struct Slot;
     struct State;
     void enqueue(Drawing& drawing);
+    // Of the buffers as they are now.
+    FrameLists lists(const FrameBatch& batch) const;
     void enlarge(const State& state);
     Slot* take_slot(bool capturing);
     template <class T>

@@ -32,6 +32,31 @@ static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsign
     }
 }
 
+// Writes the records of those gaussians from `at` on whose bits are set in `lanes`.
+template <class T, class V, class I>
+static V3DG_INLINE void write_records(const Draw<T>& draw, uint64_t at, unsigned lanes,
+                                      const Gaussian3d<V>& g, const Ellipse<V>& e, const PixelBox<I>& box,
+                                      Record<T>* records) {
+    const GaussianPlanes<T>& model = *draw.model;
+    V sh[3 * kMaxShBases], color[3];
+    if (draw.palette.sh != nullptr) {
+        load_palette(draw.palette, at, lanes, sh);
+        color_of_sh(0, g.mean, draw.view, sh, color);
+    } else {
+        for (int k = 0; k < 3 * num_sh_bases(model.sh_degree); ++k) sh[k] = load(model.sh[k] + at);
+        color_of_sh(model.sh_degree, g.mean, draw.view, sh, color);
+    }
+    for (Record<T>* r = records; lanes != 0; lanes &= lanes - 1, ++r) {
+        const int i = __builtin_ctz(lanes);
+        const Ellipse<T> mine{e.u[i], e.v[i], e.l11[i], e.l12[i], e.l22[i], e.log2_opacity[i], e.depth[i]};
+        set_ellipse(mine,
+                    PixelBox<int>{static_cast<int>(box.x0[i]), static_cast<int>(box.x1[i]),
+                                  static_cast<int>(box.y0[i]), static_cast<int>(box.y1[i])},
+                    *r);
+        for (int c = 0; c < 3; ++c) r->color[c] = color[c][i];
+    }
+}
+
 template <class T>
 size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
                const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base,
@@ -77,33 +102,15 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
 
         box.x0 = max_of(box.x0, I{} + window.x0), box.x1 = min_of(box.x1, I{} + (window.x1 - 1));
         box.y0 = max_of(box.y0, I{} + window.y0), box.y1 = min_of(box.y1, I{} + (window.y1 - 1));
-        unsigned kept = drawn_bits & bits_of(box.holds_pixels());
+        const unsigned kept = drawn_bits & bits_of(box.holds_pixels());
         if (kept == 0) continue;
 
-        V sh[3 * kMaxShBases], color[3];
-        if (draw.palette.sh != nullptr) {
-            load_palette(draw.palette, at, kept, sh);
-            color_of_sh(0, g.mean, mv, sh, color);
-        } else {
-            const int num_sh = 3 * num_sh_bases(model.sh_degree);
-            for (int k = 0; k < num_sh; ++k) sh[k] = load(model.sh[k] + at);
-            color_of_sh(model.sh_degree, g.mean, mv, sh, color);
-        }
-
-        while (kept != 0) {
-            const int i = __builtin_ctz(kept);
-            kept &= kept - 1;
-            Record<T>& r = records[num_records];
-            const Ellipse<T> mine{e.u[i],    e.v[i], e.l11[i], e.l12[i], e.l22[i], e.log2_opacity[i],
-                                  e.depth[i]};
-            set_ellipse(mine,
-                        PixelBox<int>{static_cast<int>(box.x0[i]), static_cast<int>(box.x1[i]),
-                                      static_cast<int>(box.y0[i]), static_cast<int>(box.y1[i])},
-                        r);
-            for (int c = 0; c < 3; ++c) r.color[c] = color[c][i];
-            if (source != nullptr) source[num_records] = source_base + static_cast<uint32_t>(done) + i;
-            ++num_records;
-        }
+        if (source != nullptr)
+            for (unsigned left = kept; left != 0; left &= left - 1)
+                source[num_records + __builtin_popcount(kept) - __builtin_popcount(left)] =
+                    source_base + static_cast<uint32_t>(done) + __builtin_ctz(left);
+        write_records(draw, at, kept, g, e, box, records + num_records);
+        num_records += __builtin_popcount(kept);
     }
     for (int i = 0; i < kWidth; ++i) {
         reach.top = min_of(reach.top, static_cast<int>(top[i]));
