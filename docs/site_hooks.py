@@ -36,9 +36,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Point links at where the site has things, and fill in the command line."""
     if page.file.src_uri == "command_line.md":
         markdown = markdown.replace("<!-- commands -->", "\n\n".join(map(command_text, COMMANDS)))
+    home = "../" * page.file.src_uri.count("/")  # from the page to the top of the site
     for source, target in PAGES.items():
-        markdown = markdown.replace(f"](../{source})", f"]({target})")
-    return markdown.replace("](../benchmarks/results/", "](benchmarks/results/")
+        markdown = markdown.replace(f"]({home}../{source})", f"]({home}{target})")
+    return markdown.replace(f"]({home}../benchmarks/results/", f"]({home}benchmarks/results/")
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
@@ -51,7 +52,7 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
 def command_text(name: str) -> str:
     """A section on one command: what it does, and tables of its arguments and options."""
     with warnings.catch_warnings():
-        # tyro wants to drop it, and has nothing else that tells what a parser takes; docs pin their tyro.
+        # tyro will drop it, and nothing else tells what a parser takes; the extra `docs` pins its version.
         warnings.simplefilter("ignore", DeprecationWarning)
         parser: argparse.ArgumentParser = tyro.extras.get_parser(
             COMMANDS[name][0], prog=f"v3dg {name}", config=(tyro.conf.FlagCreatePairsOff,)

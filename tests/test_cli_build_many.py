@@ -94,7 +94,7 @@ def test_an_interrupt_says_how_far_it_got(folder):
 
 
 def test_errors_before_anything_is_built(folder):
-    fails(2, "PATH: expected an asset", "build", cwd=folder)
+    fails(2, "PATH: expected one or more assets", "build", cwd=folder)
     fails(2, "expected a folder for the bundles", "build", ".", "-o", "all.v3dg", cwd=folder)
     (folder / "empty").mkdir()
     fails(1, "empty: expected a folder with assets (.ply", "build", "empty", cwd=folder)

@@ -99,7 +99,7 @@ def test_what_cannot_be_meant_is_refused(folder):
     fails(2, "--level: expected 0 to", "convert", "tuft.v3dg", "x.ply", "--level", "99", cwd=folder)
     fails(
         2,
-        "--level: expected no options of a cut",
+        "--level: expected no scene, camera, tolerance or budget with it",
         "convert",
         "tuft.v3dg",
         "x.ply",

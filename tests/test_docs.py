@@ -22,7 +22,7 @@ import v3dg
 from v3dg.donut import make_donut
 
 ROOT = Path(__file__).parent.parent
-PAGES = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").glob("*.md"))]
+PAGES = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^(?:<!-- test: (?P<how>.*?) -->\n)?```(?P<kind>\w+)\n(?P<code>.*?)^```$", re.M | re.S)
 
 

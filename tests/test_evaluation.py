@@ -244,15 +244,22 @@ def test_clipping_is_compared_at_equal_counts(results):
 
 
 @pytest.mark.slow
-def test_page_begins_with_wins_and_losses(results):
+def test_page_begins_with_a_table_and_lists_wins_and_losses(results):
     folder, _ = results
-    text = report.page([folder], folder / "results.md")
-    beginning = text.splitlines()[:10]
-    assert any(line.startswith("**Where we win**: ") for line in beginning)
-    assert any(line.startswith("**Where we do not**: ") for line in beginning)
+    text = report.page([folder], folder / "results.md", folder / "notes" / "evaluation.md")
+    assert text.splitlines()[2].startswith("| scene | ")
+    assert "## Where we win\n\n- " in text
+    assert "## Where we do not\n" in text
+    assert "](notes/evaluation.md)" in text
+
+
+@pytest.mark.slow
+def test_page_of_tables_has_every_part(results):
+    folder, _ = results
+    text = report.tables_page([folder], folder / "notes" / "evaluation.md")
     for name in evaluation.NAMES:
         assert f"### {evaluation.part(name).TITLE}" in text
-    assert "](clipping.jpg)" in text
+    assert "](../clipping.jpg)" in text
 
 
 @pytest.mark.slow

@@ -252,7 +252,7 @@ def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):
         with pytest.raises(ValueError, match=f"{name}: expected a new folder, or one with an earlier export"):
             export_streamed_sog(bundle, tmp_path / name)
     with pytest.raises(
-        ValueError, match=r"chunk: expected at least \d+ gaussians, a group of the asset, got 9"
+        ValueError, match=r"chunk: expected at least \d+ gaussians, the size of a group of the asset, got 9"
     ):
         export_streamed_sog(bundle, tmp_path / "web", chunk=9)
     with pytest.raises(ValueError, match="bundle: expected gaussians to export, got none"):

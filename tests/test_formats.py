@@ -352,14 +352,14 @@ HOSTILE_SPZ = {
     "version 4 in gzip": (spz(version=4), "expected version 1 to 3 in gzip, got 4"),
     "degree": (spz(degree=4), "expected SH degree 0 to 3, got 4"),
     "fraction bits": (spz(bits=25), "expected at most 24 fraction bits, got 25"),
-    "too short": (spz()[:-1], "expected 40 bytes of gaussians, got a file that does not end with them"),
-    "header only": (spz()[:16], "expected 40 bytes of gaussians, got a file that does not end with them"),
+    "too short": (spz()[:-1], "expected a gzip stream that ends after 40 bytes of gaussians, got another"),
+    "header only": (spz()[:16], "expected a gzip stream that ends after 40 bytes of gaussians, got another"),
     "no header": (spz()[:15], "expected a header of 16 bytes, got 15"),
     "huge count": (
         spz(count=2**32 - 1),
         "expected the 85899345900 bytes that its header promises, got a file of",
     ),
-    "a long trailer": (spz() + bytes(2 << 20), "got a file that does not end with them"),
+    "a long trailer": (spz() + bytes(2 << 20), "that ends after 40 bytes of gaussians, got another"),
 }
 
 
@@ -399,7 +399,7 @@ def test_extensions_after_the_gaussians_of_spz_are_passed_over(tmp_path):
         (8, 65, "expected 585 bytes in stream 0, got 576"),
         (11, 255, "bytes that its header promises, got a file of 2635"),
         (32 + 7, 255, "expected 576 bytes in stream 0, got 576 of"),
-        (4, 3, "expected version 3 in gzip, got it as it is"),
+        (4, 3, "expected version 3 in a gzip stream, got it outside of one"),
         (128, 0, "expected a zstd stream, got one that is damaged"),
     ],
 )

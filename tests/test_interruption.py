@@ -1,6 +1,6 @@
 """Builds that are killed at any moment: what they leave, and what resuming makes of it.
 
-V3DG_KILLS sets how many are killed; docs/robustness.md has the record of a long run.
+V3DG_KILLS sets how many are killed; docs/notes/robustness.md has the record of a long run.
 """
 
 import os

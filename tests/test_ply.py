@@ -337,23 +337,23 @@ ASCII = "format ascii 1.0"
 ROW_BYTES = 14 * 4
 
 HOSTILE = {
-    "empty file": (b"", "expected a first line 'ply', found an empty file"),
-    "bad magic": (b"PLY\n" + header()[4:], "expected a first line 'ply', found 'PLY'"),
-    "no text": (bytes(range(256)) * 9, "expected a first line 'ply', found '????"),
-    "one endless line": (b"ply" + b"a" * 2_000_000, "expected a first line 'ply', found 'plyaaaa"),
-    "no end": (header()[:-11], "expected end_header within the first 1048576 bytes, found none in 36"),
+    "empty file": (b"", "expected a first line 'ply', got an empty file"),
+    "bad magic": (b"PLY\n" + header()[4:], "expected a first line 'ply', got 'PLY'"),
+    "no text": (bytes(range(256)) * 9, "expected a first line 'ply', got '????"),
+    "one endless line": (b"ply" + b"a" * 2_000_000, "expected a first line 'ply', got 'plyaaaa"),
+    "no end": (header()[:-11], "expected end_header within the first 1048576 bytes, got none in 36"),
     "endless header": (
         b"ply\n" + b"comment a\n" * 300_000,
-        "expected end_header within the first 1048576 bytes, found none in",
+        "expected end_header within the first 1048576 bytes, got none in",
     ),
     "format missing": (
         b"ply\nelement vertex 0\nend_header\n",
-        "header line 3: expected a line 'format' before end_header, found none",
+        "header line 3: expected a line 'format' before end_header, got none",
     ),
-    "format twice": (header(ASCII), "header line 3: expected one line 'format', found a second"),
+    "format twice": (header(ASCII), "header line 3: expected one line 'format', got a second"),
     "format unknown": (
         header(format_line="format binary_pdp_endian 1.0"),
-        "header line 2: expected format ascii, binary_little_endian or binary_big_endian, found 'binary_pdp",
+        "header line 2: expected format ascii, binary_little_endian or binary_big_endian, got 'binary_pdp",
     ),
     "version": (
         header(format_line="format ascii 2.0"),
@@ -365,36 +365,36 @@ HOSTILE = {
     ),
     "element without count": (
         header("element vertex"),
-        "header line 3: expected 'element NAME COUNT', found 2",
+        "header line 3: expected 'element NAME COUNT', got 2",
     ),
     "negative count": (
         header(*vertex_lines(-5)),
-        "header line 3: expected a count of element 'vertex', found '-5'",
+        "header line 3: expected a count of element 'vertex', got '-5'",
     ),
-    "fractional count": (header(*vertex_lines("1e9")), "expected a count of element 'vertex', found '1e9'"),
+    "fractional count": (header(*vertex_lines("1e9")), "expected a count of element 'vertex', got '1e9'"),
     "count beyond 64 bits": (
         header(*vertex_lines(10**20)),
-        "expected a count of element 'vertex', found '1000",
+        "expected a count of element 'vertex', got '1000",
     ),
     "count that overflows": (
         header(*vertex_lines(2**64 - 1)) + b"\0" * ROW_BYTES,
-        "expected 18446744073709551615 rows of element 'vertex' with 56 bytes each, found 56 bytes",
+        "expected 18446744073709551615 rows of element 'vertex' with 56 bytes each, got 56 bytes",
     ),
     "huge count": (
         header(*vertex_lines(10**9)) + b"\0" * 100,
-        "expected 1000000000 rows of element 'vertex' with 56 bytes each, found 100 bytes",
+        "expected 1000000000 rows of element 'vertex' with 56 bytes each, got 100 bytes",
     ),
     "huge count, ascii": (
         header(*vertex_lines(10**9), format_line=ASCII) + b"0 " * 100,
-        "expected 1000000000 rows of element 'vertex' with at least 28 bytes each, found 200 bytes",
+        "expected 1000000000 rows of element 'vertex' with at least 28 bytes each, got 200 bytes",
     ),
     "huge element before": (
         header("element face 99999999999", "property int a", *vertex_lines()) + b"\0" * 100,
-        "expected 99999999999 rows of element 'face' with 4 bytes each, found 100 bytes",
+        "expected 99999999999 rows of element 'face' with 4 bytes each, got 100 bytes",
     ),
     "truncated": (
         header(*vertex_lines(2)) + b"\0" * (2 * ROW_BYTES - 1),
-        "expected 2 rows of element 'vertex' with 56 bytes each, found 111 bytes",
+        "expected 2 rows of element 'vertex' with 56 bytes each, got 111 bytes",
     ),
     "property before element": (
         header("property float x"),
@@ -406,34 +406,34 @@ HOSTILE = {
     ),
     "unknown type": (
         header("element vertex 0", "property float128 x"),
-        "header line 4: expected a scalar type such as float, found 'float128'",
+        "header line 4: expected a scalar type such as float, got 'float128'",
     ),
     "list with float length": (
         header("element vertex 0", "property list float int x"),
-        "header line 4: expected an integer type for the length of a list, found 'float'",
+        "header line 4: expected an integer type for the length of a list, got 'float'",
     ),
     "endless elements": (
         header(*[f"element e{i} 0" for i in range(65)], *vertex_lines(0)),
-        "header line 67: expected at most 64 elements, found one more",
+        "header line 67: expected at most 64 elements, got one more",
     ),
-    "no vertex": (header("element face 0"), "expected one element 'vertex', found 0"),
-    "two vertices": (header(*vertex_lines(0), *vertex_lines(0)), "expected one element 'vertex', found 2"),
+    "no vertex": (header("element face 0"), "expected one element 'vertex', got 0"),
+    "two vertices": (header(*vertex_lines(0), *vertex_lines(0)), "expected one element 'vertex', got 2"),
     "duplicate property": (
         header(*vertex_lines(0), "property float x"),
-        "expected each vertex property once, found 'x' twice",
+        "expected each vertex property once, got 'x' twice",
     ),
     "duplicate extra property": (
         header(*vertex_lines(0), "property float n", "property list uchar int n"),
-        "expected each vertex property once, found 'n' twice",
+        "expected each vertex property once, got 'n' twice",
     ),
     "missing property": (
         header(*(line for line in vertex_lines(0) if not line.endswith("rot_2"))),
-        "expected vertex properties rot_2, found 'x', 'y', 'z', 'f_dc_0', 'f_dc_1', 'f_dc_2',"
+        "expected vertex properties rot_2, got 'x', 'y', 'z', 'f_dc_0', 'f_dc_1', 'f_dc_2',"
         " 'opacity', 'scale_0' and 5 more",
     ),
     "mesh": (
         header("element vertex 0", "property float x", "property float y", "property float z"),
-        "found 'x', 'y', 'z'; this is not a file of gaussians",
+        "got 'x', 'y', 'z'; this is not a file of gaussians",
     ),
     "compressed": (
         header("element vertex 0", "property uint packed_position"),
@@ -441,73 +441,73 @@ HOSTILE = {
     ),
     "list for a number": (
         header("element vertex 0", *("property list uchar float x", *vertex_lines(0)[2:])),
-        "expected a number as vertex property 'x', found a list",
+        "expected a number as vertex property 'x', got a list",
     ),
     "f_rest of no degree": (
         header(*vertex_lines(0), *(f"property float f_rest_{i}" for i in range(10))),
-        "expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), found 10",
+        "expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got 10",
     ),
     "f_rest of degree 4": (header(*vertex_lines(0, 4)), "expected 0, 9, 24 or 45 properties f_rest_*"),
     "f_rest with a gap": (
         header(*vertex_lines(0, 1), "property float y2").replace(b"f_rest_8", b"f_rest_9"),
-        "expected vertex properties f_rest_8, found",
+        "expected vertex properties f_rest_8, got",
     ),
     "f_rest without a number": (
         header(*vertex_lines(0, 1)).replace(b"f_rest_8", b"f_rest_x"),
-        "expected vertex properties f_rest_8, found",
+        "expected vertex properties f_rest_8, got",
     ),
     "ascii with a short row": (
         header(*vertex_lines(2), format_line=ASCII) + b"0 " * 14 + b"\n" + b"0 " * 13,
-        "vertex 1: expected 14 numbers, found 13",
+        "vertex 1: expected 14 numbers, got 13",
     ),
     "ascii with a long row": (
         header(*vertex_lines(1), format_line=ASCII) + b"0 " * 15,
-        "vertex 0: expected 14 numbers, found 15",
+        "vertex 0: expected 14 numbers, got 15",
     ),
     "ascii with too few rows": (
         header(*vertex_lines(3), format_line=ASCII) + (b"0.00 " * 14 + b"\n\n") * 2,
-        "expected 3 lines for element 'vertex', found 2",
+        "expected 3 lines for element 'vertex', got 2",
     ),
     "ascii with too few rows before": (
         header("element a 9", "property int a", *vertex_lines(0), format_line=ASCII)
         + b"12345678901234567890",
-        "expected 9 lines for element 'a', found 1",
+        "expected 9 lines for element 'a', got 1",
     ),
     "ascii with a word": (
         header(*vertex_lines(1), format_line=ASCII) + b"0 " * 13 + b"0x1F\n",
-        "vertex 0: expected a number, found '0x1F'",
+        "vertex 0: expected a number, got '0x1F'",
     ),
     "ascii with a control character": (
         header(*vertex_lines(1), format_line=ASCII) + b"0 " * 13 + b"\x1b[31m\xff\n",
-        "vertex 0: expected a number, found '?[31m?'",
+        "vertex 0: expected a number, got '?[31m?'",
     ),
     "ascii with a list that is too long": (
         header(*vertex_lines(1), "property list uchar int n", format_line=ASCII) + b"0 " * 14 + b"1e300 1 2",
-        "vertex 0: expected at least 15 numbers, found 17",
+        "vertex 0: expected at least 15 numbers, got 17",
     ),
     "ascii with a list of negative length": (
         header(*vertex_lines(1), "property list uchar int n", format_line=ASCII) + b"0 " * 14 + b"-1",
-        "vertex 0: expected a length of list 'n', found -1",
+        "vertex 0: expected a length of list 'n', got -1",
     ),
     "ascii in one line of many megabytes": (
         header(*vertex_lines(1), format_line=ASCII) + b"0 " * 3_000_000,
-        "expected lines of at most 4194304 bytes, found a longer one",
+        "expected lines of at most 4194304 bytes, got a longer one",
     ),
     "list that ends after the file": (
         header("element face 1", "property list uint double n", *vertex_lines(0)) + b"\xff" * 40,
-        "expected 1 rows of element 'face', found the end of the file in row 0",
+        "expected 1 rows of element 'face', got the end of the file in row 0",
     ),
     "list of negative length": (
         header("element face 1", "property list char double n", *vertex_lines(0)) + b"\xff" * 40,
-        "expected a length of list 'n' in row 0, found -1",
+        "expected a length of list 'n' in row 0, got -1",
     ),
     "vertex with lists, truncated": (
         header(*vertex_lines(2), "property list uchar int n") + b"\1" * (2 * 57),
-        "expected 2 rows of element 'vertex', found the end of the file in row 1",
+        "expected 2 rows of element 'vertex', got the end of the file in row 1",
     ),
     "name with a line feed's looks": (
         header("element vertex 0", "property float " + "\x07" * 100),
-        "found '????????????????????????????????????????...'",
+        "got '????????????????????????????????????????...'",
     ),
 }
 
@@ -574,7 +574,7 @@ def test_missing_files_and_folders_keep_their_own_errors(tmp_path):
 
 def test_a_pipe_is_refused_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")
-    with pytest.raises(ValueError, match="expected a regular file, found a device or a pipe"):
+    with pytest.raises(ValueError, match="expected a regular file, got a device or a pipe"):
         load(tmp_path / "pipe.ply")
 
 

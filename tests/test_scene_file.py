@@ -286,7 +286,7 @@ def test_flat_layouts_are_read(tmp_path):
     ("place", "value", "message"),
     [
         (["layouts"], [], "layouts: expected one layout, got 0"),
-        (["layouts"], [{}, {}], "layouts: expected one layout, got 2; each is a scene"),
+        (["layouts"], [{}, {}], "layouts: expected one layout, got 2; each layout is a scene"),
         (["layouts", 0, "assets"], None, "layouts[0]: expected the field assets"),
         (["layouts", 0, "assets", 1, "asset_name"], 3, "layouts[0].assets[1].asset_name: expected a string"),
         (

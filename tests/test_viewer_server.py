@@ -124,11 +124,14 @@ def test_command_says_where_and_ends_with_an_interrupt(bundle, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["asset.ply", "--budget", "9"], "--budget: asset.ply has no levels to choose from; build a bundle"),
+        (
+            ["asset.ply", "--budget", "9"],
+            "--budget: expected a bundle or a scene, got the asset asset.ply; build a bundle",
+        ),
         (["asset.ply", "--port", "70000"], "--port: expected 0 to 65535, got 70000"),
         (["asset.ply", "--tolerance", "inf"], "--tolerance: expected a number, got inf"),
         (["asset.ply", "--host", "192.0.2.1"], "host: expected an address of this machine, got 192.0.2.1"),
-        (["nothing.v3dg"], "nothing.v3dg: expected a file, got nothing there"),
+        (["nothing.v3dg"], "nothing.v3dg: expected a file, got a path where there is none"),
     ],
 )
 def test_command_refuses_what_cannot_be_meant(arguments, message, tmp_path, monkeypatch, capsys):

@@ -80,8 +80,9 @@ class Node:
         """An error that begins with the place."""
         return ValueError(f"{self.file}: {self.path or 'top level'}: {text}")
 
-    def error(self, expected: str) -> ValueError:
-        return self.problem(f"expected {expected}, got {shown(self.value)}")
+    def error(self, expected: str, advice: str = "") -> ValueError:
+        end = f"; {advice}" if advice else ""
+        return self.problem(f"expected {expected}, got {shown(self.value)}{end}")
 
     def attempt(self, make: Callable[[], T]) -> T:
         """What ``make`` makes of the fields; its ValueErrors, which begin with a field, get their place."""

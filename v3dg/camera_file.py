@@ -100,13 +100,13 @@ def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -
 def _check_is_pinhole(fields: Mapping[str, Node], distortion: str) -> None:
     model = fields.get("camera_model")
     if model is not None and model.value not in _PINHOLES:
-        raise model.error(f"a pinhole camera ({', '.join(_PINHOLES)}), undistort the pictures first")
+        raise model.error(f"a pinhole camera ({', '.join(_PINHOLES)})", "undistort the pictures first")
     fisheye = fields.get("is_fisheye")
     if fisheye is not None and fisheye.value not in (False, 0):
-        raise fisheye.error("a pinhole camera, undistort the pictures first")
+        raise fisheye.error("a pinhole camera", "undistort the pictures first")
     for name in _DISTORTION if distortion == "refuse" else ():
         if name in fields and fields[name].number() != 0:
-            raise fields[name].error("no lens distortion; undistort the pictures first, or ignore it")
+            raise fields[name].error("no lens distortion", "undistort the pictures first, or ignore it")
 
 
 def _rows(node: Node) -> Floats:
@@ -141,7 +141,9 @@ def _intrinsics(
     if "w" in fields and "h" in fields:
         width, height = fields["w"].size(), fields["h"].size()
     elif "fl_x" in focal:
-        raise frame.problem("expected w and h, in the frame or at the top, got focal lengths in px without")
+        raise frame.problem(
+            "expected w and h, in the frame or at the top, got focal lengths in px and no size"
+        )
     elif size is None:
         raise frame.problem("expected w and h, in the frame or at the top, got neither; give the size")
     else:

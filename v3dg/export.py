@@ -221,7 +221,8 @@ class _Plan:
             if largest > chunk:
                 if level == 1:
                     raise ValueError(
-                        f"chunk: expected at least {largest} gaussians, a group of the asset, got {chunk}"
+                        f"chunk: expected at least {largest} gaussians, the size of a group of the asset, "
+                        f"got {chunk}"
                     )
                 break
             top = level

@@ -54,7 +54,7 @@ class ResidentScene:
         if self.device.is_cuda and _device.is_capturing():
             raise RuntimeError(
                 "scene: expected no change while a CUDA graph is captured, got a new or changed scene; "
-                "draw as much once before"
+                "draw it once before the capture"
             )
         self.finish_drawings()
         if self.bundles != scene.bundles:

@@ -185,7 +185,7 @@ def _read_layouts(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[S
     layouts = root.child("layouts").items()
     if len(layouts) != 1:
         raise root.child("layouts").problem(
-            f"expected one layout, got {len(layouts)}; each is a scene, make a file of each"
+            f"expected one layout, got {len(layouts)}; each layout is a scene, so make a file of each"
         )
     top = layouts[0].some_fields(("assets", "cameras"))
     bundles, instances = {}, []

@@ -31,7 +31,7 @@ def write_film(
     try:
         import av
     except ImportError as error:
-        raise ImportError("films want PyAV, which is not installed; pip install 'v3dg[video]'") from error
+        raise ImportError("films need PyAV, which is not installed; pip install 'v3dg[video]'") from error
     if not os.fspath(path).endswith(".mp4"):
         raise ValueError(f"{os.fspath(path)}: expected a file name ending in .mp4")
     count, size = 0, None

@@ -18,7 +18,7 @@ class Evaluate:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("evaluation")
     """Folder for the results; made if it is not there."""
     preset: Literal["small", "full"] = "small"
-    """small takes minutes on two cores, full wants a GPU."""
+    """small takes minutes on two cores, full needs a GPU."""
     parts: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
     """Which parts of the evaluation; all if not given."""
     asset: Annotated[Path | None, option("PATH")] = None

@@ -1,4 +1,4 @@
-"""`python -m benchmarks report`: from recorded results to a page with plots."""
+"""`python -m benchmarks report`: from recorded results to a short page, a page of all tables, and plots."""
 
 from __future__ import annotations
 
@@ -17,14 +17,24 @@ from v3dg.cli._common import Flag
 
 @dataclass
 class Report:
-    """Make a page with plots of what `evaluate` has recorded."""
+    """Make two pages with plots of what `evaluate` has recorded: what it comes to, and all tables."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders with results of `evaluate`; the first one is what the page begins with."""
+    """Folders with results of `evaluate`; the first one is what the pages begin with."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("results.md")
-    """Page to write."""
+    """Page to write: an overview, and where we win and lose."""
+    tables: Annotated[Path, tyro.conf.arg(metavar="PATH")] = Path("evaluation.md")
+    """Page to write with all tables and pictures."""
     no_plots: Flag = False
-    """Leave the plots in the folders as they are; drawing them wants matplotlib."""
+    """Leave the plots in the folders as they are; drawing them needs matplotlib."""
+
+
+HOW = (
+    "Error is FLIP (67 pixels per degree) and PSNR to the full scene at twice the resolution, box-averaged. "
+    "Times are medians of single frames after a warm-up, selection included, from an idle device to an idle "
+    "device; a picture is checked before its time counts. The JSON that a run writes has the spread and "
+    "every view."
+)
 
 
 def read_results(folder: Path) -> dict[str, dict[str, Any]]:
@@ -44,54 +54,87 @@ def read_results(folder: Path) -> dict[str, dict[str, Any]]:
     return results
 
 
-def page(folders: Sequence[Path], output: Path) -> str:
-    """The page; pictures are linked relative to where it will be."""
+def page(folders: Sequence[Path], output: Path, tables: Path) -> str:
+    """The short page: a table, a picture, and what each part comes to in a sentence.
+
+    Pictures and the page of all tables are linked relative to where the page will be.
+    """
     sections = [(folder, read_results(folder)) for folder in folders]
-    machines = [machine(list(results.values())) for _, results in sections]
     # The first folder counts; the others for parts that it does not have.
-    measured = {name: result for _, results in reversed(sections) for name, result in results.items()}
-    home = place(next(iter(sections[0][1].values())))
-    wins, losses = [], []
-    for name, result in measured.items():
-        summary = part(name).summary(result)
-        where = "" if place(result) == home else f" (on {place(result)})"
-        wins.append([sentence + where for sentence in summary.wins])
-        losses.append([sentence + where for sentence in summary.losses])
+    measured = {name: (folder, r) for folder, results in reversed(sections) for name, r in results.items()}
+    wins, losses = _sentences(measured, place(next(iter(sections[0][1].values()))))
+    machines = [machine(list(results.values())) for _, results in sections]
     lines = [
         "# Results",
+        *_overview(measured, output),
         "",
-        f"**Where we win**: {_heads(wins)} ([all](#where-we-win)).",
-        "",
-        f"**Where we do not**: {_heads(losses)} ([all](#where-we-do-not)).",
-        "",
-        "Written by `python -m benchmarks report` from recorded JSON, never by hand; here on "
-        f"{'; what is not measured there, on '.join(machines)}.",
+        "All tables and pictures, with the command and the commit of each, are in "
+        f"[the evaluation]({Path(os.path.relpath(tables, output.parent)).as_posix()}).",
         "",
         "## Where we win",
         "",
-        *(f"- {sentence}" for sentences in wins for sentence in sentences),
+        *(wins or ["Nowhere in what was measured."]),
         "",
         "## Where we do not",
         "",
-        *(f"- {sentence}" for sentences in losses for sentence in sentences),
+        *(losses or ["Nowhere in what was measured."]),
         "",
         "## How it is measured",
         "",
-        "Error is FLIP (67 pixels per degree) and PSNR to the full scene at twice the resolution, "
-        "box-averaged. Times are medians of single frames after a warm-up, selection included, from an "
-        "idle device to an idle device; a picture is checked before its time counts. The JSON that a "
-        "run writes has the spread and every view.",
+        HOW,
+        "",
+        "This page is written by `python -m benchmarks report` from recorded JSON, never by hand. It was "
+        f"measured on {'. What was not measured there was measured on '.join(machines)}.",
     ]
-    for folder, results in sections:
-        lines += ["", f"## {heading(next(iter(results.values())))}"]
-        for name, result in results.items():
-            lines += _part_lines(name, result, Path(os.path.relpath(folder, output.parent)), folder)
     return "\n".join(lines) + "\n"
 
 
-def _heads(sentences_of_parts: Sequence[Sequence[str]]) -> str:
-    """The first sentences of the first parts that have some: what a reader in a hurry gets."""
-    return "; ".join([s[0] for s in sentences_of_parts if s][:4]) or "nowhere in what was measured"
+def _overview(measured: dict[str, tuple[Path, dict[str, Any]]], output: Path) -> list[str]:
+    """The table and the picture that the short page opens with."""
+    lines = []
+    if "composed" in measured:
+        _, result = measured["composed"]
+        composed = part("composed")
+        lines += ["", composed.overview(result), "", f"Drawn on {place(result)}. {composed.OVERVIEW}"]
+    if "tolerance" in measured:
+        folder, result = measured["tolerance"]
+        if (folder / "tolerance.png").exists():
+            picture = Path(os.path.relpath(folder, output.parent), "tolerance.png").as_posix()
+            caption = f"Milliseconds a frame against FLIP on {place(result)}, a point for each tolerance."
+            lines += ["", f"![{part('tolerance').TITLE}]({picture})", "", caption]
+    return lines
+
+
+def _sentences(measured: dict[str, tuple[Path, dict[str, Any]]], home: str) -> tuple[list[str], list[str]]:
+    """Lists in Markdown of where we win and where we do not, in the order of parts."""
+    wins: list[str] = []
+    losses: list[str] = []
+    for name in [name for name in NAMES if name in measured]:
+        _, result = measured[name]
+        summary = part(name).summary(result)
+        where = "" if place(result) == home else f" (on {place(result)})"
+        wins += [f"- {sentence}{where}" for sentence in summary.wins]
+        losses += [f"- {sentence}{where}" for sentence in summary.losses]
+    return wins, losses
+
+
+def tables_page(folders: Sequence[Path], output: Path) -> str:
+    """The page of all tables; pictures are linked relative to where it will be."""
+    lines = [
+        "# The evaluation",
+        "",
+        "All tables of the evaluation, written by `python -m benchmarks report` from recorded JSON, never by "
+        "hand.",
+        "",
+        HOW,
+    ]
+    for folder in folders:
+        results = read_results(folder)
+        lines += ["", f"## {heading(next(iter(results.values())))}"]
+        lines += ["", f"Measured on {machine(list(results.values()))}."]
+        for name, result in results.items():
+            lines += _part_lines(name, result, Path(os.path.relpath(folder, output.parent)), folder)
+    return "\n".join(lines) + "\n"
 
 
 def place(result: dict[str, Any]) -> str:
@@ -140,4 +183,6 @@ def run(options: Report) -> None:
     for folder in options.folders:
         if not options.no_plots:
             draw_plots(folder)
-    options.output.write_text(page(options.folders, options.output), encoding="utf-8")
+    short = page(options.folders, options.output, options.tables)
+    options.output.write_text(short, encoding="utf-8")
+    options.tables.write_text(tables_page(options.folders, options.tables), encoding="utf-8")

@@ -1,6 +1,6 @@
 """What each choice of the build gives: one change at a time, drawn in a layout of many instances.
 
-The table of docs/levels.md: Gaussians in the frustum, FLIP and PSNR against a given picture at three
+The table of docs/notes/levels.md: Gaussians in the frustum, FLIP and PSNR against a given picture at three
 tolerances, and the processor seconds of the build.
 """
 

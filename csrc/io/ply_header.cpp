@@ -33,29 +33,29 @@ PlyType parse_type(const std::string& name) {
     };
     for (const auto& [text, type] : kTypes)
         if (name == text) return type;
-    throw PlyError("expected a scalar type such as float, found " + quoted(name));
+    throw PlyError("expected a scalar type such as float, got " + quoted(name));
 }
 
 PlyEncoding parse_format(const std::vector<std::string>& words) {
     if (words.size() != 3 || words[2] != "1.0")
-        throw PlyError("expected a format and the version 1.0, found " + std::to_string(words.size() - 1) +
+        throw PlyError("expected a format and the version 1.0, got " + std::to_string(words.size() - 1) +
                        " words" + (words.size() > 2 ? " and version " + quoted(words[2]) : ""));
     if (words[1] == "ascii") return PlyEncoding::ascii;
     if (words[1] == "binary_little_endian") return PlyEncoding::binary_little_endian;
     if (words[1] == "binary_big_endian") return PlyEncoding::binary_big_endian;
-    throw PlyError("expected format ascii, binary_little_endian or binary_big_endian, found " +
+    throw PlyError("expected format ascii, binary_little_endian or binary_big_endian, got " +
                    quoted(words[1]));
 }
 
 PlyElement parse_element(const std::vector<std::string>& words) {
     if (words.size() != 3)
-        throw PlyError("expected 'element NAME COUNT', found " + std::to_string(words.size()) + " words");
+        throw PlyError("expected 'element NAME COUNT', got " + std::to_string(words.size()) + " words");
     PlyElement element;
     element.name = words[1];
     const char* end = words[2].data() + words[2].size();
     const auto [stop, error] = std::from_chars(words[2].data(), end, element.count);
     if (error != std::errc() || stop != end)
-        throw PlyError("expected a count of element " + quoted(words[1]) + ", found " + quoted(words[2]));
+        throw PlyError("expected a count of element " + quoted(words[1]) + ", got " + quoted(words[2]));
     return element;
 }
 
@@ -64,14 +64,14 @@ PlyProperty parse_property(const std::vector<std::string>& words) {
     property.is_list = words.size() > 1 && words[1] == "list";
     if (words.size() != (property.is_list ? 5u : 3u))
         throw PlyError(std::string("expected 'property ") +
-                       (property.is_list ? "list COUNT_TYPE TYPE NAME'" : "TYPE NAME'") + ", found " +
+                       (property.is_list ? "list COUNT_TYPE TYPE NAME'" : "TYPE NAME'") + ", got " +
                        std::to_string(words.size()) + " words");
     property.type = parse_type(words[words.size() - 2]);
     property.name = words.back();
     if (property.is_list) {
         property.count_type = parse_type(words[2]);
         if (property.count_type == PlyType::float32 || property.count_type == PlyType::float64)
-            throw PlyError("expected an integer type for the length of a list, found " + quoted(words[2]));
+            throw PlyError("expected an integer type for the length of a list, got " + quoted(words[2]));
     }
     return property;
 }
@@ -86,23 +86,23 @@ struct HeaderParser {
         const std::vector<std::string> words = words_of(line);
         if (words.empty() || words[0] == "comment" || words[0] == "obj_info") return false;
         if (words[0] == "format") {
-            if (has_format) throw PlyError("expected one line 'format', found a second");
+            if (has_format) throw PlyError("expected one line 'format', got a second");
             header.encoding = parse_format(words);
             has_format = true;
         } else if (words[0] == "element") {
             if (header.elements.size() == kMaxElements)
                 throw PlyError("expected at most " + std::to_string(kMaxElements) +
-                               " elements, found one more");
+                               " elements, got one more");
             header.elements.push_back(parse_element(words));
         } else if (words[0] == "property") {
             if (header.elements.empty())
-                throw PlyError("expected an element before the first property, found none");
+                throw PlyError("expected an element before the first property, got none");
             header.elements.back().properties.push_back(parse_property(words));
         } else if (words[0] == "end_header") {
-            if (!has_format) throw PlyError("expected a line 'format' before end_header, found none");
+            if (!has_format) throw PlyError("expected a line 'format' before end_header, got none");
             return true;
         } else {
-            throw PlyError("expected format, element, property or end_header, found " + quoted(words[0]));
+            throw PlyError("expected format, element, property or end_header, got " + quoted(words[0]));
         }
         return false;
     }
@@ -148,7 +148,7 @@ PlyHeader read_ply_header(const PosixFile& file) {
         std::string line = text.substr(line_begin, line_end - line_begin);
         if (!line.empty() && line.back() == '\r') line.pop_back();
         if (line_number == 1 && line != "ply")
-            throw PlyError("expected a first line 'ply', found " +
+            throw PlyError("expected a first line 'ply', got " +
                            (text.empty() ? "an empty file" : quoted(line)));
         try {
             if (line_number > 1 && !is_cut && parser.take(line)) {
@@ -160,7 +160,7 @@ PlyHeader read_ply_header(const PosixFile& file) {
         }
         if (line_end >= text.size())
             throw PlyError("expected end_header within the first " + std::to_string(kMaxHeaderBytes) +
-                           " bytes, found none in " + std::to_string(text.size()));
+                           " bytes, got none in " + std::to_string(text.size()));
         line_begin = line_end + 1;
     }
 }

@@ -49,7 +49,7 @@ size_t num_sh_of(const PlyElement& vertex) {
     for (const PlyProperty& property : vertex.properties) num_rest += property.name.rfind("f_rest_", 0) == 0;
     for (const size_t num_sh : {1, 4, 9, 16})
         if (num_rest == 3 * (num_sh - 1)) return num_sh;
-    throw PlyError("expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), found " +
+    throw PlyError("expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got " +
                    std::to_string(num_rest));
 }
 
@@ -58,7 +58,7 @@ std::string missing_text(const PlyElement& vertex, const std::vector<std::string
     constexpr size_t kMaxNames = 8;
     for (size_t i = 0; i < missing.size() && i < kMaxNames; ++i) text += (i == 0 ? "" : ", ") + missing[i];
     if (missing.size() > kMaxNames) text += " and " + std::to_string(missing.size() - kMaxNames) + " more";
-    text += ", found ";
+    text += ", got ";
     for (size_t i = 0; i < vertex.properties.size() && i < kMaxNames; ++i)
         text += (i == 0 ? "" : ", ") + quoted(vertex.properties[i].name);
     if (vertex.properties.empty()) text += "none";
@@ -78,7 +78,7 @@ std::vector<Field> fields_of(const PlyElement& vertex, size_t num_sh) {
                              : field_from_name.insert({property.name, {p, offset, property.type}}).second &&
                                    !lists.count(property.name);
         if (!is_new)
-            throw PlyError("expected each vertex property once, found " + quoted(property.name) + " twice");
+            throw PlyError("expected each vertex property once, got " + quoted(property.name) + " twice");
         if (!property.is_list) offset += size_of(property.type);
     }
     std::vector<Field> fields;
@@ -86,7 +86,7 @@ std::vector<Field> fields_of(const PlyElement& vertex, size_t num_sh) {
     for (const std::string& name : slot_names(num_sh)) {
         const auto found = field_from_name.find(name);
         if (lists.count(name))
-            throw PlyError("expected a number as vertex property " + quoted(name) + ", found a list");
+            throw PlyError("expected a number as vertex property " + quoted(name) + ", got a list");
         if (found == field_from_name.end())
             missing.push_back(name);
         else
@@ -206,8 +206,7 @@ class ByteReader {
     void skip(size_t size, const PlyElement& element, uint64_t row) {
         if (size > file_bytes_ - std::min(offset_, file_bytes_))
             throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
-                           quoted(element.name) + ", found the end of the file in row " +
-                           std::to_string(row));
+                           quoted(element.name) + ", got the end of the file in row " + std::to_string(row));
         offset_ += size;
     }
     // Valid until the next call. At most kBlockBytes.
@@ -217,7 +216,8 @@ class ByteReader {
         if (begin < buffer_begin_ || begin + size > buffer_begin_ + buffer_size_) {
             buffer_begin_ = begin;
             buffer_size_ = file_.read_at(begin, buffer_.data(), buffer_.size());
-            if (buffer_size_ < size) throw PlyError("expected no change while it is read, found it shorter");
+            if (buffer_size_ < size)
+                throw PlyError("expected the file not to change while it is read, got a shorter one");
         }
         return buffer_.data() + (begin - buffer_begin_);
     }
@@ -240,8 +240,7 @@ void walk_row(ByteReader& reader, const PlyElement& element, uint64_t row, bool 
                 load_scalar(reader.take(count_bytes, element, row), property.count_type, is_swapped);
             if (count < 0)
                 throw PlyError("expected a length of list " + quoted(property.name) + " in row " +
-                               std::to_string(row) + ", found " +
-                               std::to_string(static_cast<int64_t>(count)));
+                               std::to_string(row) + ", got " + std::to_string(static_cast<int64_t>(count)));
             reader.skip(static_cast<size_t>(count) * size_of(property.type), element, row);
         } else if (packed) {
             const size_t size = size_of(property.type);
@@ -280,10 +279,10 @@ class LineReader {
             cut_lines(max_lines, at_end);
             if (!lines_.empty() || at_end) break;
             if (begin_ == 0 && end_ == buffer_.size() && end_ < kChunkBytes)
-                throw PlyError("expected no change while it is read, found it longer");
+                throw PlyError("expected the file not to change while it is read, got a longer one");
             if (begin_ == 0 && end_ == buffer_.size())
                 throw PlyError("expected lines of at most " + std::to_string(kChunkBytes) +
-                               " bytes, found a longer one");
+                               " bytes, got a longer one");
             std::memmove(buffer_.data(), buffer_.data() + begin_, end_ - begin_);
             end_ -= begin_;
             begin_ = 0;
@@ -334,7 +333,7 @@ class NumberReader {
         const char* first = word + (*word == '+' && rest_.begin - word > 1 && word[1] != '-');
         const auto [stop, error] = std::from_chars(first, rest_.begin, value);
         if (error != std::errc() || stop != rest_.begin)
-            throw PlyError("vertex " + std::to_string(row_) + ": expected a number, found " +
+            throw PlyError("vertex " + std::to_string(row_) + ": expected a number, got " +
                            quoted(std::string(word, rest_.begin)));
         ++num_read_;
         return value;
@@ -343,7 +342,7 @@ class NumberReader {
         const double count = next();
         if (!(count >= 0) || count != std::floor(count))
             throw PlyError("vertex " + std::to_string(row_) + ": expected a length of list " +
-                           quoted(property.name) + ", found " + std::to_string(count));
+                           quoted(property.name) + ", got " + std::to_string(count));
         for (double i = 0; i < count; ++i) next();
     }
     void expect_end() {
@@ -351,7 +350,7 @@ class NumberReader {
         while (!at_end()) next();
         if (num_read_ != num_wanted)
             throw PlyError("vertex " + std::to_string(row_) + ": expected " + std::to_string(num_wanted) +
-                           " numbers, found " + std::to_string(num_read_));
+                           " numbers, got " + std::to_string(num_read_));
     }
     size_t num_read() const { return num_read_; }
 
@@ -378,14 +377,14 @@ void parse_row(Line line, uint64_t row, const PlyElement& vertex, double* value_
     } catch (const NumberReader::EndOfLine&) {
         throw PlyError("vertex " + std::to_string(row) + ": expected " +
                        (vertex.has_lists() ? "at least " : "") + std::to_string(vertex.properties.size()) +
-                       " numbers, found " + std::to_string(numbers.num_read()));
+                       " numbers, got " + std::to_string(numbers.num_read()));
     }
     numbers.expect_end();
 }
 
 [[noreturn]] void throw_too_few(const PlyElement& element, uint64_t found) {
     throw PlyError("expected " + std::to_string(element.count) + " lines for element " +
-                   quoted(element.name) + ", found " + std::to_string(found));
+                   quoted(element.name) + ", got " + std::to_string(found));
 }
 
 size_t skip_text(const PlyFile& ply, size_t offset, const PlyElement& element) {
@@ -407,7 +406,7 @@ void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
     if (row_bytes != 0 && element.count > (left + (is_text ? 1 : 0)) / row_bytes)
         throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
                        quoted(element.name) + " with " + (is_text || element.has_lists() ? "at least " : "") +
-                       std::to_string(row_bytes) + " bytes each, found " + std::to_string(left) + " bytes");
+                       std::to_string(row_bytes) + " bytes each, got " + std::to_string(left) + " bytes");
 }
 
 // Returns the offset after the element that begins at `offset`.
@@ -440,7 +439,7 @@ void read_fixed_rows(const PlyFile& ply, const PlyGaussians<float>& out) {
             const size_t count = std::min(block_rows, num_rows - first);
             const size_t size = count * row_bytes;
             if (ply.file.read_at(ply.vertex_offset + first * row_bytes, rows, size) != size)
-                throw PlyError("expected no change while it is read, found it shorter");
+                throw PlyError("expected the file not to change while it is read, got a shorter one");
             decoder.decode(rows, count, first);
         });
     }
@@ -492,13 +491,13 @@ PlyFile open_ply(const char* path) {
     PosixFile file = PosixFile::open(path);
     const struct stat status = file.status();
     if (S_ISDIR(status.st_mode)) throw std::system_error(EISDIR, std::generic_category());
-    if (!S_ISREG(status.st_mode)) throw PlyError("expected a regular file, found a device or a pipe");
+    if (!S_ISREG(status.st_mode)) throw PlyError("expected a regular file, got a device or a pipe");
 
     const PlyHeader header = read_ply_header(file);
     PlyFile ply = {std::move(file), static_cast<size_t>(status.st_size), header.encoding, {}, header.size, 1};
     const auto is_vertex = [](const PlyElement& element) { return element.name == "vertex"; };
     const auto num_found = std::count_if(header.elements.begin(), header.elements.end(), is_vertex);
-    if (num_found != 1) throw PlyError("expected one element 'vertex', found " + std::to_string(num_found));
+    if (num_found != 1) throw PlyError("expected one element 'vertex', got " + std::to_string(num_found));
     const auto vertex = std::find_if(header.elements.begin(), header.elements.end(), is_vertex);
     ply.vertex = *vertex;
     ply.num_sh = num_sh_of(ply.vertex);

@@ -1,4 +1,4 @@
-"""Make the figures of docs/how_it_works.md and docs/choosing.md; wants the extra `bench`, takes a minute.
+"""Make the figures of docs/how_it_works.md and docs/choosing.md; needs the extra `bench`, takes a minute.
 
 The pictures are drawn by v3dg of an asset that is made here, the curves are those of recorded results.
 """

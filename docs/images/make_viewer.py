@@ -1,4 +1,4 @@
-"""Make viewer_*.jpg: a tab of the viewer in Chromium, in each of its modes. Wants playwright.
+"""Make viewer_*.jpg: a tab of the viewer in Chromium, in each of its modes. Needs playwright.
 
 python docs/images/make_viewer.py donutsea.json 048_camera_8
 """

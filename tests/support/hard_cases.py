@@ -176,11 +176,11 @@ def places() -> dict[str, HardCase]:
             ),
         ),
         "far off the axis": HardCase(
-            "The Jacobian is held past 1.3 times the field of view, also on the way back.",
+            "The Jacobian is constant past 1.3 times the field of view, also in the backward pass.",
             crowd(8, means=spread + ahead, scales=10 ** rng.uniform(-1, 5, (NUM, 3)), opacities=0.1),
         ),
         "larger than the screen": HardCase(
-            "Nothing but time.", crowd(9, scales=10 ** rng.uniform(0, 3, (NUM, 3)), opacities=0.1)
+            "It only takes time.", crowd(9, scales=10 ** rng.uniform(0, 3, (NUM, 3)), opacities=0.1)
         ),
         "5,000 equal depths": HardCase(
             "Blended in the order of their index.", crowd(10, num=crowded, means=disc, opacities=0.05)
@@ -248,14 +248,16 @@ def cameras() -> dict[str, HardCase]:
     small, large = zoomed(1e-6), zoomed(1e6)
     return {
         "a scene 10⁻⁶ across": HardCase("No formula has a size of its own.", *small, mode=FILTER),
-        "a scene 10⁶ across": HardCase("The same.", *large, mode=FILTER),
+        "a scene 10⁶ across": HardCase("As above: no formula has a size of its own.", *large, mode=FILTER),
         "a camera 10⁹ away": HardCase(
             "Depths are as float32 has them: 60 units apart, or ties.",
             scenes.gaussians(distant, quats=(0.9, 0.1, 0.2, 0.3), scales=(2e7, 1e7, 3e7)),
             mode=FILTER,
         ),
-        "a field of view of 0.005°": HardCase("Nothing.", crowd(12, telescope), telescope, FILTER),
-        "a field of view of 178°": HardCase("The Jacobian is held.", crowd(13, wide), wide, FILTER),
+        "a field of view of 0.005°": HardCase("Nothing special.", crowd(12, telescope), telescope, FILTER),
+        "a field of view of 178°": HardCase(
+            "Past 1.3 times that, the Jacobian is constant.", crowd(13, wide), wide, FILTER
+        ),
         "a principal point 4,000 px aside": HardCase(
             "A place on the screen is a difference of numbers of that size: off by 5e-4 px.",
             crowd(14, aside),
@@ -263,9 +265,9 @@ def cameras() -> dict[str, HardCase]:
             FILTER,
             FAR_ASIDE_FLOAT,
         ),
-        "a picture of one column": HardCase("Nothing.", crowd(15, column), column, FILTER),
-        "a picture of one row": HardCase("Nothing.", crowd(16, row), row, FILTER),
-        "a picture of one pixel": HardCase("Nothing.", crowd(17, pixel), pixel, FILTER),
+        "a picture of one column": HardCase("Nothing special.", crowd(15, column), column, FILTER),
+        "a picture of one row": HardCase("Nothing special.", crowd(16, row), row, FILTER),
+        "a picture of one pixel": HardCase("Nothing special.", crowd(17, pixel), pixel, FILTER),
     }
 
 

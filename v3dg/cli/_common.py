@@ -54,7 +54,7 @@ def load_asset_or_bundle(path: Path) -> Gaussians | Bundle:
 
 def require_file(path: Path, *suffixes: str) -> None:
     if not path.exists():
-        raise ValueError(f"{path}: expected a file, got nothing there; check the path")
+        raise ValueError(f"{path}: expected a file, got a path where there is none; check it")
     if not path.name.lower().endswith(suffixes):
         raise ValueError(f"{path}: expected a file ending in {', '.join(suffixes)}")
 

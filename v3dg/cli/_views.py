@@ -83,7 +83,9 @@ def choose_cameras(
     if own is None:
         return _turntable(subject, options)
     if not own:
-        raise ValueError(f"{options.cameras or path}: expected cameras, got a file without; add some to it")
+        raise ValueError(
+            f"{options.cameras or path}: expected cameras, got a file without any; add some to it"
+        )
     return own if options.camera is None else _one_camera(own, options.camera)
 
 

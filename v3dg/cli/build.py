@@ -35,12 +35,12 @@ _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
 @dataclass
 class Build:
-    """Build a bundle from a trained asset, or from each of many, of which one that fails stops no other."""
+    """Build a bundle from a trained asset, or from each of many; one that fails does not stop the others."""
 
     assets: Annotated[tuple[Path, ...], tyro.conf.Positional, _SEVERAL]
     """Files of trained gaussians, or folders of such files."""
     output: Annotated[Path | None, option("PATH", "-o")] = None
-    """Bundle to write, for many assets the folder; if not given, beside the asset, its name with .v3dg."""
+    """Bundle to write, or the folder for those of many assets; if not given, beside each asset."""
     config: Literal["default", "paper"] = "default"
     """Settings to start from: ours, or those of the V3DG paper."""
     cluster_size: Annotated[int | None, option("N")] = None
@@ -64,7 +64,7 @@ class Build:
 def run(options: Build) -> None:
     if not options.assets:
         raise UsageError(
-            "PATH: expected an asset, several, or a folder of them, got nothing; run v3dg build --help"
+            "PATH: expected one or more assets, or a folder of them, got nothing; run v3dg build --help"
         )
     if len(options.assets) == 1 and not options.assets[0].is_dir():
         asset = options.assets[0]
@@ -125,7 +125,7 @@ def _outputs(options: Build) -> dict[Path, Path]:
             found = sorted(p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file())
             if not found:
                 raise ValueError(
-                    f"{path}: expected a folder with assets ({', '.join(SUFFIXES)}), got none in it"
+                    f"{path}: expected a folder with assets ({', '.join(SUFFIXES)}), got one without"
                 )
         assets += found
     if folder is not None:

@@ -46,7 +46,7 @@ class Compare:
     test: tyro.conf.Positional[Path]
     """What to compare with it: any of those, or a picture of the same size."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("compare.png")
-    """Picture to write, .png or .jpg: reference, test and a map of FLIP where that is there, side by side."""
+    """Picture to write, .png or .jpg: reference, test and, where FLIP is installed, a map of it."""
     pictures: Literal["worst", "all"] = "worst"
     """Show the view that differs most, or write a picture of every view."""
     tolerance: Annotated[float | None, option("PX2")] = None
@@ -54,7 +54,7 @@ class Compare:
     budget: Annotated[int | None, option("N")] = None
     """Most gaussians of the test to draw in one picture."""
     supersample: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Draw the reference so many times larger and average; 2 tells detail from aliasing."""
+    """Draw the reference this many times larger and average it; with 2, aliasing is not taken for detail."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to draw; auto is a CUDA device where there is one and torch can use it."""
     threads: Threads = None

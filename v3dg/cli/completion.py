@@ -22,7 +22,7 @@ class Completion:
     """Print a script that completes commands, options and files (docs/install.md says where to put it)."""
 
     shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]
-    """Shell that is to read it."""
+    """Shell that will read it."""
 
 
 def run(options: Completion) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Convert:
-    """Write an asset, a level of a bundle, or the cut that a camera needs of it, in another format."""
+    """Write an asset, a level of a bundle, or its cut for a camera, in another format."""
 
     subject: tyro.conf.Positional[Path]
     """An asset in any format that is read (docs/formats.md), a bundle (.v3dg) or a scene (.json)."""
@@ -34,7 +34,7 @@ class Convert:
     tolerance: Annotated[float | None, option("PX2")] = None
     """Write the cut of this tolerance, the px² that one gaussian of a coarser cluster may stand for."""
     budget: Annotated[int | None, option("N")] = None
-    """Write the cut with at most so many gaussians."""
+    """Write the cut with at most this many gaussians."""
     outside: Literal["drop", "keep"] = "drop"
     """What becomes of the part of the cut that the camera does not see."""
     threads: Threads = None
@@ -88,7 +88,9 @@ def _check(options: Convert) -> None:
         raise ValueError(f"{options.output}: expected a file name that ends in {', '.join(SAVE_SUFFIXES)}")
     _files.check_folder(options.output)
     if options.level is not None and _wants_cut(options):
-        raise UsageError("--level: expected no options of a cut beside it; leave it or them out")
+        raise UsageError(
+            "--level: expected no scene, camera, tolerance or budget with it; leave out one or the other"
+        )
 
 
 def _wants_cut(options: Convert) -> bool:

@@ -13,14 +13,14 @@ from v3dg.cli._common import Flag, Threads, option, print_result
 
 @dataclass
 class Demo:
-    """Build an asset that v3dg makes itself, place it 2,000 times, draw it from near to far, measure."""
+    """Build an asset that v3dg makes itself, place it 2,000 times, draw it from near to far, and measure."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("v3dg_demo.png")
     """Picture to write, .png or .jpg."""
     gaussians: int = 50_000
     """Gaussians of the asset."""
     instances: int = 2000
-    """How often it is placed."""
+    """Number of instances of it."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (380, 440)
     """Width and height of one panel in px."""
     tolerance: Annotated[float | None, option("PX2")] = None

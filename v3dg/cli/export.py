@@ -21,11 +21,11 @@ class Export:
     bundle: tyro.conf.Positional[Path]
     """A bundle (.v3dg)."""
     output: Annotated[Path | None, option("FOLDER", "-o")] = None
-    """Folder to write; viewers are given its lod-meta.json. The bundle's name with _web if not given."""
+    """Folder to write, whose lod-meta.json viewers open; the bundle's name with _web if not given."""
     chunk: Annotated[int | None, option("N")] = None
     """Most gaussians of the asset in a chunk, for which the viewer chooses a level; 16384 if not given."""
     up: Axis = "-y"
-    """What is up in the asset, which viewers take to be -y, as in most trained ones."""
+    """Direction that is up in the asset; viewers assume -y, as in most trained assets."""
     threads: Threads = None
     """CPU threads; all if not given."""
     json: Flag = False

@@ -24,13 +24,13 @@ class Render:
     tolerance: Annotated[float | None, option("PX2")] = None
     """Screen area in px² that one gaussian of a coarser cluster may stand for; 0 draws everything."""
     budget: Annotated[int | None, option("N")] = None
-    """Most gaussians to draw in one picture; without a tolerance, as fine as that allows."""
+    """Most gaussians to draw in one picture; without a tolerance, the picture is as fine as that allows."""
     min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Draw no level finer than this, except where an asset has no coarser one."""
     color_by: Literal["appearance", "level", "cluster"] = "appearance"
     """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
-    """Colour behind, each 0 to 1."""
+    """Red, green and blue of the background, each 0 to 1."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to draw; auto is a CUDA device where there is one and torch can use it."""
     threads: Threads = None

@@ -21,15 +21,15 @@ class View:
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply)."""
     host: str = "127.0.0.1"
-    """Address to listen at; the default lets in this machine alone, 0.0.0.0 anyone who reaches it."""
+    """Address to listen at; by default only this machine can connect, with 0.0.0.0 everyone can."""
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
     up: Axis = "z"
     """Which way is up."""
     tolerance: Annotated[float | None, option("PX2")] = None
-    """Largest px² that one gaussian of a coarser cluster may stand for, to begin with; 3, 0 with a budget."""
+    """Screen area in px² that a coarser cluster's gaussian may stand for, at first; 3, or 0 with a budget."""
     budget: Annotated[int | None, option("N")] = None
-    """Most gaussians to draw in one picture, to begin with."""
+    """Most gaussians to draw in one picture, at first."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to draw; auto is a CUDA device where there is one and torch can use it."""
     threads: Threads = None
@@ -53,7 +53,9 @@ def run(options: View) -> None:
         raise UsageError(f"--tolerance: expected a number, got {tolerance}")
     subject, cameras = load_subject(options.subject)
     if isinstance(subject, Gaussians) and options.budget is not None:
-        raise UsageError(f"--budget: {options.subject} has no levels to choose from; build a bundle of it")
+        raise UsageError(
+            f"--budget: expected a bundle or a scene, got the asset {options.subject}; build a bundle of it"
+        )
     scene_view = SceneView(subject, device=options.device)
     site = Site(
         scene_view,

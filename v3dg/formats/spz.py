@@ -203,7 +203,7 @@ def _sections_of_gzip(path: str | os.PathLike[str], content: bytes) -> tuple[int
         raise problem(path, f"expected a gzip stream, got one that is damaged: {error}") from None
     if len(body) < sum(sizes) or not stream.eof:
         raise problem(
-            path, f"expected {sum(sizes)} bytes of gaussians, got a file that does not end with them"
+            path, f"expected a gzip stream that ends after {sum(sizes)} bytes of gaussians, got another"
         )
     return version, degree, fraction_bits, _split(body, sizes)
 
@@ -213,7 +213,7 @@ def _sections_of_zstd(path: str | os.PathLike[str], content: bytes) -> tuple[int
         raise problem(path, f"expected a header of {_ZSTD_HEADER_BYTES} bytes, got {len(content)}")
     version, degree, fraction_bits, sizes = _checked_header(path, content)
     if version < 4:
-        raise problem(path, f"expected version {version} in gzip, got it as it is")
+        raise problem(path, f"expected version {version} in a gzip stream, got it outside of one")
     num_streams, table = content[15], int.from_bytes(content[16:20], "little")
     wanted = sizes if degree else sizes[:-1]
     first = table + num_streams * _STREAM_SIZES.size

@@ -62,7 +62,7 @@ class Site:
             import viser
         except ImportError as error:
             raise ImportError(
-                "the viewer wants viser, which is not installed; pip install 'v3dg[viewer]'"
+                "the viewer needs viser, which is not installed; pip install 'v3dg[viewer]'"
             ) from error
         _require_own_address(host)
         # A tab may be closed while a picture is on its way to it.

@@ -291,8 +291,8 @@ def summary(result: dict[str, Any]) -> Summary:
         if "gsplat_ms" in row:
             out.judge(
                 row["frame_ms"] < row["gsplat_ms"],
-                f"{count_text(row['gaussians'])} random gaussians: {row['frame_ms']:.2f} ms, gsplat "
-                f"{row['gsplat_ms']:.2f} ms, {row['psnr_to_gsplat']:.0f} dB apart",
+                f"{count_text(row['gaussians'])} random gaussians take {row['frame_ms']:.2f} ms, gsplat "
+                f"{row['gsplat_ms']:.2f} ms; the pictures are {row['psnr_to_gsplat']:.0f} dB apart",
             )
     return out
 

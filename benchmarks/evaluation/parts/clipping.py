@@ -102,7 +102,7 @@ def summary(result: dict[str, Any]) -> Summary:
     row = max(result["rows"], key=lambda row: (row["distance"], row["tolerance"]))
     out.judge(
         row["ours_flip"] < row["clipped_flip"],
-        f"at equal counts ({row['ours_in_frustum']:,}) clipping small gaussians is at FLIP "
-        f"{row['clipped_flip']:.4f}, ours at {row['ours_flip']:.4f}",
+        f"with {row['ours_in_frustum']:,} gaussians in the frustum, clipping small gaussians has FLIP "
+        f"{row['clipped_flip']:.4f}, our cut {row['ours_flip']:.4f}",
     )
     return out

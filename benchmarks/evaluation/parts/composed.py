@@ -119,6 +119,37 @@ def tables(result: dict[str, Any]) -> str:
     )
 
 
+OVERVIEW = (
+    "Full is every gaussian at one sample a pixel, ours the cut at the default tolerance, both drawn by the "
+    "same rasterizer. Mean is over all distances from near to far, far is the farthest. FLIP is the error "
+    "against the full scene at twice the resolution: less is better."
+)
+_OVERVIEW_COLUMNS = (
+    Column("scene", "scene"),
+    Column("gaussians", "gaussians", "count"),
+    *(
+        Column(f"{where}: {unit}, {who}" if who == "full" else who, f"{where}_{who}_{key}", form)
+        for where in ("mean", "far")
+        for key, unit, form in (("ms", "ms", ".2f"), ("flip", "FLIP", ".4f"))
+        for who in ("full", "ours")
+    ),
+)
+
+
+def overview(result: dict[str, Any]) -> str:
+    """A row a scene: its mean over the distances, and its farthest."""
+    table = []
+    for scene in result["scenes"]:
+        rows = by_distance(scene)
+        means = mean_of(rows, *(f"{who}_{key}" for who in ("full", "ours") for key in ("ms", "flip")))
+        table.append(
+            {"scene": scene["scene"], "gaussians": scene["gaussians"]}
+            | {f"mean_{key}": value for key, value in means.items()}
+            | {f"far_{key}": value for key, value in rows[-1].items()}
+        )
+    return markdown(_OVERVIEW_COLUMNS, table)
+
+
 def summary(result: dict[str, Any]) -> Summary:
     out = Summary()
     for scene in result["scenes"]:

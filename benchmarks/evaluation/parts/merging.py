@@ -186,22 +186,22 @@ def summary(result: dict[str, Any]) -> Summary:
     )
     out.judge(
         ours["drawn_flip"] < merged["drawn_flip"],
-        f"at equal counts (tolerance 8) levels that are only merged are at FLIP {merged['drawn_flip']:.4f}, "
-        f"fitted ones at {ours['drawn_flip']:.4f}; the fit costs "
+        f"at tolerance 8, levels that are only merged have FLIP {merged['drawn_flip']:.4f}, fitted ones "
+        f"with as many gaussians {ours['drawn_flip']:.4f}; the fit costs "
         f"{ours['build_seconds'] - merged['build_seconds']:.1f} s of build",
     )
     for tool in sorted({row["tool"] for row in result["peers"]}):
         rows = [row for row in result["peers"] if row["tool"] == tool]
         for where, text in (
-            ("cut", "at the size at which it is drawn"),
+            ("cut", "at the size at which the level is drawn"),
             ("large", f"enlarged to {_LARGE_PX} px"),
         ):
             won = [row for row in rows if row[f"{where}_ours_flip"] < row[f"{where}_theirs_flip"]]
             lost = [row for row in rows if row not in won]
             if won:
-                out.wins.append(f"{tool} {text}: lower FLIP at {percents(won)} kept")
+                out.wins.append(f"against {tool}, {text}: our FLIP is lower with {percents(won)} kept")
             if lost:
-                out.losses.append(f"{tool} {text}: higher FLIP at {percents(lost)} kept")
+                out.losses.append(f"against {tool}, {text}: our FLIP is higher with {percents(lost)} kept")
     return out
 
 

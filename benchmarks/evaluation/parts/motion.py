@@ -99,8 +99,8 @@ def summary(result: dict[str, Any]) -> Summary:
     out = Summary()
     out.judge(
         ours["above_truth"] <= full["above_truth"],
-        f"in a zoom, consecutive frames of ours differ by FLIP {ours['above_truth']:+.4f} more than the "
-        f"truth's do, those of the full scene by {full['above_truth']:+.4f}",
+        f"in a zoom, the FLIP between consecutive frames differs from the truth's by "
+        f"{ours['above_truth']:+.4f} for our cut and by {full['above_truth']:+.4f} for the full scene",
     )
     return out
 

@@ -50,7 +50,7 @@ def summary(result: dict[str, Any]) -> Summary:
     out.judge(
         ours["drawn_flip"] < rival["drawn_flip"],
         f"tree or DAG makes little difference to the paper's settings (FLIP {min(flips):.4f} to "
-        f"{max(flips):.4f}); its tree is at {rival['drawn_flip']:.4f} and {rival['drawn_psnr']:.1f} dB, "
-        f"ours with as many gaussians at {ours['drawn_flip']:.4f} and {ours['drawn_psnr']:.1f} dB",
+        f"{max(flips):.4f}); its tree has FLIP {rival['drawn_flip']:.4f} and {rival['drawn_psnr']:.1f} dB, "
+        f"ours with as many gaussians {ours['drawn_flip']:.4f} and {ours['drawn_psnr']:.1f} dB",
     )
     return out
