@@ -575,9 +575,9 @@ void bind_scene(py::module_& m) {
         .def(py::init<int>(), "device"_a)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "background"_a,
-             "stop"_a = nullptr)
+             "stop"_a = nullptr, py::keep_alive<0, 1>())
         .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,
-             "background"_a, "stop"_a = nullptr)
+             "background"_a, "stop"_a = nullptr, py::keep_alive<0, 1>())
         .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,
              "cluster_ids"_a, "stop"_a = nullptr)
         .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
@@ -585,7 +585,8 @@ void bind_scene(py::module_& m) {
     py::class_<BoundAssetFrame>(m, "AssetFrame",
                                 "Draws gaussians without levels on the device that they are on.")
         .def(py::init<py::object>(), "model"_a)
-        .def("draw", &BoundAssetFrame::draw, "camera"_a, "background"_a, "stop"_a = nullptr);
+        .def("draw", &BoundAssetFrame::draw, "camera"_a, "background"_a, "stop"_a = nullptr,
+             py::keep_alive<0, 1>());
 }
 
 }  // namespace v3dg

@@ -80,10 +80,12 @@ __device__ inline Blended blend_records(const CellPixel& p, const CellRecords& r
     Blended out;
 #pragma unroll
     for (int q = 0; q < kAtOnce; ++q) {
-        const Record<float> r = load_record(records.record[q]);
-        out.alpha[q] =
-            alpha_of(falloff_at(p.center_x, p.center_y, r.u, r.v, r.l11, r.l12, r.l22, r.log2_opacity));
-        out.color[q] = make_float3(r.color[0], r.color[1], r.color[2]);
+        // As vectors (frame/record.cuh): nvcc rounds the falloff of a record that is taken apart otherwise.
+        const Record<float>& r = *records.record[q];
+        const float4 a = *reinterpret_cast<const float4*>(&r.u);
+        const float4 b = *reinterpret_cast<const float4*>(&r.l22);
+        out.alpha[q] = alpha_of(falloff_at(p.center_x, p.center_y, a.x, a.y, a.z, a.w, b.x, b.y));
+        out.color[q] = make_float3(b.z, b.w, r.color[2]);
     }
     blend_weights(out.alpha, transmittance, out.before, out.weight);
     return out;
@@ -98,11 +100,12 @@ struct BlendTargets {
     float2* errors;        // measure
 };
 
-// Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk.
+// Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk. What RowSums says of a
+// row is written out: through it nvcc rounds the sums otherwise, and bundles would change in their last bits.
 template <class Fit>
-__device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Record<float>& record,
-                       float* slot) {
-    const Record<float> r = load_record(&record);
+__device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Record<float>& r, float* slot) {
+    const float4 e = *reinterpret_cast<const float4*>(&r.u);
+    const float l22 = r.l22;
     const uint32_t half = threadIdx.x % 32 / kCellPixels;
     const float2* shares = fit.fragments() + 33 * i + half * kCellPixels;
     const float4* d_colors = fit.d_pixels() + half * kCellPixels;
@@ -112,19 +115,27 @@ __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Rec
     float color[3] = {0, 0, 0};
 #pragma unroll
     for (int y = 0; y < kCell; ++y) {
-        RowSums<float> row{};
+        float exponent = 0, t1 = 0, t1_dx = 0;
         Falloff<float> f;
 #pragma unroll
         for (int x = 0; x < kCell; ++x) {
             const float2 share = shares[y * kCell + x];
             const float4 d_color = d_colors[y * kCell + x];
-            f = falloff_at(left + x, top + y, r.u, r.v, r.l11, r.l12, r.l22, 0.0f);
-            row.add(f, share.x);
+            f = falloff_at(left + x, top + y, e.x, e.y, e.z, e.w, l22, 0.0f);
+            const float d_t1 = share.x * f.t1;
+            exponent += share.x;
+            t1 += d_t1;
+            t1_dx += d_t1 * f.dx;
             color[0] += share.y * d_color.x;
             color[1] += share.y * d_color.y;
             color[2] += share.y * d_color.z;
         }
-        sums += row.of_falloff(f);
+        sums.exponent += exponent;
+        sums.t1 -= 2 * t1;
+        sums.t1_dx -= 2 * t1_dx;
+        sums.t1_dy -= 2 * t1 * f.dy;
+        sums.t2 -= 2 * f.t2 * exponent;
+        sums.t2_dy -= 2 * f.t2 * exponent * f.dy;
     }
     slot[0] = sums.exponent;
     slot[1] = sums.t1;

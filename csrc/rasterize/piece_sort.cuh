@@ -1,7 +1,7 @@
 #pragma once
 
-// Pieces of a tile's list: taken from the list nearest first, without entries over pixels that have all stopped,
-// and sorted.
+// Pieces of a tile's list: taken from the list nearest first, without entries over pixels that have all
+// stopped, and sorted.
 
 #include "frame/record.cuh"
 #include "rasterize/tile_lists.cuh"
@@ -59,7 +59,7 @@ struct BlendShared {
         };
         float4 record[kRecordVectors][kBlendBatch];
     };
-    uint16_t sorted[kPiece];  // places in `key`
+    uint16_t sorted[kPiece];       // places in `key`
     uint32_t blocks[kBlendBatch];  // live ones that the batch's records may reach
     // Of the batch, those that may reach the sub-tile of a warp: where they begin in a vector of `record`.
     uint32_t list[kBlendWarps][kBlendBatch + 1];
@@ -74,7 +74,7 @@ struct BlendShared {
 
 // The end of the bucket that entry `first` is in; the entries up to `last` are in bucket order.
 __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint32_t last,
-                                  const Buckets& buckets) {
+                                         const Buckets& buckets) {
     const uint32_t bucket = buckets.of(entries[first].key);
     for (uint32_t at = first; at < last; at += kBlendThreads) {
         const uint32_t i = at + threadIdx.x;
@@ -86,8 +86,9 @@ __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t firs
 
 // Adds those entries [first, end) to the piece that lie over live pixels. Takes none from the bucket `beyond`
 // on. Returns where it stopped and how many the piece now holds.
-__device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end, const Buckets& buckets,
-                             uint32_t beyond, uint32_t held, uint32_t window_number, BlendShared& s) {
+__device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, uint32_t end,
+                                    const Buckets& buckets, uint32_t beyond, uint32_t held,
+                                    uint32_t window_number, BlendShared& s) {
     const int lane = threadIdx.x % 32;
     ListWindow& window = s.window[window_number % 3];
     TileEntry entry[kEntriesAtOnce];
@@ -169,7 +170,8 @@ __device__ inline void sort_piece(const Record<float>* records, uint32_t count, 
         s.highest = 0;
     }
     if (few) return;
-    for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads) atomicAdd(&s.bucket[buckets.of(s.key[i])], 1u);
+    for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)
+        atomicAdd(&s.bucket[buckets.of(s.key[i])], 1u);
     __syncthreads();
     scan_buckets<1 << kLog2Sort, kBlendThreads>(s.bucket, s.warp_sum);
     for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)

@@ -107,21 +107,19 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, BlendShare
     for (int c = 0; c < 3; ++c) p.color[c] = pixels.color[c][sub][lane];
     if (kWithDepth) p.depth = pixels.depth[sub][lane];
     bool alive = p.transmittance > 0;
-    const auto record_at = [&](uint32_t offset) {
-        const auto vector = [&](int k) -> const float4& {
-            return *reinterpret_cast<const float4*>(reinterpret_cast<const unsigned char*>(s.record[k]) +
-                                                    offset);
-        };
-        return record_of_vectors(vector(0), vector(1), vector(2));
+    // A record is used as its vectors (frame/record.cuh) here: taken apart first, nvcc rounds the falloff
+    // otherwise, and pictures would change in their last bits.
+    const auto vector = [&](int k, uint32_t offset) -> const float4& {
+        return *reinterpret_cast<const float4*>(reinterpret_cast<const unsigned char*>(s.record[k]) + offset);
     };
     for (int first = 0; first < listed; first += 32) {
         // The last lane takes the first record, which becomes the highest bit of a pixel.
         const uint32_t* last_of_group = list + first + 31;
         uint32_t bits = 0;
         if (first + 31 - lane < listed) {
-            const Record<float> own = record_at(last_of_group[-lane]);
-            bits = reached_pixels(own.u - corner_x, own.v - corner_y, own.l11, own.l12, own.l22,
-                                  own.log2_opacity);
+            const uint32_t own = last_of_group[-lane];
+            const float4 a = vector(0, own), b = vector(1, own);
+            bits = reached_pixels(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
         }
         bits = transpose_bits(bits);
         if (!alive) bits = 0;
@@ -129,15 +127,17 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, BlendShare
         int highest = 31 - __clz(static_cast<int>(bits));
         uint32_t next = last_of_group[-highest];
         while (bits != 0) {
-            const Record<float> r = record_at(next);
+            const float4 a = vector(0, next), b = vector(1, next), c = vector(2, next);
             bits ^= __funnelshift_l(0u, 1u, highest);  // 1 << highest, without a register for the 1
             highest = 31 - __clz(static_cast<int>(bits));
             next = last_of_group[-highest];
-            const Falloff<float> f = falloff_at(p.x, p.y, r.u, r.v, r.l11, r.l12, r.l22, r.log2_opacity);
+            const Falloff<float> f = falloff_at(p.x, p.y, a.x, a.y, a.z, a.w, b.x, b.y);
             float weight;
             alive = blend_live(alpha_of(f), p.transmittance, weight);
-            for (int c = 0; c < 3; ++c) p.color[c] += weight * r.color[c];
-            if (kWithDepth) p.depth += weight * r.depth;
+            p.color[0] += weight * b.z;
+            p.color[1] += weight * b.w;
+            p.color[2] += weight * c.x;
+            if (kWithDepth) p.depth += weight * c.y;
             if (!alive) bits = 0;
         }
         __syncwarp();
@@ -227,7 +227,8 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
             // Not even one does.
             const uint32_t end = end_of_bucket(from, done, level.end, level.buckets);
             const Buckets buckets = find_buckets<kBlendThreads>(from, done, end, false, s.spreading);
-            spread<kBlendThreads>(from, level.in_scratch ? entries : scratch, done, end, buckets, s.spreading);
+            spread<kBlendThreads>(from, level.in_scratch ? entries : scratch, done, end, buckets,
+                                  s.spreading);
             if (threadIdx.x == 0) s.level[depth] = {end, !level.in_scratch, buckets};
             __syncthreads();
             ++depth;
@@ -363,7 +364,8 @@ __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists list
     }
 }
 
-__global__ void __launch_bounds__(kBlendThreads, kBlocks) rasterize_kernel(FrameLists lists, RasterTape tape) {
+__global__ void __launch_bounds__(kBlendThreads, kBlocks)
+    rasterize_kernel(FrameLists lists, RasterTape tape) {
     if (!lists.capacity.holds(*lists.counters)) return;
     BlendShared& s = *reinterpret_cast<BlendShared*>(shared_memory());
     const TilePlan plan = lists.plans[blockIdx.x];
@@ -382,8 +384,8 @@ void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t str
     launch("plan_kernel", plan_kernel, 1, kPlanThreads, 0, stream, lists);
     launch("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles), kPlanThreads,
            0, stream, lists);
-    launch("rasterize_kernel", rasterize_kernel, lists.num_tiles, kBlendThreads, sizeof(BlendShared), stream, lists,
-           tape == nullptr ? RasterTape{} : *tape);
+    launch("rasterize_kernel", rasterize_kernel, lists.num_tiles, kBlendThreads, sizeof(BlendShared), stream,
+           lists, tape == nullptr ? RasterTape{} : *tape);
 }
 
 }  // namespace cuda

@@ -86,16 +86,6 @@ template <class T>
 struct FalloffSums {
     T exponent, t1, t2;
     T t1_dx, t1_dy, t2_dy;  // gradient by t1 times dx, ...
-
-    V3DG_HD V3DG_INLINE FalloffSums& operator+=(const FalloffSums& d) {
-        exponent += d.exponent;
-        t1 += d.t1;
-        t2 += d.t2;
-        t1_dx += d.t1_dx;
-        t1_dy += d.t1_dy;
-        t2_dy += d.t2_dy;
-        return *this;
-    }
 };
 
 // The same over the pixels of one row, which have dy and t2 in common: of the gradient by the exponent, and

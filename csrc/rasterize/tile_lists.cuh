@@ -15,8 +15,8 @@ constexpr int kEntriesAtOnce = 4;  // that a thread has in flight
 constexpr int kDepthShift = kEntryRecordBits + kEntryBoxBits;
 __device__ inline uint32_t depth_of_key(EntryKey key) { return static_cast<uint32_t>(key >> kDepthShift); }
 
-// Buckets of entries, of equal width in the bits of their depths, which are logarithmic over octaves and linear
-// within one; or, where all depths are equal, of equal width in the record.
+// Buckets of entries, of equal width in the bits of their depths, which are logarithmic over octaves and
+// linear within one; or, where all depths are equal, of equal width in the record.
 struct Buckets {
     uint32_t lowest, last;  // `last` is the number of the last bucket
     int shift;
@@ -26,7 +26,9 @@ struct Buckets {
         return by_record ? record_of(TileEntry{key}) : depth_of_key(key);
     }
     // Keys outside the range that the buckets were made for belong to the first or the last.
-    __device__ uint32_t of(EntryKey key) const { return min((max(part_of(key), lowest) - lowest) >> shift, last); }
+    __device__ uint32_t of(EntryKey key) const {
+        return min((max(part_of(key), lowest) - lowest) >> shift, last);
+    }
     // The part of a key where a bucket begins; nothing lies before the first.
     __device__ uint32_t begin_of(uint32_t bucket) const {
         return bucket == 0 ? 0 : lowest + (bucket << shift);
