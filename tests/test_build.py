@@ -385,7 +385,7 @@ def test_wrong_settings_are_named(changes, message):
 
 
 def test_wrong_options_are_named(asset):
-    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu' or 'cuda', got 'gpu'"):
+    with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'gpu'"):
         build(asset, device="gpu")
     with pytest.raises(TypeError, match="progress: expected True or False, got 'yes'"):
         build_bundle(asset, progress="yes")

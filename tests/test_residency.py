@@ -31,7 +31,7 @@ def where(device):
 def made(monkeypatch):
     """Counts what is made: the name of each kind of the core's, as often as one was made."""
     made = []
-    for name in ("ClusterTable", "Model", "SceneFrame", "ResidentScene"):
+    for name in ("ClusterTable", "Model", "Palette", "SceneFrame", "ResidentScene"):
         monkeypatch.setattr(_core, name, counted(getattr(_core, name), made))
     return made
 
@@ -46,15 +46,18 @@ def counted(kind, made):
 
 def test_all_is_made_once_for_a_bundle_and_a_device(where, made):
     asset, other = bundle(0), bundle(1)
-    first = residency.table(asset), residency.model(asset, where, "appearance")
+    first = residency.table(asset), residency.model(asset, where)
     for _ in range(2):
         render(asset, CAMERA, device=where).stats  # noqa: B018  waits for the picture
         select(asset, CAMERA, device=where)
-        assert (residency.table(asset), residency.model(asset, where, "appearance")) == first
+        assert (residency.table(asset), residency.model(asset, where)) == first
     assert sorted(made) == ["ClusterTable", "Model", "ResidentScene", "SceneFrame"]
     assert residency.table(other) is not first[0]
-    assert residency.model(other, where, "appearance") is not first[1]
-    assert residency.model(asset, where, "level") is not first[1]
+    assert residency.model(other, where) is not first[1]
+    del made[:]
+    for color_by in ("level", "cluster"):
+        render(asset, CAMERA, color_by=color_by, device=where).stats  # noqa: B018
+    assert sorted(made) == 2 * ["Palette"] + 2 * ["SceneFrame"]  # of the same gaussians
 
 
 def test_scene_of_one_bundle_has_the_bundles_own_model(where, made):
@@ -69,13 +72,13 @@ def test_added_bundle_leaves_the_others_where_they_are(where, made):
     first, second, scene = bundle(0), bundle(1), Scene()
     scene.add(first)
     render(scene, CAMERA, device=where).stats  # noqa: B018
-    model, gaussians = residency.model(first, where, "appearance"), residency.gaussians(first, where)
+    model, gaussians = residency.model(first, where), residency.gaussians(first, where)
     resident = residency.scene(scene, where)
     del made[:]
     scene.add(second, positions=(1.0, 0, 0))
     image = render(scene, CAMERA, device=where)
     assert image.stats.gaussians_selected > 0
-    assert residency.model(first, where, "appearance") is model
+    assert residency.model(first, where) is model
     assert residency.gaussians(first, where) is gaussians
     assert residency.scene(scene, where) is resident
     assert resident.bundles == (first, second)
@@ -118,9 +121,8 @@ def test_bytes_grow_with_what_is_there(where):
     assert kept.num_bytes(where) == 0
     sizes = [0]
     for make in (
-        lambda: kept.model(asset, where, "appearance"),
-        lambda: kept.model(asset, where, "cluster"),
-        lambda: kept.model(bundle_that_stays, where, "appearance"),
+        lambda: kept.model(asset, where),
+        lambda: kept.model(bundle_that_stays, where),
     ):
         make()
         sizes.append(kept.num_bytes(where))
@@ -140,11 +142,11 @@ def test_what_is_cleared_is_made_again(where):
     asset = bundle(0)
     image = render(asset, CAMERA, device=where)
     renderer = Renderer(asset, device=where)
-    model, table = residency.model(asset, where, "appearance"), residency.table(asset)
+    model, table = residency.model(asset, where), residency.table(asset)
     residency.clear()
     assert residency.num_bytes(where) == 0
     assert residency.table(asset) is not table
-    assert residency.model(asset, where, "appearance") is not model
+    assert residency.model(asset, where) is not model
     for again in (render(asset, CAMERA, device=where), renderer.render(CAMERA)):  # which keeps what it has
         np.testing.assert_array_equal(host(again.color), host(image.color))
 
@@ -171,7 +173,7 @@ def test_threads_get_the_same(where, made):
         return (
             i % 3,
             kept.table(asset),
-            kept.model(asset, where, "appearance"),
+            kept.model(asset, where),
             kept.gaussians(asset, where),
             kept.scene(asset, where),
         )

@@ -98,7 +98,7 @@ def test_cut_is_the_same_on_the_other_device():
 
 def test_each_device_has_a_bundle_of_its_own():
     bundle = scenes_lod.lod_bundle(np.random.default_rng(7), asset(7), 64)
-    models = [residency.model(bundle, Device(number), "appearance") for number in (0, 1)]
+    models = [residency.model(bundle, Device(number)) for number in (0, 1)]
     assert models[0] is not models[1]
     assert residency.num_bytes(Device(0)) >= models[0].bytes
     assert residency.num_bytes(Device(1)) >= models[1].bytes
@@ -166,10 +166,14 @@ def test_rows_of_two_devices_are_refused():
 def test_frame_refuses_what_is_on_the_other_device():
     bundle = scenes_lod.lod_bundle(np.random.default_rng(12), asset(12), 64)
     frame = _core.SceneFrame(0)
-    with pytest.raises(ValueError, match="models: expected gaussians on the frame's device, got others"):
-        frame.set_models([residency.model(bundle, Device(1), "appearance")])
+    with pytest.raises(ValueError, match="models: expected what is on the frame's device, got others"):
+        frame.set_models([residency.model(bundle, Device(1))], [])
+    colors = np.zeros((len(bundle.clusters.level), 3), np.float32)
+    palette = _core.Palette(residency.table(bundle), colors, 1)
+    with pytest.raises(ValueError, match="palettes: expected what is on the frame's device, got others"):
+        frame.set_models([residency.model(bundle, Device(0))], [palette])
     scene = Scene.of(bundle)
-    frame.set_models([residency.model(bundle, Device(0), "appearance")])
+    residency.set_models(frame, [bundle], Device(0), "cluster")
     rule = _core.Rule(tolerance_px2=1.0, budget=None, min_level=0, footprint="solid_angle", culls=True)
     with pytest.raises(ValueError, match="scene: expected one on the frame's device"):
         frame.draw(residency.scene(scene, Device(1)).core, CAMERA.core, rule, [0, 0, 0])

@@ -248,12 +248,14 @@ def test_operations_on_doubles_are_refused():
 
 def test_other_values_are_refused():
     camera, rule = _core.Camera(**CAMERA), _core.Rule(**RULE)
-    scene, frame = _core.ResidentScene(-1), _core.SceneFrame(-1)
+    scene, frame, model = _core.ResidentScene(-1), _core.SceneFrame(-1), _core.Model(rows())
     for wrong in (None, 3, camera):
         kind = type(wrong).__name__
         for name, expected, call in (
             ("tables", "ClusterTable", lambda w=wrong: scene.set_bundles([w])),
-            ("models", "Model", lambda w=wrong: frame.set_models([w])),
+            ("models", "Model", lambda w=wrong: frame.set_models([w], [])),
+            ("palettes", "Palette", lambda w=wrong: frame.set_models([model], [w])),
+            ("table", "ClusterTable", lambda w=wrong: _core.Palette(w, np.zeros((1, 3), np.float32), -1)),
             ("scene", "ResidentScene", lambda w=wrong: frame.draw(w, camera, rule, [0, 0, 0])),
             ("model", "Model", lambda w=wrong: _core.AssetFrame(w)),
         ):
@@ -265,7 +267,7 @@ def test_other_values_are_refused():
 
 def test_frame_refuses_a_scene_of_other_bundles():
     frame = _core.SceneFrame(-1)
-    frame.set_models([_core.Model(rows())])
+    frame.set_models([_core.Model(rows())], [])
     with pytest.raises(ValueError, match="scene: expected one of the bundles that the frame has the"):
         frame.draw(_core.ResidentScene(-1), _core.Camera(**CAMERA), _core.Rule(**RULE), [0, 0, 0])
 

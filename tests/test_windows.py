@@ -24,7 +24,7 @@ def draw_window(scene, camera, window):
     """Colour, alpha, depth and statistics of the pixels [x0, x1) x [y0, y1)."""
     selection = select(scene, camera, tolerance=0.0)
     frame = _core.SceneFrame(CPU.number)
-    frame.set_models([residency.model(bundle, CPU, "appearance") for bundle in scene.bundles])
+    residency.set_models(frame, scene.bundles, CPU, "appearance")
     drawing = frame.draw_cut(
         residency.scene(scene, CPU).core,
         camera.core.window(*window),

@@ -132,8 +132,9 @@ def render(
             the place of `tolerance`, `budget` and `min_level`.
         color_by: "level" or "cluster" colours gaussians by the one that they belong to.
         background: Three numbers.
-        device: "cpu", "cuda" or "auto"; CUDA draws on torch's current stream and keeps on the device what the
-            next picture of the same scene or bundle needs. Use a `Renderer` to say how long.
+        device: "cpu", "cuda", "cuda:1" or "auto"; CUDA draws on the stream that is torch's current one there
+            and keeps on the device what the next picture of the same scene or bundle needs. Use a `Renderer`
+            to say how long.
 
     Raises:
         ValueError: An argument is not as above, or the coarsest cut has more gaussians than the budget; on

@@ -85,13 +85,13 @@ class BoundPalette {
   public:
     BoundPalette(const py::object& table_object, const py::array& sh, int device)
         : table_(table_object), sh_(sh), device_{device} {
-        const auto& table = table_object.cast<const BoundTable&>();
+        const auto& table = held<BoundTable>(table_object, "table");
         const auto clusters = static_cast<py::ssize_t>(table.table().num_clusters());
         const Span<const float> colors = span_of<const float>(sh, "sh", {clusters, 3});
         host_ = {colors.data, whole_bundle(table.table()).first_row.data, static_cast<uint32_t>(clusters)};
+        const Work work(device_);
 #if V3DG_WITH_CUDA
         if (device_.is_host()) return;
-        const Work work(device_);
         on_device_ = std::make_shared<cuda::DevicePalette>(colors, table.on_device(work), work.stream());
 #endif
     }
@@ -127,8 +127,8 @@ struct SceneState {
 class BoundScene {
   public:
     explicit BoundScene(int device) : device_{device}, state_(std::make_shared<SceneState>()) {
-#if V3DG_WITH_CUDA
         const Work work(device_);
+#if V3DG_WITH_CUDA
         if (!device_.is_host()) {
             on_device_ = std::make_unique<cuda::SceneTables>();
             cut_ = std::make_unique<cuda::Cut>();
