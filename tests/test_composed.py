@@ -366,7 +366,8 @@ def test_asset_and_bundle_are_seen_from_the_same_place(device):
         for name in ("color", "alpha", "depth"):
             error = np.abs(host(getattr(picture, name)) - host(getattr(as_bundle, name)))
             assert error.max() < 2e-4, name
-            assert error.mean() < 1e-6, name
+            # Depths are of 6, where float32 has steps of 5e-7; what is packed is rounded once more.
+            assert error.mean() < 3e-6, name
 
 
 @pytest.mark.gpu

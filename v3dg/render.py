@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, overload
 
@@ -12,7 +11,7 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
-from v3dg.residency import residency
+from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
 from v3dg.select import Selection, over_budget, rule_of
 
@@ -205,13 +204,13 @@ class _Frame:
 
     def __init__(self, subject: Scene | Bundle | Gaussians, color_by: ColorBy, device: Device) -> None:
         self._device, self._color_by = device, color_by
-        self._bundles: tuple[weakref.ref[Bundle], ...] | None = None  # that it has the gaussians of
+        self._generation: object = None  # of the bundles that it has the gaussians of
         if isinstance(subject, Gaussians):
             _check_asset(color_by)
             self._asset = _core.AssetFrame(_core.Model(_device.place(subject, device).rows))
         else:
             self._frame = _core.SceneFrame(device.number)
-            self._take_models(Scene.of(subject).bundles)
+            self._take_models(residency.scene(subject, device))
 
     def draw(
         self,
@@ -229,7 +228,7 @@ class _Frame:
             return Image(drawing, lambda: _stats(drawing.finish(), 0.0))
         rule = rule_of(**options, footprint="solid_angle", cull=True)
         resident = residency.scene(subject, self._device)
-        self._take_models(resident.bundles)
+        self._take_models(resident)
         if cut is None:
             drawing = self._frame.draw(resident.core, camera.core, rule, shade)
         else:
@@ -250,11 +249,10 @@ class _Frame:
             finish()
         return Image(drawing, finish)
 
-    def _take_models(self, bundles: tuple[Bundle, ...]) -> None:
-        references = tuple(map(weakref.ref, bundles))
-        if self._bundles != references:
-            residency.set_models(self._frame, bundles, self._device, self._color_by)
-            self._bundles = references
+    def _take_models(self, resident: ResidentScene) -> None:
+        if self._generation is not resident.generation:
+            residency.set_models(self._frame, resident.bundles, self._device, self._color_by)
+            self._generation = resident.generation
 
     def _here(self, ids: Any) -> Any:
         if not self._device.is_cuda:

@@ -24,6 +24,7 @@ class ResidentScene:
 
     Attributes:
         core: The compiled module's part.
+        generation: Another object whenever the bundles change.
     """
 
     def __init__(self, device: Device) -> None:
@@ -34,23 +35,25 @@ class ResidentScene:
         self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()  # that may be under way
         self._lock = threading.Lock()  # of that set
         self._seen: tuple[int, int] | None = None
+        self.generation = object()
 
     @property
     def bundles(self) -> tuple[Bundle, ...]:
         """The bundles whose tables are there."""
         return tuple(bundle for reference in self._bundles if (bundle := reference()) is not None)
 
+    def is_current(self, scene: Scene) -> bool:
+        """Whether nothing has changed since the last update."""
+        return self._seen == scene.revision
+
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
-        """Take over what has changed since the last time: nothing, the poses, or all instances.
+        """Take over what has changed since the last time: the poses, or all instances.
 
         Frames under way are finished first: one that found a buffer too small will be drawn again.
 
         Raises:
             RuntimeError: Something has changed, and a CUDA graph is being captured.
         """
-        revision = scene.revision
-        if self._seen == revision:
-            return
         if self.device.is_cuda and _device.is_capturing():
             raise RuntimeError(
                 "scene: expected no change while a CUDA graph is captured, got a new or changed scene; "
@@ -60,6 +63,8 @@ class ResidentScene:
         if self.bundles != scene.bundles:
             self.core.set_bundles(tables)
             self._bundles = tuple(map(weakref.ref, scene.bundles))
+            self.generation = object()
+        revision = scene.revision
         poses = [self._here(rows) for rows in self._poses_of(scene)]
         if self._seen is not None and self._seen[0] == revision[0]:
             self.core.set_poses(*poses)
@@ -141,7 +146,8 @@ class Residency:
             if resident is None:
                 resident = ResidentScene(device)
             scene = Scene.of(subject)
-            resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
+            if not resident.is_current(scene):
+                resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
             known[device] = resident
             return resident
 

@@ -1,5 +1,7 @@
 #include "bindings/array.h"
 
+#include <pybind11/gil_safe_call_once.h>
+
 #if V3DG_WITH_CUDA
 #include "base/device_guard.h"
 #endif
@@ -28,6 +30,31 @@ py::object interface_of(const py::handle& array) {
     PyErr_Clear();
     return py::none();
 }
+
+// What is asked of torch for every frame, looked up once. It stays to the end of the process, which may come
+// after Python's.
+struct Torch {
+    py::object empty, current_stream;
+
+    static const Torch& get() {
+        PYBIND11_CONSTINIT static py::gil_safe_call_once_and_store<Torch> known;
+        return known.call_once_and_store_result([] { return Torch(); }).get_stored();
+    }
+
+    const py::object& dtype(const py::dtype& wanted) const {
+        return wanted.kind() == 'f' ? float32_ : wanted.itemsize() == 8 ? int64_ : uint8_;
+    }
+
+  private:
+    Torch()
+        : empty(py::module_::import("torch").attr("empty")),
+          current_stream(py::module_::import("torch.cuda").attr("current_stream")),
+          float32_(py::module_::import("torch").attr("float32")),
+          int64_(py::module_::import("torch").attr("int64")),
+          uint8_(py::module_::import("torch").attr("uint8")) {}
+
+    py::object float32_, int64_, uint8_;
+};
 
 template <class Lengths>
 bool fits_shape(const Lengths& got, Shape wanted) {
@@ -136,11 +163,10 @@ void check_is_on([[maybe_unused]] Device device, [[maybe_unused]] const void* me
 
 py::object new_array(Device device, const py::dtype& dtype, const std::vector<py::ssize_t>& shape) {
     if (device.is_host()) return py::array(dtype, shape);
-    const py::module_ torch = py::module_::import("torch");
-    const py::object place = py::str("cuda:" + std::to_string(device.number));
+    const Torch& torch = Torch::get();
     try {
-        return torch.attr("empty")(py::tuple(py::cast(shape)),
-                                   "dtype"_a = torch.attr(py::str(dtype.attr("name"))), "device"_a = place);
+        return torch.empty(py::tuple(py::cast(shape)), "dtype"_a = torch.dtype(dtype),
+                           "device"_a = device.number);
     } catch (py::error_already_set& error) {
         if (text_of(error.type().attr("__name__")) != "OutOfMemoryError") throw;
         PyErr_SetString(PyExc_MemoryError, text_of(error.value()).c_str());
@@ -158,7 +184,7 @@ struct Work::Guard {
 Work::Work(Device device) : device_(device) {
     if (device.is_host()) return;
     guard_ = std::make_unique<Guard>(device.number);
-    const py::object stream = py::module_::import("torch.cuda").attr("current_stream")(device.number);
+    const py::object stream = Torch::get().current_stream(device.number);
     stream_ = reinterpret_cast<cuda::Stream>(stream.attr("cuda_stream").cast<uintptr_t>());
 }
 

@@ -247,9 +247,10 @@ class BoundDrawing {
     BoundDrawing(NewPicture picture, const FrameStats& stats) : picture_(std::move(picture)), stats_(stats) {}
 
 #if V3DG_WITH_CUDA
-    BoundDrawing(NewPicture picture, py::object read, Device device, std::unique_ptr<cuda::Drawing> drawing)
+    // `kept` are the frame, which may have to draw again, and what it reads.
+    BoundDrawing(NewPicture picture, py::object kept, Device device, std::unique_ptr<cuda::Drawing> drawing)
         : picture_(std::move(picture)),
-          read_(std::move(read)),
+          kept_(std::move(kept)),
           device_(device),
           drawing_(std::move(drawing)) {}
 #endif
@@ -285,9 +286,9 @@ class BoundDrawing {
     NewPicture picture_;
     FrameStats stats_{};
 #if V3DG_WITH_CUDA
-    py::object read_;
+    py::object kept_;
     Device device_;
-    std::unique_ptr<cuda::Drawing> drawing_;  // gone before what it reads
+    std::unique_ptr<cuda::Drawing> drawing_;  // gone before what it needs
 #endif
 };
 
@@ -347,7 +348,8 @@ class BoundSceneFrame {
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
         const cuda::FrameImage image = picture.on_device(device_, camera.camera, background);
         auto drawing = frame_->draw(scene.on_device(), camera.camera, rule, image, work.stream());
-        return std::make_unique<BoundDrawing>(std::move(picture), scene_object, device_, std::move(drawing));
+        return std::make_unique<BoundDrawing>(
+            std::move(picture), py::make_tuple(py::cast(this), scene_object), device_, std::move(drawing));
 #else
         return nullptr;
 #endif
@@ -372,9 +374,9 @@ class BoundSceneFrame {
         const cuda::FrameImage image = picture.on_device(device_, camera.camera, background);
         auto drawing =
             frame_->draw_cut(scene.on_device(), camera.camera, instance, cluster, image, work.stream());
-        return std::make_unique<BoundDrawing>(std::move(picture),
-                                              py::make_tuple(scene_object, instance_ids, cluster_ids),
-                                              device_, std::move(drawing));
+        return std::make_unique<BoundDrawing>(
+            std::move(picture), py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids),
+            device_, std::move(drawing));
 #else
         return nullptr;
 #endif
@@ -510,7 +512,7 @@ class BoundAssetFrame {
         const cuda::PackedModel& packed = *model.packed();
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
                                     work.stream(), &packed.packed());
-        return std::make_unique<BoundDrawing>(std::move(picture), model_, device, std::move(drawing));
+        return std::make_unique<BoundDrawing>(std::move(picture), py::cast(this), device, std::move(drawing));
 #else
         return nullptr;
 #endif
@@ -575,9 +577,9 @@ void bind_scene(py::module_& m) {
         .def(py::init<int>(), "device"_a)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "background"_a,
-             "stop"_a = nullptr, py::keep_alive<0, 1>())
+             "stop"_a = nullptr)
         .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,
-             "background"_a, "stop"_a = nullptr, py::keep_alive<0, 1>())
+             "background"_a, "stop"_a = nullptr)
         .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,
              "cluster_ids"_a, "stop"_a = nullptr)
         .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
@@ -585,8 +587,7 @@ void bind_scene(py::module_& m) {
     py::class_<BoundAssetFrame>(m, "AssetFrame",
                                 "Draws gaussians without levels on the device that they are on.")
         .def(py::init<py::object>(), "model"_a)
-        .def("draw", &BoundAssetFrame::draw, "camera"_a, "background"_a, "stop"_a = nullptr,
-             py::keep_alive<0, 1>());
+        .def("draw", &BoundAssetFrame::draw, "camera"_a, "background"_a, "stop"_a = nullptr);
 }
 
 }  // namespace v3dg

@@ -95,14 +95,21 @@ Rows::Rows(py::object means, py::object quats, py::object scales, py::object opa
     size_ = static_cast<size_t>(centers[0]);
     is_double_ = device_.is_host() && py::isinstance<py::array_t<double>>(arrays_[0]);
     if (is_double_) {
-        read<double>();
+        remember(spans<const double>());
         return;
     }
-    const GaussianRows<const float> rows = read<float>();
+    const GaussianRows<const float> rows = spans<const float>();
+    remember(rows);
     if (device_.is_host()) return;
     for (const float* start : {rows.quats, rows.sh})
         if (reinterpret_cast<uintptr_t>(start) % 16 != 0)
             throw py::value_error("quats, sh: expected memory that begins at a multiple of 16 bytes");
+}
+
+void Rows::check_precision(bool wants_double) const {
+    if (wants_double != is_double_)
+        throw py::value_error(std::string("means: expected dtype ") + (wants_double ? "float64" : "float32") +
+                              ", got " + (is_double_ ? "float64" : "float32"));
 }
 
 NewRows::NewRows(Device device, size_t size, int sh_degree)

@@ -36,7 +36,9 @@ class Rows {
     // Borrowed, in the precision that they have.
     template <class T>
     GaussianRows<const T> read() const {
-        return spans<const T>();
+        check_precision(std::is_same<T, double>::value);
+        const auto at = [&](int k) { return static_cast<const T*>(memory_[k]); };
+        return {at(0), at(1), at(2), at(3), at(4), size_, sh_degree_};
     }
     // Borrowed to be written to, float32.
     GaussianRows<float> write() const { return spans<float>(); }
@@ -55,7 +57,14 @@ class Rows {
                 sh_degree_};
     }
 
+    template <class T>
+    void remember(const GaussianRows<T>& rows) {
+        memory_ = {rows.means, rows.quats, rows.scales, rows.opacities, rows.sh};
+    }
+    void check_precision(bool wants_double) const;
+
     std::array<py::object, 5> arrays_;
+    std::array<const void*, 5> memory_{};
     Device device_;
     size_t size_ = 0;
     int sh_degree_ = 0;
