@@ -117,7 +117,7 @@ bool is_capturing(cudaStream_t stream) {
 void refuse_capture(cudaStream_t stream) {
     if (is_capturing(stream))
         throw std::runtime_error(
-            "cuda: no memory can be had while a graph is captured; draw as much once before");
+            "cuda: no memory can be had while a graph is captured; draw it once before the capture");
 }
 
 StreamMutex::StreamMutex() {

@@ -44,8 +44,8 @@ V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotatio
 }
 
 // Writes the three coefficients of one SH basis of that gaussian, rotated into the world with its band.
-V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations, size_t s, int64_t within, int basis,
-                              const GaussianRows<float>& out) {
+V3DG_HD inline void gather_sh(const GatherInput& in, const Rotations& rotations, size_t s, int64_t within,
+                              int basis, const GaussianRows<float>& out) {
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
     const size_t i = in.instance[s];
     const GaussianRows<const float>& rows = in.bundles[in.bundle[i]];
