@@ -61,7 +61,7 @@ SOURCES = sorted(str(p.relative_to(ROOT)) for p in CSRC.rglob("*") if p.suffix i
 MODULES = sorted((ROOT / "v3dg").rglob("*.py"))
 MEASURING = sorted(p for part in ("evaluation", "worlds") for p in (ROOT / "benchmarks" / part).rglob("*.py"))
 MOST_LINES, MOST_LINES_A_FILE = 10_000, 400
-TOO_LONG = {"v3dg/build.py", "v3dg/bundle.py"}
+MOST_LINES_A_SOURCE, MOST_LINES_A_FUNCTION = 600, 60
 
 
 def module_name(path):
@@ -239,11 +239,24 @@ def test_what_is_installed_is_the_library_alone():
     assert sum(bool(line.strip()) for line in lines) <= MOST_LINES
 
 
-def test_files_of_the_library_are_short():
-    lengths = {
-        p.relative_to(ROOT).as_posix(): len(p.read_text(encoding="utf-8").splitlines()) for p in MODULES
-    }
-    assert {path for path, length in lengths.items() if length > MOST_LINES_A_FILE} <= TOO_LONG
+def test_files_are_short():
+    def longer(paths, most):
+        return [str(p) for p in paths if len(p.read_text(encoding="utf-8").splitlines()) > most]
+
+    assert longer(MODULES, MOST_LINES_A_FILE) == []
+    sources = (p for p in CSRC.rglob("*") if p.suffix in {".h", ".cpp", ".cu", ".cuh"})
+    assert longer(sources, MOST_LINES_A_SOURCE) == []
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
+def test_functions_fit_a_screen(path):
+    functions = (
+        node
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+    )
+    too_long = [f.name for f in functions if f.end_lineno - f.lineno >= MOST_LINES_A_FUNCTION]
+    assert too_long == []
 
 
 @pytest.mark.parametrize("path", MODULES, ids=module_name)

@@ -149,15 +149,13 @@ def run_demo(
     scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
 
     columns, pictures = [], []
-    with tqdm(total=len(views), desc="draw", unit="distance", leave=False, disable=not progress) as bar:
-        for distance, elevation in views:
-            camera = view_camera(distance, elevation, *size)
-            truth = _truth(scene, camera, where)
-            full, full_picture = _measure(scene, camera, 0.0, truth, where)
-            ours, our_picture = _measure(scene, camera, tolerance, truth, where)
-            columns.append(Column(distance, full, ours))
-            pictures.append((full_picture, our_picture))
-            bar.update()
+    for distance, elevation in tqdm(views, "draw", unit="distance", leave=False, disable=not progress):
+        camera = view_camera(distance, elevation, *size)
+        truth = _truth(scene, camera, where)
+        full, full_picture = _measure(scene, camera, 0.0, truth, where)
+        ours, our_picture = _measure(scene, camera, tolerance, truth, where)
+        columns.append(Column(distance, full, ours))
+        pictures.append((full_picture, our_picture))
 
     result = DemoResult(
         picture=str(path),

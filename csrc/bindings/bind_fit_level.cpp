@@ -108,7 +108,7 @@ FitConfig make_config(int steps, int views_per_step, int num_views, int supersam
     config.px2_per_gaussian = px2_per_gaussian;
     config.distance = distance;
     config.filter_px2 = filter_px2;
-    config.compensate = antialiased;
+    config.antialiased = antialiased;
     config.loss = {loss_l1, loss_dssim, loss_alpha};
     config.step_position = step_position;
     config.step_log_scale = step_log_scale;

@@ -14,6 +14,7 @@ void bind_gather(pybind11::module_& m);
 void bind_select(pybind11::module_& m);
 void bind_rasterize(pybind11::module_& m);
 void bind_scene(pybind11::module_& m);
+void bind_frame(pybind11::module_& m);
 void bind_fit_level(pybind11::module_& m);
 
 }  // namespace v3dg

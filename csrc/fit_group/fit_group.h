@@ -23,7 +23,7 @@ struct FitConfig {
     float px2_per_gaussian;  // of the ball's footprint, where image_size is 0
     float distance;          // of the camera from the centre, in radii
     float filter_px2;        // of the gaussians that are fitted, with compensated opacity
-    bool compensate;
+    bool antialiased;
     LossWeights loss;
     // Step sizes of Adam: position in radii or, if `position_in_world`, in world units; the last step takes
     // `final_step` of them, exponentially.
@@ -44,7 +44,7 @@ struct FitGroup {
 struct FitTarget {
     const GaussianPlanes<float>* model;
     float filter_px2;
-    bool compensate;
+    bool antialiased;
 };
 
 // Shared with whoever waits for the result.

@@ -64,7 +64,7 @@ void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget&
     const int ss = config.supersample;
     const Draw<float> draw{target.model,       group.target_first,
                            group.target_count, view_of_world(config, group, view),
-                           target.filter_px2,  target.compensate};
+                           target.filter_px2,  target.antialiased};
     const size_t count = project_sorted(draw, camera_of(view, static_cast<float>(ss)), scratch);
     const int across = tiles_across(view);
     image.assign(static_cast<size_t>(across) * across * kPlanes * kTilePixels, 0.0f);
@@ -125,7 +125,7 @@ class Student {
     }
 
     Draw<float> draw(const FitView& view) const {
-        return {&model_, 0, n_, view_of_group(config_, view), config_.filter_px2, config_.compensate};
+        return {&model_, 0, n_, view_of_group(config_, view), config_.filter_px2, config_.antialiased};
     }
 
     void clear_gradient() { std::fill(gradient_.begin(), gradient_.end(), 0.0f); }

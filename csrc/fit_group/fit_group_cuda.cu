@@ -49,7 +49,7 @@ __device__ bool project_one(const Fit& fit, uint32_t i, const ModelView<float>& 
     const Gaussian3d<float> g = gaussian_of(fit, i);
     Projection<float> p;
     const Ellipse<float> e =
-        project_gaussian(g, view, camera, fit.in.config.filter_px2, fit.in.config.compensate, p);
+        project_gaussian(g, view, camera, fit.in.config.filter_px2, fit.in.config.antialiased, p);
     float half_x, half_y;
     if (!(e.depth >= camera.near_depth) || !extent_of(g.opacity, e, p, half_x, half_y)) return false;
     if (!meets_image(e.u, half_x, camera.width) || !meets_image(e.v, half_y, camera.height)) return false;
@@ -106,14 +106,14 @@ __device__ void project_views_backward(const Fit& fit, const FitCameras& cameras
         const ModelView<float>& view = cameras.view[b];
         const Pinhole<float>& camera = cameras.camera[b];
         const float filter_px2 = fit.in.config.filter_px2;
-        const bool compensate = fit.in.config.compensate;
+        const bool antialiased = fit.in.config.antialiased;
         const Gaussian3d<float> g = gaussian_of(fit, i);
         Projection<float> p;
-        const Ellipse<float> e = project_gaussian(g, view, camera, filter_px2, compensate, p);
+        const Ellipse<float> e = project_gaussian(g, view, camera, filter_px2, antialiased, p);
         const Ellipse<float> d_ellipse =
             falloff_vjp(e.l11, e.l12, e.l22, FalloffSums<float>{d[0], d[1], d[2], d[3], d[4], d[5]});
         Gaussian3d<float> d_g =
-            project_gaussian_vjp(g, view, camera, filter_px2, compensate, p, e, d_ellipse);
+            project_gaussian_vjp(g, view, camera, filter_px2, antialiased, p, e, d_ellipse);
         const float* sh = value + 11 * fit.n + fit.num_sh * i;
         with_degree(fit.in.rows.sh_degree, [&](auto degree) {
             float color[3];

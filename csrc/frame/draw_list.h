@@ -13,11 +13,11 @@ namespace v3dg {
 // How gaussians are drawn, apart from where. Neighbours in memory of the same appearance are drawn together.
 template <class T>
 struct Appearance {
-    T filter_px2;     // added to the variances on screen
-    bool compensate;  // opacity for what the filter adds
+    T filter_px2;      // added to the variances on screen
+    bool antialiased;  // the opacity makes up for what the filter adds
 
     V3DG_HD bool operator==(const Appearance& other) const {
-        return filter_px2 == other.filter_px2 && compensate == other.compensate;
+        return filter_px2 == other.filter_px2 && antialiased == other.antialiased;
     }
 };
 

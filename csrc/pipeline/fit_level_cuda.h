@@ -11,7 +11,7 @@ namespace cuda {
 struct DeviceFitTarget {
     GaussianRows<const float> rows;
     float filter_px2;
-    bool compensate;
+    bool antialiased;
 };
 
 // As v3dg::fit_level, with rows on the device and `error` on the host. Returns when all is done.

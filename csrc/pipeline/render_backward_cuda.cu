@@ -27,7 +27,7 @@ void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
     in_ = in;
     check(cudaStreamWaitEvent(stream, gone_back_, 0), "cudaStreamWaitEvent");
     const std::unique_ptr<Drawing> drawing =
-        frame_.draw(in.rows, in.view, in.filter_px2, in.compensate, in.image, stream);
+        frame_.draw(in.rows, in.view, in.filter_px2, in.antialiased, in.image, stream);
     num_slots_ = drawing->settle().slots;
     if (num_slots_ > UINT32_MAX)
         throw std::length_error(
@@ -49,7 +49,7 @@ void DifferentiableFrame::backward(const PictureGradient<float>& d_picture, cons
                         tape.raster.blended, tape.lists.plans, d_picture},
                        slots, d_background_of_tile.data(), d_background, stream);
     project_backward({tape.item_records, tape.lists.records, tape.source, in_.rows, in_.view,
-                      in_.image.camera, in_.filter_px2, in_.compensate},
+                      in_.image.camera, in_.filter_px2, in_.antialiased},
                      slots, out, stream);
     check(cudaEventRecord(gone_back_, stream), "cudaEventRecord");
 }

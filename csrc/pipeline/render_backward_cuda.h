@@ -13,7 +13,7 @@ struct ModelPicture {
     GaussianRows<const float> rows;
     ModelView<float> view;
     float filter_px2;
-    bool compensate;
+    bool antialiased;
     FrameImage image;
 };
 

@@ -107,7 +107,7 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
 }
 
 std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
-                                          float filter_px2, bool compensate, const FrameImage& image,
+                                          float filter_px2, bool antialiased, const FrameImage& image,
                                           cudaStream_t stream, const PackedPlanes* packed) {
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
@@ -120,7 +120,7 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
         batch,
         [=](const ItemList& items, cudaStream_t on) {
             launch("model_kernel", model_kernel, blocks, kModelThreads, 0, on, tables, on_device,
-                   Appearance<float>{filter_px2, compensate}, items);
+                   Appearance<float>{filter_px2, antialiased}, items);
         },
         stream);
 }

@@ -81,7 +81,7 @@ class ModelFrame {
 
     // The rows, and what is packed of them, stay where they are until the drawing is finished.
     std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
-                                  float filter_px2, bool compensate, const FrameImage& image,
+                                  float filter_px2, bool antialiased, const FrameImage& image,
                                   cudaStream_t stream, const PackedPlanes* packed = nullptr);
     FrameTape tape() const { return frame_.tape(); }
 

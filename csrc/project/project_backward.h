@@ -25,7 +25,7 @@ struct ProjectBackwardInput {
     ModelView<float> view;
     Pinhole<float> camera;
     float filter_px2;
-    bool compensate;
+    bool antialiased;
 };
 
 // Writes the gradients of every gaussian, zeros for those without a record. Those of the SH coefficients

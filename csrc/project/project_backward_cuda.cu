@@ -156,9 +156,9 @@ __global__ void __launch_bounds__(kThreads)
 
     if (used) {
         Projection<float> s;
-        const Ellipse<float> e = project_gaussian(g, in.view, in.camera, in.filter_px2, in.compensate, s);
+        const Ellipse<float> e = project_gaussian(g, in.view, in.camera, in.filter_px2, in.antialiased, s);
         Gaussian3d<float> d_gaussian =
-            project_gaussian_vjp(g, in.view, in.camera, in.filter_px2, in.compensate, s, e, d.ellipse);
+            project_gaussian_vjp(g, in.view, in.camera, in.filter_px2, in.antialiased, s, e, d.ellipse);
         Word words[Row::kWords];
         Word* row = sh_rows + (i - first) * Row::kStride;
         for (int k = 0; k < Row::kWords; ++k) words[k] = row[k];

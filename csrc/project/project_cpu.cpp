@@ -79,7 +79,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         if ((bits_of(in_front) & lanes) == 0) continue;
         Projection<V> s;
         const Ellipse<V> e =
-            project_gaussian(g, mv, camera, draw.appearance.filter_px2, draw.appearance.compensate, s);
+            project_gaussian(g, mv, camera, draw.appearance.filter_px2, draw.appearance.antialiased, s);
 
         V half_x, half_y;
         const auto drawable = in_front & extent_of(g.opacity, e, s, half_x, half_y);
@@ -155,12 +155,12 @@ void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordG
             for (int c = 0; c < 3; ++c) d_color[c][i] = r.color[c];
         }
         Projection<V> s;
-        const Ellipse<V> e =
-            project_gaussian(g, draw.view, camera, draw.appearance.filter_px2, draw.appearance.compensate, s);
+        const Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.appearance.filter_px2,
+                                              draw.appearance.antialiased, s);
         V color[3], d_sh[3 * kMaxShBases];
         color_of_sh(m.sh_degree, g.mean, draw.view, sh, color);
         Gaussian3d<V> d_g = project_gaussian_vjp(g, draw.view, camera, draw.appearance.filter_px2,
-                                                 draw.appearance.compensate, s, e, d);
+                                                 draw.appearance.antialiased, s, e, d);
         color_of_sh_vjp(m.sh_degree, g.mean, draw.view, sh, color, d_color, d_g.mean, d_sh);
         for (size_t i = 0; i < lanes; ++i) {
             const uint64_t at = source[done + i];

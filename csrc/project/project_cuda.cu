@@ -104,7 +104,7 @@ struct RowSource {
         gaussian.quat[3] = quat.w;
         if (m.sh_degree == 0) color_of<0>(m.sh, g, gaussian.mean, view, color);
         return project_gaussian(gaussian, view, in.image.camera, in.item.appearance.filter_px2,
-                                in.item.appearance.compensate, s);
+                                in.item.appearance.antialiased, s);
     }
 };
 
@@ -123,7 +123,7 @@ struct PackedSource {
         color[2] = c.w;
         const PackedGaussian gaussian{{}, 0.0f, {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, c.x};
         return project_packed(gaussian, view, in.image.camera, in.limits, in.item.appearance.filter_px2,
-                              in.item.appearance.compensate, s);
+                              in.item.appearance.antialiased, s);
     }
 };
 
@@ -147,7 +147,7 @@ __device__ SphereTest test_sphere(const ItemTables<Model>& in, const float p[3],
     const bool is_outside =
         !(p[2] >= cam.near_depth) | (reach < 0) | (from_x - half >= middle_x) | (from_y - half >= middle_y);
     // With its centre in the image it is in the frustum for certain, unless compensation makes it too faint.
-    const bool is_inside = (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.compensate;
+    const bool is_inside = (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.antialiased;
     const bool misses = is_inside & (misses_centers(u, half) | misses_centers(v, half));
     return {!(is_outside | misses), misses && !is_outside};
 }

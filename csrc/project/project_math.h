@@ -55,11 +55,11 @@ V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const Pinhole<T>& cam, T filter_p
     return e;
 }
 
-// Ellipse of a gaussian with p[2] > 0. `filter_px2` is added to both variances; with `compensate` (0 or 1)
+// Ellipse of a gaussian with p[2] > 0. `filter_px2` is added to both variances; with `antialiased` (0 or 1)
 // the opacity is multiplied by sqrt(det before / det after), which keeps what the gaussian covers.
 template <class V, class T>
 V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const ModelView<T>& mv,
-                                                const Pinhole<T>& cam, T filter_px2, bool compensate,
+                                                const Pinhole<T>& cam, T filter_px2, bool antialiased,
                                                 Projection<V>& s) {
     for (int i = 0; i < 3; ++i)
         s.p[i] = mv.linear[3 * i] * g.mean[0] + mv.linear[3 * i + 1] * g.mean[1] +
@@ -78,7 +78,7 @@ V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const Mo
         s.a2[k] = cam.fy * inv_z * (s.linear_rs[3 + k] - s.slope_y * s.linear_rs[6 + k]);
     }
     Ellipse<V> e = ellipse_of_axes(cam, filter_px2, inv_z, s);
-    const V opacity = compensate ? g.opacity * sqrt_of(s.det0 / s.det) : g.opacity;
+    const V opacity = antialiased ? g.opacity * sqrt_of(s.det0 / s.det) : g.opacity;
     e.log2_opacity = log2_of(opacity);
     return e;
 }
@@ -100,7 +100,7 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
 // As project_gaussian(); s.p is set, s.linear_rs is left alone.
 V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g, const ModelView<float>& mv,
                                                   const Pinhole<float>& cam, const SlopeLimits<float>& limits,
-                                                  float filter_px2, bool compensate, Projection<float>& s) {
+                                                  float filter_px2, bool antialiased, Projection<float>& s) {
     const float inv_z = 1 / s.p[2];
     set_slopes(limits, inv_z, s);
     float row1[3], row2[3];  // of the Jacobian times the view
@@ -115,7 +115,7 @@ V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g, const
     s.a1[2] = row1[1] * g.f[6] + row1[2] * g.f[7];
     s.a2[2] = row2[1] * g.f[6] + row2[2] * g.f[7];
     Ellipse<float> e = ellipse_of_axes(cam, filter_px2, inv_z, s);
-    e.log2_opacity = compensate ? g.log2_opacity + 0.5f * log2_of(s.det0 / s.det) : g.log2_opacity;
+    e.log2_opacity = antialiased ? g.log2_opacity + 0.5f * log2_of(s.det0 / s.det) : g.log2_opacity;
     return e;
 }
 
@@ -171,7 +171,7 @@ V3DG_HD V3DG_INLINE auto pixel_box(const Ellipse<V>& e, V half_x, V half_y, cons
 // Gradients of the gaussian's mean, quaternion, scales and opacity from those of its ellipse.
 template <class V, class T>
 V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g, const ModelView<T>& mv,
-                                                       const Pinhole<T>& cam, T filter_px2, bool compensate,
+                                                       const Pinhole<T>& cam, T filter_px2, bool antialiased,
                                                        const Projection<V>& s, const Ellipse<V>& e,
                                                        const Ellipse<V>& d) {
     const V inv_z = 1 / s.p[2];
@@ -185,7 +185,7 @@ V3DG_HD V3DG_INLINE Gaussian3d<V> project_gaussian_vjp(const Gaussian3d<V>& g, c
     Gaussian3d<V> out;
     // log2_opacity = log2(opacity) + log2(det0 / det) / 2
     out.opacity = d.log2_opacity / (T(kLn2) * g.opacity);
-    if (compensate) {
+    if (antialiased) {
         d_det -= d.log2_opacity / (T(2 * kLn2) * s.det);
         d_det0 = d.log2_opacity / (T(2 * kLn2) * s.det0);
     }

@@ -68,7 +68,7 @@ BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& a
     upload.add(t.top_group);
     upload.add(t.top_cluster);
     upload.add(on_device_.appearance.filter_px2);
-    upload.add(on_device_.appearance.compensate);
+    upload.add(on_device_.appearance.antialiased);
     upload.add(on_device_.bounds);
     upload.add(joins_on_device);
     upload.finish(storage_, stream);

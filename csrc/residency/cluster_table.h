@@ -31,10 +31,10 @@ struct ClusterTable {
 
 // How the clusters of a bundle are drawn.
 struct ClusterAppearance {
-    Span<const float> filter_px2;    // [C]
-    Span<const uint8_t> compensate;  // [C]
+    Span<const float> filter_px2;     // [C]
+    Span<const uint8_t> antialiased;  // [C]
 
-    V3DG_HD Appearance<float> operator[](size_t c) const { return {filter_px2[c], compensate[c] != 0}; }
+    V3DG_HD Appearance<float> operator[](size_t c) const { return {filter_px2[c], antialiased[c] != 0}; }
 };
 
 // The tables of a bundle on the host. Borrows the arrays that it is given and owns what it derives from them.

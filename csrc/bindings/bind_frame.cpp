@@ -1,0 +1,377 @@
+#include <atomic>
+#include <memory>
+#include <vector>
+
+#include "bindings/operations.h"
+#include "bindings/picture.h"
+#include "bindings/resident.h"
+#include "pipeline/scene_frame.h"
+
+namespace v3dg {
+
+namespace {
+
+// Asks, from any thread, for work under way to end early.
+class Stop {
+  public:
+    void request() { requested_.store(true, std::memory_order_relaxed); }
+    bool is_requested() const { return requested_.load(std::memory_order_relaxed); }
+    const std::atomic<bool>* flag() const { return &requested_; }
+
+  private:
+    std::atomic<bool> requested_{false};
+};
+
+const std::atomic<bool>* flag_of(const Stop* stop) { return stop == nullptr ? nullptr : stop->flag(); }
+
+// What a frame came to; times in milliseconds.
+struct FrameStats {
+    int64_t gaussians;  // selected; where the budget is exceeded, what the coarsest cut has
+    uint64_t in_frustum, records, entries, items;
+    float tolerance_px2;
+    bool exceeds_budget;
+    double select_ms, draw_ms;
+};
+
+FrameStats stats_of(const SceneFrameCounts& c) {
+    return {c.gaussians,     c.render.in_frustum, c.render.records,       c.render.entries,    0,
+            c.tolerance_px2, c.exceeds_budget,    1e3 * c.select_seconds, 1e3 * c.draw_seconds};
+}
+
+// A frame that has been drawn, or enqueued on a device, with what it reads and writes.
+class BoundDrawing {
+  public:
+    BoundDrawing(NewPicture picture, const FrameStats& stats) : picture_(std::move(picture)), stats_(stats) {}
+
+#if V3DG_WITH_CUDA
+    // `kept` are the frame, which may have to draw again, and what it reads.
+    BoundDrawing(NewPicture picture, py::object kept, Device device, std::unique_ptr<cuda::Drawing> drawing)
+        : picture_(std::move(picture)),
+          kept_(std::move(kept)),
+          device_(device),
+          drawing_(std::move(drawing)) {}
+#endif
+
+    const NewPicture& picture() const { return picture_; }
+
+    const FrameStats& finish() {
+#if V3DG_WITH_CUDA
+        if (drawing_ != nullptr) {
+            const Work work(device_);
+            {
+                const py::gil_scoped_release unlocked;
+                drawing_->wait();
+            }
+            const cuda::FrameCounters& c = drawing_->finish();  // may draw, and so keeps other threads out
+            const cuda::FrameTimes times = drawing_->times();
+            const bool exceeds = c.choice.exceeds_budget;
+            stats_ = {static_cast<int64_t>(exceeds ? c.choice.least : c.gaussians),
+                      c.in_frustum,
+                      c.records,
+                      c.entries,
+                      c.items,
+                      c.choice.tolerance_px2,
+                      exceeds,
+                      times.prepare_ms,
+                      times.draw_ms};
+        }
+#endif
+        return stats_;
+    }
+
+  private:
+    NewPicture picture_;
+    FrameStats stats_{};
+#if V3DG_WITH_CUDA
+    py::object kept_;
+    Device device_;
+    std::unique_ptr<cuda::Drawing> drawing_;  // gone before what it needs
+#endif
+};
+
+using Background = std::array<double, 3>;
+
+NewPicture picture_of(const Window& window, bool with_depth) {
+    return {window.height(), window.width(), {}, {}, py::none(), with_depth};
+}
+
+// Draws scenes of the same bundles on one device.
+class BoundSceneFrame {
+  public:
+    explicit BoundSceneFrame(int device) : device_{device} {
+        const Work work(device_);
+#if V3DG_WITH_CUDA
+        if (!device_.is_host()) frame_ = std::make_unique<cuda::SceneFrame>();
+#endif
+    }
+
+    // The gaussians of each bundle and, unless there are none, the colours of their clusters.
+    void set_models(const py::list& models, const py::list& palettes) {
+        if (!palettes.empty() && palettes.size() != models.size())
+            throw py::value_error("palettes: expected none, or one for each model");
+        std::vector<SceneModel> host;
+        std::vector<size_t> num_gaussians;
+        for (const py::handle& item : models) {
+            const auto& model = held<BoundModel>(item, "models");
+            check_device(model.device(), "models");
+            num_gaussians.push_back(model.size());
+            if (device_.is_host()) host.push_back({&model.host().planes(), {}, {}, {}});
+        }
+        for (size_t b = 0; b < palettes.size(); ++b) {
+            const auto& palette = held<BoundPalette>(palettes[b], "palettes");
+            check_device(palette.device(), "palettes");
+            if (device_.is_host()) host[b].palette = palette.host();
+        }
+#if V3DG_WITH_CUDA
+        if (!device_.is_host()) set_models_on_device(models, palettes);
+#endif
+        host_ = std::move(host);
+        num_gaussians_ = std::move(num_gaussians);
+        models_ = models;
+        palettes_ = palettes;
+    }
+
+    std::unique_ptr<BoundDrawing> draw(const py::object& scene_object, const BoundCamera& camera,
+                                       const SelectRule& rule, const Background& background,
+                                       const Stop* stop) {
+        auto& scene = checked(scene_object);
+        if (device_.is_host())
+            return on_host(scene, camera, background, true,
+                           [&](const HostScene& host, const Picture<float>& picture) {
+                               return cpu::draw_scene(host, camera.camera, rule, picture, flag_of(stop));
+                           });
+#if V3DG_WITH_CUDA
+        const Work work(device_);
+        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
+        const cuda::FrameImage image = picture.on_device(device_, camera.camera, background);
+        auto drawing = frame_->draw(scene.on_device(), camera.camera, rule, image, work.stream());
+        return std::make_unique<BoundDrawing>(
+            std::move(picture), py::make_tuple(py::cast(this), scene_object), device_, std::move(drawing));
+#else
+        return nullptr;
+#endif
+    }
+
+    std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object, const BoundCamera& camera,
+                                           const py::object& instance_ids, const py::object& cluster_ids,
+                                           const Background& background, const Stop* stop) {
+        auto& scene = checked(scene_object);
+        const Span<const int32_t> instance =
+            span_on<const int32_t>(device_, instance_ids, "instance_ids", {-1});
+        const Span<const int32_t> cluster = span_on<const int32_t>(device_, cluster_ids, "cluster_ids",
+                                                                   {static_cast<py::ssize_t>(instance.size)});
+        if (device_.is_host())
+            return on_host(
+                scene, camera, background, true, [&](const HostScene& host, const Picture<float>& picture) {
+                    return cpu::draw_cut(host, camera.camera, instance, cluster, picture, flag_of(stop));
+                });
+#if V3DG_WITH_CUDA
+        const Work work(device_);
+        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
+        const cuda::FrameImage image = picture.on_device(device_, camera.camera, background);
+        auto drawing =
+            frame_->draw_cut(scene.on_device(), camera.camera, instance, cluster, image, work.stream());
+        return std::make_unique<BoundDrawing>(
+            std::move(picture), py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids),
+            device_, std::move(drawing));
+#else
+        return nullptr;
+#endif
+    }
+
+    // As draw_cut(), with the number of gaussians that each pixel is blended of in place of depth.
+    std::unique_ptr<BoundDrawing> count_cut(const py::object& scene_object, const BoundCamera& camera,
+                                            const py::array& instance_ids, const py::array& cluster_ids,
+                                            const Stop* stop) {
+        require_host("count_cut");
+        const Span<const int32_t> instance = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
+        const Span<const int32_t> cluster =
+            span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instance.size)});
+        return on_host(checked(scene_object), camera, {0, 0, 0}, true,
+                       [&](const HostScene& host, Picture<float> picture) {
+                           std::swap(picture.depth, picture.count);
+                           return cpu::draw_cut(host, camera.camera, instance, cluster, picture,
+                                                flag_of(stop));
+                       });
+    }
+
+    // (place in the cut, weight, depth), or None.
+    py::object pick_cut(const py::object& scene_object, const BoundCamera& camera,
+                        const py::array& instance_ids, const py::array& cluster_ids) {
+        require_host("pick_cut");
+        const std::shared_ptr<const SceneState> state = checked(scene_object).state();
+        const Span<const int32_t> instance = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
+        const Span<const int32_t> cluster =
+            span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instance.size)});
+        const std::vector<SceneModel> models = models_of(*state);
+        ScenePick picked{};
+        bool shows_any = false;
+        {
+            const py::gil_scoped_release unlocked;
+            shows_any = cpu::pick_cut(host_scene(*state, models), camera.camera, instance, cluster, picked);
+        }
+        if (!shows_any) return py::none();
+        return py::make_tuple(picked.pair, picked.weight, picked.depth);
+    }
+
+  private:
+    BoundScene& checked(const py::object& scene_object) const {
+        auto& scene = held<BoundScene>(scene_object, "scene");
+        if (scene.device() != device_) throw py::value_error("scene: expected one on the frame's device");
+        if (scene.state()->num_gaussians != num_gaussians_)
+            throw py::value_error("scene: expected one of the bundles that the frame has the gaussians of");
+        return scene;
+    }
+
+    void check_device(Device device, const char* name) const {
+        if (device != device_)
+            throw py::value_error(std::string(name) + ": expected what is on the frame's device, got others");
+    }
+
+#if V3DG_WITH_CUDA
+    void set_models_on_device(const py::list& models, const py::list& palettes) {
+        std::vector<std::shared_ptr<const cuda::PackedModel>> packed;
+        for (const py::handle& model : models) packed.push_back(model.cast<const BoundModel&>().packed());
+        std::vector<std::shared_ptr<const cuda::DevicePalette>> colors;
+        for (const py::handle& palette : palettes)
+            colors.push_back(palette.cast<const BoundPalette&>().on_device());
+        const Work work(device_);
+        frame_->set_models(std::move(packed), std::move(colors), work.stream());
+    }
+#endif
+
+    void require_host(const char* name) const {
+        if (!device_.is_host())
+            throw py::value_error(std::string(name) +
+                                  ": expected a frame on the CPU, got one on a CUDA device");
+    }
+
+    std::vector<SceneModel> models_of(const SceneState& scene) const {
+        std::vector<SceneModel> models = host_;
+        for (size_t b = 0; b < models.size(); ++b) {
+            models[b].pages = whole_bundle(scene.tables[b]);
+            models[b].appearance = scene.bundle(b).appearance();
+        }
+        return models;
+    }
+
+    static HostScene host_scene(const SceneState& scene, const std::vector<SceneModel>& models) {
+        return {{scene.tables.data(), scene.tables.size()}, {models.data(), models.size()}, scene.instances};
+    }
+
+    // The window of the camera, drawn by draw(host scene, picture) without Python's lock.
+    template <class DrawPicture>
+    std::unique_ptr<BoundDrawing> on_host(const BoundScene& scene, const BoundCamera& camera,
+                                          const Background& background, bool with_depth,
+                                          const DrawPicture& draw_picture) const {
+        const Window window = window_of(camera.camera);
+        NewPicture out = picture_of(window, with_depth);
+        const Picture<float> picture = out.on_host<float>(window, background);
+        const std::shared_ptr<const SceneState> state = scene.state();
+        const std::vector<SceneModel> models = models_of(*state);
+        const py::list gaussians = models_, colors = palettes_;  // which another thread may replace meanwhile
+        SceneFrameCounts counts;
+        {
+            const py::gil_scoped_release unlocked;
+            counts = draw_picture(host_scene(*state, models), picture);
+        }
+        return std::make_unique<BoundDrawing>(std::move(out), stats_of(counts));
+    }
+
+    Device device_;
+    py::list models_, palettes_;
+    std::vector<size_t> num_gaussians_;  // of each bundle
+    std::vector<SceneModel> host_;       // without what the scene knows of the clusters
+#if V3DG_WITH_CUDA
+    std::unique_ptr<cuda::SceneFrame> frame_;  // on a device
+#endif
+};
+
+// Draws the gaussians of one asset, which have no levels.
+class BoundAssetFrame {
+  public:
+    explicit BoundAssetFrame(const py::object& model) : model_(model) {
+        const Work work(held<BoundModel>(model, "model").device());
+#if V3DG_WITH_CUDA
+        if (!work.device().is_host()) frame_ = std::make_unique<cuda::ModelFrame>();
+#endif
+    }
+
+    std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Background& background,
+                                       const Stop* stop) {
+        const auto& model = held<BoundModel>(model_, "model");
+        if (model.device().is_host()) return on_host(model.host(), camera, background, stop);
+#if V3DG_WITH_CUDA
+        const Device device = model.device();
+        const Work work(device);
+        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
+        const cuda::FrameImage image = picture.on_device(device, camera.camera, background);
+        const cuda::PackedModel& packed = *model.packed();
+        auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
+                                    work.stream(), &packed.packed());
+        return std::make_unique<BoundDrawing>(std::move(picture), py::cast(this), device, std::move(drawing));
+#else
+        return nullptr;
+#endif
+    }
+
+  private:
+    static std::unique_ptr<BoundDrawing> on_host(const Model<float>& model, const BoundCamera& camera,
+                                                 const Background& background, const Stop* stop) {
+        const Window window = window_of(camera.camera);
+        NewPicture out = picture_of(window, true);
+        const Picture<float> picture = out.on_host<float>(window, background);
+        SceneFrameCounts counts;
+        {
+            const py::gil_scoped_release unlocked;
+            counts = cpu::draw_model(model.planes(), model.size(), camera.camera, picture, flag_of(stop));
+        }
+        return std::make_unique<BoundDrawing>(std::move(out), stats_of(counts));
+    }
+
+    py::object model_;
+#if V3DG_WITH_CUDA
+    std::unique_ptr<cuda::ModelFrame> frame_;  // on a device
+#endif
+};
+
+}  // namespace
+
+void bind_frame(py::module_& m) {
+    py::class_<Stop>(m, "Stop", "Asks, from any thread, for a picture under way to be given up.")
+        .def(py::init<>())
+        .def("request", &Stop::request)
+        .def_property_readonly("is_requested", &Stop::is_requested);
+    py::class_<FrameStats>(m, "FrameStats", "What a frame came to.")
+        .def_readonly("gaussians", &FrameStats::gaussians)
+        .def_readonly("in_frustum", &FrameStats::in_frustum)
+        .def_readonly("records", &FrameStats::records)
+        .def_readonly("entries", &FrameStats::entries)
+        .def_readonly("items", &FrameStats::items)
+        .def_readonly("tolerance_px2", &FrameStats::tolerance_px2)
+        .def_readonly("exceeds_budget", &FrameStats::exceeds_budget)
+        .def_readonly("select_ms", &FrameStats::select_ms)
+        .def_readonly("draw_ms", &FrameStats::draw_ms);
+    py::class_<BoundDrawing>(m, "Drawing", "A frame that has been drawn, or enqueued on a device.")
+        .def_property_readonly("color", [](const BoundDrawing& d) { return d.picture().color; })
+        .def_property_readonly("alpha", [](const BoundDrawing& d) { return d.picture().alpha; })
+        .def_property_readonly("depth", [](const BoundDrawing& d) { return d.picture().depth; })
+        .def("finish", &BoundDrawing::finish, py::return_value_policy::copy, "Waits for the picture.");
+    py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
+        .def(py::init<int>(), "device"_a)
+        .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
+        .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "background"_a,
+             "stop"_a = nullptr)
+        .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,
+             "background"_a, "stop"_a = nullptr)
+        .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,
+             "cluster_ids"_a, "stop"_a = nullptr)
+        .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
+             "cluster_ids"_a);
+    py::class_<BoundAssetFrame>(m, "AssetFrame",
+                                "Draws gaussians without levels on the device that they are on.")
+        .def(py::init<py::object>(), "model"_a)
+        .def("draw", &BoundAssetFrame::draw, "camera"_a, "background"_a, "stop"_a = nullptr);
+}
+
+}  // namespace v3dg

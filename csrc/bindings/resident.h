@@ -1,0 +1,221 @@
+#pragma once
+
+// What stays on one device from frame to frame: gaussians, palettes and scenes.
+
+#include <memory>
+#include <vector>
+
+#include "bindings/tables.h"
+#include "pipeline/model.h"
+#include "select/select.h"
+
+#if V3DG_WITH_CUDA
+#include "pipeline/scene_frame_cuda.h"
+#endif
+
+namespace v3dg {
+
+// The gaussians of a bundle or an asset as frames of one device read them.
+class BoundModel {
+  public:
+    explicit BoundModel(const Rows& rows) : device_(rows.device()), size_(rows.size()) {
+        const GaussianRows<const float> read = rows.read<float>();
+        const Work work(device_);
+        if (device_.is_host()) {
+            const py::gil_scoped_release unlocked;
+            host_ = std::make_shared<Model<float>>(read);
+            return;
+        }
+#if V3DG_WITH_CUDA
+        rows_ = std::make_unique<Rows>(rows);
+        packed_ = std::make_shared<cuda::PackedModel>(read, work.stream());
+#endif
+    }
+
+    Device device() const { return device_; }
+    size_t size() const { return size_; }
+    const Model<float>& host() const { return *host_; }
+    size_t bytes() const {
+        if (host_ != nullptr) return host_->bytes();
+#if V3DG_WITH_CUDA
+        return packed_->bytes() + size_ * sizeof(float) * (11 + 3 * num_sh_bases(rows_->sh_degree()));
+#else
+        return 0;
+#endif
+    }
+#if V3DG_WITH_CUDA
+    const std::shared_ptr<const cuda::PackedModel>& packed() const { return packed_; }
+#endif
+
+  private:
+    Device device_;
+    size_t size_;
+    std::shared_ptr<Model<float>> host_;
+#if V3DG_WITH_CUDA
+    std::unique_ptr<Rows> rows_;  // which the packed model reads
+    std::shared_ptr<const cuda::PackedModel> packed_;
+#endif
+};
+
+// Colours of the clusters of one bundle on one device.
+class BoundPalette {
+  public:
+    BoundPalette(const py::object& table_object, const py::array& sh, int device)
+        : table_(table_object), sh_(sh), device_{device} {
+        const auto& table = held<BoundTable>(table_object, "table");
+        const auto clusters = static_cast<py::ssize_t>(table.table().num_clusters());
+        const Span<const float> colors = span_of<const float>(sh, "sh", {clusters, 3});
+        host_ = {colors.data, whole_bundle(table.table()).first_row.data, static_cast<uint32_t>(clusters)};
+        const Work work(device_);
+#if V3DG_WITH_CUDA
+        if (device_.is_host()) return;
+        on_device_ = std::make_shared<cuda::DevicePalette>(colors, table.on_device(work), work.stream());
+#endif
+    }
+
+    Device device() const { return device_; }
+    const Palette& host() const { return host_; }
+#if V3DG_WITH_CUDA
+    const std::shared_ptr<const cuda::DevicePalette>& on_device() const { return on_device_; }
+#endif
+
+  private:
+    py::object table_;
+    py::array sh_;
+    Device device_;
+    Palette host_;
+#if V3DG_WITH_CUDA
+    std::shared_ptr<const cuda::DevicePalette> on_device_;
+#endif
+};
+
+// A scene as the host knows it. It stays as it is: whoever draws it keeps it, and a change makes another.
+struct SceneState {
+    py::list bundles;
+    py::tuple arrays;
+    std::vector<ClusterTable> tables;
+    std::vector<size_t> num_gaussians;  // of each bundle
+    InstanceTable instances;
+
+    const BoundTable& bundle(size_t b) const { return held<BoundTable>(bundles[b], "tables"); }
+};
+
+// What selection reads of a scene, on one device.
+class BoundScene {
+  public:
+    explicit BoundScene(int device) : device_{device}, state_(std::make_shared<SceneState>()) {
+        const Work work(device_);
+#if V3DG_WITH_CUDA
+        if (!device_.is_host()) {
+            on_device_ = std::make_unique<cuda::SceneTables>();
+            cut_ = std::make_unique<cuda::Cut>();
+        }
+#endif
+        set_bundles(py::list());
+    }
+
+    Device device() const { return device_; }
+    std::shared_ptr<const SceneState> state() const { return state_; }
+#if V3DG_WITH_CUDA
+    const cuda::SceneTables& on_device() const { return *on_device_; }
+#endif
+
+    // Takes the place of all bundles; instances come next.
+    void set_bundles(const py::list& bundles) {
+        auto state = std::make_shared<SceneState>();
+        state->bundles = bundles;
+        for (const py::handle& bundle : bundles) {
+            const auto& table = held<BoundTable>(bundle, "tables");
+            state->tables.push_back(table.table());
+            state->num_gaussians.push_back(table.num_gaussians());
+        }
+#if V3DG_WITH_CUDA
+        if (!device_.is_host()) {
+            const Work work(device_);
+            std::vector<std::shared_ptr<const cuda::BundleTables>> tables;
+            for (size_t b = 0; b < state->tables.size(); ++b)
+                tables.push_back(state->bundle(b).on_device(work));
+            on_device_->set_bundles(std::move(tables), work.stream());
+        }
+#endif
+        state_ = std::move(state);
+    }
+
+    void set_instances(const py::array& bundle, const py::array& importance, const py::object& positions,
+                       const py::object& quaternions, const py::object& scales) {
+        auto state = std::make_shared<SceneState>(*state_);
+        InstanceTable& instances = state->instances;
+        instances.bundle = span_of<const int32_t>(bundle, "bundle", {-1});
+        check_instance_bundles(instances.bundle, state->tables.size());
+        const auto count = static_cast<py::ssize_t>(instances.bundle.size);
+        instances.importance = span_of<const float>(importance, "importance", {count});
+        state->arrays = py::make_tuple(bundle, importance, positions, quaternions, scales);
+        if (device_.is_host()) {
+            instances.position = span_of<const double>(positions, "positions", {count, 3});
+            instances.quaternion = span_of<const double>(quaternions, "quaternions", {count, 4});
+            instances.scale = span_of<const double>(scales, "scales", {count});
+        }
+#if V3DG_WITH_CUDA
+        if (!device_.is_host()) {
+            const Work work(device_);
+            on_device_->set_instances(instances.bundle, instances.importance, work.stream());
+        }
+#endif
+        state_ = std::move(state);
+        if (!device_.is_host()) set_poses(positions, quaternions, scales);
+    }
+
+    // New poses of the same instances.
+    void set_poses(const py::object& positions, const py::object& quaternions, const py::object& scales) {
+        if (device_.is_host()) {
+            const py::tuple arrays = state_->arrays;
+            set_instances(arrays[0], arrays[1], positions, quaternions, scales);
+            return;
+        }
+#if V3DG_WITH_CUDA
+        auto state = std::make_shared<SceneState>(*state_);
+        const auto count = static_cast<py::ssize_t>(state->instances.bundle.size);
+        state->arrays = py::make_tuple(state->arrays[0], state->arrays[1], positions, quaternions, scales);
+        const Work work(device_);
+        on_device_->set_poses(doubles_anywhere(positions, "positions", {count, 3}),
+                              doubles_anywhere(quaternions, "quaternions", {count, 4}),
+                              doubles_anywhere(scales, "scales", {count}), work.stream());
+        state_ = std::move(state);
+#endif
+    }
+
+    BoundCut select(const BoundCamera& camera, const SelectRule& rule) {
+        const std::shared_ptr<const SceneState> state = state_;
+        SelectOutput out;
+        const Work work(device_);
+        {
+            const py::gil_scoped_release unlocked;
+            if (device_.is_host())
+                cpu::select(
+                    {{state->tables.data(), state->tables.size()}, state->instances, camera.camera, rule},
+                    out);
+#if V3DG_WITH_CUDA
+            else
+                cut_->select(*on_device_, camera.camera, rule, out, work.stream());
+#endif
+        }
+        return BoundCut(out);
+    }
+
+  private:
+#if V3DG_WITH_CUDA
+    static cuda::PoseSpan doubles_anywhere(const py::handle& array, const char* name, Shape shape) {
+        const bool is_host = device_of(array, name).is_host();
+        return {is_host ? span_of<const double>(array, name, shape)
+                        : device_span_of<const double>(array, name, shape),
+                !is_host};
+    }
+    std::unique_ptr<cuda::SceneTables> on_device_;
+    std::unique_ptr<cuda::Cut> cut_;
+#endif
+
+    Device device_;
+    std::shared_ptr<const SceneState> state_;
+};
+
+}  // namespace v3dg

@@ -1,0 +1,100 @@
+// Draws a small scene with the core alone, without Python: two instances of a bundle of one level, chosen and
+// drawn in one call, as a .ppm. Built by `cmake --build build/cpu --target draw_scene`.
+
+#include <cmath>
+#include <cstdio>
+#include <vector>
+
+#include "math/sh.h"
+#include "pipeline/model.h"
+#include "pipeline/scene_frame.h"
+
+using namespace v3dg;
+
+constexpr size_t kGaussians = 2000, kClusterSize = 250, kClusters = kGaussians / kClusterSize;
+constexpr int kWidth = 320, kHeight = 240;
+
+// Gaussians on a spiral around a unit sphere, clusters from pole to pole.
+struct Globe {
+    std::vector<float> means, quats, scales, opacities, sh;
+
+    Globe() {
+        for (size_t i = 0; i < kGaussians; ++i) {
+            const double z = 1 - (2 * i + 1) / double(kGaussians), turn = 2.4 * i,
+                         ring = std::sqrt(1 - z * z);
+            for (const double x : {ring * std::cos(turn), ring * std::sin(turn), z}) {
+                means.push_back(float(x));
+                scales.push_back(0.04f);
+                sh.push_back(float(0.4 * x / kShBase0));
+            }
+            for (const float q : {1.0f, 0.0f, 0.0f, 0.0f}) quats.push_back(q);
+            opacities.push_back(0.9f);
+        }
+    }
+    GaussianRows<const float> rows() const {
+        return {means.data(), quats.data(), scales.data(), opacities.data(), sh.data(), kGaussians, 0};
+    }
+};
+
+int main(int num_arguments, char** arguments) {
+    const Globe globe;
+    const Model<float> model(globe.rows());
+
+    // A bundle of one level: no groups, so every cluster is a leaf and a root.
+    std::vector<Box> boxes(kClusters, Box{{-1.2f, -1.2f, -1.2f}, {1.2f, 1.2f, 1.2f}});
+    const std::vector<int32_t> no_group(kClusters, -1);
+    const std::vector<float> filters(kClusters, 0.0f);
+    const std::vector<uint8_t> antialiased(kClusters, 0);
+    std::vector<int64_t> offset;
+    for (size_t c = 0; c <= kClusters; ++c) offset.push_back(static_cast<int64_t>(c * kClusterSize));
+    ClusterTable given{};
+    given.own_group = {no_group.data(), kClusters};
+    given.parent_group = {no_group.data(), kClusters};
+    given.box = {boxes.data(), kClusters};
+    given.offset = {offset.data(), offset.size()};
+    const HostTable table(given, {{filters.data(), kClusters}, {antialiased.data(), kClusters}});
+
+    const std::vector<int32_t> bundle_of_instance{0, 0};
+    const std::vector<double> position{-1.3, 0, 0, 1.3, 0, 0}, quaternion{1, 0, 0, 0, 1, 0, 0, 0},
+        scale{1, 0.7};
+    const std::vector<float> importance{1, 1};
+    const SceneModel drawn{&model.planes(), whole_bundle(table.table()), table.appearance(), {}};
+    const HostScene scene{{&table.table(), 1},
+                          {&drawn, 1},
+                          {{bundle_of_instance.data(), 2},
+                           {position.data(), 6},
+                           {quaternion.data(), 8},
+                           {scale.data(), 2},
+                           {importance.data(), 2}}};
+
+    // A camera at (0, 0, -6) that looks along z.
+    Camera camera{};
+    const double viewmat[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 6, 0, 0, 0, 1};
+    for (int row = 0; row < 3; ++row) {
+        for (int k = 0; k < 3; ++k) camera.rotation[3 * row + k] = viewmat[4 * row + k];
+        camera.translation[row] = viewmat[4 * row + 3];
+    }
+    eye_of(viewmat, camera.eye);
+    camera.fx = camera.fy = 400;
+    camera.cx = kWidth / 2;
+    camera.cy = kHeight / 2;
+    camera.x1 = camera.width = kWidth;
+    camera.y1 = camera.height = kHeight;
+    camera.near = 0.01;
+
+    std::vector<float> color(3 * kWidth * kHeight), alpha(kWidth * kHeight);
+    const Picture<float> picture{
+        {0, 0, kWidth, kHeight}, {0.1f, 0.1f, 0.15f}, color.data(), alpha.data(), nullptr};
+    SelectRule rule{};
+    rule.tolerance_px2 = 3.0f;
+    const SceneFrameCounts counts = cpu::draw_scene(scene, camera, rule, picture);
+    std::printf("%lld gaussians selected, %llu in the frustum\n", static_cast<long long>(counts.gaussians),
+                static_cast<unsigned long long>(counts.render.in_frustum));
+
+    std::FILE* file = std::fopen(num_arguments > 1 ? arguments[1] : "draw_scene.ppm", "wb");
+    if (file == nullptr) return 1;
+    std::fprintf(file, "P6\n%d %d\n255\n", kWidth, kHeight);
+    for (const float value : color)
+        std::fputc(static_cast<int>(255 * std::fmin(std::fmax(value, 0), 1) + 0.5f), file);
+    return std::fclose(file);
+}

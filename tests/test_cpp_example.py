@@ -1,0 +1,26 @@
+"""The C++ example: the core draws a scene without Python."""
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent
+# What .ci/run and the presets of CMake make.
+BUILDS = [path for name in ("ci/cpp", "dev", "cpu") if (path := ROOT / "build" / name).is_dir()]
+
+
+def test_core_draws_a_scene_without_python(tmp_path):
+    if not BUILDS:
+        pytest.skip("needs a build by a preset: cmake --preset cpu")
+    subprocess.run(["cmake", "--build", BUILDS[0], "--target", "draw_scene"], check=True, capture_output=True)
+    picture = tmp_path / "scene.ppm"
+    done = subprocess.run([BUILDS[0] / "draw_scene", picture], check=True, capture_output=True, text=True)
+    assert done.stdout == "4000 gaussians selected, 4000 in the frustum\n"
+    pixels = np.frombuffer(picture.read_bytes()[-320 * 240 * 3 :], np.uint8).reshape(240, 320, 3)
+    background = np.array([26, 26, 38])
+    shown = (pixels != background).any(axis=2)
+    # A ball on either side, the right one smaller.
+    left, right = shown[:, :160].sum(), shown[:, 160:].sum()
+    assert 0.1 < right / shown.size < left / shown.size < 0.4
