@@ -30,7 +30,7 @@ struct Workspace {
 struct RenderCounts {
     uint64_t in_frustum;  // gaussians whose extent meets the image
     uint64_t records;     // of them, those that reach a pixel centre
-    uint64_t entries;     // (record, tile) pairs in the window
+    uint64_t entries;     // records in the lists of the window's tiles
     double project_seconds, bin_seconds, rasterize_seconds;
 };
 

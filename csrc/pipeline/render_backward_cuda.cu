@@ -30,9 +30,8 @@ void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
         frame_.draw(in.rows, in.view, in.filter_px2, in.antialiased, in.image, stream);
     num_slots_ = drawing->settle().slots;
     if (num_slots_ > UINT32_MAX)
-        throw std::length_error(
-            "gaussians: expected at most 4294967295 pairs with tiles to differentiate, got " +
-            std::to_string(num_slots_));
+        throw std::length_error("gaussians: expected at most 4294967295 gradient slots, got " +
+                                std::to_string(num_slots_));
     check(cudaEventRecord(drawn_, stream), "cudaEventRecord");
 }
 

@@ -105,7 +105,7 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std
         const double share =
             static_cast<double>(pieces[p].count) /
             static_cast<double>(std::min(kFew, pieces[p].count) * (last - first + 1)) *
-            static_cast<double>(few.drawn * sizeof(Record<T>) + few.pairs * sizeof(uint64_t));
+            static_cast<double>(few.drawn * sizeof(Record<T>) + few.entries * sizeof(uint64_t));
         for (int r = std::max(first - grid.first_row, 0); r <= std::min(last - grid.first_row, grid.rows - 1);
              ++r) {
             row_bytes[r] += share;
@@ -245,16 +245,16 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
     const uint64_t* entry = ws.lists.entry.data();
-    // Each (record, tile) pair has a place of its own, the pairs of a record side by side in the order of the
+    // Each tile of a record has a gradient slot, the slots of a record side by side in the order of the
     // tiles, so the sum over tiles does not depend on which thread came first.
-    std::vector<uint64_t> pair_first(ws.num_records);
-    uint64_t num_pairs = 0;
+    std::vector<uint64_t> first_slot(ws.num_records);
+    uint64_t num_slots = 0;
     for (size_t c = 0; c < ws.num_chunks; ++c)
         for (uint64_t r = ws.chunk_first.data()[c], end = r + ws.chunk_count.data()[c]; r < end; ++r) {
-            pair_first[r] = num_pairs;
-            num_pairs += num_tiles_of(records[r]);
+            first_slot[r] = num_slots;
+            num_slots += num_tiles_of(records[r]);
         }
-    std::vector<RecordGradient<T>> d_pair(num_pairs);
+    std::vector<RecordGradient<T>> d_slot(num_slots);
     std::vector<T> d_background_of_tile(3 * grid.size(), T(0));
     const std::vector<uint32_t> order = tiles_by_load(offset, grid.size());
     std::vector<std::vector<RecordGradient<T>>> d_entries(omp_get_max_threads());
@@ -270,7 +270,7 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
             const uint32_t r = record_of(entry[offset[t] + e]);
             const int x0 = records[r].x0 / kTileSize, x1 = records[r].x1 / kTileSize,
                       y0 = records[r].y0 / kTileSize;
-            d_pair[pair_first[r] + static_cast<uint64_t>(row - y0) * (x1 - x0 + 1) + (column - x0)] =
+            d_slot[first_slot[r] + static_cast<uint64_t>(row - y0) * (x1 - x0 + 1) + (column - x0)] =
                 d_entry[e];
         }
     });
@@ -283,8 +283,8 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
         std::vector<RecordGradient<T>> d_records(count);
         for (uint32_t i = 0; i < count; ++i) {
             const Record<T>& r = records[first + i];
-            const uint64_t pairs = num_tiles_of(r);
-            for (uint64_t p = 0; p < pairs; ++p) d_records[i] += d_pair[pair_first[first + i] + p];
+            const uint64_t slots = num_tiles_of(r);
+            for (uint64_t p = 0; p < slots; ++p) d_records[i] += d_slot[first_slot[first + i] + p];
         }
         V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(), count,
                           camera, out);

@@ -16,7 +16,7 @@ namespace v3dg {
 struct Reach {
     uint64_t in_frustum = 0;              // gaussians whose extent meets the image
     uint64_t drawn = 0;                   // of them, those that reach a pixel centre
-    uint64_t pairs = 0;                   // of those with tiles
+    uint64_t entries = 0;                 // of those in the lists of tiles, by their pixel boxes
     int top = INT_MAX, bottom = INT_MIN;  // rows that hold all those pixels
 };
 

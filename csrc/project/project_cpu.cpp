@@ -66,7 +66,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
     constexpr int kWidth = kLanes<T>;
     const GaussianPlanes<T>& model = *draw.model;
     const int width = static_cast<int>(camera.width), height = static_cast<int>(camera.height);
-    I top = I{} + INT_MAX, bottom = I{} - 1, pairs = I{};
+    I top = I{} + INT_MAX, bottom = I{} - 1, entries = I{};
     size_t num_records = 0;
     for (uint64_t done = 0; done < count; done += kWidth) {
         const uint64_t at = draw.first + skip + done;
@@ -98,7 +98,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         // The boxes of gaussians that are not drawn may be so large that the product overflows.
         const I columns = drawn ? tiles_of(box.x0, box.x1) : I{},
                 rows = drawn ? tiles_of(box.y0, box.y1) : I{};
-        pairs += columns * rows;
+        entries += columns * rows;
 
         box.x0 = max_of(box.x0, I{} + window.x0), box.x1 = min_of(box.x1, I{} + (window.x1 - 1));
         box.y0 = max_of(box.y0, I{} + window.y0), box.y1 = min_of(box.y1, I{} + (window.y1 - 1));
@@ -115,7 +115,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
     for (int i = 0; i < kWidth; ++i) {
         reach.top = min_of(reach.top, static_cast<int>(top[i]));
         reach.bottom = max_of(reach.bottom, static_cast<int>(bottom[i]));
-        reach.pairs += static_cast<uint64_t>(pairs[i]);
+        reach.entries += static_cast<uint64_t>(entries[i]);
     }
     return num_records;
 }

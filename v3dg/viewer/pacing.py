@@ -54,7 +54,7 @@ class Pacer:
         """Return a size with about the shape of ``full``, not larger, at first a quarter of its width."""
         whole = full[0] * full[1]
         share = (self._target_ms * self._work_per_ms or whole / 16) / whole
-        # A hair more, lest rounding takes a step that fits.
+        # A little more, so that rounding refuses no step that fits.
         scale = 2 ** (math.floor(_STEPS_AN_OCTAVE * math.log2(share) / 2 + 1e-6) / _STEPS_AN_OCTAVE)
         coarser = min(max((_SMALLEST / scale) ** 2, 1.0), _COARSEST)
         return Draft(scaled(full, min(max(scale, _SMALLEST), 1.0)), coarser)
