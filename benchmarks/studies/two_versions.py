@@ -14,7 +14,10 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
+import platform
 import statistics
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -158,22 +161,48 @@ class Run:
         self.digests[f"gradients {count}"] = digest(*(leaf.grad for leaf in leaves))
 
 
-def compare(old_path: Path, new_path: Path) -> int:
+def compare(old_path: Path, new_path: Path, output: Path | None) -> int:
+    """Print what differs, and write it where that is asked for; the number of digests that differ."""
     old, new = (json.loads(path.read_text()) for path in (old_path, new_path))
     names = sorted(old["digests"].keys() | new["digests"].keys())
     differ = [name for name in names if old["digests"].get(name) != new["digests"].get(name)]
     print(f"{len(names) - len(differ)} of {len(names)} digests are the same; others: {differ or 'none'}")
+    times = {}
     print(f"{'':58} {'old ms':>9} {'new ms':>9} {'ratio':>6} {'least':>6}")
     for name, before in old["ms"].items():
         after = new["ms"].get(name)
         if after is None:
             continue
         middle = statistics.median(before), statistics.median(after)
+        times[name] = {
+            "old_ms": [round(middle[0], 4), round(min(before), 4)],
+            "new_ms": [round(middle[1], 4), round(min(after), 4)],
+        }
         print(
             f"{name:58} {middle[0]:9.3f} {middle[1]:9.3f} {middle[1] / middle[0]:6.3f} "
             f"{min(after) / min(before):6.3f}"
         )
+    if output:
+        about = {"old": old["machine"], "new": new["machine"], "times": "median and least, ms"}
+        same = {"digests": len(names), "differ": differ}
+        output.write_text(json.dumps({**about, **same, "ms": times}, indent=1) + "\n")
     return len(differ)
+
+
+def machine(device: str, commit: str) -> dict[str, Any]:
+    names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+    about = {
+        "commit": commit,
+        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "processor": names[0].split(":", 1)[1].strip() if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "isa": v3dg._core.isa(),
+    }
+    if device == "cuda":
+        import torch
+
+        about |= {"gpu": torch.cuda.get_device_name(), "cuda": str(torch.version.cuda)}
+    return about
 
 
 def main() -> None:
@@ -186,10 +215,11 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--count", type=int, default=100_000, help="gaussians that are rasterized")
     parser.add_argument("--output", type=Path, help="written, or added to where it is there")
+    parser.add_argument("--commit", default="", help="of the version that runs")
     parser.add_argument("--compare", type=Path, nargs=2, metavar=("OLD", "NEW"))
     arguments = parser.parse_args()
     if arguments.compare:
-        raise SystemExit(compare(*arguments.compare) != 0)
+        raise SystemExit(compare(*arguments.compare, arguments.output) != 0)
     run = Run(arguments.device, arguments.repeats)
     if arguments.output and arguments.output.is_file():
         run.ms = json.loads(arguments.output.read_text())["ms"]
@@ -201,7 +231,8 @@ def main() -> None:
     if arguments.layout:
         from v3dg.scene_file import read_scene
 
-        asset = v3dg.load(arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"])
+        read_asset = getattr(v3dg, "read_asset", None) or v3dg.load  # as an older version calls it
+        asset = read_asset(arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"])
         config = v3dg.BuildConfig(steps=20)
         name = json.loads(arguments.layout.read_text())["asset"]
         donut = v3dg.build_bundle(asset, config=config, device=arguments.device, progress=False)
@@ -212,7 +243,16 @@ def main() -> None:
         )
     run.rasterize(arguments.count, 3 if arguments.device == "cuda" else 1, 1280, 720)
     if arguments.output:
-        arguments.output.write_text(json.dumps({"digests": run.digests, "ms": run.ms}, indent=1))
+        arguments.output.write_text(
+            json.dumps(
+                {
+                    "machine": machine(arguments.device, arguments.commit),
+                    "digests": run.digests,
+                    "ms": run.ms,
+                },
+                indent=1,
+            )
+        )
 
 
 if __name__ == "__main__":
