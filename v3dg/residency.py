@@ -1,4 +1,7 @@
-"""Residency: what of which bundle and scene is on which device. The only cache of the package."""
+"""Residency: what of which bundle and scene is on which device. The only cache of the package.
+
+What is there is freed with its bundle or scene, or by `residency.clear()`.
+"""
 
 from __future__ import annotations
 

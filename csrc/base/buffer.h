@@ -1,5 +1,7 @@
 #pragma once
 
+// Memory on the host that grows by forgetting what it held.
+
 #include <cstdlib>
 #include <new>
 #include <utility>

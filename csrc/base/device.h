@@ -1,6 +1,7 @@
 #pragma once
 
-// Memory and errors of the CUDA half. Sources that include it are built only with CUDA.
+// Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its device, trim_pool()
+// gives what the pool keeps to the driver. Sources that include it are built only with CUDA.
 
 #include <cuda_runtime.h>
 

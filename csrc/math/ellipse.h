@@ -1,6 +1,7 @@
 #pragma once
 
-// The ellipse that a gaussian covers on the image, and the rows of pixels that it meets.
+// The ellipse that a gaussian covers on the image, and the rows of pixels that it meets. Its falloff over a
+// pixel is computed in rasterize/rasterize_math.h.
 
 #include "math/gaussian.h"
 

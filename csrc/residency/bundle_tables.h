@@ -1,5 +1,8 @@
 #pragma once
 
+// The tables of a bundle on a device. They live as long as a scene that v3dg/residency.py keeps there has
+// them.
+
 #include "base/device.h"
 #include "residency/cluster_bounds.h"
 #include "residency/page_table.h"

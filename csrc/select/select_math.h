@@ -2,8 +2,9 @@
 
 // The decisions of selection, compiled without contraction on both halves so that they give the same bits.
 //
-// Every comparison of a metric with the tolerance goes through fits(), and a cluster is drawn when its own
-// group fits and the group above does not: what one test accepts, the other refuses.
+// InstanceCut::draws() decides: a cluster is drawn when its own group fits, the group above does not, and it
+// is not culled. Every comparison of a metric with the tolerance goes through fits(): what one test accepts,
+// the other refuses.
 
 #include <cfloat>
 #include <cmath>

@@ -13,7 +13,8 @@ from v3dg.build.config import BuildConfig
 from v3dg.build.files import build_file, is_current, levels_path
 from v3dg.build.whole import build_into
 from v3dg.bundle import Bundle, Clusters, Groups
-from v3dg.bundle.pages import Float32Codec, MemoryPages, PageLayout
+from v3dg.bundle.codec import Codec
+from v3dg.bundle.pages import MemoryPages, PageLayout
 from v3dg.gaussians import Gaussians
 
 __all__ = ["BuildConfig", "build_bundle", "build_file", "discard_levels", "is_current", "levels_path"]
@@ -74,7 +75,7 @@ class _Memory:
     """A sink for pages whose bundle is in memory."""
 
     @contextmanager
-    def open(self, layout: PageLayout, codec: Float32Codec, made_with: dict[str, Any]) -> Iterator[_Memory]:
+    def open(self, layout: PageLayout, codec: Codec, made_with: dict[str, Any]) -> Iterator[_Memory]:
         self._pages = MemoryPages(layout, codec.empty(int(layout.first_gaussian[-1])))
         self._made_with = made_with
         yield self

@@ -16,8 +16,9 @@ from v3dg.build.config import BuildConfig
 from v3dg.build.whole import build_into
 from v3dg.bundle import Bundle
 from v3dg.bundle.bundle import config_to_json
+from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundleWriter, writing
-from v3dg.bundle.pages import Float32Codec, PageLayout
+from v3dg.bundle.pages import PageLayout
 from v3dg.gaussians import Gaussians
 from v3dg.io import load
 
@@ -81,7 +82,7 @@ def build_file(
 
 
 def _open_file(
-    path: Path, layout: PageLayout, codec: Float32Codec, made_with: dict[str, Any]
+    path: Path, layout: PageLayout, codec: Codec, made_with: dict[str, Any]
 ) -> AbstractContextManager[BundleWriter]:
     """The levels beside the bundle are locked, so no other build writes to it."""
     return writing(path, layout, codec, config_to_json(made_with), is_locked=True)

@@ -12,7 +12,7 @@ from v3dg import _core, _device
 from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
 from v3dg.build.plan import LevelPlan, Offsets, Plan
-from v3dg.bundle.pages import Float32Codec
+from v3dg.bundle.codec import Float32Codec
 from v3dg.gaussians import Array, Gaussians
 
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.

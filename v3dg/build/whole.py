@@ -21,7 +21,8 @@ from v3dg.build.plan import Plan
 from v3dg.build.progress import Bar
 from v3dg.build.simplify import Level, LevelTables, build_levels
 from v3dg.bundle import Clusters, Groups
-from v3dg.bundle.pages import Float32Codec, PageLayout
+from v3dg.bundle.codec import Codec, Float32Codec
+from v3dg.bundle.pages import PageLayout
 from v3dg.gaussians import Gaussians
 
 
@@ -35,7 +36,7 @@ class Sink(Protocol):
         """Take the tables, when all pages are there."""
 
 
-OpenSink: TypeAlias = Callable[[PageLayout, Float32Codec, dict[str, Any]], AbstractContextManager[Sink]]
+OpenSink: TypeAlias = Callable[[PageLayout, Codec, dict[str, Any]], AbstractContextManager[Sink]]
 """Makes a sink for the pages of this layout and codec; the last argument says how the bundle is built."""
 
 

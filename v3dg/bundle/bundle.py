@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v3dg._json import parse_json
+from v3dg.bundle.codec import Codec, Float32Codec
 from v3dg.bundle.file import BundleFile, writing
 from v3dg.bundle.format import VERSION, file_bytes, page_file_bytes, page_tables
-from v3dg.bundle.pages import FilePages, Float32Codec, MemoryPages, PageLayout, PageSource, runs_of_pages
+from v3dg.bundle.pages import FilePages, MemoryPages, PageLayout, PageSource, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_all, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
@@ -60,7 +61,7 @@ class Bundle:
         clusters: Clusters,
         groups: Groups,
         config: dict[str, Any],
-        codec: Float32Codec,
+        codec: Codec,
         layout: PageLayout,
         pages: PageSource,
         file: BundleFile | None,

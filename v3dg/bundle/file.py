@@ -19,6 +19,7 @@ import numpy as np
 
 from v3dg import _files
 from v3dg._json import parse_json
+from v3dg.bundle.codec import Codec, codec_of
 from v3dg.bundle.format import (
     ALIGNMENT_BYTES,
     DTYPES,
@@ -34,7 +35,6 @@ from v3dg.bundle.format import (
     page_hash,
     page_tables,
 )
-from v3dg.bundle.pages import Float32Codec
 from v3dg.bundle.tables import check_tables
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class BundleWriter:
         descriptor: int,
         pool: ThreadPoolExecutor,
         layout: PageLayout,
-        codec: Float32Codec,
+        codec: Codec,
         config_json: str,
     ) -> None:
         self._fd = descriptor
@@ -124,7 +124,7 @@ class BundleWriter:
 def writing(
     path: str | os.PathLike[str],
     layout: PageLayout,
-    codec: Float32Codec,
+    codec: Codec,
     config_json: str,
     *,
     is_locked: bool = False,
@@ -226,7 +226,7 @@ class BundleFile:
             self._fail(f"version: expected 1 or more, got {_short(version)}")
         if metadata.get("sh_degree") not in ("0", "1", "2", "3"):
             self._fail(f"sh_degree: expected '0' to '3', got {_short(metadata.get('sh_degree'))}")
-        self.codec = Float32Codec(int(metadata["sh_degree"]))
+        self.codec = codec_of(metadata)
         config = metadata.get("config")
         if not isinstance(config, str):
             self._fail(f"config: expected a string of JSON, got {_short(config)}")

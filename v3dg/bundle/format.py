@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from v3dg.bundle.pages import Float32Codec, PageLayout
+    from v3dg.bundle.codec import Codec
+    from v3dg.bundle.pages import PageLayout
 
 FORMAT = "v3dg"
 VERSION = 1
@@ -56,7 +57,7 @@ def page_file_bytes(page_bytes: NDArray[np.int64]) -> NDArray[np.int64]:
     return page_bytes + -page_bytes % ALIGNMENT_BYTES
 
 
-def page_tables(layout: PageLayout, codec: Float32Codec) -> dict[str, NDArray[Any]]:
+def page_tables(layout: PageLayout, codec: Codec) -> dict[str, NDArray[Any]]:
     """The tables of the pages except the hashes; all follow from what is in each page."""
     num_bytes = codec.page_bytes(layout.num_gaussians)
     ends = np.cumsum(page_file_bytes(num_bytes))
@@ -97,7 +98,7 @@ def entries_of(num_clusters: int, num_groups: int, num_pages: int, pages_bytes: 
     return entries
 
 
-def entries_of_layout(layout: PageLayout, codec: Float32Codec) -> dict[str, Any]:
+def entries_of_layout(layout: PageLayout, codec: Codec) -> dict[str, Any]:
     """The same from what is in each page: a group for each but the last."""
     pages_bytes = int(page_file_bytes(codec.page_bytes(layout.num_gaussians)).sum())
     return entries_of(layout.num_clusters, max(layout.num_pages - 1, 0), layout.num_pages, pages_bytes)
@@ -115,7 +116,7 @@ def header_of(entries: dict[str, Any], sh_degree: int, config_json: str) -> byte
     return len(text).to_bytes(8, "little") + text
 
 
-def file_bytes(layout: PageLayout, codec: Float32Codec, config_json: str) -> int:
+def file_bytes(layout: PageLayout, codec: Codec, config_json: str) -> int:
     """Size of the file that this makes."""
     entries = entries_of_layout(layout, codec)
     header = header_of(entries, codec.sh_degree, config_json)

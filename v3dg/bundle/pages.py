@@ -1,11 +1,11 @@
-"""Pages: which clusters lie together, what the bytes of a page are, and where its gaussians come from."""
+"""Pages: which clusters lie together, and where the gaussians of a page come from. Bytes are codec.py's."""
 
 from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from v3dg import _device
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
@@ -66,39 +66,6 @@ class PageLayout:
         """Where a page's gaussians are among those that begin with the first page's."""
         rows, before = self.rows(page, page + 1), int(self.first_gaussian[first_page])
         return slice(rows.start - before, rows.stop - before)
-
-
-class Float32Codec:
-    """What the bytes of a page are: the arrays of its gaussians, float32, one whole array after another."""
-
-    def __init__(self, sh_degree: int) -> None:
-        self.sh_degree = sh_degree
-
-    @property
-    def floats_per_gaussian(self) -> int:
-        """3 mean, 4 quaternion, 3 scale, 1 opacity, 3 (d+1)² SH."""
-        return 11 + 3 * (self.sh_degree + 1) ** 2
-
-    def page_bytes(self, num_gaussians: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Sizes of pages of so many gaussians, without what they are filled up with."""
-        return num_gaussians * (4 * self.floats_per_gaussian)
-
-    def most_gaussians(self, num_bytes: int) -> int:
-        """How many gaussians so many bytes can hold."""
-        return num_bytes // (4 * self.floats_per_gaussian)
-
-    def encode(self, gaussians: Gaussians, rows: slice) -> list[NDArray[Any]]:
-        """Arrays whose bytes, one array after another, are those of the page that has these rows."""
-        return [getattr(gaussians, field.name)[rows] for field in fields(Gaussians)]
-
-    def decode(self, read: Callable[[Sequence[NDArray[Any]]], None], out: Gaussians, rows: slice) -> None:
-        """Fill the rows with a page, whose bytes `read` reads into the arrays that it is given."""
-        read(self.encode(out, rows))
-
-    def empty(self, count: int) -> Gaussians:
-        """Gaussians on the host to decode to, with any values."""
-        shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (self.sh_degree + 1) ** 2, 3)]
-        return Gaussians(*(np.empty(shape, np.float32) for shape in shapes))
 
 
 class PageSource(Protocol):
