@@ -88,12 +88,12 @@ import v3dg
 from benchmarks.worlds.procedural import make_asset
 config = v3dg.BuildConfig(cluster_size=32, steps=10)
 asset = make_asset(num_gaussians=1200, seed=0)
-v3dg.build_bundle(asset, config=config, progress=False, device="cpu").save(sys.argv[1])
+v3dg.build_bundle(asset, config=config, progress=False, device="cpu").write(sys.argv[1])
 """
 
 
 def test_same_file_on_any_number_of_threads(asset, tmp_path):
-    build(asset, device="cpu").save(tmp_path / "here.v3dg")
+    build(asset, device="cpu").write(tmp_path / "here.v3dg")
     files = [tmp_path / "here.v3dg"]
     for threads in (1, 2, 4):
         files.append(tmp_path / f"{threads}.v3dg")

@@ -16,8 +16,8 @@ def folder(tmp_path_factory):
     """A folder with an asset, a bundle and a scene of two instances and two cameras."""
     folder = tmp_path_factory.mktemp("convert")
     asset = make_asset(2000)
-    v3dg.save(folder / "tuft.ply", asset)
-    v3dg.build_bundle(asset, config=v3dg.BuildConfig(cluster_size=64, steps=0), progress=False).save(
+    v3dg.write_asset(folder / "tuft.ply", asset)
+    v3dg.build_bundle(asset, config=v3dg.BuildConfig(cluster_size=64, steps=0), progress=False).write(
         folder / "tuft.v3dg"
     )
     scene = {
@@ -39,12 +39,12 @@ def converted(folder, *arguments):
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["bytes"] == (folder / arguments[1]).stat().st_size
-    return result, v3dg.load(folder / arguments[1])
+    return result, v3dg.read_asset(folder / arguments[1])
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
 def test_an_asset_becomes_any_format_and_that_a_ply(folder, suffix):
-    asset = v3dg.load(folder / "tuft.ply")
+    asset = v3dg.read_asset(folder / "tuft.ply")
     result, _ = converted(folder, "tuft.ply", f"a{suffix}")
     assert result["gaussians"] == len(asset)
     assert result["sh_degree"] == asset.sh_degree
@@ -134,7 +134,7 @@ def test_what_cannot_be_meant_is_refused(folder):
 
 def test_the_meta_json_of_an_asset_is_no_scene(folder):
     (folder / "sog").mkdir()
-    v3dg.save(folder / "a.sog", v3dg.load(folder / "tuft.ply"))
+    v3dg.write_asset(folder / "a.sog", v3dg.read_asset(folder / "tuft.ply"))
     with zipfile.ZipFile(folder / "a.sog") as bundle:
         bundle.extractall(folder / "sog")
     for command in (["info"], ["render", "-o", "picture.png", "--size", 64, 48]):

@@ -55,7 +55,7 @@ def gsplat_example(tmp_path):
     """The example, and its settings for a field of small donuts."""
     example = load_example("with_gsplat")
     config = v3dg.BuildConfig(cluster_size=64, steps=0)
-    v3dg.build_bundle(make_donut(2000), config=config, progress=False).save(tmp_path / "donut.v3dg")
+    v3dg.build_bundle(make_donut(2000), config=config, progress=False).write(tmp_path / "donut.v3dg")
     return example, example.Config(
         tmp_path / "donut.v3dg", tmp_path / "picture.png", rows=4, size=(160, 120), tolerance=30
     )

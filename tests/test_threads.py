@@ -130,8 +130,8 @@ def call_what_takes_long(folder):
     import torch
 
     many = scenes.random_gaussians(0, CAMERA, 100_000, sh_degree=1)
-    v3dg.save(folder / "many.ply", many)
-    v3dg.load(folder / "many.ply")
+    v3dg.write_asset(folder / "many.ply", many)
+    v3dg.read_asset(folder / "many.ply")
     gradient(many)
     with torch.no_grad():
         picture(many)

@@ -32,7 +32,7 @@ def site(tmp_path_factory):
     rng = np.random.default_rng(0)
     bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 600, size=0.3), 64)
     path = tmp_path_factory.mktemp("viewer") / "blob.v3dg"
-    bundle.save(path)
+    bundle.write(path)
     scene = v3dg.Scene()
     scene.add(v3dg.Bundle.open(path), positions=rng.normal(size=(200, 3)), scales=np.full(200, 0.3))
     scene_view = SceneView(scene)

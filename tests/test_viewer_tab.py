@@ -46,7 +46,7 @@ def scene_view(bundle):
 @pytest.fixture(scope="module")
 def site(bundle, tmp_path_factory):
     path = tmp_path_factory.mktemp("tab") / "blob.v3dg"
-    bundle.save(path)
+    bundle.write(path)
     scene = v3dg.Scene()
     positions = np.random.default_rng(1).normal(size=(30, 3))
     scene.add(v3dg.Bundle.open(path), positions=positions, scales=np.full(30, 0.5))

@@ -14,7 +14,7 @@ from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.camera_file import read_cameras, write_cameras
 from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
-from v3dg.io import load, save
+from v3dg.io import read_asset, write_asset
 from v3dg.pick import Pick, pick
 from v3dg.rasterize import Raster, rasterize
 from v3dg.render import Image, Renderer, Stats, render
@@ -39,15 +39,15 @@ __all__ = [
     "Stats",
     "__version__",
     "build_bundle",
-    "load",
     "pick",
     "rasterize",
+    "read_asset",
     "read_cameras",
     "read_scene",
     "render",
-    "save",
     "select",
     "turntable",
+    "write_asset",
     "write_cameras",
     "write_scene",
 ]

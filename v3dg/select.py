@@ -123,7 +123,7 @@ class Selection:
 
 @overload
 def select(
-    scene_or_bundle: Scene | Bundle,
+    subject: Scene | Bundle,
     camera: Camera,
     *,
     tolerance: float | None = ...,
@@ -135,7 +135,7 @@ def select(
 ) -> Selection: ...
 @overload
 def select(
-    scene_or_bundle: Scene | Bundle,
+    subject: Scene | Bundle,
     camera: Sequence[Camera],
     *,
     tolerance: float | None = ...,
@@ -146,7 +146,7 @@ def select(
     device: str | Device = ...,
 ) -> list[Selection]: ...
 def select(
-    scene_or_bundle: Scene | Bundle,
+    subject: Scene | Bundle,
     camera: Camera | Sequence[Camera],
     *,
     tolerance: float | None = None,
@@ -184,8 +184,8 @@ def select(
     rule = rule_of(tolerance, budget, min_level, footprint, cull)
     where = _device.resolve(device)
     if not isinstance(camera, Camera):
-        return [_select(scene_or_bundle, view, rule, budget, where) for view in camera]
-    return _select(scene_or_bundle, camera, rule, budget, where)
+        return [_select(subject, view, rule, budget, where) for view in camera]
+    return _select(subject, camera, rule, budget, where)
 
 
 def _select(
@@ -203,10 +203,10 @@ def _select(
 
 
 def group_metrics(
-    scene_or_bundle: Scene | Bundle, camera: Camera, *, footprint: Footprint = "solid_angle"
+    subject: Scene | Bundle, camera: Camera, *, footprint: Footprint = "solid_angle"
 ) -> list[npt.NDArray[np.float32]]:
     """Return for each instance what tolerance is compared with: its groups' metrics, (G,) in px²."""
-    scene = Scene.of(scene_or_bundle)
+    scene = Scene.of(subject)
     instances = _core.Instances(
         bundle=scene.instance_bundle,
         positions=scene.positions,

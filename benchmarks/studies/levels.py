@@ -56,7 +56,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    asset = v3dg.load(config.asset)
+    asset = v3dg.read_asset(config.asset)
     truth = np.asarray(Image.open(config.truth).convert("RGB"), np.float32) / 255
     name = json.loads(config.layout.read_text())["asset"]
     rows = []

@@ -201,7 +201,7 @@ def main() -> None:
     if arguments.layout:
         from v3dg.scene_file import read_scene
 
-        asset = v3dg.load(arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"])
+        asset = v3dg.read_asset(arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"])
         config = v3dg.BuildConfig(steps=20)
         name = json.loads(arguments.layout.read_text())["asset"]
         donut = v3dg.build_bundle(asset, config=config, device=arguments.device, progress=False)

@@ -28,7 +28,7 @@ from v3dg._judges import mean_of
 from v3dg.build import BuildConfig
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
-from v3dg.io import load
+from v3dg.io import read_asset
 from v3dg.metrics import draw_truth, psnr
 from v3dg.pictures import Picture, to_8bit
 from v3dg.rasterize import rasterize
@@ -68,7 +68,7 @@ def peer_rows(evaluation: Evaluation) -> list[Row]:
         if found is None:
             raise ValueError(f"{path}: expected a name like {evaluation.asset_name}_TOOL_50.ply")
         tool, percent = found.groups()
-        theirs = load(path)
+        theirs = read_asset(path)
         footprint = footprint_of_cut(bundle, len(theirs))
         row: Row = {
             "tool": tool,
