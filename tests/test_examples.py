@@ -66,7 +66,7 @@ def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
     example, config = gsplat_example
     scene, camera = example.make_scene(config)
     camera = v3dg.Camera(camera.viewmat, camera.K, camera.width, camera.height, near=0.02)
-    selection = v3dg.select(scene, camera, tolerance=config.tolerance)
+    selection = v3dg.select(scene, camera, tolerance=config.tolerance, device="cpu")
     assert selection.num_gaussians < example.num_gaussians(scene) / 4
     arguments = example.gsplat_arguments(selection, camera, "cpu")
     tensors = [value for value in arguments.values() if isinstance(value, torch.Tensor)]
@@ -89,7 +89,7 @@ def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
         filter_px2=arguments["eps2d"],
         antialiased=True,
     )
-    wanted = v3dg.render(scene, camera, tolerance=config.tolerance)
+    wanted = v3dg.render(scene, camera, tolerance=config.tolerance, device="cpu")
     assert wanted.alpha.max() > 0.9
     # Coarser levels have the filter of the arguments; what is left is rounding of the translation.
     assert psnr(wanted.color, drawn.color.numpy()) > 100

@@ -39,7 +39,7 @@ def bundle():
 
 @pytest.fixture(scope="module")
 def scene_view(bundle):
-    return SceneView(bundle)
+    return SceneView(bundle, device="cpu")
 
 
 def listens_at(port, host):

@@ -102,7 +102,7 @@ def test_every_camera_sees_some_of_the_crowd():
     bundle = v3dg.build_bundle(world.assets["person_00"].make(), config=config, progress=False, device="cpu")
     scene = worlds.scene_of(world, {"person_00": bundle})
     for name, camera in world.cameras(width=64, height=36).items():
-        assert v3dg.render(scene, camera).color.any(), name
+        assert v3dg.render(scene, camera, device="cpu").color.any(), name
 
 
 def test_a_crowd_of_fewer_than_there_are_persons():
@@ -151,7 +151,7 @@ def test_scene_of_a_world_draws():
     scene = worlds.scene_of(world, bundles)
     assert len(scene) == 6
     camera = world.cameras(width=64, height=36)["099_camera_19"]
-    assert v3dg.render(scene, camera).alpha.max() > 0.5
+    assert v3dg.render(scene, camera, device="cpu").alpha.max() > 0.5
 
 
 def test_a_written_world_is_read_and_drawn(tmp_path):

@@ -64,7 +64,8 @@ def pick(
         raise ValueError(f"x, y: expected a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
     scene = Scene.of(subject)
     if budget is not None:  # which is for the whole picture
-        tolerance = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level).tolerance
+        whole = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU)
+        tolerance = whole.tolerance
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
     pixel = camera.core.window(x, y, x + 1, y + 1)
     resident = residency.scene(subject, CPU)

@@ -110,7 +110,7 @@ def render(
     cut: Selection | None = None,
     color_by: ColorBy = "appearance",
     background: Sequence[float] = (0.0, 0.0, 0.0),
-    device: str | Device = "cpu",
+    device: str | Device = "auto",
 ) -> RenderedImage | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
@@ -129,9 +129,9 @@ def render(
             the place of `tolerance`, `budget` and `min_level`.
         color_by: "level" or "cluster" colours gaussians by the one that they belong to.
         background: Three numbers.
-        device: "cpu", "cuda", "cuda:1" or "auto"; CUDA draws on the stream that is torch's current one there
-            and keeps on the device what the next picture of the same scene or bundle needs. Use a `Renderer`
-            to say how long.
+        device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws torch tensors there, on
+            the stream that is torch's current one, and keeps on the device what the next picture of the same
+            scene or bundle needs. Use a `Renderer` to say how long. "auto" is "cuda" where that works.
 
     Raises:
         ValueError: An argument is not as above, or the coarsest cut has more gaussians than the budget; on

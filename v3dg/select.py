@@ -51,7 +51,7 @@ class Selection:
     def __len__(self) -> int:
         return len(self.instance_ids)
 
-    def gaussians(self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str | Device = "cpu") -> Gaussians:
+    def gaussians(self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str | Device = "auto") -> Gaussians:
         """Return the selected gaussians in the world, N in the order of the selection, for any rasterizer.
 
         Spherical harmonics are rotated into the world's frame, which is exact. The degree is the highest of
@@ -60,8 +60,8 @@ class Selection:
         Args:
             origin: (3,) point in the world that means are relative to; take the camera's position where the
                 scene is so far from zero that float32 would not hold it.
-            device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there, ``"auto"`` for the better
-                of the two that works. Both hold the same numbers.
+            device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there, ``"auto"`` for the latter
+                where CUDA works. Both hold the same numbers.
         """
         where = _device.resolve(device)
         shift = np.asarray(origin, np.float64)
@@ -154,7 +154,7 @@ def select(
     min_level: int = 0,
     footprint: Footprint = "solid_angle",
     cull: bool = True,
-    device: str | Device = "cpu",
+    device: str | Device = "auto",
 ) -> Selection | list[Selection]:
     """Choose the clusters that are just detailed enough for one view, or for each of several.
 
@@ -172,7 +172,8 @@ def select(
         footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with which a path can
             have more than one cluster.
         cull: False keeps what lies outside the frustum.
-        device: ``"cpu"`` or ``"cuda"``; both choose the same.
+        device: Where to choose: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is CUDA where that works; all
+            choose the same.
 
     Raises:
         ValueError: The coarsest cut has more gaussians than the budget, ``tolerance`` is negative or not a

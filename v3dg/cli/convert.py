@@ -108,17 +108,20 @@ def _level(bundle: Bundle, level: int) -> tuple[Gaussians, dict[str, Any]]:
 def _cut(
     options: Convert, subject: Scene | Bundle, cameras: dict[str, Any]
 ) -> tuple[Gaussians, dict[str, Any]]:
+    from v3dg._device import CPU
     from v3dg.bundle import Bundle
     from v3dg.gaussians import Gaussians
     from v3dg.select import select
 
     ((name, camera),) = cameras.items()
     keep = options.outside == "keep"
-    selection = select(subject, camera, tolerance=options.tolerance, budget=options.budget, cull=not keep)
+    selection = select(
+        subject, camera, tolerance=options.tolerance, budget=options.budget, cull=not keep, device=CPU
+    )
     if isinstance(subject, Bundle) and len(selection):  # its clusters alone are read
         gaussians = Gaussians.concatenate([subject.cluster_gaussians(int(c)) for c in selection.cluster_ids])
     else:
-        gaussians = selection.gaussians()
+        gaussians = selection.gaussians(device=CPU)
     # JSON has no infinity, which a budget can come to.
     tolerance = selection.tolerance if math.isfinite(selection.tolerance) else None
     return gaussians, {"camera": name, "tolerance": tolerance, "clusters": len(selection)}
