@@ -21,7 +21,7 @@ import v3dg
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # for benchmarks/ of this checkout
 from benchmarks.worlds import donut_shower
 from benchmarks.worlds.procedural import make_donut
-from v3dg.video import write_film
+from v3dg.video import write_video
 
 FPS = 30
 STEPS_PER_FRAME = 2  # of the physics: a sixtieth of a second each
@@ -69,7 +69,7 @@ def main(config: Config) -> None:
             for _ in range(STEPS_PER_FRAME):
                 pile.step(1 / (FPS * STEPS_PER_FRAME))
 
-    write_film(config.output, frames(), fps=FPS)
+    write_video(config.output, frames(), fps=FPS)
 
 
 def make_scene(

@@ -151,7 +151,7 @@ def assert_close(got, expected, bound: Bound) -> None:
 
 
 def assert_pictures_agree(raster, picture, bound: PictureBound) -> None:
-    """Compare a v3dg.Raster (NumPy or torch) with a reference Picture."""
+    """Compare a v3dg.Image (NumPy or torch) with a reference Picture."""
     color, alpha, depth = (np.asarray(x, np.float64) for x in (raster.color, raster.alpha, raster.depth))
     assert color.shape == picture.color.shape
     assert alpha.shape == depth.shape == picture.alpha.shape

@@ -88,12 +88,12 @@ import v3dg
 from benchmarks.worlds.procedural import make_asset
 config = v3dg.BuildConfig(cluster_size=32, steps=10)
 asset = make_asset(num_gaussians=1200, seed=0)
-v3dg.build_bundle(asset, config=config, progress=False, device="cpu").save(sys.argv[1])
+v3dg.build_bundle(asset, config=config, progress=False, device="cpu").write(sys.argv[1])
 """
 
 
 def test_same_file_on_any_number_of_threads(asset, tmp_path):
-    build(asset, device="cpu").save(tmp_path / "here.v3dg")
+    build(asset, device="cpu").write(tmp_path / "here.v3dg")
     files = [tmp_path / "here.v3dg"]
     for threads in (1, 2, 4):
         files.append(tmp_path / f"{threads}.v3dg")
@@ -288,9 +288,9 @@ def test_any_asset_is_built_selected_and_drawn(name, init, device):
     center, radius = ball_around(asset)
     for tolerance in (0.0, 0.5, 1e9):
         camera = camera_at(center, radius, [1, 0.3, 0.2], 300.0)
-        num = select(bundle, camera, tolerance=tolerance).num_gaussians
+        num = select(bundle, camera, tolerance=tolerance, device="cpu").num_gaussians
         assert 1 <= num <= len(asset)
-        image = render(bundle, camera, tolerance=tolerance)
+        image = render(bundle, camera, tolerance=tolerance, device="cpu")
         assert all(np.isfinite(picture).all() for picture in (image.color, image.alpha, image.depth))
 
 
@@ -403,7 +403,7 @@ def test_paper_settings_build(asset, group_size, changes, device):
     assert clusters == [16, 8, 4, 2]
     assert bundle.config["build"]["group_size"] == group_size
     camera = camera_at(*ball_around(asset), [0.3, 1, 0.2], 400.0)
-    assert np.isfinite(render(bundle, camera).color).all()
+    assert np.isfinite(render(bundle, camera, device="cpu").color).all()
 
 
 def test_paper_fit_reduces_the_error(asset, device):

@@ -140,7 +140,7 @@ def test_a_subtree_alone_is_that_of_the_whole(asset, name):
 def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
     """Their pages go to the file as they are finished; what is above is built from what they became."""
     config = CONFIGS[name]
-    build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu").save(tmp_path / "whole.v3dg")
+    build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu").write(tmp_path / "whole.v3dg")
     made_with = v3dg.Bundle.open(tmp_path / "whole.v3dg").config
     leaves, plan = _in_split_order(asset, config), Plan.of(len(asset), config)
     level = 2
@@ -167,12 +167,12 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
 
 
 def test_a_file_is_built_as_a_bundle_is(asset, tmp_path):
-    v3dg.save(tmp_path / "asset.ply", asset)
+    v3dg.write_asset(tmp_path / "asset.ply", asset)
     options = {"config": SMALL, "seed": SEED, "progress": False, "device": "cpu"}
     bundle, is_built = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
     assert is_built
     assert bundle.path == str(tmp_path / "out.v3dg")
-    build_bundle(v3dg.load(tmp_path / "asset.ply"), **options).save(tmp_path / "memory.v3dg")
+    build_bundle(v3dg.read_asset(tmp_path / "asset.ply"), **options).write(tmp_path / "memory.v3dg")
     assert (tmp_path / "out.v3dg").read_bytes() == (tmp_path / "memory.v3dg").read_bytes()
     assert {path.name for path in tmp_path.iterdir()} == {"asset.ply", "out.v3dg", "memory.v3dg"}
     again = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
@@ -181,7 +181,7 @@ def test_a_file_is_built_as_a_bundle_is(asset, tmp_path):
 
 def test_what_a_killed_build_left_of_a_file_is_written_over(asset, tmp_path):
     """And not of another file, whose name begins alike."""
-    v3dg.save(tmp_path / "asset.ply", asset)
+    v3dg.write_asset(tmp_path / "asset.ply", asset)
     names = [f"{'long' * 20}_{end}.v3dg" for end in "ab"]
     left = []
     for name in names:
@@ -198,7 +198,7 @@ def test_what_a_killed_build_left_of_a_file_is_written_over(asset, tmp_path):
 
 
 def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatch):
-    v3dg.save(tmp_path / "asset.ply", asset)
+    v3dg.write_asset(tmp_path / "asset.ply", asset)
     options = {"config": SMALL, "progress": False, "device": "cpu"}
 
     def interrupt(*_):

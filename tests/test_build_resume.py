@@ -37,7 +37,7 @@ try:
     )
 except KeyboardInterrupt:
     sys.exit(130)
-bundle.save(sys.argv[3])
+bundle.write(sys.argv[3])
 """
 # Generous: a build that did not listen would take days.
 PATIENCE = 60
@@ -50,7 +50,7 @@ def asset():
 
 def bytes_of(bundle, folder):
     path = folder / "bytes.v3dg"
-    bundle.save(path)
+    bundle.write(path)
     return path.read_bytes()
 
 

@@ -48,7 +48,7 @@ def saved(tmp_path):
     """A small bundle of three levels and its file."""
     bundle = random_bundle(3, config={"seed": 3})
     path = tmp_path / "small.v3dg"
-    bundle.save(path)
+    bundle.write(path)
     return bundle, path
 
 
@@ -108,7 +108,7 @@ def open_changed(path, change):
 @given(bundle=some_bundles)
 def test_what_is_saved_is_opened(tmp_path_factory, bundle):
     path = tmp_path_factory.mktemp("round_trip") / "a.v3dg"
-    bundle.save(path)
+    bundle.write(path)
     opened = Bundle.open(path)
     assert_same_tables(bundle, opened)
     for cluster in range(len(bundle.clusters)):
@@ -125,7 +125,7 @@ def test_what_is_saved_is_opened(tmp_path_factory, bundle):
 @given(bundle=some_bundles)
 def test_official_reader_sees_the_same(tmp_path_factory, bundle):
     path = tmp_path_factory.mktemp("official") / "a.v3dg"
-    bundle.save(path)
+    bundle.write(path)
     with safe_open(path, "np") as file:
         assert file.metadata()["format"] == "v3dg"
         for table in ("clusters", "groups"):
@@ -145,7 +145,7 @@ def test_reader_of_the_format_page_reads_it(tmp_path_factory, bundle):
     scope = {}
     exec(compile(code, str(FORMAT_PAGE), "exec"), scope)
     path = tmp_path_factory.mktemp("docs") / "a.v3dg"
-    bundle.save(path)
+    bundle.write(path)
     metadata, tables, read_page = scope["read_bundle"](path)
     assert int(metadata["sh_degree"]) == bundle.sh_degree
     np.testing.assert_array_equal(tables["clusters.box"], bundle.clusters.box)
@@ -165,11 +165,11 @@ def test_format_page_lists_the_tables_in_file_order(saved):
 def test_same_bundle_gives_same_bytes(saved, tmp_path):
     _, path = saved
     again, from_file, loaded = (tmp_path / name for name in ("again", "from_file", "loaded"))
-    random_bundle(3, config={"seed": 3}).save(again)
-    Bundle.open(path).save(from_file)
+    random_bundle(3, config={"seed": 3}).write(again)
+    Bundle.open(path).write(from_file)
     opened = Bundle.open(path)
     assert len(opened.gaussians) == opened.num_gaussians
-    opened.save(loaded)
+    opened.write(loaded)
     assert path.read_bytes() == again.read_bytes() == from_file.read_bytes() == loaded.read_bytes()
 
 
@@ -214,7 +214,7 @@ def test_threads_read_large_bundles(tmp_path, monkeypatch):
     monkeypatch.setattr("v3dg.bundle.pages._BYTES_PER_TASK", 4096)
     bundle = random_bundle(1, num_levels=6, sh_degree=1, max_cluster=100)
     path = tmp_path / "a.v3dg"
-    bundle.save(path)
+    bundle.write(path)
     assert_same_gaussians(Bundle.open(path).gaussians, bundle.gaussians)
 
 
@@ -558,7 +558,7 @@ def test_wrong_table_is_refused(saved, name, row, value, message):
 @given(data=st.data())
 def test_random_tables_open_or_are_refused(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("fuzz") / "small.v3dg"
-    random_bundle(3).save(path)
+    random_bundle(3).write(path)
     header, tensors = split_file(path.read_bytes())
     name = data.draw(st.sampled_from([name for name in TABLE_NAMES if name != "pages.hash"]))
     values = tensors[name].reshape(-1)
@@ -585,7 +585,7 @@ json_values = st.recursive(
 @given(data=st.data())
 def test_random_headers_open_or_are_refused(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("fuzz") / "small.v3dg"
-    random_bundle(3).save(path)
+    random_bundle(3).write(path)
     header, tensors = split_file(path.read_bytes())
     name = data.draw(st.sampled_from(sorted(header)))
     key = data.draw(st.sampled_from([None, *sorted(header[name])]))
@@ -602,7 +602,7 @@ def test_random_headers_open_or_are_refused(tmp_path_factory, data):
 
 
 class Stop(BaseException):
-    """Stands for whatever ends a save, Ctrl-C included."""
+    """Stands for whatever ends a write, Ctrl-C included."""
 
 
 def test_an_interrupted_save_changes_nothing(saved, monkeypatch):
@@ -622,7 +622,7 @@ def test_an_interrupted_save_changes_nothing(saved, monkeypatch):
     for target in (path, path.with_name("new.v3dg")):
         num_calls = 0
         with pytest.raises(Stop):
-            bundle.save(target)
+            bundle.write(target)
     assert os.listdir(path.parent) == [path.name]
     assert path.read_bytes() == before
 
@@ -636,7 +636,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(saved, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match=r"No space left on device.*small\.v3dg"):
-        bundle.save(path)
+        bundle.write(path)
     assert os.listdir(path.parent) == [path.name]
     assert path.read_bytes() == before
 
@@ -646,7 +646,7 @@ def test_a_half_written_file_is_refused_and_replaced(saved):
     bundle, path = saved
     leftover = path.with_name(".small.v3dg.0123456789abcdef.tmp")
     leftover.write_bytes(path.read_bytes()[:9000])
-    bundle.save(path)
+    bundle.write(path)
     with pytest.raises(ValueError, match="truncated"):
         Bundle.open(leftover)
     assert_same_gaussians(Bundle.open(path).gaussians, bundle.gaussians)
@@ -657,18 +657,18 @@ def test_save_refuses_what_is_not_a_file(saved, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", os.devnull):
         with pytest.raises(ValueError, match="expected the path of a file"):
-            bundle.save(path)
+            bundle.write(path)
     with pytest.raises(IsADirectoryError, match=tmp_path.name):
-        bundle.save(tmp_path)
+        bundle.write(tmp_path)
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        bundle.save(tmp_path / "nowhere" / "a.v3dg")
+        bundle.write(tmp_path / "nowhere" / "a.v3dg")
 
 
 def test_save_follows_a_link(saved, tmp_path):
     _, path = saved
     link = tmp_path / "link.v3dg"
     link.symlink_to(path)
-    random_bundle(8).save(link)
+    random_bundle(8).write(link)
     assert link.is_symlink()
     assert Bundle.open(path).num_gaussians == random_bundle(8).num_gaussians
 
@@ -676,15 +676,15 @@ def test_save_follows_a_link(saved, tmp_path):
 def test_saving_over_an_open_bundle_does_not_change_it(saved):
     bundle, path = saved
     opened = Bundle.open(path)
-    opened.save(path)
-    random_bundle(4).save(path)
+    opened.write(path)
+    random_bundle(4).write(path)
     assert_same_gaussians(opened.gaussians, bundle.gaussians)
 
 
 def test_long_names_can_be_saved(saved, tmp_path):
     bundle, _ = saved
     for name in ("x" * 250 + ".v3dg", "ü" * 120 + ".v3dg"):
-        bundle.save(tmp_path / name)
+        bundle.write(tmp_path / name)
         Bundle.open(tmp_path / name)
 
 
@@ -739,7 +739,7 @@ def test_config_that_no_reader_would_accept_is_refused(saved):
     bundle, path = saved
     large = Bundle(bundle.clusters, bundle.groups, bundle.gaussians, {"note": "x" * (1 << 20)})
     with pytest.raises(ValueError, match="config: expected at most 1048576 bytes of JSON"):
-        large.save(path)
+        large.write(path)
     assert_same_gaussians(Bundle.open(path).gaussians, bundle.gaussians)
 
 

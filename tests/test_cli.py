@@ -23,7 +23,7 @@ from v3dg import cli
 def folder(tmp_path_factory):
     """A folder with an asset, a bundle and a scene of three instances and two cameras."""
     folder = tmp_path_factory.mktemp("cli")
-    v3dg.save(folder / "tuft.ply", make_asset(1000))
+    v3dg.write_asset(folder / "tuft.ply", make_asset(1000))
     done = run("build", "tuft.ply", "--quiet", "--json", cwd=folder)
     assert done.returncode == 0, done.stderr
     (folder / "build.json").write_text(done.stdout)
@@ -164,7 +164,7 @@ def dirty(folder):
     asset.sh[3, 0, 1] = np.nan
     asset.opacities[5] = 0.001
     asset.means[7] = 0, 0, 1e4
-    v3dg.save(folder / "dirty.ply", asset)
+    v3dg.write_asset(folder / "dirty.ply", asset)
     return folder / "dirty.ply"
 
 
@@ -193,7 +193,7 @@ def test_build_leaves_out_what_cannot_be_drawn_and_says_so(dirty, tmp_path):
 def test_build_refuses_an_asset_with_nothing_left(folder, tmp_path):
     asset = make_asset(1000)
     asset.opacities[:] = 0
-    v3dg.save(tmp_path / "hidden.ply", asset)
+    v3dg.write_asset(tmp_path / "hidden.ply", asset)
     fails(1, "got none: 1,000 of 1,000 gaussians", "build", "hidden.ply", cwd=tmp_path)
 
 
@@ -318,7 +318,7 @@ def test_failures(folder):
 
 
 def test_interrupt_leaves_no_bundle_and_says_so(tmp_path):
-    v3dg.save(tmp_path / "big.ply", make_asset(60_000))
+    v3dg.write_asset(tmp_path / "big.ply", make_asset(60_000))
     command = [*COMMAND, "build", "big.ply", "--quiet"]
     process = subprocess.Popen(
         command,

@@ -21,7 +21,7 @@ def tiny(seed=0):
 def folder(tmp_path):
     """Three assets, one of which cannot be read, and a file that is no asset."""
     for name in ("a", "c"):
-        v3dg.save(tmp_path / f"{name}.ply", tiny(ord(name)))
+        v3dg.write_asset(tmp_path / f"{name}.ply", tiny(ord(name)))
     (tmp_path / "b.ply").write_bytes(b"ply\n")
     (tmp_path / "notes.txt").write_text("not an asset")
     return tmp_path
@@ -72,7 +72,7 @@ def test_resume_keeps_what_is_done_with_these_settings(folder):
 
 def test_an_interrupt_says_how_far_it_got(folder):
     (folder / "b.ply").unlink()
-    v3dg.save(folder / "b.ply", make_asset(60_000))
+    v3dg.write_asset(folder / "b.ply", make_asset(60_000))
     process = subprocess.Popen(
         [*COMMAND, "build", ".", "--cluster-size", "64"],
         cwd=folder,
@@ -98,7 +98,7 @@ def test_errors_before_anything_is_built(folder):
     fails(2, "expected a folder for the bundles", "build", ".", "-o", "all.v3dg", cwd=folder)
     (folder / "empty").mkdir()
     fails(1, "empty: expected a folder with assets (.ply", "build", "empty", cwd=folder)
-    v3dg.save(folder / "empty" / "a.ply", tiny())
+    v3dg.write_asset(folder / "empty" / "a.ply", tiny())
     message = "out/a.v3dg: expected one asset for it, got a.ply and empty/a.ply"
     (folder / "out").mkdir()
     fails(1, message, "build", "a.ply", "empty", "-o", "out", cwd=folder)

@@ -18,9 +18,9 @@ def folder(tmp_path_factory):
     """An asset, its bundle, and a scene of it with one near and one far camera."""
     folder = tmp_path_factory.mktemp("compare")
     asset = make_asset(1000)
-    v3dg.save(folder / "tuft.ply", asset)
+    v3dg.write_asset(folder / "tuft.ply", asset)
     bundle = v3dg.build_bundle(asset, config=v3dg.BuildConfig(steps=20), progress=False, device="cpu")
-    bundle.save(folder / "tuft.v3dg")
+    bundle.write(folder / "tuft.v3dg")
     scene = v3dg.Scene()
     scene.add(bundle, positions=[[0, 0, 0]])
     cameras = {

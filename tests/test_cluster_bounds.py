@@ -36,7 +36,7 @@ def may_draw(scene, camera, *, tolerance, min_level=0, footprint="solid_angle", 
 
 def drawn(scene, camera, **options):
     """The same for what is drawn."""
-    cut = select(scene, camera, **options)
+    cut = select(scene, camera, device="cpu", **options)
     masks = [np.zeros(len(scene.bundles[b].clusters.level), bool) for b in scene.instance_bundle]
     for i, c in zip(cut.instance_ids, cut.cluster_ids, strict=True):
         masks[i][c] = True

@@ -43,8 +43,8 @@ def composed(rng, count=40, **change):
 def test_budget_is_met_by_the_finest_cut(device, seed):
     rng = np.random.default_rng(seed)
     scene, camera = composed(rng), random_camera(rng, distance=6)
-    full = select(scene, camera, tolerance=0.0).num_gaussians
-    least = select(scene, camera, tolerance=np.inf).num_gaussians
+    full = select(scene, camera, tolerance=0.0, device="cpu").num_gaussians
+    least = select(scene, camera, tolerance=np.inf, device="cpu").num_gaussians
     for budget in (least, least + 1, *rng.integers(least, full + 1, 4), full, full + 1):
         cut = select(scene, camera, budget=int(budget), device=device)
         assert cut.num_gaussians <= budget
@@ -77,7 +77,7 @@ def test_tolerance_and_budget_both_hold(device):
 def test_budget_below_the_coarsest_cut_is_refused(device):
     rng = np.random.default_rng(4)
     scene, camera = composed(rng), random_camera(rng, distance=6)
-    least = select(scene, camera, tolerance=np.inf).num_gaussians
+    least = select(scene, camera, tolerance=np.inf, device="cpu").num_gaussians
     message = rf"budget: expected at least {least} gaussians, .*, got {least - 1}"
     with pytest.raises(ValueError, match=message):
         select(scene, camera, budget=least - 1, device=device)
@@ -86,16 +86,18 @@ def test_budget_below_the_coarsest_cut_is_refused(device):
     with pytest.raises(ValueError, match=message):
         render(scene, camera, budget=least - 1, device=device).stats  # noqa: B018  waits for the picture
     with pytest.raises(ValueError, match="budget: expected 0 gaussians or more, got -1"):
-        select(scene, camera, budget=-1)
+        select(scene, camera, budget=-1, device="cpu")
 
 
 def test_budget_with_the_papers_footprint(device):
     rng = np.random.default_rng(5)
     scene, camera = composed(rng), random_camera(rng, distance=6)
-    full = select(scene, camera, tolerance=0.0, footprint="paper").num_gaussians
+    full = select(scene, camera, tolerance=0.0, footprint="paper", device="cpu").num_gaussians
     cut = select(scene, camera, budget=full // 2, footprint="paper", device=device)
     assert 0 < cut.num_gaussians <= full // 2
-    assert pairs(cut) == pairs(select(scene, camera, tolerance=cut.tolerance, footprint="paper"))
+    assert pairs(cut) == pairs(
+        select(scene, camera, tolerance=cut.tolerance, footprint="paper", device="cpu")
+    )
 
 
 def test_importance_divides_the_tolerance(device):
@@ -133,7 +135,7 @@ def test_nothing_finer_than_the_least_level(device, min_level):
             assert len(mine.intersection(path)) == 1
     assert pairs(select(scene, camera, tolerance=0.0, min_level=min_level, device=device))
     with pytest.raises(ValueError, match="min_level: expected a level, 0 or more, got -1"):
-        select(scene, camera, min_level=-1)
+        select(scene, camera, min_level=-1, device="cpu")
 
 
 def rebuilt(scene):
@@ -167,7 +169,7 @@ def test_scene_that_changes_is_the_scene_built_anew(device):
         fresh = rebuilt(scene)
         a, b = (select(s, camera, tolerance=0.2, device=device) for s in (scene, fresh))
         assert len(scene) == len(fresh)
-        assert pairs(a) == pairs(b) == pairs(select(scene, camera, tolerance=0.2))
+        assert pairs(a) == pairs(b) == pairs(select(scene, camera, tolerance=0.2, device="cpu"))
         same_picture(*(render(s, camera, tolerance=0.2, device=device) for s in (scene, fresh)))
 
 
@@ -283,19 +285,21 @@ def test_cut_can_be_kept_while_the_camera_moves(device):
     # Drawn as an asset is, from the same gaussians in the world.
     own = render(scene, other, tolerance=0.5, device=device)
     assert not np.array_equal(host(kept.color), host(own.color))
-    nothing = select(scene, v3dg.Camera.look_at((1e6, 0, 0), (2e6, 0, 0), width=8, height=8), tolerance=1.0)
+    nothing = select(
+        scene, v3dg.Camera.look_at((1e6, 0, 0), (2e6, 0, 0), width=8, height=8), tolerance=1.0, device="cpu"
+    )
     assert not host(render(scene, camera, cut=nothing, device=device).alpha).any()
 
 
 def test_cut_of_another_scene_is_refused(device):
     rng = np.random.default_rng(13)
     scene, camera = composed(rng), random_camera(rng)
-    cut = select(scene, camera)
+    cut = select(scene, camera, device="cpu")
     with pytest.raises(ValueError, match="cut: expected a selection from this scene"):
         render(composed(rng), camera, cut=cut, device=device)
     with pytest.raises(ValueError, match="budget: expected nothing beside a cut"):
         render(scene, camera, cut=cut, budget=10**6, device=device)
-    everything = select(scene, camera, cull=False)
+    everything = select(scene, camera, cull=False, device="cpu")
     scene.remove(len(scene) - 1)
     with pytest.raises(ValueError, match="cut: expected instances of the scene"):
         render(scene, camera, cut=everything, device=device)
@@ -376,7 +380,7 @@ def test_both_devices_choose_the_same():
     for trial in range(20):
         scene, camera = composed(rng, 100, log_scale=0.5), random_camera(rng, distance=20)
         options = {"min_level": int(rng.integers(3)), "cull": bool(trial % 2)}
-        least = select(scene, camera, tolerance=np.inf, **options).num_gaussians
+        least = select(scene, camera, tolerance=np.inf, device="cpu", **options).num_gaussians
         for choice in ({"tolerance": float(10 ** rng.uniform(-3, 3))}, {"budget": 2 * least + 5}):
             cpu, cuda = (select(scene, camera, device=d, **choice, **options) for d in ("cpu", "cuda"))
             assert pairs(cpu) == pairs(cuda)
@@ -390,8 +394,8 @@ def test_budgets_before_do_not_matter():
     for _ in range(20):
         scene = random_scene(rng, lod_bundle(rng, blob(rng, 120), 8), 3, spread=1)
         camera = random_camera(rng, distance=1)
-        least = select(scene, camera, tolerance=np.inf).num_gaussians
-        full = select(scene, camera, tolerance=0.0).num_gaussians
+        least = select(scene, camera, tolerance=np.inf, device="cpu").num_gaussians
+        full = select(scene, camera, tolerance=0.0, device="cpu").num_gaussians
         for budget in rng.integers(least, full + 2, 12):
             cpu, cuda = (select(scene, camera, budget=int(budget), device=d) for d in ("cpu", "cuda"))
             assert cpu.tolerance == cuda.tolerance
@@ -415,8 +419,8 @@ def test_pick_finds_what_a_pixel_shows():
     rng = np.random.default_rng(17)
     scene, camera = composed(rng, 15), random_camera(rng, distance=8)
     options = {"tolerance": 0.3}
-    image = render(scene, camera, **options)
-    full = select(scene, camera, **options)
+    image = render(scene, camera, device="cpu", **options)
+    full = select(scene, camera, device="cpu", **options)
     seen = 0
     for x, y in rng.integers(0, (camera.width, camera.height), (40, 2)):
         found = v3dg.pick(scene, camera, x, y, **options)
@@ -429,7 +433,7 @@ def test_pick_finds_what_a_pixel_shows():
         # Without its cluster the pixel loses at least as much as the picked gaussian gave, behind or not.
         keep = (full.instance_ids != found.instance) | (full.cluster_ids != found.cluster)
         rest = replace(full, instance_ids=full.instance_ids[keep], cluster_ids=full.cluster_ids[keep])
-        assert image.alpha[y, x] != render(scene, camera, cut=rest).alpha[y, x]
+        assert image.alpha[y, x] != render(scene, camera, cut=rest, device="cpu").alpha[y, x]
         ray = camera.viewmat[:3, :3] @ (found.position - camera.position)
         np.testing.assert_allclose(
             ray[:2] / ray[2] * [camera.fx, camera.fy] + [camera.cx, camera.cy], [x + 0.5, y + 0.5], atol=1e-6

@@ -16,8 +16,8 @@ def folder(tmp_path_factory):
     """A folder with an asset, a bundle and a scene of two instances and two cameras."""
     folder = tmp_path_factory.mktemp("convert")
     asset = make_asset(2000)
-    v3dg.save(folder / "tuft.ply", asset)
-    v3dg.build_bundle(asset, config=v3dg.BuildConfig(cluster_size=64, steps=0), progress=False).save(
+    v3dg.write_asset(folder / "tuft.ply", asset)
+    v3dg.build_bundle(asset, config=v3dg.BuildConfig(cluster_size=64, steps=0), progress=False).write(
         folder / "tuft.v3dg"
     )
     scene = {
@@ -39,12 +39,12 @@ def converted(folder, *arguments):
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["bytes"] == (folder / arguments[1]).stat().st_size
-    return result, v3dg.load(folder / arguments[1])
+    return result, v3dg.read_asset(folder / arguments[1])
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
 def test_an_asset_becomes_any_format_and_that_a_ply(folder, suffix):
-    asset = v3dg.load(folder / "tuft.ply")
+    asset = v3dg.read_asset(folder / "tuft.ply")
     result, _ = converted(folder, "tuft.ply", f"a{suffix}")
     assert result["gaussians"] == len(asset)
     assert result["sh_degree"] == asset.sh_degree
@@ -75,16 +75,16 @@ def test_the_cut_of_a_scene_for_one_of_its_cameras(folder):
         result, gaussians = converted(
             folder, "scene.json", "cut.ply", "--camera", "near", "--tolerance", "2", "--outside", outside
         )
-        wanted = v3dg.select(scene, cameras["near"], tolerance=2, cull=cull)
+        wanted = v3dg.select(scene, cameras["near"], tolerance=2, cull=cull, device="cpu")
         assert result["clusters"] == len(wanted)
-        np.testing.assert_array_equal(gaussians.means, wanted.gaussians().means)
+        np.testing.assert_array_equal(gaussians.means, wanted.gaussians(device="cpu").means)
 
 
 def test_cameras_of_a_file(folder):
     camera = v3dg.Camera.look_at((0, -30, 2), (0, 0, 0), (0, 0, 1), fov_x=0.8, width=64, height=48)
     v3dg.write_cameras(folder / "transforms.json", {"a": camera})
     _, gaussians = converted(folder, "tuft.v3dg", "cut.ply", "--cameras", "transforms.json")
-    wanted = v3dg.select(v3dg.Bundle.open(folder / "tuft.v3dg"), camera)
+    wanted = v3dg.select(v3dg.Bundle.open(folder / "tuft.v3dg"), camera, device="cpu")
     assert len(gaussians) == wanted.num_gaussians
 
 
@@ -134,7 +134,7 @@ def test_what_cannot_be_meant_is_refused(folder):
 
 def test_the_meta_json_of_an_asset_is_no_scene(folder):
     (folder / "sog").mkdir()
-    v3dg.save(folder / "a.sog", v3dg.load(folder / "tuft.ply"))
+    v3dg.write_asset(folder / "a.sog", v3dg.read_asset(folder / "tuft.ply"))
     with zipfile.ZipFile(folder / "a.sog") as bundle:
         bundle.extractall(folder / "sog")
     for command in (["info"], ["render", "-o", "picture.png", "--size", 64, 48]):

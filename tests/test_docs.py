@@ -57,17 +57,17 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("docs")
     asset = make_donut(1000, seed=0)
     for name in ("donut.ply", "donut.spz"):
-        v3dg.save(folder / name, asset)
+        v3dg.write_asset(folder / name, asset)
     config = v3dg.BuildConfig(steps=10, cluster_size=64)
     bundle = v3dg.build_bundle(asset, config=config, progress=False, device="cpu")
-    bundle.save(folder / "donut.v3dg")
+    bundle.write(folder / "donut.v3dg")
     for name in ("plants", "assets", "trees"):
         (folder / name).mkdir()
-    bundle.save(folder / "plants" / "tree.v3dg")
+    bundle.write(folder / "plants" / "tree.v3dg")
     for i in range(8):
         tree = asset.subset(slice(100 * i, 100 * i + 100))
-        v3dg.save(folder / "trees" / f"tree{i}.ply", tree)
-        v3dg.save(folder / "assets" / f"asset{i}.ply", tree)
+        v3dg.write_asset(folder / "trees" / f"tree{i}.ply", tree)
+        v3dg.write_asset(folder / "assets" / f"asset{i}.ply", tree)
     scene = v3dg.Scene()
     scene.add(bundle, positions=[[0, 0, 0], [1, 0, 0]])
     around = v3dg.turntable((0, 0, 0), 3, 6, width=64, height=48)
@@ -76,7 +76,7 @@ def files(tmp_path_factory):
     # The folders of the V3DG paper's code.
     theirs = folder / "_3dgs-assets" / "donut" / "donut" / "point_cloud" / "iteration_30000"
     theirs.mkdir(parents=True)
-    v3dg.save(theirs / "fused.ply", asset)
+    v3dg.write_asset(theirs / "fused.ply", asset)
     (folder / "_layout-descriptions").mkdir()
     (folder / "_layout-descriptions" / "DonutSea.json").write_text(json.dumps(published_layout()))
     commands = folder / "bin"

@@ -87,7 +87,9 @@ def test_cut_of_the_hierarchy_has_one_node_above_every_leaf(asset, scene, target
 def test_hierarchy_at_size_zero_draws_the_asset(asset, scene):
     theirs = HierarchyScene(build_hierarchy(asset), scene, "cpu")
     found = theirs.gaussians(theirs.cut(eye_camera(12), 0.0))
-    expected = v3dg.select(scene, eye_camera(12), tolerance=0, cull=False).gaussians()
+    expected = v3dg.select(scene, eye_camera(12), tolerance=0, cull=False, device="cpu").gaussians(
+        device="cpu"
+    )
     order = [np.lexsort(g.means.T) for g in (found, expected)]
     np.testing.assert_allclose(found.means[order[0]], expected.means[order[1]], atol=1e-5)
     np.testing.assert_allclose(found.opacities[order[0]], expected.opacities[order[1]], atol=1e-6)
@@ -143,8 +145,8 @@ def test_clip_leaves_at_most_as_many_as_wanted(asset):
 def test_tolerance_for_a_count_is_the_smallest_that_fits(scene):
     camera = eye_camera(12)
     tolerance = measure.tolerance_for(scene, camera, 3000)
-    assert v3dg.select(scene, camera, tolerance=tolerance).num_gaussians <= 3000
-    assert v3dg.select(scene, camera, tolerance=0.99 * tolerance).num_gaussians > 3000
+    assert v3dg.select(scene, camera, tolerance=tolerance, device="cpu").num_gaussians <= 3000
+    assert v3dg.select(scene, camera, tolerance=0.99 * tolerance, device="cpu").num_gaussians > 3000
 
 
 def test_tolerance_for_a_count_that_cannot_be_is_the_coarsest(scene):

@@ -55,7 +55,7 @@ def gsplat_example(tmp_path):
     """The example, and its settings for a field of small donuts."""
     example = load_example("with_gsplat")
     config = v3dg.BuildConfig(cluster_size=64, steps=0)
-    v3dg.build_bundle(make_donut(2000), config=config, progress=False).save(tmp_path / "donut.v3dg")
+    v3dg.build_bundle(make_donut(2000), config=config, progress=False).write(tmp_path / "donut.v3dg")
     return example, example.Config(
         tmp_path / "donut.v3dg", tmp_path / "picture.png", rows=4, size=(160, 120), tolerance=30
     )
@@ -66,7 +66,7 @@ def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
     example, config = gsplat_example
     scene, camera = example.make_scene(config)
     camera = v3dg.Camera(camera.viewmat, camera.K, camera.width, camera.height, near=0.02)
-    selection = v3dg.select(scene, camera, tolerance=config.tolerance)
+    selection = v3dg.select(scene, camera, tolerance=config.tolerance, device="cpu")
     assert selection.num_gaussians < example.num_gaussians(scene) / 4
     arguments = example.gsplat_arguments(selection, camera, "cpu")
     tensors = [value for value in arguments.values() if isinstance(value, torch.Tensor)]
@@ -89,7 +89,7 @@ def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
         filter_px2=arguments["eps2d"],
         antialiased=True,
     )
-    wanted = v3dg.render(scene, camera, tolerance=config.tolerance)
+    wanted = v3dg.render(scene, camera, tolerance=config.tolerance, device="cpu")
     assert wanted.alpha.max() > 0.9
     # Coarser levels have the filter of the arguments; what is left is rounding of the translation.
     assert psnr(wanted.color, drawn.color.numpy()) > 100

@@ -12,7 +12,7 @@ import pytest
 import v3dg
 from command_line import fails, run
 from random_bundle import random_bundle
-from v3dg.export import export_streamed_sog
+from v3dg.export import write_streamed_sog
 from v3dg.metrics import psnr
 
 
@@ -31,7 +31,7 @@ def assert_holds(folder, bundle, chunk):
     """Every leaf has all levels; together the leaves have each gaussian once, and the files nothing else."""
     index = json.loads((folder / "lod-meta.json").read_text())
     leaves = leaves_of(index["tree"])
-    files = [v3dg.load(folder / name) for name in index["filenames"]]
+    files = [v3dg.read_asset(folder / name) for name in index["filenames"]]
     used = [np.zeros(len(file), int) for file in files]
     for level in range(index["lodLevels"]):
         wanted = bundle.level_gaussians(level)
@@ -73,7 +73,7 @@ def bundle():
 
 @pytest.mark.parametrize("chunk", [70, 250, 500, 10**9])
 def test_every_gaussian_is_in_one_chunk_of_its_level(tmp_path, bundle, chunk):
-    done = export_streamed_sog(bundle, tmp_path / "web", chunk=chunk)
+    done = write_streamed_sog(bundle, tmp_path / "web", chunk=chunk)
     index, leaves = assert_holds(tmp_path / "web", bundle, chunk)
     assert (done.counts, done.chunks, done.files) == (index["counts"], len(leaves), len(index["filenames"]))
     assert done.bytes == sum(file.stat().st_size for file in (tmp_path / "web").rglob("*.*"))
@@ -85,14 +85,14 @@ def test_every_gaussian_is_in_one_chunk_of_its_level(tmp_path, bundle, chunk):
 
 
 def test_the_finest_level_of_an_export_loads(tmp_path, bundle):
-    export_streamed_sog(bundle, tmp_path / "web", chunk=250)
-    loaded, wanted = v3dg.load(tmp_path / "web" / "lod-meta.json"), bundle.level_gaussians(0)
+    write_streamed_sog(bundle, tmp_path / "web", chunk=250)
+    loaded, wanted = v3dg.read_asset(tmp_path / "web" / "lod-meta.json"), bundle.level_gaussians(0)
     np.testing.assert_allclose(np.sort(loaded.means, axis=0), np.sort(wanted.means, axis=0), atol=5e-4)
 
 
 def edited(tmp_path, bundle, **changes):
     """The index of an export with other values at the top, or in its first leaf's finest level."""
-    export_streamed_sog(bundle, tmp_path / "web", chunk=10**9)
+    write_streamed_sog(bundle, tmp_path / "web", chunk=10**9)
     path = tmp_path / "web" / "lod-meta.json"
     index = json.loads(path.read_text())
     for name, value in changes.items():
@@ -103,12 +103,12 @@ def edited(tmp_path, bundle, **changes):
 
 def test_an_environment_is_loaded_with_the_rest(tmp_path, bundle):
     path = edited(tmp_path, bundle, environment="3_0/meta.json")
-    assert len(v3dg.load(path)) == len(bundle.level_gaussians(0)) + len(bundle.level_gaussians(3))
+    assert len(v3dg.read_asset(path)) == len(bundle.level_gaussians(0)) + len(bundle.level_gaussians(3))
 
 
 def test_an_environment_that_is_null_is_none(tmp_path, bundle):
     path = edited(tmp_path, bundle, environment=None)
-    assert len(v3dg.load(path)) == len(bundle.level_gaussians(0))
+    assert len(v3dg.read_asset(path)) == len(bundle.level_gaussians(0))
 
 
 def test_a_leaf_without_its_finest_level_has_the_next(tmp_path, bundle):
@@ -116,7 +116,7 @@ def test_a_leaf_without_its_finest_level_has_the_next(tmp_path, bundle):
     index = json.loads(path.read_text())
     index["tree"]["lods"]["0"]["count"] = 0
     path.write_text(json.dumps(index))
-    assert len(v3dg.load(path)) == len(bundle.level_gaussians(1))
+    assert len(v3dg.read_asset(path)) == len(bundle.level_gaussians(1))
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_a_leaf_without_its_finest_level_has_the_next(tmp_path, bundle):
 def test_hostile_indices_are_refused(tmp_path, bundle, changes, message):
     path = edited(tmp_path, bundle, **changes)
     with pytest.raises(ValueError, match=r"lod-meta\.json") as error:
-        v3dg.load(path)
+        v3dg.read_asset(path)
     assert message in str(error.value)
 
 
@@ -150,7 +150,7 @@ def test_a_wrong_index_is_refused_before_a_chunk_is_decoded(tmp_path, bundle, ch
     decoded = []
     monkeypatch.setattr(v3dg.formats.sog, "read", decoded.append)
     with pytest.raises(ValueError, match=r"lod-meta\.json"):
-        v3dg.load(path)
+        v3dg.read_asset(path)
     assert decoded == []
 
 
@@ -158,7 +158,7 @@ def test_a_wrong_index_is_refused_before_a_chunk_is_decoded(tmp_path, bundle, ch
 def test_bundles_of_any_shape_are_exported(tmp_path, seed):
     """Groups of several clusters, clusters without gaussians, one level or four, SH of every degree."""
     bundle = random_bundle(seed, num_levels=1 + seed % 4, sh_degree=seed % 4, max_cluster=9)
-    export_streamed_sog(bundle, tmp_path / "web", chunk=100)
+    write_streamed_sog(bundle, tmp_path / "web", chunk=100)
     index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
     for level, count in enumerate(index["counts"]):
         assert count == len(bundle.level_gaussians(level))
@@ -166,17 +166,17 @@ def test_bundles_of_any_shape_are_exported(tmp_path, seed):
 
 def test_many_chunks_share_a_folder_up_to_its_size(tmp_path, bundle, monkeypatch):
     monkeypatch.setattr(v3dg.export, "_FOLDER_GAUSSIANS", 300)
-    export_streamed_sog(bundle, tmp_path / "web", chunk=150)
+    write_streamed_sog(bundle, tmp_path / "web", chunk=150)
     index, _ = assert_holds(tmp_path / "web", bundle, 150)
     of_level_0 = [name for name in index["filenames"] if name.startswith("0_")]
     assert of_level_0 == [f"0_{i}/meta.json" for i in range(len(of_level_0))]
-    sizes = [len(v3dg.load(tmp_path / "web" / name)) for name in of_level_0]
+    sizes = [len(v3dg.read_asset(tmp_path / "web" / name)) for name in of_level_0]
     assert all(300 <= size < 450 for size in sizes[:-1])
 
 
 def test_an_earlier_export_is_replaced_and_kept_on_failure(tmp_path, bundle, monkeypatch):
     folder = tmp_path / "web"
-    export_streamed_sog(bundle, folder, chunk=200)
+    write_streamed_sog(bundle, folder, chunk=200)
     before = sorted(os.listdir(folder))
     with monkeypatch.context() as patch:
 
@@ -185,15 +185,15 @@ def test_an_earlier_export_is_replaced_and_kept_on_failure(tmp_path, bundle, mon
 
         patch.setattr(v3dg.export.sog, "encode", full_disk)
         with pytest.raises(OSError, match="No space left on device"):
-            export_streamed_sog(bundle, folder, chunk=10**9)
+            write_streamed_sog(bundle, folder, chunk=10**9)
     assert sorted(os.listdir(folder)) == before
-    export_streamed_sog(bundle, folder, chunk=10**9)
+    write_streamed_sog(bundle, folder, chunk=10**9)
     assert sorted(os.listdir(folder)) != before
     assert os.listdir(tmp_path) == ["web"]
 
 
 def test_a_viewer_starts_where_it_sees_the_asset(tmp_path, bundle):
-    export_streamed_sog(bundle, tmp_path / "web")
+    write_streamed_sog(bundle, tmp_path / "web")
     pose = json.loads((tmp_path / "web" / "settings.json").read_text())["cameras"][0]["initial"]
     turn = np.diag([-1.0, -1.0, 1.0])  # of an asset in the viewer
     position, target = (turn @ pose[name] for name in ("position", "target"))
@@ -227,8 +227,8 @@ def test_what_is_up_becomes_what_viewers_take_to_be_up(tmp_path, up):
 
     asset = make_donut(1000)
     bundle = v3dg.build_bundle(asset, config=v3dg.BuildConfig(steps=0), progress=False)
-    export_streamed_sog(bundle, tmp_path / "web", chunk=2000, up=up)
-    turned = v3dg.load(tmp_path / "web" / "0_0" / "meta.json")
+    write_streamed_sog(bundle, tmp_path / "web", chunk=2000, up=up)
+    turned = v3dg.read_asset(tmp_path / "web" / "0_0" / "meta.json")
     axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
     side = np.eye(3)[("xyz".index(up[-1]) + 1) % 3]
     eye = 0.5 * side + 0.3 * axis
@@ -250,20 +250,20 @@ def test_other_folders_and_impossible_chunks_are_refused(tmp_path, bundle):
     (tmp_path / "file").touch()
     for name in ("mine", "file"):
         with pytest.raises(ValueError, match=f"{name}: expected a new folder, or one with an earlier export"):
-            export_streamed_sog(bundle, tmp_path / name)
+            write_streamed_sog(bundle, tmp_path / name)
     with pytest.raises(
         ValueError, match=r"chunk: expected at least \d+ gaussians, the size of a group of the asset, got 9"
     ):
-        export_streamed_sog(bundle, tmp_path / "web", chunk=9)
+        write_streamed_sog(bundle, tmp_path / "web", chunk=9)
     with pytest.raises(ValueError, match="bundle: expected gaussians to export, got none"):
-        export_streamed_sog(random_bundle(num_levels=0), tmp_path / "web")
+        write_streamed_sog(random_bundle(num_levels=0), tmp_path / "web")
     with pytest.raises(FileNotFoundError, match="absent"):
-        export_streamed_sog(bundle, tmp_path / "absent" / "web")
+        write_streamed_sog(bundle, tmp_path / "absent" / "web")
     assert sorted(os.listdir(tmp_path)) == ["file", "mine"]
 
 
 def test_the_command(tmp_path, bundle):
-    bundle.save(tmp_path / "tuft.v3dg")
+    bundle.write(tmp_path / "tuft.v3dg")
     done = run("export", "tuft.v3dg", "--chunk", 200, "--json", "--quiet", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
@@ -279,10 +279,10 @@ def test_the_command(tmp_path, bundle):
 @pytest.mark.witness
 @pytest.mark.skipif(shutil.which("splat-transform") is None, reason="needs splat-transform")
 def test_splat_transform_reads_an_export(tmp_path, bundle):
-    export_streamed_sog(bundle, tmp_path / "web", chunk=500)
+    write_streamed_sog(bundle, tmp_path / "web", chunk=500)
     for level in (0, 2):
         arguments = ["-g", "cpu", "-q", "-w", "-L", str(level), "web/lod-meta.json", "back.ply"]
         subprocess.run(["splat-transform", *arguments], cwd=tmp_path, check=True)
-        back, wanted = v3dg.load(tmp_path / "back.ply"), bundle.level_gaussians(level)
+        back, wanted = v3dg.read_asset(tmp_path / "back.ply"), bundle.level_gaussians(level)
         assert len(back) == len(wanted)
         np.testing.assert_allclose(back.means.mean(axis=0), wanted.means.mean(axis=0), atol=1e-4)

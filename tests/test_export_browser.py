@@ -19,7 +19,7 @@ from PIL import Image
 import chromium
 import v3dg
 from benchmarks.worlds.procedural import make_donut
-from v3dg.export import export_streamed_sog
+from v3dg.export import write_streamed_sog
 from v3dg.metrics import psnr
 
 pytest.importorskip("playwright.sync_api")
@@ -51,7 +51,7 @@ def bundle():
 def server(tmp_path_factory, bundle):
     folder = tmp_path_factory.mktemp("web") / "site"
     shutil.copytree(VIEWER, folder)
-    export_streamed_sog(bundle, folder / "donut", chunk=6000, up="z")
+    write_streamed_sog(bundle, folder / "donut", chunk=6000, up="z")
     handler = functools.partial(Handler, directory=folder)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         server.asked, server.folder = [], folder

@@ -19,7 +19,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from test_ply import random_gaussians
-from v3dg import Gaussians, load, save
+from v3dg import Gaussians, read_asset, write_asset
 
 FIXTURES = Path(__file__).parent / "fixtures"
 SH_C0 = 0.28209479177387814
@@ -124,7 +124,7 @@ FOREIGN = {
 
 
 def reference_of(name):
-    return load(FIXTURES / ("sh3.ply" if "sh3" in name else "sh0.ply"))
+    return read_asset(FIXTURES / ("sh3.ply" if "sh3" in name else "sh0.ply"))
 
 
 def in_order_of(reference, gaussians):
@@ -165,7 +165,7 @@ def assert_within(gaussians, reference, bounds):
 @pytest.mark.parametrize("name", FOREIGN)
 def test_what_other_tools_write_is_read(name):
     reference = reference_of(name)
-    gaussians = in_order_of(reference, load(FIXTURES / name))
+    gaussians = in_order_of(reference, read_asset(FIXTURES / name))
     if name.endswith("splat"):
         sh = np.ascontiguousarray(reference.sh[:, : gaussians.sh.shape[1]])
         sh[:, 0] = np.clip(sh[:, 0], -0.5 / SH_C0, 0.5 / SH_C0)  # between black and white
@@ -176,21 +176,21 @@ def test_what_other_tools_write_is_read(name):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("suffix", WRITTEN)
 def test_what_is_written_reads_back(tmp_path, suffix, degree):
-    reference = load(FIXTURES / "sh3.ply")
+    reference = read_asset(FIXTURES / "sh3.ply")
     sh = np.ascontiguousarray(reference.sh[:, : (degree + 1) ** 2])
     reference = Gaussians(reference.means, reference.quats, reference.scales, reference.opacities, sh)
     path = tmp_path / f"a{suffix}"
-    save(path, reference)
-    assert_within(in_order_of(reference, load(path)), reference, WRITTEN[suffix](reference))
+    write_asset(path, reference)
+    assert_within(in_order_of(reference, read_asset(path)), reference, WRITTEN[suffix](reference))
     assert path.stat().st_size < 64 * (20 + 3 * sh.shape[1]) + 17_000  # SOG's tables
 
 
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".spz"])
 def test_gsply_reads_what_we_write(tmp_path, suffix, degree):
-    reference = load(FIXTURES / f"sh{degree}.ply")
+    reference = read_asset(FIXTURES / f"sh{degree}.ply")
     path = tmp_path / f"a{suffix}"
-    save(path, reference)
+    write_asset(path, reference)
     theirs = gsply.read_spz(str(path)) if suffix == ".spz" else gsply.plyread(str(path))
     num = len(reference)
     sh = theirs.sh0[:, None] if not degree else np.concatenate([theirs.sh0[:, None], theirs.shN], axis=1)
@@ -212,14 +212,14 @@ def test_gsply_reads_what_we_write(tmp_path, suffix, degree):
 @pytest.mark.parametrize("suffix", WRITTEN)
 def test_no_gaussians_and_extreme_ones_are_written(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
-    save(path, random_gaussians(0, 1))
-    assert len(load(path)) == 0
+    write_asset(path, random_gaussians(0, 1))
+    assert len(read_asset(path)) == 0
     one = random_gaussians(1, 0)
     one.scales[:] = 0, 1e-30, 1e30
     one.opacities[:] = 1
     one.quats[:] = -1e-20, 0, 0, 0
-    save(path, one)
-    back = load(path)
+    write_asset(path, one)
+    back = read_asset(path)
     np.testing.assert_array_equal(back.opacities, one.opacities)
     np.testing.assert_allclose(np.abs(back.quats), [[1, 0, 0, 0]], atol=4e-3)
     assert np.isfinite(back.scales).all()
@@ -229,12 +229,14 @@ def test_small_and_large_assets_keep_their_shape_in_spz(tmp_path):
     for size in (1e-4, 1.0, 1e3, 4e6):
         asset = random_gaussians(100, 0)
         means = (asset.means / np.abs(asset.means).max() * size).astype(np.float32)
-        save(tmp_path / "a.spz", Gaussians(means, asset.quats, asset.scales, asset.opacities, asset.sh))
-        assert np.abs(load(tmp_path / "a.spz").means - means).max() <= max(size * 2**-17, 2**-22)
+        write_asset(
+            tmp_path / "a.spz", Gaussians(means, asset.quats, asset.scales, asset.opacities, asset.sh)
+        )
+        assert np.abs(read_asset(tmp_path / "a.spz").means - means).max() <= max(size * 2**-17, 2**-22)
     with pytest.raises(
         ValueError, match=r"means: expected coordinates within ±8388607 for \.spz, got 1e\+07"
     ):
-        save(
+        write_asset(
             tmp_path / "b.spz",
             Gaussians(means * np.float32(2.5), asset.quats, asset.scales, asset.opacities, asset.sh),
         )
@@ -245,8 +247,8 @@ def test_small_and_large_assets_keep_their_shape_in_spz(tmp_path):
 def test_what_no_pixel_shows_is_not_rounded_up_to_what_one_does(tmp_path, suffix):
     asset = random_gaussians(4, 0)
     asset.opacities[:] = 0.0, 0.9 / 255, 1 / 255, 1.4 / 255
-    save(tmp_path / f"a{suffix}", asset)
-    found = in_order_of(asset, load(tmp_path / f"a{suffix}")).opacities
+    write_asset(tmp_path / f"a{suffix}", asset)
+    found = in_order_of(asset, read_asset(tmp_path / f"a{suffix}")).opacities
     np.testing.assert_allclose(found, np.array([0, 0, 1, 1]) / 255, rtol=1e-6)
 
 
@@ -265,7 +267,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path, suffix, name, row, value
     asset = random_gaussians(10, 0)
     getattr(asset, name)[row] = value
     with pytest.raises(ValueError, match=message):
-        save(tmp_path / f"a{suffix}", asset)
+        write_asset(tmp_path / f"a{suffix}", asset)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -273,15 +275,17 @@ def test_an_encoding_is_for_ply_only(tmp_path):
     with pytest.raises(
         ValueError, match=r"encoding: expected none for .*a\.spz, which is no \.ply, got 'ascii'"
     ):
-        save(tmp_path / "a.spz", random_gaussians(1, 0), encoding="ascii")
+        write_asset(tmp_path / "a.spz", random_gaussians(1, 0), encoding="ascii")
 
 
 def test_a_compressed_ply_is_told_by_its_content(tmp_path):
     (tmp_path / "a.ply").write_bytes((FIXTURES / "sh0.compressed.ply").read_bytes())
-    np.testing.assert_array_equal(load(tmp_path / "a.ply").means, load(FIXTURES / "sh0.compressed.ply").means)
-    save(tmp_path / "b.ply", random_gaussians(3, 0))
+    np.testing.assert_array_equal(
+        read_asset(tmp_path / "a.ply").means, read_asset(FIXTURES / "sh0.compressed.ply").means
+    )
+    write_asset(tmp_path / "b.ply", random_gaussians(3, 0))
     (tmp_path / "b.ply").rename(tmp_path / "b.compressed.ply")
-    assert len(load(tmp_path / "b.compressed.ply")) == 3
+    assert len(read_asset(tmp_path / "b.compressed.ply")) == 3
 
 
 def test_chunks_without_colours_mean_black_to_white(tmp_path):
@@ -298,7 +302,7 @@ def test_chunks_without_colours_mean_black_to_white(tmp_path):
     old.write_bytes(b"\n".join(lines) + b"\nend_header\n" + chunks.tobytes() + body[2 * 72 :])
     words = np.frombuffer(body, "<u4", 4 * 300, 2 * 72).reshape(300, 4)[:, 3]
     red = (words >> 24) / 255
-    np.testing.assert_allclose(load(old).sh[:, 0, 0], (red - 0.5) / SH_C0, atol=1e-6)
+    np.testing.assert_allclose(read_asset(old).sh[:, 0, 0], (red - 0.5) / SH_C0, atol=1e-6)
 
 
 def spz_of_version(version, asset, fraction_bits=12):
@@ -324,12 +328,12 @@ def spz_of_version(version, asset, fraction_bits=12):
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_old_versions_of_spz_are_read(tmp_path, version):
-    reference = load(FIXTURES / "sh3.ply")
+    reference = read_asset(FIXTURES / "sh3.ply")
     (tmp_path / "a.spz").write_bytes(gzip.compress(spz_of_version(version, reference)))
     bounds = spz_bounds() | {"quats": 0.1}  # where w is nearly 0, it has the square root of x y z's errors
     if version == 1:
         bounds["means"] = np.abs(reference.means).max() * 2**-11  # half precision
-    assert_within(load(tmp_path / "a.spz"), reference, bounds)
+    assert_within(read_asset(tmp_path / "a.spz"), reference, bounds)
 
 
 def spz(**changes):
@@ -372,11 +376,11 @@ def test_hostile_spz_is_refused(tmp_path, case):
 
 def assert_refused_cheaply(path, message):
     with pytest.raises(ValueError, match=f"^{path}: "):  # what is imported late is imported here
-        load(path)
+        read_asset(path)
     tracemalloc.start()
     try:
         with pytest.raises(ValueError, match=f"^{path}: ") as error:
-            load(path)
+            read_asset(path)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -387,7 +391,7 @@ def assert_refused_cheaply(path, message):
 
 def test_extensions_after_the_gaussians_of_spz_are_passed_over(tmp_path):
     (tmp_path / "a.spz").write_bytes(gzip.compress(spz(flags=2) + b"extension" * 100))
-    assert len(load(tmp_path / "a.spz")) == 2
+    assert len(read_asset(tmp_path / "a.spz")) == 2
 
 
 @pytest.mark.parametrize(
@@ -503,7 +507,7 @@ def test_other_pictures_are_refused_or_read(tmp_path):
         sog_with(tmp_path, files={"quats.webp": picture(20, 20, "TIFF")}), "expected a picture in"
     )
     path = sog_with(tmp_path, files={"quats.webp": picture(20, 20, "PNG")})
-    assert len(load(path)) == 300
+    assert len(read_asset(path)) == 300
     small = picture(4, 4)
     assert_refused_cheaply(
         sog_with(tmp_path, files={"quats.webp": small}), "expected 300 pixels in 'quats.webp'"
@@ -520,7 +524,7 @@ def test_a_first_value_that_is_null_continues_its_codebook(tmp_path):
         tmp_path, lambda text: re.sub(r'("scales":\{"codebook":\[)[^,]+', r"\1null", text, count=1)
     )
     first = codebook[1] + (codebook[1] - codebook[255]) / 255
-    assert np.isclose(np.log(load(path).scales.min()), first, rtol=1e-5)
+    assert np.isclose(np.log(read_asset(path).scales.min()), first, rtol=1e-5)
 
 
 def test_splat_of_another_length_is_refused(tmp_path):
@@ -628,7 +632,7 @@ def test_changed_bytes_never_do_worse_than_an_error(tmp_path_factory, name, edit
         gzip.compress(content) if unpacked is not content and name.endswith("v3.spz") else content
     )
     try:
-        assert len(load(path)) <= 64 * len(content)
+        assert len(read_asset(path)) <= 64 * len(content)
     except ValueError as error:
         assert str(error).startswith(f"{path}")  # noqa: PT017 (either outcome is right)
 
@@ -659,7 +663,7 @@ def test_checkpoints_of_gsplat_are_read(tmp_path, degree):
     asset = random_gaussians(50, degree)
     splats = torch.nn.ParameterDict(gsplat_tensors(asset)).state_dict()
     torch.save({"step": 29999, "splats": splats}, tmp_path / "ckpt_29999_rank0.pt")
-    assert_same(load(tmp_path / "ckpt_29999_rank0.pt"), asset)
+    assert_same(read_asset(tmp_path / "ckpt_29999_rank0.pt"), asset)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -682,7 +686,7 @@ def test_checkpoints_of_nerfstudio_are_read(tmp_path, degree):
     }
     asset = Gaussians(tensors["means"].numpy(), asset.quats, asset.scales, asset.opacities, asset.sh)
     torch.save(content, tmp_path / "step-000029999.ckpt")
-    assert_same(load(tmp_path / "step-000029999.ckpt"), asset)
+    assert_same(read_asset(tmp_path / "step-000029999.ckpt"), asset)
 
 
 class Harmful:
@@ -725,7 +729,7 @@ def test_changed_bytes_of_a_checkpoint_never_do_worse_than_an_error(tmp_path):
         for value in (0, 255):
             path.write_bytes(content[:place] + bytes([value]) + content[place + 1 :])
             try:
-                load(path)
+                read_asset(path)
             except ValueError as error:
                 assert str(error).startswith(f"{path}: ")  # noqa: PT017 (either outcome is right)
 
@@ -734,4 +738,4 @@ def test_torch_is_asked_for_where_it_is_missing(tmp_path, monkeypatch):
     torch.save({}, tmp_path / "a.pt")
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(ImportError, match=r"a\.pt: a checkpoint needs torch; pip install 'v3dg\[torch\]'"):
-        load(tmp_path / "a.pt")
+        read_asset(tmp_path / "a.pt")

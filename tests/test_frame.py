@@ -49,7 +49,7 @@ def composed_scene(rng, sh_degree=1):
 @pytest.mark.parametrize("tolerance", [0.0, 2.0, np.inf])
 def test_scene_looks_as_on_the_cpu(sh_degree, tolerance):
     scene = composed_scene(np.random.default_rng(sh_degree), sh_degree)
-    expected = render(scene, CAMERA, tolerance=tolerance, background=BACKGROUND)
+    expected = render(scene, CAMERA, tolerance=tolerance, background=BACKGROUND, device="cpu")
     image = render(scene, CAMERA, tolerance=tolerance, background=BACKGROUND, device="cuda")
     assert_like_cpu(image, expected)
 
@@ -72,7 +72,7 @@ def test_neighbours_that_share_a_cluster_look_as_on_the_cpu(sh_degree, tops):
             quaternions=rng.normal(size=(count, 4)),
             scales=np.exp(rng.normal(size=count) - 1),
         )
-    expected = render(scene, CAMERA, tolerance=np.inf, background=BACKGROUND)
+    expected = render(scene, CAMERA, tolerance=np.inf, background=BACKGROUND, device="cpu")
     image = render(scene, CAMERA, tolerance=np.inf, background=BACKGROUND, device="cuda")
     assert_like_cpu(image, expected)
     one_by_one = select(scene, CAMERA, tolerance=np.inf, device="cuda")
@@ -82,7 +82,7 @@ def test_neighbours_that_share_a_cluster_look_as_on_the_cpu(sh_degree, tops):
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
 def test_asset_looks_as_on_the_cpu(sh_degree):
     asset = scenes_lod.blob(np.random.default_rng(sh_degree), 5000, sh_degree=sh_degree)
-    assert_like_cpu(render(asset, CAMERA, device="cuda"), render(asset, CAMERA))
+    assert_like_cpu(render(asset, CAMERA, device="cuda"), render(asset, CAMERA, device="cpu"))
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 3.0, 100.0])
@@ -92,7 +92,7 @@ def test_gaussians_of_any_size(scale):
     blob = scenes_lod.blob(rng, 600)
     scales = (scale * np.exp(0.3 * rng.normal(size=(600, 3)))).astype(np.float32)
     asset = Gaussians(blob.means, blob.quats, scales, 0.3 * blob.opacities, blob.sh)
-    assert_like_cpu(render(asset, CAMERA, device="cuda"), render(asset, CAMERA))
+    assert_like_cpu(render(asset, CAMERA, device="cuda"), render(asset, CAMERA, device="cpu"))
 
 
 def test_poisoned_gaussians_are_left_out():
@@ -103,7 +103,7 @@ def test_poisoned_gaussians_are_left_out():
             poisoned[name][40 * i + k] = value
     poisoned["sh"][:] = asset.sh  # a colour that is no number is one on both devices
     subject = Gaussians(**poisoned)
-    assert_like_cpu(render(subject, CAMERA, device="cuda"), render(subject, CAMERA))
+    assert_like_cpu(render(subject, CAMERA, device="cuda"), render(subject, CAMERA, device="cpu"))
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_what_is_added_to_a_scene_is_drawn():
     scene = composed_scene(rng)
     render(scene, CAMERA, device="cuda")
     scene.add(scene.bundles[1], positions=(0.0, -1.0, 0.0))
-    assert_like_cpu(render(scene, CAMERA, device="cuda"), render(scene, CAMERA))
+    assert_like_cpu(render(scene, CAMERA, device="cuda"), render(scene, CAMERA, device="cpu"))
 
 
 def test_other_streams_see_the_picture():

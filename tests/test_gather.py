@@ -48,7 +48,7 @@ def test_gaussians_are_those_of_the_instances_in_the_world(device, seed, sh_degr
     bundle = lod_bundle(rng, blob(rng, 40, sh_degree=sh_degree), 8)
     scene = random_scene(rng, bundle, 3, origin=origin)
     camera = random_camera(rng, origin=origin)
-    selection = select(scene, camera, tolerance=float(rng.choice([0.0, 1.0, 1e3])), cull=False)
+    selection = select(scene, camera, tolerance=float(rng.choice([0.0, 1.0, 1e3])), cull=False, device="cpu")
     world = host(selection.gaussians(origin=camera.position, device=device))
     assert len(world) == selection.num_gaussians
     first = 0
@@ -131,7 +131,7 @@ def mixed_selection():
     for bundle in (low, high, low):
         scene.add(bundle, positions=rng.normal(size=(2, 3)))
     scene.add(unseen, positions=np.zeros((0, 3)))
-    return select(scene, random_camera(rng, distance=30), tolerance=0.0, cull=False)
+    return select(scene, random_camera(rng, distance=30), tolerance=0.0, cull=False, device="cpu")
 
 
 def test_bundles_of_different_degrees(device):
@@ -154,8 +154,11 @@ def test_bundles_of_different_degrees(device):
 def test_both_devices_give_the_same_bits():
     rng = np.random.default_rng(9)
     turned = random_scene(rng, lod_bundle(rng, blob(rng, 400, sh_degree=3), 16), 40, spread=20)
-    for selection in (mixed_selection(), select(turned, random_camera(rng, distance=30), tolerance=0.1)):
-        on_cpu, on_device = selection.gaussians(), host(selection.gaussians(device="cuda"))
+    for selection in (
+        mixed_selection(),
+        select(turned, random_camera(rng, distance=30), tolerance=0.1, device="cpu"),
+    ):
+        on_cpu, on_device = selection.gaussians(device="cpu"), host(selection.gaussians(device="cuda"))
         assert len(on_cpu) > 0
         for name in scenes.NAMES:
             np.testing.assert_array_equal(getattr(on_cpu, name), getattr(on_device, name))
@@ -164,7 +167,7 @@ def test_both_devices_give_the_same_bits():
 def test_nothing_selected_gives_no_gaussians(device):
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8)
     for scene in (Scene(), random_bundle(num_levels=0)):
-        gaussians = select(scene, camera, tolerance=1.0).gaussians(device=device)
+        gaussians = select(scene, camera, tolerance=1.0, device="cpu").gaussians(device=device)
         assert len(gaussians) == 0
         assert ("torch" in repr(gaussians)) == (device == "cuda")
 
@@ -173,15 +176,15 @@ def test_gaussians_of_an_unplaced_bundle_are_its_own(device):
     rng = np.random.default_rng(0)
     one = lod_bundle(rng, blob(rng, 1, size=0.01), 4, past_root=0)
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8)
-    world = host(select(one, camera, tolerance=1.0).gaussians(device=device))
+    world = host(select(one, camera, tolerance=1.0, device="cpu").gaussians(device=device))
     np.testing.assert_array_equal(world.means, one.gaussians.means)
 
 
 def test_wrong_arguments_are_named():
     selection = select(
-        random_bundle(1), Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8), tolerance=1
+        random_bundle(1), Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8), tolerance=1, device="cpu"
     )
     with pytest.raises(ValueError, match=r"origin: expected shape \(3,\)"):
-        selection.gaussians(origin=1.0)
+        selection.gaussians(origin=1.0, device="cpu")
     with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'gpu'"):
         selection.gaussians(device="gpu")

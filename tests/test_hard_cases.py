@@ -109,7 +109,7 @@ def test_maps_keep_their_detail(device):
     scene = v3dg.Scene()
     scene.add(bundle, positions=place[None])
     got = v3dg.render(scene, far, tolerance=0.0, device=device)
-    raster = v3dg.Raster(*host((got.color, got.alpha, got.depth)))
+    raster = v3dg.Image(*host((got.color, got.alpha, got.depth)))
     expected = reference_rasterize.rasterize(asset, near)
     assert (expected.alpha > 0.5).mean() > 0.3
     assert_pictures_agree(raster, expected, PICTURE_FLOAT)

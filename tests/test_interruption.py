@@ -41,7 +41,7 @@ def finished(folder, *options):
 def whole(tmp_path_factory):
     """The bundle of a build that nothing interrupts, and the seconds it took."""
     folder = tmp_path_factory.mktemp("whole")
-    v3dg.save(folder / "asset.ply", make_asset(num_gaussians=2000, seed=0))
+    v3dg.write_asset(folder / "asset.ply", make_asset(num_gaussians=2000, seed=0))
     start = time.perf_counter()
     finished(folder)
     return (

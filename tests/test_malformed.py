@@ -39,12 +39,12 @@ def read_bundle(path):
 
 
 def bundle_content(folder):
-    BUNDLE.save(folder / "whole.v3dg")
+    BUNDLE.write(folder / "whole.v3dg")
     return (folder / "whole.v3dg").read_bytes()
 
 
 def written(path):
-    v3dg.save(path, BUNDLE.level_gaussians(0))
+    v3dg.write_asset(path, BUNDLE.level_gaussians(0))
     return path.read_bytes()
 
 
@@ -55,17 +55,21 @@ def checkpoint(path):
 
 # Name of a file, what is in a good one, and how it is read.
 READERS = {
-    "ply": ("a.ply", lambda _: ply_bytes([Element("vertex", random_columns(2, 0))], "ascii"), v3dg.load),
+    "ply": (
+        "a.ply",
+        lambda _: ply_bytes([Element("vertex", random_columns(2, 0))], "ascii"),
+        v3dg.read_asset,
+    ),
     "bundle": ("a.v3dg", bundle_content, read_bundle),
     "scene": ("a.json", lambda _: json.dumps(GOOD).encode(), read_scene),
     "layout": ("a.json", lambda _: json.dumps(published_layout()).encode(), read_scene),
     "flat layout": ("a.json", lambda _: json.dumps(flat_layout()).encode(), read_scene),
-    "compressed ply": ("a.ply", lambda folder: written(folder / "w.compressed.ply"), v3dg.load),
-    "spz": ("a.spz", lambda folder: written(folder / "w.spz"), v3dg.load),
-    "spz 4": ("a.spz", lambda _: (FIXTURES / "sh3_v4.spz").read_bytes(), v3dg.load),
-    "ksplat": ("a.ksplat", lambda _: (FIXTURES / "sh3_mkkellogg_2.ksplat").read_bytes(), v3dg.load),
-    "sog": ("a.sog", lambda _: (FIXTURES / "sh3.sog").read_bytes(), v3dg.load),
-    "checkpoint": ("a.pt", lambda folder: checkpoint(folder / "w.pt"), v3dg.load),
+    "compressed ply": ("a.ply", lambda folder: written(folder / "w.compressed.ply"), v3dg.read_asset),
+    "spz": ("a.spz", lambda folder: written(folder / "w.spz"), v3dg.read_asset),
+    "spz 4": ("a.spz", lambda _: (FIXTURES / "sh3_v4.spz").read_bytes(), v3dg.read_asset),
+    "ksplat": ("a.ksplat", lambda _: (FIXTURES / "sh3_mkkellogg_2.ksplat").read_bytes(), v3dg.read_asset),
+    "sog": ("a.sog", lambda _: (FIXTURES / "sh3.sog").read_bytes(), v3dg.read_asset),
+    "checkpoint": ("a.pt", lambda folder: checkpoint(folder / "w.pt"), v3dg.read_asset),
     "cameras": ("a.json", lambda _: json.dumps(CAPTURE).encode(), v3dg.read_cameras),
 }
 
@@ -318,7 +322,7 @@ def test_claims_of_a_header_cost_no_memory(tmp_path, claim):
     name, content = CLAIMS[claim]
     path = tmp_path / name
     path.write_bytes(content)
-    read = v3dg.load if name.endswith(".ply") else read_bundle
+    read = v3dg.read_asset if name.endswith(".ply") else read_bundle
     assert_refused(read, path)  # what is imported late is imported here
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     tracemalloc.start()
@@ -349,11 +353,11 @@ def test_nothing_that_is_read_can_be_executed():
 ASSET = random_gaussians(np.random.default_rng(0), 200)
 CAMERA = v3dg.Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8)
 WRITERS = {
-    "ply": ("a.ply", lambda path: v3dg.save(path, ASSET)),
-    "bundle": ("a.v3dg", BUNDLE.save),
+    "ply": ("a.ply", lambda path: v3dg.write_asset(path, ASSET)),
+    "bundle": ("a.v3dg", BUNDLE.write),
     "scene": ("a.json", lambda path: v3dg.write_scene(path, v3dg.Scene.of(BUNDLE), ["b.v3dg"])),
-    "compressed ply": ("a.compressed.ply", lambda path: v3dg.save(path, ASSET)),
-    "spz": ("a.spz", lambda path: v3dg.save(path, ASSET)),
+    "compressed ply": ("a.compressed.ply", lambda path: v3dg.write_asset(path, ASSET)),
+    "spz": ("a.spz", lambda path: v3dg.write_asset(path, ASSET)),
     "cameras": ("a.json", lambda path: v3dg.write_cameras(path, {"a": CAMERA})),
     "picture": ("a.png", lambda path: write_picture(path, np.zeros((8, 8, 3), np.float32))),
 }

@@ -167,7 +167,7 @@ def test_truth_clips_samples_before_it_averages_them():
         sh=np.full((1, 1, 3), 100, np.float32),
     )
     camera = Camera(np.eye(4), np.array([[500.0, 0, 8], [0, 500, 8], [0, 0, 1]]), 16, 16)
-    samples = render(bright, camera.scaled(2), tolerance=0).color
+    samples = render(bright, camera.scaled(2), tolerance=0, device="cpu").color
     assert samples.max() > 2
     expected = metrics.box_downsample(np.clip(samples, 0, 1), 2)
-    np.testing.assert_array_equal(metrics.draw_truth(bright, camera), to_8bit(expected))
+    np.testing.assert_array_equal(metrics.draw_truth(bright, camera, device="cpu"), to_8bit(expected))

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v3dg import Gaussians, load, save
+from v3dg import Gaussians, read_asset, write_asset
 
 NAMES = ("means", "quats", "scales", "opacities", "sh")
 ENCODINGS = ("ascii", "binary_little_endian", "binary_big_endian")
@@ -156,8 +156,8 @@ READ_SCALE_ERROR = 1.2e-7
 def test_what_is_written_reads_back(tmp_path_factory, num, degree, encoding, seed):
     gaussians = random_gaussians(num, degree, seed)
     path = tmp_path_factory.getbasetemp() / "round_trip.ply"
-    save(path, gaussians, encoding=encoding)
-    assert_close(load(path), gaussians, scale_error=ROUND_TRIP_SCALE_ERROR)
+    write_asset(path, gaussians, encoding=encoding)
+    assert_close(read_asset(path), gaussians, scale_error=ROUND_TRIP_SCALE_ERROR)
 
 
 @st.composite
@@ -203,7 +203,7 @@ def test_reads_any_layout(tmp_path_factory, layout):
     content, expected = layout
     path = tmp_path_factory.getbasetemp() / "layout.ply"
     path.write_bytes(content)
-    assert_close(load(path), expected, scale_error=READ_SCALE_ERROR)
+    assert_close(read_asset(path), expected, scale_error=READ_SCALE_ERROR)
 
 
 def test_all_blocks_and_all_threads_agree_with_one_row_at_a_time(tmp_path):
@@ -211,33 +211,33 @@ def test_all_blocks_and_all_threads_agree_with_one_row_at_a_time(tmp_path):
     path = tmp_path / "many.ply"
     for encoding in ("binary_little_endian", "ascii"):
         path.write_bytes(ply_bytes([Element("vertex", columns)], encoding))
-        assert_close(load(path), expected_gaussians(columns), scale_error=READ_SCALE_ERROR)
+        assert_close(read_asset(path), expected_gaussians(columns), scale_error=READ_SCALE_ERROR)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_many_blocks_are_written_in_order(tmp_path, encoding):
     gaussians = random_gaussians(50_000, 0)
-    save(tmp_path / "many.ply", gaussians, encoding=encoding)
-    assert_close(load(tmp_path / "many.ply"), gaussians, scale_error=ROUND_TRIP_SCALE_ERROR)
+    write_asset(tmp_path / "many.ply", gaussians, encoding=encoding)
+    assert_close(read_asset(tmp_path / "many.ply"), gaussians, scale_error=ROUND_TRIP_SCALE_ERROR)
 
 
 def test_rest_coefficients_are_channel_by_channel_in_the_file(tmp_path):
     sh = np.arange(12, dtype=np.float32).reshape(1, 4, 3)  # coefficient k, channel c holds 3 k + c
     one = random_gaussians(1, 1)
     path = tmp_path / "one.ply"
-    save(path, Gaussians(one.means, one.quats, one.scales, one.opacities, sh), encoding="ascii")
+    write_asset(path, Gaussians(one.means, one.quats, one.scales, one.opacities, sh), encoding="ascii")
     lines = path.read_text().splitlines()
     names = [line.split()[2] for line in lines if line.startswith("property")]
     row = dict(zip(names, lines[-1].split(), strict=True))
     assert [row[f"f_dc_{i}"] for i in range(3)] == ["0", "1", "2"]
     assert [row[f"f_rest_{i}"] for i in range(9)] == ["3", "6", "9", "4", "7", "10", "5", "8", "11"]
-    np.testing.assert_array_equal(load(path).sh, sh)
+    np.testing.assert_array_equal(read_asset(path).sh, sh)
 
 
 @pytest.mark.parametrize("degree", range(4))
 def test_gsply_reads_what_we_write(tmp_path, degree):
     gaussians = random_gaussians(300, degree)
-    save(tmp_path / "ours.ply", gaussians)
+    write_asset(tmp_path / "ours.ply", gaussians)
     theirs = gsply.plyread(str(tmp_path / "ours.ply"))
     np.testing.assert_array_equal(theirs.means, gaussians.means)
     np.testing.assert_array_equal(theirs.quats, gaussians.quats)
@@ -263,7 +263,7 @@ def test_we_read_what_gsply_writes(tmp_path, degree):
         sh[:, 0],
         sh[:, 1:] if degree else None,
     )
-    assert_close(load(tmp_path / "theirs.ply"), expected, scale_error=READ_SCALE_ERROR)
+    assert_close(read_asset(tmp_path / "theirs.ply"), expected, scale_error=READ_SCALE_ERROR)
 
 
 def test_zero_and_one_are_written_finite_and_read_back_exactly(tmp_path):
@@ -276,11 +276,11 @@ def test_zero_and_one_are_written_finite_and_read_back_exactly(tmp_path):
         sh=np.zeros((4, 1, 3), np.float32),
     )
     for encoding in ENCODINGS:
-        save(tmp_path / "ends.ply", gaussians, encoding=encoding)
-        back = load(tmp_path / "ends.ply")
+        write_asset(tmp_path / "ends.ply", gaussians, encoding=encoding)
+        back = read_asset(tmp_path / "ends.ply")
         np.testing.assert_array_equal(back.scales, gaussians.scales)
         np.testing.assert_array_equal(back.opacities, gaussians.opacities)
-    save(tmp_path / "ends.ply", gaussians)
+    write_asset(tmp_path / "ends.ply", gaussians)
     stored = gsply.plyread(str(tmp_path / "ends.ply"))
     np.testing.assert_array_equal(stored.opacities[[0, 3]], [-110, 20])
     np.testing.assert_array_equal(stored.scales[:, 0], -110)
@@ -296,32 +296,32 @@ def test_values_that_are_not_finite_pass_through(tmp_path, encoding):
     gaussians.opacities[2] = np.nan
     gaussians.quats[3] = np.nan, 1, 2, np.inf
     gaussians.sh[3, 1] = np.nan
-    save(tmp_path / "wild.ply", gaussians, encoding=encoding)
-    assert_close(load(tmp_path / "wild.ply"), gaussians, scale_error=ROUND_TRIP_SCALE_ERROR)
+    write_asset(tmp_path / "wild.ply", gaussians, encoding=encoding)
+    assert_close(read_asset(tmp_path / "wild.ply"), gaussians, scale_error=ROUND_TRIP_SCALE_ERROR)
 
 
 def test_zero_quaternions_stay_and_others_are_normalised(tmp_path):
     gaussians = random_gaussians(4, 0)
     gaussians.quats[:] = [[0, 0, 0, 0], [3, 0, 0, 4], [0, 1e-44, 0, 0], [0, 0, -3e38, 3e38]]
-    save(tmp_path / "quats.ply", gaussians)
+    write_asset(tmp_path / "quats.ply", gaussians)
     half = np.sqrt(0.5)
     wanted = np.float32([[0, 0, 0, 0], [0.6, 0, 0, 0.8], [0, 1, 0, 0], [0, 0, -half, half]])
-    np.testing.assert_array_equal(load(tmp_path / "quats.ply").quats, wanted)
+    np.testing.assert_array_equal(read_asset(tmp_path / "quats.ply").quats, wanted)
 
 
 def test_normalised_quaternions_are_not_touched_again(tmp_path):
     gaussians = random_gaussians(5000, 0)
-    save(tmp_path / "quats.ply", gaussians)
-    np.testing.assert_array_equal(load(tmp_path / "quats.ply").quats, gaussians.quats)
+    write_asset(tmp_path / "quats.ply", gaussians)
+    np.testing.assert_array_equal(read_asset(tmp_path / "quats.ply").quats, gaussians.quats)
 
 
 def test_tensors_are_written_like_arrays(tmp_path):
     pytest.importorskip("torch")
     gaussians = random_gaussians(10, 1)
-    save(tmp_path / "numpy.ply", gaussians)
+    write_asset(tmp_path / "numpy.ply", gaussians)
     tensors = gaussians.torch()
     tensors.means.requires_grad_()
-    save(tmp_path / "torch.ply", tensors)
+    write_asset(tmp_path / "torch.ply", tensors)
     assert (tmp_path / "numpy.ply").read_bytes() == (tmp_path / "torch.ply").read_bytes()
 
 
@@ -518,7 +518,7 @@ def test_broken_files_are_refused_with_what_is_wrong(tmp_path, case):
     path = tmp_path / "broken.ply"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=re.escape(message)) as error:
-        load(path)
+        read_asset(path)
     text = str(error.value)
     assert text.startswith(f"{path}: ")
     assert text.isprintable()  # hence one line
@@ -535,7 +535,7 @@ def test_every_cut_of_a_file_is_refused(tmp_path, encoding):
     for size in (*range(0, body, 7), *range(body, last)):
         path.write_bytes(content[:size])
         with pytest.raises(ValueError, match="expected"):
-            load(path)
+            read_asset(path)
 
 
 @given(
@@ -553,33 +553,33 @@ def test_changed_bytes_never_do_worse_than_an_error(tmp_path_factory, encoding, 
     path = tmp_path_factory.getbasetemp() / "changed.ply"
     path.write_bytes(content)
     try:
-        assert len(load(path)) <= len(content)
+        assert len(read_asset(path)) <= len(content)
     except ValueError as error:
         assert str(error).startswith(f"{path}: ")  # noqa: PT017 (either outcome is right)
 
 
 def test_missing_files_and_folders_keep_their_own_errors(tmp_path):
     with pytest.raises(FileNotFoundError) as error:
-        load(tmp_path / "absent.ply")
+        read_asset(tmp_path / "absent.ply")
     assert error.value.filename == str(tmp_path / "absent.ply")
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(IsADirectoryError):
-        load(tmp_path / "folder.ply")
+        read_asset(tmp_path / "folder.ply")
     with pytest.raises(IsADirectoryError):
-        save(tmp_path / "folder.ply", random_gaussians(1, 0))
+        write_asset(tmp_path / "folder.ply", random_gaussians(1, 0))
     with pytest.raises(FileNotFoundError) as error:
-        save(tmp_path / "absent" / "a.ply", random_gaussians(1, 0))
+        write_asset(tmp_path / "absent" / "a.ply", random_gaussians(1, 0))
     assert error.value.filename == str(tmp_path / "absent" / "a.ply")
 
 
 def test_a_pipe_is_refused_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")
     with pytest.raises(ValueError, match="expected a regular file, got a device or a pipe"):
-        load(tmp_path / "pipe.ply")
+        read_asset(tmp_path / "pipe.ply")
 
 
 def test_other_suffixes_are_refused(tmp_path):
-    for call in (lambda path: load(path), lambda path: save(path, random_gaussians(1, 0))):
+    for call in (lambda path: read_asset(path), lambda path: write_asset(path, random_gaussians(1, 0))):
         with pytest.raises(
             ValueError, match=r"a\.obj: expected a file name that ends in \.(compressed\.)?ply, "
         ):
@@ -590,8 +590,8 @@ def test_unusual_names_work(tmp_path):
     path = os.path.join(
         os.fspath(tmp_path), "ünï \udcff.PLY"
     )  # the surrogate stands for a byte that is no UTF-8
-    save(path, random_gaussians(3, 0))
-    assert len(load(path)) == 3
+    write_asset(path, random_gaussians(3, 0))
+    assert len(read_asset(path)) == 3
 
 
 @pytest.mark.parametrize(
@@ -612,16 +612,16 @@ def test_a_failed_save_changes_nothing(tmp_path, change, message, encoding):
     path.write_bytes(b"before")
     change(gaussians)
     with pytest.raises(ValueError, match=message):
-        save(path, gaussians, encoding=encoding)
+        write_asset(path, gaussians, encoding=encoding)
     assert path.read_bytes() == b"before"
     assert os.listdir(tmp_path) == ["kept.ply"]
 
 
 def test_save_refuses_what_it_cannot_write(tmp_path):
     with pytest.raises(ValueError, match=r"encoding: expected binary_little_endian, .* got 'text'"):
-        save(tmp_path / "a.ply", random_gaussians(1, 0), encoding="text")
+        write_asset(tmp_path / "a.ply", random_gaussians(1, 0), encoding="text")
     with pytest.raises(TypeError, match="gaussians: expected Gaussians, got int"):
-        save(tmp_path / "a.ply", 3)
+        write_asset(tmp_path / "a.ply", 3)
     assert os.listdir(tmp_path) == []
 
 
@@ -629,12 +629,12 @@ def test_save_writes_through_links_and_obeys_the_umask(tmp_path):
     (tmp_path / "link.ply").symlink_to("real.ply")
     old = os.umask(0o027)
     try:
-        save(tmp_path / "link.ply", random_gaussians(3, 0))
+        write_asset(tmp_path / "link.ply", random_gaussians(3, 0))
     finally:
         os.umask(old)
     assert (tmp_path / "link.ply").is_symlink()
     assert (tmp_path / "real.ply").stat().st_mode & 0o777 == 0o640
-    assert len(load(tmp_path / "real.ply")) == 3
+    assert len(read_asset(tmp_path / "real.ply")) == 3
 
 
 PEAK_MEMORY = """
@@ -647,9 +647,9 @@ def peak():
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
 
 start = peak()
-gaussians = v3dg.load(sys.argv[1])
+gaussians = v3dg.read_asset(sys.argv[1])
 loaded = peak()
-v3dg.save(sys.argv[2], gaussians)
+v3dg.write_asset(sys.argv[2], gaussians)
 print(loaded - start, peak() - loaded)
 """
 

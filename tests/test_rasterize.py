@@ -51,7 +51,7 @@ def torch():
 def draw(device, gaussians, camera, **mode):
     """The picture drawn on `device`, as NumPy arrays."""
     raster = v3dg.rasterize(on(device, gaussians), camera, **mode)
-    return v3dg.Raster(*host((raster.color, raster.alpha, raster.depth)))
+    return v3dg.Image(*host((raster.color, raster.alpha, raster.depth)))
 
 
 def draw_double(torch, gaussians, camera, **mode):
@@ -757,4 +757,4 @@ def test_every_instruction_set_draws_the_reference(tmp_path, isa):
         antialiased=True,
         background=(0.1, 0.2, 0.3),
     )
-    assert_pictures_agree(v3dg.Raster(*arrays), picture, NEEDLES_FLOAT)
+    assert_pictures_agree(v3dg.Image(*arrays), picture, NEEDLES_FLOAT)

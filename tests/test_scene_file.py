@@ -78,7 +78,7 @@ def put(path, document):
 
 def test_bundles_are_opened_beside_the_file(tmp_path):
     (tmp_path / "sub").mkdir()
-    BUNDLE.save(tmp_path / "sub" / "donut.v3dg")
+    BUNDLE.write(tmp_path / "sub" / "donut.v3dg")
     scene, cameras = read_scene(put(tmp_path / "scene.json", GOOD))
     assert len(scene.bundles) == 1
     np.testing.assert_array_equal(scene.bundles[0].groups.ball, BUNDLE.groups.ball)
@@ -240,10 +240,10 @@ def test_published_layouts_find_bundles_where_a_build_puts_them(tmp_path):
     path = put(tmp_path / "layouts" / "layout.json", published_layout())
     with pytest.raises(FileNotFoundError, match=r"layouts\[0\]\.assets\[0\]\.asset_name: .*oak\.v3dg or "):
         read_scene(path)
-    BUNDLE.save(tmp_path / "layouts" / "donut.v3dg")
+    BUNDLE.write(tmp_path / "layouts" / "donut.v3dg")
     place = tmp_path / "_3dgs-assets" / "trees" / "oak" / "point_cloud"
     place.mkdir(parents=True)
-    OTHER.save(place / "fused.v3dg")
+    OTHER.write(place / "fused.v3dg")
     scene, _ = read_scene(path)
     assert [bundle.num_gaussians for bundle in scene.bundles] == [OTHER.num_gaussians, BUNDLE.num_gaussians]
 
@@ -278,7 +278,7 @@ def test_flat_layouts_are_read(tmp_path):
     np.testing.assert_allclose(cameras["0"].position, [0, -5, 1])
     with pytest.raises(FileNotFoundError, match=r"layout\.json: asset: expected a bundle at .*donut\.v3dg"):
         read_scene(path)
-    BUNDLE.save(tmp_path / "donut.v3dg")
+    BUNDLE.write(tmp_path / "donut.v3dg")
     assert len(read_scene(path)[0]) == 2
 
 

@@ -62,7 +62,7 @@ def test_every_path_draws_exactly_one_cluster(data, bundle, seed, place):
     scene = random_scene(rng, bundle, 3, origin=origin)
     camera = random_camera(rng, distance=distance, origin=origin)
     tolerance = tolerances_of(data.draw, scene, camera)
-    selection = select(scene, camera, tolerance=tolerance, cull=False)
+    selection = select(scene, camera, tolerance=tolerance, cull=False, device="cpu")
     paths = reference.paths(bundle.clusters, bundle.groups)
     for i in range(len(scene)):
         drawn = set(selection.cluster_ids[selection.instance_ids == i].tolist())
@@ -132,7 +132,7 @@ def test_cut_agrees_with_reference(seed, footprint, tolerance):
     for metric in group_metrics(scene, camera, footprint=footprint):
         if (np.abs(metric - tolerance) <= 1e-3 * tolerance).any():
             return  # rounding may decide
-    selection = select(scene, camera, tolerance=tolerance, footprint=footprint, cull=False)
+    selection = select(scene, camera, tolerance=tolerance, footprint=footprint, cull=False, device="cpu")
     assert pairs(selection) == reference.cut(scene, camera, tolerance, footprint)
 
 
@@ -158,7 +158,8 @@ def test_tolerance_orders_the_detail():
     bundle = lod_bundle(rng, blob(rng, 500), 16, past_root=3)
     camera = random_camera(rng, distance=20)
     counts = [
-        select(bundle, camera, tolerance=t, cull=False).num_gaussians for t in (0, 1e-3, 0.1, 10, 1e3, np.inf)
+        select(bundle, camera, tolerance=t, cull=False, device="cpu").num_gaussians
+        for t in (0, 1e-3, 0.1, 10, 1e3, np.inf)
     ]
     assert counts == sorted(counts, reverse=True)
     assert counts[0] == 500
@@ -178,7 +179,8 @@ def test_turning_the_camera_changes_nothing(bundle, seed):
         for a, b in zip(group_metrics(scene, camera), group_metrics(scene, other), strict=True):
             np.testing.assert_array_equal(a, b)
         same(
-            select(scene, camera, tolerance=0.5, cull=False), select(scene, other, tolerance=0.5, cull=False)
+            select(scene, camera, tolerance=0.5, cull=False, device="cpu"),
+            select(scene, other, tolerance=0.5, cull=False, device="cpu"),
         )
 
 
@@ -190,7 +192,8 @@ def test_turning_a_camera_anywhere_changes_nothing():
         camera = random_camera(rng, distance=30)
         other = Camera(turned(camera, rng).viewmat, camera.K, 64, 48)
         same(
-            select(scene, camera, tolerance=0.5, cull=False), select(scene, other, tolerance=0.5, cull=False)
+            select(scene, camera, tolerance=0.5, cull=False, device="cpu"),
+            select(scene, other, tolerance=0.5, cull=False, device="cpu"),
         )
 
 
@@ -205,7 +208,10 @@ def test_moving_scene_and_camera_together_changes_nothing(shift):
         eye, target = 30 * rng.normal(size=3), rng.normal(size=3)
         camera = Camera.look_at(eye, target, width=64, height=48)
         moved = Camera.look_at(eye + shift, target + shift, width=64, height=48)
-        a, b = select(near, camera, tolerance=0.5), select(far, moved, tolerance=0.5)
+        a, b = (
+            select(near, camera, tolerance=0.5, device="cpu"),
+            select(far, moved, tolerance=0.5, device="cpu"),
+        )
         assert len(a) > 0
         same(a, b)
 
@@ -229,8 +235,8 @@ def test_frustum_never_drops_what_a_pixel_shows(seed, distance, off_center):
         K = camera.K + np.array([[0, 0, rng.uniform(-40, 40)], [0, 0, rng.uniform(-40, 40)], [0, 0, 0]])
         camera = Camera(camera.viewmat, K, camera.width, camera.height, camera.near)
     tolerance = float(rng.choice([0.0, 0.5, 100.0]))
-    everything = pairs(select(scene, camera, tolerance=tolerance, cull=False))
-    kept = pairs(select(scene, camera, tolerance=tolerance))
+    everything = pairs(select(scene, camera, tolerance=tolerance, cull=False, device="cpu"))
+    kept = pairs(select(scene, camera, tolerance=tolerance, device="cpu"))
     assert kept == [pair for pair in everything if pair in set(kept)]
     for i, c in set(everything) - set(kept):
         gaussians = bundle.cluster_gaussians(c)
@@ -259,10 +265,10 @@ def test_frustum_keeps_needles_whose_image_leans_in(side):
     camera = Camera(np.eye(4), [[50, 0, 50], [0, 50, 50], [0, 0, 1]], 100, 100)
     mean, covariance = (values[0] for values in frames(asset, scene, 0, camera))
     assert reference.touches_image(mean, covariance, 0.0, camera)
-    assert len(select(scene, camera, tolerance=1.0)) == 1
+    assert len(select(scene, camera, tolerance=1.0, device="cpu")) == 1
     away = Scene()
     away.add(bundle, turn @ [2.5, 0, 1], quaternions=scene.quaternions)
-    assert len(select(away, camera, tolerance=1.0)) == 0
+    assert len(select(away, camera, tolerance=1.0, device="cpu")) == 0
 
 
 def test_frustum_drops_most_of_what_lies_outside():
@@ -270,11 +276,11 @@ def test_frustum_drops_most_of_what_lies_outside():
     bundle = lod_bundle(rng, blob(rng, 200, size=0.1), 10)
     scene = random_scene(rng, bundle, 400, spread=20, log_scale=0.1)
     camera = Camera.look_at((0, 0, 0), (1, 0, 0), fov_x=0.8, width=64, height=64)
-    kept = select(scene, camera, tolerance=0.5)
-    everything = select(scene, camera, tolerance=0.5, cull=False)
+    kept = select(scene, camera, tolerance=0.5, device="cpu")
+    everything = select(scene, camera, tolerance=0.5, cull=False, device="cpu")
     assert 0 < len(kept) < 0.2 * len(everything)
     behind = Camera.look_at((1000, 0, 0), (2000, 0, 0), fov_x=0.8, width=64, height=64)
-    assert len(select(scene, behind, tolerance=0.5)) == 0
+    assert len(select(scene, behind, tolerance=0.5, device="cpu")) == 0
 
 
 @given(bundle=bundles(), other=bundles(), seed=seeds)
@@ -285,7 +291,7 @@ def test_order_counts_and_scenes_of_several_bundles(bundle, other, seed):
         count = int(rng.integers(0, 4))
         scene.add(bundle if rng.random() < 0.5 else other, positions=rng.normal(size=(count, 3)))
     camera = random_camera(rng)
-    selection = select(scene, camera, tolerance=float(rng.choice([0, 0.5, 50])))
+    selection = select(scene, camera, tolerance=float(rng.choice([0, 0.5, 50])), device="cpu")
     assert pairs(selection) == sorted(set(pairs(selection)))
     assert selection.instance_ids.dtype == selection.cluster_ids.dtype == np.int32
     sizes = [np.diff(scene.bundles[scene.instance_bundle[i]].clusters.offset)[c] for i, c in pairs(selection)]
@@ -294,20 +300,20 @@ def test_order_counts_and_scenes_of_several_bundles(bundle, other, seed):
     for i in range(len(scene)):
         alone = Scene()
         alone.add(scene.bundles[scene.instance_bundle[i]], scene.positions[i])
-        mine = select(alone, camera, tolerance=0.5, cull=False).cluster_ids
-        everything = select(scene, camera, tolerance=0.5, cull=False)
+        mine = select(alone, camera, tolerance=0.5, cull=False, device="cpu").cluster_ids
+        everything = select(scene, camera, tolerance=0.5, cull=False, device="cpu")
         np.testing.assert_array_equal(mine, everything.cluster_ids[everything.instance_ids == i])
 
 
 def test_empty_and_smallest_scenes():
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8)
-    nothing = select(Scene(), camera, tolerance=1.0)
+    nothing = select(Scene(), camera, tolerance=1.0, device="cpu")
     assert len(nothing) == nothing.num_gaussians == len(nothing.filters_px2) == 0
     empty = random_bundle(num_levels=0)
-    assert select(empty, camera, tolerance=1.0).num_gaussians == 0
+    assert select(empty, camera, tolerance=1.0, device="cpu").num_gaussians == 0
     rng = np.random.default_rng(0)
     one = lod_bundle(rng, blob(rng, 1, size=0.01), 4, past_root=0)
-    selection = select(one, camera, tolerance=1.0)
+    selection = select(one, camera, tolerance=1.0, device="cpu")
     assert pairs(selection) == [(0, 0)]
 
 
@@ -315,11 +321,11 @@ def test_bad_arguments_are_refused():
     bundle = random_bundle(1)
     camera = Camera.look_at((0, -5, 0), (0, 0, 0), width=8, height=8)
     with pytest.raises(ValueError, match=r"tolerance: expected 0 px² or more, got -1\.0"):
-        select(bundle, camera, tolerance=-1)
+        select(bundle, camera, tolerance=-1, device="cpu")
     with pytest.raises(ValueError, match="tolerance: expected 0 px² or more, got nan"):
-        select(bundle, camera, tolerance=float("nan"))
+        select(bundle, camera, tolerance=float("nan"), device="cpu")
     with pytest.raises(ValueError, match="footprint: expected solid_angle or paper, got ball"):
-        select(bundle, camera, tolerance=1, footprint="ball")
+        select(bundle, camera, tolerance=1, footprint="ball", device="cpu")
     with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'tpu'"):
         select(bundle, camera, tolerance=1, device="tpu")
     for device in ("cpu", "auto"):
@@ -377,7 +383,7 @@ from scenes_lod import blob, lod_bundle, random_camera, random_scene
 from v3dg import select
 rng = np.random.default_rng(5)
 scene = random_scene(rng, lod_bundle(rng, blob(rng, 500), 8), 300)
-selection = select(scene, random_camera(rng), tolerance=0.5)
+selection = select(scene, random_camera(rng), tolerance=0.5, device="cpu")
 assert len(selection) > 1000
 print(hashlib.sha256(selection.instance_ids.tobytes() + selection.cluster_ids.tobytes()).hexdigest())
 """

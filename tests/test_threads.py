@@ -130,8 +130,8 @@ def call_what_takes_long(folder):
     import torch
 
     many = scenes.random_gaussians(0, CAMERA, 100_000, sh_degree=1)
-    v3dg.save(folder / "many.ply", many)
-    v3dg.load(folder / "many.ply")
+    v3dg.write_asset(folder / "many.ply", many)
+    v3dg.read_asset(folder / "many.ply")
     gradient(many)
     with torch.no_grad():
         picture(many)
@@ -140,10 +140,10 @@ def call_what_takes_long(folder):
     scene = crowd()
     scene.add(scene.bundles[0], positions=np.zeros((3000, 3)))
     frame(scene)
-    v3dg.render(many, CAMERA)
-    cut = v3dg.select(scene, CAMERA, tolerance=0.0)
-    cut.gaussians()
-    v3dg.render(scene, CAMERA, cut=cut)
+    v3dg.render(many, CAMERA, device="cpu")
+    cut = v3dg.select(scene, CAMERA, tolerance=0.0, device="cpu")
+    cut.gaussians(device="cpu")
+    v3dg.render(scene, CAMERA, cut=cut, device="cpu")
 
 
 def test_other_threads_go_on_while_the_core_is_at_work(tmp_path, monkeypatch):

@@ -3,7 +3,7 @@ import sys
 import numpy as np
 import pytest
 
-from v3dg.video import write_film
+from v3dg.video import write_video
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def stripes(place):
 
 def test_pictures_come_back_in_order(av, tmp_path):
     path = tmp_path / "film.mp4"
-    assert write_film(path, (stripes(i) for i in range(6)), fps=24) == 6
+    assert write_video(path, (stripes(i) for i in range(6)), fps=24) == 6
     with av.open(str(path)) as film:
         assert film.streams.video[0].average_rate == 24
         pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
@@ -31,7 +31,7 @@ def test_pictures_come_back_in_order(av, tmp_path):
 
 def test_tensors_make_a_film_too(av, tmp_path):
     torch = pytest.importorskip("torch")
-    assert write_film(tmp_path / "film.mp4", [torch.zeros(16, 16, 3)]) == 1
+    assert write_video(tmp_path / "film.mp4", [torch.zeros(16, 16, 3)]) == 1
 
 
 @pytest.mark.parametrize(
@@ -47,16 +47,16 @@ def test_tensors_make_a_film_too(av, tmp_path):
 )
 def test_wrong_pictures_are_refused_and_leave_no_file(av, tmp_path, pictures, message):
     with pytest.raises(ValueError, match=message):
-        write_film(tmp_path / "film.mp4", pictures)
+        write_video(tmp_path / "film.mp4", pictures)
     assert not list(tmp_path.iterdir())
 
 
 def test_another_suffix_is_refused(av, tmp_path):
     with pytest.raises(ValueError, match=r"film.gif: expected a file name ending in .mp4"):
-        write_film(tmp_path / "film.gif", [stripes(0)])
+        write_video(tmp_path / "film.gif", [stripes(0)])
 
 
 def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(ImportError, match=r"pip install 'v3dg\[video\]'"):
-        write_film(tmp_path / "film.mp4", [stripes(0)])
+        write_video(tmp_path / "film.mp4", [stripes(0)])

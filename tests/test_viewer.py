@@ -159,14 +159,14 @@ def test_an_empty_picture_is_black_in_every_mode(scene_view):
 )
 def test_count_is_of_the_gaussians_that_a_pixel_is_blended_of(opacities, count):
     """A gaussian that would take the transmittance to 1e-4 or below is not blended, nor what is behind it."""
-    scene_view = SceneView(stack(opacities))
+    scene_view = SceneView(stack(opacities), device="cpu")
     camera = AXIS.camera(33, 33, 0.01)
-    cut = v3dg.select(scene_view.scene, camera)
+    cut = v3dg.select(scene_view.scene, camera, device="cpu")
     window = (0, 0, 33, 33)
     counts, in_view = scene_view._count(cut, camera, window, None)
     assert counts[16, 16] == count
     assert in_view == len(opacities)
-    alpha = v3dg.render(scene_view.scene, camera).alpha
+    alpha = v3dg.render(scene_view.scene, camera, device="cpu").alpha
     np.testing.assert_array_equal(counts > 0, alpha > 0)
 
 
@@ -222,22 +222,22 @@ def test_frozen_cut_stays_while_the_camera_moves(scene_view, view):
 
 def test_asset_is_drawn_whole_and_has_one_level(view):
     asset = scenes_lod.blob(np.random.default_rng(1), 500)
-    scene_view = SceneView(asset)
+    scene_view = SceneView(asset, device="cpu")
     assert scene_view.num_levels == 1
     assert scene_view.num_gaussians == 500
     frame = scene_view.frame(view, SIZE, Settings())
-    whole = to_8bit(v3dg.render(asset, view.camera(*SIZE, scene_view.near)).color)
+    whole = to_8bit(v3dg.render(asset, view.camera(*SIZE, scene_view.near), device="cpu").color)
     assert abs(frame.pixels.astype(int) - whole).max() <= 1
     assert whole.any()
 
 
 def test_scene_of_nothing_is_drawn():
-    frame = SceneView(Scene()).frame(AXIS, SIZE, Settings())
+    frame = SceneView(Scene(), device="cpu").frame(AXIS, SIZE, Settings())
     assert not frame.pixels.any()
 
 
 def test_a_picture_that_is_stopped_is_given_up(crowd, view):
-    scene_view, stop = SceneView(crowd), _core.Stop()
+    scene_view, stop = SceneView(crowd, device="cpu"), _core.Stop()
     stop.request()
     for shows in ("appearance", "count", "difference"):
         with pytest.raises(Stopped):
@@ -251,7 +251,7 @@ def test_a_stop_ends_a_long_picture_early():
         scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 4000, size=0.2), 256),
         positions=rng.normal(size=(2000, 3)),
     )
-    scene_view, settings = SceneView(scene), Settings(tolerance=0.0)
+    scene_view, settings = SceneView(scene, device="cpu"), Settings(tolerance=0.0)
     view = look_at((0, -9, 0), (0, 0, 0), (0, 0, 1), 0.7, 1.5)
     start = time.monotonic()
     undisturbed = scene_view.frame(view, (800, 600), settings).pixels

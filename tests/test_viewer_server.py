@@ -39,7 +39,7 @@ def bundle():
 
 @pytest.fixture(scope="module")
 def scene_view(bundle):
-    return SceneView(bundle)
+    return SceneView(bundle, device="cpu")
 
 
 def listens_at(port, host):
@@ -92,7 +92,7 @@ def test_tab_begins_with_all_of_the_scene_in_view(scene_view, up):
 
 
 def test_command_says_where_and_ends_with_an_interrupt(bundle, tmp_path):
-    bundle.save(tmp_path / "blob.v3dg")
+    bundle.write(tmp_path / "blob.v3dg")
     environment = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
     process = subprocess.Popen(
         [sys.executable, "-m", "v3dg", "view", "blob.v3dg", "--port", "0"],
@@ -136,7 +136,7 @@ def test_command_says_where_and_ends_with_an_interrupt(bundle, tmp_path):
 )
 def test_command_refuses_what_cannot_be_meant(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    v3dg.save("asset.ply", scenes_lod.blob(np.random.default_rng(0), 50))
+    v3dg.write_asset("asset.ply", scenes_lod.blob(np.random.default_rng(0), 50))
     assert v3dg.cli.main(["view", *arguments]) != 0
     assert message in capsys.readouterr().err
 

@@ -40,19 +40,19 @@ def bundle():
 
 @pytest.fixture(scope="module")
 def scene_view(bundle):
-    return SceneView(bundle)
+    return SceneView(bundle, device="cpu")
 
 
 @pytest.fixture(scope="module")
 def site(bundle, tmp_path_factory):
     path = tmp_path_factory.mktemp("tab") / "blob.v3dg"
-    bundle.save(path)
+    bundle.write(path)
     scene = v3dg.Scene()
     positions = np.random.default_rng(1).normal(size=(30, 3))
     scene.add(v3dg.Bundle.open(path), positions=positions, scales=np.full(30, 0.5))
     cameras = {"aside": v3dg.Camera.look_at((9, 0, 0), (0, 0, 0), width=64, height=48)}
-    site = Site(SceneView(scene), name="blobs", cameras=cameras, port=0)
-    site.home = start_view(SceneView(scene), (0, 0, 1), SIZE[0] / SIZE[1])
+    site = Site(SceneView(scene, device="cpu"), name="blobs", cameras=cameras, port=0)
+    site.home = start_view(SceneView(scene, device="cpu"), (0, 0, 1), SIZE[0] / SIZE[1])
     yield site
     site.close()
 
@@ -112,7 +112,7 @@ def test_tab_gets_a_small_picture_and_then_the_full_one(site):
 
 
 def test_asset_has_no_controls_of_levels():
-    scene_view = SceneView(scenes_lod.blob(np.random.default_rng(0), 500))
+    scene_view = SceneView(scenes_lod.blob(np.random.default_rng(0), 500), device="cpu")
     site = Site(scene_view, port=0)
     try:
         with viewer_client.Tab(site.port) as tab:

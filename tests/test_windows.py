@@ -22,7 +22,7 @@ def crowd(rng, count, num_gaussians=400):
 
 def draw_window(scene, camera, window):
     """Colour, alpha, depth and statistics of the pixels [x0, x1) x [y0, y1)."""
-    selection = select(scene, camera, tolerance=0.0)
+    selection = select(scene, camera, tolerance=0.0, device="cpu")
     frame = _core.SceneFrame(CPU.number)
     residency.set_models(frame, scene.bundles, CPU, "appearance")
     drawing = frame.draw_cut(
@@ -36,7 +36,7 @@ def draw_window(scene, camera, window):
 
 
 def assert_windows_are_parts(scene, camera, windows):
-    image = render(scene, camera, tolerance=0.0, background=(0.1, 0.2, 0.3))
+    image = render(scene, camera, tolerance=0.0, background=(0.1, 0.2, 0.3), device="cpu")
     assert (image.alpha > 0.5).mean() > 0.1
     for x0, y0, x1, y1 in windows:
         *part, stats = draw_window(scene, camera, (x0, y0, x1, y1))

@@ -102,7 +102,7 @@ def test_every_camera_sees_some_of_the_crowd():
     bundle = v3dg.build_bundle(world.assets["person_00"].make(), config=config, progress=False, device="cpu")
     scene = worlds.scene_of(world, {"person_00": bundle})
     for name, camera in world.cameras(width=64, height=36).items():
-        assert v3dg.render(scene, camera).color.any(), name
+        assert v3dg.render(scene, camera, device="cpu").color.any(), name
 
 
 def test_a_crowd_of_fewer_than_there_are_persons():
@@ -151,7 +151,7 @@ def test_scene_of_a_world_draws():
     scene = worlds.scene_of(world, bundles)
     assert len(scene) == 6
     camera = world.cameras(width=64, height=36)["099_camera_19"]
-    assert v3dg.render(scene, camera).alpha.max() > 0.5
+    assert v3dg.render(scene, camera, device="cpu").alpha.max() > 0.5
 
 
 def test_a_written_world_is_read_and_drawn(tmp_path):
@@ -165,8 +165,11 @@ def test_a_written_world_is_read_and_drawn(tmp_path):
     assert len(scene) == 5
     assert len(cameras) == 400
     assert np.array_equal(scene.positions, all_of(world, "positions"))
-    assert len(v3dg.load(path.parent / "person_00.ply")) == 2000
-    assert v3dg.render(scene, world.cameras(width=64, height=36)["059_camera_19"]).alpha.max() > 0.5
+    assert len(v3dg.read_asset(path.parent / "person_00.ply")) == 2000
+    assert (
+        v3dg.render(scene, world.cameras(width=64, height=36)["059_camera_19"], device="cpu").alpha.max()
+        > 0.5
+    )
 
 
 def test_an_interrupted_world_goes_on(tmp_path, monkeypatch):
@@ -210,7 +213,7 @@ def test_command_line_writes_a_world(tmp_path, monkeypatch, capsys):
     assert result["output"] == str(folder / "crowd.json")
     assert (result["instances"], result["gaussians"]) == (2, 4000)
     assert np.array_equal(
-        v3dg.load(folder / "person_00.ply").means,
+        v3dg.read_asset(folder / "person_00.ply").means,
         worlds.crowd(2, 2000, persons=1, seed=3).assets["person_00"].make().means,
     )
 

@@ -14,10 +14,11 @@ from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.camera_file import read_cameras, write_cameras
 from v3dg.cameras import Camera, turntable
 from v3dg.gaussians import Gaussians
-from v3dg.io import load, save
+from v3dg.image import Image
+from v3dg.io import read_asset, write_asset
 from v3dg.pick import Pick, pick
-from v3dg.rasterize import Raster, rasterize
-from v3dg.render import Image, Renderer, Stats, render
+from v3dg.rasterize import rasterize
+from v3dg.render import RenderedImage, Renderer, Stats, render
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene, write_scene
 from v3dg.select import DEFAULT_TOLERANCE, Selection, select
@@ -32,22 +33,22 @@ __all__ = [
     "Groups",
     "Image",
     "Pick",
-    "Raster",
+    "RenderedImage",
     "Renderer",
     "Scene",
     "Selection",
     "Stats",
     "__version__",
     "build_bundle",
-    "load",
     "pick",
     "rasterize",
+    "read_asset",
     "read_cameras",
     "read_scene",
     "render",
-    "save",
     "select",
     "turntable",
+    "write_asset",
     "write_cameras",
     "write_scene",
 ]

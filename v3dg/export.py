@@ -67,7 +67,7 @@ class Export:
     bytes: int
 
 
-def export_streamed_sog(
+def write_streamed_sog(
     bundle: Bundle,
     folder: str | os.PathLike[str],
     *,

@@ -33,13 +33,13 @@ _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
 }
 
 SUFFIXES = tuple(_READERS)
-"""How the names of files end that `load` reads."""
+"""How the names of files end that `read_asset` reads."""
 
-SAVE_SUFFIXES = tuple(_WRITERS)
-"""How the names of files end that `save` writes."""
+WRITE_SUFFIXES = tuple(_WRITERS)
+"""How the names of files end that `write_asset` writes."""
 
 
-def load(path: Path) -> Gaussians:
+def read_asset(path: Path) -> Gaussians:
     """Read an asset; the end of the file's name tells its kind (docs/formats.md):
 
     - `.ply`, as trainers write it: ascii or binary of either byte order, its properties in any order and of
@@ -64,7 +64,7 @@ def load(path: Path) -> Gaussians:
     return _by_name(path, _READERS)(path)
 
 
-def save(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "binary_little_endian") -> None:
+def write_asset(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "binary_little_endian") -> None:
     """Write an asset, replacing what is there in one step once all is written.
 
     The end of the name tells the kind (docs/formats.md has what each loses):

@@ -158,7 +158,9 @@ def box_downsample(image: Any, factor: int) -> Any:
     return blocks.mean((1, 3))
 
 
-def draw_truth(subject: Any, camera: Camera, device: str | Device = "cpu", supersampling: int = 2) -> Picture:
+def draw_truth(
+    subject: Any, camera: Camera, device: str | Device = "auto", supersampling: int = 2
+) -> Picture:
     """Draw what the others are compared with, in 8 bits: all gaussians, with so many samples a pixel's side.
 
     Each sample is clipped to [0,1] as a screen does, before it is averaged over its pixel.

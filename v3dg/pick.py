@@ -38,7 +38,7 @@ class Pick:
 
 
 def pick(
-    scene_or_bundle: Scene | Bundle,
+    subject: Scene | Bundle,
     camera: Camera,
     x: int,
     y: int,
@@ -62,12 +62,13 @@ def pick(
     x, y = operator.index(x), operator.index(y)
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise ValueError(f"x, y: expected a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
-    scene = Scene.of(scene_or_bundle)
+    scene = Scene.of(subject)
     if budget is not None:  # which is for the whole picture
-        tolerance = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level).tolerance
+        whole = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU)
+        tolerance = whole.tolerance
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
     pixel = camera.core.window(x, y, x + 1, y + 1)
-    resident = residency.scene(scene_or_bundle, CPU)
+    resident = residency.scene(subject, CPU)
     cut = resident.core.select(pixel, rule)
     frame = _core.SceneFrame(CPU.number)
     residency.set_models(frame, resident.bundles, CPU, "appearance")

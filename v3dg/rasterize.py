@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,24 +10,10 @@ import numpy as np
 from v3dg import _core, _device
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
+from v3dg.image import Image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-
-@dataclass(frozen=True, eq=False)
-class Raster:
-    """A picture of H x W pixels, of the same kind of arrays as the gaussians it was drawn from.
-
-    Attributes:
-        color: (H, W, 3) premultiplied colour, the background composed last.
-        alpha: (H, W) coverage.
-        depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn.
-    """
-
-    color: Any
-    alpha: Any
-    depth: Any
 
 
 def rasterize(
@@ -38,7 +23,7 @@ def rasterize(
     filter_px2: float = 0.0,
     antialiased: bool = False,
     background: Sequence[float] = (0.0, 0.0, 0.0),
-) -> Raster:
+) -> Image:
     """Draw gaussians with the meaning of 3D Gaussian Splatting, as gsplat 1.5 defines it.
 
     Alpha is cut at 0.999, contributions below 1/255 are skipped, a pixel stops before its transmittance would
@@ -77,13 +62,11 @@ def rasterize(
         color, alpha, depth, _, _ = _core.rasterize(
             gaussians.rows, camera.core, background=shade, keep_tape=False, **options
         )
-        return Raster(color, alpha, depth)
+        return Image(color, alpha, depth)
     return _rasterize_torch(gaussians, camera, options, background)
 
 
-def _rasterize_torch(
-    gaussians: Gaussians, camera: Camera, options: dict[str, Any], background: Any
-) -> Raster:
+def _rasterize_torch(gaussians: Gaussians, camera: Camera, options: dict[str, Any], background: Any) -> Image:
     import torch
 
     means = gaussians.means
@@ -96,7 +79,7 @@ def _rasterize_torch(
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     shade = torch.as_tensor(background, dtype=means.dtype)
     keep_tape = torch.is_grad_enabled() and any(t.requires_grad for t in (*arrays, shade))
-    return Raster(*_function().apply(camera.core, {**options, "keep_tape": keep_tape}, *arrays, shade))
+    return Image(*_function().apply(camera.core, {**options, "keep_tape": keep_tape}, *arrays, shade))
 
 
 @functools.cache

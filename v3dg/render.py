@@ -11,6 +11,7 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
+from v3dg.image import Image
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
 from v3dg.select import Selection, over_budget, rule_of
@@ -40,16 +41,13 @@ class Stats:
     draw_ms: float
 
 
-class Image:
-    """A picture of H x W pixels: NumPy arrays, or torch tensors on the CUDA device that drew it.
+class RenderedImage(Image):
+    """An `Image` that says what it cost.
 
-    A picture drawn by CUDA may still be under way; to look at one of its attributes waits until it is there,
-    and raises what went wrong.
+    One that CUDA draws may still be under way; to look at one of its attributes waits until it is there, and
+    raises what went wrong.
 
     Attributes:
-        color: (H, W, 3) premultiplied colour, the background composed last.
-        alpha: (H, W) coverage.
-        depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn.
         stats: What it cost.
     """
 
@@ -88,7 +86,7 @@ def render(
     color_by: ColorBy = ...,
     background: Sequence[float] = ...,
     device: str | Device = ...,
-) -> Image: ...
+) -> RenderedImage: ...
 @overload
 def render(
     subject: Scene | Bundle | Gaussians,
@@ -101,7 +99,7 @@ def render(
     color_by: ColorBy = ...,
     background: Sequence[float] = ...,
     device: str | Device = ...,
-) -> list[Image]: ...
+) -> list[RenderedImage]: ...
 def render(
     subject: Scene | Bundle | Gaussians,
     camera: Camera | Sequence[Camera],
@@ -112,8 +110,8 @@ def render(
     cut: Selection | None = None,
     color_by: ColorBy = "appearance",
     background: Sequence[float] = (0.0, 0.0, 0.0),
-    device: str | Device = "cpu",
-) -> Image | list[Image]:
+    device: str | Device = "auto",
+) -> RenderedImage | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each stand for at most `tolerance` px² are drawn in place of finer ones; level 0
@@ -131,9 +129,9 @@ def render(
             the place of `tolerance`, `budget` and `min_level`.
         color_by: "level" or "cluster" colours gaussians by the one that they belong to.
         background: Three numbers.
-        device: "cpu", "cuda", "cuda:1" or "auto"; CUDA draws on the stream that is torch's current one there
-            and keeps on the device what the next picture of the same scene or bundle needs. Use a `Renderer`
-            to say how long.
+        device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws torch tensors there, on
+            the stream that is torch's current one, and keeps on the device what the next picture of the same
+            scene or bundle needs. Use a `Renderer` to say how long. "auto" is "cuda" where that works.
 
     Raises:
         ValueError: An argument is not as above, or the coarsest cut has more gaussians than the budget; on
@@ -142,7 +140,7 @@ def render(
     """
     frame = _frame_of(subject, color_by, _device.resolve(device))
 
-    def one(view: Camera) -> Image:
+    def one(view: Camera) -> RenderedImage:
         return frame.draw(
             subject, view, background, tolerance=tolerance, budget=budget, min_level=min_level, cut=cut
         )
@@ -186,7 +184,7 @@ class Renderer:
         min_level: int = 0,
         cut: Selection | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
-    ) -> Image:
+    ) -> RenderedImage:
         """Draw as `v3dg.render` does."""
         return self._frame.draw(
             self._subject,
@@ -220,12 +218,12 @@ class _Frame:
         *,
         cut: Selection | None,
         **options: Any,
-    ) -> Image:
+    ) -> RenderedImage:
         shade = _three(background)
         if isinstance(subject, Gaussians):
             _check_asset(self._color_by, cut=cut, **options)
             drawing = self._asset.draw(camera.core, shade)
-            return Image(drawing, lambda: _stats(drawing.finish(), 0.0))
+            return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
         rule = rule_of(**options, footprint="solid_angle", cull=True)
         resident = residency.scene(subject, self._device)
         self._take_models(resident)
@@ -247,7 +245,7 @@ class _Frame:
 
         if not self._device.is_cuda:
             finish()
-        return Image(drawing, finish)
+        return RenderedImage(drawing, finish)
 
     def _take_models(self, resident: ResidentScene) -> None:
         if self._generation is not resident.generation:

@@ -38,12 +38,12 @@ class Scene:
         self._num_changes = self._num_moves = 0
 
     @classmethod
-    def of(cls, scene_or_bundle: Scene | Bundle) -> Scene:
+    def of(cls, subject: Scene | Bundle) -> Scene:
         """Return a scene as it is, and a bundle as a scene of one instance at the origin."""
-        if isinstance(scene_or_bundle, Scene):
-            return scene_or_bundle
+        if isinstance(subject, Scene):
+            return subject
         scene = cls()
-        scene.add(scene_or_bundle)
+        scene.add(subject)
         return scene
 
     def add(

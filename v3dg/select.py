@@ -51,7 +51,7 @@ class Selection:
     def __len__(self) -> int:
         return len(self.instance_ids)
 
-    def gaussians(self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str | Device = "cpu") -> Gaussians:
+    def gaussians(self, origin: VectorLike = (0.0, 0.0, 0.0), *, device: str | Device = "auto") -> Gaussians:
         """Return the selected gaussians in the world, N in the order of the selection, for any rasterizer.
 
         Spherical harmonics are rotated into the world's frame, which is exact. The degree is the highest of
@@ -60,8 +60,8 @@ class Selection:
         Args:
             origin: (3,) point in the world that means are relative to; take the camera's position where the
                 scene is so far from zero that float32 would not hold it.
-            device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there, ``"auto"`` for the better
-                of the two that works. Both hold the same numbers.
+            device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there, ``"auto"`` for the latter
+                where CUDA works. Both hold the same numbers.
         """
         where = _device.resolve(device)
         shift = np.asarray(origin, np.float64)
@@ -123,7 +123,7 @@ class Selection:
 
 @overload
 def select(
-    scene_or_bundle: Scene | Bundle,
+    subject: Scene | Bundle,
     camera: Camera,
     *,
     tolerance: float | None = ...,
@@ -135,7 +135,7 @@ def select(
 ) -> Selection: ...
 @overload
 def select(
-    scene_or_bundle: Scene | Bundle,
+    subject: Scene | Bundle,
     camera: Sequence[Camera],
     *,
     tolerance: float | None = ...,
@@ -146,7 +146,7 @@ def select(
     device: str | Device = ...,
 ) -> list[Selection]: ...
 def select(
-    scene_or_bundle: Scene | Bundle,
+    subject: Scene | Bundle,
     camera: Camera | Sequence[Camera],
     *,
     tolerance: float | None = None,
@@ -154,7 +154,7 @@ def select(
     min_level: int = 0,
     footprint: Footprint = "solid_angle",
     cull: bool = True,
-    device: str | Device = "cpu",
+    device: str | Device = "auto",
 ) -> Selection | list[Selection]:
     """Choose the clusters that are just detailed enough for one view, or for each of several.
 
@@ -172,7 +172,8 @@ def select(
         footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with which a path can
             have more than one cluster.
         cull: False keeps what lies outside the frustum.
-        device: ``"cpu"`` or ``"cuda"``; both choose the same.
+        device: Where to choose: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is CUDA where that works; all
+            choose the same.
 
     Raises:
         ValueError: The coarsest cut has more gaussians than the budget, ``tolerance`` is negative or not a
@@ -184,8 +185,8 @@ def select(
     rule = rule_of(tolerance, budget, min_level, footprint, cull)
     where = _device.resolve(device)
     if not isinstance(camera, Camera):
-        return [_select(scene_or_bundle, view, rule, budget, where) for view in camera]
-    return _select(scene_or_bundle, camera, rule, budget, where)
+        return [_select(subject, view, rule, budget, where) for view in camera]
+    return _select(subject, camera, rule, budget, where)
 
 
 def _select(
@@ -203,10 +204,10 @@ def _select(
 
 
 def group_metrics(
-    scene_or_bundle: Scene | Bundle, camera: Camera, *, footprint: Footprint = "solid_angle"
+    subject: Scene | Bundle, camera: Camera, *, footprint: Footprint = "solid_angle"
 ) -> list[npt.NDArray[np.float32]]:
     """Return for each instance what tolerance is compared with: its groups' metrics, (G,) in px²."""
-    scene = Scene.of(scene_or_bundle)
+    scene = Scene.of(subject)
     instances = _core.Instances(
         bundle=scene.instance_bundle,
         positions=scene.positions,

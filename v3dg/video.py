@@ -1,4 +1,4 @@
-"""Films: pictures in a row as a video file, written whole or not at all. Wants the extra `video`."""
+"""Videos: pictures in a row in one file, written whole or not at all. Wants the extra `video`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from v3dg import _files
 from v3dg.pictures import to_8bit
 
 
-def write_film(
+def write_video(
     path: str | os.PathLike[str], pictures: Iterable[Any], *, fps: int = 30, quality: int = 18
 ) -> int:
     """Encode pictures as H.264 in an .mp4 file, each as it comes; the file appears when all are in it.
@@ -22,7 +22,7 @@ def write_film(
         quality: Constant rate factor, 0 to 51; smaller is better and larger, 18 shows no difference.
 
     Returns:
-        How many pictures the film has.
+        How many pictures the video has.
 
     Raises:
         ImportError: The extra is not installed.
@@ -31,12 +31,12 @@ def write_film(
     try:
         import av
     except ImportError as error:
-        raise ImportError("films need PyAV, which is not installed; pip install 'v3dg[video]'") from error
+        raise ImportError("videos need PyAV, which is not installed; pip install 'v3dg[video]'") from error
     if not os.fspath(path).endswith(".mp4"):
         raise ValueError(f"{os.fspath(path)}: expected a file name ending in .mp4")
     count, size = 0, None
-    with _files.replacing(path) as temporary, av.open(temporary, "w", format="mp4") as film:
-        stream = film.add_stream("h264", rate=fps, options={"crf": str(quality)})
+    with _files.replacing(path) as temporary, av.open(temporary, "w", format="mp4") as video:
+        stream = video.add_stream("h264", rate=fps, options={"crf": str(quality)})
         stream.pix_fmt = "yuv420p"
         for picture in pictures:
             pixels = to_8bit(picture)
@@ -46,9 +46,9 @@ def write_film(
             if pixels.shape != size or len(size) != 3 or size[0] % 2 or size[1] % 2:
                 expected = "an even height and width" if pixels.shape == size else f"{size} as before"
                 raise ValueError(f"pictures: expected {expected}, got {pixels.shape}")
-            film.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
             count += 1
         if not count:
             raise ValueError("pictures: expected at least one, got none")
-        film.mux(stream.encode())
+        video.mux(stream.encode())
     return count

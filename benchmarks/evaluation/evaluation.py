@@ -23,7 +23,7 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.gaussians import Gaussians
-from v3dg.io import load
+from v3dg.io import read_asset
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import Stats, render
@@ -145,7 +145,7 @@ class Evaluation:
     def asset(self) -> Gaussians:
         if self.asset_path is None:
             return self._main_world.assets["donut"].make()
-        return load(self.asset_path)
+        return read_asset(self.asset_path)
 
     @property
     def asset_name(self) -> str:

@@ -99,9 +99,9 @@ class Judge(Judges):
 
 def tolerance_for(scene: Scene, camera: Camera, count: int) -> float:
     """The tolerance at which at most `count` gaussians are selected; `COARSEST` where that is not enough."""
-    if select(scene, camera, tolerance=COARSEST).num_gaussians > count:
+    if select(scene, camera, tolerance=COARSEST, device="cpu").num_gaussians > count:
         return COARSEST
-    return select(scene, camera, budget=count).tolerance
+    return select(scene, camera, budget=count, device="cpu").tolerance
 
 
 def _bisect(fits: Callable[[float], bool], low: float, high: float) -> float:

@@ -55,7 +55,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    asset = make_asset() if config.asset is None else v3dg.load(config.asset)
+    asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
     rows = []
     for part in config.parts:
         for device in config.devices:

@@ -66,7 +66,7 @@ def main(config: Config) -> None:
         print(row, flush=True)
         rows.append(row)
 
-    asset = make_asset() if config.asset is None else v3dg.load(config.asset)
+    asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
     if config.layout is not None:
         # One level is all that is drawn.
         bundle = build_bundle(asset, config=BuildConfig(min_clusters=1 << 30), progress=False, device="cpu")

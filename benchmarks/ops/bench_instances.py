@@ -56,7 +56,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    asset = make_asset() if config.asset is None else v3dg.load(config.asset)
+    asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
     with gpu.PeakMemory():  # takes note of an idle process
         torch.zeros(1, device=gpu.DEVICE)
     bundle = build_bundle(asset, progress=False, device=gpu.DEVICE)

@@ -69,21 +69,21 @@ def main(config: Config) -> None:
     }
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.ply"
-        save_bytes = peak_growth(lambda: v3dg.save(path, gaussians))
-        load_bytes = peak_growth(lambda: v3dg.load(path))
+        save_bytes = peak_growth(lambda: v3dg.write_asset(path, gaussians))
+        load_bytes = peak_growth(lambda: v3dg.read_asset(path))
         file_bytes = path.stat().st_size
         report["file_megabytes"] = file_megabytes = file_bytes / 1e6
         report["save_peak_over_file"] = save_bytes / file_bytes
         report["load_peak_over_file"] = load_bytes / file_bytes
-        back = v3dg.load(path)
+        back = v3dg.read_asset(path)
         report["largest_relative_scale_error"] = float(np.max(np.abs(back.scales / gaussians.scales - 1)))
         report["largest_opacity_error"] = float(np.max(np.abs(back.opacities - gaussians.opacities)))
         if not np.array_equal(back.sh, gaussians.sh) or not np.array_equal(back.means, gaussians.means):
             raise SystemExit("what was read is not what was written")
         del back
         for name, run in (
-            ("save", lambda: v3dg.save(path, gaussians)),
-            ("load", lambda: v3dg.load(path)),
+            ("write", lambda: v3dg.write_asset(path, gaussians)),
+            ("read", lambda: v3dg.read_asset(path)),
         ):
             times = seconds(config.repeats, run)
             report[f"{name}_ms"] = [

@@ -35,7 +35,7 @@ def camera_that_fills(gaussians: v3dg.Gaussians, width: int, height: int) -> Cam
 
 
 def main(config: Config) -> None:
-    gaussians = make_asset() if config.asset is None else v3dg.load(config.asset)
+    gaussians = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
     camera = camera_that_fills(gaussians, config.size, config.size)
     look = {"filter_px2": 0.0, "antialiased": False, "background": [0.0] * 3}
     options = {**look, "with_depth": False, "keep_tape": False}

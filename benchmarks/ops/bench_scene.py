@@ -44,10 +44,12 @@ def main(config: Config) -> None:
     if config.truth is not None:
         truth = np.asarray(Image.open(config.truth).convert("RGB"), np.float32) / 255
     else:
-        truth = metrics.box_downsample(np.clip(render(scene, camera.scaled(2), tolerance=0).color, 0, 1), 2)
+        truth = metrics.box_downsample(
+            np.clip(render(scene, camera.scaled(2), tolerance=0, device="cpu").color, 0, 1), 2
+        )
     rows = []
     for tolerance in config.tolerances:
-        frames = [render(scene, camera, tolerance=tolerance) for _ in range(config.repeats + 1)]
+        frames = [render(scene, camera, tolerance=tolerance, device="cpu") for _ in range(config.repeats + 1)]
         stats = [frame.stats for frame in frames[1:]]
         color = np.round(np.clip(frames[-1].color, 0, 1) * 255) / np.float32(255)
         row = {

@@ -56,7 +56,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    asset = v3dg.load(config.asset)
+    asset = v3dg.read_asset(config.asset)
     truth = np.asarray(Image.open(config.truth).convert("RGB"), np.float32) / 255
     name = json.loads(config.layout.read_text())["asset"]
     rows = []
@@ -70,7 +70,7 @@ def main(config: Config) -> None:
         camera = list(cameras.values())[config.camera]
         row["frames"] = []
         for tolerance in config.tolerances:
-            image = v3dg.render(scene, camera, tolerance=tolerance)
+            image = v3dg.render(scene, camera, tolerance=tolerance, device="cpu")
             color = np.round(np.clip(image.color, 0, 1) * 255) / np.float32(255)
             row["frames"].append(
                 {

@@ -114,7 +114,7 @@ def with_their_falloff(
 
 
 def main(config: Config) -> None:
-    asset = v3dg.load(config.asset)
+    asset = v3dg.read_asset(config.asset)
     center = np.median(asset.means, axis=0).astype(np.float64)
     radius = float(np.quantile(np.linalg.norm(asset.means - center, axis=1), 0.99))
     cameras = v3dg.turntable(

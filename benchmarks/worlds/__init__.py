@@ -29,7 +29,7 @@ from v3dg.build import BuildConfig, build_file
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.gaussians import Gaussians
-from v3dg.io import load, save
+from v3dg.io import read_asset, write_asset
 from v3dg.scene import Scene
 from v3dg.scene_file import write_scene
 
@@ -317,8 +317,8 @@ def write_world(
     for name, asset in tqdm(world.assets.items(), desc=world.name, unit="asset", disable=not progress):
         gaussians = asset.make()
         asset_path, bundle_path = folder / f"{name}.ply", folder / f"{name}.v3dg"
-        if not (resume and asset_path.is_file() and _is_same(load(asset_path), gaussians)):
-            save(asset_path, gaussians)
+        if not (resume and asset_path.is_file() and _is_same(read_asset(asset_path), gaussians)):
+            write_asset(asset_path, gaussians)
         bundles[name], _ = build_file(
             asset_path,
             bundle_path,

@@ -61,7 +61,7 @@ def levels(bundle: v3dg.Bundle) -> None:
         row = []
         for level in LEVELS:
             image = v3dg.render(
-                bundle, camera, tolerance=0, min_level=level, color_by=color_by, background=SKY
+                bundle, camera, tolerance=0, min_level=level, color_by=color_by, background=SKY, device="cpu"
             )
             count = image.stats.gaussians_selected
             row.append((f"level {level}: {count:,} gaussians" if color_by == "appearance" else "", image))
@@ -80,7 +80,7 @@ def cut(bundle: v3dg.Bundle) -> None:
         ("appearance", "what is drawn"),
         ("level", "the level of each cluster in the cut"),
     ):
-        image = v3dg.render(scene, camera, color_by=color_by, background=SKY)
+        image = v3dg.render(scene, camera, color_by=color_by, background=SKY, device="cpu")
         row.append(
             (
                 f"{text}: {image.stats.gaussians_selected / 1e6:.1f} M of "

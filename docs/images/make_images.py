@@ -35,10 +35,12 @@ def main(config: Config) -> None:
     intrinsics[:2, 2] -= (left, top)
     camera = replace(whole, K=intrinsics, width=width, height=height)
 
-    truth = box_downsample(np.clip(v3dg.render(scene, camera.scaled(2), tolerance=0).color, 0, 1), 2)
+    truth = box_downsample(
+        np.clip(v3dg.render(scene, camera.scaled(2), tolerance=0, device="cpu").color, 0, 1), 2
+    )
     panels = [("truth: all gaussians, twice the size, box-averaged", truth)]
     for tolerance in (0.0, *config.tolerances):
-        image = v3dg.render(scene, camera, tolerance=tolerance)
+        image = v3dg.render(scene, camera, tolerance=tolerance, device="cpu")
         color = np.clip(image.color, 0, 1)
         count = f"{image.stats.gaussians_in_frustum / 1e6:.2f} M gaussians, FLIP {flip(truth, color):.3f}"
         panels.append((f"{'all' if tolerance == 0 else f'tolerance {tolerance:g}'}: {count}", color))

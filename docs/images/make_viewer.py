@@ -24,7 +24,7 @@ MODES = ("Colour", "Level", "Cluster", "Depth", "Alpha", "Gaussians per pixel", 
 
 def main(scene_path: str, camera: str) -> None:
     scene, cameras = v3dg.read_scene(scene_path)
-    site = Site(SceneView(scene), name="DonutSea", cameras=cameras, port=0)
+    site = Site(SceneView(scene, device="cpu"), name="DonutSea", cameras=cameras, port=0)
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
         page = browser.new_page(viewport={"width": 1120, "height": 640})

@@ -68,7 +68,7 @@ def look(
 
 
 def picture(subject: Any, camera: v3dg.Camera) -> Any:
-    image = v3dg.render(subject, camera.scaled(2), tolerance=0, background=BACKGROUND)
+    image = v3dg.render(subject, camera.scaled(2), tolerance=0, background=BACKGROUND, device="cpu")
     return box_downsample(np.clip(image.color, 0, 1), 2)
 
 

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "support"))
 from fuzz.targets import META_IN_SOG, SOG, zipped
 from random_bundle import random_bundle, random_gaussians
 from test_ply import HOSTILE, Element, ply_bytes, random_columns
-from v3dg.io import save
+from v3dg.io import write_asset
 
 LARGEST_SEED = 10_000  # bytes; a few of the broken files are made to be large
 
@@ -42,7 +42,7 @@ def bundle_seeds():
         bundle = random_bundle(
             seed, num_levels=num_levels, sh_degree=degree, max_cluster=2, config={"seed": seed}
         )
-        bundle.save(path)
+        bundle.write(path)
         yield path.read_bytes()
     path.unlink()
 
@@ -84,7 +84,7 @@ def format_seeds():
     for kind, suffix in ((0, ".compressed.ply"), (2, ".spz")):
         for degree in (0, 1):
             file = path.with_suffix(suffix)
-            save(file, random_gaussians(np.random.default_rng(degree), 3, degree))
+            write_asset(file, random_gaussians(np.random.default_rng(degree), 3, degree))
             content = file.read_bytes()
             file.unlink()
             yield bytes([kind]) + content

@@ -15,7 +15,7 @@ from v3dg._json import is_one_line
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
 from v3dg.formats import sog
-from v3dg.io import load
+from v3dg.io import read_asset
 from v3dg.scene_file import read_scene
 
 BUNDLES = {"a": random_bundle(0), "a.v3dg": random_bundle(1), "sub/b.v3dg": random_bundle(2)}
@@ -24,7 +24,7 @@ BUNDLES = {"a": random_bundle(0), "a.v3dg": random_bundle(1), "sub/b.v3dg": rand
 def read_ply(content, folder):
     path = put(folder / "fuzz.ply", content)
     with only_errors_that_name(path):
-        assert len(load(path)) <= len(content)
+        assert len(read_asset(path)) <= len(content)
 
 
 def read_bundle(content, folder):
@@ -51,7 +51,7 @@ def read_format(content, folder):
     suffix, packed = FORMATS[content[0] % len(FORMATS)] if content else FORMATS[0]
     path = put(folder / f"fuzz{suffix}", packed(content[1:]))
     with only_errors_that_name(path):
-        assert len(load(path)) <= 1032 * path.stat().st_size  # the most that deflate can make of a byte
+        assert len(read_asset(path)) <= 1032 * path.stat().st_size  # the most that deflate can make of a byte
 
 
 def zipped(files):

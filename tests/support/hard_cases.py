@@ -279,10 +279,10 @@ def hard_cases() -> dict[str, HardCase]:
 # Measures
 
 
-def picture(case: HardCase, device: str) -> v3dg.Raster:
+def picture(case: HardCase, device: str) -> v3dg.Image:
     """What float32 draws, as NumPy arrays."""
     raster = v3dg.rasterize(on(device, case.gaussians), case.camera, **case.mode)
-    return v3dg.Raster(*host((raster.color, raster.alpha, raster.depth)))
+    return v3dg.Image(*host((raster.color, raster.alpha, raster.depth)))
 
 
 def expected_picture(case: HardCase) -> reference_rasterize.Picture:
@@ -290,7 +290,7 @@ def expected_picture(case: HardCase) -> reference_rasterize.Picture:
         return reference_rasterize.rasterize(case.gaussians, case.camera, **case.mode)
 
 
-def picture_error(raster: v3dg.Raster, expected: reference_rasterize.Picture) -> np.ndarray:
+def picture_error(raster: v3dg.Image, expected: reference_rasterize.Picture) -> np.ndarray:
     """(H, W) largest error of colour and alpha."""
     return np.maximum(
         np.abs(raster.color - expected.color).max(axis=2), np.abs(raster.alpha - expected.alpha)

@@ -20,7 +20,7 @@ from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundleWriter, writing
 from v3dg.bundle.pages import PageLayout
 from v3dg.gaussians import Gaussians
-from v3dg.io import load
+from v3dg.io import read_asset
 
 
 def build_file(
@@ -50,7 +50,7 @@ def build_file(
         The bundle, opened from its file, and whether it was built.
 
     Raises:
-        ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As `load` and `build_bundle`.
+        ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As `read_asset` and `build_bundle`.
     """
     asset_path, bundle_path = Path(asset_path), Path(bundle_path)
     config = config or BuildConfig()
@@ -62,7 +62,7 @@ def build_file(
     if not resume:
         discard_levels(levels)
     if asset is None:
-        asset = load(asset_path)
+        asset = read_asset(asset_path)
     try:
         build_into(
             partial(_open_file, bundle_path),

@@ -1,4 +1,4 @@
-"""Bundle: all clusters of all levels of one asset; save and open."""
+"""Bundle: all clusters of all levels of one asset; write and open."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Bundle:
         bundle._set(clusters, groups, file.config, file.codec, layout, FilePages(layout, file), file)
         return bundle
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str]) -> None:
         """Write the bundle to a file; the same bundle gives the same bytes.
 
         The file appears at ``path`` when it is complete and not before: on an error or an interrupt, what was

@@ -47,9 +47,9 @@ Threads: TypeAlias = Annotated[int | None, option("N")]
 
 def load_asset_or_bundle(path: Path) -> Gaussians | Bundle:
     from v3dg.bundle import Bundle
-    from v3dg.io import load
+    from v3dg.io import read_asset
 
-    return Bundle.open(path) if path.suffix == ".v3dg" else load(path)
+    return Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path)
 
 
 def require_file(path: Path, *suffixes: str) -> None:

@@ -143,7 +143,7 @@ def _outputs(options: Build) -> dict[Path, Path]:
 
 
 def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
-    """Build and save one bundle; what was done, as JSON values."""
+    """Build and write one bundle; what was done, as JSON values."""
     require_file(asset_path, *SUFFIXES)
     from v3dg.build import build_file
     from v3dg.cleaning import AssetWarning

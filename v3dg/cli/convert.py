@@ -13,7 +13,7 @@ import tyro
 from v3dg import _files
 from v3dg.cli._common import Flag, Threads, UsageError, bytes_text, option, print_result, require_subject
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, is_scene, load_subject
-from v3dg.io import SAVE_SUFFIXES
+from v3dg.io import WRITE_SUFFIXES
 
 if TYPE_CHECKING:
     from v3dg.bundle import Bundle
@@ -49,7 +49,7 @@ def run(options: Convert) -> None:
     _check(options)
     from v3dg.bundle import Bundle
     from v3dg.gaussians import Gaussians
-    from v3dg.io import save
+    from v3dg.io import write_asset
 
     start = time.perf_counter()
     subject, own_cameras = load_subject(options.subject)
@@ -65,7 +65,7 @@ def run(options: Convert) -> None:
         if len(cameras) != 1:
             raise UsageError(f"--camera: expected one of {len(cameras)} cameras; give its name or its place")
         gaussians, told = _cut(options, subject, cameras)
-    save(options.output, gaussians)
+    write_asset(options.output, gaussians)
     size = options.output.stat().st_size
     result = {
         "output": str(options.output),
@@ -84,8 +84,8 @@ def run(options: Convert) -> None:
 def _check(options: Convert) -> None:
     """Refuse, before anything is read, what cannot be meant."""
     options.view.check(options.subject)
-    if not options.output.name.lower().endswith(SAVE_SUFFIXES):
-        raise ValueError(f"{options.output}: expected a file name that ends in {', '.join(SAVE_SUFFIXES)}")
+    if not options.output.name.lower().endswith(WRITE_SUFFIXES):
+        raise ValueError(f"{options.output}: expected a file name that ends in {', '.join(WRITE_SUFFIXES)}")
     _files.check_folder(options.output)
     if options.level is not None and _wants_cut(options):
         raise UsageError(
@@ -108,17 +108,20 @@ def _level(bundle: Bundle, level: int) -> tuple[Gaussians, dict[str, Any]]:
 def _cut(
     options: Convert, subject: Scene | Bundle, cameras: dict[str, Any]
 ) -> tuple[Gaussians, dict[str, Any]]:
+    from v3dg._device import CPU
     from v3dg.bundle import Bundle
     from v3dg.gaussians import Gaussians
     from v3dg.select import select
 
     ((name, camera),) = cameras.items()
     keep = options.outside == "keep"
-    selection = select(subject, camera, tolerance=options.tolerance, budget=options.budget, cull=not keep)
+    selection = select(
+        subject, camera, tolerance=options.tolerance, budget=options.budget, cull=not keep, device=CPU
+    )
     if isinstance(subject, Bundle) and len(selection):  # its clusters alone are read
         gaussians = Gaussians.concatenate([subject.cluster_gaussians(int(c)) for c in selection.cluster_ids])
     else:
-        gaussians = selection.gaussians()
+        gaussians = selection.gaussians(device=CPU)
     # JSON has no infinity, which a budget can come to.
     tolerance = selection.tolerance if math.isfinite(selection.tolerance) else None
     return gaussians, {"camera": name, "tolerance": tolerance, "clusters": len(selection)}

@@ -39,12 +39,12 @@ def run(options: Export) -> None:
     if options.chunk is not None and options.chunk < 1:
         raise UsageError(f"--chunk: expected at least 1, got {options.chunk}")
     from v3dg.bundle import Bundle
-    from v3dg.export import DEFAULT_CHUNK, INDEX, export_streamed_sog
+    from v3dg.export import DEFAULT_CHUNK, INDEX, write_streamed_sog
 
     folder = options.output or options.bundle.with_name(f"{options.bundle.stem}_web")
     _files.check_folder(folder)
     start = time.perf_counter()
-    done = export_streamed_sog(
+    done = write_streamed_sog(
         Bundle.open(options.bundle),
         folder,
         chunk=DEFAULT_CHUNK if options.chunk is None else options.chunk,

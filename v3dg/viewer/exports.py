@@ -16,7 +16,7 @@ from v3dg.camera_file import write_cameras
 from v3dg.cameras import Camera
 from v3dg.scene import Scene
 from v3dg.scene_file import write_scene
-from v3dg.video import write_film
+from v3dg.video import write_video
 from v3dg.viewer.frame import Pixels
 
 if TYPE_CHECKING:
@@ -31,10 +31,10 @@ def picture_bytes(pixels: Pixels) -> bytes:
 
 
 def film_bytes(pictures: Iterable[Pixels], fps: int) -> bytes:
-    """Return an .mp4 file; errors are those of `write_film`."""
+    """Return an .mp4 file; errors are those of `write_video`."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "film.mp4")
-        write_film(path, pictures, fps=fps)
+        write_video(path, pictures, fps=fps)
         return path.read_bytes()
 
 

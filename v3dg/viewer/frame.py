@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core, _device
-from v3dg._device import CPU
+from v3dg._device import CPU, Device
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
@@ -131,7 +131,7 @@ class SceneView:
 
     Args:
         subject: A scene, a bundle, or an asset, which is split into clusters but gets no coarser levels.
-        device: "cpu" or "cuda".
+        device: Where to draw: "cpu", "cuda", or "auto", which is CUDA where that works.
         near: As in `v3dg.Camera`; None for what suits the scene's size.
 
     Attributes:
@@ -140,7 +140,11 @@ class SceneView:
     """
 
     def __init__(
-        self, subject: Scene | Bundle | Gaussians, *, device: str = "cpu", near: float | None = None
+        self,
+        subject: Scene | Bundle | Gaussians,
+        *,
+        device: str | Device = "auto",
+        near: float | None = None,
     ) -> None:
         if isinstance(subject, Gaussians):
             only_leaves = BuildConfig(min_clusters=1 << 31)

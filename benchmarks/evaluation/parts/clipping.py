@@ -72,7 +72,9 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
 
 def clipped(evaluation: Evaluation, view: View, count: int) -> tuple[float, int, Picture]:
     """The clip that leaves at most so many of the full scene's gaussians in the picture, and the picture."""
-    everything = select(evaluation.full_scene, view.camera, tolerance=0.0).gaussians(device=evaluation.device)
+    everything = select(evaluation.full_scene, view.camera, tolerance=0.0, device="cpu").gaussians(
+        device=evaluation.device
+    )
     radii = screen_radii(everything, view.camera)
     clip = clip_radius_for(radii, count)
     kept = radii > clip

@@ -28,7 +28,7 @@ from v3dg._judges import mean_of
 from v3dg.build import BuildConfig
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
-from v3dg.io import load
+from v3dg.io import read_asset
 from v3dg.metrics import draw_truth, psnr
 from v3dg.pictures import Picture, to_8bit
 from v3dg.rasterize import rasterize
@@ -68,7 +68,7 @@ def peer_rows(evaluation: Evaluation) -> list[Row]:
         if found is None:
             raise ValueError(f"{path}: expected a name like {evaluation.asset_name}_TOOL_50.ply")
         tool, percent = found.groups()
-        theirs = load(path)
+        theirs = read_asset(path)
         footprint = footprint_of_cut(bundle, len(theirs))
         row: Row = {
             "tool": tool,
@@ -111,7 +111,9 @@ def footprint_of_cut(bundle: Bundle, count: int) -> float:
     for _ in range(24):
         middle = math.sqrt(low * high)
         cameras = [view_camera(bundle, view, middle) for view in range(_VIEWS)]
-        mean = np.mean([select(scene, c, tolerance=DEFAULT_TOLERANCE).num_gaussians for c in cameras])
+        mean = np.mean(
+            [select(scene, c, tolerance=DEFAULT_TOLERANCE, device="cpu").num_gaussians for c in cameras]
+        )
         low, high = (middle, high) if mean <= count else (low, middle)
     return low
 
@@ -126,7 +128,7 @@ def compare(evaluation: Evaluation, bundle: Bundle, theirs: Any, footprint_px2: 
     for view in range(_VIEWS):
         camera = view_camera(bundle, view, footprint_px2)
         truth = draw_truth(bundle, camera, "cpu")
-        ours = render(bundle, camera, tolerance=tolerance_for(scene, camera, len(theirs)))
+        ours = render(bundle, camera, tolerance=tolerance_for(scene, camera, len(theirs)), device="cpu")
         counts.append(ours.stats.gaussians_selected)
         # Theirs as the asset is drawn, or with our filter where that suits it better.
         drawn = [
@@ -134,7 +136,7 @@ def compare(evaluation: Evaluation, bundle: Bundle, theirs: Any, footprint_px2: 
             for px2, compensated in ((0.0, False), own_filter)
         ]
         their_best = max(drawn, key=lambda p: psnr(truth / np.float32(255), p / np.float32(255)))
-        full = to_8bit(render(bundle, camera, tolerance=0.0).color)
+        full = to_8bit(render(bundle, camera, tolerance=0.0, device="cpu").color)
         pairs += [(truth, full), (truth, their_best), (truth, to_8bit(ours.color))]
     errors = evaluation.judge.errors(pairs)
     row: Row = {"size_px": camera.width, "ours_gaussians": float(np.mean(counts))}

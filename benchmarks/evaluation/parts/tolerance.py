@@ -42,7 +42,9 @@ def gsplat_row(evaluation: Evaluation) -> Row:
     """gsplat draws every gaussian of the scene, which it is given in the world."""
     import torch
 
-    every_one = select(evaluation.full_scene, evaluation.camera_sweep[0].camera, tolerance=0.0, cull=False)
+    every_one = select(
+        evaluation.full_scene, evaluation.camera_sweep[0].camera, tolerance=0.0, cull=False, device="cpu"
+    )
     placed = every_one.gaussians(device="cuda")
     pictures, rows = [], []
     for view, ours in zip(evaluation.camera_sweep, evaluation.full_sweep, strict=True):
