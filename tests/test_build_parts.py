@@ -19,8 +19,8 @@ from v3dg.build.plan import Plan
 from v3dg.build.simplify import Level, LevelTables, build_levels
 from v3dg.build.whole import _in_split_order
 from v3dg.bundle.bundle import config_to_json
-from v3dg.bundle.file import writing
 from v3dg.bundle.codec import Float32Codec
+from v3dg.bundle.file import writing
 from v3dg.bundle.pages import PageLayout
 
 SMALL = BuildConfig(cluster_size=32, steps=4, num_views=4, supersample=2)

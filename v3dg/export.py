@@ -101,23 +101,8 @@ def write_streamed_sog(
     turn = _Turn(_TO_UPRIGHT[up])
     plan = _Plan.of(bundle, chunk)
     with _replacing_folder(Path(folder)) as place:
-        names: list[str] = []
-        lods: list[dict[str, dict[str, int]]] = [{} for _ in range(plan.num_chunks)]
-        counts = [0] * plan.num_levels
         with _bar(plan.num_gaussians, progress) as advance:
-            for level in range(plan.num_levels):
-                for i, (first, parts) in enumerate(_folders(bundle, plan, level, turn)):
-                    gaussians = Gaussians.concatenate(parts)
-                    offset = 0
-                    for number, part in enumerate(parts, first):
-                        lods[number][str(level)] = {"file": len(names), "offset": offset, "count": len(part)}
-                        offset += len(part)
-                    names.append(f"{level}_{i}")
-                    (place / names[-1]).mkdir()
-                    for file, content in sog.encode(gaussians).items():
-                        (place / names[-1] / file).write_bytes(content)
-                    counts[level] += len(gaussians)
-                    advance(len(gaussians))
+            names, lods, counts = _write_folders(place, bundle, plan, turn, advance)
         index = {
             "version": 1,
             "asset": {"generator": f"v3dg {__version__}"},
@@ -132,6 +117,29 @@ def write_streamed_sog(
             (place / file).write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
         size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
     return Export(counts, plan.num_chunks, len(names), size)
+
+
+def _write_folders(
+    place: Path, bundle: Bundle, plan: _Plan, turn: _Turn, advance: Callable[[int], None]
+) -> tuple[list[str], list[dict[str, dict[str, int]]], list[int]]:
+    """Write a folder of SOG after another: their names, where each chunk's levels are, gaussians by level."""
+    names: list[str] = []
+    lods: list[dict[str, dict[str, int]]] = [{} for _ in range(plan.num_chunks)]
+    counts = [0] * plan.num_levels
+    for level in range(plan.num_levels):
+        for i, (first, parts) in enumerate(_folders(bundle, plan, level, turn)):
+            gaussians = Gaussians.concatenate(parts)
+            offset = 0
+            for number, part in enumerate(parts, first):
+                lods[number][str(level)] = {"file": len(names), "offset": offset, "count": len(part)}
+                offset += len(part)
+            names.append(f"{level}_{i}")
+            (place / names[-1]).mkdir()
+            for file, content in sog.encode(gaussians).items():
+                (place / names[-1] / file).write_bytes(content)
+            counts[level] += len(gaussians)
+            advance(len(gaussians))
+    return names, lods, counts
 
 
 def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
