@@ -193,7 +193,7 @@ def machine(device: str, commit: str) -> dict[str, Any]:
     names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
     about = {
         "commit": commit,
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": " ".join(Path(word).name if os.sep in word else word for word in sys.argv),
         "processor": names[0].split(":", 1)[1].strip() if names else platform.processor(),
         "cores": os.cpu_count(),
         "isa": v3dg._core.isa(),

@@ -34,7 +34,7 @@ __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound ro
         } else {
             const ClusterTable& table = mine.bundle->table;
             const InstanceView view = scene.views[mine.instance];
-            const InstanceCut<GroupMetrics> cut{table, view, rule, {table, view, rule}, rule.culls};
+            const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
             ask_clusters(mine, view, rule, Tolerances::from_this_on, [&](int32_t c) {
                 const BinRange bins = cut.bins(c);
                 if (bins.is_empty()) return false;

@@ -56,7 +56,7 @@ __device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Ca
         scene.views[i] = view;
         return source;
     }
-    const InstanceCut<GroupMetrics> cut{table, view, rule, {table, view, rule}, rule.culls};
+    const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
     unsigned drawn = 0;
     for (unsigned k = 0; k < table.top_cluster.size; ++k)
         if (!cut.is_culled(table.top_cluster[k])) drawn |= 1u << k;
@@ -148,7 +148,7 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
             if (!mine.are_tops) {
                 const ClusterTable& table = mine.bundle->table;
                 const InstanceView view = scene.views[mine.instance];
-                const InstanceCut<GroupMetrics> cut{table, view, rule, {table, view, rule}, rule.culls};
+                const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
                 mine.drawn = ask_clusters(mine, view, rule, Tolerances::this_one,
                                           [&](int32_t c) { return cut.draws(c); });
             }

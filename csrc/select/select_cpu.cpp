@@ -1,4 +1,5 @@
-// Threads work on chunks of instances. The metric of a group is computed once; its clusters then look it up.
+// Threads work on chunks of instances. What the decision asks of a group is answered once; its clusters then
+// look it up.
 
 #include "select/select.h"
 
@@ -14,11 +15,16 @@ namespace {
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
 
-// Metrics of the groups of one instance, computed before.
-struct KnownMetrics {
-    const float* metric;
+// Answers for the groups of one instance: whether each fits, or its bin.
+struct KnownFits {
+    const uint8_t* fits_group;
 
-    float operator()(int32_t g) const { return metric[g]; }
+    bool fits(int32_t g) const { return fits_group[g] != 0; }
+};
+struct KnownBins {
+    const uint32_t* bin_of_group;
+
+    uint32_t bin(int32_t g) const { return bin_of_group[g]; }
 };
 
 // An instance in front of the camera. One without a pose is hidden.
@@ -41,24 +47,22 @@ struct SeenInstance {
         return is_placed ? source_of_cut(table, view, rule, SIZE_MAX) : CutSource::nowhere;
     }
 
-    // With the metrics that `metrics` has room for.
-    InstanceCut<KnownMetrics> cut(const SelectRule& rule, const std::vector<float>& metrics) const {
-        return {table, view, rule, {metrics.data()}, rule.culls && !is_inside(table.bounds, view)};
+    // With answers that are filled in before clusters ask.
+    template <class Groups>
+    InstanceCut<Groups> cut(const SelectRule& rule, const Groups& groups) const {
+        return {table, view, rule, groups, rule.culls && !is_inside(table.bounds, view)};
     }
 
-    void find_metrics(const SelectRule& rule, float* metrics) const {
-        for (size_t g = 0; g < table.ball.size; ++g)
-            metrics[g] = metric_px2(table, static_cast<int32_t>(g), view, rule);
-    }
+    AskedGroups groups(const SelectRule& rule) const { return {table, view, rule}; }
 };
 
-// Appends what instance i draws. metrics: scratch for as many groups as any bundle has.
-void select_instance(const SelectInput& in, const SelectRule& rule, size_t i, std::vector<float>& metrics,
+// Appends what instance i draws. fits: scratch for as many groups as any bundle has.
+void select_instance(const SelectInput& in, const SelectRule& rule, size_t i, std::vector<uint8_t>& fits,
                      SelectOutput& out) {
     const SeenInstance seen(in, i);
     const CutSource source = seen.source(rule);
     if (source == CutSource::nowhere) return;
-    const InstanceCut<KnownMetrics> cut = seen.cut(rule, metrics);
+    const auto cut = seen.cut(rule, KnownFits{fits.data()});
     const auto add = [&](size_t c) {
         out.instance.push_back(static_cast<int32_t>(i));
         out.cluster.push_back(static_cast<int32_t>(c));
@@ -69,8 +73,10 @@ void select_instance(const SelectInput& in, const SelectRule& rule, size_t i, st
             if (!cut.is_culled(c)) add(c);
         return;
     }
-    seen.find_metrics(rule, metrics.data());
-    for (size_t c = 0; c < seen.table.num_clusters(); ++c)
+    const AskedGroups groups = seen.groups(rule);
+    const size_t num_groups = seen.table.ball.size, num_clusters = seen.table.num_clusters();
+    for (size_t g = 0; g < num_groups; ++g) fits[g] = groups.fits(static_cast<int32_t>(g));
+    for (size_t c = 0; c < num_clusters; ++c)
         if (cut.draws(c)) add(c);
 }
 
@@ -81,24 +87,25 @@ size_t most_groups(const SelectInput& in) {
 }
 
 // Adds to `change`, for each tolerance that a budget chooses from, by how many gaussians the cut of instance
-// i differs from that of the tolerance before. metrics: as above.
-void count_instance(const SelectInput& in, size_t i, std::vector<float>& metrics,
+// i differs from that of the tolerance before. bins: as above.
+void count_instance(const SelectInput& in, size_t i, std::vector<uint32_t>& bins,
                     std::vector<int64_t>& change) {
     const SeenInstance seen(in, i);
     const CutSource source = seen.source(in.rule);
     if (source == CutSource::nowhere) return;
-    const InstanceCut<KnownMetrics> cut = seen.cut(in.rule, metrics);
+    const auto cut = seen.cut(in.rule, KnownBins{bins.data()});
     if (source == CutSource::tops) {
         for (const int32_t c : seen.table.top_cluster)
             if (!cut.is_culled(c)) change[0] += seen.table.num_gaussians(c);
         return;
     }
-    seen.find_metrics(in.rule, metrics.data());
+    const AskedGroups groups = seen.groups(in.rule);
+    for (size_t g = 0; g < seen.table.ball.size; ++g) bins[g] = groups.bin(static_cast<int32_t>(g));
     for (size_t c = 0; c < seen.table.num_clusters(); ++c) {
-        const BinRange bins = cut.bins(c);
-        if (bins.is_empty()) continue;
-        change[bins.first] += seen.table.num_gaussians(c);
-        change[bins.end] -= seen.table.num_gaussians(c);
+        const BinRange range = cut.bins(c);
+        if (range.is_empty()) continue;
+        change[range.first] += seen.table.num_gaussians(c);
+        change[range.end] -= seen.table.num_gaussians(c);
     }
 }
 
@@ -110,9 +117,9 @@ int64_t meet_budget(const SelectInput& in, SelectRule& rule) {
     std::vector<std::vector<int64_t>> changes(std::min(kBudgetParts, num_instances));
     parallel_for(changes.size(), 1, [&](size_t part) {
         changes[part].assign(kNumBudgetBins + 1, 0);
-        std::vector<float> metrics(num_groups);
+        std::vector<uint32_t> bins(num_groups);
         for (size_t i = part; i < num_instances; i += changes.size())
-            count_instance(in, i, metrics, changes[part]);
+            count_instance(in, i, bins, changes[part]);
     });
     int64_t count = 0, chosen_count = 0;
     uint32_t chosen = 0;
@@ -144,9 +151,9 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
     const size_t num_groups = most_groups(in);
     std::vector<SelectOutput> chunks(num_chunks);
     parallel_for(num_chunks, 1, [&](size_t k) {
-        std::vector<float> metrics(num_groups);
+        std::vector<uint8_t> fits(num_groups);
         for (size_t i = k * kChunk; i < std::min(num_instances, (k + 1) * kChunk); ++i)
-            select_instance(in, rule, i, metrics, chunks[k]);
+            select_instance(in, rule, i, fits, chunks[k]);
     });
     std::vector<size_t> first(num_chunks + 1, 0);
     for (size_t k = 0; k < num_chunks; ++k) {
@@ -163,7 +170,10 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
 
 void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric) {
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
-        SeenInstance(in, i).find_metrics(in.rule, metric.data + metric_offset[i]);
+        const SeenInstance seen(in, i);
+        for (size_t g = 0; g < seen.table.ball.size; ++g)
+            metric[metric_offset[i] + g] =
+                metric_px2(seen.table, static_cast<int32_t>(g), seen.view, in.rule);
     });
 }
 

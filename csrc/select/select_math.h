@@ -181,23 +181,25 @@ struct BinRange {
     V3DG_HD bool is_empty() const { return first >= end; }
 };
 
-// Computes the metrics of an instance's groups when a cluster asks for them.
-struct GroupMetrics {
+// What the decision asks of a group, answered when it is asked.
+struct AskedGroups {
     const ClusterTable& table;
     const InstanceView& view;
     const SelectRule& rule;
 
-    V3DG_HD float operator()(int32_t g) const { return metric_px2(table, g, view, rule); }
+    V3DG_HD bool fits(int32_t g) const { return v3dg::fits(metric_px2(table, g, view, rule), rule); }
+    V3DG_HD uint32_t bin(int32_t g) const {
+        return bin_of_metric(metric_px2(table, g, view, rule), rule.tolerance_px2);
+    }
 };
 
-// The decision, cluster by cluster of an instance's table. `Metric` gives the metric of a group:
-// GroupMetrics, or what was computed before.
-template <class Metric>
+// The decision, cluster by cluster of an instance's table. `Groups` is AskedGroups, or has its answers.
+template <class Groups>
 struct InstanceCut {
     const ClusterTable& table;
     const InstanceView& view;
     const SelectRule& rule;
-    Metric metric_of_group;
+    Groups groups;
     bool culls;  // whether some of the clusters may lie outside
 
     V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
@@ -205,22 +207,16 @@ struct InstanceCut {
     // Below the leaves everything fits, above the roots nothing does.
     V3DG_HD bool draws(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
-        const bool own_fits = own < 0 || fits(metric_of_group(own), rule);
-        const bool parent_fits = parent >= 0 && fits(metric_of_group(parent), rule);
+        const bool own_fits = own < 0 || groups.fits(own);
+        const bool parent_fits = parent >= 0 && groups.fits(parent);
         return own_fits && !parent_fits && !is_culled(c);
     }
 
     // The tolerances from the rule's own on at which draws(c) holds.
     V3DG_HD BinRange bins(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
-        const BinRange range{own < 0 ? 0 : bin_of_group(own),
-                             parent < 0 ? kNumBudgetBins : bin_of_group(parent)};
+        const BinRange range{own < 0 ? 0 : groups.bin(own), parent < 0 ? kNumBudgetBins : groups.bin(parent)};
         return range.is_empty() || is_culled(c) ? BinRange{0, 0} : range;
-    }
-
-  private:
-    V3DG_HD uint32_t bin_of_group(int32_t g) const {
-        return bin_of_metric(metric_of_group(g), rule.tolerance_px2);
     }
 };
 
