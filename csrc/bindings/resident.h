@@ -7,6 +7,7 @@
 
 #include "bindings/tables.h"
 #include "pipeline/model.h"
+#include "residency/page_table.h"
 #include "select/select.h"
 
 #if V3DG_WITH_CUDA
