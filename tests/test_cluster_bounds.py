@@ -18,15 +18,8 @@ TOGETHER = 8
 def may_draw(scene, camera, *, tolerance, min_level=0, footprint="solid_angle", cull=True, and_coarser=False):
     """For each instance, whether its clusters may be drawn, cluster by cluster."""
     rule = rule_of(tolerance, None, min_level, footprint, cull)
-    instances = _core.Instances(
-        bundle=scene.instance_bundle,
-        positions=scene.positions,
-        quaternions=scene.quaternions,
-        scales=scene.scales,
-        importance=scene.importance,
-    )
     tables = [residency.table(bundle) for bundle in scene.bundles]
-    flags, first = _core.bounds_may_draw(tables, instances, camera.core, rule, and_coarser)
+    flags, first = _core.bounds_may_draw(tables, scene.core, camera.core, rule, and_coarser)
     counts = [len(scene.bundles[b].clusters.level) for b in scene.instance_bundle]
     return [
         np.repeat(flags[first[i] : first[i + 1]].astype(bool), TOGETHER)[:count]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from v3dg import _core
 from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
 from v3dg.rotations import rotation_from_quaternion
@@ -196,6 +197,17 @@ class Scene:
     def poses(self) -> tuple[Any, Any, Any]:
         """Positions, quaternions and scales where they are: NumPy arrays, or tensors on a CUDA device."""
         return self._poses["positions"], self._poses["quaternions"], self._poses["scales"]
+
+    @property
+    def core(self) -> _core.Instances:
+        """The same instances as the compiled operations take them, on the host."""
+        return _core.Instances(
+            bundle=self.instance_bundle,
+            positions=self.positions,
+            quaternions=self.quaternions,
+            scales=self.scales,
+            importance=self.importance,
+        )
 
     def _on_host(self, name: str) -> Floats:
         rows = self._poses[name]

@@ -208,16 +208,9 @@ def group_metrics(
 ) -> list[npt.NDArray[np.float32]]:
     """Return for each instance what tolerance is compared with: its groups' metrics, (G,) in px²."""
     scene = Scene.of(subject)
-    instances = _core.Instances(
-        bundle=scene.instance_bundle,
-        positions=scene.positions,
-        quaternions=scene.quaternions,
-        scales=scene.scales,
-        importance=scene.importance,
-    )
     rule = rule_of(0.0, None, 0, footprint, False)
     tables = [residency.table(bundle) for bundle in scene.bundles]
-    metric, offset = _core.group_metrics(tables, instances, camera.core, rule)
+    metric, offset = _core.group_metrics(tables, scene.core, camera.core, rule)
     return np.split(metric, offset[1:-1]) if len(scene) else []
 
 
