@@ -1,3 +1,5 @@
+import gc
+
 import pytest
 from hypothesis import settings
 
@@ -24,6 +26,13 @@ def browser():
         browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=chromium.ARGUMENTS)
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="module")
+def collected_connections():
+    """No connection that a module's tests left to the collector is there in the tests after them."""
+    yield
+    gc.collect()
 
 
 def pytest_collection_modifyitems(items):

@@ -1,6 +1,5 @@
 """The viewer's server and command: where they listen, what a tab begins with, and how they end."""
 
-import gc
 import os
 import signal
 import socket
@@ -20,15 +19,12 @@ from v3dg.viewer.server import Site, start_view
 
 pytest.importorskip("viser")
 
-# A site that closes while somebody is just connecting leaves viser's end of that connection to the collector.
-pytestmark = pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def collected_connections():
-    """Nothing of that is left to the tests after these."""
-    yield
-    gc.collect()
+pytestmark = [
+    # A site that closes while somebody is just connecting leaves viser's end of the connection to the
+    # collector.
+    pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
+    pytest.mark.usefixtures("collected_connections"),
+]
 
 
 @pytest.fixture(scope="module")

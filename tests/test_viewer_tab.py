@@ -1,6 +1,5 @@
 """A tab of the viewer, from the browser's side of its connection, which viewer_client plays."""
 
-import gc
 import io
 import re
 import time
@@ -19,17 +18,14 @@ from v3dg.viewer.view import look_at
 pytest.importorskip("viser")
 viewer_client = pytest.importorskip("viewer_client")
 
-# A site that closes while somebody is just connecting leaves viser's end of that connection to the collector.
-pytestmark = pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+pytestmark = [
+    # A site that closes while somebody is just connecting leaves viser's end of the connection to the
+    # collector.
+    pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
+    pytest.mark.usefixtures("collected_connections"),
+]
 
 SIZE = (240, 160)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def collected_connections():
-    """Nothing of that is left to the tests after these."""
-    yield
-    gc.collect()
 
 
 @pytest.fixture(scope="module")
