@@ -46,8 +46,8 @@ __device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Ca
     const int32_t b = scene.instances.bundle[i];
     const ClusterTable& table = scene.bundles[b].table;
     const InstanceAxes axes = axes_of_instance(camera, pose);
-    const InstanceView view =
-        view_from_instance(camera, axes, pose, scene.instances.importance[i], table.pad_px);
+    const InstanceView view = view_from_instance(camera, frustum_sides(camera, table.pad_px), axes, pose,
+                                                 scene.instances.importance[i]);
     const CutSource source = source_of_cut(table, view, rule, kLaneClusters);
     if (source == CutSource::nowhere) return source;
     if (placements != nullptr)

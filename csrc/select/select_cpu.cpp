@@ -4,6 +4,7 @@
 #include "select/select.h"
 
 #include <algorithm>
+#include <numeric>
 #include <utility>
 
 #include "base/parallel_for.h"
@@ -27,20 +28,35 @@ struct KnownBins {
     uint32_t bin(int32_t g) const { return bin_of_group[g]; }
 };
 
+// What to select from, with what all instances share.
+struct View {
+    const SelectInput& in;
+    std::vector<FrustumSides> sides;            // of each bundle
+    size_t most_groups = 0, most_clusters = 0;  // of any bundle
+
+    explicit View(const SelectInput& input) : in(input) {
+        for (const ClusterTable& table : in.bundles) {
+            sides.push_back(frustum_sides(in.camera, table.pad_px));
+            most_groups = std::max(most_groups, table.ball.size);
+            most_clusters = std::max(most_clusters, table.num_clusters());
+        }
+    }
+};
+
 // An instance in front of the camera. One without a pose is hidden.
 struct SeenInstance {
     const ClusterTable& table;
     InstanceView view;
     bool is_placed;
 
-    SeenInstance(const SelectInput& in, size_t i)
-        : table(in.bundles[in.instances.bundle[i]]),
-          view(),
-          is_placed(v3dg::is_placed(in.instances.pose(i))) {
-        if (!is_placed) return;
-        const Pose pose = in.instances.pose(i);
-        view = view_from_instance(in.camera, axes_of_instance(in.camera, pose), pose,
-                                  in.instances.importance[i], table.pad_px);
+    V3DG_INLINE SeenInstance(const View& of, size_t i)
+        : table(of.in.bundles[of.in.instances.bundle[i]]), view(), is_placed(false) {
+        const InstanceTable& instances = of.in.instances;
+        const Pose pose = instances.pose(i);
+        is_placed = v3dg::is_placed(pose);
+        if (is_placed)
+            view = view_from_instance(of.in.camera, of.sides[instances.bundle[i]],
+                                      axes_of_instance(of.in.camera, pose), pose, instances.importance[i]);
     }
 
     CutSource source(const SelectRule& rule) const {
@@ -56,50 +72,79 @@ struct SeenInstance {
     AskedGroups groups(const SelectRule& rule) const { return {table, view, rule}; }
 };
 
-// Appends what instance i draws. fits: scratch for as many groups as any bundle has.
-void select_instance(const SelectInput& in, const SelectRule& rule, size_t i, std::vector<uint8_t>& fits,
-                     SelectOutput& out) {
-    const SeenInstance seen(in, i);
-    const CutSource source = seen.source(rule);
-    if (source == CutSource::nowhere) return;
-    const auto cut = seen.cut(rule, KnownFits{fits.data()});
-    const auto add = [&](size_t c) {
-        out.instance.push_back(static_cast<int32_t>(i));
-        out.cluster.push_back(static_cast<int32_t>(c));
-        out.num_gaussians += seen.table.num_gaussians(c);
-    };
-    if (source == CutSource::tops) {
-        for (const int32_t c : seen.table.top_cluster)
-            if (!cut.is_culled(c)) add(c);
-        return;
-    }
-    const AskedGroups groups = seen.groups(rule);
-    const size_t num_groups = seen.table.ball.size, num_clusters = seen.table.num_clusters();
-    for (size_t g = 0; g < num_groups; ++g) fits[g] = groups.fits(static_cast<int32_t>(g));
-    for (size_t c = 0; c < num_clusters; ++c)
-        if (cut.draws(c)) add(c);
+// What a thread works in.
+struct Scratch {
+    std::vector<uint8_t> fits;    // of each group
+    std::vector<int32_t> chosen;  // clusters
+
+    explicit Scratch(const View& view) : fits(view.most_groups), chosen(view.most_clusters) {}
+};
+
+// Answers for all groups of an instance. What it reads comes as copies, which nothing that it writes can
+// change, so that the compiler works on several groups at once.
+template <Footprint footprint>
+void ask_groups(const ClusterTable table, const InstanceView view, SelectRule rule,
+                uint8_t* __restrict fits) {
+    rule.footprint = footprint;
+    const AskedGroups groups{table, view, rule};
+    const int32_t num_groups = static_cast<int32_t>(table.ball.size);
+    for (int32_t g = 0; g < num_groups; ++g) fits[g] = groups.fits(g);
 }
 
-size_t most_groups(const SelectInput& in) {
-    size_t most = 0;
-    for (const ClusterTable& table : in.bundles) most = std::max(most, table.ball.size);
-    return most;
+// Returns how many clusters suffice and writes which.
+size_t find_sufficient(const ClusterTable table, const InstanceView view, const SelectRule rule,
+                       const uint8_t* __restrict fits, int32_t* __restrict cluster) {
+    const InstanceCut<KnownFits> cut{table, view, rule, KnownFits{fits}, false};
+    const size_t num_clusters = table.num_clusters();
+    size_t num_sufficient = 0;
+    // Without a branch, because none could be foretold.
+    for (size_t c = 0; c < num_clusters; ++c) {
+        cluster[num_sufficient] = static_cast<int32_t>(c);
+        num_sufficient += cut.suffices(c);
+    }
+    return num_sufficient;
+}
+
+// Appends what instance i draws.
+void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch& scratch,
+                     SelectOutput& out) {
+    const SeenInstance seen(view, i);
+    const CutSource source = seen.source(rule);
+    if (source == CutSource::nowhere) return;
+    uint8_t* fits = scratch.fits.data();
+    const auto cut = seen.cut(rule, KnownFits{fits});
+    int32_t* chosen = scratch.chosen.data();
+    int32_t* end = chosen;
+    if (source == CutSource::tops) {
+        end = std::copy(seen.table.top_cluster.begin(), seen.table.top_cluster.end(), chosen);
+    } else {
+        if (rule.footprint == Footprint::solid_angle)
+            ask_groups<Footprint::solid_angle>(seen.table, seen.view, rule, fits);
+        else
+            ask_groups<Footprint::paper>(seen.table, seen.view, rule, fits);
+        end += find_sufficient(seen.table, seen.view, rule, fits, chosen);
+    }
+    if (cut.culls) end = std::remove_if(chosen, end, [&](int32_t c) { return cut.is_culled(c); });
+    out.instance.insert(out.instance.end(), end - chosen, static_cast<int32_t>(i));
+    out.cluster.insert(out.cluster.end(), chosen, end);
+    out.num_gaussians += std::accumulate(
+        chosen, end, int64_t(0), [&](int64_t sum, int32_t c) { return sum + seen.table.num_gaussians(c); });
 }
 
 // Adds to `change`, for each tolerance that a budget chooses from, by how many gaussians the cut of instance
 // i differs from that of the tolerance before. bins: as above.
-void count_instance(const SelectInput& in, size_t i, std::vector<uint32_t>& bins,
-                    std::vector<int64_t>& change) {
-    const SeenInstance seen(in, i);
-    const CutSource source = seen.source(in.rule);
+void count_instance(const View& view, size_t i, std::vector<uint32_t>& bins, std::vector<int64_t>& change) {
+    const SelectRule& rule = view.in.rule;
+    const SeenInstance seen(view, i);
+    const CutSource source = seen.source(rule);
     if (source == CutSource::nowhere) return;
-    const auto cut = seen.cut(in.rule, KnownBins{bins.data()});
+    const auto cut = seen.cut(rule, KnownBins{bins.data()});
     if (source == CutSource::tops) {
         for (const int32_t c : seen.table.top_cluster)
             if (!cut.is_culled(c)) change[0] += seen.table.num_gaussians(c);
         return;
     }
-    const AskedGroups groups = seen.groups(in.rule);
+    const AskedGroups groups = seen.groups(rule);
     for (size_t g = 0; g < seen.table.ball.size; ++g) bins[g] = groups.bin(static_cast<int32_t>(g));
     for (size_t c = 0; c < seen.table.num_clusters(); ++c) {
         const BinRange range = cut.bins(c);
@@ -111,15 +156,15 @@ void count_instance(const SelectInput& in, size_t i, std::vector<uint32_t>& bins
 
 // Sets the tolerance of `rule`. Returns how many gaussians its cut has; more than the budget where no cut
 // fits.
-int64_t meet_budget(const SelectInput& in, SelectRule& rule) {
-    const size_t num_instances = in.instances.bundle.size, num_groups = most_groups(in);
+int64_t meet_budget(const View& view, SelectRule& rule) {
+    const size_t num_instances = view.in.instances.bundle.size;
     // Each part takes every kBudgetParts-th instance, because neighbours cost about the same.
     std::vector<std::vector<int64_t>> changes(std::min(kBudgetParts, num_instances));
     parallel_for(changes.size(), 1, [&](size_t part) {
         changes[part].assign(kNumBudgetBins + 1, 0);
-        std::vector<uint32_t> bins(num_groups);
+        std::vector<uint32_t> bins(view.most_groups);
         for (size_t i = part; i < num_instances; i += changes.size())
-            count_instance(in, i, bins, changes[part]);
+            count_instance(view, i, bins, changes[part]);
     });
     int64_t count = 0, chosen_count = 0;
     uint32_t chosen = 0;
@@ -131,16 +176,17 @@ int64_t meet_budget(const SelectInput& in, SelectRule& rule) {
             chosen_count = count;
     }
     if (chosen == kNumBudgetBins) return count;
-    rule.tolerance_px2 = tolerance_of_bin(chosen, in.rule.tolerance_px2);
+    rule.tolerance_px2 = tolerance_of_bin(chosen, rule.tolerance_px2);
     return chosen_count;
 }
 
 }  // namespace
 
 void cpu::select(const SelectInput& in, SelectOutput& out) {
+    const View view(in);
     SelectRule rule = in.rule;
     if (rule.budget != kNoBudget) {
-        out.num_gaussians = meet_budget(in, rule);
+        out.num_gaussians = meet_budget(view, rule);
         out.fits_budget = static_cast<uint64_t>(out.num_gaussians) <= rule.budget;
         if (!out.fits_budget) return;
     }
@@ -148,12 +194,11 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
     out.num_gaussians = 0;
     const size_t num_instances = in.instances.bundle.size;
     const size_t num_chunks = (num_instances + kChunk - 1) / kChunk;
-    const size_t num_groups = most_groups(in);
     std::vector<SelectOutput> chunks(num_chunks);
     parallel_for(num_chunks, 1, [&](size_t k) {
-        std::vector<uint8_t> fits(num_groups);
+        Scratch scratch(view);
         for (size_t i = k * kChunk; i < std::min(num_instances, (k + 1) * kChunk); ++i)
-            select_instance(in, rule, i, fits, chunks[k]);
+            select_instance(view, rule, i, scratch, chunks[k]);
     });
     std::vector<size_t> first(num_chunks + 1, 0);
     for (size_t k = 0; k < num_chunks; ++k) {
@@ -169,8 +214,9 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
 }
 
 void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric) {
+    const View view(in);
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
-        const SeenInstance seen(in, i);
+        const SeenInstance seen(view, i);
         for (size_t g = 0; g < seen.table.ball.size; ++g)
             metric[metric_offset[i] + g] =
                 metric_px2(seen.table, static_cast<int32_t>(g), seen.view, in.rule);
@@ -181,8 +227,9 @@ void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<con
                           Span<uint8_t> may_draw) {
     std::vector<std::vector<ClusterBounds>> bounds;
     for (const ClusterTable& table : in.bundles) bounds.push_back(bounds_of_clusters(table));
+    const View view(in);
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
-        const SeenInstance seen(in, i);
+        const SeenInstance seen(view, i);
         uint8_t* out = may_draw.data + first[i];
         for (const ClusterBounds& b : bounds[in.instances.bundle[i]])
             *out++ = seen.is_placed && v3dg::may_draw(b, seen.view, in.rule, tolerances);

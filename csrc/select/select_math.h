@@ -58,8 +58,8 @@ V3DG_HD inline float distance2_to(const Ball& ball, const InstanceView& view) {
 // Screen area, px2, of a ball whose centre is this far from the eye, squared.
 V3DG_HD inline float footprint_at(float radius, float distance2, const InstanceView& view) {
     const float x2 = radius * radius / distance2;
-    if (!(x2 < 1.0f)) return INFINITY;
-    return solid_angle_of_ball(x2) * view.px2_per_steradian;
+    const float area = solid_angle_of_ball(x2) * view.px2_per_steradian;
+    return x2 < 1.0f ? area : INFINITY;
 }
 
 // Screen area that the ball covers, px2. +inf when the eye is inside, or where there is no number.
@@ -75,8 +75,8 @@ V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view, F
 // be drawn, so that the group always fits.
 V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
                                 const SelectRule& rule) {
-    if (table.level[g] <= rule.min_level) return 0.0f;
-    return footprint_px2(table.ball[g], view, rule.footprint) * table.weight[g];
+    const float metric = footprint_px2(table.ball[g], view, rule.footprint) * table.weight[g];
+    return table.level[g] <= rule.min_level ? 0.0f : metric;
 }
 
 V3DG_HD inline bool fits(float metric_px2, const SelectRule& rule) {
@@ -204,13 +204,16 @@ struct InstanceCut {
 
     V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
 
-    // Below the leaves everything fits, above the roots nothing does.
-    V3DG_HD bool draws(size_t c) const {
+    // Whether the cluster is just detailed enough. Below the leaves everything fits, above the roots nothing
+    // does.
+    V3DG_HD bool suffices(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         const bool own_fits = own < 0 || groups.fits(own);
         const bool parent_fits = parent >= 0 && groups.fits(parent);
-        return own_fits && !parent_fits && !is_culled(c);
+        return own_fits && !parent_fits;
     }
+
+    V3DG_HD bool draws(size_t c) const { return suffices(c) && !is_culled(c); }
 
     // The tolerances from the rule's own on at which draws(c) holds.
     V3DG_HD BinRange bins(size_t c) const {
