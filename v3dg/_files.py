@@ -12,26 +12,26 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _PIECE_BYTES = 16 << 20
+_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str], *, is_locked: bool = False) -> Iterator[str]:
-    """Give a name beside `path` to write to; at the end it replaces `path`, on failure it is removed.
+    """Give an empty file beside `path` to write to; at the end it replaces `path`, on failure it is removed.
 
-    What is written is on the disk before it gets its name. A link stays a link, to the new file. Where the
-    caller sees to it that no other writes to `path` meanwhile, the name is always the same, and what a killed
-    program left there is removed.
+    What is written is on the disk before it gets its name, and has the permissions of what it replaces, and
+    the owner and group where the system allows it. A link at `path` stays a link, to the new file; at the
+    name beside it, none is followed. Where the caller sees to it that no other writes to `path` meanwhile,
+    that name is always the same, and what a killed program left there is removed.
 
     Raises:
         IsADirectoryError: `path` is a folder.
+        PermissionError: What is there may not be written to.
         ValueError: `path` is a device or a pipe.
         OSError: As writing raised it, with `path` for the file's name.
     """
+    replaced = _status_of_file(path)
     target = os.path.realpath(path)
-    if os.path.isdir(target):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
-    if os.path.exists(target) and not os.path.isfile(target):
-        raise ValueError(f"{os.fspath(path)}: expected the path of a file, got a device or a pipe")
     folder, name = os.path.split(target)
     own = hashlib.blake2b(os.fsencode(os.path.abspath(path)), digest_size=8).hexdigest()
     # The start of the name only: a name may have 255 bytes, and a character up to four.
@@ -40,14 +40,45 @@ def replacing(path: str | os.PathLike[str], *, is_locked: bool = False) -> Itera
         if is_locked:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(temporary)
+        # Nobody may read what replaces a private file before it has the permissions of that.
+        os.close(os.open(temporary, _NEW_FILE, 0o666 if replaced is None else 0o600))
         try:
             yield temporary
-            _flush(temporary)
+            _finish(temporary, replaced)
             os.replace(temporary, target)
         except BaseException:
             with contextlib.suppress(FileNotFoundError, NotADirectoryError):
                 os.unlink(temporary)
             raise
+
+
+def _status_of_file(path: str | os.PathLike[str]) -> os.stat_result | None:
+    """Of what is to be replaced, if there is something and it may be."""
+    try:
+        status = os.stat(path)
+    except FileNotFoundError:
+        return None
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError(f"{os.fspath(path)}: expected the path of a file, got a device or a pipe")
+    # Renaming asks the folder alone; that the file itself may be written to, opening it finds out.
+    os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
+    return status
+
+
+def _finish(path: str, replaced: os.stat_result | None) -> None:
+    """Bring a new file to the disk, with the permissions of what it replaces."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        if replaced is not None:
+            for owner, group in ((-1, replaced.st_gid), (replaced.st_uid, -1)):
+                with contextlib.suppress(OSError):
+                    os.fchown(descriptor, owner, group)
+            os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 @contextlib.contextmanager
@@ -59,14 +90,6 @@ def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -
         if error.errno is None or error.filename not in (None, other_name):
             raise
         raise OSError(error.errno, os.strerror(error.errno), os.fspath(path)) from error
-
-
-def _flush(path: str) -> None:
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int) -> None:

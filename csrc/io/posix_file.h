@@ -19,7 +19,7 @@ class PosixFile {
         return PosixFile(::open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK));
     }
     static PosixFile create(const char* path) {
-        return PosixFile(::open(path, O_WRONLY | O_CLOEXEC | O_CREAT | O_EXCL, 0666));
+        return PosixFile(::open(path, O_WRONLY | O_CLOEXEC | O_CREAT | O_TRUNC, 0666));
     }
     PosixFile(PosixFile&& other) noexcept : descriptor_(other.descriptor_) { other.descriptor_ = -1; }
     PosixFile& operator=(PosixFile&&) = delete;

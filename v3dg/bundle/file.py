@@ -136,7 +136,7 @@ def writing(
     """
     with (
         _files.replacing(path, is_locked=is_locked) as temporary,
-        open(temporary, "xb", buffering=0) as file,
+        open(temporary, "wb", buffering=0) as file,
         ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool,
     ):
         writer = BundleWriter(file.fileno(), pool, layout, codec, config_json)
