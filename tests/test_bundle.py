@@ -1,3 +1,4 @@
+import copy
 import dataclasses
 import errno
 import hashlib
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+import v3dg
 from random_bundle import random_bundle, random_gaussians
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.bundle import file as bundle_file
@@ -200,14 +202,39 @@ def test_torch_gaussians_are_kept_as_numpy(saved):
     assert_same_gaussians(Bundle(bundle.clusters, bundle.groups, tensors).gaussians, bundle.gaussians)
 
 
-def test_opened_arrays_can_be_written(saved):
+def tables_of(bundle):
+    return [*vars(bundle.clusters).values(), *vars(bundle.groups).values()]
+
+
+def test_opened_gaussians_can_be_written(saved):
     opened = Bundle.open(saved[1])
-    arrays = [
-        *vars(opened.clusters).values(),
-        *vars(opened.groups).values(),
-        *vars(opened.gaussians).values(),
-    ]
-    assert all(array.flags.writeable and array.flags.aligned for array in arrays)
+    assert all(array.flags.aligned for array in (*tables_of(opened), *vars(opened.gaussians).values()))
+    assert all(array.flags.writeable for array in vars(opened.gaussians).values())
+
+
+def test_tables_cannot_be_changed_after_they_were_checked(saved):
+    """Drawing trusts them: an offset that is wrong would read anywhere."""
+    bundle, path = saved
+    built = v3dg.build_bundle(bundle.level_gaussians(0), config=v3dg.BuildConfig(steps=0), progress=False)
+    opened = Bundle.open(path)
+    copies = [copy.copy(bundle), copy.deepcopy(bundle), copy.copy(opened), copy.deepcopy(opened)]
+    copies += [pickle.loads(pickle.dumps(some)) for some in (bundle, opened)]
+    tables = Clusters(*map(np.copy, vars(bundle.clusters).values()))
+    for some in (bundle, opened, built, *copies, Bundle(tables, bundle.groups, bundle.gaussians)):
+        for array in tables_of(some):
+            with pytest.raises(ValueError, match="read-only"):
+                array[...] = 0
+        for name in ("clusters", "groups"):
+            with pytest.raises(AttributeError):
+                setattr(some, name, getattr(bundle, name))
+
+
+def test_arrays_that_tables_were_made_of_stay_their_owner_s(saved):
+    bundle, _ = saved
+    offset = bundle.clusters.offset.copy()
+    made = Bundle(dataclasses.replace(bundle.clusters, offset=offset), bundle.groups, bundle.gaussians)
+    offset[:] = 2**40
+    np.testing.assert_array_equal(made.clusters.offset, bundle.clusters.offset)
 
 
 def test_threads_read_large_bundles(tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,8 +27,6 @@ class Bundle:
     """All clusters of all levels of one asset. In memory, or a file of which pages are read when needed.
 
     Attributes:
-        clusters: C clusters.
-        groups: G groups.
         config: How it was built, as JSON values.
         sh_degree: 0 to 3, the same for all gaussians.
 
@@ -51,6 +49,8 @@ class Bundle:
         ):
             if not isinstance(value, kind):
                 raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+        # Made anew, because unpickling leaves out what making does: checks, and that arrays are read-only.
+        clusters, groups = replace(clusters), replace(groups)
         check_tables(clusters, groups, len(gaussians))
         layout = PageLayout.of(clusters)
         pages = MemoryPages(layout, gaussians.numpy())
@@ -68,8 +68,8 @@ class Bundle:
     ) -> None:
         self._config_json = config_to_json(config)
         self.config: dict[str, Any] = parse_json(self._config_json)
-        self.clusters = clusters
-        self.groups = groups
+        self._clusters = clusters
+        self._groups = groups
         self.sh_degree = codec.sh_degree
         self._codec = codec
         self._layout = layout
@@ -125,6 +125,16 @@ class Bundle:
         if self._file is not None:
             return Bundle.open, (os.path.abspath(self._file.path),)
         return Bundle, (self.clusters, self.groups, self.gaussians, self.config)
+
+    @property
+    def clusters(self) -> Clusters:
+        """C clusters."""
+        return self._clusters
+
+    @property
+    def groups(self) -> Groups:
+        """G groups."""
+        return self._groups
 
     @property
     def path(self) -> str | None:

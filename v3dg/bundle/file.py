@@ -159,7 +159,7 @@ class BundleFile:
         pages_bytes: Size of all pages with their padding.
         codec: What the bytes of its pages are.
         config: The JSON object that was saved.
-        tables: One array for every name in TABLE_NAMES, with the shapes of docs/format.md.
+        tables: One read-only array for every name in TABLE_NAMES, with the shapes of docs/format.md.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -278,6 +278,7 @@ class BundleFile:
             self._fail(
                 "hash: the header and tables do not match it; the file is damaged, copy or build it again"
             )
+        data.flags.writeable = False
         self.tables: dict[str, NDArray[Any]] = {}
         for name, dtype, _, _ in SCHEMA:
             first, last = (offset - start for offset in entries[name]["data_offsets"])

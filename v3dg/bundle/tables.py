@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from v3dg.bundle.format import DTYPES, SCHEMA
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -20,7 +22,7 @@ _ROUNDING = 1e-9  # two ways to compute the same double need not agree to the la
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """C clusters, by level (0 first), then by position in the split tree.
+    """C clusters, by level (0 first), then by position in the split tree; the arrays are read-only.
 
     Attributes:
         offset: (C+1,) int64. Cluster c holds gaussians offset[c] to offset[c+1].
@@ -42,14 +44,7 @@ class Clusters:
     antialiased: NDArray[np.uint8]
 
     def __post_init__(self) -> None:
-        count = _row_count("clusters.level", self.level)
-        _check_array("clusters.offset", self.offset, np.int64, (count + 1,))
-        _check_array("clusters.level", self.level, np.int32, (count,))
-        _check_array("clusters.own_group", self.own_group, np.int32, (count,))
-        _check_array("clusters.parent_group", self.parent_group, np.int32, (count,))
-        _check_array("clusters.box", self.box, np.float32, (count, 2, 3))
-        _check_array("clusters.filter_px2", self.filter_px2, np.float32, (count,))
-        _check_array("clusters.antialiased", self.antialiased, np.uint8, (count,))
+        _check_arrays("clusters.", self)
 
     def __len__(self) -> int:
         return len(self.level)
@@ -57,7 +52,7 @@ class Clusters:
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """G groups, in the order of the clusters that they replace, hence by level.
+    """G groups, in the order of the clusters that they replace, hence by level; the arrays are read-only.
 
     Attributes:
         ball: (G,4) float32. Centre and radius in the asset's frame; contains the balls of the groups below.
@@ -75,12 +70,7 @@ class Groups:
     error: NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        count = _row_count("groups.parent", self.parent)
-        _check_array("groups.ball", self.ball, np.float32, (count, 4))
-        _check_array("groups.weight", self.weight, np.float32, (count,))
-        _check_array("groups.parent", self.parent, np.int32, (count,))
-        _check_array("groups.level", self.level, np.int32, (count,))
-        _check_array("groups.error", self.error, np.float32, (count, 2))
+        _check_arrays("groups.", self)
 
     def __len__(self) -> int:
         return len(self.parent)
@@ -91,21 +81,24 @@ def check_index(name: str, index: int, count: int) -> None:
         raise ValueError(f"{name}: expected 0 to {count - 1}, got {index}")
 
 
-def _row_count(name: str, array: object) -> int:
-    if not isinstance(array, np.ndarray):
-        raise TypeError(f"{name}: expected a NumPy array, got {type(array).__name__}")
-    if array.ndim == 0:
-        raise ValueError(f"{name}: expected an array with rows, got a scalar")
-    return len(array)
-
-
-def _check_array(name: str, array: object, dtype: type[np.generic], shape: tuple[int, ...]) -> None:
-    if not isinstance(array, np.ndarray):
-        raise TypeError(f"{name}: expected a NumPy array, got {type(array).__name__}")
-    if array.dtype != dtype or array.shape != shape:
-        raise ValueError(f"{name}: expected {dtype.__name__} {shape}, got {array.dtype} {array.shape}")
-    if not array.flags.c_contiguous:
-        raise ValueError(f"{name}: expected a C-contiguous array; use np.ascontiguousarray")
+def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
+    """Check kinds and shapes, and take copies of arrays that could be changed after all checks."""
+    columns = [column for column in SCHEMA if column[0].startswith(prefix)]
+    arrays = [getattr(part, name.removeprefix(prefix)) for name, _, _, _ in columns]
+    for (name, _, _, _), array in zip(columns, arrays, strict=True):
+        if not isinstance(array, np.ndarray):
+            raise TypeError(f"{name}: expected a NumPy array, got {type(array).__name__}")
+    count = part.level.size
+    for (name, kind, rows, rest), array in zip(columns, arrays, strict=True):
+        dtype, shape = np.dtype(DTYPES[kind]), (count + (rows == "C+1"), *rest)
+        if array.dtype != dtype or array.shape != shape:
+            raise ValueError(f"{name}: expected {dtype} {shape}, got {array.dtype} {array.shape}")
+        if not array.flags.c_contiguous:
+            raise ValueError(f"{name}: expected a C-contiguous array; use np.ascontiguousarray")
+        if array.flags.writeable:
+            own = array.copy()
+            own.flags.writeable = False
+            object.__setattr__(part, name.removeprefix(prefix), own)
 
 
 def check_all(name: str, values: NDArray[Any], good: NDArray[np.bool_], expected: Any) -> None:
