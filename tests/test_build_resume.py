@@ -1,5 +1,6 @@
 """Builds that are interrupted, killed, gone on with; and the checkpoints that they leave."""
 
+import hashlib
 import os
 import resource
 import signal
@@ -16,7 +17,9 @@ import pytest
 import v3dg
 import v3dg.build
 from benchmarks.worlds.procedural import make_asset
+from random_bundle import random_gaussians
 from v3dg import BuildConfig, build_bundle
+from v3dg.build.checkpoint import _open_locked, digest_of
 
 CONFIG = BuildConfig(cluster_size=32, steps=400)
 # Runs for days; only the first level's checkpoint would end it.
@@ -236,6 +239,66 @@ def test_a_second_build_to_the_same_place_is_refused(asset, tmp_path):
     v3dg.build.discard_levels(tmp_path / "levels")
     v3dg.build.discard_levels(tmp_path / "levels")
     assert names_in(tmp_path) == []
+
+
+def test_the_digest_of_an_asset_is_the_one_of_the_format_page():
+    asset = random_gaussians(np.random.default_rng(0), 70_000, sh_degree=1)
+
+    def blake2b(*pieces):
+        return hashlib.blake2b(b"".join(pieces), digest_size=16)
+
+    def block(first, last):
+        arrays = (asset.means, asset.quats, asset.scales, asset.opacities, asset.sh)
+        return blake2b(*(array[first:last].tobytes() for array in arrays)).digest()
+
+    assert digest_of(asset) == blake2b(block(0, 65_536), block(65_536, 70_000)).hexdigest()
+
+
+@pytest.mark.parametrize("target", ["absent", "levels of another", "text"])
+def test_links_at_the_levels_are_refused(asset, checkpoint, tmp_path, target):
+    """Neither written through nor removed: what they lead to may be anyone's."""
+    checkpoint.rename(tmp_path / "levels of another")
+    (tmp_path / "text").write_bytes(b"")
+    before = {name: (tmp_path / name).read_bytes() for name in names_in(tmp_path)}
+    checkpoint.symlink_to(tmp_path / target)
+    for use in (
+        lambda: build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint),
+        lambda: v3dg.build.discard_levels(checkpoint),
+    ):
+        with pytest.raises(ValueError, match="levels: expected a file of levels, got a link; remove it"):
+            use()
+    checkpoint.unlink()
+    assert {name: (tmp_path / name).read_bytes() for name in names_in(tmp_path)} == before
+
+
+def test_levels_are_for_their_owner_alone(checkpoint):
+    assert checkpoint.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
+    """A build that has opened the file of one that then ends and removes it would be alone with its lock."""
+    path = tmp_path / "levels"
+
+    def lock(file):
+        if not locked:
+            path.unlink()
+        locked.append(file.name)
+
+    locked = []
+    monkeypatch.setattr("v3dg.build.checkpoint._lock", lock)
+    with _open_locked(path) as file:
+        assert os.path.samestat(os.fstat(file.fileno()), path.stat())
+    assert len(locked) == 2
+
+
+def test_levels_that_a_kill_left_beside_a_bundle_are_removed(asset, tmp_path):
+    v3dg.write_asset(tmp_path / "asset.ply", asset)
+    options = {"config": QUICK, "progress": False}
+    v3dg.build.build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
+    (tmp_path / "out.v3dg.partial").touch()
+    _, is_built = v3dg.build.build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
+    assert not is_built
+    assert names_in(tmp_path) == ["asset.ply", "out.v3dg"]
 
 
 @contextmanager

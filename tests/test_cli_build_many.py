@@ -4,11 +4,13 @@ import signal
 import subprocess
 import time
 
+import numpy as np
 import pytest
 
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 from command_line import COMMAND, ENVIRONMENT, fails, run
+from v3dg.build import build_file
 
 FAST = ("--quiet", "--cluster-size", 64)
 
@@ -64,10 +66,70 @@ def test_resume_keeps_what_is_done_with_these_settings(folder):
     assert statuses() == ["built", "built"]
     assert statuses() == ["kept", "kept"]
     assert statuses("--seed", 1) == ["built", "built"]
-    soon = time.time_ns() + 10**9
-    os.utime(folder / "a.ply", ns=(soon, soon))  # the asset has changed since
-    (folder / "c.v3dg").write_bytes(b"cut off")
+    # Dates say nothing: these are other gaussians in files that are older than their bundles, and the same
+    # in files that are newer.
+    (folder / "a.ply").rename(folder / "b.ply")
+    (folder / "c.ply").rename(folder / "a.ply")
+    (folder / "b.ply").rename(folder / "c.ply")
+    os.utime(folder / "a.ply", ns=(0, 0))
     assert statuses("--seed", 1) == ["built", "built"]
+    soon = time.time_ns() + 10**9
+    os.utime(folder / "a.ply", ns=(soon, soon))
+    (folder / "c.v3dg").write_bytes(b"cut off")
+    assert statuses("--seed", 1) == ["kept", "built"]
+
+
+def test_resume_needs_no_format(folder):
+    """The same gaussians in another file are the same asset."""
+    assert run("build", "a.ply", "-o", "out.v3dg", *FAST, cwd=folder).returncode == 0
+    v3dg.write_asset(folder / "ascii.ply", v3dg.read_asset(folder / "a.ply"), encoding="ascii")
+    done = run("build", "ascii.ply", "-o", "out.v3dg", *FAST, "--resume", "--json", cwd=folder)
+    assert json.loads(done.stdout)["status"] == "kept"
+
+
+def lies(config):
+    return [
+        {},
+        {"note": "of another program"},
+        config | {"dropped": 5},
+        config | {"dropped": {"a\nb": 1}},
+        config | {"dropped": None},
+        config | {"dropped": {"transparent": "many"}},
+        config | {"asset_gaussians": [1]},
+        config | {"asset_gaussians": -1},
+        config | {"asset_digest": 0},
+        config | {"build": []},
+        config | {"seed": {}},
+        {name: value for name, value in config.items() if name != "asset_digest"},  # as of earlier builds
+    ]
+
+
+def test_resume_builds_over_a_bundle_whose_config_lies(folder):
+    output = folder / "a.v3dg"
+    options = {"config": v3dg.BuildConfig(cluster_size=64, steps=1), "progress": False}
+    bundle, _ = build_file(folder / "a.ply", output, **options)
+    whole = output.read_bytes()
+    for config in lies(bundle.config):
+        v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, config).write(output)
+        assert v3dg.Bundle.open(output).config == config
+        assert build_file(folder / "a.ply", output, resume=True, **options)[1], config
+        assert output.read_bytes() == whole
+    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, bundle.config | {"dropped": 5}).write(
+        output
+    )
+    done = run("build", "a.ply", *FAST, "--resume", "--json", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["status"] == "built"
+
+
+def test_strict_refuses_also_what_resume_would_keep(folder):
+    asset = v3dg.read_asset(folder / "a.ply")
+    asset.opacities[0] = np.nan
+    v3dg.write_asset(folder / "bad.ply", asset)
+    assert run("build", "bad.ply", *FAST, cwd=folder).returncode == 0
+    fails(
+        1, "bad.ply: asset: expected gaussians", "build", "bad.ply", *FAST, "--resume", "--strict", cwd=folder
+    )
 
 
 def test_an_interrupt_says_how_far_it_got(folder):

@@ -10,14 +10,14 @@ from typing import Any, Literal
 from v3dg._device import Device
 from v3dg.build.checkpoint import discard_levels
 from v3dg.build.config import BuildConfig
-from v3dg.build.files import build_file, is_current, levels_path
-from v3dg.build.whole import build_into
+from v3dg.build.files import build_file, levels_path
+from v3dg.build.whole import Job, build_into
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.pages import MemoryPages, PageLayout
 from v3dg.gaussians import Gaussians
 
-__all__ = ["BuildConfig", "build_bundle", "build_file", "discard_levels", "is_current", "levels_path"]
+__all__ = ["BuildConfig", "build_bundle", "build_file", "discard_levels", "levels_path"]
 
 
 def build_bundle(
@@ -60,13 +60,10 @@ def build_bundle(
     memory = _Memory()
     build_into(
         memory.open,
-        asset,
-        config=config or BuildConfig(),
-        seed=seed,
+        Job.of(asset, config, seed, unusable),
         progress=progress,
         device=device,
         resume_path=resume_path,
-        unusable=unusable,
     )
     return memory.bundle
 

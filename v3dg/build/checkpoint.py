@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import hashlib
 import json
 import math
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import asdict, fields
+from contextlib import contextmanager, suppress
+from dataclasses import fields
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -23,13 +22,13 @@ import numpy.typing as npt
 from v3dg import _device, _files
 from v3dg._device import Device
 from v3dg._version import __version__
-from v3dg.build.config import BuildConfig
 from v3dg.build.plan import LevelPlan, Plan
 from v3dg.build.simplify import Level, LevelTables
+from v3dg.bundle.format import HASH_BYTES, page_hash
 from v3dg.gaussians import Gaussians
 
-_DIGEST_BYTES = 16
-_PIECE_BYTES = 16 << 20
+_FLOATS_AT_ONCE = 4 << 20
+_GAUSSIANS_AT_ONCE = 1 << 16  # of this the digest of an asset depends
 
 
 class Checkpoint:
@@ -37,26 +36,25 @@ class Checkpoint:
 
     A level whose writing was cut off does not count; one that is whole but damaged is an error. The file is
     locked while a build uses it, and is gone after one that finished no level.
+
+    Args:
+        made_with: What the bundle will say of how it was built, its asset's digest with it.
     """
 
     def __init__(
         self,
         path: str | os.PathLike[str] | None,
-        asset: Gaussians,
         plan: Plan,
-        config: BuildConfig,
-        seed: int,
+        sh_degree: int,
+        made_with: dict[str, Any],
         device: Device,
     ) -> None:
         self.num_levels = 0  # that are in the file, beside the leaves
         self._path = None if path is None else Path(path)
-        if self._path is None:
-            return
         self._levels = plan.levels
-        what = [asdict(config), seed, _device.describe(device), __version__, len(asset), asset.sh_degree]
-        text = json.dumps(what, sort_keys=True).encode()
-        self._head = b"v3dg levels 3\n" + _digest(text, _arrays_of(asset.numpy()))
-        self._num_bases = asset.sh.shape[1]
+        what = json.dumps([made_with, _device.describe(device), __version__], sort_keys=True).encode()
+        self._head = b"v3dg levels 3\n" + page_hash([np.frombuffer(what, np.uint8)])
+        self._num_bases = (sh_degree + 1) ** 2
         self._num_bytes = 0  # of the file that are good
 
     def __enter__(self) -> Checkpoint:
@@ -113,11 +111,11 @@ class Checkpoint:
         """The next level; None where the file ends before it does."""
         shapes = self._shapes(plan)
         left = os.fstat(self._file.fileno()).st_size - self._file.tell()
-        if _DIGEST_BYTES + 4 * sum(map(math.prod, shapes)) > left:
+        if HASH_BYTES + 4 * sum(map(math.prod, shapes)) > left:
             return None
-        digest = self._file.read(_DIGEST_BYTES)
+        digest = self._file.read(HASH_BYTES)
         arrays = [np.fromfile(self._file, np.float32, math.prod(shape)).reshape(shape) for shape in shapes]
-        if _digest(b"", arrays) != digest:
+        if _digest_of_arrays(arrays) != digest:
             raise ValueError("a level is damaged")
         return Level(Gaussians(*arrays[:5]), LevelTables(*arrays[5:]))
 
@@ -130,8 +128,8 @@ class Checkpoint:
         os.ftruncate(descriptor, end)
         with _files.naming_errors(self._path):
             try:
-                head = self._head if end == 0 else b""
-                pieces: list[bytes | memoryview] = [head, _digest(b"", arrays), *map(_bytes_of, arrays)]
+                head = (self._head if end == 0 else b"") + _digest_of_arrays(arrays)
+                pieces = [memoryview(head), *(array.reshape(-1).view(np.uint8).data for array in arrays)]
                 for data in pieces:
                     _files.write_at(descriptor, data, end)
                     end += len(data)
@@ -162,16 +160,25 @@ def discard_levels(resume_path: str | os.PathLike[str]) -> None:
 def _open_locked(path: str | os.PathLike[str]) -> FileIO:
     """Open or make a file to read and write; other builds are kept out until it is closed."""
     # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
-    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
-    file = FileIO(path, "r+", opener=lambda name, _: os.open(name, flags, 0o666))
-    try:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a device or a pipe")
-        _lock(file)
-    except BaseException:
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+    while True:
+        if os.path.islink(path):
+            raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a link; remove it")
+        # Whoever may see the bundle is settled when it replaces what is there.
+        file = FileIO(path, "r+", opener=lambda name, _: os.open(name, flags, 0o600))
+        try:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a device or a pipe")
+            _lock(file)
+            # The build that had the lock before may have removed the file.
+            with suppress(FileNotFoundError):
+                if os.path.samestat(status, os.lstat(path)):
+                    return file
+        except BaseException:
+            file.close()
+            raise
         file.close()
-        raise
-    return file
 
 
 def _lock(file: FileIO) -> None:
@@ -191,21 +198,20 @@ def _arrays_of(parts: Gaussians | LevelTables) -> list[npt.NDArray[np.float32]]:
     return [getattr(parts, field.name) for field in fields(parts)]
 
 
-def _bytes_of(array: npt.NDArray[np.float32]) -> memoryview:
-    return memoryview(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+def digest_of(asset: Gaussians) -> str:
+    """What tells an asset from others, wherever it was read from; docs/format.md has the definition."""
+    host = asset.numpy()
+    starts = range(0, len(host), _GAUSSIANS_AT_ONCE)
+    blocks = (_arrays_of(host.subset(slice(i, i + _GAUSSIANS_AT_ONCE))) for i in starts)
+    return _digest(blocks).hex()
 
 
-def _digest(head: bytes, arrays: Sequence[npt.NDArray[Any]]) -> bytes:
-    """Of the head and the arrays' bytes; in pieces, so that all cores share the work."""
-    pieces: list[Any] = [head]
-    for array in arrays:
-        data = _bytes_of(array)
-        pieces += [data[i : i + _PIECE_BYTES] for i in range(0, len(data), _PIECE_BYTES)]
+def _digest_of_arrays(arrays: Sequence[npt.NDArray[np.float32]]) -> bytes:
+    flat = [array.reshape(-1) for array in arrays]
+    return _digest([a[i : i + _FLOATS_AT_ONCE]] for a in flat for i in range(0, len(a), _FLOATS_AT_ONCE))
 
-    def digest(piece: Any) -> bytes:
-        return hashlib.blake2b(piece, digest_size=_DIGEST_BYTES).digest()
 
-    if sum(array.nbytes for array in arrays) < _PIECE_BYTES:  # less work than starting threads
-        return digest(b"".join(map(digest, pieces)))
+def _digest(blocks: Iterable[Sequence[npt.NDArray[np.float32]]]) -> bytes:
+    """Of the digests of the blocks, so that all cores share the work."""
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
-        return digest(b"".join(pool.map(digest, pieces)))
+        return page_hash([np.frombuffer(b"".join(pool.map(page_hash, blocks)), np.uint8)])

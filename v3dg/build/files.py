@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from contextlib import AbstractContextManager
-from dataclasses import asdict
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +12,7 @@ from v3dg import _device, _files
 from v3dg._device import Device
 from v3dg.build.checkpoint import discard_levels
 from v3dg.build.config import BuildConfig
-from v3dg.build.whole import build_into
+from v3dg.build.whole import Job, build_into
 from v3dg.bundle import Bundle
 from v3dg.bundle.bundle import config_to_json
 from v3dg.bundle.codec import Codec
@@ -42,8 +41,8 @@ def build_file(
 
     Args:
         asset: What is in the asset's file, where it is in memory already.
-        resume: Keep a bundle that is newer than the asset and made with these settings, and go on from the
-            levels of a build that was interrupted; otherwise all is made anew.
+        resume: Keep a bundle that says that it was made of these gaussians with these settings, and go on
+            from the levels of a build that was interrupted; otherwise all is made anew.
         config, seed, progress, device, unusable: As for `build_bundle`.
 
     Returns:
@@ -53,32 +52,34 @@ def build_file(
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As `read_asset` and `build_bundle`.
     """
     asset_path, bundle_path = Path(asset_path), Path(bundle_path)
-    config = config or BuildConfig()
+    levels = levels_path(bundle_path)
     _files.check_folder(bundle_path)
     _device.resolve(device)  # before anything is read
-    if resume and is_current(bundle_path, asset_path, config, seed):
-        return Bundle.open(bundle_path), False
-    levels = levels_path(bundle_path)
     if not resume:
         discard_levels(levels)
     if asset is None:
         asset = read_asset(asset_path)
     try:
-        build_into(
-            partial(_open_file, bundle_path),
-            asset,
-            config=config,
-            seed=seed,
-            progress=progress,
-            device=device,
-            resume_path=levels,
-            unusable=unusable,
-        )
+        job = Job.of(asset, config, seed, unusable)
+        del asset
+        is_kept = resume and _is_of(bundle_path, job)
+        if not is_kept:
+            open_sink = partial(_open_file, bundle_path)
+            build_into(open_sink, job, progress=progress, device=device, resume_path=levels)
     except ValueError as error:
         place = f"{asset_path}: " if str(error).startswith("asset: ") else ""
         raise ValueError(f"{place}{error}") from None
-    levels.unlink(missing_ok=True)
-    return Bundle.open(bundle_path), True
+    with suppress(RuntimeError):  # another build to the same place has begun
+        discard_levels(levels)
+    return Bundle.open(bundle_path), not is_kept
+
+
+def _is_of(bundle_path: Path, job: Job) -> bool:
+    """Whether a bundle is there and says that it was made by this job."""
+    try:
+        return Bundle.open(bundle_path).config == job.made_with
+    except (ValueError, OSError):  # none, damaged, or of another version: build it
+        return False
 
 
 def _open_file(
@@ -92,18 +93,3 @@ def levels_path(bundle_path: str | os.PathLike[str]) -> Path:
     """Where `build_file` keeps finished levels until the bundle is there."""
     path = Path(bundle_path)
     return path.with_name(path.name + ".partial")
-
-
-def is_current(
-    bundle_path: str | os.PathLike[str], asset_path: str | os.PathLike[str], config: BuildConfig, seed: int
-) -> bool:
-    """Whether a bundle is there, was made with these settings, and its asset's file has not changed since."""
-    bundle_path = Path(bundle_path)
-    if not bundle_path.is_file() or bundle_path.stat().st_mtime_ns < os.stat(asset_path).st_mtime_ns:
-        return False
-    try:
-        made_with = Bundle.open(bundle_path).config
-    except ValueError:  # damaged, or of another version: build it again
-        return False
-    is_ours = made_with.keys() >= {"build", "seed", "asset_gaussians", "dropped"}
-    return bool(is_ours and made_with["build"] == asdict(config) and made_with["seed"] == seed)

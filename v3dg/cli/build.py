@@ -52,7 +52,7 @@ class Build:
     strict: Flag = False
     """Refuse an asset with wrong values, instead of leaving out the gaussians that have them."""
     resume: Flag = False
-    """Continue after the last finished level; keep bundles newer than their asset and of these settings."""
+    """Continue after the last finished level; keep bundles of these gaussians and settings."""
     threads: Threads = None
     """CPU threads; all if not given. The result does not depend on it."""
     json: Flag = False
