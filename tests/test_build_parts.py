@@ -18,8 +18,7 @@ from v3dg.build.fit import fit_config
 from v3dg.build.plan import Plan
 from v3dg.build.simplify import Level, LevelTables, build_levels
 from v3dg.build.whole import _in_split_order
-from v3dg.bundle.bundle import config_to_json
-from v3dg.bundle.codec import Float32Codec
+from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import writing
 from v3dg.bundle.pages import PageLayout
 
@@ -146,8 +145,8 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
     level = 2
     num_groups = plan.levels[level].num_groups
     subtrees = {}
-    layout, codec, first_page = plan.layout, Float32Codec(asset.sh_degree), plan.first_page
-    with writing(tmp_path / "parts.v3dg", layout, codec, config_to_json(made_with)) as writer:
+    layout, codec, first_page = plan.layout, Codec(asset.sh_degree), plan.first_page
+    with writing(tmp_path / "parts.v3dg", layout, codec, made_with) as writer:
         for group in np.random.default_rng(0).permutation(num_groups):
             levels, part = build_subtree(leaves, plan, config, level, group, group + 1)
             for number, above in enumerate(part.levels[1:]):
@@ -217,10 +216,10 @@ def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatc
 
 def test_an_unfinished_file_never_gets_its_name(asset, tmp_path):
     bundle = build_bundle(asset, config=replace(SMALL, steps=0), progress=False, device="cpu")
-    layout, codec = PageLayout.of(bundle.clusters), Float32Codec(bundle.sh_degree)
+    layout, codec = PageLayout.of(bundle.clusters), Codec(bundle.sh_degree)
 
     def write(first_page, finish):
-        with writing(tmp_path / "out.v3dg", layout, codec, config_to_json({})) as writer:
+        with writing(tmp_path / "out.v3dg", layout, codec, {}) as writer:
             rest = bundle.gaussians.subset(slice(layout.first_gaussian[first_page], None))
             writer.write(first_page, layout.num_pages, rest)
             if finish:

@@ -11,7 +11,6 @@ import stat
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import fields
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -63,7 +62,13 @@ class Checkpoint:
                 raise ValueError(f"resume_path: expected a file in an existing folder, got {self._path}")
             self._file = _open_locked(self._path)
             try:
-                self._check_head()
+                with self._reading():
+                    head = self._file.read(len(self._head))
+                if not self._head.startswith(head):
+                    raise ValueError(
+                        f"{self._path}: holds something else, or levels of another asset, config, seed, "
+                        "device or version; remove it to start again"
+                    )
             except BaseException:
                 self._file.close()
                 raise
@@ -88,15 +93,6 @@ class Checkpoint:
             self.num_levels += 1
             yield level
 
-    def _check_head(self) -> None:
-        with self._reading():
-            head = self._file.read(len(self._head))
-        if not self._head.startswith(head):
-            raise ValueError(
-                f"{self._path}: holds something else, or levels of another asset, config, seed, device or "
-                "version; remove it to start again"
-            )
-
     @contextmanager
     def _reading(self) -> Iterator[None]:
         try:
@@ -109,7 +105,9 @@ class Checkpoint:
 
     def _read(self, plan: LevelPlan) -> Level | None:
         """The next level; None where the file ends before it does."""
-        shapes = self._shapes(plan)
+        n, clusters, groups = plan.num_gaussians, plan.num_clusters, plan.num_groups
+        shapes: list[tuple[int, ...]] = [(n, 3), (n, 4), (n, 3), (n,), (n, self._num_bases, 3)]
+        shapes += [(clusters, 2, 3), (groups, 4), (groups, 2)]
         left = os.fstat(self._file.fileno()).st_size - self._file.tell()
         if HASH_BYTES + 4 * sum(map(math.prod, shapes)) > left:
             return None
@@ -123,7 +121,7 @@ class Checkpoint:
         """Add a level that is on the host; what a full disk cuts off is removed again."""
         if self._path is None:
             return
-        arrays = [*_arrays_of(level.gaussians), *_arrays_of(level.tables)]
+        arrays = [*vars(level.gaussians).values(), *vars(level.tables).values()]
         descriptor, end = self._file.fileno(), self._num_bytes
         os.ftruncate(descriptor, end)
         with _files.naming_errors(self._path):
@@ -138,12 +136,6 @@ class Checkpoint:
                 raise
         self._num_bytes = end
         self.num_levels += 1
-
-    def _shapes(self, plan: LevelPlan) -> list[tuple[int, ...]]:
-        """Of the arrays of a level, in order; all are float32."""
-        n, clusters, groups = plan.num_gaussians, plan.num_clusters, plan.num_groups
-        rows: list[tuple[int, ...]] = [(n, 3), (n, 4), (n, 3), (n,), (n, self._num_bases, 3)]
-        return [*rows, (clusters, 2, 3), (groups, 4), (groups, 2)]
 
 
 def discard_levels(resume_path: str | os.PathLike[str]) -> None:
@@ -194,15 +186,11 @@ def _lock(file: FileIO) -> None:
             raise
 
 
-def _arrays_of(parts: Gaussians | LevelTables) -> list[npt.NDArray[np.float32]]:
-    return [getattr(parts, field.name) for field in fields(parts)]
-
-
 def digest_of(asset: Gaussians) -> str:
     """What tells an asset from others, wherever it was read from; docs/format.md has the definition."""
     host = asset.numpy()
     starts = range(0, len(host), _GAUSSIANS_AT_ONCE)
-    blocks = (_arrays_of(host.subset(slice(i, i + _GAUSSIANS_AT_ONCE))) for i in starts)
+    blocks = ([*vars(host.subset(slice(i, i + _GAUSSIANS_AT_ONCE))).values()] for i in starts)
     return _digest(blocks).hex()
 
 

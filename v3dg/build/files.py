@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from v3dg import _device, _files
 from v3dg._device import Device
@@ -14,10 +14,7 @@ from v3dg.build.checkpoint import discard_levels
 from v3dg.build.config import BuildConfig
 from v3dg.build.whole import Job, build_into
 from v3dg.bundle import Bundle
-from v3dg.bundle.bundle import config_to_json
-from v3dg.bundle.codec import Codec
-from v3dg.bundle.file import BundleWriter, writing
-from v3dg.bundle.pages import PageLayout
+from v3dg.bundle.file import writing
 from v3dg.gaussians import Gaussians
 from v3dg.io import read_asset
 
@@ -64,7 +61,8 @@ def build_file(
         del asset
         is_kept = resume and _is_of(bundle_path, job)
         if not is_kept:
-            open_sink = partial(_open_file, bundle_path)
+            # The levels beside the bundle are locked, so no other build writes to it.
+            open_sink = partial(writing, bundle_path, is_locked=True)
             build_into(open_sink, job, progress=progress, device=device, resume_path=levels)
     except ValueError as error:
         place = f"{asset_path}: " if str(error).startswith("asset: ") else ""
@@ -80,13 +78,6 @@ def _is_of(bundle_path: Path, job: Job) -> bool:
         return Bundle.open(bundle_path).config == job.made_with
     except (ValueError, OSError):  # none, damaged, or of another version: build it
         return False
-
-
-def _open_file(
-    path: Path, layout: PageLayout, codec: Codec, made_with: dict[str, Any]
-) -> AbstractContextManager[BundleWriter]:
-    """The levels beside the bundle are locked, so no other build writes to it."""
-    return writing(path, layout, codec, config_to_json(made_with), is_locked=True)
 
 
 def levels_path(bundle_path: str | os.PathLike[str]) -> Path:

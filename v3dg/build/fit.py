@@ -7,6 +7,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import TypeVar
 
 from v3dg import _core, _device
@@ -16,31 +17,25 @@ from v3dg.build.config import BuildConfig
 _T = TypeVar("_T")
 
 
+# What of a config shapes the levels; all else is the fit's.
+_OF_LEVELS = {
+    "cluster_size",
+    "group_size",
+    "min_clusters",
+    "min_gaussians",
+    "init",
+    "prune_growth",
+    "targets",
+    "asset_filter_px2",
+    "asset_antialiased",
+}
+
+
 def fit_config(config: BuildConfig, seed: int, level: int) -> _core.FitConfig:
-    """The settings of the core's fit, all of which it asks for."""
-    return _core.FitConfig(
-        steps=config.steps,
-        views_per_step=config.views_per_step,
-        num_views=config.num_views,
-        supersample=config.supersample,
-        image_size=config.image_size,
-        px2_per_gaussian=config.px2_per_gaussian,
-        distance=config.distance,
-        filter_px2=config.filter_px2,
-        antialiased=True,
-        loss_l1=config.loss_l1,
-        loss_dssim=config.loss_dssim,
-        loss_alpha=config.loss_alpha,
-        step_position=config.step_position,
-        step_log_scale=config.step_log_scale,
-        step_quat=config.step_quat,
-        step_logit=config.step_logit,
-        step_sh0=config.step_sh0,
-        step_sh_rest=config.step_sh_rest,
-        position_in_world=config.position_in_world,
-        final_step=config.final_step,
-        seed=seed * 64 + level,  # every level has views of its own
-    )
+    """The settings of the core's fit, which refuses one that it does not know or misses."""
+    settings = {name: value for name, value in asdict(config).items() if name not in _OF_LEVELS}
+    # Every level has views of its own.
+    return _core.FitConfig(**settings, antialiased=True, seed=seed * 64 + level)
 
 
 def run_fit(

@@ -14,41 +14,33 @@ class Bar:
     """One bar over all levels; it advances by fitted gaussians, which is what time goes with."""
 
     def __init__(self, plan: Plan, is_visible: bool) -> None:
-        self._plan = plan
+        self._levels = plan.levels
         self._is_visible = is_visible
         # Gaussians of the levels from 1 on up to each.
         self._before = np.cumsum([0, 0, *(level.num_gaussians for level in plan.levels[1:])]).tolist()
-        self._level = 0
         self._bar: Any = None
 
     def show(self, level: int, state: _core.FitProgress) -> None:
         """Show how many groups of the level are done."""
-        if not self._is_visible:
-            return
-        if self._bar is None:
-            self._bar = self._start(level)
-        if level != self._level:
-            self._level = level
-            self._bar.set_description(f"level {level}/{len(self._plan.levels) - 1}")
-        done = state.groups_done
-        if done == 0:
-            return
-        here = self._plan.levels[level]
-        text = f"groups {done}/{here.num_groups}, loss {state.loss_sum / done:.4f}"
-        self._bar.set_postfix_str(text, refresh=False)
-        self._bar.update(self._before[level] + here.num_gaussians * done // here.num_groups - self._bar.n)
-
-    def _start(self, level: int) -> Any:
         from tqdm import tqdm
 
-        return tqdm(
-            total=self._before[-1],
-            initial=self._before[level],
-            unit=" gaussians",
-            unit_scale=True,
-            smoothing=0.1,
-            dynamic_ncols=True,
-        )
+        if self._bar is None:
+            self._bar = tqdm(
+                total=self._before[-1],
+                initial=self._before[level],
+                unit=" gaussians",
+                unit_scale=True,
+                smoothing=0.1,
+                dynamic_ncols=True,
+                disable=not self._is_visible,
+            )
+        self._bar.set_description(f"level {level}/{len(self._levels) - 1}", refresh=False)
+        done = state.groups_done
+        if done > 0:
+            here = self._levels[level]
+            text = f"groups {done}/{here.num_groups}, loss {state.loss_sum / done:.4f}"
+            self._bar.set_postfix_str(text, refresh=False)
+            self._bar.update(self._before[level] + here.num_gaussians * done // here.num_groups - self._bar.n)
 
     def close(self) -> None:
         if self._bar is not None:

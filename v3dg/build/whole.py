@@ -22,7 +22,7 @@ from v3dg.build.plan import Plan
 from v3dg.build.progress import Bar
 from v3dg.build.simplify import Level, LevelTables, build_levels
 from v3dg.bundle import Clusters, Groups
-from v3dg.bundle.codec import Codec, Float32Codec
+from v3dg.bundle.codec import Codec
 from v3dg.bundle.pages import PageLayout
 from v3dg.gaussians import Gaussians
 
@@ -111,7 +111,7 @@ def build_into(
         checkpoint = Checkpoint(resume_path, plan, asset.sh_degree, job.made_with, where)
         leaves = _in_split_order(placed, config)
         del placed  # twice is enough: the caller's, and in the order of the leaves
-        codec = Float32Codec(leaves.sh_degree)
+        codec = Codec(leaves.sh_degree)
         bar = Bar(plan, progress)
         with checkpoint, open_sink(plan.layout, codec, job.made_with) as sink:
             levels = build_levels(leaves, plan, config, job.seed, finished=checkpoint.load(), show=bar.show)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
@@ -10,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v3dg._json import parse_json
-from v3dg.bundle.codec import Codec, Float32Codec
+from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundleFile, writing
-from v3dg.bundle.format import VERSION, file_bytes, page_file_bytes, page_tables
+from v3dg.bundle.format import VERSION, config_to_json, file_bytes, page_file_bytes, page_tables
 from v3dg.bundle.pages import FilePages, MemoryPages, PageLayout, PageSource, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_all, check_index, check_tables
 from v3dg.gaussians import Gaussians
@@ -52,9 +51,8 @@ class Bundle:
         # Made anew, because unpickling leaves out what making does: checks, and that arrays are read-only.
         clusters, groups = replace(clusters), replace(groups)
         check_tables(clusters, groups, len(gaussians))
-        layout = PageLayout.of(clusters)
-        pages = MemoryPages(layout, gaussians.numpy())
-        self._set(clusters, groups, config or {}, Float32Codec(gaussians.sh_degree), layout, pages, None)
+        pages = MemoryPages(PageLayout.of(clusters), gaussians.numpy())
+        self._set(clusters, groups, config or {}, Codec(gaussians.sh_degree), pages, None)
 
     def _set(
         self,
@@ -62,17 +60,15 @@ class Bundle:
         groups: Groups,
         config: dict[str, Any],
         codec: Codec,
-        layout: PageLayout,
         pages: PageSource,
         file: BundleFile | None,
     ) -> None:
-        self._config_json = config_to_json(config)
-        self.config: dict[str, Any] = parse_json(self._config_json)
+        self.config: dict[str, Any] = parse_json(config_to_json(config))
         self._clusters = clusters
         self._groups = groups
         self.sh_degree = codec.sh_degree
         self._codec = codec
-        self._layout = layout
+        self._layout = pages.layout
         self._pages = pages
         self._file = file
 
@@ -99,13 +95,13 @@ class Bundle:
                     f"clusters.offset[-1]: expected at most {most} gaussians, got {num_gaussians}"
                 )
             check_tables(clusters, groups, num_gaussians)
-            layout = PageLayout.of(clusters)
-            _check_page_tables(tables, page_tables(layout, file.codec), file.pages_bytes)
+            pages = FilePages(PageLayout.of(clusters), file)
+            _check_page_tables(tables, page_tables(pages.layout, file.codec), file.pages_bytes)
+            bundle = cls.__new__(cls)
+            bundle._set(clusters, groups, file.config, file.codec, pages, file)
         except ValueError as error:
             file.close()
             raise ValueError(f"{file.path}: {error}") from None
-        bundle = cls.__new__(cls)
-        bundle._set(clusters, groups, file.config, file.codec, layout, FilePages(layout, file), file)
         return bundle
 
     def write(self, path: str | os.PathLike[str]) -> None:
@@ -115,7 +111,7 @@ class Bundle:
         there stays and nothing else is left.
         """
         page_bytes = self._codec.page_bytes(self._layout.num_gaussians)
-        with writing(path, self._layout, self._codec, self._config_json) as writer:
+        with writing(path, self._layout, self._codec, self.config) as writer:
             for pages in runs_of_pages(0, self.num_pages, page_bytes, _BYTES_AT_ONCE):
                 writer.write(pages.start, pages.stop, self._pages.read(pages.start, pages.stop))
             writer.finish(self.clusters, self.groups)
@@ -223,7 +219,7 @@ class Bundle:
         return {
             "path": self.path,
             "version": VERSION,
-            "bytes": file_bytes(self._layout, self._codec, self._config_json),
+            "bytes": file_bytes(self._layout, self._codec, self.config),
             "sh_degree": self.sh_degree,
             "num_gaussians": self.num_gaussians,
             "num_clusters": len(self.clusters),
@@ -251,17 +247,3 @@ def _check_page_tables(
 def _mean(values: NDArray[np.float32]) -> float | None:
     known = values[~np.isnan(values)]
     return float(known.mean(dtype=np.float64)) if known.size else None
-
-
-def config_to_json(config: dict[str, Any]) -> str:
-    """The text that a bundle keeps of its config.
-
-    Raises:
-        TypeError, ValueError: It is not a dict, or has values that JSON cannot hold.
-    """
-    if not isinstance(config, dict):
-        raise TypeError(f"config: expected a dict, got {type(config).__name__}")
-    try:
-        return json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"config: expected values that JSON can hold, got {error}") from None

@@ -1,72 +1,44 @@
-"""Codecs: what the bytes of a page are.
-
-A new codec is a class here with what `Codec` has; `codec_of` is where a file's header picks it.
-"""
+"""The codec: what the bytes of a page are."""
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
 
-class Codec(Protocol):
-    """Gaussians of one SH degree as bytes, page by page, and back."""
-
-    sh_degree: int
-
-    def page_bytes(self, num_gaussians: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Sizes of pages of so many gaussians, without what they are filled up with."""
-
-    def most_gaussians(self, num_bytes: int) -> int:
-        """How many gaussians so many bytes can hold."""
-
-    def encode(self, gaussians: Gaussians, rows: slice) -> list[NDArray[Any]]:
-        """Arrays whose bytes, one array after another, are those of the page that has these rows."""
-
-    def decode(self, read: Callable[[Sequence[NDArray[Any]]], None], out: Gaussians, rows: slice) -> None:
-        """Fill the rows with a page, whose bytes `read` reads into the arrays that it is given."""
-
-    def empty(self, count: int) -> Gaussians:
-        """Gaussians on the host to decode to, with any values."""
-
-
-def codec_of(metadata: Mapping[str, str]) -> Codec:
-    """The codec of a file with this header: version 1 of the format has one."""
-    return Float32Codec(int(metadata["sh_degree"]))
-
-
-class Float32Codec:
-    """The arrays of a page's gaussians, float32, one whole array after another."""
+class Codec:
+    """Gaussians of one SH degree as bytes, and back: the arrays of a page, float32, one after another."""
 
     def __init__(self, sh_degree: int) -> None:
         self.sh_degree = sh_degree
-
-    @property
-    def floats_per_gaussian(self) -> int:
-        """3 mean, 4 quaternion, 3 scale, 1 opacity, 3 (d+1)² SH."""
-        return 11 + 3 * (self.sh_degree + 1) ** 2
+        # 3 mean, 4 quaternion, 3 scale, 1 opacity, 3 (d+1)² SH.
+        self._gaussian_bytes = 4 * (11 + 3 * (sh_degree + 1) ** 2)
 
     def page_bytes(self, num_gaussians: NDArray[np.int64]) -> NDArray[np.int64]:
-        return num_gaussians * (4 * self.floats_per_gaussian)
+        """Sizes of pages of so many gaussians, without what they are filled up with."""
+        return num_gaussians * self._gaussian_bytes
 
     def most_gaussians(self, num_bytes: int) -> int:
-        return num_bytes // (4 * self.floats_per_gaussian)
+        """How many gaussians so many bytes can hold."""
+        return num_bytes // self._gaussian_bytes
 
     def encode(self, gaussians: Gaussians, rows: slice) -> list[NDArray[Any]]:
-        return [getattr(gaussians, field.name)[rows] for field in fields(Gaussians)]
+        """Arrays whose bytes, one array after another, are those of the page that has these rows."""
+        return [array[rows] for array in vars(gaussians).values()]
 
     def decode(self, read: Callable[[Sequence[NDArray[Any]]], None], out: Gaussians, rows: slice) -> None:
+        """Fill the rows with a page, whose bytes `read` reads into the arrays that it is given."""
         read(self.encode(out, rows))
 
     def empty(self, count: int) -> Gaussians:
+        """Gaussians on the host to decode to, with any values."""
         shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (self.sh_degree + 1) ** 2, 3)]
         return Gaussians(*(np.empty(shape, np.float32) for shape in shapes))

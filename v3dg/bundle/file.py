@@ -9,17 +9,17 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
 from v3dg import _files
-from v3dg._json import parse_json
-from v3dg.bundle.codec import Codec, codec_of
+from v3dg._json import parse_json, shown
+from v3dg.bundle.codec import Codec
 from v3dg.bundle.format import (
     ALIGNMENT_BYTES,
     DTYPES,
@@ -63,14 +63,14 @@ class BundleWriter:
         pool: ThreadPoolExecutor,
         layout: PageLayout,
         codec: Codec,
-        config_json: str,
+        config: dict[str, Any],
     ) -> None:
         self._fd = descriptor
         self._pool = pool
         self._layout = layout
         self._codec = codec
         self._entries = entries_of_layout(layout, codec)
-        self._header = header_of(self._entries, codec.sh_degree, config_json)
+        self._header = header_of(self._entries, codec.sh_degree, config)
         self._page_tables = page_tables(layout, codec)
         self._hashes = np.zeros((layout.num_pages, HASH_BYTES), np.uint8)
         self._is_written = np.zeros(layout.num_pages, bool)
@@ -106,7 +106,7 @@ class BundleWriter:
         check_tables(clusters, groups, int(self._layout.first_gaussian[-1]))
         tables = self._page_tables | {"pages.hash": self._hashes}
         for prefix, part in (("clusters", clusters), ("groups", groups)):
-            tables |= {f"{prefix}.{field.name}": getattr(part, field.name) for field in fields(part)}
+            tables |= {f"{prefix}.{name}": array for name, array in vars(part).items()}
         digest = hashlib.blake2b(self._header, digest_size=HASH_BYTES)
         end = bytearray()
         for name, dtype, _, _ in SCHEMA:
@@ -125,7 +125,7 @@ def writing(
     path: str | os.PathLike[str],
     layout: PageLayout,
     codec: Codec,
-    config_json: str,
+    config: dict[str, Any],
     *,
     is_locked: bool = False,
 ) -> Iterator[BundleWriter]:
@@ -139,15 +139,10 @@ def writing(
         open(temporary, "wb", buffering=0) as file,
         ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool,
     ):
-        writer = BundleWriter(file.fileno(), pool, layout, codec, config_json)
+        writer = BundleWriter(file.fileno(), pool, layout, codec, config)
         yield writer
         if not writer.is_finished:
             raise RuntimeError(f"{os.fspath(path)}: expected the tables after the pages, got none")
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 class BundleFile:
@@ -198,9 +193,9 @@ class BundleFile:
         try:
             header = parse_json(text.tobytes())
         except ValueError as error:
-            self._fail(f"header: expected JSON (safetensors), got {_short(str(error))}")
+            self._fail(f"header: expected JSON (safetensors), got {error}")
         if not isinstance(header, dict):
-            self._fail(f"header: expected a JSON object (safetensors), got {_short(header)}")
+            self._fail(f"header: expected a JSON object (safetensors), got {shown(header)}")
 
         self._read_metadata(header.pop("__metadata__", None))
         self._data_start = 8 + header_bytes
@@ -209,33 +204,28 @@ class BundleFile:
         self._read_tables(entries, (length, text))
 
     def _read_metadata(self, metadata: Any) -> None:
-        if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-            found = metadata.get("format") if isinstance(metadata, dict) else None
-            self._fail(f"format: expected '{FORMAT}', got {_short(found)}; not a bundle")
+        metadata = metadata if isinstance(metadata, dict) else {}
+        if metadata.get("format") != FORMAT:
+            self._fail(f"format: expected '{FORMAT}', got {shown(metadata.get('format'))}; not a bundle")
         version = metadata.get("version")
-        if (
-            not isinstance(version, str)
-            or not version.isdecimal()
-            or not version.isascii()
-            or len(version) > 9
-        ):
-            self._fail(f"version: expected a number, got {_short(version)}")
+        if not isinstance(version, str) or not re.fullmatch("[0-9]{1,9}", version):
+            self._fail(f"version: expected a number, got {shown(version)}")
         if int(version) > VERSION:
             self._fail(f"version {int(version)}, this build reads up to {VERSION}; update v3dg")
         if int(version) < 1:
-            self._fail(f"version: expected 1 or more, got {_short(version)}")
+            self._fail(f"version: expected 1 or more, got {shown(version)}")
         if metadata.get("sh_degree") not in ("0", "1", "2", "3"):
-            self._fail(f"sh_degree: expected '0' to '3', got {_short(metadata.get('sh_degree'))}")
-        self.codec = codec_of(metadata)
+            self._fail(f"sh_degree: expected '0' to '3', got {shown(metadata.get('sh_degree'))}")
+        self.codec = Codec(int(metadata["sh_degree"]))
         config = metadata.get("config")
         if not isinstance(config, str):
-            self._fail(f"config: expected a string of JSON, got {_short(config)}")
+            self._fail(f"config: expected a string of JSON, got {shown(config)}")
         try:
             self.config = parse_json(config)
         except ValueError as error:
-            self._fail(f"config: expected JSON, got {_short(str(error))}")
+            self._fail(f"config: expected JSON, got {error}")
         if not isinstance(self.config, dict):
-            self._fail(f"config: expected a JSON object, got {_short(self.config)}")
+            self._fail(f"config: expected a JSON object, got {shown(self.config)}")
 
     def _check_entries(self, header: dict[str, Any]) -> dict[str, Any]:
         """Compare the header with the one that its own counts and the file's size call for."""
@@ -244,20 +234,20 @@ class BundleFile:
             entry = header.get(name)
             shape = entry.get("shape") if isinstance(entry, dict) else None
             if not isinstance(shape, list) or len(shape) != 1 or type(shape[0]) is not int or shape[0] < 0:
-                self._fail(f"{name}: expected a tensor with one side, got {_short(entry)}")
+                self._fail(f"{name}: expected a tensor with one side, got {shown(entry)}")
             counts.append(shape[0])
         if max(counts) > self.num_bytes:
             self._fail(
-                f"size: expected more than {_short(max(counts))} bytes for tensors, got {self.num_bytes}; "
+                f"size: expected more than {shown(max(counts))} bytes for tensors, got {self.num_bytes}; "
                 "the file is truncated"
             )
         expected = entries_of(*counts)
         for name, entry in expected.items():
             if header.get(name) != entry:
-                self._fail(f"{name}: expected {entry}, got {_short(header.get(name))}")
+                self._fail(f"{name}: expected {entry}, got {shown(header.get(name))}")
         unknown = sorted(set(header) - set(expected))
         if unknown:
-            self._fail(f"{_short(unknown[0])}: expected only the tensors of version {VERSION}")
+            self._fail(f"{shown(unknown[0])}: expected only the tensors of version {VERSION}")
         for name, value in (("header", self._data_start), ("pages", counts[3])):
             if value % ALIGNMENT_BYTES:
                 self._fail(f"{name}: expected to end at a multiple of {ALIGNMENT_BYTES}, got {value}")

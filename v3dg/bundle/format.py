@@ -104,20 +104,34 @@ def entries_of_layout(layout: PageLayout, codec: Codec) -> dict[str, Any]:
     return entries_of(layout.num_clusters, max(layout.num_pages - 1, 0), layout.num_pages, pages_bytes)
 
 
-def header_of(entries: dict[str, Any], sh_degree: int, config_json: str) -> bytes:
+def header_of(entries: dict[str, Any], sh_degree: int, config: dict[str, Any]) -> bytes:
     """The length and the JSON, filled up with spaces so that the data starts aligned."""
-    metadata = {"format": FORMAT, "version": str(VERSION), "sh_degree": str(sh_degree), "config": config_json}
+    metadata = {"format": FORMAT, "version": str(VERSION), "sh_degree": str(sh_degree)}
+    metadata["config"] = config_to_json(config)
     text = json.dumps({"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")).encode()
     text += b" " * padding_bytes(8 + len(text))
     if len(text) > MAX_HEADER_BYTES:
-        raise ValueError(
-            f"config: expected at most {MAX_HEADER_BYTES} bytes of JSON, got {len(config_json)}; shorten it"
-        )
+        size = len(metadata["config"])
+        raise ValueError(f"config: expected at most {MAX_HEADER_BYTES} bytes of JSON, got {size}; shorten it")
     return len(text).to_bytes(8, "little") + text
 
 
-def file_bytes(layout: PageLayout, codec: Codec, config_json: str) -> int:
+def config_to_json(config: dict[str, Any]) -> str:
+    """The text that a bundle keeps of its config.
+
+    Raises:
+        TypeError, ValueError: It is not a dict, or has values that JSON cannot hold.
+    """
+    if not isinstance(config, dict):
+        raise TypeError(f"config: expected a dict, got {type(config).__name__}")
+    try:
+        return json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"config: expected values that JSON can hold, got {error}") from None
+
+
+def file_bytes(layout: PageLayout, codec: Codec, config: dict[str, Any]) -> int:
     """Size of the file that this makes."""
     entries = entries_of_layout(layout, codec)
-    header = header_of(entries, codec.sh_degree, config_json)
+    header = header_of(entries, codec.sh_degree, config)
     return len(header) + int(entries["hash"]["data_offsets"][1])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -71,6 +71,8 @@ class PageLayout:
 class PageSource(Protocol):
     """Where the gaussians of pages come from."""
 
+    layout: PageLayout
+
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Gaussians of a run of pages, on the host; those of a file are verified."""
 
@@ -79,26 +81,26 @@ class MemoryPages:
     """Pages whose gaussians are all in memory, on the host."""
 
     def __init__(self, layout: PageLayout, gaussians: Gaussians) -> None:
-        self._layout = layout
+        self.layout = layout
         self.gaussians = gaussians
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Shares memory with `gaussians`."""
-        rows = self._layout.rows(first_page, last_page)
+        rows = self.layout.rows(first_page, last_page)
         return self.gaussians.subset(slice(rows.start, rows.stop))
 
     def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
         """Copy the gaussians of a run of pages, on any device, to their place."""
-        place = self.read(first_page, last_page)
-        for field in fields(Gaussians):
-            _device.copy_to_host(getattr(gaussians, field.name), getattr(place, field.name))
+        place = vars(self.read(first_page, last_page)).values()
+        for array, out in zip(vars(gaussians).values(), place, strict=True):
+            _device.copy_to_host(array, out)
 
 
 class FilePages:
     """Pages that are read from a file when they are asked for; a single one is kept until the next."""
 
     def __init__(self, layout: PageLayout, file: BundleFile) -> None:
-        self._layout = layout
+        self.layout = layout
         self._file = file
         self._last_page: tuple[int, Gaussians] | None = None
 
@@ -112,11 +114,11 @@ class FilePages:
 
     def _read(self, first_page: int, last_page: int) -> Gaussians:
         """Read pages straight into the arrays of the result."""
-        result = self._file.codec.empty(len(self._layout.rows(first_page, last_page)))
+        result = self._file.codec.empty(len(self.layout.rows(first_page, last_page)))
 
         def read(pages: range) -> None:
             for page in pages:
-                self._file.read_page(page, result, self._layout.slice_in(page, first_page))
+                self._file.read_page(page, result, self.layout.slice_in(page, first_page))
 
         tasks = list(runs_of_pages(first_page, last_page, self._file.tables["pages.bytes"], _BYTES_PER_TASK))
         if len(tasks) == 1:
