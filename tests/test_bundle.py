@@ -481,7 +481,7 @@ def with_metadata(**values):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (with_metadata(version="0"), "version: expected 1 or more"),
+        (with_metadata(version="0"), "version: expected a number of 1 or more"),
         (with_metadata(version="-1"), "version: expected a number"),
         (with_metadata(version="١"), "version: expected a number"),
         (with_metadata(version=1), "version: expected a number"),

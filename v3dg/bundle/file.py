@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from v3dg.gaussians import Gaussians
 
 _THREADS = 8
-_READ_BYTES = 1 << 30  # one read call moves at most 2 GiB - 4 KiB
 
 
 class BundleWriter:
@@ -208,12 +207,10 @@ class BundleFile:
         if metadata.get("format") != FORMAT:
             self._fail(f"format: expected '{FORMAT}', got {shown(metadata.get('format'))}; not a bundle")
         version = metadata.get("version")
-        if not isinstance(version, str) or not re.fullmatch("[0-9]{1,9}", version):
-            self._fail(f"version: expected a number, got {shown(version)}")
+        if not isinstance(version, str) or not re.fullmatch("[1-9][0-9]{0,8}", version):
+            self._fail(f"version: expected a number of 1 or more, got {shown(version)}")
         if int(version) > VERSION:
             self._fail(f"version {int(version)}, this build reads up to {VERSION}; update v3dg")
-        if int(version) < 1:
-            self._fail(f"version: expected 1 or more, got {shown(version)}")
         if metadata.get("sh_degree") not in ("0", "1", "2", "3"):
             self._fail(f"sh_degree: expected '0' to '3', got {shown(metadata.get('sh_degree'))}")
         self.codec = Codec(int(metadata["sh_degree"]))
@@ -278,10 +275,7 @@ class BundleFile:
         """Fill all buffers from one place of the file."""
         remaining = [memoryview(buffer.reshape(-1).view(np.uint8).data) for buffer in buffers if buffer.size]
         while remaining:
-            if len(remaining[0]) > _READ_BYTES:
-                num_read = os.preadv(self._fd, [remaining[0][:_READ_BYTES]], offset)
-            else:
-                num_read = os.preadv(self._fd, remaining, offset)
+            num_read = os.preadv(self._fd, remaining, offset)  # the system stops at about 2 GiB
             if num_read == 0:
                 self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
             offset += num_read
