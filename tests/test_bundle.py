@@ -19,9 +19,10 @@ import v3dg
 from random_bundle import random_bundle, random_gaussians
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.bundle import file as bundle_file
-from v3dg.bundle.format import TABLE_NAMES
+from v3dg.bundle.format import SCHEMA
 from v3dg.gaussians import Gaussians
 
+TABLE_NAMES = [name for name, *_ in SCHEMA]
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh")
 FORMAT_PAGE = Path(__file__).parent.parent / "docs" / "format.md"
 DTYPES = {"I64": "<i8", "I32": "<i4", "F32": "<f4", "U8": "u1"}

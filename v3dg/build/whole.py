@@ -71,7 +71,8 @@ class Job:
             raise ValueError(f"unusable: expected 'drop' or 'refuse', got {unusable!r}")
         if len(asset) == 0:
             raise ValueError("asset: expected at least one gaussian, got none")
-        findings = cleaning.examine(asset)
+        with _device.memory_errors():
+            findings = cleaning.examine(asset)
         if findings.num_wrong and unusable == "refuse":
             raise ValueError(f"asset: expected gaussians that can be drawn, got others: {findings.text}")
         if not findings.drawable.any():

@@ -12,7 +12,7 @@ from v3dg._json import parse_json
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundleFile, writing
 from v3dg.bundle.format import VERSION, config_to_json, file_bytes, page_file_bytes, page_tables
-from v3dg.bundle.pages import FilePages, MemoryPages, PageLayout, PageSource, runs_of_pages
+from v3dg.bundle.pages import FilePages, MemoryPages, PageLayout, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_all, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
@@ -60,7 +60,7 @@ class Bundle:
         groups: Groups,
         config: dict[str, Any],
         codec: Codec,
-        pages: PageSource,
+        pages: MemoryPages | FilePages,
         file: BundleFile | None,
     ) -> None:
         self.config: dict[str, Any] = parse_json(config_to_json(config))
@@ -69,7 +69,7 @@ class Bundle:
         self.sh_degree = codec.sh_degree
         self._codec = codec
         self._layout = pages.layout
-        self._pages = pages
+        self._pages: MemoryPages | FilePages = pages
         self._file = file
 
     @classmethod

@@ -153,7 +153,7 @@ class BundleFile:
         pages_bytes: Size of all pages with their padding.
         codec: What the bytes of its pages are.
         config: The JSON object that was saved.
-        tables: One read-only array for every name in TABLE_NAMES, with the shapes of docs/format.md.
+        tables: One read-only array for every name in SCHEMA, with the shapes of docs/format.md.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -284,15 +284,12 @@ class BundleFile:
             if num_read:
                 remaining[0] = remaining[0][num_read:]
 
-    def read_page(self, page: int, out: Gaussians, rows: slice) -> None:
-        """Read a page's gaussians into the rows, and verify its hash.
+    def read_page(self, page: int, arrays: Sequence[NDArray[Any]]) -> None:
+        """Read a page's bytes into the arrays, one after another, and verify its hash.
 
         Raises:
             ValueError: The page is damaged, or the file was truncated after it was opened.
         """
-        self.codec.decode(lambda arrays: self._read_page(page, arrays), out, rows)
-
-    def _read_page(self, page: int, arrays: Sequence[NDArray[Any]]) -> None:
         num_bytes = int(self.tables["pages.bytes"][page])
         padding = np.empty(padding_bytes(num_bytes), np.uint8)
         first = int(self.tables["pages.first_cluster"][page])

@@ -44,7 +44,6 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
     ("clusters.antialiased", "U8", "C", ()),
     ("pages.hash", "U8", "P", (HASH_BYTES,)),
 )
-TABLE_NAMES = tuple(name for name, _, _, _ in SCHEMA)
 
 
 def padding_bytes(num_bytes: int) -> int:

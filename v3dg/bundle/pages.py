@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -68,15 +69,6 @@ class PageLayout:
         return slice(rows.start - before, rows.stop - before)
 
 
-class PageSource(Protocol):
-    """Where the gaussians of pages come from."""
-
-    layout: PageLayout
-
-    def read(self, first_page: int, last_page: int) -> Gaussians:
-        """Gaussians of a run of pages, on the host; those of a file are verified."""
-
-
 class MemoryPages:
     """Pages whose gaussians are all in memory, on the host."""
 
@@ -85,7 +77,7 @@ class MemoryPages:
         self.gaussians = gaussians
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
-        """Shares memory with `gaussians`."""
+        """Gaussians of a run of pages; they share memory with `gaussians`."""
         rows = self.layout.rows(first_page, last_page)
         return self.gaussians.subset(slice(rows.start, rows.stop))
 
@@ -105,6 +97,7 @@ class FilePages:
         self._last_page: tuple[int, Gaussians] | None = None
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
+        """Gaussians of a run of pages, on the host; verified."""
         if last_page - first_page != 1:
             return self._read(first_page, last_page)
         kept = self._last_page
@@ -118,7 +111,8 @@ class FilePages:
 
         def read(pages: range) -> None:
             for page in pages:
-                self._file.read_page(page, result, self.layout.slice_in(page, first_page))
+                read_arrays = partial(self._file.read_page, page)
+                self._file.codec.decode(read_arrays, result, self.layout.slice_in(page, first_page))
 
         tasks = list(runs_of_pages(first_page, last_page, self._file.tables["pages.bytes"], _BYTES_PER_TASK))
         if len(tasks) == 1:
