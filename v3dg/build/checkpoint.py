@@ -8,7 +8,7 @@ import json
 import math
 import os
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from io import FileIO
@@ -190,16 +190,18 @@ def digest_of(asset: Gaussians) -> str:
     """What tells an asset from others, wherever it was read from; docs/format.md has the definition."""
     host = asset.numpy()
     starts = range(0, len(host), _GAUSSIANS_AT_ONCE)
-    blocks = ([*vars(host.subset(slice(i, i + _GAUSSIANS_AT_ONCE))).values()] for i in starts)
-    return _digest(blocks).hex()
+    return _digest([[*vars(host.subset(slice(i, i + _GAUSSIANS_AT_ONCE))).values()] for i in starts]).hex()
 
 
 def _digest_of_arrays(arrays: Sequence[npt.NDArray[np.float32]]) -> bytes:
     flat = [array.reshape(-1) for array in arrays]
-    return _digest([a[i : i + _FLOATS_AT_ONCE]] for a in flat for i in range(0, len(a), _FLOATS_AT_ONCE))
+    return _digest([[a[i : i + _FLOATS_AT_ONCE]] for a in flat for i in range(0, len(a), _FLOATS_AT_ONCE)])
 
 
-def _digest(blocks: Iterable[Sequence[npt.NDArray[np.float32]]]) -> bytes:
+def _digest(blocks: Sequence[Sequence[npt.NDArray[np.float32]]]) -> bytes:
     """Of the digests of the blocks, so that all cores share the work."""
+    if sum(array.size for block in blocks for array in block) < _FLOATS_AT_ONCE:
+        # Less work than starting threads, which Python does not do safely where memory runs out.
+        return page_hash([np.frombuffer(b"".join(map(page_hash, blocks)), np.uint8)])
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
         return page_hash([np.frombuffer(b"".join(pool.map(page_hash, blocks)), np.uint8)])
