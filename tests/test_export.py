@@ -13,6 +13,7 @@ import v3dg
 from command_line import fails, run
 from random_bundle import random_bundle
 from v3dg.export import write_streamed_sog
+from v3dg.io import asset_bytes
 from v3dg.metrics import psnr
 
 
@@ -274,6 +275,19 @@ def test_the_command(tmp_path, bundle):
     fails(2, "--chunk: expected at least 1", "export", "tuft.v3dg", "--chunk", "0", cwd=tmp_path)
     fails(1, "create it first", "export", "tuft.v3dg", "-o", "no/web", cwd=tmp_path)
     fails(1, "expected a file ending in .v3dg", "export", "tuft_web/lod-meta.json", cwd=tmp_path)
+
+
+def test_info_of_an_export_has_the_size_of_all_its_files(tmp_path, bundle):
+    """Of every level and of the environment, once each; the page's settings are not part of the asset."""
+    path = edited(tmp_path, bundle, environment="3_0/meta.json")
+    num_bytes = sum(file.stat().st_size for file in (tmp_path / "web").rglob("*.*"))
+    num_bytes -= (tmp_path / "web" / "settings.json").stat().st_size
+    result = json.loads(run("info", path, "--json").stdout)
+    assert result["bytes"] == num_bytes > 10 * path.stat().st_size
+    shutil.rmtree(tmp_path / "web" / "2_0")  # a level that is not read may be missing
+    assert asset_bytes(path) < num_bytes
+    folder = tmp_path / "web" / "1_0"
+    assert asset_bytes(folder / "meta.json") == sum(file.stat().st_size for file in folder.iterdir())
 
 
 @pytest.mark.witness

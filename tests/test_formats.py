@@ -5,6 +5,7 @@ What all readers share is in test_malformed.py.
 """
 
 import gzip
+import os
 import struct
 import sys
 import tracemalloc
@@ -20,6 +21,7 @@ from hypothesis import strategies as st
 
 from test_ply import random_gaussians
 from v3dg import Gaussians, read_asset, write_asset
+from v3dg.formats import _reading
 
 FIXTURES = Path(__file__).parent / "fixtures"
 SH_C0 = 0.28209479177387814
@@ -361,7 +363,7 @@ HOSTILE_SPZ = {
     "no header": (spz()[:15], "expected a header of 16 bytes, got 15"),
     "huge count": (
         spz(count=2**32 - 1),
-        "expected the 85899345900 bytes that its header promises, got a file of",
+        "expected a byte a gaussian beyond 262144, got 4294967295 gaussians in",
     ),
     "a long trailer": (spz() + bytes(2 << 20), "that ends after 40 bytes of gaussians, got another"),
 }
@@ -401,10 +403,10 @@ def test_extensions_after_the_gaussians_of_spz_are_passed_over(tmp_path):
         (16, 31, "expected a table of 6 streams after the header, got 6 at 31"),
         (19, 255, "expected a table of 6 streams after the header, got 6 at 42"),
         (8, 65, "expected 585 bytes in stream 0, got 576"),
-        (11, 255, "bytes that its header promises, got a file of 2635"),
+        (11, 255, "expected a byte a gaussian beyond 262144, got 4278190144 gaussians in 2635 bytes"),
         (32 + 7, 255, "expected 576 bytes in stream 0, got 576 of"),
         (4, 3, "expected version 3 in a gzip stream, got it outside of one"),
-        (128, 0, "expected a zstd stream, got one that is damaged"),
+        (128, 0, "expected a zstd stream that is not damaged, got zstd decompress error"),
     ],
 )
 def test_hostile_spz_of_version_4_is_refused(tmp_path, place, value, message):
@@ -449,7 +451,7 @@ HOSTILE_SOG = {
     ),
     "huge count": (
         replaced('"count":300', '"count":99999999999'),
-        "expected 99999999999 pixels in 'means_l.webp'",
+        "count: expected a number of gaussians, got 99999999999",
     ),
     "path": (replaced('"means_l.webp"', '"../means_l.webp"'), "expected the name of a file beside meta.json"),
     "parent": (replaced('"means_l.webp"', '".."'), "expected the name of a file beside meta.json"),
@@ -465,7 +467,7 @@ HOSTILE_SOG = {
         replaced('"codebook":[', '"codebook":[[],'),
         "scales.codebook: expected 1 to 256 numbers",
     ),
-    "no JSON": (lambda text: text[:-1], "expected JSON in meta.json, got text that does not parse"),
+    "no JSON": (lambda text: text[:-1], "expected JSON in meta.json, got Expecting"),
 }
 
 
@@ -487,26 +489,18 @@ def picture(width, height, kind="WEBP"):
     return stream.getvalue()
 
 
-def test_pictures_that_claim_more_than_a_file_can_hold_are_refused(tmp_path):
-    bomb = picture(4000, 4000)
-    assert len(bomb) < 2000
-    path = sog_with(tmp_path, files={"quats.webp": bomb})
-    assert_refused_cheaply(path, "got one that claims 16000000 pixels")
-
-
-def test_zips_that_expand_are_refused(tmp_path):
-    path = sog_with(tmp_path, files={"quats.webp": bytes(1 << 26)}, compression=zipfile.ZIP_DEFLATED)
-    assert_refused_cheaply(path, "expected 'quats.webp' no larger than the zip, got 67108864 bytes")
-
-
-def test_other_pictures_are_refused_or_read(tmp_path):
+def test_other_pictures_are_refused(tmp_path):
     assert_refused_cheaply(
-        sog_with(tmp_path, files={"quats.webp": b"no picture"}), "expected a picture in 'quats.webp'"
+        sog_with(tmp_path, files={"quats.webp": b"no picture"}), "expected a WebP picture in 'quats.webp'"
     )
-    assert_refused_cheaply(
-        sog_with(tmp_path, files={"quats.webp": picture(20, 20, "TIFF")}), "expected a picture in"
-    )
-    path = sog_with(tmp_path, files={"quats.webp": picture(20, 20, "PNG")})
+    for kind in ("PNG", "TIFF"):
+        path = sog_with(tmp_path, files={"quats.webp": picture(20, 20, kind)})
+        assert_refused_cheaply(path, "a.sog: expected a WebP picture in 'quats.webp'")
+    whole = zipfile.ZipFile(FIXTURES / "sh0.sog").read("quats.webp")
+    for damaged in (whole[:-40], whole[:40], whole[:60] + bytes(200) + whole[260:]):
+        path = sog_with(tmp_path, files={"quats.webp": damaged})
+        assert_refused_cheaply(path, "a.sog: expected a WebP picture in 'quats.webp'")
+    path = sog_with(tmp_path, files={"quats.webp": picture(20, 20)})
     assert len(read_asset(path)) == 300
     small = picture(4, 4)
     assert_refused_cheaply(
@@ -632,7 +626,7 @@ def test_changed_bytes_never_do_worse_than_an_error(tmp_path_factory, name, edit
         gzip.compress(content) if unpacked is not content and name.endswith("v3.spz") else content
     )
     try:
-        assert len(read_asset(path)) <= 64 * len(content)
+        assert len(read_asset(path)) <= (1 << 18) + len(content)
     except ValueError as error:
         assert str(error).startswith(f"{path}")  # noqa: PT017 (either outcome is right)
 
@@ -734,8 +728,134 @@ def test_changed_bytes_of_a_checkpoint_never_do_worse_than_an_error(tmp_path):
                 assert str(error).startswith(f"{path}: ")  # noqa: PT017 (either outcome is right)
 
 
-def test_torch_is_asked_for_where_it_is_missing(tmp_path, monkeypatch):
-    torch.save({}, tmp_path / "a.pt")
+def test_a_checkpoint_needs_no_torch(tmp_path, monkeypatch):
+    torch.save({"splats": gsplat_tensors(random_gaussians(2, 0))}, tmp_path / "a.pt")
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(ImportError, match=r"a\.pt: a checkpoint needs torch; pip install 'v3dg\[torch\]'"):
-        read_asset(tmp_path / "a.pt")
+    assert len(read_asset(tmp_path / "a.pt")) == 2
+
+
+def members_of(path):
+    with zipfile.ZipFile(path) as source:
+        return {name: source.read(name) for name in source.namelist()}
+
+
+def write_zip(path, members, compression=zipfile.ZIP_STORED):
+    with zipfile.ZipFile(path, "w", compression) as target:
+        for name, content in members.items():
+            target.writestr(name, content)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    asset = random_gaussians(20, 1)
+    torch.save({"splats": gsplat_tensors(asset)}, tmp_path / "a.pt")
+    return tmp_path / "a.pt", asset
+
+
+def test_a_checkpoint_that_was_packed_again_is_the_same(saved):
+    path, asset = saved
+    write_zip(path, members_of(path), zipfile.ZIP_DEFLATED)
+    assert_same(read_asset(path), asset)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_checkpoints_of_other_floats_are_read(tmp_path, dtype):
+    tensors = {name: tensor.to(dtype) for name, tensor in gsplat_tensors(random_gaussians(20, 1)).items()}
+    torch.save({"splats": tensors}, tmp_path / "a.pt")
+    found = read_asset(tmp_path / "a.pt")
+    np.testing.assert_array_equal(found.means, tensors["means"].float().numpy())
+    np.testing.assert_array_equal(found.sh[:, 1:], tensors["shN"].float().numpy())
+
+
+def test_views_of_a_checkpoint_are_read(tmp_path):
+    asset = random_gaussians(20, 1)
+    tensors = gsplat_tensors(asset)
+    tensors["means"] = torch.nn.Parameter(tensors["means"].T.contiguous().T)
+    both = torch.cat([torch.zeros(5, 4), tensors["quats"]])
+    tensors["quats"] = both[5:]
+    torch.save({"splats": tensors}, tmp_path / "a.pt")
+    assert_same(read_asset(tmp_path / "a.pt"), asset)
+
+
+def test_a_checkpoint_without_checksums_is_read(tmp_path):
+    torch.serialization.set_crc32_options(False)
+    try:
+        torch.save({"splats": gsplat_tensors(random_gaussians(20, 1))}, tmp_path / "a.pt")
+    finally:
+        torch.serialization.set_crc32_options(True)
+    assert len(read_asset(tmp_path / "a.pt")) == 20
+
+
+@pytest.mark.parametrize("change", ["cut", "longer", "gone", "big-endian", "a bit"])
+def test_a_checkpoint_whose_numbers_are_others_is_refused(saved, change):
+    path, _ = saved
+    members = members_of(path)
+    name = next(name for name in members if name.endswith("data/0"))
+    order = name.replace("data/0", "byteorder")
+    if change == "a bit":
+        content = bytearray(path.read_bytes())
+        content[content.index(members[name])] ^= 1
+        path.write_bytes(content)
+        assert_refused_cheaply(path, "expected a zip that is not damaged, got Bad CRC-32 for file")
+        return
+    messages = {
+        "cut": "expected 240 bytes of means, got 236",
+        "longer": "expected 240 bytes of means, got 244",
+        "gone": f"expected {name!a} in the zip, got none",
+        "big-endian": "expected little-endian numbers, got a checkpoint of another byte order",
+    }
+    changed = {
+        "cut": members[name][:-4],
+        "longer": members[name] + bytes(4),
+        "gone": b"",
+        "big-endian": b"big",
+    }
+    members[order if change == "big-endian" else name] = changed[change]
+    if change == "gone":
+        del members[name]
+    write_zip(path, members)
+    assert_refused_cheaply(path, messages[change])
+
+
+@pytest.mark.parametrize("suffix", [".pt", ".sog"])
+def test_a_file_that_shrinks_while_it_is_read_is_refused(tmp_path, monkeypatch, suffix):
+    """Of these the parts are read one by one; nothing is mapped, which would end the process."""
+    path, asset = tmp_path / f"a{suffix}", random_gaussians(5000, 0)
+    if suffix == ".sog":
+        write_asset(path, asset)
+    else:
+        torch.save({"splats": gsplat_tensors(asset)}, path)
+    read_member = _reading.Archive.read
+
+    def read_and_cut(archive, name):
+        content = read_member(archive, name)
+        os.truncate(path, 700)
+        return content
+
+    monkeypatch.setattr(_reading.Archive, "read", read_and_cut)
+    with pytest.raises(ValueError, match=f"^{path}: expected a zip that is not damaged, got "):
+        read_asset(path)
+
+
+@pytest.mark.parametrize("bands", ["[1]", "{}", '"1"', "1.0", "true", "null", "0", "4"])
+def test_bands_of_another_kind_are_refused(tmp_path, bands):
+    path = sog_with(
+        tmp_path,
+        replaced('"version":2', f'"shN":{{"bands":{bands},"count":1,"files":["a","b"]}},"version":2'),
+        files={},
+    )
+    with zipfile.ZipFile(path, "a") as target:
+        target.writestr("a", b"")
+        target.writestr("b", b"")
+    assert_refused_cheaply(path, "shN.bands: expected 1 to 3, got ")
+
+
+@pytest.mark.parametrize("gone", ["min_r", "max_b", "min_r min_g min_b", "max_r max_g max_b"])
+def test_half_of_the_ranges_of_colour_is_refused(tmp_path, gone):
+    content = (FIXTURES / "sh0.compressed.ply").read_bytes()
+    for name in gone.split():
+        content = content.replace(f"property float {name}\n".encode(), f"property float x{name}\n".encode())
+    (tmp_path / "a.ply").write_bytes(content)
+    assert_refused_cheaply(
+        tmp_path / "a.ply", f"expected 'property float {gone.split()[0]}' in element chunk"
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -31,6 +32,12 @@ _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
     ".spz": spz.write,
     ".sog": sog.write,
 }
+# The files of an asset, where they may be several.
+_FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
+    "lod-meta.json": streamed_sog.files,
+    "meta.json": sog.files,
+    "": lambda path: [path],
+}
 
 SUFFIXES = tuple(_READERS)
 """How the names of files end that `read_asset` reads."""
@@ -54,14 +61,20 @@ def read_asset(path: Path) -> Gaussians:
     - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto, from which nothing
       but tensors is taken.
 
-    Coordinates are those of the file: no axes are turned.
+    Coordinates are those of the file: no axes are turned. Memory and time are bounded by the size of the file
+    (docs/robustness.md).
 
     Raises:
         ValueError: Another name, or the content is not of its kind; says what was expected and found.
-        ImportError: The format needs a package that is missing; names it.
         OSError: The file cannot be opened or read (FileNotFoundError, IsADirectoryError, ...).
     """
     return _by_name(path, _READERS)(path)
+
+
+def asset_bytes(path: Path) -> int:
+    """Bytes on disk of an asset that can be read: of all files that it names and that are there, once each."""
+    files = set(_by_name(path, _FILES)(pathlib.Path(path)))
+    return sum(file.stat().st_size for file in files if file.exists())
 
 
 def write_asset(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "binary_little_endian") -> None:

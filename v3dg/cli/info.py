@@ -56,7 +56,9 @@ def _asset_info(path: Path, asset: Gaussians) -> tuple[dict[str, Any], str]:
     import numpy as np
 
     from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
+    from v3dg.io import asset_bytes
 
+    num_bytes = asset_bytes(path)
     findings = examine(asset)
     drawable = asset.subset(findings.drawable)
     far = outliers(drawable.means)
@@ -78,12 +80,12 @@ def _asset_info(path: Path, asset: Gaussians) -> tuple[dict[str, Any], str]:
         "not_drawable": findings.counts,
         "outliers": int(far.sum()),
         "sh_degree": asset.sh_degree,
-        "bytes": path.stat().st_size,
+        "bytes": num_bytes,
         **boxes,
         "percentiles_5_50_95": spread,
     }
     lines = [
-        f"{path}: asset, {bytes_text(path.stat().st_size)}",
+        f"{path}: asset, {bytes_text(num_bytes)}",
         f"{len(asset):,} gaussians, SH degree {asset.sh_degree}",
     ]
     if findings.counts:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _core, _files
+from v3dg import _core
 from v3dg.gaussians import Gaussians
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
@@ -27,21 +26,6 @@ _LEAST_SEEN = np.float32(_core.min_alpha)
 
 # The components that stay when one is left out, in ascending order.
 _KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-
-
-def read_bytes(path: str | os.PathLike[str]) -> bytes:
-    """All of a regular file.
-
-    Raises:
-        ValueError: It is a directory, a device or a pipe.
-        OSError: It cannot be read.
-    """
-    with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
-        return file.read()
-
-
-def problem(path: str | os.PathLike[str], text: str) -> ValueError:
-    return ValueError(f"{os.fspath(path)}: {text}")
 
 
 def blocks(count: int) -> Iterator[slice]:

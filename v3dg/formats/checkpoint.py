@@ -1,17 +1,24 @@
 """Checkpoints of trainers, `.pt` and `.ckpt`: gsplat's `simple_trainer`, and splatfacto of nerfstudio.
 
 Both hold means, log scales, quaternions w x y z, logits of opacities and SH coefficients as tensors, gsplat
-in a dict `splats`, nerfstudio among the values of `pipeline`. Nothing else of the pickle is executed or kept.
+in a dict `splats`, nerfstudio among the values of `pipeline`. The file is a zip of a pickle and of the
+numbers of each tensor. The pickle is followed as far as it builds dicts, plain values and tensors; nothing
+that it names is imported or called, and only the numbers of the gaussians are read.
 """
 
 from __future__ import annotations
 
+import io
+import math
 import os
-import warnings
-from typing import Any
+import pickletools
+from typing import Any, NamedTuple
 
-from v3dg import _files
-from v3dg.formats._packing import DEGREES, Floats, assemble, normalised, problem
+import numpy as np
+from numpy.typing import NDArray
+
+from v3dg.formats._packing import DEGREES, Floats, assemble, normalised
+from v3dg.formats._reading import Archive, Claims, problem, telling
 from v3dg.gaussians import Gaussians
 
 # Field: its name in gsplat's checkpoints, in nerfstudio's.
@@ -24,104 +31,189 @@ _FIELDS = {
     "shN": ("shN", "features_rest"),
 }
 _NERFSTUDIO_PREFIX = "_model.gauss_params."
+_MAX_PICKLE = 1 << 20  # bytes; trainers' have far less, and each byte can be an object
+_MAX_DIMENSIONS = 8
+# Operations that push a value; of those without one, no field is told by it.
+_VALUES = ("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "NONE", "NEWTRUE", "NEWFALSE")
+_TYPES = {"DoubleStorage": "<f8", "FloatStorage": "<f4", "HalfStorage": "<f2", "BFloat16Storage": "<u2"}
+# Modules of which a trainer's own values are, such as a device. Others are refused, and none is imported.
+_KNOWN = ("torch", "torch._utils", "torch._tensor", "torch.nn.parameter", "collections", "_codecs")
+
+
+class _Named(NamedTuple):
+    """What stands for a class, a function or what a call of it would make."""
+
+    name: str
+
+
+class _Tensor(NamedTuple):
+    kind: str  # of its storage
+    key: str
+    num_stored: int
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read the gaussians of a checkpoint.
 
     Raises:
-        ValueError: It is none of the two, or its pickle wants more than tensors and plain values.
-        ImportError: torch is missing.
+        ValueError: It is none of the two, damaged, big-endian, or its pickle wants more than tensors and
+            plain values.
         OSError: It cannot be read.
     """
-    tensors = _tensors(path, _loaded(path))
-    count = len(tensors["means"])
-    shapes = {
-        "means": (count, 3),
-        "scales": (count, 3),
-        "quats": (count, 4),
-        "opacities": (count,),
-        "sh0": (count, 3),
-    }
-    num_higher = tensors["shN"].numel() // max(1, 3 * count)
+    claims = Claims()
+    with claims.open(path) as file:
+        archive = Archive(path, file)
+        root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
+        pickle = archive.read(f"{root}data.pkl")
+        if len(pickle) > _MAX_PICKLE:
+            raise problem(path, f"expected a pickle of at most {_MAX_PICKLE} bytes, got {len(pickle)}")
+        if f"{root}byteorder" in archive.names and archive.read(f"{root}byteorder") != b"little":
+            raise problem(path, "expected little-endian numbers, got a checkpoint of another byte order")
+        with telling(path, "a checkpoint of tensors and plain values"):
+            content = _followed(pickle)
+        fields = _fields(path, content)
+        claims.add(path, fields["means"].shape[0])
+        arrays = {name: _array(path, name, field, archive, root) for name, field in fields.items()}
+    count = len(arrays["means"])
+    num_higher = arrays["shN"].size // max(1, 3 * count)
     if num_higher not in DEGREES:
-        raise problem(path, f"expected SH degree 0 to 3, got shN of shape {tuple(tensors['shN'].shape)}")
-    shapes["shN"] = (count, num_higher, 3)
-    arrays = {}
-    for name, shape in shapes.items():
-        tensor = tensors[name]
-        if tensor.numel() != _product(shape):
-            raise problem(path, f"expected {name} of shape {shape}, got {tuple(tensor.shape)}")
-        arrays[name] = tensor.detach().double().reshape(shape)
-    import torch
+        raise problem(path, f"expected SH degree 0 to 3, got shN of shape {fields['shN'].shape}")
+    wanted = ((count, 3), (count, 3), (count, 4), (count,), (count, 1, 3), (count, num_higher, 3))
+    for name, shape in zip(_FIELDS, wanted, strict=True):
+        if arrays[name].size != math.prod(shape):
+            raise problem(path, f"expected {name} of shape {shape}, got {fields[name].shape}")
+        arrays[name] = arrays[name].reshape(shape)
 
     def decode(rows: slice) -> tuple[Floats, ...]:
-        block = {name: array[rows] for name, array in arrays.items()}
-        sh = torch.cat([block["sh0"][:, None], block["shN"]], dim=1)
-        scales, opacities = block["scales"].exp(), block["opacities"].sigmoid()
-        return (
-            block["means"].numpy(),
-            normalised(block["quats"].numpy()),
-            scales.numpy(),
-            opacities.numpy(),
-            sh.numpy(),
-        )
+        means, scales, quats, logits, *sh = (_doubles(arrays[name][rows]) for name in _FIELDS)
+        opacities = 1.0 / (1.0 + np.exp(-logits))
+        return means, normalised(quats), np.exp(scales), opacities, np.concatenate(sh, axis=1)
 
     return assemble(count, DEGREES[num_higher], decode)
 
 
-def _product(shape: tuple[int, ...]) -> int:
-    product = 1
-    for size in shape:
-        product *= size
-    return product
+def _doubles(values: NDArray[Any]) -> Floats:
+    if values.dtype == np.uint16:  # bfloat16: the upper half of a float32
+        values = (values.astype(np.uint32) << 16).view(np.float32)
+    return values.astype(np.float64)
 
 
-def _loaded(path: str | os.PathLike[str]) -> Any:
-    try:
-        import torch
-    except ImportError:
-        raise ImportError(f"{os.fspath(path)}: a checkpoint needs torch; pip install 'v3dg[torch]'") from None
-    with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
-        file.read(1)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what torch warns of in damaged files becomes an error below
-            # Mapped: a checkpoint's optimiser is twice as large as its gaussians, and is not read.
-            return torch.load(os.fspath(path), map_location="cpu", weights_only=True, mmap=True)
-    except MemoryError:
-        raise
-    except Exception as error:  # damaged files raise RuntimeError, EOFError, OSError, UnpicklingError, ...
-        lines = [ascii(line)[1:-1] for line in str(error).splitlines()]
-        wanted = next((line for line in lines if "GLOBAL" in line or "Unsupported" in line), None)
-        found = (
-            f"one that wants more: {wanted}"
-            if wanted
-            else f"a file that torch cannot read: {' '.join(lines)}"
-        )
-        raise problem(path, f"expected a checkpoint of tensors and plain values, got {found[:200]}") from None
-
-
-def _tensors(path: str | os.PathLike[str], content: Any) -> dict[str, Any]:
-    import torch
-
-    found: dict[str, Any] = {}
-    if isinstance(content, dict) and isinstance(content.get("splats"), dict):
-        found = {name: content["splats"].get(key) for name, (key, _) in _FIELDS.items()}
-    elif isinstance(content, dict) and isinstance(content.get("pipeline"), dict):
-        found = {
-            name: content["pipeline"].get(_NERFSTUDIO_PREFIX + key) for name, (_, key) in _FIELDS.items()
-        }
+def _fields(path: str | os.PathLike[str], content: Any) -> dict[str, _Tensor]:
+    found: dict[str, Any] = content if isinstance(content, dict) else {}
+    if isinstance(found.get("splats"), dict):
+        fields = {name: found["splats"].get(key) for name, (key, _) in _FIELDS.items()}
+    elif isinstance(found.get("pipeline"), dict):
+        fields = {name: found["pipeline"].get(_NERFSTUDIO_PREFIX + key) for name, (_, key) in _FIELDS.items()}
     else:
-        keys = (
-            ", ".join(ascii(key) for key in list(content)[:6]) if isinstance(content, dict) else type(content)
-        )
+        keys = ", ".join(f"{key[:40]!a}" for key in list(found)[:6]) or "none"
         raise problem(
             path, f"expected 'splats' (gsplat) or 'pipeline' (nerfstudio) in the checkpoint, got {keys}"
         )
-    for name, tensor in found.items():
-        if not isinstance(tensor, torch.Tensor) or not tensor.is_floating_point() or tensor.ndim == 0:
-            raise problem(
-                path, f"expected a tensor of floats {name} in the checkpoint, got {type(tensor).__name__}"
-            )
-    return found
+    for name, tensor in fields.items():
+        if not isinstance(tensor, _Tensor) or not tensor.shape:
+            kind = f"{tensor.name[:60]!a}" if isinstance(tensor, _Named) else type(tensor).__name__
+            raise problem(path, f"expected a tensor of floats {name} in the checkpoint, got {kind}")
+    return fields
+
+
+def _array(
+    path: str | os.PathLike[str], name: str, tensor: _Tensor, archive: Archive, root: str
+) -> NDArray[Any]:
+    """The numbers of a tensor, which must all be in the file: none stands for many."""
+    steps = zip(tensor.shape, tensor.strides, strict=True)
+    last = tensor.offset + sum((size - 1) * step for size, step in steps)
+    count, stored_count = math.prod(tensor.shape), tensor.num_stored
+    if count > stored_count or (count and last >= stored_count):
+        raise problem(
+            path, f"expected {name} within the {stored_count} numbers of its storage, got {tensor[3:]}"
+        )
+    dtype = np.dtype(_TYPES[tensor.kind])
+    content = archive.read(f"{root}data/{tensor.key}")
+    if len(content) != stored_count * dtype.itemsize:
+        raise problem(path, f"expected {stored_count * dtype.itemsize} bytes of {name}, got {len(content)}")
+    stored = np.frombuffer(content, dtype)[tensor.offset :]
+    strides = [step * dtype.itemsize for step in tensor.strides]
+    return np.lib.stride_tricks.as_strided(stored, tensor.shape, strides, writeable=False)
+
+
+def _followed(pickle: bytes) -> Any:
+    """What a pickle of torch.save builds: values of lists are dropped, of dicts all but those with a name.
+
+    Every step is one of a few on a stack, so time and memory are in proportion to the pickle.
+    """
+    stack: list[Any] = []
+    marks: list[int] = []
+    memo: dict[int, Any] = {}
+
+    def above_mark() -> list[Any]:
+        start = marks.pop()
+        values = stack[start:]
+        del stack[start:]
+        return values
+
+    argument: Any
+    for opcode, argument, _ in pickletools.genops(io.BytesIO(pickle)):
+        match opcode.name:
+            case "PROTO" | "BINPERSID":
+                pass  # the tuple that names a storage stands for it
+            case "STOP":
+                break
+            case "MARK":
+                marks.append(len(stack))
+            case "EMPTY_DICT":
+                stack.append({})
+            case "EMPTY_LIST" | "EMPTY_TUPLE":
+                stack.append(())
+            case name if name in _VALUES:
+                stack.append(argument)
+            case "BINPUT" | "LONG_BINPUT":
+                memo[argument] = stack[-1]
+            case "BINGET" | "LONG_BINGET":
+                stack.append(memo[argument])
+            case "TUPLE":
+                stack.append(tuple(above_mark()))
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                size = int(opcode.name[-1])
+                stack[-size:] = [tuple(stack[-size:])]
+            case "SETITEM" | "SETITEMS":
+                items = above_mark() if opcode.name == "SETITEMS" else [stack.pop(-2), stack.pop()]
+                if isinstance(stack[-1], dict):
+                    pairs = zip(items[::2], items[1::2], strict=True)
+                    stack[-1].update((key, value) for key, value in pairs if isinstance(key, str))
+            case "APPEND" | "BUILD":
+                stack.pop()
+            case "APPENDS":
+                above_mark()
+            case "GLOBAL":
+                module, _, name = argument.partition(" ")
+                stack.append(_Named(f"{module[:60]}.{name[:60]}"))
+                if module not in _KNOWN:
+                    raise ValueError(f"one that wants more: {stack[-1].name}")
+            case "REDUCE" | "NEWOBJ":
+                arguments = stack.pop()
+                stack[-1] = _called(stack[-1].name, arguments)
+            case _:
+                raise ValueError(f"one that wants more: the operation {opcode.name}")
+    return stack.pop()
+
+
+def _called(name: str, arguments: tuple[Any, ...]) -> Any:
+    if name == "collections.OrderedDict":
+        return {}
+    if name == "torch._utils._rebuild_parameter":
+        return arguments[0]
+    if name != "torch._utils._rebuild_tensor_v2":
+        return _Named(name)
+    (_, kind, key, _, num_stored), offset, shape, strides = arguments[:4]
+    kind = kind.name.removeprefix("torch.")
+    # Dimensions first: many calls may share what is long.
+    if not isinstance(key, str) or not len(shape) == len(strides) <= _MAX_DIMENSIONS:
+        raise ValueError("a tensor of another shape")
+    if not all(
+        type(number) is int and 0 <= number < 1 << 48 for number in (num_stored, offset, *shape, *strides)
+    ):
+        raise ValueError("a tensor of another shape")
+    return _Tensor(kind, key, num_stored, offset, shape, strides) if kind in _TYPES else _Named(kind)

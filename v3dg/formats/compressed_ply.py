@@ -25,12 +25,11 @@ from v3dg.formats._packing import (
     log_scales,
     morton_order,
     opacity_bytes,
-    problem,
     quats_from_three,
-    read_bytes,
     three_of_quats,
     to_integers,
 )
+from v3dg.formats._reading import problem, read_bytes
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
@@ -177,7 +176,8 @@ def _names(end: str, kind: str) -> list[str]:
 
 def _ranges(path: str | os.PathLike[str], chunk: NDArray[Any]) -> dict[str, tuple[Floats, Floats]]:
     """Lowest and highest of each chunk, (C, 3) each; files without ranges of colour mean 0 to 1."""
-    kinds = [kind for kind in _RANGES if kind != "color" or "min_r" in (chunk.dtype.names or ())]
+    colors = {*_names("min", "color"), *_names("max", "color")}
+    kinds = [kind for kind in _RANGES if kind != "color" or colors & set(chunk.dtype.names or ())]
     ranges: dict[str, tuple[Floats, Floats]] = {
         "color": (np.zeros((len(chunk), 3)), np.ones((len(chunk), 3)))
     }

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.formats._packing import SH_C0, Floats, assemble, normalised, problem, read_bytes
+from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
+from v3dg.formats._reading import problem, read_bytes
 from v3dg.gaussians import Gaussians
 
 _HEADER_BYTES = 4096

@@ -7,16 +7,12 @@ higher SH an index into a palette of whole sets of coefficients. See docs/format
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import math
 import os
-import struct
-import warnings
 import zipfile
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,99 +30,84 @@ from v3dg.formats._packing import (
     log_scales,
     morton_order,
     opacity_bytes,
-    problem,
     quats_from_three,
-    read_bytes,
     three_of_quats,
     to_integers,
 )
+from v3dg.formats._reading import Archive, Claims, least_bytes, problem, telling, whole
 from v3dg.gaussians import Gaussians
 
-# What compresses better than this was not made of gaussians that differ.
-_MAX_GAUSSIANS_PER_BYTE = 64
-_MAX_META = 1 << 24
+_MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
+# A picture may have this many times the pixels that are needed, and some: writers round up differently.
+_SPARE, _FREE_PIXELS = 4, 1 << 16
 _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 _PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
 _SQRT2 = math.sqrt(2.0)
 _MAX_LOG = 88.0  # of a float32
 
-Load = Callable[[str], bytes]
+# Parts of meta.json, and how many pictures each has.
+_PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
 
 
-def read(path: str | os.PathLike[str]) -> Gaussians:
+def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussians:
     """Read a `.sog` file, or the `meta.json` of a folder with its pictures.
 
     Raises:
         ValueError: It is none, incomplete, or of another version than 2.
         OSError: It cannot be read.
     """
-    path = Path(path)
+    path, claims = Path(path), claims or Claims()
     if path.suffix == ".json":
-        meta = read_bytes(path)
-        return _read(path, meta, lambda name: read_bytes(path.with_name(name)))
-    content = read_bytes(path)
-    if content[:4] != b"PK\3\4":  # zipfile would look for a zip anywhere in the file
-        raise problem(path, f"expected a zip with SOG, got a file that begins with {content[:4].hex(' ')}")
-    load = _zip_loader(path, content)
-    return _read(path, load("meta.json"), load)
+        text = claims.read(path)
+        return _read(path, text, lambda name: claims.read(path.with_name(name)), claims)
+    with claims.open(path) as file:
+        archive = Archive(path, file)
+        return _read(path, archive.read("meta.json"), archive.read, claims)
 
 
-def _zip_loader(path: Path, content: bytes) -> Load:
-    """What reads a file of a zip by its name."""
-    with _telling_damage(path):
-        bundle = zipfile.ZipFile(io.BytesIO(content))
-
-    def load(name: str) -> bytes:
-        if name not in bundle.namelist():
-            raise problem(path, f"expected {name!a} in the zip, got none")
-        member = bundle.getinfo(name)
-        if member.file_size > max(len(content), _MAX_META):  # pictures are compressed already
-            raise problem(path, f"expected {name!a} no larger than the zip, got {member.file_size} bytes")
-        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise problem(path, f"expected {name!a} stored or deflated in the zip, got neither")
-        with _telling_damage(path):
-            return bundle.read(member)
-
-    return load
+def files(path: Path) -> list[Path]:
+    """The `.sog` file itself, or a `meta.json` and its pictures."""
+    if path.suffix != ".json":
+        return [path]
+    names = _names(_meta(path, Claims().read(path)))
+    return [path, *(path.with_name(name) for part in names.values() for name in part)]
 
 
-@contextlib.contextmanager
-def _telling_damage(path: Path) -> Iterator[None]:
-    """Turn all that zipfile raises for damaged files, which it does not document, into one error."""
-    try:
-        yield
-    except (zipfile.BadZipFile, EOFError, RuntimeError, ValueError, struct.error, zlib.error) as error:
-        raise problem(path, f"expected a zip with SOG, got one that is damaged: {str(error)!a}") from None
+def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims) -> Gaussians:
+    meta = _meta(path, text)
+    count = whole(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
+    names = _names(meta)
+    pictures = {name: load(name) for part in names.values() for name in part}
+    claims.add(path, count)  # all that it has on disk is known now
 
+    def pixels(name: str) -> NDArray[np.uint8]:
+        """(N, 4) red, green, blue and alpha of the gaussians."""
+        return _decoded(path, name, pictures[name], count).reshape(-1, 4)[:count]
 
-def _read(path: Path, text: bytes, load: Load) -> Gaussians:
-    try:
-        meta = Node(parse_json(text.decode("utf-8")), os.fspath(path), "")
-    except ValueError as error:
-        raise problem(path, f"expected JSON in meta.json, got text that does not parse: {error}") from None
-    fields = meta.some_fields(())
-    if "version" not in fields:
-        raise problem(
-            path, "expected SOG version 2, got an older file; convert it with splat-transform first"
-        )
-    if fields["version"].value != 2:
-        raise fields["version"].error("SOG version 2")
-    fields = meta.some_fields(("count", "means", "scales", "quats", "sh0"))
-    count = fields["count"].value
-    if not isinstance(count, int) or isinstance(count, bool) or count < 0:
-        raise fields["count"].error("a number of gaussians")
-    pictures = _Pictures(path, load, count)
-    means_fields = fields["means"].some_fields(("mins", "maxs", "files"))
-    low = np.array(means_fields["mins"].vector(3))
-    high = np.array(means_fields["maxs"].vector(3))
-    lower, upper = (pictures.pixels(name) for name in _names(means_fields["files"], 2))
-    (quats,) = (pictures.pixels(name) for name in _names(fields["quats"].some_fields(("files",))["files"], 1))
-    scale_table, scales = _indexed(fields["scales"], pictures)
-    color_table, color = _indexed(fields["sh0"], pictures)
+    limits = meta["means"].some_fields(("mins", "maxs"))
+    low, high = (np.array(limits[name].vector(3)) for name in ("mins", "maxs"))
+    lower, upper = map(pixels, names["means"])
+    scales, quats, color = (pixels(names[part][0]) for part in ("scales", "quats", "sh0"))
+    scale_table, color_table = _codebook(meta["scales"]), _codebook(meta["sh0"])
     tags = quats[:, 3]
     if count and tags.min() < 252:
         raise problem(path, f"expected quaternions tagged 252 to 255, got {tags.min()}")
-    degree, higher = _higher(path, fields.get("shN"), pictures)
+    degree = 0
+    table: Floats = np.zeros(1)
+    palette: NDArray[Any] = np.zeros((1, 0, 3), np.uint8)
+    labels: NDArray[Any] = np.zeros(count, np.uint8)
+    if "shN" in meta:
+        fields = meta["shN"].some_fields(("count", "bands"))
+        degree = whole(fields["bands"], "1 to 3", 1, 3)
+        num_entries = whole(fields["count"], "1 to 65536 entries", 1, 65536)
+        table = _codebook(meta["shN"])
+        num_rows, width = -(-num_entries // _PALETTE_COLUMNS), _PALETTE_COLUMNS * _COEFFICIENTS[degree]
+        centroids = _decoded(path, names["shN"][0], pictures[names["shN"][0]], num_rows * width, width)
+        palette = centroids[:num_rows, :, :3].reshape(-1, _COEFFICIENTS[degree], 3)
+        places = pixels(names["shN"][1])
+        labels = places[:, 0] | (places[:, 1].astype(np.uint16) << 8)
+        if count and labels.max() >= len(palette):
+            raise problem(path, f"expected labels below {num_entries}, got {labels.max()}")
 
     def decode(rows: slice) -> tuple[Floats, ...]:
         whole = lower[rows, :3] | (upper[rows, :3].astype(np.uint16) << 8)
@@ -134,10 +115,70 @@ def _read(path: Path, text: bytes, load: Load) -> Gaussians:
         means = np.sign(logs) * np.expm1(np.abs(logs))
         three = (quats[rows, :3] / 255.0 * 2.0 - 1.0) / _SQRT2
         widths = np.exp(scale_table[scales[rows, :3]])
-        sh = np.concatenate([color_table[color[rows, :3]][:, None], higher(rows)], axis=1)
+        sh = np.concatenate([color_table[color[rows, :3]][:, None], table[palette[labels[rows]]]], axis=1)
         return means, quats_from_three(three, tags[rows] - 252), widths, color[rows, 3] / 255.0, sh
 
     return assemble(count, degree, decode)
+
+
+def _meta(path: Path, text: bytes) -> dict[str, Node]:
+    with telling(path, "JSON in meta.json"):
+        document = parse_json(text.decode("utf-8"))
+    meta = Node(document, os.fspath(path), "").some_fields(())
+    if "version" not in meta:
+        raise problem(
+            path, "expected SOG version 2, got an older file; convert it with splat-transform first"
+        )
+    if meta["version"].value != 2:
+        raise meta["version"].error("SOG version 2")
+    return Node(document, os.fspath(path), "").some_fields(("count", "means", "scales", "quats", "sh0"))
+
+
+def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
+    """Names of the pictures of each part, beside meta.json; nothing outside of its folder is read."""
+    names = {}
+    for part, count in _PARTS.items():
+        if part not in meta:
+            continue
+        node = meta[part].some_fields(("files",))["files"]
+        if not isinstance(node.value, list) or len(node.value) != count:
+            raise node.error(f"{count} file names")
+        for item in node.items():
+            if item.text() != os.path.basename(item.text()) or "\\" in item.text() or item.text() == "..":
+                raise item.error("the name of a file beside meta.json")
+        names[part] = [item.text() for item in node.items()]
+    return names
+
+
+def _codebook(part: Node) -> Floats:
+    """A table of 256 values."""
+    node = part.some_fields(("codebook",))["codebook"]
+    if not isinstance(node.value, list) or not 1 <= len(node.value) <= 256:
+        raise node.error("1 to 256 numbers")
+    entries = node.items()
+    table = np.zeros(256)
+    # Some versions of splat-transform wrote null for the first value, which continues the others.
+    skip = int(entries[0].value is None and len(entries) == 256)
+    table[skip : len(entries)] = [entry.number() for entry in entries[skip:]]
+    if skip:
+        table[0] = table[1] + (table[1] / 255 - table[255] / 255)
+    return table
+
+
+def _decoded(
+    path: Path, name: str, content: bytes, num_pixels: int, width: int | None = None
+) -> NDArray[np.uint8]:
+    """(H, W, 4) of a picture that has the pixels that are needed, and not many more."""
+    from PIL.WebPImagePlugin import WebPImageFile  # Image.open would ask what other format it is
+
+    with telling(path, f"a WebP picture in {name!a}"):
+        picture = WebPImageFile(io.BytesIO(content))
+    got = picture.width * picture.height
+    if width not in (None, picture.width) or not num_pixels <= got <= _SPARE * num_pixels + _FREE_PIXELS:
+        shape = f"{num_pixels} pixels" + ("" if width is None else f" in rows of {width}")
+        raise problem(path, f"expected {shape} in {name!a}, got {picture.width} x {picture.height}")
+    with telling(path, f"a WebP picture in {name!a}"), picture:
+        return np.asarray(picture.convert("RGBA"))
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
@@ -148,9 +189,13 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
         OSError: It cannot be written.
     """
     host = check_writable(gaussians)
-    files = encode(host.subset(morton_order(host.means)))
+    contents = encode(host.subset(morton_order(host.means)))
+    # Gaussians that are all alike take too little to be believed.
+    missing = least_bytes(len(host)) - sum(map(len, contents.values()))
+    if missing > 0:
+        contents["padding"] = bytes(missing)
     with _files.replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
-        for name, content in files.items():
+        for name, content in contents.items():
             bundle.writestr(zipfile.ZipInfo(name), content)  # of 1980: the same gaussians, the same file
 
 
@@ -172,7 +217,7 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
     three, largest = three_of_quats(gaussians.quats)
     log_widths = log_scales(gaussians.scales)
     scale_table, color_table = table_of(log_widths), table_of(gaussians.sh[:, 0])
-    files = {
+    contents = {
         "means_l.webp": picture(*(whole & 255).T),
         "means_u.webp": picture(*(whole >> 8).T),
         "scales.webp": picture(*nearest(scale_table, log_widths).T),
@@ -201,15 +246,15 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         rows = -(-len(palette) // _PALETTE_COLUMNS)
         pixels = np.full((rows * _PALETTE_COLUMNS, coefficients, 4), 255, np.uint8)
         pixels[: len(palette), :, :3] = nearest(table, palette).reshape(-1, coefficients, 3)
-        files["shN_centroids.webp"] = _webp(pixels.reshape(rows, _PALETTE_COLUMNS * coefficients, 4))
-        files["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
+        contents["shN_centroids.webp"] = _webp(pixels.reshape(rows, _PALETTE_COLUMNS * coefficients, 4))
+        contents["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
         meta["shN"] = {
             "count": len(palette),
             "bands": gaussians.sh_degree,
             "codebook": table.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-    return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **files}
+    return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **contents}
 
 
 def _palette_size(count: int) -> int:
@@ -224,101 +269,3 @@ def _webp(pixels: NDArray[np.uint8]) -> bytes:
     # exact: without it, colours of pixels whose alpha is 0 are lost.
     Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True, quality=50, method=4)
     return stream.getvalue()
-
-
-class _Pictures:
-    """The pictures of one file, each loaded once it is known to be no larger than the file can justify."""
-
-    def __init__(self, path: Path, load: Load, count: int) -> None:
-        self._path, self._load, self._count = path, load, count
-
-    def pixels(self, name: str) -> NDArray[np.uint8]:
-        """(N, 4) red, green, blue and alpha of the gaussians."""
-        return self._decoded(name, self._count, None).reshape(-1, 4)[: self._count]
-
-    def palette(self, name: str, width: int, rows: int) -> NDArray[np.uint8]:
-        """(rows, width, 3)."""
-        return self._decoded(name, width * rows, width)[:rows, :, :3]
-
-    def _decoded(self, name: str, at_least: int, width: int | None) -> NDArray[np.uint8]:
-        from PIL import Image, UnidentifiedImageError
-
-        content = self._load(name)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter(
-                    "ignore", Image.DecompressionBombWarning
-                )  # what is too large is told below
-                picture = Image.open(io.BytesIO(content), formats=("WEBP", "PNG"))
-            with picture:
-                num_pixels = picture.width * picture.height
-                if num_pixels < at_least or (width is not None and picture.width != width):
-                    shape = f"{at_least} pixels" + ("" if width is None else f" in rows of {width}")
-                    raise problem(
-                        self._path,
-                        f"expected {shape} in {name!a}, got {picture.width} x {picture.height}",
-                    )
-                if num_pixels > _MAX_GAUSSIANS_PER_BYTE * max(len(content), 1024):
-                    raise problem(
-                        self._path,
-                        f"expected a picture of {len(content)} bytes in {name!a}, "
-                        f"got one that claims {num_pixels} pixels",
-                    )
-                return np.asarray(picture.convert("RGBA"))
-        except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
-            raise problem(self._path, f"expected a picture in {name!a}, got {str(error)!a}") from None
-
-
-def _names(node: Node, count: int) -> list[str]:
-    """Names of files beside meta.json; nothing outside of its folder is read."""
-    items = node.items()
-    if len(items) != count:
-        raise node.error(f"{count} file names")
-    for item in items:
-        if item.text() != os.path.basename(item.text()) or "\\" in item.text() or item.text() == "..":
-            raise item.error("the name of a file beside meta.json")
-    return [item.text() for item in items]
-
-
-def _indexed(node: Node, pictures: _Pictures) -> tuple[Floats, NDArray[np.uint8]]:
-    """A table of 256 values, and the pixels that hold indices into it."""
-    fields = node.some_fields(("codebook", "files"))
-    (name,) = _names(fields["files"], 1)
-    return _codebook(fields["codebook"]), pictures.pixels(name)
-
-
-def _codebook(node: Node) -> Floats:
-    entries = node.items()
-    if not 1 <= len(entries) <= 256:
-        raise node.error("1 to 256 numbers")
-    table = np.zeros(256)
-    # Some versions of splat-transform wrote null for the first value, which continues the others.
-    skip = int(entries[0].value is None and len(entries) == 256)
-    table[skip : len(entries)] = [entry.number() for entry in entries[skip:]]
-    if skip:
-        table[0] = table[1] + (table[1] - table[255]) / 255
-    return table
-
-
-def _higher(path: Path, node: Node | None, pictures: _Pictures) -> tuple[int, Callable[[slice], Floats]]:
-    """The degree, and (n, K - 1, 3) coefficients past the first for a block."""
-    if node is None:
-        return 0, lambda rows: np.zeros((rows.stop - rows.start, 0, 3))
-    fields = node.some_fields(("count", "bands", "codebook", "files"))
-    degree, entries = fields["bands"].value, fields["count"].value
-    if degree not in _COEFFICIENTS or isinstance(degree, bool):
-        raise fields["bands"].error("1 to 3")
-    if not isinstance(entries, int) or isinstance(entries, bool) or not 1 <= entries <= 65536:
-        raise fields["count"].error("1 to 65536 entries")
-    coefficients = _COEFFICIENTS[degree]
-    table = _codebook(fields["codebook"])
-    palette_name, labels_name = _names(fields["files"], 2)
-    rows = -(-entries // _PALETTE_COLUMNS)
-    palette = pictures.palette(palette_name, _PALETTE_COLUMNS * coefficients, rows).reshape(
-        -1, coefficients, 3
-    )
-    pixels = pictures.pixels(labels_name)
-    labels = pixels[:, 0] | (pixels[:, 1].astype(np.uint16) << 8)
-    if len(labels) and labels.max() >= len(palette):
-        raise problem(path, f"expected labels below {entries}, got {labels.max()}")
-    return degree, lambda rows: table[palette[labels[rows]]]

@@ -10,7 +10,8 @@ import os
 
 import numpy as np
 
-from v3dg.formats._packing import SH_C0, Floats, assemble, normalised, problem, read_bytes
+from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
+from v3dg.formats._reading import problem, read_bytes
 from v3dg.gaussians import Gaussians
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

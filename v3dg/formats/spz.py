@@ -26,20 +26,17 @@ from v3dg.formats._packing import (
     log_scales,
     normalised,
     opacity_bytes,
-    problem,
     quats_from_three,
-    read_bytes,
     three_of_quats,
     to_integers,
 )
+from v3dg.formats._reading import Claims, least_bytes, problem, telling
 from v3dg.gaussians import Gaussians
 
 _MAGIC = 0x5053474E  # NGSP
 _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
-# What deflate can reach at best. A file that claims more was not made of gaussians.
-_MAX_EXPANSION = 1032
 _MAX_TRAILER = 1 << 20  # bytes after the attributes, which vendors' extensions may take
 _COLOR_SCALE = 0.15
 _SQRT2 = math.sqrt(2.0)
@@ -53,11 +50,12 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         ValueError: It is none, incomplete, or of a higher version or SH degree.
         OSError: It cannot be read.
     """
-    content = read_bytes(path)
+    claims = Claims()
+    content = claims.read(path)
     if content[:2] == b"\x1f\x8b":
-        return _decode(path, *_sections_of_gzip(path, content))
+        return _decode(*_sections_of_gzip(path, content, claims))
     if content[:4] == _MAGIC.to_bytes(4, "little"):
-        return _decode(path, *_sections_of_zstd(path, content))
+        return _decode(*_sections_of_zstd(path, content, claims))
     raise problem(path, f"expected a .spz file, which begins with 1f 8b or NGSP, got {content[:4].hex(' ')}")
 
 
@@ -94,6 +92,8 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
         for block in blocks(len(host)):
             put(_bytes(host.sh[block, 1:] * 128.0 + 128.0))
         file.write(compressor.flush())
+        # Gaussians that are all alike take too little to be believed; gzip passes over zeros at the end.
+        file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
 
 
 def _bytes(values: Floats) -> bytes:
@@ -117,9 +117,7 @@ def _rotation_words(quats: Floats) -> bytes:
     return words.astype("<u4").tobytes()
 
 
-def _decode(
-    path: str | os.PathLike[str], version: int, degree: int, fraction_bits: int, sections: list[memoryview]
-) -> Gaussians:
+def _decode(version: int, degree: int, fraction_bits: int, sections: list[memoryview]) -> Gaussians:
     count = len(sections[1])
 
     def rows(section: memoryview, dtype: str, width: int) -> NDArray[Any]:
@@ -163,7 +161,9 @@ def _quats(rotations: NDArray[Any]) -> Floats:
     return np.roll(quats_from_three(three, words >> 30), 1, axis=1)
 
 
-def _checked_header(path: str | os.PathLike[str], header: bytes) -> tuple[int, int, int, list[int]]:
+def _checked_header(
+    path: str | os.PathLike[str], header: bytes, claims: Claims
+) -> tuple[int, int, int, list[int]]:
     """Version, SH degree, fraction bits, and the bytes of each section."""
     magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack_from(header)
     if magic != _MAGIC:
@@ -174,33 +174,27 @@ def _checked_header(path: str | os.PathLike[str], header: bytes) -> tuple[int, i
         raise problem(path, f"expected SH degree 0 to 3, got {degree}")
     if fraction_bits > 24:
         raise problem(path, f"expected at most 24 fraction bits, got {fraction_bits}")
+    claims.add(path, count)
     widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * ((degree + 1) ** 2 - 1))
     return version, degree, fraction_bits, [count * width for width in widths]
 
 
-def _check_expansion(path: str | os.PathLike[str], expanded: int, content: bytes) -> None:
-    if expanded > _MAX_EXPANSION * len(content):
-        raise problem(
-            path, f"expected the {expanded} bytes that its header promises, got a file of {len(content)}"
-        )
-
-
-def _sections_of_gzip(path: str | os.PathLike[str], content: bytes) -> tuple[int, int, int, list[memoryview]]:
+def _sections_of_gzip(
+    path: str | os.PathLike[str], content: bytes, claims: Claims
+) -> tuple[int, int, int, list[memoryview]]:
     stream = zlib.decompressobj(31)
-    try:
+    with telling(path, "a gzip stream that is not damaged"):
         header = stream.decompress(content, _HEADER.size)
-        if len(header) < _HEADER.size:
-            raise problem(path, f"expected a header of {_HEADER.size} bytes, got {len(header)}")
-        version, degree, fraction_bits, sizes = _checked_header(path, header)
-        if version > 3:
-            raise problem(path, f"expected version 1 to 3 in gzip, got {version}")
-        _check_expansion(path, sum(sizes), content)
-        # One byte more than needed: a length of 0 would mean no limit.
+    if len(header) < _HEADER.size:
+        raise problem(path, f"expected a header of {_HEADER.size} bytes, got {len(header)}")
+    version, degree, fraction_bits, sizes = _checked_header(path, header, claims)
+    if version > 3:
+        raise problem(path, f"expected version 1 to 3 in gzip, got {version}")
+    with telling(path, "a gzip stream that is not damaged"):
+        # More than needed: a length of 0 would mean no limit.
         body = stream.decompress(stream.unconsumed_tail, sum(sizes) + _MAX_TRAILER)
         if not stream.eof and len(body) >= sum(sizes):
             stream.decompress(stream.unconsumed_tail, 1)  # the checksum may be all that is left
-    except zlib.error as error:
-        raise problem(path, f"expected a gzip stream, got one that is damaged: {error}") from None
     if len(body) < sum(sizes) or not stream.eof:
         raise problem(
             path, f"expected a gzip stream that ends after {sum(sizes)} bytes of gaussians, got another"
@@ -208,10 +202,14 @@ def _sections_of_gzip(path: str | os.PathLike[str], content: bytes) -> tuple[int
     return version, degree, fraction_bits, _split(body, sizes)
 
 
-def _sections_of_zstd(path: str | os.PathLike[str], content: bytes) -> tuple[int, int, int, list[memoryview]]:
+def _sections_of_zstd(
+    path: str | os.PathLike[str], content: bytes, claims: Claims
+) -> tuple[int, int, int, list[memoryview]]:
+    import zstandard
+
     if len(content) < _ZSTD_HEADER_BYTES:
         raise problem(path, f"expected a header of {_ZSTD_HEADER_BYTES} bytes, got {len(content)}")
-    version, degree, fraction_bits, sizes = _checked_header(path, content)
+    version, degree, fraction_bits, sizes = _checked_header(path, content, claims)
     if version < 4:
         raise problem(path, f"expected version {version} in a gzip stream, got it outside of one")
     num_streams, table = content[15], int.from_bytes(content[16:20], "little")
@@ -221,7 +219,6 @@ def _sections_of_zstd(path: str | os.PathLike[str], content: bytes) -> tuple[int
         raise problem(
             path, f"expected a table of {len(wanted)} streams after the header, got {num_streams} at {table}"
         )
-    _check_expansion(path, sum(sizes), content)
     sections = []
     for i, size in enumerate(wanted):
         packed, expanded = _STREAM_SIZES.unpack_from(content, table + i * _STREAM_SIZES.size)
@@ -229,24 +226,14 @@ def _sections_of_zstd(path: str | os.PathLike[str], content: bytes) -> tuple[int
             raise problem(
                 path, f"expected {size} bytes in stream {i}, got {expanded} of {packed} in the file"
             )
-        sections.append(_expand(path, content[first : first + packed], size))
+        with telling(path, "a zstd stream that is not damaged"):
+            reader = zstandard.ZstdDecompressor().stream_reader(content[first : first + packed])
+            section = reader.read(size + 1)
+        if len(section) != size:
+            raise problem(path, f"expected {size} bytes in stream {i}, got another number")
+        sections.append(memoryview(section))
         first += packed
     return version, degree, fraction_bits, [*sections, memoryview(b"")][:6]
-
-
-def _expand(path: str | os.PathLike[str], packed: bytes, size: int) -> memoryview:
-    import zstandard
-
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
-            body = reader.read(size + 1)
-    except zstandard.ZstdError as error:
-        raise problem(path, f"expected a zstd stream, got one that is damaged: {error}") from None
-    if len(body) != size:
-        raise problem(
-            path, f"expected {size} bytes in a stream, got {'more' if len(body) > size else len(body)}"
-        )
-    return memoryview(body)
 
 
 def _split(body: bytes, sizes: list[int]) -> list[memoryview]:

@@ -6,14 +6,18 @@ The leaves of a tree say for each level which gaussians of which folder stand fo
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from v3dg._json import Node, parse_json
 from v3dg.formats import sog
-from v3dg.formats._packing import problem, read_bytes
+from v3dg.formats._reading import Claims, problem, telling, whole
 from v3dg.gaussians import Gaussians
+
+_LEVEL = re.compile(r"[0-9]{1,9}")
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
@@ -23,70 +27,93 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         ValueError: It is none, or incomplete.
         OSError: A file cannot be read.
     """
-    path = Path(path)
-    content = read_bytes(path)
-    try:
-        index = Node(parse_json(content.decode("utf-8")), os.fspath(path), "")
-    except ValueError as error:
-        raise problem(path, f"expected JSON, got a file that does not parse: {error}") from None
-    fields = index.some_fields(("filenames", "tree"))
-    if "version" in fields and fields["version"].value != 1:
-        raise fields["version"].error("streamed SOG version 1")
-    names = [_inside(item) for item in fields["filenames"].items()]
-    finest = _finest(fields["tree"], len(names))
-    has_environment = "environment" in fields and fields["environment"].value is not None
-    environment = _inside(fields["environment"]) if has_environment else None
+    path, claims = Path(path), Claims()
+    tree, names, environment = _index(path, claims.read(path))
+    finest = _finest(tree, names)
     if not finest and environment is None:
         raise problem(path, "expected gaussians in the tree, got none")
     parts = []
-    for file, rows in sorted(finest.items()):
-        gaussians = sog.read(path.parent / names[file])
+    for name in filter(finest.__contains__, dict.fromkeys(names)):  # a name that is there twice is read once
+        rows = finest[name]
+        gaussians = sog.read(path.parent / name, claims)
         # No more than it has: else a small file could ask for any number.
         if sum(len(r) for r in rows) > len(gaussians) or max(r.stop for r in rows) > len(gaussians):
-            raise problem(path, f"expected at most {len(gaussians)} gaussians of {names[file]!a}, got more")
+            raise problem(path, f"expected at most {len(gaussians)} gaussians of {str(name)!a}, got more")
         parts.append(gaussians.subset(np.concatenate([np.arange(r.start, r.stop) for r in rows])))
     if environment is not None:
-        parts.append(sog.read(path.parent / environment))
+        parts.append(sog.read(path.parent / environment, claims))
     degrees = sorted({part.sh_degree for part in parts})
     if len(degrees) > 1:
         raise problem(path, f"expected one SH degree in all folders, got {degrees}")
     return Gaussians.concatenate(parts)
 
 
-def _inside(node: Node) -> str:
+def files(path: Path) -> list[Path]:
+    """The index and the files of all levels and of the environment, as far as they are there."""
+    _, names, environment = _index(path, Claims().read(path))
+    parts = [path.parent / name for name in dict.fromkeys([*names, environment]) if name is not None]
+    return [path, *(file for part in parts if part.exists() for file in sog.files(part))]
+
+
+def _index(path: Path, text: bytes) -> tuple[Node, list[PurePosixPath], PurePosixPath | None]:
+    """The tree, the names of the files, and of the environment."""
+    with telling(path, "JSON"):
+        index = Node(parse_json(text.decode("utf-8")), os.fspath(path), "")
+    if index.has("version") and index.child("version").value != 1:
+        raise index.child("version").error("streamed SOG version 1")
+    names = [_inside(name) for name in _each(_field(index, "filenames"))]
+    has_environment = index.has("environment") and index.child("environment").value is not None
+    environment = _inside(index.child("environment")) if has_environment else None
+    return _field(index, "tree"), names, environment
+
+
+def _field(node: Node, name: str) -> Node:
+    if not isinstance(node.value, dict):
+        raise node.error("an object")
+    if name not in node.value:
+        raise node.problem(f"expected the field {name}, got an object without it")
+    return node.child(name)
+
+
+def _each(node: Node) -> Iterator[Node]:
+    """An array's values, one at a time: the places of all, in a deep tree, take far more than the file."""
+    if not isinstance(node.value, list):
+        raise node.error("an array")
+    return (Node(value, node.file, f"{node.path}[{i}]") for i, value in enumerate(node.value))
+
+
+def _inside(node: Node) -> PurePosixPath:
     """The path of a file in the folder of the index, or below it."""
-    name = node.text()
-    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\\" in name:
+    path = PurePosixPath(node.text())
+    if path.is_absolute() or ".." in path.parts or "\\" in node.text():
         raise node.error("a path below that of lod-meta.json")
-    return name
+    return path
 
 
-def _finest(tree: Node, num_files: int) -> dict[int, list[range]]:
+def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[range]]:
     """For each file, the runs of gaussians that are the finest level of a leaf."""
-    found: dict[int, list[range]] = {}
-    todo = [tree]
+    found: dict[PurePosixPath, list[range]] = {}
+    todo = [iter([tree])]
     while todo:
-        fields = todo.pop().some_fields(())
-        if "children" in fields:
-            todo += fields["children"].items()
-        if "lods" not in fields:
+        node = next(todo[-1], None)
+        if node is None:
+            todo.pop()
             continue
-        levels = fields["lods"].some_fields(())
-        if not all(level.isdecimal() for level in levels):
-            raise fields["lods"].error("levels by number")
-        used = [levels[level] for level in sorted(levels, key=int)]
-        for lod in used:
-            run = lod.some_fields(("file", "offset", "count"))
-            file, offset, count = (_whole(run[name]) for name in ("file", "offset", "count"))
-            if file >= num_files:
-                raise run["file"].error(f"0 to {num_files - 1}")
+        if not isinstance(node.value, dict):
+            raise node.error("an object")
+        if node.has("children"):
+            todo.append(_each(node.child("children")))
+        if not node.has("lods"):
+            continue
+        levels = node.child("lods")
+        if not isinstance(levels.value, dict) or not all(map(_LEVEL.fullmatch, levels.value)):
+            raise levels.error("levels by number")
+        for level in sorted(levels.value, key=int):
+            lod = levels.child(level)
+            file = whole(_field(lod, "file"), f"0 to {len(names) - 1}", 0, len(names) - 1)
+            run = (_field(lod, name) for name in ("offset", "count"))
+            offset, count = (whole(number, "a whole number, 0 or more", 0, 1 << 32) for number in run)
             if count:
-                found.setdefault(file, []).append(range(offset, offset + count))
+                found.setdefault(names[file], []).append(range(offset, offset + count))
                 break
     return found
-
-
-def _whole(node: Node) -> int:
-    if not isinstance(node.value, int) or isinstance(node.value, bool) or not 0 <= node.value < 1 << 32:
-        raise node.error("a whole number, 0 or more")
-    return node.value
