@@ -77,7 +77,7 @@ def examine(asset: Gaussians) -> Findings:
     finite = {
         name: isfinite(getattr(asset, name)) for name in ("means", "quats", "scales", "opacities", "sh")
     }
-    masks: dict[str, Any] = {f"{name}_not_finite": ~_all(good) for name, good in finite.items()}
+    masks: dict[str, Any] = {f"{name}_not_finite": _any(~good) for name, good in finite.items()}
     too_far, too_wide = (finite[name] & (abs(getattr(asset, name)) > LARGEST) for name in ("means", "scales"))
     masks["too_large"] = _any(too_far) | _any(too_wide)
     masks["negative_scale"] = _any(asset.scales < 0)
@@ -111,10 +111,6 @@ def ball_of_most(points: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
-def _all(values: Array) -> Any:
-    """Whether all of a row is true, for each row of an array of any dimensions."""
-    return values.reshape(len(values), math.prod(values.shape[1:])).all(axis=1)
-
-
 def _any(values: Array) -> Any:
-    return ~_all(~values)
+    """Whether any of a row is true, for each row of an array of any dimensions."""
+    return values.reshape(len(values), math.prod(values.shape[1:])).any(axis=1)

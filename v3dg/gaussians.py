@@ -115,12 +115,10 @@ class Gaussians:
         if not _is_tensor(self.means):
             rows = cast(Any, index).cpu().numpy() if _is_tensor(index) else index
             return self._map(lambda array: np.ascontiguousarray(array[rows]))
-        import torch
-
-        if isinstance(index, np.ndarray):
-            index = torch.from_numpy(np.ascontiguousarray(index))
         if not isinstance(index, slice):
-            index = index.to(self.means.device)
+            import torch
+
+            index = torch.as_tensor(index, device=self.means.device)
             if index.is_cuda:
                 _check_range(index, len(self))
         return self._map(lambda tensor: tensor[index].contiguous())
@@ -209,9 +207,9 @@ def _checked_index(index: Any) -> Array:
         )
     if array.ndim != 1:
         raise ValueError(f"index: expected one dimension, got shape {tuple(array.shape)}")
-    if dtype == "bool":
-        return array
-    return array.long() if _is_tensor(array) else array.astype(np.int64)
+    if _is_tensor(array):
+        return array if dtype == "bool" else array.long()
+    return np.ascontiguousarray(array, bool if dtype == "bool" else np.int64)
 
 
 def _check_range(index: Any, count: int) -> None:

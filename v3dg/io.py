@@ -72,7 +72,7 @@ def read_asset(path: Path) -> Gaussians:
 
 
 def asset_bytes(path: Path) -> int:
-    """Bytes on disk of an asset that can be read: of all files that it names and that are there, once each."""
+    """Bytes on disk of an asset that can be read: of all files that it names and that are there."""
     files = set(_by_name(path, _FILES)(pathlib.Path(path)))
     return sum(file.stat().st_size for file in files if file.exists())
 

@@ -8,9 +8,7 @@ that it names is imported or called, and only the numbers of the gaussians are r
 
 from __future__ import annotations
 
-import io
 import math
-import os
 import pickletools
 from typing import Any, NamedTuple
 
@@ -18,18 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg.formats._packing import DEGREES, Floats, assemble, normalised
-from v3dg.formats._reading import Archive, Claims, problem, telling
+from v3dg.formats._reading import Archive, Claims, Path, check, telling
 from v3dg.gaussians import Gaussians
 
-# Field: its name in gsplat's checkpoints, in nerfstudio's.
-_FIELDS = {
-    "means": ("means", "means"),
-    "scales": ("scales", "scales"),
-    "quats": ("quats", "quats"),
-    "opacities": ("opacities", "opacities"),
-    "sh0": ("sh0", "features_dc"),
-    "shN": ("shN", "features_rest"),
-}
+_FIELDS = ("means", "scales", "quats", "opacities", "sh0", "shN")
+_NERFSTUDIO = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 _NERFSTUDIO_PREFIX = "_model.gauss_params."
 _MAX_PICKLE = 1 << 20  # bytes; trainers' have far less, and each byte can be an object
 _MAX_DIMENSIONS = 8
@@ -55,23 +46,17 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
 
-def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read the gaussians of a checkpoint.
-
-    Raises:
-        ValueError: It is none of the two, damaged, big-endian, or its pickle wants more than tensors and
-            plain values.
-        OSError: It cannot be read.
-    """
+def read(path: Path) -> Gaussians:
+    """Read the gaussians of a checkpoint."""
     claims = Claims()
     with claims.open(path) as file:
         archive = Archive(path, file)
         root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
         pickle = archive.read(f"{root}data.pkl")
-        if len(pickle) > _MAX_PICKLE:
-            raise problem(path, f"expected a pickle of at most {_MAX_PICKLE} bytes, got {len(pickle)}")
-        if f"{root}byteorder" in archive.names and archive.read(f"{root}byteorder") != b"little":
-            raise problem(path, "expected little-endian numbers, got a checkpoint of another byte order")
+        size = len(pickle)
+        check(path, size <= _MAX_PICKLE, f"a pickle of at most {_MAX_PICKLE} bytes, got {size}")
+        is_little = f"{root}byteorder" not in archive.names or archive.read(f"{root}byteorder") == b"little"
+        check(path, is_little, "little-endian numbers, got a checkpoint of another byte order")
         with telling(path, "a checkpoint of tensors and plain values"):
             content = _followed(pickle)
         fields = _fields(path, content)
@@ -79,12 +64,11 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         arrays = {name: _array(path, name, field, archive, root) for name, field in fields.items()}
     count = len(arrays["means"])
     num_higher = arrays["shN"].size // max(1, 3 * count)
-    if num_higher not in DEGREES:
-        raise problem(path, f"expected SH degree 0 to 3, got shN of shape {fields['shN'].shape}")
+    check(path, num_higher in DEGREES, f"SH degree 0 to 3, got shN of shape {fields['shN'].shape}")
     wanted = ((count, 3), (count, 3), (count, 4), (count,), (count, 1, 3), (count, num_higher, 3))
     for name, shape in zip(_FIELDS, wanted, strict=True):
-        if arrays[name].size != math.prod(shape):
-            raise problem(path, f"expected {name} of shape {shape}, got {fields[name].shape}")
+        fits = arrays[name].size == math.prod(shape)
+        check(path, fits, f"{name} of shape {shape}, got {fields[name].shape}")
         arrays[name] = arrays[name].reshape(shape)
 
     def decode(rows: slice) -> tuple[Floats, ...]:
@@ -101,39 +85,33 @@ def _doubles(values: NDArray[Any]) -> Floats:
     return values.astype(np.float64)
 
 
-def _fields(path: str | os.PathLike[str], content: Any) -> dict[str, _Tensor]:
+def _fields(path: Path, content: Any) -> dict[str, _Tensor]:
     found: dict[str, Any] = content if isinstance(content, dict) else {}
+    keys = ", ".join(f"{key[:40]!a}" for key in list(found)[:6]) or "none"
     if isinstance(found.get("splats"), dict):
-        fields = {name: found["splats"].get(key) for name, (key, _) in _FIELDS.items()}
-    elif isinstance(found.get("pipeline"), dict):
-        fields = {name: found["pipeline"].get(_NERFSTUDIO_PREFIX + key) for name, (_, key) in _FIELDS.items()}
+        values = [found["splats"].get(name) for name in _FIELDS]
     else:
-        keys = ", ".join(f"{key[:40]!a}" for key in list(found)[:6]) or "none"
-        raise problem(
-            path, f"expected 'splats' (gsplat) or 'pipeline' (nerfstudio) in the checkpoint, got {keys}"
-        )
-    for name, tensor in fields.items():
-        if not isinstance(tensor, _Tensor) or not tensor.shape:
-            kind = f"{tensor.name[:60]!a}" if isinstance(tensor, _Named) else type(tensor).__name__
-            raise problem(path, f"expected a tensor of floats {name} in the checkpoint, got {kind}")
-    return fields
+        is_known = isinstance(found.get("pipeline"), dict)
+        check(path, is_known, f"'splats' (gsplat) or 'pipeline' (nerfstudio), got {keys}")
+        values = [found["pipeline"].get(_NERFSTUDIO_PREFIX + name) for name in _NERFSTUDIO]
+    for field, tensor in zip(_FIELDS, values, strict=True):
+        kind = f"{tensor.name!a}" if isinstance(tensor, _Named) else type(tensor).__name__
+        is_tensor = isinstance(tensor, _Tensor) and tensor.shape
+        check(path, is_tensor, f"a tensor of floats {field} in the checkpoint, got {kind}")
+    return dict(zip(_FIELDS, values, strict=True))
 
 
-def _array(
-    path: str | os.PathLike[str], name: str, tensor: _Tensor, archive: Archive, root: str
-) -> NDArray[Any]:
+def _array(path: Path, name: str, tensor: _Tensor, archive: Archive, root: str) -> NDArray[Any]:
     """The numbers of a tensor, which must all be in the file: none stands for many."""
     steps = zip(tensor.shape, tensor.strides, strict=True)
     last = tensor.offset + sum((size - 1) * step for size, step in steps)
     count, stored_count = math.prod(tensor.shape), tensor.num_stored
-    if count > stored_count or (count and last >= stored_count):
-        raise problem(
-            path, f"expected {name} within the {stored_count} numbers of its storage, got {tensor[3:]}"
-        )
+    is_inside = count <= stored_count and (not count or last < stored_count)
+    check(path, is_inside, f"{name} within the {stored_count} numbers of its storage, got {tensor[3:]}")
     dtype = np.dtype(_TYPES[tensor.kind])
     content = archive.read(f"{root}data/{tensor.key}")
-    if len(content) != stored_count * dtype.itemsize:
-        raise problem(path, f"expected {stored_count * dtype.itemsize} bytes of {name}, got {len(content)}")
+    size = stored_count * dtype.itemsize
+    check(path, len(content) == size, f"{size} bytes of {name}, got {len(content)}")
     stored = np.frombuffer(content, dtype)[tensor.offset :]
     strides = [step * dtype.itemsize for step in tensor.strides]
     return np.lib.stride_tricks.as_strided(stored, tensor.shape, strides, writeable=False)
@@ -155,7 +133,7 @@ def _followed(pickle: bytes) -> Any:
         return values
 
     argument: Any
-    for opcode, argument, _ in pickletools.genops(io.BytesIO(pickle)):
+    for opcode, argument, _ in pickletools.genops(pickle):
         match opcode.name:
             case "PROTO" | "BINPERSID":
                 pass  # the tuple that names a storage stands for it
@@ -180,9 +158,8 @@ def _followed(pickle: bytes) -> Any:
                 stack[-size:] = [tuple(stack[-size:])]
             case "SETITEM" | "SETITEMS":
                 items = above_mark() if opcode.name == "SETITEMS" else [stack.pop(-2), stack.pop()]
-                if isinstance(stack[-1], dict):
-                    pairs = zip(items[::2], items[1::2], strict=True)
-                    stack[-1].update((key, value) for key, value in pairs if isinstance(key, str))
+                pairs = zip(items[::2], items[1::2], strict=True)
+                stack[-1].update((key, value) for key, value in pairs if isinstance(key, str))
             case "APPEND" | "BUILD":
                 stack.pop()
             case "APPENDS":
@@ -201,7 +178,7 @@ def _followed(pickle: bytes) -> Any:
 
 
 def _called(name: str, arguments: tuple[Any, ...]) -> Any:
-    if name == "collections.OrderedDict":
+    if name.startswith("collections."):
         return {}
     if name == "torch._utils._rebuild_parameter":
         return arguments[0]
@@ -209,11 +186,9 @@ def _called(name: str, arguments: tuple[Any, ...]) -> Any:
         return _Named(name)
     (_, kind, key, _, num_stored), offset, shape, strides = arguments[:4]
     kind = kind.name.removeprefix("torch.")
-    # Dimensions first: many calls may share what is long.
-    if not isinstance(key, str) or not len(shape) == len(strides) <= _MAX_DIMENSIONS:
-        raise ValueError("a tensor of another shape")
-    if not all(
-        type(number) is int and 0 <= number < 1 << 48 for number in (num_stored, offset, *shape, *strides)
-    ):
+    # No more of them than may be: many calls can share what is long.
+    numbers = (num_stored, offset, *shape[:_MAX_DIMENSIONS], *strides[:_MAX_DIMENSIONS])
+    is_plain = all(type(number) is int and 0 <= number < 1 << 48 for number in numbers)
+    if not is_plain or not isinstance(key, str) or not len(shape) == len(strides) <= _MAX_DIMENSIONS:
         raise ValueError("a tensor of another shape")
     return _Tensor(kind, key, num_stored, offset, shape, strides) if kind in _TYPES else _Named(kind)

@@ -8,7 +8,7 @@ coefficient, channel by channel, for -4 to 4. See docs/formats.md.
 
 from __future__ import annotations
 
-import os
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from v3dg.formats._packing import (
     three_of_quats,
     to_integers,
 )
-from v3dg.formats._reading import problem, read_bytes
+from v3dg.formats._reading import Path, check, read_bytes
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
@@ -44,7 +44,7 @@ _THREE_SHIFT, _THREE_MAX = (20, 10, 0), (1023, 1023, 1023)
 _RGBA_SHIFT, _RGBA_MAX = (24, 16, 8, 0), (255, 255, 255, 255)
 
 
-def is_compressed(path: str | os.PathLike[str]) -> bool:
+def is_compressed(path: Path) -> bool:
     """Whether a `.ply` has packed positions. What is wrong with other files is for their reader to say."""
     try:
         descriptor = _files.open_regular(path)
@@ -55,24 +55,18 @@ def is_compressed(path: str | os.PathLike[str]) -> bool:
     return any(line.split()[-1:] == [b"packed_position"] for line in header.splitlines())
 
 
-def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a `.compressed.ply` file.
-
-    Raises:
-        ValueError: It is none, or incomplete; says what was expected.
-        OSError: It cannot be read.
-    """
-    content = read_bytes(path)
-    elements = _elements(path, content)
+def read(path: Path) -> Gaussians:
+    """Read a `.compressed.ply` file."""
+    elements = _elements(path, read_bytes(path))
     for name in ("chunk", "vertex"):
-        if name not in elements:
-            raise problem(path, f"expected the elements chunk and vertex of a compressed .ply, got no {name}")
+        is_there = name in elements
+        check(path, is_there, f"the elements chunk and vertex of a compressed .ply, got no {name}")
     chunk, vertex, sh = elements["chunk"], elements["vertex"], elements.get("sh")
     count = len(vertex)
     ranges = _ranges(path, chunk)
-    _require(path, "vertex", vertex, dict.fromkeys(_PACKED, "<u4"))
-    if len(chunk) * _CHUNK < count:
-        raise problem(path, f"expected {-(-count // _CHUNK)} chunks for {count} gaussians, got {len(chunk)}")
+    _require(path, "vertex", vertex, _PACKED, "uint")
+    num_chunks = -(-count // _CHUNK)
+    check(path, len(chunk) >= num_chunks, f"{num_chunks} chunks for {count} gaussians, got {len(chunk)}")
     rest, degree = _rest(path, sh, count)
 
     def decode(rows: slice) -> tuple[Floats, ...]:
@@ -96,13 +90,8 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
     return assemble(count, degree, decode)
 
 
-def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a `.compressed.ply` file; gaussians are put in an order that keeps neighbours together.
-
-    Raises:
-        ValueError: A value that the format cannot hold.
-        OSError: It cannot be written.
-    """
+def write(path: Path, gaussians: Gaussians) -> None:
+    """Write a `.compressed.ply` file; gaussians are put in an order that keeps neighbours together."""
     host = check_writable(gaussians)
     order = morton_order(host.means)
     count, num_rest = len(host), 3 * (host.sh.shape[1] - 1)
@@ -113,30 +102,23 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
         "color": host.sh[order, 0].astype(np.float64) * SH_C0 + 0.5,
     }
     starts = np.arange(num_chunks) * _CHUNK
-    lows, highs, fractions = [], [], {}
+    ranges, fractions = [], {}
     for kind, array in values.items():
-        if not count:
-            continue
         # Rounded first, so that writer and reader mean the same range.
         low = np.minimum.reduceat(array, starts).astype(np.float32)
         high = np.maximum.reduceat(array, starts).astype(np.float32)
-        lows.append(low)
-        highs.append(high)
+        ranges += [low, high]
         chunks = np.arange(count) // _CHUNK
         extent = np.where(high > low, high.astype(np.float64) - low, 1.0)[chunks]
         fractions[kind] = np.clip((array - low[chunks]) / extent, 0.0, 1.0)
     header = ["ply", "format binary_little_endian 1.0", "comment made by v3dg", f"element chunk {num_chunks}"]
-    header += [
-        f"property float {name}" for kind in _RANGES for name in (*_names("min", kind), *_names("max", kind))
-    ]
+    header += [f"property float {name}" for kind in _RANGES for name in _range_names(kind)]
     header += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED)]
     if num_rest:
         header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(num_rest))]
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode())
-        pairs = [array for pair in zip(lows, highs, strict=True) for array in pair]
-        if pairs:
-            file.write(np.concatenate(pairs, axis=1).astype("<f4").tobytes())
+        file.write(np.concatenate(ranges, axis=1).astype("<f4").tobytes())
         for block in blocks(count):
             rows = order[block]
             three, largest = three_of_quats(host.quats[rows])
@@ -170,89 +152,75 @@ def _word(fractions: Floats, shifts: tuple[int, ...], largest: tuple[int, ...]) 
     return word
 
 
-def _names(end: str, kind: str) -> list[str]:
-    return [f"{end}_{'' if kind == 'color' else kind}{axis}" for axis in _RANGES[kind]]
+def _range_names(kind: str) -> list[str]:
+    prefix = "" if kind == "color" else kind
+    return [f"{end}_{prefix}{axis}" for end in ("min", "max") for axis in _RANGES[kind]]
 
 
-def _ranges(path: str | os.PathLike[str], chunk: NDArray[Any]) -> dict[str, tuple[Floats, Floats]]:
+def _ranges(path: Path, chunk: NDArray[Any]) -> dict[str, tuple[Floats, Floats]]:
     """Lowest and highest of each chunk, (C, 3) each; files without ranges of colour mean 0 to 1."""
-    colors = {*_names("min", "color"), *_names("max", "color")}
-    kinds = [kind for kind in _RANGES if kind != "color" or colors & set(chunk.dtype.names or ())]
     ranges: dict[str, tuple[Floats, Floats]] = {
         "color": (np.zeros((len(chunk), 3)), np.ones((len(chunk), 3)))
     }
-    for kind in kinds:
-        _require(path, "chunk", chunk, dict.fromkeys([*_names("min", kind), *_names("max", kind)], "<f4"))
-        low, high = (np.stack([chunk[name] for name in _names(end, kind)], axis=1) for end in ("min", "max"))
-        with np.errstate(invalid="ignore"):  # signalling NaN
-            ranges[kind] = (low.astype(np.float64), high.astype(np.float64))
+    for kind in _RANGES:
+        names = _range_names(kind)
+        if kind != "color" or set(names) & set(chunk.dtype.names or ()):
+            _require(path, "chunk", chunk, names, "float")
+            with np.errstate(invalid="ignore"):  # signalling NaN
+                values = np.stack([chunk[name] for name in names], axis=1).astype(np.float64)
+            ranges[kind] = (values[:, :3], values[:, 3:])
     return ranges
 
 
-def _rest(path: str | os.PathLike[str], sh: NDArray[Any] | None, count: int) -> tuple[NDArray[Any], int]:
+def _rest(path: Path, sh: NDArray[Any] | None, count: int) -> tuple[NDArray[Any], int]:
     """(N, 3 K) bytes, channel by channel, and the degree."""
     if sh is None:
         return np.zeros((count, 0), np.uint8), 0
     names = [f"f_rest_{i}" for i in range(len(sh.dtype.names or ()))]
-    degree = DEGREES.get(len(names) // 3) if len(names) % 3 == 0 else None
-    if degree is None:
-        raise problem(
-            path, f"expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {len(names)}"
-        )
-    _require(path, "sh", sh, dict.fromkeys(names, "u1"))
-    if len(sh) != count:
-        raise problem(path, f"expected {count} rows of element sh like vertex, got {len(sh)}")
+    degree = DEGREES.get(len(names) // 3, -1) if len(names) % 3 == 0 else -1
+    check(path, degree >= 0, f"0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {len(names)}")
+    _require(path, "sh", sh, names, "uchar")
+    check(path, len(sh) == count, f"{count} rows of element sh like vertex, got {len(sh)}")
     return np.stack([sh[name] for name in names], axis=1), degree
 
 
-def _require(path: str | os.PathLike[str], element: str, rows: NDArray[Any], types: dict[str, str]) -> None:
-    for name, dtype in types.items():
-        if name not in (rows.dtype.names or ()) or rows.dtype[name] != np.dtype(dtype):
-            kind = next(ply for ply, numpy in _PLY_TYPES.items() if numpy == dtype)
-            raise problem(path, f"expected 'property {kind} {name}' in element {element}, got none")
+def _require(path: Path, element: str, rows: NDArray[Any], names: Sequence[str], kind: str) -> None:
+    for name in names:
+        is_there = name in (rows.dtype.names or ()) and rows.dtype[name] == np.dtype(_PLY_TYPES[kind])
+        check(path, is_there, f"'property {kind} {name}' in element {element}, got none")
 
 
-def _elements(path: str | os.PathLike[str], content: bytes) -> dict[str, NDArray[Any]]:
+def _elements(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
     """The rows of each element, as the header lists them."""
     head, mark, _ = content[:_MAX_HEADER].partition(b"end_header\n")
     if not mark:
         head, mark, _ = content[:_MAX_HEADER].partition(b"end_header\r\n")
-    if not mark:
-        raise problem(path, f"expected end_header within the first {_MAX_HEADER} bytes, got none")
+    check(path, mark, f"end_header within the first {_MAX_HEADER} bytes, got none")
     lines = head.decode("ascii", "replace").splitlines()
-    if lines[:1] != ["ply"]:
-        raise problem(path, "expected a first line 'ply'")
-    if "format binary_little_endian 1.0" not in lines:
-        raise problem(
-            path, "expected 'format binary_little_endian 1.0' in a compressed .ply, got another format"
-        )
+    check(path, lines[:1] == ["ply"], "a first line 'ply'")
+    wanted = "format binary_little_endian 1.0"
+    check(path, wanted in lines, f"{wanted!r} in a compressed .ply, got another format")
     counts: dict[str, int] = {}
     fields: dict[str, list[tuple[str, str]]] = {}
     for line in lines:
-        words = line.split()
+        words, shown = line.split(), f"{line[:60]!a}"
         if words[:1] == ["element"]:
-            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 12 or words[1] in counts:
-                raise problem(path, f"expected 'element NAME COUNT', each name once, got {line[:60]!a}")
+            is_count = len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 12
+            check(path, is_count and words[1] not in counts, f"'element NAME COUNT', each once, got {shown}")
             counts[words[1]], fields[words[1]] = int(words[2]), []
         elif words[:1] == ["property"]:
-            if len(words) != 3 or words[1] not in _PLY_TYPES or not counts:
-                raise problem(path, f"expected 'property float|uint|uchar NAME', got {line[:60]!a}")
+            is_known = len(words) == 3 and words[1] in _PLY_TYPES and counts
+            check(path, is_known, f"'property float|uint|uchar NAME', got {shown}")
             fields[list(counts)[-1]].append((words[2], _PLY_TYPES[words[1]]))
     rows: dict[str, NDArray[Any]] = {}
     offset = len(head) + len(mark)
     for name, count in counts.items():
-        names = [field for field, _ in fields[name]]
-        if not names or len(set(names)) < len(names):
-            raise problem(path, f"expected properties of element {name[:40]!a}, each once")
-        dtype = np.dtype(fields[name])
-        if count * dtype.itemsize > len(content) - offset:
-            raise problem(
-                path,
-                f"expected {count} rows of element {name[:40]!a} with {dtype.itemsize} bytes each, "
-                f"got {len(content) - offset} bytes",
-            )
+        names, shown = dict(fields[name]), f"element {name[:40]!a}"
+        check(path, 0 < len(names) == len(fields[name]), f"properties of {shown}, each once")
+        dtype, left = np.dtype(fields[name]), len(content) - offset
+        wanted = f"{count} rows of {shown} with {dtype.itemsize} bytes each"
+        check(path, count * dtype.itemsize <= left, f"{wanted}, got {left} bytes")
         rows[name] = np.frombuffer(content, dtype, count, offset)
-        offset += count * dtype.itemsize
-    if offset != len(content):
-        raise problem(path, f"expected the end of the file after {offset} bytes, got {len(content)}")
+        offset += rows[name].nbytes
+    check(path, offset == len(content), f"the end of the file after {offset} bytes, got {len(content)}")
     return rows

@@ -34,7 +34,7 @@ from v3dg.formats._packing import (
     three_of_quats,
     to_integers,
 )
-from v3dg.formats._reading import Archive, Claims, least_bytes, problem, telling, whole
+from v3dg.formats._reading import Archive, Claims, check, least_bytes, telling, whole
 from v3dg.gaussians import Gaussians
 
 _MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
@@ -50,12 +50,7 @@ _PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
 
 
 def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussians:
-    """Read a `.sog` file, or the `meta.json` of a folder with its pictures.
-
-    Raises:
-        ValueError: It is none, incomplete, or of another version than 2.
-        OSError: It cannot be read.
-    """
+    """Read a `.sog` file, or the `meta.json` of a folder with its pictures."""
     path, claims = Path(path), claims or Claims()
     if path.suffix == ".json":
         text = claims.read(path)
@@ -90,8 +85,8 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     scales, quats, color = (pixels(names[part][0]) for part in ("scales", "quats", "sh0"))
     scale_table, color_table = _codebook(meta["scales"]), _codebook(meta["sh0"])
     tags = quats[:, 3]
-    if count and tags.min() < 252:
-        raise problem(path, f"expected quaternions tagged 252 to 255, got {tags.min()}")
+    smallest = tags.min(initial=255)
+    check(path, smallest >= 252, f"quaternions tagged 252 to 255, got {smallest}")
     degree = 0
     table: Floats = np.zeros(1)
     palette: NDArray[Any] = np.zeros((1, 0, 3), np.uint8)
@@ -106,12 +101,12 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
         palette = centroids[:num_rows, :, :3].reshape(-1, _COEFFICIENTS[degree], 3)
         places = pixels(names["shN"][1])
         labels = places[:, 0] | (places[:, 1].astype(np.uint16) << 8)
-        if count and labels.max() >= len(palette):
-            raise problem(path, f"expected labels below {num_entries}, got {labels.max()}")
+        largest = labels.max(initial=0)
+        check(path, largest < len(palette), f"labels below {num_entries}, got {largest}")
 
     def decode(rows: slice) -> tuple[Floats, ...]:
-        whole = lower[rows, :3] | (upper[rows, :3].astype(np.uint16) << 8)
-        logs = np.clip(low + (high - low) * (whole / 65535.0), -_MAX_LOG, _MAX_LOG)
+        steps = lower[rows, :3] | (upper[rows, :3].astype(np.uint16) << 8)
+        logs = np.clip(low + (high - low) * (steps / 65535.0), -_MAX_LOG, _MAX_LOG)
         means = np.sign(logs) * np.expm1(np.abs(logs))
         three = (quats[rows, :3] / 255.0 * 2.0 - 1.0) / _SQRT2
         widths = np.exp(scale_table[scales[rows, :3]])
@@ -124,30 +119,31 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
 def _meta(path: Path, text: bytes) -> dict[str, Node]:
     with telling(path, "JSON in meta.json"):
         document = parse_json(text.decode("utf-8"))
-    meta = Node(document, os.fspath(path), "").some_fields(())
-    if "version" not in meta:
-        raise problem(
-            path, "expected SOG version 2, got an older file; convert it with splat-transform first"
-        )
-    if meta["version"].value != 2:
-        raise meta["version"].error("SOG version 2")
-    return Node(document, os.fspath(path), "").some_fields(("count", "means", "scales", "quats", "sh0"))
+    meta = Node(document, os.fspath(path), "")
+    advice = "convert it with splat-transform first"
+    check(path, "version" in meta.some_fields(()), f"SOG version 2, got an older file; {advice}")
+    if meta.value["version"] != 2:
+        raise meta.child("version").error("SOG version 2")
+    return meta.some_fields(("count", "means", "scales", "quats", "sh0"))
 
 
 def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
     """Names of the pictures of each part, beside meta.json; nothing outside of its folder is read."""
     names = {}
     for part, count in _PARTS.items():
-        if part not in meta:
-            continue
-        node = meta[part].some_fields(("files",))["files"]
-        if not isinstance(node.value, list) or len(node.value) != count:
-            raise node.error(f"{count} file names")
-        for item in node.items():
-            if item.text() != os.path.basename(item.text()) or "\\" in item.text() or item.text() == "..":
-                raise item.error("the name of a file beside meta.json")
-        names[part] = [item.text() for item in node.items()]
+        if part in meta:
+            node = meta[part].some_fields(("files",))["files"]
+            if not isinstance(node.value, list) or len(node.value) != count:
+                raise node.error(f"{count} file names")
+            names[part] = [_beside(item) for item in node.items()]
     return names
+
+
+def _beside(node: Node) -> str:
+    name = node.text()
+    if name != os.path.basename(name) or "\\" in name or name == "..":
+        raise node.error("the name of a file beside meta.json")
+    return name
 
 
 def _codebook(part: Node) -> Floats:
@@ -156,13 +152,12 @@ def _codebook(part: Node) -> Floats:
     if not isinstance(node.value, list) or not 1 <= len(node.value) <= 256:
         raise node.error("1 to 256 numbers")
     entries = node.items()
-    table = np.zeros(256)
     # Some versions of splat-transform wrote null for the first value, which continues the others.
-    skip = int(entries[0].value is None and len(entries) == 256)
-    table[skip : len(entries)] = [entry.number() for entry in entries[skip:]]
-    if skip:
-        table[0] = table[1] + (table[1] / 255 - table[255] / 255)
-    return table
+    has_null = entries[0].value is None and len(entries) == 256
+    values = [entry.number() for entry in entries[has_null:]]
+    if has_null:
+        values.insert(0, values[0] + (values[0] / 255 - values[-1] / 255))
+    return np.pad(values, (0, 256 - len(values)))
 
 
 def _decoded(
@@ -173,21 +168,16 @@ def _decoded(
 
     with telling(path, f"a WebP picture in {name!a}"):
         picture = WebPImageFile(io.BytesIO(content))
-    got = picture.width * picture.height
-    if width not in (None, picture.width) or not num_pixels <= got <= _SPARE * num_pixels + _FREE_PIXELS:
-        shape = f"{num_pixels} pixels" + ("" if width is None else f" in rows of {width}")
-        raise problem(path, f"expected {shape} in {name!a}, got {picture.width} x {picture.height}")
+    is_large_enough = num_pixels <= picture.width * picture.height <= _SPARE * num_pixels + _FREE_PIXELS
+    fits = is_large_enough and width in (None, picture.width)
+    shape = f"{num_pixels} pixels" + ("" if width is None else f" in rows of {width}")
+    check(path, fits, f"{shape} in {name!a}, got {picture.width} x {picture.height}")
     with telling(path, f"a WebP picture in {name!a}"), picture:
         return np.asarray(picture.convert("RGBA"))
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a `.sog` file; gaussians are put in an order that keeps neighbours together.
-
-    Raises:
-        ValueError: A value that the format cannot hold.
-        OSError: It cannot be written.
-    """
+    """Write a `.sog` file; gaussians are put in an order that keeps neighbours together."""
     host = check_writable(gaussians)
     contents = encode(host.subset(morton_order(host.means)))
     # Gaussians that are all alike take too little to be believed.
@@ -228,20 +218,16 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "version": 2,
         "asset": {"generator": f"v3dg {__version__}"},
         "count": count,
-        "means": {
-            "mins": low.tolist(),
-            "maxs": high.tolist(),
-            "files": ["means_l.webp", "means_u.webp"],
-        },
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_table.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
     }
     if gaussians.sh_degree:
         coefficients = _COEFFICIENTS[gaussians.sh_degree]
-        palette, labels = palette_of(
-            gaussians.sh[:, 1:].reshape(count, 3 * coefficients), _palette_size(count)
-        )
+        # A quarter of the gaussians, but enough for a small asset to keep all its coefficients, and 16 bits.
+        size = min(max(1024, count // 4), 65536)
+        palette, labels = palette_of(gaussians.sh[:, 1:].reshape(count, 3 * coefficients), size)
         table = table_of(palette)
         rows = -(-len(palette) // _PALETTE_COLUMNS)
         pixels = np.full((rows * _PALETTE_COLUMNS, coefficients, 4), 255, np.uint8)
@@ -255,11 +241,6 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
     return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **contents}
-
-
-def _palette_size(count: int) -> int:
-    """A quarter of the gaussians, but enough for a small asset to keep all its coefficients, and 16 bits."""
-    return min(max(1024, count // 4), 65536)
 
 
 def _webp(pixels: NDArray[np.uint8]) -> bytes:

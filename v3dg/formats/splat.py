@@ -6,27 +6,20 @@ and the quaternion w x y z (a byte each, 128 for 0). There is no header.
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 
 from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
-from v3dg.formats._reading import problem, read_bytes
+from v3dg.formats._reading import Path, check, read_bytes
 from v3dg.gaussians import Gaussians
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a `.splat` file.
-
-    Raises:
-        ValueError: Its size is no multiple of 32 bytes.
-        OSError: It cannot be read.
-    """
+def read(path: Path) -> Gaussians:
+    """Read a `.splat` file."""
     content = read_bytes(path)
-    if len(content) % _RECORD.itemsize:
-        raise problem(path, f"expected a multiple of 32 bytes, got {len(content)}; is the file complete?")
+    is_whole = len(content) % _RECORD.itemsize == 0
+    check(path, is_whole, f"a multiple of 32 bytes, got {len(content)}; is the file complete?")
     records = np.frombuffer(content, _RECORD)
 
     def decode(rows: slice) -> tuple[Floats, ...]:

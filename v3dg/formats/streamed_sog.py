@@ -14,37 +14,31 @@ import numpy as np
 
 from v3dg._json import Node, parse_json
 from v3dg.formats import sog
-from v3dg.formats._reading import Claims, problem, telling, whole
+from v3dg.formats._reading import Claims, check, telling, whole
 from v3dg.gaussians import Gaussians
 
 _LEVEL = re.compile(r"[0-9]{1,9}")
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
-    """Read the finest level of each leaf, and the environment, of a `lod-meta.json`.
-
-    Raises:
-        ValueError: It is none, or incomplete.
-        OSError: A file cannot be read.
-    """
+    """Read the finest level of each leaf, and the environment, of a `lod-meta.json`."""
     path, claims = Path(path), Claims()
     tree, names, environment = _index(path, claims.read(path))
     finest = _finest(tree, names)
-    if not finest and environment is None:
-        raise problem(path, "expected gaussians in the tree, got none")
+    check(path, finest or environment is not None, "gaussians in the tree, got none")
     parts = []
     for name in filter(finest.__contains__, dict.fromkeys(names)):  # a name that is there twice is read once
         rows = finest[name]
         gaussians = sog.read(path.parent / name, claims)
         # No more than it has: else a small file could ask for any number.
-        if sum(len(r) for r in rows) > len(gaussians) or max(r.stop for r in rows) > len(gaussians):
-            raise problem(path, f"expected at most {len(gaussians)} gaussians of {str(name)!a}, got more")
+        count = len(gaussians)
+        fits = sum(len(r) for r in rows) <= count and max(r.stop for r in rows) <= count
+        check(path, fits, f"at most {count} gaussians of {str(name)!a}, got more")
         parts.append(gaussians.subset(np.concatenate([np.arange(r.start, r.stop) for r in rows])))
     if environment is not None:
         parts.append(sog.read(path.parent / environment, claims))
     degrees = sorted({part.sh_degree for part in parts})
-    if len(degrees) > 1:
-        raise problem(path, f"expected one SH degree in all folders, got {degrees}")
+    check(path, len(degrees) == 1, f"one SH degree in all folders, got {degrees}")
     return Gaussians.concatenate(parts)
 
 
