@@ -114,12 +114,22 @@ def lying_zip():
     return bytes(content)
 
 
+def many_members():
+    """Entries of a zip's directory, of 47 bytes each."""
+    entry = struct.pack("<4s4B4HL2L5H2L", b"PK\1\2", 20, 0, 20, 0, *[0] * 7, 1, *[0] * 6) + b"a"
+    end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, 100_000 * len(entry), 4, 0)
+    return b"PK\3\4" + 100_000 * entry + end
+
+
 SOG = {
     "pictures larger than the count": lambda: zipped(
-        sog_files(9) | dict.fromkeys(["quats.webp", "scales.webp"], HUGE + bytes(4 << 20))
+        sog_files(9) | dict.fromkeys(["quats.webp", "scales.webp"], HUGE)
+    ),
+    "pictures larger than the count, in many bytes": lambda: zipped(
+        sog_files(9) | dict.fromkeys(["quats.webp", "scales.webp"], HUGE + bytes(1_000_000))
     ),
     "a palette larger than its count": lambda: zipped(
-        sog_files(9, 3) | {"shN_centroids.webp": picture(960, 16383, lossless=True) + bytes(4 << 20)}
+        sog_files(9, 3) | {"shN_centroids.webp": picture(960, 16383, lossless=True)}
     ),
     "pictures of another format": lambda: zipped(sog_files(9) | {"quats.webp": picture(9999, 9999, "PNG")}),
     "equal gaussians": lambda: zipped(
@@ -131,6 +141,7 @@ SOG = {
     "meta.json of many fields": lambda: zipped(sog_files(9) | {"meta.json": many_fields()}),
     "a picture that expands": lambda: zipped(sog_files(9) | {"quats.webp": bytes(1 << 28)}),
     "a member that lies": lying_zip,
+    "many members": many_members,
 }
 
 
@@ -326,6 +337,7 @@ STREAMED = {
     "300 links": lambda folder: one_file(folder, lambda i: f"{i}.sog" if i else "a.sog", 300),
     "300 hard links": lambda folder: one_file(folder, lambda i: f"hard{i}.sog" if i else "a.sog", 300),
     "a tree": deep_and_wide,
+    "many objects": lambda folder: streamed(folder, [{"a": 0}] * 200_000),
     "a long number of a level": lambda folder: streamed(folder, [], tree={"lods": {"1" * 5000: {}}}),
     "a run": lambda folder: streamed(folder, ["a.sog"], [(0, 0, 1 << 32)]),
     "runs": lambda folder: streamed(folder, ["a.sog"], [(0, 0, 60_000)] * 10_000),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
@@ -13,6 +14,7 @@ from v3dg.gaussians import Gaussians
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 
+SQRT2 = math.sqrt(2.0)
 SH_C0 = _core.sh_base0
 """The basis function of degree 0: colour is SH_C0 times its coefficient, plus ½."""
 
@@ -123,19 +125,6 @@ def morton_order(means: Floats) -> NDArray[np.intp]:
     extent = np.maximum(means.max(axis=0) - low, np.finfo(np.float32).tiny)
     cells = ((means - low) / extent * ((1 << _MORTON_BITS) - 1)).astype(np.uint64)
     code = np.zeros(len(means), np.uint64)
-    for axis in range(3):
-        code |= _spread(cells[:, axis]) << np.uint64(axis)
+    for bit in range(3 * _MORTON_BITS):
+        code |= (cells[:, bit % 3] >> np.uint64(bit // 3) & np.uint64(1)) << np.uint64(bit)
     return np.argsort(code, kind="stable")
-
-
-def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The lowest 21 bits, two zeros after each."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
-    return bits

@@ -18,6 +18,7 @@ from v3dg import _files
 from v3dg.formats._packing import (
     DEGREES,
     SH_C0,
+    SQRT2,
     Floats,
     assemble,
     blocks,
@@ -29,7 +30,7 @@ from v3dg.formats._packing import (
     three_of_quats,
     to_integers,
 )
-from v3dg.formats._reading import Path, check, read_bytes
+from v3dg.formats._reading import Claims, Path, check, read_bytes
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
@@ -37,7 +38,6 @@ _MAX_HEADER = 1 << 16
 _PLY_TYPES = {"float": "<f4", "float32": "<f4", "uint": "<u4", "uint32": "<u4", "uchar": "u1", "uint8": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
-_SQRT2 = float(np.sqrt(2.0))
 # Where the fields of a word begin, and the largest value of each.
 _XYZ_SHIFT, _XYZ_MAX = (21, 11, 0), (2047, 1023, 2047)
 _THREE_SHIFT, _THREE_MAX = (20, 10, 0), (1023, 1023, 1023)
@@ -47,11 +47,10 @@ _RGBA_SHIFT, _RGBA_MAX = (24, 16, 8, 0), (255, 255, 255, 255)
 def is_compressed(path: Path) -> bool:
     """Whether a `.ply` has packed positions. What is wrong with other files is for their reader to say."""
     try:
-        descriptor = _files.open_regular(path)
-    except ValueError:
+        with Claims().open(path) as file:
+            header = file.read(_MAX_HEADER).split(b"end_header", 1)[0]
+    except ValueError:  # a folder or a pipe
         return False
-    with _files.naming_errors(path), open(descriptor, "rb") as file:
-        header = file.read(_MAX_HEADER).split(b"end_header", 1)[0]
     return any(line.split()[-1:] == [b"packed_position"] for line in header.splitlines())
 
 
@@ -78,7 +77,7 @@ def read(path: Path) -> Gaussians:
             return np.asarray(low * (1.0 - fractions) + high * fractions)
 
         rotation = block["packed_rotation"]
-        three = (_fractions(rotation, _THREE_SHIFT, _THREE_MAX) - 0.5) * _SQRT2
+        three = (_fractions(rotation, _THREE_SHIFT, _THREE_MAX) - 0.5) * SQRT2
         rgba = _fractions(block["packed_color"], _RGBA_SHIFT, _RGBA_MAX)
         color = (within("color", rgba[:, :3]) - 0.5) / SH_C0
         means = within("", _fractions(block["packed_position"], _XYZ_SHIFT, _XYZ_MAX))
@@ -124,7 +123,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
             three, largest = three_of_quats(host.quats[rows])
             words = np.empty((len(rows), 4), "<u4")
             words[:, 0] = _word(fractions[""][block], _XYZ_SHIFT, _XYZ_MAX)
-            words[:, 1] = _word(three / _SQRT2 + 0.5, _THREE_SHIFT, _THREE_MAX) | (largest.astype("u4") << 30)
+            words[:, 1] = _word(three / SQRT2 + 0.5, _THREE_SHIFT, _THREE_MAX) | (largest.astype("u4") << 30)
             words[:, 2] = _word(fractions["scale_"][block], _XYZ_SHIFT, _XYZ_MAX)
             rgb = _word(fractions["color"][block], _RGBA_SHIFT[:3], _RGBA_MAX[:3])
             words[:, 3] = rgb | opacity_bytes(host.opacities[rows])
@@ -200,24 +199,26 @@ def _elements(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
     check(path, lines[:1] == ["ply"], "a first line 'ply'")
     wanted = "format binary_little_endian 1.0"
     check(path, wanted in lines, f"{wanted!r} in a compressed .ply, got another format")
-    counts: dict[str, int] = {}
-    fields: dict[str, list[tuple[str, str]]] = {}
+    elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
     for line in lines:
         words, shown = line.split(), f"{line[:60]!a}"
         if words[:1] == ["element"]:
             is_count = len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 12
-            check(path, is_count and words[1] not in counts, f"'element NAME COUNT', each once, got {shown}")
-            counts[words[1]], fields[words[1]] = int(words[2]), []
+            check(
+                path, is_count and words[1] not in elements, f"'element NAME COUNT', each once, got {shown}"
+            )
+            fields: list[tuple[str, str]] = []
+            elements[words[1]] = int(words[2]), fields
         elif words[:1] == ["property"]:
-            is_known = len(words) == 3 and words[1] in _PLY_TYPES and counts
+            is_known = len(words) == 3 and words[1] in _PLY_TYPES and elements
             check(path, is_known, f"'property float|uint|uchar NAME', got {shown}")
-            fields[list(counts)[-1]].append((words[2], _PLY_TYPES[words[1]]))
+            fields.append((words[2], _PLY_TYPES[words[1]]))
     rows: dict[str, NDArray[Any]] = {}
     offset = len(head) + len(mark)
-    for name, count in counts.items():
-        names, shown = dict(fields[name]), f"element {name[:40]!a}"
-        check(path, 0 < len(names) == len(fields[name]), f"properties of {shown}, each once")
-        dtype, left = np.dtype(fields[name]), len(content) - offset
+    for name, (count, fields) in elements.items():
+        shown = f"element {name[:40]!a}"
+        check(path, 0 < len(dict(fields)) == len(fields), f"properties of {shown}, each once")
+        dtype, left = np.dtype(fields), len(content) - offset
         wanted = f"{count} rows of {shown} with {dtype.itemsize} bytes each"
         check(path, count * dtype.itemsize <= left, f"{wanted}, got {left} bytes")
         rows[name] = np.frombuffer(content, dtype, count, offset)

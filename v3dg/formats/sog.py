@@ -24,6 +24,7 @@ from v3dg._json import Node, parse_json
 from v3dg._version import __version__
 from v3dg.formats._codebook import nearest, palette_of, table_of
 from v3dg.formats._packing import (
+    SQRT2,
     Floats,
     assemble,
     check_writable,
@@ -42,7 +43,6 @@ _MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
 _SPARE, _FREE_PIXELS = 4, 1 << 16
 _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 _PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
-_SQRT2 = math.sqrt(2.0)
 _MAX_LOG = 88.0  # of a float32
 
 # Parts of meta.json, and how many pictures each has.
@@ -108,7 +108,7 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
         steps = lower[rows, :3] | (upper[rows, :3].astype(np.uint16) << 8)
         logs = np.clip(low + (high - low) * (steps / 65535.0), -_MAX_LOG, _MAX_LOG)
         means = np.sign(logs) * np.expm1(np.abs(logs))
-        three = (quats[rows, :3] / 255.0 * 2.0 - 1.0) / _SQRT2
+        three = (quats[rows, :3] / 255.0 * 2.0 - 1.0) / SQRT2
         widths = np.exp(scale_table[scales[rows, :3]])
         sh = np.concatenate([color_table[color[rows, :3]][:, None], table[palette[labels[rows]]]], axis=1)
         return means, quats_from_three(three, tags[rows] - 252), widths, color[rows, 3] / 255.0, sh
@@ -211,7 +211,7 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "means_l.webp": picture(*(whole & 255).T),
         "means_u.webp": picture(*(whole >> 8).T),
         "scales.webp": picture(*nearest(scale_table, log_widths).T),
-        "quats.webp": picture(*to_integers((three * _SQRT2 + 1.0) * 127.5, 255).T, largest + 252),
+        "quats.webp": picture(*to_integers((three * SQRT2 + 1.0) * 127.5, 255).T, largest + 252),
         "sh0.webp": picture(*nearest(color_table, gaussians.sh[:, 0]).T, opacity_bytes(gaussians.opacities)),
     }
     meta: dict[str, Any] = {

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg.formats._packing import (
+    SQRT2,
     Floats,
     assemble,
     blocks,
@@ -39,7 +40,6 @@ _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
 _MAX_TRAILER = 1 << 20  # bytes after the attributes, which vendors' extensions may take
 _COLOR_SCALE = 0.15
-_SQRT2 = math.sqrt(2.0)
 _LARGEST_FIXED = (1 << 23) - 1
 
 
@@ -98,7 +98,7 @@ def _fraction_bits(reach: float) -> int:
 def _rotation_words(quats: Floats) -> bytes:
     # Components are numbered x y z w here.
     three, largest = three_of_quats(np.roll(quats, -1, axis=1))
-    magnitude = to_integers(np.abs(three) * _SQRT2 * 511.0, 511)
+    magnitude = to_integers(np.abs(three) * SQRT2 * 511.0, 511)
     words = largest.astype("<u4")
     for column in range(3):
         field = magnitude[:, column] | ((three[:, column] < 0).astype(np.uint32) << 9)
@@ -140,7 +140,7 @@ def _quats(rotations: NDArray[Any]) -> Floats:
         return normalised(quats)
     words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
-    three = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511.0 * _SQRT2)
+    three = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511.0 * SQRT2)
     return np.roll(quats_from_three(three, words >> 30), 1, axis=1)
 
 
