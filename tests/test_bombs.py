@@ -114,6 +114,14 @@ def lying_zip():
     return bytes(content)
 
 
+def canvas(width, height):
+    """A small picture in a file that says it is part of a large one."""
+    small = picture(4, 4, lossless=True)[12:]
+    sides = (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
+    body = b"WEBPVP8X" + struct.pack("<IB3x", 10, 0x10) + sides + small
+    return b"RIFF" + struct.pack("<I", len(body)) + body
+
+
 def many_members():
     """Entries of a zip's directory, of 47 bytes each."""
     entry = struct.pack("<4s4B4HL2L5H2L", b"PK\1\2", 20, 0, 20, 0, *[0] * 7, 1, *[0] * 6) + b"a"
@@ -128,6 +136,10 @@ SOG = {
     "pictures larger than the count, in many bytes": lambda: zipped(
         sog_files(9) | dict.fromkeys(["quats.webp", "scales.webp"], HUGE + bytes(1_000_000))
     ),
+    "pictures that Pillow warns of": lambda: zipped(
+        sog_files(9) | dict.fromkeys(["quats.webp", "scales.webp"], picture(10_000, 10_000, lossless=True))
+    ),
+    "a canvas larger than its picture": lambda: zipped(sog_files(9) | {"scales.webp": canvas(16384, 16384)}),
     "a palette larger than its count": lambda: zipped(
         sog_files(9, 3) | {"shN_centroids.webp": picture(960, 16383, lossless=True)}
     ),

@@ -477,14 +477,14 @@ def test_hostile_sog_is_refused(tmp_path, case):
     assert_refused_cheaply(sog_with(tmp_path, edit), message)
 
 
-def picture(width, height, kind="WEBP"):
+def picture(width, height, kind="WEBP", lossless=True):
     import io
 
     from PIL import Image
 
     stream = io.BytesIO()
     Image.new("RGBA", (width, height), (1, 2, 3, 252)).save(
-        stream, kind, **({"lossless": True} if kind == "WEBP" else {})
+        stream, kind, **({"lossless": lossless} if kind == "WEBP" else {})
     )
     return stream.getvalue()
 
@@ -500,8 +500,9 @@ def test_other_pictures_are_refused(tmp_path):
     for damaged in (whole[:-40], whole[:40], whole[:60] + bytes(200) + whole[260:]):
         path = sog_with(tmp_path, files={"quats.webp": damaged})
         assert_refused_cheaply(path, "a.sog: expected a WebP picture in 'quats.webp'")
-    path = sog_with(tmp_path, files={"quats.webp": picture(20, 20)})
-    assert len(read_asset(path)) == 300
+    for lossless in (True, False):
+        path = sog_with(tmp_path, files={"quats.webp": picture(20, 20, lossless=lossless)})
+        assert len(read_asset(path)) == 300
     small = picture(4, 4)
     assert_refused_cheaply(
         sog_with(tmp_path, files={"quats.webp": small}), "expected 300 pixels in 'quats.webp'"

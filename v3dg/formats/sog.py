@@ -161,19 +161,36 @@ def _codebook(part: Node) -> Floats:
 
 
 def _decoded(
-    path: Path, name: str, content: bytes, num_pixels: int, width: int | None = None
+    path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None
 ) -> NDArray[np.uint8]:
     """(H, W, 4) of a picture that has the pixels that are needed, and not many more."""
     from PIL.WebPImagePlugin import WebPImageFile  # Image.open would ask what other format it is
 
-    with telling(path, f"a WebP picture in {name!a}"):
-        picture = WebPImageFile(io.BytesIO(content))
-    is_large_enough = num_pixels <= picture.width * picture.height <= _SPARE * num_pixels + _FREE_PIXELS
-    fits = is_large_enough and width in (None, picture.width)
-    shape = f"{num_pixels} pixels" + ("" if width is None else f" in rows of {width}")
-    check(path, fits, f"{shape} in {name!a}, got {picture.width} x {picture.height}")
-    with telling(path, f"a WebP picture in {name!a}"), picture:
+    size = width, height = _size_of_webp(content)
+    check(path, width, f"a WebP picture in {name!a}, got another file")
+    fits = num_pixels <= width * height <= _SPARE * num_pixels + _FREE_PIXELS and row in (None, width)
+    shape = f"{num_pixels} pixels" + ("" if row is None else f" in rows of {row}")
+    check(path, fits, f"{shape} in {name!a}, got {width} x {height}")
+    with telling(path, f"a WebP picture in {name!a}"), WebPImageFile(io.BytesIO(content)) as picture:
+        if picture.size != size:
+            raise ValueError(f"one of {picture.size}")
         return np.asarray(picture.convert("RGBA"))
+
+
+def _size_of_webp(content: bytes) -> tuple[int, int]:
+    """Width and height as its first chunk says, before a decoder takes memory for them; else 0."""
+
+    def number(first: int, size: int) -> int:
+        return int.from_bytes(content[first : first + size], "little")
+
+    match content[:4] + content[8:16]:
+        case b"RIFFWEBPVP8X":
+            return 1 + number(24, 3), 1 + number(27, 3)
+        case b"RIFFWEBPVP8L":
+            return 1 + (number(21, 4) & 0x3FFF), 1 + (number(21, 4) >> 14 & 0x3FFF)
+        case b"RIFFWEBPVP8 ":
+            return number(26, 2) & 0x3FFF, number(28, 2) & 0x3FFF
+    return 0, 0
 
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
