@@ -1,10 +1,13 @@
 import gc
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
 import chromium
+import scenes_lod
 from v3dg import _device
+from v3dg.viewer.frame import SceneView
 
 # A shared machine can stall for longer than any deadline that would still mean something.
 settings.register_profile("v3dg", deadline=None, print_blob=True)
@@ -26,6 +29,19 @@ def browser():
         browser = play.chromium.launch(executable_path=chromium.PROGRAM, args=chromium.ARGUMENTS)
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def blob_bundle():
+    """A small bundle, for the viewer's tests."""
+    rng = np.random.default_rng(0)
+    return scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 3000, size=0.5), 64)
+
+
+@pytest.fixture(scope="session")
+def blob_view(blob_bundle):
+    """What the viewer draws of it, on the CPU."""
+    return SceneView(blob_bundle, device="cpu")
 
 
 @pytest.fixture(scope="module")

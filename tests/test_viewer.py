@@ -15,7 +15,7 @@ import v3dg
 from v3dg import Camera, Gaussians, Scene, _core
 from v3dg.pictures import to_8bit
 from v3dg.viewer.frame import MOST_COUNTED, Frame, SceneView, Settings, Stopped, ramp
-from v3dg.viewer.pacing import Draft, Pacer, RenderLoop, Request, finer_sizes
+from v3dg.viewer.pacing import PATIENCE_SECONDS, Draft, Pacer, RenderLoop, Request, finer_sizes
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View, look_at
 
@@ -330,19 +330,19 @@ def test_sizes_double_up_to_the_full_one():
 
 
 class FakeSceneView:
-    """Notes what is drawn; `hold` makes larger pictures wait until they are stopped."""
+    """Notes what is drawn; pictures of the widths in `hold` wait until they are stopped."""
 
     draws_all_while_moving = False
 
     def __init__(self):
-        self.drawn, self.hold = [], False
+        self.drawn, self.hold = [], ()
         self.is_held = threading.Event()
 
-    def frame(self, view, size, settings, stop=None):
+    def frame(self, view, size, settings, stop):
         self.drawn.append((view, size, settings))
         if isinstance(view, Exception):
             raise view
-        while stop is not None and self.hold:
+        while stop.is_requested or size[0] in self.hold:
             self.is_held.set()
             if stop.is_requested:
                 raise Stopped
@@ -376,7 +376,7 @@ def rendering(request):
 
     loop = RenderLoop(scene_view, send, fail, getattr(request, "param", None))
     yield SimpleNamespace(loop=loop, scene_view=scene_view, sent=sent, errors=errors, is_final=is_final)
-    loop.close()
+    assert loop.close(SECONDS)
 
 
 def wait(event):
@@ -391,10 +391,10 @@ def test_a_request_is_answered_small_and_then_in_full(rendering):
 
 
 def test_a_new_request_ends_a_large_picture(rendering):
-    rendering.scene_view.hold = True
+    rendering.scene_view.hold = (80, 160)
     rendering.loop.ask(Request(1, (160, 80), Settings()))
     wait(rendering.scene_view.is_held)
-    rendering.scene_view.hold = False
+    rendering.scene_view.hold = ()
     rendering.loop.ask(Request(2, (160, 80), Settings()))
     wait(rendering.is_final)
     assert (1, (160, 80), True) not in rendering.sent
@@ -455,11 +455,61 @@ def test_an_error_is_told_and_the_next_request_is_drawn(rendering):
     assert rendering.sent[-1] == (5, (160, 80), True)
 
 
-def test_closing_ends_the_thread_in_the_middle_of_a_picture(rendering):
-    rendering.scene_view.hold = True
+def test_a_draft_that_takes_too_long_is_given_up_for_a_newer_request(rendering):
+    rendering.scene_view.hold = (40,)
     rendering.loop.ask(Request(1, (160, 80), Settings()))
     wait(rendering.scene_view.is_held)
-    rendering.loop.close()
+    rendering.loop.ask(Request(2, (160, 80), Settings()))
+    assert len(rendering.scene_view.drawn) == 1  # it may take a little while
+    time.sleep(PATIENCE_SECONDS)
+    rendering.loop.ask(Request(3, (160, 80), Settings()))
+    wait(rendering.is_final)
+    (_, first, _), (view, second, _), *_ = rendering.scene_view.drawn
+    assert view == 3
+    assert second < first
+    assert rendering.sent[-1] == (3, (160, 80), True)
+
+
+def test_the_least_draft_is_finished_so_that_something_is_seen(rendering):
+    rendering.scene_view.hold = tuple(range(1, 200))
+    for view in range(60):
+        rendering.loop.ask(Request(view, (160, 80), Settings()))
+        time.sleep(PATIENCE_SECONDS / 4)
+    widths = [size[0] for _, size, _ in rendering.scene_view.drawn]
+    assert widths[-1] == round(160 / 6)
+    assert len(widths) < 12  # the last is not given up
+    rendering.scene_view.hold = ()
+    wait(rendering.is_final)
+    assert len(rendering.sent) > 1
+
+
+@pytest.mark.parametrize("failing", ["frame", "send", "fail"])
+def test_no_error_ends_the_loop(rendering, failing):
+    def broken(*_):
+        raise MemoryError("no more")
+
+    if failing == "frame":
+        rendering.loop.ask(Request(MemoryError(), (160, 80), Settings()))
+        wait(rendering.is_final)
+    else:
+        working = rendering.loop._send, rendering.loop._fail
+        rendering.loop._send = broken
+        rendering.loop._fail = broken if failing == "fail" else working[1]
+        rendering.loop.ask(Request(4, (160, 80), Settings()))
+        time.sleep(0.2)
+        rendering.loop._send, rendering.loop._fail = working
+    rendering.loop.ask(Request(5, (160, 80), Settings()))
+    wait(rendering.is_final)
+    while not rendering.sent:
+        wait(rendering.is_final)
+    assert rendering.sent[-1] == (5, (160, 80), True)
+
+
+def test_closing_ends_the_thread_in_the_middle_of_a_picture(rendering):
+    rendering.scene_view.hold = (80, 160)
+    rendering.loop.ask(Request(1, (160, 80), Settings()))
+    wait(rendering.scene_view.is_held)
+    assert rendering.loop.close(SECONDS)
     assert not any(thread.name == "v3dg render loop" for thread in threading.enumerate())
 
 
@@ -533,5 +583,5 @@ def test_recorded_views_are_not_denser_than_a_film():
 
 
 def test_empty_path_is_an_error():
-    with pytest.raises(ValueError, match="path: expected at least one view, got none"):
+    with pytest.raises(ValueError, match="path: expected at least one view"):
         CameraPath().at(0.0)

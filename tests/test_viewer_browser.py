@@ -4,7 +4,9 @@ import io
 import itertools
 import json
 import re
+import socket
 import time
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -38,6 +40,7 @@ def site(tmp_path_factory):
     scene_view = SceneView(scene, device="cpu")
     cameras = {"from the side": v3dg.Camera.look_at((6, 0, 0), (0, 0, 0), width=640, height=480)}
     site = Site(scene_view, name="blobs", cameras=cameras, port=0)
+    site.scene_view, site.folder = scene_view, path.parent
     yield site
     site.close()
 
@@ -45,12 +48,12 @@ def site(tmp_path_factory):
 class Tab:
     """A tab and what can be seen and done there."""
 
-    def __init__(self, browser, site):
+    def __init__(self, browser, url):
         self.errors = []
         self.page = browser.new_page(viewport={"width": 900, "height": 600})
         self.page.on("console", lambda m: m.type == "error" and self.errors.append(m.text))
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.goto(f"http://127.0.0.1:{site.port}/?fixedDpr=1")
+        self.page.goto(url + ("&" if "?" in url else "?") + "fixedDpr=1")
 
     def figure(self, name):
         found = re.search(rf"{name}\s+([\d,.]+)", self.page.inner_text("body"))
@@ -95,7 +98,7 @@ class Tab:
 
 @pytest.fixture
 def tab(browser, site):
-    tab = Tab(browser, site)
+    tab = Tab(browser, f"{site.url}/")
     yield tab
     tab.page.close()
     assert tab.errors == []
@@ -117,6 +120,26 @@ def test_picture_is_there_and_follows_the_camera_and_a_slider(tab):
     coarse = tab.settled()
     assert tab.figure("selected") < 0.7 * selected
     assert differ(turned, coarse) > 0.001
+
+
+def test_page_of_a_token_reaches_the_viewer(browser, site):
+    elsewhere = Site(site.scene_view, host="0.0.0.0", port=0)
+    try:
+        tab = Tab(browser, f"http://127.0.0.1:{elsewhere.port}{urlsplit(elsewhere.url).path}")
+        assert (tab.settled().max(axis=2) > 30).mean() > 0.05
+        tab.page.close()
+    finally:
+        elsewhere.close()
+
+
+def test_page_talks_to_no_other_server(browser, site):
+    """Which could have it run anything in the name of this one."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        other.settimeout(3)
+        tab = Tab(browser, f"{site.url}/?websocket=ws://127.0.0.1:{other.getsockname()[1]}")
+        with pytest.raises(TimeoutError):
+            other.accept()
+        tab.page.close()
 
 
 def test_picture_comes_while_the_mouse_is_still_down(tab):
@@ -149,7 +172,7 @@ def test_every_mode_looks_different(tab):
 
 
 def test_tabs_have_their_own_camera_and_settings(browser, site, tab):
-    other = Tab(browser, site)
+    other = Tab(browser, site.url)
     first = other.settled()
     tab.settled()
     tab.drag()
@@ -183,7 +206,7 @@ def test_budget_is_kept(tab):
     assert tab.figure("tolerance") > 3
 
 
-def test_pictures_paths_and_scenes_are_saved(tab, tmp_path):
+def test_pictures_paths_and_scenes_are_saved(tab, site, tmp_path):
     tab.settled()
     name, png = tab.saved("Save picture")
     assert name == "blobs.png"
@@ -203,8 +226,8 @@ def test_pictures_paths_and_scenes_are_saved(tab, tmp_path):
     first, *_, last = cameras.values()
     assert np.linalg.norm(first.position - last.position) > 0.1
     name, content = tab.saved("Save scene (.json)")
-    (tmp_path / name).write_bytes(content)
-    scene, cameras = v3dg.read_scene(tmp_path / name)
+    (site.folder / name).write_bytes(content)
+    scene, cameras = v3dg.read_scene(site.folder / name)
     assert len(scene) == 200
     assert len(cameras) == 61
     assert json.loads(content)["format"] == "v3dg-scene"

@@ -29,25 +29,15 @@ SIZE = (240, 160)
 
 
 @pytest.fixture(scope="module")
-def bundle():
-    rng = np.random.default_rng(0)
-    return scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 3000, size=0.5), 64)
-
-
-@pytest.fixture(scope="module")
-def scene_view(bundle):
-    return SceneView(bundle, device="cpu")
-
-
-@pytest.fixture(scope="module")
-def site(bundle, tmp_path_factory):
+def site(blob_bundle, tmp_path_factory):
     path = tmp_path_factory.mktemp("tab") / "blob.v3dg"
-    bundle.write(path)
+    blob_bundle.write(path)
     scene = v3dg.Scene()
     positions = np.random.default_rng(1).normal(size=(30, 3))
     scene.add(v3dg.Bundle.open(path), positions=positions, scales=np.full(30, 0.5))
     cameras = {"aside": v3dg.Camera.look_at((9, 0, 0), (0, 0, 0), width=64, height=48)}
     site = Site(SceneView(scene, device="cpu"), name="blobs", cameras=cameras, port=0)
+    site.folder = path.parent
     site.home = start_view(SceneView(scene, device="cpu"), (0, 0, 1), SIZE[0] / SIZE[1])
     yield site
     site.close()
@@ -177,11 +167,11 @@ def test_frozen_cut_is_kept_until_it_is_let_go(tab, site):
     assert figure(tab, "selected") < selected
 
 
-def test_what_cannot_be_drawn_is_explained(scene_view):
-    site = Site(scene_view, port=0, budget=3)
+def test_what_cannot_be_drawn_is_explained(blob_view):
+    site = Site(blob_view, port=0, budget=3)
     try:
         with viewer_client.Tab(site.port) as tab:
-            tab.look(start_view(scene_view, (0, 0, 1)), SIZE)
+            tab.look(start_view(blob_view, (0, 0, 1)), SIZE)
             wait_for(tab, lambda: "budget: expected at least" in tab.text)
             tab.set("Millions", 1.0)
             settled(tab)
@@ -206,8 +196,9 @@ def test_path_is_saved_as_cameras_a_scene_and_a_film(tab, site, tmp_path):
     np.testing.assert_allclose(cameras[0].position, (x, y, z), atol=1e-9)
     np.testing.assert_allclose(cameras[-1].position, (-y, x, z), atol=1e-9)
 
-    (tmp_path / "scene.json").write_bytes(saved(tab, "Save scene (.json)", "blobs.json"))
-    scene, cameras = v3dg.read_scene(tmp_path / "scene.json")
+    beside = site.folder / "scene.json"
+    beside.write_bytes(saved(tab, "Save scene (.json)", "blobs.json"))
+    scene, cameras = v3dg.read_scene(beside)
     assert (len(scene), len(cameras)) == (30, 16)
 
     av = pytest.importorskip("av")

@@ -15,6 +15,7 @@ class Tab:
     """What a browser tab is to the server.
 
     Attributes:
+        uuids: Of the controls, by their labels.
         text: The HTML of the panel's figures.
         updates: What the server changed of its controls.
         positions: Where the server took the camera.
@@ -22,14 +23,15 @@ class Tab:
         files: Contents of the files that were downloaded, by name.
     """
 
-    def __init__(self, port):
+    def __init__(self, port, path="", **options):
         self._connection = connect(
-            f"ws://127.0.0.1:{port}",
+            f"ws://127.0.0.1:{port}{path}",
             subprotocols=[f"viser-v{viser.__version__}"],
             compression=None,
             max_size=None,
+            **options,
         )
-        self._uuids, self._props, self._figures = {}, {}, None
+        self.uuids, self._props, self._figures = {}, {}, None
         self._names, self._parts = {}, {}
         self.text, self.updates, self.notices, self.files = "", [], [], {}
         self.positions = []
@@ -43,22 +45,26 @@ class Tab:
     def look(self, view, size):
         """Say that the camera is there now, in a window of that size."""
         forward = view.camera(1, 1, 0.01).viewmat[2, :3]
-        self._send(
-            "ViewerCameraMessage",
-            wxyz=view.wxyz,
-            position=view.position,
-            fov=view.fov_y,
-            near=0.01,
-            far=1000.0,
-            image_height=size[1],
-            image_width=size[0],
-            look_at=(np.array(view.position) + forward).tolist(),
-            up_direction=(0.0, 0.0, 1.0),
-        )
+        message = {
+            "type": "ViewerCameraMessage",
+            "wxyz": list(view.wxyz),
+            "position": list(view.position),
+            "fov": view.fov_y,
+            "near": 0.01,
+            "far": 1000.0,
+            "image_height": size[1],
+            "image_width": size[0],
+            "look_at": (np.array(view.position) + forward).tolist(),
+            "up_direction": [0.0, 0.0, 1.0],
+        }
+        self.send(message)
+        return message
 
     def set(self, label, value):
         """Give the control with that label a value; True presses a button."""
-        self._send("GuiUpdateMessage", uuid=self._uuids[label], updates={"value": value})
+        message = {"type": "GuiUpdateMessage", "uuid": self.uuids[label], "updates": {"value": value}}
+        self.send(message)
+        return message
 
     def visible(self, label):
         """Whether the control with that label is shown at first."""
@@ -88,7 +94,7 @@ class Tab:
         if kind == "GuiHtmlMessage":
             self._figures, self.text = message["uuid"], message["props"]["content"]
         elif kind.startswith("Gui") and "label" in message.get("props", {}):
-            self._uuids[message["props"]["label"]] = message["uuid"]
+            self.uuids[message["props"]["label"]] = message["uuid"]
             self._props[message["props"]["label"]] = message["props"]
         elif kind == "GuiUpdateMessage":
             self.updates.append(str(message["updates"]))
@@ -109,8 +115,10 @@ class Tab:
                 self.files[name] = b"".join(parts[i] for i in range(count))
         return None
 
-    def _send(self, kind, **fields):
-        self._connection.send(msgspec.msgpack.encode({"type": kind, **fields}))
+    def send(self, message):
+        """Send what becomes MessagePack, or else a text or bytes as they are."""
+        raw = isinstance(message, (str, bytes))
+        self._connection.send(message if raw else msgspec.msgpack.encode(message))
 
 
 def messages(data):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
 from v3dg.select import DEFAULT_TOLERANCE
@@ -23,6 +23,24 @@ _SHOWS: dict[str, Shows] = {
     "Difference to all gaussians": "difference",
 }
 _WANTS_LEVELS = ("level", "difference")
+
+
+def value_of(slider: Any) -> float:
+    """What a slider is at; within its range, to which a page need not keep."""
+    return float(max(slider.min, min(slider.max, slider.value)))  # the upper end for NaN, in this order
+
+
+def in_order(act: Callable[[], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
+    """A callback that viser calls on its event loop, so that a tab's changes follow each other."""
+
+    async def called(_: Any) -> None:
+        act()
+
+    return called
+
+
+def add_button(gui: Any, label: str, act: Callable[[], None]) -> None:
+    gui.add_button(label).on_click(in_order(act))
 
 
 class Controls:
@@ -47,31 +65,31 @@ class Controls:
         has_levels = scene_view.num_levels > 1
         names = [name for name, shows in _SHOWS.items() if has_levels or shows not in _WANTS_LEVELS]
         self._shows = gui.add_dropdown("Show", names)
-        self._shows.on_update(lambda _: self._choose_shows())
+        self._shows.on_update(in_order(self._choose_shows))
         self._gain = gui.add_slider("Amplify", 1, 50, 1, round(settings.gain), visible=False)
-        self._gain.on_update(lambda _: changed())
+        self._gain.on_update(in_order(changed))
         self._add_cut_controls(gui, settings, has_levels)
         self._resolution = gui.add_slider(
             "Resolution %", 10, 100, 5, 100, hint="Of the window, at rest; while moving it follows the speed."
         )
-        self._resolution.on_update(lambda _: changed())
+        self._resolution.on_update(in_order(changed))
 
     @property
     def settings(self) -> Settings:
         return Settings(
-            shows=_SHOWS[self._shows.value],
-            tolerance=float(self._tolerance.value),
-            budget=round(1e6 * self._budget.value) if self._limits.value else None,
-            min_level=int(self._min_level.value),
-            gain=float(self._gain.value),
-            split=float(self._split.value),
+            shows=_SHOWS.get(self._shows.value, "appearance"),
+            tolerance=value_of(self._tolerance),
+            budget=round(1e6 * value_of(self._budget)) if self._limits.value else None,
+            min_level=round(value_of(self._min_level)),
+            gain=value_of(self._gain),
+            split=value_of(self._split),
             frozen=self._frozen,
         )
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the picture at rest, px."""
-        return self._camera.size(self._resolution.value / 100)
+        return self._camera.size(value_of(self._resolution) / 100)
 
     def _add_cut_controls(self, gui: Any, settings: Settings, visible: bool) -> None:
         """Add those that choose among levels."""
@@ -105,14 +123,14 @@ class Controls:
         hint = "All gaussians on the left, the cut on the right."
         self._split = gui.add_slider("Split", 0.0, 1.0, 0.01, 0.0, visible=visible, hint=hint)
         for slider in (self._tolerance, self._budget, self._min_level, self._split):
-            slider.on_update(lambda _: self._changed())
-        self._limits.on_update(lambda _: self._choose_limits())
+            slider.on_update(in_order(self._changed))
+        self._limits.on_update(in_order(self._choose_limits))
         hint = "Keep what this camera needs, and fly around it."
         self._freeze = gui.add_checkbox("Freeze the cut", False, visible=visible, hint=hint)
-        self._freeze.on_update(lambda _: self._choose_freeze())
+        self._freeze.on_update(in_order(self._choose_freeze))
 
     def _choose_shows(self) -> None:
-        self._gain.visible = _SHOWS[self._shows.value] == "difference"
+        self._gain.visible = self.settings.shows == "difference"
         self._changed()
 
     def _choose_limits(self) -> None:

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING
 
 from PIL import Image
 
+from v3dg import _core
 from v3dg.camera_file import write_cameras
 from v3dg.cameras import Camera
 from v3dg.scene import Scene
 from v3dg.scene_file import write_scene
 from v3dg.video import write_video
-from v3dg.viewer.frame import Pixels
+from v3dg.viewer.frame import Pixels, SceneView
 
 if TYPE_CHECKING:
     import viser
@@ -32,64 +33,72 @@ def picture_bytes(pixels: Pixels) -> bytes:
 
 def film_bytes(pictures: Iterable[Pixels], fps: int) -> bytes:
     """Return an .mp4 file; errors are those of `write_video`."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "film.mp4")
-        write_video(path, pictures, fps=fps)
-        return path.read_bytes()
+    return _written("film.mp4", lambda path: write_video(path, pictures, fps=fps))
 
 
 def cameras_bytes(cameras: Mapping[str, Camera]) -> bytes:
     """Return a `transforms.json`."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "transforms.json")
-        write_cameras(path, cameras)
-        return path.read_bytes()
+    return _written("transforms.json", lambda path: write_cameras(path, cameras))
 
 
 def scene_bytes(scene: Scene, cameras: Mapping[str, Camera]) -> bytes:
-    """Return a scene file, which names the files of the scene's bundles; all must have one."""
-    bundles = [os.path.abspath(bundle.path or "") for bundle in scene.bundles]
+    """Return a scene file for the folder that all of the scene's bundles, which must be files, lie below."""
+    paths = [os.path.abspath(bundle.path or "") for bundle in scene.bundles]
+    folder = os.path.commonpath([os.path.dirname(path) for path in paths] or ["/"])
+    names = [os.path.relpath(path, folder) for path in paths]
+    return _written("scene.json", lambda path: write_scene(path, scene, names, cameras))
+
+
+def _written(name: str, write: Callable[[Path], object]) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "scene.json")
-        write_scene(path, scene, bundles, cameras)
+        path = Path(folder, name)
+        write(path)
         return path.read_bytes()
 
 
 class Exporter:
-    """Does for a tab what takes long: one thing at a time, in a thread, until it is done or stopped.
+    """Does for a tab what takes long: one thing at a time, in a thread, until it is done or stopped."""
 
-    Attributes:
-        stopped: Set when the work under way is to end; the work looks.
-    """
-
-    def __init__(self, client: viser.ClientHandle) -> None:
-        self._client = client
+    def __init__(self, client: viser.ClientHandle, scene_view: SceneView) -> None:
+        self._client, self._scene_view = client, scene_view
+        self._lock, self._is_closed = threading.Lock(), False
         self._thread: threading.Thread | None = None
-        self.stopped = threading.Event()
+        self._stop = _core.Stop()
 
-    def begin(self, work: Callable[[], None]) -> None:
-        """Start work whose errors become notices, unless there is some under way."""
-        if self._thread is not None and self._thread.is_alive():
-            self._client.add_notification("Still at work", "Stop it first, or wait.", auto_close_seconds=4)
-            return
-        self.stopped.clear()
+    def begin(self, work: Callable[[_core.Stop], None]) -> None:
+        """Start work that ends when it is asked to, and whose errors become notices, unless there is some."""
+        with self._lock:
+            if self._is_closed:
+                return
+            if self._thread is not None and self._thread.is_alive():
+                self._notify("Still at work", "Stop it first, or wait.")
+                return
+            self._stop = _core.Stop()
+            self._thread = threading.Thread(target=self._run, args=(work,), name="v3dg export", daemon=True)
+            self._thread.start()
 
-        def run() -> None:
-            try:
-                work()
-            except Exception as error:
-                text = " ".join(str(error).split())
-                self._client.add_notification("Not done", text, color="red", auto_close_seconds=10)
+    def _run(self, work: Callable[[_core.Stop], None]) -> None:
+        try:
+            work(self._stop)
+        except Exception as error:
+            self._notify("Not done", self._scene_view.explain(error))
 
-        self._thread = threading.Thread(target=run, name="v3dg export", daemon=True)
-        self._thread.start()
+    def _notify(self, title: str, text: str) -> None:
+        self._client.add_notification(title, text, auto_close_seconds=8)
 
     def download(self, name: str, content: bytes) -> None:
         """Have the browser save a file."""
         self._client.send_file_download(name, content, save_immediately=True)
 
-    def close(self) -> None:
-        """Stop the work under way, and wait for it to end."""
-        self.stopped.set()
+    def stop(self) -> None:
+        """Ask the work under way to end."""
+        self._stop.request()
+
+    def close(self, seconds: float) -> bool:
+        """Stop for good; returns whether the thread has ended, waiting so long for it."""
+        with self._lock:
+            self._is_closed = True
+        self.stop()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(seconds)
+        return self._thread is None or not self._thread.is_alive()

@@ -31,9 +31,9 @@ class FiguresPanel:
             self._last = now
             self._html.content = figures_html(frame)
 
-    def explain(self, error: Exception) -> None:
+    def explain(self, reason: str) -> None:
         """Show why there is no picture."""
-        self._html.content = _box(f"<b>Not drawn.</b> {html.escape(' '.join(str(error).split()))}")
+        self._html.content = _box(f"<b>Not drawn.</b> {html.escape(reason)}")
 
 
 def figures_html(frame: Frame) -> str:

@@ -163,6 +163,13 @@ class SceneView:
         """Whether all gaussians are few enough to be drawn in every picture."""
         return self.device.is_cuda or self.num_gaussians <= _FEW_GAUSSIANS
 
+    def explain(self, error: Exception) -> str:
+        """Return an error's line, in which bundles go by names, not paths: the tab may be somebody else's."""
+        text = " ".join(str(error).split())
+        for path in (bundle.path for bundle in self.scene.bundles):
+            text = text.replace(path, os.path.basename(path)) if path else text
+        return text
+
     def frame(
         self, view: View, size: tuple[int, int], settings: Settings, stop: _core.Stop | None = None
     ) -> Frame:
@@ -172,6 +179,7 @@ class SceneView:
             Stopped: ``stop`` was requested; it is raised soon after.
             ValueError: The budget is too small for any cut.
         """
+        _check(stop)
         camera = view.camera(*size, self.near)
         chooser = camera if settings.frozen is None else settings.frozen.camera(*size, self.near)
         start = time.perf_counter()
@@ -286,7 +294,7 @@ class SceneView:
 
 def _check(stop: _core.Stop | None) -> None:
     if stop is not None and stop.is_requested:
-        raise Stopped
+        raise Stopped("it was stopped")
 
 
 def _bounds(scene: Scene) -> tuple[Floats, float]:

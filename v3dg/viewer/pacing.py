@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -19,6 +20,8 @@ Size = tuple[int, int]
 TARGET_MS = 60.0
 # Without a change for so long, a larger picture is begun.
 REST_SECONDS = 0.15
+# A draft that has taken so long is given up for what is asked for now.
+PATIENCE_SECONDS = 4e-3 * TARGET_MS
 # Smaller ones show nothing; from there on the cut gets coarser, which shows less.
 _SMALLEST = 1 / 6
 _COARSEST = 32.0
@@ -32,6 +35,11 @@ class Draft:
 
     size: Size
     coarser: float = 1.0
+
+    @property
+    def is_least(self) -> bool:
+        """Whether no draft is quicker."""
+        return self.coarser >= _COARSEST
 
     @property
     def work(self) -> float:
@@ -95,11 +103,12 @@ class RenderLoop:
     """Draws what one tab asked for last, in a thread of its own, as often and as large as time allows.
 
     A request is answered by a small picture; after a rest larger ones follow, up to the full size. A new
-    request ends a larger picture at once.
+    request ends a larger picture at once, and a small one that has taken too long, after which the next is
+    smaller; the smallest is always finished, so that something is seen.
 
     Args:
         send: Called with each picture and whether it is the final one; in the loop's thread.
-        fail: Called with what could not be drawn; in the loop's thread.
+        fail: Called with what could not be drawn or sent; in the loop's thread.
     """
 
     def __init__(
@@ -114,7 +123,7 @@ class RenderLoop:
         self._changed = threading.Condition()
         self._request: Request | None = None
         self._is_closed = False
-        self._stop = _core.Stop()
+        self._stop, self._patience_ends = _core.Stop(), 0.0
         self._thread = threading.Thread(target=self._run, name="v3dg render loop", daemon=True)
         self._thread.start()
 
@@ -122,21 +131,23 @@ class RenderLoop:
         """Ask for a picture, in place of what was asked for before."""
         with self._changed:
             self._request = request
-            self._stop.request()
+            if time.monotonic() >= self._patience_ends:
+                self._stop.request()
             self._changed.notify()
 
-    def close(self) -> None:
-        """Draw nothing more, and wait for what is under way to end."""
+    def close(self, seconds: float) -> bool:
+        """Draw nothing more; returns whether the thread has ended, waiting so long for it."""
         with self._changed:
             self._is_closed = True
             self._stop.request()
             self._changed.notify()
-        self._thread.join()
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._is_closed or self._request is not None)
+                self._changed.wait_for(self._has_news)
                 request, self._request = self._request, None
             if self._is_closed or request is None:
                 return
@@ -145,24 +156,30 @@ class RenderLoop:
             except Stopped:
                 pass
             except Exception as error:  # a tab that shows the reason is better than one that stands still
-                self._fail(error)
+                with contextlib.suppress(Exception):
+                    self._fail(error)
 
     def _draw(self, request: Request) -> None:
         draft = self._pacer.draft(request.size)
         settings = self._while_moving(request.settings, draft)
+        stop = self._begin(math.inf if draft.is_least else PATIENCE_SECONDS)
         start = time.perf_counter()
-        frame = self._scene_view.frame(request.view, draft.size, settings)
+        try:
+            frame = self._scene_view.frame(request.view, draft.size, settings, stop)
+        except Stopped:  # it would have taken so long at least
+            self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
+            raise
         self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
         sizes = finer_sizes(draft.size, request.size)
         if settings != request.settings and not sizes:
             sizes = [draft.size]
         self._send(frame, not sizes)
-        for place, finer in enumerate(sizes):
-            stop = self._rest(REST_SECONDS if place == 0 else 0.0)
-            if stop is None:
+        with self._changed:
+            if self._changed.wait_for(self._has_news, REST_SECONDS):
                 return
-            is_final = place == len(sizes) - 1
-            self._send(self._scene_view.frame(request.view, finer, request.settings, stop), is_final)
+        for size in sizes:
+            frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0))
+            self._send(frame, size == sizes[-1])
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
         """What of the settings there is time for."""
@@ -174,10 +191,13 @@ class RenderLoop:
                 settings = replace(settings, shows="appearance", split=0.0)
         return replace(settings, tolerance=max(settings.tolerance, least) * draft.coarser)
 
-    def _rest(self, seconds: float) -> _core.Stop | None:
-        """Wait whether something new is asked for; None if so, else what a new request will end."""
+    def _has_news(self) -> bool:
+        return self._is_closed or self._request is not None
+
+    def _begin(self, patience: float) -> _core.Stop:
+        """Return what ends the next picture once something new is asked for, after so many seconds."""
         with self._changed:
-            if self._changed.wait_for(lambda: self._is_closed or self._request is not None, seconds):
-                return None
-            self._stop = _core.Stop()
+            self._stop, self._patience_ends = _core.Stop(), time.monotonic() + patience
+            if self._is_closed or (patience == 0 and self._request is not None):
+                self._stop.request()
             return self._stop

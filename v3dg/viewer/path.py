@@ -39,8 +39,15 @@ class CameraPath:
             self.times.append(now)
             self.views.append(view)
 
+    def copy(self) -> CameraPath:
+        return CameraPath(self.times.copy(), self.views.copy())
+
     def at(self, seconds: float) -> View:
-        """Return the view that long after the first, on a smooth curve through all of them.
+        """Return the view so long after the first; errors are those of `views_at`."""
+        return self.views_at(np.array([seconds]))[0]
+
+    def views_at(self, seconds: Floats) -> list[View]:
+        """Return the views so long after the first, on a smooth curve through all of them.
 
         Positions, rotations and fields of view follow cubic Hermite curves whose slopes are those of
         Catmull-Rom for uneven times; rotations are normalised. Before the first and after the last time it
@@ -50,35 +57,30 @@ class CameraPath:
             ValueError: The path is empty.
         """
         if not self.views:
-            raise ValueError("path: expected at least one view, got none")
-        times = np.asarray(self.times) - self.times[0]
-        rows = _rows(self.views)
-        if len(times) == 1:
-            return self.views[0]
-        seconds = float(np.clip(seconds, 0.0, times[-1]))
-        after = int(np.clip(np.searchsorted(times, seconds, side="right"), 1, len(times) - 1))
-        first, last = rows[after - 1], rows[after]
-        length = times[after] - times[after - 1]
-        t = (seconds - times[after - 1]) / length
-        slope_first, slope_last = _slope(times, rows, after - 1), _slope(times, rows, after)
-        row = (
-            (2 * t**3 - 3 * t**2 + 1) * first
-            + (t**3 - 2 * t**2 + t) * length * slope_first
-            + (3 * t**2 - 2 * t**3) * last
-            + (t**3 - t**2) * length * slope_last
-        )
-        quaternion = row[:4] / np.linalg.norm(row[:4])
-        w, x, y, z = (float(q) for q in quaternion)
-        return View((w, x, y, z), (float(row[4]), float(row[5]), float(row[6])), float(row[7]), float(row[8]))
+            raise ValueError("path: expected at least one view; add this one, or record while you fly")
+        if len(self.views) == 1:
+            return self.views * len(seconds)
+        times, rows = np.asarray(self.times) - self.times[0], _rows(self.views)
+        places = np.arange(len(times))
+        before, after = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
+        slopes = (rows[after] - rows[before]) / (times[after] - times[before])[:, None]
+        now = np.clip(seconds, 0.0, times[-1])
+        last = np.clip(np.searchsorted(times, now, side="right"), 1, places[-1])
+        first = last - 1
+        length = (times[last] - times[first])[:, None]
+        t = (now - times[first])[:, None] / length
+        curve = (2 * t**3 - 3 * t**2 + 1) * rows[first] + (3 * t**2 - 2 * t**3) * rows[last]
+        curve += length * ((t**3 - 2 * t**2 + t) * slopes[first] + (t**3 - t**2) * slopes[last])
+        curve[:, :4] /= np.linalg.norm(curve[:, :4], axis=1, keepdims=True)
+        return [View(tuple(row[:4]), tuple(row[4:7]), row[7], row[8]) for row in curve.tolist()]
 
-    def views_at(self, fps: int) -> list[View]:
+    def film(self, fps: int) -> list[View]:
         """Return the views of a film: the first, the last, and those between at ``fps`` a second."""
-        count = max(round(self.seconds * fps), 1) + 1
-        return [self.at(t) for t in np.linspace(0.0, self.seconds, count)]
+        return self.views_at(np.linspace(0.0, self.seconds, max(round(self.seconds * fps), 1) + 1))
 
     def cameras(self, fps: int, width: int, height: int, near: float) -> dict[str, Camera]:
         """Return the film's cameras by name."""
-        views = self.views_at(fps)
+        views = self.film(fps)
         digits = len(str(len(views) - 1))
         return {f"{i:0{digits}}": view.camera(width, height, near) for i, view in enumerate(views)}
 
@@ -91,9 +93,3 @@ def _rows(views: list[View]) -> Floats:
         if before[:4] @ row[:4] < 0:
             row[:4] *= -1
     return rows
-
-
-def _slope(times: Floats, rows: Floats, place: int) -> Floats:
-    """Change a second at one of the rows; the paths' ends are gone out of and into along a straight line."""
-    before, after = max(place - 1, 0), min(place + 1, len(times) - 1)
-    return np.asarray((rows[after] - rows[before]) / (times[after] - times[before]))

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-import logging
 import math
-import socket
-import threading
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
@@ -24,6 +22,8 @@ if TYPE_CHECKING:
     import viser
 
 _FOV_Y = math.radians(45)
+# What is still at work after so long is left behind.
+_CLOSE_SECONDS = 1.0
 
 
 class Site:
@@ -33,13 +33,15 @@ class Site:
         scene_view: What to show.
         name: Title of the tabs, and of the files that they save.
         cameras: Named cameras to jump to.
-        host: Address to listen at; ``"0.0.0.0"`` lets anyone in who reaches this machine.
+        host: Address to listen at. Where other machines can connect, as at ``"0.0.0.0"``, a secret in the URL
+            lets in who has it.
         port: Where to listen; the next free one where it is taken.
         tolerance, budget: What a tab begins with.
         up: (3,) direction in the world.
 
     Attributes:
         port: The one that was free.
+        url: What a browser is to open.
 
     Raises:
         ImportError: The extra is not installed.
@@ -60,19 +62,20 @@ class Site:
     ) -> None:
         try:
             import viser
+
+            from v3dg.viewer.gate import Gate
         except ImportError as error:
             raise ImportError(
                 "the viewer needs viser, which is not installed; pip install 'v3dg[viewer]'"
             ) from error
-        _require_own_address(host)
         # A tab may be closed while a picture is on its way to it.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
         self._tabs: dict[int, Tab] = {}
-        self._lock = threading.Lock()
-        logging.getLogger("websockets.server").addFilter(_is_news)
-        with _quiet():
-            self._server = viser.ViserServer(host=host, port=port, label=name, verbose=False)
-        self.port = self._server.get_port()
+        self._ending: list[Tab] = []
+        self._gate = Gate(host, port)
+        self.port, self.url = self._gate.port, self._gate.url
+        with _quiet(), self._gate.guarding():  # which tells viser where to listen
+            self._server = viser.ViserServer(host="127.0.0.1", port=0, label=name, verbose=False)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.gui.main_panel.dock_right()  # beside the picture, not over it
         self._server.scene.set_up_direction(_three(up))
@@ -80,32 +83,28 @@ class Site:
         first = self._server.initial_camera
         first.position, first.look_at = start.position, _three(scene_view.center)
         first.up, first.fov = _three(up), _FOV_Y
+        settings = Settings(tolerance=tolerance, budget=budget)
 
-        def connect(client: viser.ClientHandle) -> None:
-            tab = Tab(
-                client, scene_view, name, cameras or {}, Settings(tolerance=tolerance, budget=budget), start
-            )
-            with self._lock:
-                self._tabs[client.client_id] = tab
+        # Both are called on the event loop, one after the other.
+        async def connect(client: viser.ClientHandle) -> None:
+            self._tabs[client.client_id] = Tab(client, scene_view, name, cameras or {}, settings, start)
 
-        def disconnect(client: viser.ClientHandle) -> None:
-            with self._lock:
-                tab = self._tabs.pop(client.client_id, None)
-            if tab is not None:
-                tab.close()
+        async def disconnect(client: viser.ClientHandle) -> None:
+            tabs = (*self._ending, self._tabs.pop(client.client_id))
+            self._ending = [tab for tab in tabs if not tab.close(0.0)]
 
         self._server.on_client_connect(connect)
         self._server.on_client_disconnect(disconnect)
 
-    def close(self) -> None:
-        """End all tabs and the server; returns when their threads have ended."""
-        with self._lock:
-            tabs = list(self._tabs.values())
-            self._tabs.clear()
-        for tab in tabs:
-            tab.close()
+    def close(self) -> bool:
+        """End all tabs and the server in about two seconds; returns whether all their threads have ended."""
+        for tab in tuple(self._tabs.values()):
+            tab.close(0.0)
         with _quiet():
             self._server.stop()
+        end = time.monotonic() + _CLOSE_SECONDS
+        tabs = (*self._tabs.values(), *self._ending)
+        return all([tab.close(max(end - time.monotonic(), 0.0)) for tab in tabs])
 
 
 def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) -> View:
@@ -120,26 +119,9 @@ def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) ->
     return look_at(scene_view.center + distance * direction, scene_view.center, axis, _FOV_Y, aspect)
 
 
-def _require_own_address(host: str) -> None:
-    """Refuse another machine's address, of which viser would try a thousand ports and then wait for ever."""
-    try:
-        family, kind, *_ = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as probe:
-            probe.bind((host, 0))
-    except OSError as error:
-        raise ValueError(
-            f"host: expected an address of this machine, got {host} ({error.strerror})"
-        ) from error
-
-
 def _three(vector: VectorLike) -> tuple[float, float, float]:
     x, y, z = (float(v) for v in vector)
     return x, y, z
-
-
-def _is_news(record: logging.LogRecord) -> bool:
-    """Not that somebody connected and said nothing, as browsers and forwarded ports do ahead of time."""
-    return record.getMessage() != "opening handshake failed"
 
 
 @contextlib.contextmanager

@@ -1,0 +1,317 @@
+"""Who may use the viewer, and what their messages can bring about."""
+
+import copy
+import http.client
+import json
+import random
+import socket
+import time
+from types import SimpleNamespace
+from urllib.parse import urlsplit
+
+import msgspec
+import pytest
+
+import v3dg
+from v3dg.viewer.browser_camera import BrowserCamera
+from v3dg.viewer.exports import scene_bytes
+from v3dg.viewer.frame import SceneView
+from v3dg.viewer.server import Site, start_view
+from v3dg.viewer.view import View
+
+viser = pytest.importorskip("viser")
+websockets = pytest.importorskip("websockets")
+viewer_client = pytest.importorskip("viewer_client")
+gate = pytest.importorskip("v3dg.viewer.gate")
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
+    pytest.mark.usefixtures("collected_connections"),
+]
+
+SIZE = (64, 48)
+SECONDS = 60
+
+
+@pytest.fixture
+def opened(blob_view):
+    """Opens sites that are closed after the test."""
+    sites = []
+
+    def open_site(**options):
+        sites.append(Site(blob_view, port=0, **options))
+        return sites[-1]
+
+    yield open_site
+    for site in sites:
+        assert site.close()
+
+
+def status(site, path="/", **headers):
+    """What a request for a page is answered with."""
+    connection = http.client.HTTPConnection("127.0.0.1", site.port, timeout=SECONDS)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    return answer.status
+
+
+def connects(site, path="", **headers):
+    """Whether a page with these headers can use the site."""
+    try:
+        viewer_client.Tab(site.port, path, additional_headers=headers).__exit__()
+    except websockets.exceptions.InvalidStatus as refusal:
+        return refusal.response.status_code != 403
+    return True
+
+
+def gets_a_picture(site, blob_view, path=""):
+    with viewer_client.Tab(site.port, path) as tab:
+        tab.look(start_view(blob_view, (0, 0, 1)), SIZE)
+        end = time.monotonic() + SECONDS
+        while time.monotonic() < end:
+            pictures = tab.pictures(time.perf_counter() + 0.3)
+            if any(picture.size == SIZE for _, picture in pictures):
+                return True
+    return False
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "http://evil.example",
+        "http://127.0.0.1",
+        "http://127.0.0.1:1",
+        "http://localhost:{port}",
+        "http://127.0.0.1:{port}.evil.example",
+        "http://evil@127.0.0.1:{port}",
+        "null",
+        "",
+        "file://",
+    ],
+)
+def test_other_pages_cannot_use_the_viewer(opened, origin):
+    site = opened()
+    origin = origin.format(port=site.port)
+    assert not connects(site, Origin=origin)
+    assert status(site, Origin=origin) == 403
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.example:{port}",
+        "127.0.0.1.evil.example:{port}",
+        "localhost.evil.example",
+        "192.0.2.1:{port}",
+        "2130706433:{port}",
+        "",
+        "[::1",
+        "evil.example@127.0.0.1.example",
+    ],
+)
+def test_names_that_others_lead_here_are_refused(opened, host):
+    """A page whose name is made to mean this machine has an Origin that is its Host."""
+    site = opened()
+    host = host.format(port=site.port)
+    assert status(site, Host=host) in (403, 500)
+    message = "GET / HTTP/1.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    message += f"Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Protocol: viser-v{viser.__version__}\r\n"
+    with socket.create_connection(("127.0.0.1", site.port)) as connection:
+        connection.sendall(f"{message}Host: {host}\r\nOrigin: http://{host}\r\n\r\n".encode())
+        assert connection.recv(12) in (b"HTTP/1.1 403", b"HTTP/1.1 500")
+
+
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "LOCALHOST", "127.8.7.6", "[::1]"])
+def test_this_machine_may_use_the_viewer_by_any_of_its_names(opened, name):
+    """Also at another port, from which a connection may be forwarded."""
+    site = opened()
+    for host in (f"{name}:{site.port}", f"{name}:9999", name):
+        assert site._gate.refusal(request(Host=host, Origin=f"http://{host}")) is None
+        assert site._gate.refusal(request(Host=host, Origin=f"https://{host}")) is None
+    assert status(site) == 200
+    assert connects(site, Origin=f"http://127.0.0.1:{site.port}")
+
+
+def request(path="/", **headers):
+    return websockets.http11.Request(path, websockets.datastructures.Headers(**headers))
+
+
+def test_an_upgrade_of_another_version_is_refused_in_silence(opened, capfd):
+    site = opened()
+    with pytest.raises(websockets.exceptions.InvalidStatus, match="403"):
+        websockets.sync.client.connect(f"ws://127.0.0.1:{site.port}", subprotocols=["viser-v0.0.1"])
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_page_is_shown_in_no_other_and_talks_to_no_other_server(opened):
+    site = opened()
+    connection = http.client.HTTPConnection("127.0.0.1", site.port, timeout=SECONDS)
+    connection.request("GET", "/?websocket=ws://evil.example")
+    policy = connection.getresponse().headers["Content-Security-Policy"]
+    connection.close()
+    assert "frame-ancestors 'none'" in policy
+    assert "connect-src 'self' data: blob:" in policy
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_other_machines_need_the_token(opened, blob_view, host):
+    if host == "::" and not socket.has_dualstack_ipv6():
+        pytest.skip("this machine has no IPv6")
+    site = opened(host=host)
+    token = urlsplit(site.url).path
+    assert len(token) > 20
+    gate = site._gate
+    assert gate.refusal(request(f"{token}?fixedDpr=1", Host="any.example")) is None
+    wrong = (token[:-1], token + "x", token.swapcase(), "/x" + token, "/é", "/\udcff", "/", "", "//", "/?")
+    for path in wrong:
+        assert gate.refusal(request(path, Host="any.example")) is not None, path
+    other = request(token, Host="any.example", Origin="http://evil.example")
+    assert gate.refusal(other) is not None
+    if host == "0.0.0.0":
+        assert status(site) == 403
+        assert status(site, token) == status(site, token + "/?darkMode") == 200
+        assert status(site, token + "/../" + token) == 404
+        assert not connects(site)
+        assert gets_a_picture(site, blob_view, token)
+
+
+def test_this_machine_alone_needs_no_token(opened):
+    site = opened(host="localhost")
+    assert site.url == f"http://localhost:{site.port}"
+    assert Site.close(site)
+
+
+def test_no_two_sites_have_the_same_token(opened):
+    assert urlsplit(opened(host="0.0.0.0").url).path != urlsplit(opened(host="0.0.0.0").url).path
+
+
+def test_where_no_port_is_free_the_viewer_does_not_wait_for_ever(blob_view):
+    with (
+        socket.create_server(("127.0.0.1", 65535)),
+        pytest.raises(ValueError, match="port: expected a free one"),
+    ):
+        Site(blob_view, port=65535)
+
+
+def test_a_server_that_goes_round_the_gate_is_refused(blob_view, monkeypatch):
+    monkeypatch.setattr(viser, "ViserServer", lambda **_: None)
+    with pytest.raises(RuntimeError, match="whose server can be guarded"):
+        Site(blob_view, port=0)
+
+
+def test_a_page_cannot_publish_the_scene(opened, blob_view, monkeypatch):
+    asked = []
+    monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda self: asked.append(self))
+    site = opened()
+    with viewer_client.Tab(site.port) as tab:
+        tab.look(start_view(blob_view, (0, 0, 1)), SIZE)
+        tab.send({"type": "ShareUrlRequest"})
+        tab.pictures(time.perf_counter() + 0.5)
+    assert not asked
+
+
+@pytest.mark.parametrize("window", [(100_000, 100_000), (1 << 20, 1), (1, 1 << 20), (4096, 4096), (30, 20)])
+def test_the_largest_picture_is_not_the_windows(window):
+    camera = SimpleNamespace(image_width=window[0], image_height=window[1])
+    width, height = BrowserCamera(SimpleNamespace(camera=camera), None).size(1.0)
+    assert 1 <= width <= 4096
+    assert 1 <= height <= 4096
+    if max(window) <= 4096:
+        assert (width, height) == window
+
+
+def test_bundles_go_by_their_names(blob_bundle, tmp_path):
+    scene = v3dg.Scene()
+    for name in ("secret/a.v3dg", "secret/more/b.v3dg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        blob_bundle.write(tmp_path / name)
+        scene.add(v3dg.Bundle.open(tmp_path / name))
+    saved = scene_bytes(scene, {})
+    assert list(json.loads(saved)["bundles"].values()) == ["a.v3dg", "more/b.v3dg"]
+    (tmp_path / "secret" / "again.json").write_bytes(saved)
+    assert len(v3dg.read_scene(tmp_path / "secret" / "again.json")[0]) == 2
+    error = OSError(5, "cannot be read", str(tmp_path / "secret" / "a.v3dg"))
+    assert SceneView(scene, device="cpu").explain(error) == "[Errno 5] cannot be read: 'a.v3dg'"
+
+
+# Hostile messages.
+
+NASTY = [
+    None, True, False, 0, -1, 1, 3.14, 1e-300, 1e300, -1e308, float("nan"), float("inf"), -float("inf"),
+    2**63, -(2**63), 2**64 - 1, "", "nan", "1e400", "\x1b[31m", "x" * 5000, b"\x00", [], [0], [[[]]], {},
+    {"value": 1}, [0, 0, 0], [0, 0, 0, 0], [1e15] * 3, [float("nan")] * 4,
+]  # fmt: skip
+
+WRITABLE = [
+    ("Show", "Depth"), ("Show", "Difference to all gaussians"), ("Amplify", 30), ("Tolerance px²", 1.0),
+    ("Limit gaussians", True), ("Millions", 0.1), ("Finest level", 1), ("Split", 0.5), ("Resolution %", 50),
+    ("Freeze the cut", True), ("Show all", True), ("Of the file", "aside"), ("Add this view", True),
+    ("Seconds a view", 0.5), ("Record", True), ("Play", True), ("Size", "as the window"), ("Stop", True),
+    ("Clear", True), ("Save picture", True), ("Save cameras (transforms.json)", True),
+]  # fmt: skip
+
+
+def mutated(rng, message):
+    """The message with one thing changed, at times with more."""
+    message = copy.deepcopy(message)
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        place, nasty = message, copy.deepcopy(rng.choice(NASTY))
+        while place:
+            key = rng.choice(list(place) if isinstance(place, dict) else range(len(place)))
+            if not isinstance(place[key], (dict, list)) or rng.random() < 0.4:
+                break
+            place = place[key]
+        if isinstance(place, dict):
+            if rng.random() < 0.2:
+                place.pop(key, None)
+                key = rng.choice(("x", "type", "update_cb", "removed", "max"))
+            place[key] = nasty
+        elif place:
+            place[key] = nasty
+    return message
+
+
+def hostile(rng, messages, kinds):
+    """Something that no browser sends."""
+    choice, message = rng.random(), mutated(rng, rng.choice(messages))
+    if choice < 0.7:
+        return message
+    if choice < 0.8:
+        return {**message, "type": rng.choice(kinds)}
+    packed = bytearray(msgspec.msgpack.encode(message))
+    if choice < 0.85:
+        return bytes(packed[: rng.randrange(len(packed))])
+    if choice < 0.95:
+        for _ in range(rng.randint(1, 4)):
+            packed[rng.randrange(len(packed))] = rng.randrange(256)
+        return bytes(packed)
+    return rng.choice(
+        ("text", "{}", "", b"\x91" * 3000, b"\xc1", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff")
+    )
+
+
+def test_no_message_ends_the_viewer(opened, blob_view, capfd):
+    """Thousands of wrong ones, with right ones between, while the viewer draws: it is silent and goes on."""
+    aside = v3dg.Camera.look_at((9, 0, 0), (0, 0, 0), width=64, height=48)
+    site, rng = opened(cameras={"aside": aside}), random.Random(7)
+    kinds = [kind.__name__ for kind in viser._messages.Message.get_subclasses()]
+    home, sent = start_view(blob_view, (0, 0, 1)), 0
+    while sent < 4000:
+        with viewer_client.Tab(site.port) as tab:
+            messages = [tab.look(home, SIZE)]
+            tab.pictures(time.perf_counter() + 0.3)
+            messages *= 6
+            messages += [tab.set(label, value) for label, value in WRITABLE if label in tab.uuids]
+            try:
+                for _ in range(400):
+                    tab.send(hostile(rng, messages, kinds))
+                    sent += 1
+                tab.pictures(time.perf_counter() + 0.2)
+                tab.look(View((1, 0, 0, 0), (1e15, -1e15, 0), 1e-4, 1.0), (1, 1 << 20))
+                tab.pictures(time.perf_counter() + 0.2)
+            except websockets.exceptions.ConnectionClosed:
+                pass  # which is what such a client may expect
+    assert gets_a_picture(site, blob_view)
+    assert capfd.readouterr() == ("", "")
