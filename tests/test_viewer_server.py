@@ -1,11 +1,14 @@
 """The viewer's server and command: where they listen, what a tab begins with, and how they end."""
 
+import contextlib
 import os
+import random
 import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 import urllib.request
 
 import numpy as np
@@ -14,10 +17,11 @@ import pytest
 import scenes_lod
 import v3dg
 import v3dg.cli
-from v3dg.viewer.frame import SceneView, Settings
+from v3dg.viewer.frame import Settings
 from v3dg.viewer.server import Site, start_view
 
 pytest.importorskip("viser")
+websockets = pytest.importorskip("websockets")
 
 pytestmark = [
     # A site that closes while somebody is just connecting leaves viser's end of the connection to the
@@ -27,24 +31,13 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(scope="module")
-def bundle():
-    rng = np.random.default_rng(0)
-    return scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 3000, size=0.5), 64)
-
-
-@pytest.fixture(scope="module")
-def scene_view(bundle):
-    return SceneView(bundle, device="cpu")
-
-
 def listens_at(port, host):
     with socket.socket() as client:
         return client.connect_ex((host, port)) == 0
 
 
-def test_viewer_is_served_to_this_machine_alone(scene_view):
-    site = Site(scene_view, port=0)
+def test_viewer_is_served_to_this_machine_alone(blob_view):
+    site = Site(blob_view, port=0)
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{site.port}") as answer:
             assert answer.status == 200
@@ -54,9 +47,9 @@ def test_viewer_is_served_to_this_machine_alone(scene_view):
     assert not listens_at(site.port, "127.0.0.1")
 
 
-def test_taken_port_is_passed_over(scene_view):
-    first = Site(scene_view, port=0)
-    second = Site(scene_view, port=first.port)
+def test_taken_port_is_passed_over(blob_view):
+    first = Site(blob_view, port=0)
+    second = Site(blob_view, port=first.port)
     try:
         assert second.port != first.port
         assert listens_at(second.port, "127.0.0.1")
@@ -65,43 +58,62 @@ def test_taken_port_is_passed_over(scene_view):
         first.close()
 
 
-def test_address_of_another_machine_is_refused(scene_view):
+def test_address_of_another_machine_is_refused(blob_view):
     with pytest.raises(ValueError, match=r"host: expected an address of this machine, got 192\.0\.2\.1"):
-        Site(scene_view, host="192.0.2.1")
+        Site(blob_view, host="192.0.2.1")
 
 
-def test_missing_extra_is_named(scene_view, monkeypatch):
+def test_missing_extra_is_named(blob_view, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ImportError, match=r"pip install 'v3dg\[viewer\]'"):
-        Site(scene_view)
+        Site(blob_view)
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 0, 0)])
-def test_tab_begins_with_all_of_the_scene_in_view(scene_view, up):
-    view = start_view(scene_view, up)
-    figures = scene_view.frame(view, (160, 90), Settings(tolerance=0.0)).figures
-    assert figures.gaussians_in_view > 0.95 * scene_view.num_gaussians
-    above = np.dot(np.array(view.position) - scene_view.center, up)
-    assert above > 0.3 * scene_view.radius
-    camera = view.camera(160, 90, scene_view.near)
+def test_tab_begins_with_all_of_the_scene_in_view(blob_view, up):
+    view = start_view(blob_view, up)
+    figures = blob_view.frame(view, (160, 90), Settings(tolerance=0.0)).figures
+    assert figures.gaussians_in_view > 0.95 * blob_view.num_gaussians
+    above = np.dot(np.array(view.position) - blob_view.center, up)
+    assert above > 0.3 * blob_view.radius
+    camera = view.camera(160, 90, blob_view.near)
     assert -camera.viewmat[1, :3] @ up > 0.8  # upright
 
 
-def test_command_says_where_and_ends_with_an_interrupt(bundle, tmp_path):
-    bundle.write(tmp_path / "blob.v3dg")
+@contextlib.contextmanager
+def viewing(bundle, folder, *options):
+    """The command in a session of its own, once it has said where; and its line."""
+    bundle.write(folder / "blob.v3dg")
     environment = os.environ | {"PYTHONPATH": os.path.dirname(os.path.dirname(v3dg.__file__))}
     process = subprocess.Popen(
-        [sys.executable, "-m", "v3dg", "view", "blob.v3dg", "--port", "0"],
-        cwd=tmp_path,
+        [sys.executable, "-m", "v3dg", "view", "blob.v3dg", "--port", "0", *options],
+        cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
+        start_new_session=True,
         # Whoever starts the tests in the background has them ignore interrupts, and children inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    line = process.stdout.readline()
     try:
+        yield process, process.stdout.readline()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def ends(process, *signals):
+    """Whether it ends as it should after these, each a moment after the one before."""
+    for number in signals:
+        process.send_signal(number)
+        time.sleep(random.uniform(0.0, 0.05))
+    _, stderr = process.communicate(timeout=30)
+    assert (process.returncode, stderr) == (130, "v3dg: error: interrupted\n")
+
+
+def test_command_says_where_and_ends_with_an_interrupt(blob_bundle, tmp_path):
+    with viewing(blob_bundle, tmp_path) as (process, line):
         assert line.startswith("http://127.0.0.1:")
         assert "blob.v3dg" in line
         address = line.split()[0]
@@ -110,11 +122,31 @@ def test_command_says_where_and_ends_with_an_interrupt(bundle, tmp_path):
             assert silent.recv(1) == b""  # the server has seen it
         with urllib.request.urlopen(address) as answer:
             assert answer.status == 200
-    finally:
-        process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert stderr == ""
+        ends(process, signal.SIGINT)
+
+
+INTERRUPTS = int(os.environ.get("V3DG_INTERRUPTS", "1"))
+JOBS = ("Add this view", "Save film (.mp4)", "Save picture", "Stop", "Play")
+
+
+@pytest.mark.parametrize("signals", [(signal.SIGINT,), (signal.SIGINT,) * 2, (signal.SIGTERM, signal.SIGINT)])
+@pytest.mark.parametrize("turn", range(INTERRUPTS))
+def test_command_ends_at_once_whatever_a_tab_does(blob_bundle, blob_view, tmp_path, signals, turn):
+    """V3DG_INTERRUPTS sets the turns; each interrupts at another moment of drawing and of jobs that begin."""
+    viewer_client = pytest.importorskip("viewer_client")
+    home, end = start_view(blob_view, (0, 0, 1)), time.monotonic() + random.uniform(0.2, 1.0)
+    with viewing(blob_bundle, tmp_path) as (process, line):
+        tab = viewer_client.Tab(int(line.split()[0].rsplit(":", 1)[1]))
+        while time.monotonic() < end:
+            tab.look(home, (3000, 2000))
+            tab.pictures(time.perf_counter() + 0.05)
+            for label in set(JOBS) & set(tab.uuids):
+                tab.set(label, True)
+        began = time.monotonic()
+        ends(process, *signals)
+        assert time.monotonic() - began < 10  # a film of 3000 x 2000 takes longer
+        with contextlib.suppress(websockets.exceptions.ConnectionClosed):
+            tab.pictures(time.perf_counter() + 0.1)
 
 
 @pytest.mark.parametrize(
@@ -137,9 +169,9 @@ def test_command_refuses_what_cannot_be_meant(arguments, message, tmp_path, monk
     assert message in capsys.readouterr().err
 
 
-def test_closing_leaves_no_thread_behind(scene_view):
+def test_closing_leaves_no_thread_behind(blob_view):
     before = set(threading.enumerate())
-    Site(scene_view, port=0).close()
+    Site(blob_view, port=0).close()
     for thread in set(threading.enumerate()) - before:
         thread.join(10)
         assert not thread.is_alive(), thread

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import signal
+import sys
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,6 +18,9 @@ import tyro
 from v3dg.cli._common import Threads, UsageError, option, require_subject
 from v3dg.cli._views import Axis, direction_of, load_subject
 
+# A wait without an end may miss an interrupt that comes just before it.
+_SECONDS = 0.2
+
 
 @dataclass
 class View:
@@ -21,7 +29,7 @@ class View:
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply)."""
     host: str = "127.0.0.1"
-    """Address to listen at; by default only this machine can connect, with 0.0.0.0 everyone can."""
+    """Address to listen at; by default only this machine can connect, with 0.0.0.0 all who have the printed URL."""
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
     up: Axis = "z"
@@ -57,24 +65,45 @@ def run(options: View) -> None:
             f"--budget: expected a bundle or a scene, got the asset {options.subject}; build a bundle of it"
         )
     scene_view = SceneView(subject, device=options.device)
-    site = Site(
-        scene_view,
-        name=options.subject.stem,
-        cameras=cameras,
-        host=options.host,
-        port=options.port,
-        tolerance=tolerance,
-        budget=options.budget,
-        up=direction_of(options.up),
-    )
+    with _until_interrupted() as interrupted:
+        site = Site(
+            scene_view,
+            name=options.subject.stem,
+            cameras=cameras,
+            host=options.host,
+            port=options.port,
+            tolerance=tolerance,
+            budget=options.budget,
+            up=direction_of(options.up),
+        )
+        has_ended = False
+        try:
+            if options.port not in (0, site.port):
+                print(f"port {options.port} is taken, listening at {site.port}")
+            print(f"{site.url} shows {options.subject}; Ctrl-C ends it", flush=True)
+            while not interrupted.wait(_SECONDS):
+                pass
+        finally:
+            has_ended = site.close()
+    if not has_ended:  # Python cannot end beneath threads that are in C++
+        print("v3dg: error: interrupted", file=sys.stderr, flush=True)
+        os._exit(130)
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def _until_interrupted() -> Iterator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set: an exception in the midst of starting threads would leave some.
+
+    After one of them they do nothing more, for the process ends.
+    """
+    interrupted = threading.Event()
+    before = {
+        number: signal.signal(number, lambda *_: interrupted.set())
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
-        if options.port not in (0, site.port):
-            print(f"port {options.port} is taken, listening at {site.port}")
-        host = {"0.0.0.0": "localhost", "::": "localhost"}.get(options.host, options.host)
-        host = f"[{host}]" if ":" in host else host
-        print(f"http://{host}:{site.port} shows {options.subject}; Ctrl-C ends it", flush=True)
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        print()
+        yield interrupted
     finally:
-        site.close()
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_IGN if interrupted.is_set() else handler)
