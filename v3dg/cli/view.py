@@ -29,7 +29,7 @@ class View:
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply)."""
     host: str = "127.0.0.1"
-    """Address to listen at; by default only this machine can connect, with 0.0.0.0 all who have the printed URL."""
+    """Address to listen at; by default for this machine alone, at 0.0.0.0 for all who have the URL."""
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
     up: Axis = "z"
@@ -76,7 +76,6 @@ def run(options: View) -> None:
             budget=options.budget,
             up=direction_of(options.up),
         )
-        has_ended = False
         try:
             if options.port not in (0, site.port):
                 print(f"port {options.port} is taken, listening at {site.port}")

@@ -1,13 +1,16 @@
-"""The controls of a tab that say what its pictures show, and how finely."""
+"""A tab's camera, and the controls that say what its pictures show, and how finely."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from v3dg.select import DEFAULT_TOLERANCE
-from v3dg.viewer.browser_camera import BrowserCamera
 from v3dg.viewer.frame import SceneView, Settings, Shows
+from v3dg.viewer.pacing import Size, scaled
 from v3dg.viewer.view import View
 
 if TYPE_CHECKING:
@@ -23,6 +26,8 @@ _SHOWS: dict[str, Shows] = {
     "Difference to all gaussians": "difference",
 }
 _WANTS_LEVELS = ("level", "difference")
+# Of a picture's longer side, however large a window the page claims to have.
+_MOST_PIXELS = 4096
 
 
 def value_of(slider: Any) -> float:
@@ -43,6 +48,37 @@ def add_button(gui: Any, label: str, act: Callable[[], None]) -> None:
     gui.add_button(label).on_click(in_order(act))
 
 
+class BrowserCamera:
+    """What a browser tab looks from, which both its user and the viewer move."""
+
+    def __init__(self, client: viser.ClientHandle, scene_view: SceneView) -> None:
+        self._client, self._scene_view = client, scene_view
+
+    @property
+    def view(self) -> View:
+        camera = self._client.camera
+        w, x, y, z = (float(v) for v in camera.wxyz)
+        px, py, pz = (float(v) for v in camera.position)
+        return View((w, x, y, z), (px, py, pz), float(camera.fov), float(camera.aspect))
+
+    def size(self, scale: float) -> Size:
+        """Width and height of the tab's picture in px, multiplied by ``scale`` or what keeps it drawable."""
+        width, height = self._client.camera.image_width, self._client.camera.image_height
+        return scaled((width, height), min(scale, _MOST_PIXELS / max(width, height)))
+
+    def look(self, view: View) -> None:
+        """Move to a view, to turn about what is in its middle, as far away as the scene."""
+        camera, eye = self._client.camera, np.asarray(view.position)
+        forward = view.camera(1, 1, self._scene_view.near).viewmat[2, :3]
+        distance = max(float((self._scene_view.center - eye) @ forward), 0.05 * self._scene_view.radius)
+        # From where a page claims to be there may be no way.
+        with contextlib.suppress(ValueError), self._client.atomic():
+            camera.position = eye
+            camera.look_at = eye + distance * forward
+            camera.wxyz = np.asarray(view.wxyz)  # whose roll the point alone leaves open
+            camera.fov = view.fov_y
+
+
 class Controls:
     """Adds the controls to the tab's panel, and tells what they are set to.
 
@@ -61,18 +97,15 @@ class Controls:
     ) -> None:
         self._client, self._scene_view, self._camera, self._changed = client, scene_view, camera, changed
         self._frozen: View | None = None
-        gui: Any = client.gui  # whose types let no value be set
+        self._gui: Any = client.gui  # whose types let no value be set
         has_levels = scene_view.num_levels > 1
         names = [name for name, shows in _SHOWS.items() if has_levels or shows not in _WANTS_LEVELS]
-        self._shows = gui.add_dropdown("Show", names)
+        self._shows = self._gui.add_dropdown("Show", names)
         self._shows.on_update(in_order(self._choose_shows))
-        self._gain = gui.add_slider("Amplify", 1, 50, 1, round(settings.gain), visible=False)
-        self._gain.on_update(in_order(changed))
-        self._add_cut_controls(gui, settings, has_levels)
-        self._resolution = gui.add_slider(
-            "Resolution %", 10, 100, 5, 100, hint="Of the window, at rest; while moving it follows the speed."
-        )
-        self._resolution.on_update(in_order(changed))
+        self._gain = self._slider("Amplify", 1, 50, 1, round(settings.gain), visible=False)
+        self._add_cut_controls(settings, has_levels)
+        hint = "Of the window, at rest; while moving it follows the speed."
+        self._resolution = self._slider("Resolution %", 10, 100, 5, 100, hint=hint)
 
     @property
     def settings(self) -> Settings:
@@ -87,46 +120,37 @@ class Controls:
         )
 
     @property
-    def size(self) -> tuple[int, int]:
+    def size(self) -> Size:
         """Width and height of the picture at rest, px."""
         return self._camera.size(value_of(self._resolution) / 100)
 
-    def _add_cut_controls(self, gui: Any, settings: Settings, visible: bool) -> None:
+    def _slider(self, *args: Any, **options: Any) -> Any:
+        """As viser's; its values are of the type of the first."""
+        slider = self._gui.add_slider(*args, **options)
+        slider.on_update(in_order(self._changed))
+        return slider
+
+    def _add_cut_controls(self, settings: Settings, visible: bool) -> None:
         """Add those that choose among levels."""
-        tolerance = float(settings.tolerance)  # a slider's values are of the type of its first
-        self._tolerance = gui.add_slider(
-            "Tolerance px²",
-            0.0,
-            max(32.0, tolerance),
-            0.25,
-            tolerance,
-            visible=visible,
-            hint="Screen area that one gaussian of a coarser cluster may stand for; 0 draws all.",
+        tolerance, budget = float(settings.tolerance), settings.budget
+        hint = "Screen area that one gaussian of a coarser cluster may stand for; 0 draws all."
+        most = max(32.0, tolerance)
+        self._tolerance = self._slider(
+            "Tolerance px²", 0.0, most, 0.25, tolerance, visible=visible, hint=hint
         )
-        self._limits = gui.add_checkbox(
-            "Limit gaussians",
-            settings.budget is not None,
-            visible=visible,
-            hint="The tolerance is raised until no more than so many are selected.",
-        )
-        millions = 2.0 if settings.budget is None else settings.budget / 1e6
-        self._budget = gui.add_slider(
-            "Millions",
-            min(0.01, millions),
-            max(20.0, millions),
-            0.01,
-            millions,
-            visible=visible and settings.budget is not None,
-        )
-        last_level = max(self._scene_view.num_levels - 1, 1)
-        self._min_level = gui.add_slider("Finest level", 0, last_level, 1, 0, visible=visible)
-        hint = "All gaussians on the left, the cut on the right."
-        self._split = gui.add_slider("Split", 0.0, 1.0, 0.01, 0.0, visible=visible, hint=hint)
-        for slider in (self._tolerance, self._budget, self._min_level, self._split):
-            slider.on_update(in_order(self._changed))
+        hint = "The tolerance is raised until no more than so many are selected."
+        limits = budget is not None
+        self._limits = self._gui.add_checkbox("Limit gaussians", limits, visible=visible, hint=hint)
         self._limits.on_update(in_order(self._choose_limits))
+        millions = 2.0 if budget is None else budget / 1e6
+        least, most = min(0.01, millions), max(20.0, millions)
+        self._budget = self._slider("Millions", least, most, 0.01, millions, visible=visible and limits)
+        last_level = max(self._scene_view.num_levels - 1, 1)
+        self._min_level = self._slider("Finest level", 0, last_level, 1, 0, visible=visible)
+        hint = "All gaussians on the left, the cut on the right."
+        self._split = self._slider("Split", 0.0, 1.0, 0.01, 0.0, visible=visible, hint=hint)
         hint = "Keep what this camera needs, and fly around it."
-        self._freeze = gui.add_checkbox("Freeze the cut", False, visible=visible, hint=hint)
+        self._freeze = self._gui.add_checkbox("Freeze the cut", False, visible=visible, hint=hint)
         self._freeze.on_update(in_order(self._choose_freeze))
 
     def _choose_shows(self) -> None:

@@ -1,63 +1,31 @@
-"""The files that a tab saves, as bytes, and the thread that they are made in."""
+"""What a tab does that takes long, such as files that it saves, and the thread that it is done in."""
 
 from __future__ import annotations
 
-import io
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PIL import Image
-
 from v3dg import _core
-from v3dg.camera_file import write_cameras
-from v3dg.cameras import Camera
 from v3dg.scene import Scene
-from v3dg.scene_file import write_scene
-from v3dg.video import write_video
-from v3dg.viewer.frame import Pixels, SceneView
+from v3dg.viewer.frame import SceneView
 
 if TYPE_CHECKING:
     import viser
 
 
-def picture_bytes(pixels: Pixels) -> bytes:
-    """Return a .png file."""
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "PNG")
-    return file.getvalue()
-
-
-def film_bytes(pictures: Iterable[Pixels], fps: int) -> bytes:
-    """Return an .mp4 file; errors are those of `write_video`."""
-    return _written("film.mp4", lambda path: write_video(path, pictures, fps=fps))
-
-
-def cameras_bytes(cameras: Mapping[str, Camera]) -> bytes:
-    """Return a `transforms.json`."""
-    return _written("transforms.json", lambda path: write_cameras(path, cameras))
-
-
-def scene_bytes(scene: Scene, cameras: Mapping[str, Camera]) -> bytes:
-    """Return a scene file for the folder that all of the scene's bundles, which must be files, lie below."""
+def bundle_names(scene: Scene) -> list[str]:
+    """Return where the scene's bundles, which must be files, are in the folder that all of them lie below."""
     paths = [os.path.abspath(bundle.path or "") for bundle in scene.bundles]
     folder = os.path.commonpath([os.path.dirname(path) for path in paths] or ["/"])
-    names = [os.path.relpath(path, folder) for path in paths]
-    return _written("scene.json", lambda path: write_scene(path, scene, names, cameras))
-
-
-def _written(name: str, write: Callable[[Path], object]) -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, name)
-        write(path)
-        return path.read_bytes()
+    return [os.path.relpath(path, folder) for path in paths]
 
 
 class Exporter:
-    """Does for a tab what takes long: one thing at a time, in a thread, until it is done or stopped."""
+    """Does one thing at a time, in a thread, until it is done or stopped."""
 
     def __init__(self, client: viser.ClientHandle, scene_view: SceneView) -> None:
         self._client, self._scene_view = client, scene_view
@@ -86,9 +54,12 @@ class Exporter:
     def _notify(self, title: str, text: str) -> None:
         self._client.add_notification(title, text, auto_close_seconds=8)
 
-    def download(self, name: str, content: bytes) -> None:
-        """Have the browser save a file."""
-        self._client.send_file_download(name, content, save_immediately=True)
+    def save(self, name: str, write: Callable[[Path], object]) -> None:
+        """Have the browser save a file that is written now."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, name)
+            write(path)
+            self._client.send_file_download(name, path.read_bytes(), save_immediately=True)
 
     def stop(self) -> None:
         """Ask the work under way to end."""

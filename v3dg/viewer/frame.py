@@ -22,7 +22,7 @@ from v3dg.pictures import to_8bit
 from v3dg.render import render
 from v3dg.residency import residency
 from v3dg.scene import Scene
-from v3dg.select import DEFAULT_TOLERANCE, Selection, rule_of, select
+from v3dg.select import DEFAULT_TOLERANCE, Selection, select
 from v3dg.viewer.view import View
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
@@ -132,10 +132,10 @@ class SceneView:
     Args:
         subject: A scene, a bundle, or an asset, which is split into clusters but gets no coarser levels.
         device: Where to draw: "cpu", "cuda", or "auto", which is CUDA where that works.
-        near: As in `v3dg.Camera`; None for what suits the scene's size.
 
     Attributes:
         scene: The subject as a scene.
+        near: As in `v3dg.Camera`, to suit the scene's size.
         center, radius: A ball that holds nearly all of it, world units.
     """
 
@@ -144,7 +144,6 @@ class SceneView:
         subject: Scene | Bundle | Gaussians,
         *,
         device: str | Device = "auto",
-        near: float | None = None,
     ) -> None:
         if isinstance(subject, Gaussians):
             only_leaves = BuildConfig(min_clusters=1 << 31)
@@ -152,7 +151,7 @@ class SceneView:
         self.scene = Scene.of(subject)
         self.device = _device.resolve(device)
         self.center, self.radius = _bounds(self.scene)
-        self.near = min(0.01, 1e-3 * self.radius) if near is None else near
+        self.near = min(0.01, 1e-3 * self.radius)
         self.num_levels = max((bundle.num_levels for bundle in self.scene.bundles), default=1)
         sizes = [bundle.clusters.offset[bundle.level_range(0).stop] for bundle in self.scene.bundles]
         instances = np.bincount(self.scene.instance_bundle, minlength=len(sizes))
@@ -240,12 +239,7 @@ class SceneView:
     def _all_gaussians(
         self, camera: Camera, window: Window, stop: _core.Stop | None
     ) -> npt.NDArray[np.float32]:
-        if self.device.is_cuda:
-            cut = select(self.scene, camera, tolerance=0.0, device=self.device)
-        else:  # which leaves out what is beside the window
-            rule = rule_of(0.0, None, 0, "solid_angle", True)
-            found = residency.scene(self.scene, CPU).core.select(camera.core.window(*window), rule)
-            cut = Selection(self.scene, found.instance_ids, found.cluster_ids, found.num_gaussians, 0.0, 0.0)
+        cut = select(self.scene, camera, tolerance=0.0, device=self.device)
         color: npt.NDArray[np.float32] = self._draw(cut, camera, window, "appearance", stop)[0]
         return color
 

@@ -164,7 +164,9 @@ class Gate:
                     response.headers.update(_PAGE_HEADERS)
                 return response
 
-            asyncio.get_running_loop().set_exception_handler(_log_exception)
+            asyncio.get_running_loop().set_exception_handler(
+                lambda _, context: _LOG.error(context["message"], exc_info=context.get("exception"))
+            )
             ours = {"process_request": process, "create_connection": _Connection, "sock": self._socket}
             return serve(handler, **(options | _OPTIONS | ours))
 
@@ -189,7 +191,3 @@ def _listening_socket(host: str, port: int) -> socket.socket:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 raise ValueError(f"host: expected an address of this machine, got {host}") from error
     raise ValueError(f"port: expected a free one among {ports[0]} to {ports[-1]}, got none")
-
-
-def _log_exception(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    _LOG.error("%s", context["message"], exc_info=context.get("exception"))

@@ -9,10 +9,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from v3dg import _core
+from v3dg.camera_file import write_cameras
 from v3dg.cameras import Camera
-from v3dg.viewer.browser_camera import BrowserCamera
-from v3dg.viewer.controls import Controls, add_button, in_order, value_of
-from v3dg.viewer.exports import Exporter, cameras_bytes, film_bytes, scene_bytes
+from v3dg.scene_file import write_scene
+from v3dg.video import write_video
+from v3dg.viewer.controls import BrowserCamera, Controls, add_button, in_order, value_of
+from v3dg.viewer.exports import Exporter, bundle_names
 from v3dg.viewer.frame import Pixels, SceneView, Settings
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View
@@ -111,10 +113,9 @@ class PathControls:
         pictures = self._film(path.film(_FPS), size, self._controls.settings, stop)
         self._progress.value, self._progress.visible = 0.0, True
         try:
-            content = film_bytes(pictures, _FPS)
+            self._exporter.save(f"{self._name}.mp4", lambda file: write_video(file, pictures, fps=_FPS))
         finally:
             self._progress.visible = False
-        self._exporter.download(f"{self._name}.mp4", content)
 
     def _film(
         self, views: list[View], size: tuple[int, int], settings: Settings, stop: _core.Stop
@@ -129,8 +130,10 @@ class PathControls:
         return path.cameras(_FPS, *self._controls.size, self._scene_view.near)
 
     def _save_cameras(self, path: CameraPath, _: _core.Stop) -> None:
-        self._exporter.download("transforms.json", cameras_bytes(self._cameras(path)))
+        cameras = self._cameras(path)
+        self._exporter.save("transforms.json", lambda file: write_cameras(file, cameras))
 
     def _save_scene(self, path: CameraPath, _: _core.Stop) -> None:
-        content = scene_bytes(self._scene_view.scene, self._cameras(path))
-        self._exporter.download(f"{self._name}.json", content)
+        scene, cameras = self._scene_view.scene, self._cameras(path)
+        names = bundle_names(scene)
+        self._exporter.save(f"{self._name}.json", lambda file: write_scene(file, scene, names, cameras))

@@ -7,7 +7,7 @@ import io
 import math
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -74,15 +74,15 @@ class Site:
         self._ending: list[Tab] = []
         self._gate = Gate(host, port)
         self.port, self.url = self._gate.port, self._gate.url
-        with _quiet(), self._gate.guarding():  # which tells viser where to listen
+        with contextlib.redirect_stdout(io.StringIO()), self._gate.guarding():  # who tells it where to listen
             self._server = viser.ViserServer(host="127.0.0.1", port=0, label=name, verbose=False)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.gui.main_panel.dock_right()  # beside the picture, not over it
-        self._server.scene.set_up_direction(_three(up))
-        start = start_view(scene_view, up)
+        start, upwards = start_view(scene_view, up), np.asarray(up, np.float64)
+        self._server.scene.set_up_direction(upwards)
         first = self._server.initial_camera
-        first.position, first.look_at = start.position, _three(scene_view.center)
-        first.up, first.fov = _three(up), _FOV_Y
+        first.position, first.look_at = start.position, scene_view.center
+        first.up, first.fov = upwards, _FOV_Y
         settings = Settings(tolerance=tolerance, budget=budget)
 
         # Both are called on the event loop, one after the other.
@@ -100,7 +100,7 @@ class Site:
         """End all tabs and the server in about two seconds; returns whether all their threads have ended."""
         for tab in tuple(self._tabs.values()):
             tab.close(0.0)
-        with _quiet():
+        with contextlib.redirect_stdout(io.StringIO()):  # the command says what there is to say
             self._server.stop()
         end = time.monotonic() + _CLOSE_SECONDS
         tabs = (*self._tabs.values(), *self._ending)
@@ -117,15 +117,3 @@ def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) ->
     direction = math.cos(0.45) * aside / np.linalg.norm(aside) + math.sin(0.45) * axis
     distance = 0.95 * scene_view.radius / math.sin(_FOV_Y / 2)
     return look_at(scene_view.center + distance * direction, scene_view.center, axis, _FOV_Y, aspect)
-
-
-def _three(vector: VectorLike) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in vector)
-    return x, y, z
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what viser prints when it starts and stops: the command says where the viewer is."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from PIL import Image
+
 from v3dg import _core
 from v3dg.cameras import Camera
-from v3dg.viewer.browser_camera import BrowserCamera
-from v3dg.viewer.controls import Controls, add_button, in_order
-from v3dg.viewer.exports import Exporter, picture_bytes
+from v3dg.viewer.controls import BrowserCamera, Controls, add_button, in_order
+from v3dg.viewer.exports import Exporter
 from v3dg.viewer.figures import FiguresPanel
 from v3dg.viewer.frame import Frame, SceneView, Settings
 from v3dg.viewer.pacing import RenderLoop, Request
@@ -92,4 +93,4 @@ class Tab:
     def _save_picture(self, stop: _core.Stop) -> None:
         request = self._wanted()
         frame = self._scene_view.frame(request.view, request.size, request.settings, stop)
-        self._exporter.download(f"{self._name}.png", picture_bytes(frame.pixels))
+        self._exporter.save(f"{self._name}.png", Image.fromarray(frame.pixels).save)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,15 +30,10 @@ class View:
     @classmethod
     def of_camera(cls, camera: Camera) -> View:
         """Take over pose and field of view; a principal point off the middle is lost."""
-        w, x, y, z = quaternion_from_rotation(camera.viewmat[:3, :3].T)
-        eye = camera.position
+        x, y, z = camera.position.tolist()
         half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
-        return cls(
-            (w, x, y, z),
-            (float(eye[0]), float(eye[1]), float(eye[2])),
-            2 * math.atan(half_y),
-            half_x / half_y,
-        )
+        wxyz = quaternion_from_rotation(camera.viewmat[:3, :3].T)
+        return cls(wxyz, (x, y, z), 2 * math.atan(half_y), half_x / half_y)
 
     def camera(self, width: int, height: int, near: float) -> Camera:
         """Return the camera whose picture of that size fills the view; its pixels need not be square."""
@@ -48,13 +43,8 @@ class View:
         viewmat[:3, :3] = rotation
         viewmat[:3, 3] = -rotation @ np.asarray(self.position, np.float64)
         half_y = math.tan(self.fov_y / 2)
-        K = np.array(
-            [
-                [width / 2 / (half_y * self.aspect), 0.0, width / 2],
-                [0.0, height / 2 / half_y, height / 2],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        fx, fy = width / 2 / (half_y * self.aspect), height / 2 / half_y
+        K = np.array([[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]])
         return Camera(viewmat, K, width, height, near)
 
 
@@ -70,13 +60,11 @@ def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, flo
             [0.0, 0.0, 0.0, r[2, 2] - r[0, 0] - r[1, 1]],
         ]
     )
-    w, x, y, z = np.linalg.eigh(symmetric, UPLO="U")[1][:, -1]
-    sign = -1.0 if w < 0 else 1.0
-    return sign * float(w), sign * float(x), sign * float(y), sign * float(z)
+    w, x, y, z = np.linalg.eigh(symmetric, UPLO="U")[1][:, -1].tolist()
+    return (-w, -x, -y, -z) if w < 0 else (w, x, y, z)
 
 
 def look_at(eye: VectorLike, target: VectorLike, up: VectorLike, fov_y: float, aspect: float) -> View:
     """Return the view at ``eye`` with ``target`` in the middle and ``up`` upwards."""
-    camera = Camera.look_at(eye, target, up, width=1, height=1)
-    of_camera = View.of_camera(camera)
-    return View(of_camera.wxyz, of_camera.position, fov_y, aspect)
+    of_camera = View.of_camera(Camera.look_at(eye, target, up, width=1, height=1))
+    return replace(of_camera, fov_y=fov_y, aspect=aspect)
