@@ -7,7 +7,7 @@ import math
 import os
 import signal
 import sys
-import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +18,8 @@ import tyro
 from v3dg.cli._common import Threads, UsageError, option, require_subject
 from v3dg.cli._views import Axis, direction_of, load_subject
 
-# A wait without an end may miss an interrupt that comes just before it.
-_SECONDS = 0.2
+# Between looks for a signal: a wait without an end misses one that comes just before it.
+_SECONDS = 0.1
 
 
 @dataclass
@@ -65,7 +65,7 @@ def run(options: View) -> None:
             f"--budget: expected a bundle or a scene, got the asset {options.subject}; build a bundle of it"
         )
     scene_view = SceneView(subject, device=options.device)
-    with _until_interrupted() as interrupted:
+    with _interrupts() as interrupts:
         site = Site(
             scene_view,
             name=options.subject.stem,
@@ -80,8 +80,8 @@ def run(options: View) -> None:
             if options.port not in (0, site.port):
                 print(f"port {options.port} is taken, listening at {site.port}")
             print(f"{site.url} shows {options.subject}; Ctrl-C ends it", flush=True)
-            while not interrupted.wait(_SECONDS):
-                pass
+            while not interrupts:
+                time.sleep(_SECONDS)
         finally:
             has_ended = site.close()
     if not has_ended:  # Python cannot end beneath threads that are in C++
@@ -91,18 +91,19 @@ def run(options: View) -> None:
 
 
 @contextlib.contextmanager
-def _until_interrupted() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set: an exception in the midst of starting threads would leave some.
+def _interrupts() -> Iterator[list[int]]:
+    """Numbers of the signals that came, Ctrl-C and SIGTERM: exceptions would leave threads half started.
 
-    After one of them they do nothing more, for the process ends.
+    After one they do nothing more, for the process ends. A handler may run inside of any lock's code, so it
+    takes none.
     """
-    interrupted = threading.Event()
+    came: list[int] = []
     before = {
-        number: signal.signal(number, lambda *_: interrupted.set())
+        number: signal.signal(number, lambda number, _: came.append(number))
         for number in (signal.SIGINT, signal.SIGTERM)
     }
     try:
-        yield interrupted
+        yield came
     finally:
         for number, handler in before.items():
-            signal.signal(number, signal.SIG_IGN if interrupted.is_set() else handler)
+            signal.signal(number, signal.SIG_IGN if came else handler)
