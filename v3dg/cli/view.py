@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import math
 import os
 import signal
@@ -65,6 +66,8 @@ def run(options: View) -> None:
             f"--budget: expected a bundle or a scene, got the asset {options.subject}; build a bundle of it"
         )
     scene_view = SceneView(subject, device=options.device)
+    with contextlib.suppress(ImportError):  # of which the site tells; it takes long
+        importlib.import_module("v3dg.viewer.gate")
     with _interrupts() as interrupts:
         site = Site(
             scene_view,
@@ -95,12 +98,12 @@ def _interrupts() -> Iterator[list[int]]:
     """Numbers of the signals that came, Ctrl-C and SIGTERM: exceptions would leave threads half started.
 
     After one they do nothing more, for the process ends. A handler may run inside of any lock's code, so it
-    takes none.
+    takes none. An alarm is a Ctrl-C that came in the midst of an import.
     """
     came: list[int] = []
     before = {
         number: signal.signal(number, lambda number, _: came.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
     }
     try:
         yield came
