@@ -115,6 +115,30 @@ def test_maps_keep_their_detail(device):
     assert_pictures_agree(raster, expected, PICTURE_FLOAT)
 
 
+@pytest.mark.parametrize("distance", [1e3, 1e4, 1e5])
+def test_assets_far_from_their_zero_keep_their_detail(device, distance):
+    """Own coordinates of up to 10⁵, and an eye among them, behind an instance that turns and scales."""
+    rng = np.random.default_rng(0)
+    near = scenes_lod.blob(rng, 400, size=0.5, sh_degree=2)
+    center = distance * np.array([0.6, -0.64, 0.48])
+    asset = scenes.replaced(near, means=near.means + center.astype(np.float32))
+    scene, quaternion, scale = v3dg.Scene(), (0.3, -0.5, 0.7, 0.4), 7.0
+    scene.add(scenes_lod.lod_bundle(rng, asset, 64), (3.0, 5e4, -700.0), quaternion, scale)
+    place = scene.positions[0] + scale * scene.rotations[0] @ center
+    camera = v3dg.Camera.look_at(place + np.array([0.3, -9.0, 1.0]), place, width=70, height=50)
+    # The same camera in the frame of the asset, which is seen at 1 / scale.
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = camera.viewmat[:3, :3] @ scene.rotations[0]
+    eye = scene.rotations[0].T @ (camera.position - scene.positions[0]) / scale
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    own = v3dg.Camera(viewmat, camera.K, 70, 50, camera.near / scale)
+    got = v3dg.render(scene, camera, tolerance=0.0, device=device)
+    raster = v3dg.Image(*host((got.color, got.alpha, got.depth / scale)))
+    expected = reference_rasterize.rasterize(asset, own)
+    assert (expected.alpha > 0.5).mean() > 0.1
+    assert_pictures_agree(raster, expected, PICTURE_FLOAT)
+
+
 UNSEEN = {
     "no gaussians": scenes.gaussians(np.zeros((0, 3))),
     "all behind": scenes.gaussians([[0, 0, -2.0]] * 300),

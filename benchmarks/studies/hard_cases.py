@@ -81,11 +81,14 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         "| --- | --- | --- |" + " --- |" * len(columns),
     ]
     for name, case in cases.hard_cases().items():
-        cells = [
-            f"{text_of(measured[part]['percent'])} ({measured[part]['largest']:.0e})"
-            for measured in (result["cases"][name] for result in results.values())
-            for part in ("picture", "gradients")
-        ]
+        cells = []
+        for result in results.values():
+            measured = result["cases"].get(name)
+            for part in ("picture", "gradients"):
+                errors = (
+                    measured and f"{text_of(measured[part]['percent'])} ({measured[part]['largest']:.0e})"
+                )
+                cells.append(errors or "not measured")
         bound = f"{case.picture.absolute:.0e}" if case.gradient else "finite"
         lines.append(f"| {name} | {case.what} | {bound} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"

@@ -63,7 +63,7 @@ void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget&
                 FitScratch& scratch, FitImage& image) {
     const int ss = config.supersample;
     const Draw<float> draw{target.model,       group.target_first,
-                           group.target_count, view_of_world(config, group, view),
+                           group.target_count, view_of_world(config, group.center, group.radius, view),
                            target.filter_px2,  target.antialiased};
     const size_t count = project_sorted(draw, camera_of(view, static_cast<float>(ss)), scratch);
     const int across = tiles_across(view);

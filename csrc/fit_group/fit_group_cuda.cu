@@ -48,6 +48,7 @@ __device__ bool project_one(const Fit& fit, uint32_t i, const ModelView<float>& 
                             const Pinhole<float>& camera, Record<float>& r) {
     const Gaussian3d<float> g = gaussian_of(fit, i);
     Projection<float> p;
+    to_view(view, g.mean, p.p);
     const Ellipse<float> e =
         project_gaussian(g, view, camera, fit.in.config.filter_px2, fit.in.config.antialiased, p);
     float half_x, half_y;
@@ -57,8 +58,10 @@ __device__ bool project_one(const Fit& fit, uint32_t i, const ModelView<float>& 
     if (!box.holds_pixels()) return false;
     set_ellipse(e, box, r);
     const float* sh = fit.at(fit.layout.value) + 11 * fit.n + fit.num_sh * i;
+    float direction[3];
+    from_eye(view, g.mean, direction);
     with_degree(fit.in.rows.sh_degree,
-                [&](auto degree) { color_of_sh<float>(decltype(degree)::value, g.mean, view, sh, r.color); });
+                [&](auto degree) { color_of_sh<float>(decltype(degree)::value, direction, sh, r.color); });
     return true;
 }
 
@@ -109,17 +112,20 @@ __device__ void project_views_backward(const Fit& fit, const FitCameras& cameras
         const bool antialiased = fit.in.config.antialiased;
         const Gaussian3d<float> g = gaussian_of(fit, i);
         Projection<float> p;
+        to_view(view, g.mean, p.p);
         const Ellipse<float> e = project_gaussian(g, view, camera, filter_px2, antialiased, p);
         const Ellipse<float> d_ellipse =
             falloff_vjp(e.l11, e.l12, e.l22, FalloffSums<float>{d[0], d[1], d[2], d[3], d[4], d[5]});
         Gaussian3d<float> d_g =
             project_gaussian_vjp(g, view, camera, filter_px2, antialiased, p, e, d_ellipse);
         const float* sh = value + 11 * fit.n + fit.num_sh * i;
+        float direction[3];
+        from_eye(view, g.mean, direction);
         with_degree(fit.in.rows.sh_degree, [&](auto degree) {
             float color[3];
             constexpr int kDegree = decltype(degree)::value;
-            color_of_sh<float>(kDegree, g.mean, view, sh, color);
-            color_of_sh_vjp<float>(kDegree, g.mean, view, sh, color, d + 6, d_g.mean, d_sh);
+            color_of_sh<float>(kDegree, direction, sh, color);
+            color_of_sh_vjp<float>(kDegree, direction, sh, color, d + 6, d_g.mean, d_sh);
         });
         for (int k = 0; k < 3; ++k) out[k * fit.n + i] = d_g.mean[k];
         for (int k = 0; k < 4; ++k) out[(3 + k) * fit.n + i] = d_g.quat[k];

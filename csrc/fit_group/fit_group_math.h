@@ -105,30 +105,27 @@ V3DG_HD inline uint64_t held_out_view(const FitConfig& config, int i) {
     return config.num_views > 0 ? static_cast<uint64_t>(config.num_views + i) : ~uint64_t(0) - i;
 }
 
-// Group frame to view.
-V3DG_HD V3DG_INLINE ModelView<float> view_of_group(const FitConfig& config, const FitView& view) {
-    ModelView<float> mv{};
-    for (int i = 0; i < 9; ++i) mv.linear[i] = view.rotation[i];
-    mv.translation[2] = config.distance;
-    for (int i = 0; i < 3; ++i) mv.eye[i] = -view.rotation[6 + i] * config.distance;
+// World to view, of a ball that is scaled to radius 1.
+V3DG_HD V3DG_INLINE ModelView<float> view_of_world(const FitConfig& config, const float center[3],
+                                                   float radius, const FitView& view) {
+    double linear[9], translation[3] = {0, 0, config.distance}, eye[3];
+    for (int i = 0; i < 3; ++i) {
+        for (int k = 0; k < 3; ++k) {
+            linear[3 * i + k] = view.rotation[3 * i + k] / static_cast<double>(radius);
+            translation[i] -= linear[3 * i + k] * center[k];
+        }
+        eye[i] = center[i] - static_cast<double>(radius) * view.rotation[6 + i] * config.distance;
+    }
+    ModelView<float> mv;
+    for (int k = 0; k < 9; ++k) mv.linear[k] = static_cast<float>(linear[k]);
+    set_eye(linear, translation, eye, mv);
     return mv;
 }
 
-// World to view, the ball scaled to radius 1.
-V3DG_HD V3DG_INLINE ModelView<float> view_of_world(const FitConfig& config, const FitGroup& group,
-                                                   const FitView& view) {
-    ModelView<float> mv = view_of_group(config, view);
-    const double shrink = 1 / static_cast<double>(group.radius);
-    for (int i = 0; i < 3; ++i) {
-        double offset = 0;
-        for (int k = 0; k < 3; ++k) {
-            offset += static_cast<double>(view.rotation[3 * i + k]) * group.center[k];
-            mv.linear[3 * i + k] = static_cast<float>(view.rotation[3 * i + k] * shrink);
-        }
-        mv.translation[i] = static_cast<float>(mv.translation[i] - offset * shrink);
-        mv.eye[i] = static_cast<float>(group.center[i] + static_cast<double>(group.radius) * mv.eye[i]);
-    }
-    return mv;
+// Group frame to view.
+V3DG_HD V3DG_INLINE ModelView<float> view_of_group(const FitConfig& config, const FitView& view) {
+    const float center[3] = {0, 0, 0};
+    return view_of_world(config, center, 1, view);
 }
 
 V3DG_HD V3DG_INLINE Pinhole<float> camera_of(const FitView& view, float scale) {

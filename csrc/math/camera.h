@@ -2,6 +2,9 @@
 
 // Pinhole cameras: the image side that projection needs, and a camera in the world.
 
+#include <cstdint>
+#include <cstring>
+
 #include "math/lanes.h"
 
 namespace v3dg {
@@ -16,13 +19,52 @@ struct Pinhole {
     T near_depth;
 };
 
-// Model space to view space: view = linear * model + translation, linear = uniform scale * rotation.
+// Model space to view space: view = linear * (model - eye) + translation, linear = uniform scale * rotation.
+// What is near the eye keeps its digits, however far from zero both are.
 template <class T>
 struct ModelView {
-    T linear[9];  // row major
-    T translation[3];
-    T eye[3];  // the camera's position in model space
+    T linear[9];            // row major
+    T translation[3];       // of what `eye` lacks
+    T eye[3], eye_rest[3];  // the camera's position in model space is their sum
 };
+
+// The leading 24 bits of a number, which a float holds. Of its bits, for GCC 12 takes (double)(float)x to be
+// x where it vectorizes.
+V3DG_HD inline double leading_bits(double x) {
+    uint64_t bits;
+    std::memcpy(&bits, &x, sizeof bits);
+    bits &= ~((uint64_t(1) << 29) - 1);
+    std::memcpy(&x, &bits, sizeof bits);
+    return x;
+}
+
+// Places the eye, in double precision; `translation` is that of view = linear * model + translation.
+template <class T>
+V3DG_HD inline void set_eye(const double linear[9], const double translation[3], const double eye[3],
+                            ModelView<T>& view) {
+    double rest[3] = {translation[0], translation[1], translation[2]};
+    for (int k = 0; k < 3; ++k) {
+        const double leading = leading_bits(eye[k]);
+        view.eye[k] = T(leading);
+        view.eye_rest[k] = T(eye[k] - leading);
+        for (int row = 0; row < 3; ++row) rest[row] += linear[3 * row + k] * leading;
+    }
+    for (int row = 0; row < 3; ++row) view.translation[row] = T(rest[row]);
+}
+
+// A point of the model in view space.
+template <class V, class T>
+V3DG_HD V3DG_INLINE void to_view(const ModelView<T>& mv, const V point[3], V p[3]) {
+    const V x = point[0] - mv.eye[0], y = point[1] - mv.eye[1], z = point[2] - mv.eye[2];
+    for (int i = 0; i < 3; ++i)
+        p[i] = mv.linear[3 * i] * x + mv.linear[3 * i + 1] * y + mv.linear[3 * i + 2] * z + mv.translation[i];
+}
+
+// From the eye to a point, both in the model.
+template <class V, class T>
+V3DG_HD V3DG_INLINE void from_eye(const ModelView<T>& mv, const V point[3], V direction[3]) {
+    for (int k = 0; k < 3; ++k) direction[k] = point[k] - mv.eye[k] - mv.eye_rest[k];
+}
 
 // Limits of x / z and y / z past which the Jacobian is held.
 template <class T>
@@ -76,8 +118,7 @@ template <class T>
 V3DG_HD inline ModelView<T> view_of_world(const Camera& c) {
     ModelView<T> view;
     for (int k = 0; k < 9; ++k) view.linear[k] = T(c.rotation[k]);
-    for (int k = 0; k < 3; ++k) view.translation[k] = T(c.translation[k]);
-    for (int k = 0; k < 3; ++k) view.eye[k] = T(c.eye[k]);
+    set_eye(c.rotation, c.translation, c.eye, view);
     return view;
 }
 

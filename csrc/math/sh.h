@@ -3,7 +3,6 @@
 // Real spherical harmonics of degree 0 to 3, in the order and with the signs that .ply assets are stored in.
 // A gaussian's colour is max(0, 1/2 + sum of coefficient * basis(view direction)).
 
-#include "math/camera.h"
 #include "math/vec.h"
 
 namespace v3dg {
@@ -73,15 +72,14 @@ V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxS
     g_dir[2] = gz;
 }
 
-// Colour in the direction from the camera's position in model space; what is not finite is 0, so that it
-// stays off pixels on which the gaussian has no weight. `sh` holds the coefficients of one gaussian (or of
-// one a lane), base by base, three channels each.
-template <class V, class T>
-V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelView<T>& mv, const V* sh,
-                                     V color[3]) {
+// Colour in a direction of any length, from the eye to the gaussian in model space; what is not finite is 0,
+// so that it stays off pixels on which the gaussian has no weight. `sh` holds the coefficients of one
+// gaussian (or of one a lane), base by base, three channels each.
+template <class V>
+V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* sh, V color[3]) {
     using L = Lane<V>;
     V basis[kMaxShBases];
-    V dir[3] = {mean[0] - mv.eye[0], mean[1] - mv.eye[1], mean[2] - mv.eye[2]};
+    V dir[3] = {direction[0], direction[1], direction[2]};
     if (degree > 0) {
         const V n2 = dot3(dir, dir);
         const V inv = n2 > V{} ? 1 / sqrt_of(n2) : V{};
@@ -89,19 +87,19 @@ V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V mean[3], const ModelVie
     }
     sh_bases(degree, dir[0], dir[1], dir[2], basis);
     for (int c = 0; c < 3; ++c) {
-        V sum = all_lanes<V>(T(0.5));
+        V sum = all_lanes<V>(L(0.5));
         for (int b = 0; b < num_sh_bases(degree); ++b) sum += basis[b] * sh[3 * b + c];
         sum = max_of(sum, V{});
         color[c] = sum < all_lanes<V>(kInfinite<L>) ? sum : V{};
     }
 }
 
-// Adds to `d_mean` and sets `d_sh` from the gradient of the colour. `d_sh` may be `sh` itself.
-template <class V, class T>
-V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V mean[3], const ModelView<T>& mv, const V* sh,
-                                         const V color[3], const V d_color[3], V d_mean[3], V* d_sh) {
+// Adds to `d_direction` and sets `d_sh` from the gradient of the colour. `d_sh` may be `sh` itself.
+template <class V>
+V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V direction[3], const V* sh, const V color[3],
+                                         const V d_color[3], V d_direction[3], V* d_sh) {
     V basis[kMaxShBases], d_basis[kMaxShBases];
-    V dir[3] = {mean[0] - mv.eye[0], mean[1] - mv.eye[1], mean[2] - mv.eye[2]};
+    V dir[3] = {direction[0], direction[1], direction[2]};
     V inv = V{};
     if (degree > 0) {
         const V n2 = dot3(dir, dir);
@@ -122,7 +120,7 @@ V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V mean[3], const Mode
     V d_dir[3];
     sh_bases_vjp(degree, dir[0], dir[1], dir[2], d_basis, d_dir);
     const V along = dot3(dir, d_dir);
-    for (int i = 0; i < 3; ++i) d_mean[i] += inv * (d_dir[i] - along * dir[i]);
+    for (int i = 0; i < 3; ++i) d_direction[i] += inv * (d_dir[i] - along * dir[i]);
 }
 
 }  // namespace v3dg

@@ -57,10 +57,12 @@ V3DG_HD inline InstanceAxes axes_of_instance(const Camera& camera, const Pose& p
 
 // What projection needs of it.
 V3DG_HD inline ModelView<float> model_view_from_instance(const InstanceAxes& in, const Pose& pose) {
+    double linear[9], translation[3];
+    for (int k = 0; k < 9; ++k) linear[k] = pose.scale * in.axes[k];
+    for (int k = 0; k < 3; ++k) translation[k] = pose.scale * in.origin[k];
     ModelView<float> view;
-    for (int k = 0; k < 9; ++k) view.linear[k] = static_cast<float>(pose.scale * in.axes[k]);
-    for (int k = 0; k < 3; ++k) view.translation[k] = static_cast<float>(pose.scale * in.origin[k]);
-    for (int k = 0; k < 3; ++k) view.eye[k] = static_cast<float>(in.eye[k]);
+    for (int k = 0; k < 9; ++k) view.linear[k] = static_cast<float>(linear[k]);
+    set_eye(linear, translation, in.eye, view);
     return view;
 }
 

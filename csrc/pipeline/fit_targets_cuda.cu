@@ -63,7 +63,8 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items, un
         image.color = t.color + 3 * p.first_pixel;
         image.alpha = t.alpha + p.first_pixel;
         t.images[blockIdx.x] = image;
-        t.placements[blockIdx.x] = {view_of_world(t.config, job.group, view), 0, blockIdx.x};
+        t.placements[blockIdx.x] = {view_of_world(t.config, job.group.center, job.group.radius, view), 0,
+                                    blockIdx.x};
     }
     if (!items.has_room_for(num_items, num_records)) return;
     const uint32_t count = static_cast<uint32_t>(job.group.target_count);

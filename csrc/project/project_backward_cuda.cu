@@ -156,6 +156,7 @@ __global__ void __launch_bounds__(kThreads)
 
     if (used) {
         Projection<float> s;
+        to_view(in.view, g.mean, s.p);
         const Ellipse<float> e = project_gaussian(g, in.view, in.camera, in.filter_px2, in.antialiased, s);
         Gaussian3d<float> d_gaussian =
             project_gaussian_vjp(g, in.view, in.camera, in.filter_px2, in.antialiased, s, e, d.ellipse);
@@ -163,7 +164,9 @@ __global__ void __launch_bounds__(kThreads)
         Word* row = sh_rows + (i - first) * Row::kStride;
         for (int k = 0; k < Row::kWords; ++k) words[k] = row[k];
         float* sh = reinterpret_cast<float*>(words);
-        color_of_sh_vjp(kDegree, g.mean, in.view, sh, color, d.color, d_gaussian.mean, sh);
+        float direction[3];
+        from_eye(in.view, g.mean, direction);
+        color_of_sh_vjp(kDegree, direction, sh, color, d.color, d_gaussian.mean, sh);
         for (int k = 0; k < Row::kWords; ++k) row[k] = words[k];
         store_row<3>(out.means, i, d_gaussian.mean);
         store_row<4>(out.quats, i, d_gaussian.quat);

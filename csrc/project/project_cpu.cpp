@@ -38,13 +38,14 @@ static V3DG_INLINE void write_records(const Draw<T>& draw, uint64_t at, unsigned
                                       const Gaussian3d<V>& g, const Ellipse<V>& e, const PixelBox<I>& box,
                                       Record<T>* records) {
     const GaussianPlanes<T>& model = *draw.model;
-    V sh[3 * kMaxShBases], color[3];
+    V sh[3 * kMaxShBases], direction[3], color[3];
+    from_eye(draw.view, g.mean, direction);
     if (draw.palette.sh != nullptr) {
         load_palette(draw.palette, at, lanes, sh);
-        color_of_sh(0, g.mean, draw.view, sh, color);
+        color_of_sh(0, direction, sh, color);
     } else {
         for (int k = 0; k < 3 * num_sh_bases(model.sh_degree); ++k) sh[k] = load(model.sh[k] + at);
-        color_of_sh(model.sh_degree, g.mean, draw.view, sh, color);
+        color_of_sh(model.sh_degree, direction, sh, color);
     }
     for (Record<T>* r = records; lanes != 0; lanes &= lanes - 1, ++r) {
         const int i = __builtin_ctz(lanes);
@@ -72,14 +73,12 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         const uint64_t at = draw.first + skip + done;
         const unsigned lanes = count - done >= kWidth ? (1u << kWidth) - 1 : (1u << (count - done)) - 1;
         const Gaussian3d<V> g = load_gaussians(model, at);
-        const ModelView<T>& mv = draw.view;
-        const V depth = mv.linear[6] * g.mean[0] + mv.linear[7] * g.mean[1] + mv.linear[8] * g.mean[2] +
-                        mv.translation[2];
-        const auto in_front = depth >= all_lanes<V>(camera.near_depth);
-        if ((bits_of(in_front) & lanes) == 0) continue;
         Projection<V> s;
-        const Ellipse<V> e =
-            project_gaussian(g, mv, camera, draw.appearance.filter_px2, draw.appearance.antialiased, s);
+        to_view(draw.view, g.mean, s.p);
+        const auto in_front = s.p[2] >= all_lanes<V>(camera.near_depth);
+        if ((bits_of(in_front) & lanes) == 0) continue;
+        const Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.appearance.filter_px2,
+                                              draw.appearance.antialiased, s);
 
         V half_x, half_y;
         const auto drawable = in_front & extent_of(g.opacity, e, s, half_x, half_y);
@@ -155,13 +154,15 @@ void project_backward(const Draw<T>& draw, const uint32_t* source, const RecordG
             for (int c = 0; c < 3; ++c) d_color[c][i] = r.color[c];
         }
         Projection<V> s;
+        to_view(draw.view, g.mean, s.p);
         const Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.appearance.filter_px2,
                                               draw.appearance.antialiased, s);
-        V color[3], d_sh[3 * kMaxShBases];
-        color_of_sh(m.sh_degree, g.mean, draw.view, sh, color);
+        V direction[3], color[3], d_sh[3 * kMaxShBases];
+        from_eye(draw.view, g.mean, direction);
+        color_of_sh(m.sh_degree, direction, sh, color);
         Gaussian3d<V> d_g = project_gaussian_vjp(g, draw.view, camera, draw.appearance.filter_px2,
                                                  draw.appearance.antialiased, s, e, d);
-        color_of_sh_vjp(m.sh_degree, g.mean, draw.view, sh, color, d_color, d_g.mean, d_sh);
+        color_of_sh_vjp(m.sh_degree, direction, sh, color, d_color, d_g.mean, d_sh);
         for (size_t i = 0; i < lanes; ++i) {
             const uint64_t at = source[done + i];
             for (int k = 0; k < 3; ++k) out.means[3 * at + k] = d_g.mean[k][i];

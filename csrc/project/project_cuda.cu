@@ -71,7 +71,9 @@ __device__ void color_of(const float* rows, uint32_t g, const float mean[3], con
 #pragma unroll
         for (int k = 0; k < kSize; ++k) sh[k] = __ldg(row + k);
     }
-    color_of_sh(kDegree, mean, view, sh, color);
+    float direction[3];
+    from_eye(view, mean, direction);
+    color_of_sh(kDegree, direction, sh, color);
 }
 
 // Gaussians as users hold them.
@@ -95,7 +97,6 @@ struct RowSource {
                                              uint32_t g, Projection<float>& s, float color[3]) {
         const GaussianRows<const float>& m = in.model;
         Gaussian3d<float> gaussian{{}, {}, {}, __ldg(m.opacities + g)};
-        for (int k = 0; k < 3; ++k) gaussian.mean[k] = __ldg(m.means + 3 * size_t(g) + k);
         for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
         const float4 quat = load4(m.quats, g);
         gaussian.quat[0] = quat.x;
@@ -329,9 +330,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         bool may_reach = false;
         float p[3];
         if (place < count && sees) {
-            for (int k = 0; k < 3; ++k)
-                p[k] = view.linear[3 * k] * sphere.x + view.linear[3 * k + 1] * sphere.y +
-                       view.linear[3 * k + 2] * sphere.z + view.translation[k];
+            const float mean[3] = {sphere.x, sphere.y, sphere.z};
+            to_view(view, mean, p);
             const SphereTest told = test_sphere(tables, p, sphere.w, reach_scale);
             may_reach = told.may_reach;
             num_in_frustum += told.misses_centers;
@@ -451,7 +451,7 @@ __global__ void pack_kernel(GaussianRows<const float> rows, float4* planes) {
     planes[2 * count + g] = {p.f[4], p.f[5], p.f[6], p.f[7]};
     float color[3];
     const float* sh = rows.sh + g * (3 * num_sh_bases(rows.sh_degree));
-    color_of_sh(0, gaussian.mean, ModelView<float>{}, sh, color);
+    color_of_sh(0, gaussian.mean, sh, color);
     planes[3 * count + g] = {p.log2_opacity, color[0], color[1], color[2]};
 }
 

@@ -55,15 +55,13 @@ V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const Pinhole<T>& cam, T filter_p
     return e;
 }
 
-// Ellipse of a gaussian with p[2] > 0. `filter_px2` is added to both variances; with `antialiased` (0 or 1)
-// the opacity is multiplied by sqrt(det before / det after), which keeps what the gaussian covers.
+// Ellipse of a gaussian; s.p is set, with p[2] > 0. `filter_px2` is added to both variances; with
+// `antialiased` (0 or 1) the opacity is multiplied by sqrt(det before / det after), which keeps what the
+// gaussian covers.
 template <class V, class T>
 V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const ModelView<T>& mv,
                                                 const Pinhole<T>& cam, T filter_px2, bool antialiased,
                                                 Projection<V>& s) {
-    for (int i = 0; i < 3; ++i)
-        s.p[i] = mv.linear[3 * i] * g.mean[0] + mv.linear[3 * i + 1] * g.mean[1] +
-                 mv.linear[3 * i + 2] * g.mean[2] + mv.translation[i];
     V r[9];
     rotation_of_quat(g.quat, r);
     for (int i = 0; i < 3; ++i)

@@ -50,9 +50,11 @@ class HardCase:
     is_drawn: bool = True  # at least one pixel
 
 
-def crowd(seed: int, camera: Camera = PLAIN, num: int = NUM, **changes: Any) -> Gaussians:
+def crowd(
+    seed: int, camera: Camera = PLAIN, num: int = NUM, *, sh_degree: int = 1, **changes: Any
+) -> Gaussians:
     """Ordinary gaussians in front of the camera, with some arrays changed; a row may hold for all."""
-    g = scenes.random_gaussians(seed, camera, num, size_px=(1, 8), aspect=4.0, sh_degree=1)
+    g = scenes.random_gaussians(seed, camera, num, size_px=(1, 8), aspect=4.0, sh_degree=sh_degree)
     rows = {n: np.broadcast_to(np.asarray(v, np.float32), getattr(g, n).shape) for n, v in changes.items()}
     return scenes.replaced(g, **{n: np.array(v, order="C") for n, v in rows.items()})
 
@@ -65,6 +67,15 @@ def zoomed(factor: float) -> tuple[Gaussians, Camera]:
     viewmat[:3, 3] *= factor
     larger = scenes.replaced(g, means=g.means * np.float32(factor), scales=g.scales * np.float32(factor))
     return larger, Camera(viewmat, camera.K, camera.width, camera.height, near=0.01 * factor)
+
+
+def away(distance: float) -> tuple[Gaussians, Camera]:
+    """A scene and its camera so far from zero, on no axis of the world or the camera."""
+    posed = scenes.CAMERAS["posed"]
+    viewmat = posed.viewmat.copy()
+    viewmat[:3, 3] -= viewmat[:3, :3] @ (distance * np.array([0.6, -0.64, 0.48]))
+    camera = Camera(viewmat, posed.K, posed.width, posed.height)
+    return crowd(2, camera, sh_degree=2), camera
 
 
 def bad_rows(array: np.ndarray, value: float) -> np.ndarray:
@@ -246,9 +257,16 @@ def cameras() -> dict[str, HardCase]:
     k = np.arange(-20, 20)
     distant = np.column_stack([0.6 * k, k % 7 - 3.0, np.full(40, 50.0)]) * 2e7
     small, large = zoomed(1e-6), zoomed(1e6)
+    far = {power: away(10.0**power) for power in (3, 5)}
     return {
         "a scene 10⁻⁶ across": HardCase("No formula has a size of its own.", *small, mode=FILTER),
         "a scene 10⁶ across": HardCase("As above: no formula has a size of its own.", *large, mode=FILTER),
+        "means 10³ from zero, eye beside them": HardCase(
+            "The eye is subtracted first, which takes no digit from what is near it.", *far[3], mode=FILTER
+        ),
+        "means 10⁵ from zero, eye beside them": HardCase(
+            "As above: what float32 loses is in the means before they are drawn.", *far[5], mode=FILTER
+        ),
         "a camera 10⁹ away": HardCase(
             "Depths are as float32 has them: 60 units apart, or ties.",
             scenes.gaussians(distant, quats=(0.9, 0.1, 0.2, 0.3), scales=(2e7, 1e7, 3e7)),
