@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 import scenes
+from random_bundle import random_bundle
 from v3dg import Camera, _core
+from v3dg._device import CPU
+from v3dg.residency import residency
 
 CAMERA = {"viewmat": np.eye(4), "K": np.diag([50.0, 50.0, 1.0]), "width": 64, "height": 48, "near": 0.01}
 RULE = {
@@ -266,10 +269,19 @@ def test_other_values_are_refused():
 
 
 def test_frame_refuses_a_scene_of_other_bundles():
-    frame = _core.SceneFrame(-1)
-    frame.set_models([_core.Model(rows())], [])
-    with pytest.raises(ValueError, match="scene: expected one of the bundles that the frame has the"):
-        frame.draw(_core.ResidentScene(-1), _core.Camera(**CAMERA), _core.Rule(**RULE), [0, 0, 0])
+    """It may have the gaussians of bundles that the scene has not yet, but not of others in their places."""
+    bundles = [random_bundle(seed) for seed in (1, 2)]
+    one, two = map(residency.table, bundles)
+    for has, tables in ((1, [two]), (1, [one, two]), (2, [two, one]), (0, [one]), (2, []), (2, [one])):
+        frame, scene = _core.SceneFrame(-1), _core.ResidentScene(-1)
+        frame.set_models([residency.model(bundle, CPU) for bundle in bundles[:has]], [])
+        scene.set_bundles(tables)
+        arguments = scene, _core.Camera(**CAMERA), _core.Rule(**RULE), [0, 0, 0]
+        if tables == [one, two][: len(tables)] and len(tables) <= has:
+            assert not frame.draw(*arguments).alpha.any()
+            continue
+        with pytest.raises(ValueError, match="scene: expected one of the bundles that the frame has the"):
+            frame.draw(*arguments)
 
 
 def test_background_has_three_numbers():

@@ -73,6 +73,7 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, 
         throw py::value_error("gaussians: expected the device and the SH degree of the target, got others");
     const std::vector<FitGroup> groups =
         groups_of(target_range, range, ball, stream, target.size(), gaussians.size());
+    for (const FitGroup& group : groups) check_size(config, group);
     const GaussianRows<float> rows = gaussians.write();
     const NewArray<float> error({}, {static_cast<py::ssize_t>(groups.size()), 2});
     std::fill(error.span.begin(), error.span.end(), 0.0f);

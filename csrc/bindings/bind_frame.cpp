@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <atomic>
 #include <memory>
 #include <vector>
@@ -95,7 +96,7 @@ NewPicture picture_of(const Window& window, bool with_depth) {
     return {window.height(), window.width(), {}, {}, py::none(), with_depth};
 }
 
-// Draws scenes of the same bundles on one device.
+// Draws scenes of the same bundles, or of the first of them, on one device.
 class BoundSceneFrame {
   public:
     explicit BoundSceneFrame(int device) : device_{device} {
@@ -218,7 +219,9 @@ class BoundSceneFrame {
     BoundScene& checked(const py::object& scene_object) const {
         auto& scene = held<BoundScene>(scene_object, "scene");
         if (scene.device() != device_) throw py::value_error("scene: expected one on the frame's device");
-        if (scene.state()->num_gaussians != num_gaussians_)
+        const std::vector<size_t>& of_scene = scene.state()->num_gaussians;
+        if (of_scene.size() > num_gaussians_.size() ||
+            !std::equal(of_scene.begin(), of_scene.end(), num_gaussians_.begin()))
             throw py::value_error("scene: expected one of the bundles that the frame has the gaussians of");
         return scene;
     }
@@ -247,7 +250,7 @@ class BoundSceneFrame {
     }
 
     std::vector<SceneModel> models_of(const SceneState& scene) const {
-        std::vector<SceneModel> models = host_;
+        std::vector<SceneModel> models(host_.begin(), host_.begin() + scene.tables.size());
         for (size_t b = 0; b < models.size(); ++b) {
             models[b].pages = whole_bundle(scene.tables[b]);
             models[b].appearance = scene.bundle(b).appearance();

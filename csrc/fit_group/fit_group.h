@@ -70,6 +70,9 @@ struct FitScratch {
     Buffer<uint64_t> order, order_scratch;
 };
 
+// Throws std::invalid_argument where a picture of the group would have a side of more than 65,535 px.
+void check_size(const FitConfig& config, const FitGroup& group);
+
 // View `index` of a group; those held out have the indices that held_out_view() gives.
 FitView fit_view(const FitConfig& config, const FitGroup& group, uint64_t index);
 

@@ -34,6 +34,20 @@ V3DG_HD V3DG_INLINE void random_rotation(double u0, double u1, double u2, double
     rotation_of_quat(quat, 2.0, r);  // its length is 1
 }
 
+// How large a group is drawn where config.image_size is 0, px.
+struct FitSize {
+    double focal, side;  // the side is whole blocks of 4 px
+};
+
+V3DG_HD V3DG_INLINE FitSize size_of_group(const FitConfig& config, const FitGroup& group) {
+    // The focal length at which the ball's footprint (select_math.h) has the wanted number of px².
+    const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
+    const double focal =
+        sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian / solid_angle_of_ball(x2));
+    const double radius_px = focal * sqrt_of(x2 / (1 - x2));
+    return {focal, 4 * ::ceil((radius_px + kMarginPx) / 2)};
+}
+
 // View `index` of a group. Fixed views lie on a lattice on the sphere, turned at random, and those held out,
 // which follow them, on one of their own; fresh ones lie anywhere.
 V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGroup& group, uint64_t index) {
@@ -74,11 +88,9 @@ V3DG_HD V3DG_INLINE FitView view_of_index(const FitConfig& config, const FitGrou
         view.size = config.image_size;
         focal = kFocalPerSize * config.image_size;
     } else {
-        // The focal length at which the ball's footprint (select_math.h) has the wanted number of px².
-        const double x2 = 1 / (static_cast<double>(config.distance) * config.distance);
-        focal = sqrt_of(static_cast<double>(group.count) * config.px2_per_gaussian / solid_angle_of_ball(x2));
-        const double radius_px = focal * sqrt_of(x2 / (1 - x2));
-        view.size = 4 * static_cast<int>(::ceil((radius_px + kMarginPx) / 2));  // whole blocks of 4 px
+        const FitSize wanted = size_of_group(config, group);
+        focal = wanted.focal;
+        view.size = static_cast<int>(wanted.side);
         shift_x = uniform(16 + 3 * index + 1) - 0.5;
         shift_y = uniform(16 + 3 * index + 2) - 0.5;
     }
