@@ -1,11 +1,15 @@
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from random_bundle import random_bundle
-from v3dg import Scene
+from v3dg import Camera, Scene, render, select
 
+CAMERA = Camera.look_at((0.5, -9, 4), (3, 4, 5), width=24, height=16)
 BUNDLE = random_bundle(1)
 OTHER = random_bundle(2)
 
@@ -84,5 +88,97 @@ def test_bad_instances_are_refused(arguments, message):
 
 
 def test_add_refuses_what_is_not_a_bundle():
-    with pytest.raises(TypeError, match="bundle: expected a Bundle, got Scene"):
-        Scene().add(Scene())
+    for wrong in (Scene(), [BUNDLE, Scene()]):
+        with pytest.raises(TypeError, match="bundle: expected a Bundle, got Scene"):
+            Scene().add(wrong, positions=np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="bundle: expected one for all or 3, got 2"):
+        Scene().add([BUNDLE, OTHER], positions=np.zeros((3, 3)))
+
+
+def test_instances_of_several_bundles_are_added_at_once():
+    scene, one_by_one = Scene(), Scene()
+    bundles = [OTHER, BUNDLE, BUNDLE, OTHER]
+    assert scene.add(bundles, positions=np.ones((4, 3)), scales=[1, 2, 3, 4]) == range(4)
+    for bundle, scale in zip(bundles, [1, 2, 3, 4], strict=True):
+        one_by_one.add(bundle, (1, 1, 1), scales=scale)
+    assert_same(scene, one_by_one)
+    assert scene.add([], positions=np.zeros((0, 3))) == range(4, 4)
+
+
+def assert_same(scene, other):
+    assert scene.bundles == other.bundles
+    for name in ("instance_bundle", "importance", "positions", "quaternions", "scales"):
+        np.testing.assert_array_equal(getattr(scene, name), getattr(other, name))
+
+
+def small_scene():
+    scene = Scene()
+    scene.add([BUNDLE, OTHER, BUNDLE], positions=np.arange(9.0).reshape(3, 3), importance=[1, 2, 3])
+    return scene
+
+
+@pytest.mark.parametrize("take", [copy.copy, copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))])
+def test_copies_of_scenes_and_cuts_go_their_own_way(take):
+    scene, same = small_scene(), small_scene()
+    cut = select(scene, CAMERA, tolerance=0.1, device="cpu")
+    taken = take(scene)
+    assert (taken.bundles == scene.bundles) == (take is copy.copy)  # which are large
+    drawn = render(scene, CAMERA, device="cpu").color
+    np.testing.assert_array_equal(render(taken, CAMERA, device="cpu").color, drawn)
+    taken.remove([0])
+    taken.move(positions=np.ones((2, 3)))
+    taken.add(random_bundle(3))
+    assert_same(scene, same)
+    scene.move(scales=0.1)
+    np.testing.assert_array_equal(taken.scales, 1)
+
+    cut_taken = take(cut)  # with its scene
+    np.testing.assert_array_equal(cut_taken.instance_ids, cut.instance_ids)
+    np.testing.assert_array_equal(cut_taken.cluster_ids, cut.cluster_ids)
+    of_copy = render(cut_taken.scene, CAMERA, cut=cut_taken, device="cpu")
+    np.testing.assert_array_equal(of_copy.color, render(scene, CAMERA, cut=cut, device="cpu").color)
+
+
+@pytest.mark.parametrize("take", [lambda s: s, copy.deepcopy, lambda s: pickle.loads(pickle.dumps(s))])
+def test_what_is_handed_out_cannot_be_written_to(take):
+    scene = small_scene()
+    cut = take(select(scene, CAMERA, tolerance=0.1, device="cpu"))
+    scene = take(scene)
+    for name in ("instance_bundle", "importance", "positions", "quaternions", "scales"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(scene, name)[0] = 1
+    for ids in (cut.instance_ids, cut.cluster_ids):
+        with pytest.raises(ValueError, match="read-only"):
+            ids[0] = 1
+
+
+def test_what_was_given_stays_the_users():
+    scene, given = Scene(), np.zeros((2, 3))
+    scene.add(BUNDLE, given)
+    scene.move(positions=given)
+    given[:] = 7
+    np.testing.assert_array_equal(scene.positions, 0)
+
+
+def test_cut_of_instances_that_are_gone_is_refused():
+    """Though others have come in their places, of other bundles; not because others came or they moved."""
+    scene = small_scene()
+    cut = select(scene, CAMERA, tolerance=0.1, device="cpu")
+    num = len(cut.gaussians(device="cpu"))
+    scene.add(OTHER)
+    scene.move([0], scales=1.5)
+    scene.set_importance(2.0)
+    assert len(cut.gaussians(device="cpu")) == num
+    assert render(scene, CAMERA, cut=cut, device="cpu").stats.gaussians_selected == num
+    scene.remove([])
+    assert len(cut.filters_px2) == num
+    scene.remove([0, 1])
+    scene.add([OTHER, OTHER], positions=np.zeros((2, 3)))
+    for use in (
+        lambda: render(scene, CAMERA, cut=cut, device="cpu"),
+        lambda: cut.gaussians(device="cpu"),
+        lambda: cut.filters_px2,
+        lambda: cut.antialiased,
+    ):
+        with pytest.raises(ValueError, match="cut: expected instances of the scene, got some of before"):
+            use()

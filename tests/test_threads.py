@@ -1,6 +1,8 @@
 """Several threads, forked processes, torch beside us: the same results, and no deadlock."""
 
+import copy
 import hashlib
+import itertools
 import subprocess
 import sys
 import threading
@@ -115,6 +117,103 @@ def test_streams_of_several_threads_get_what_one_gets_alone():
     with ThreadPoolExecutor(4) as pool:
         for found in pool.map(on_a_stream_of_its_own, range(4)):
             assert found == 10 * [expected]
+
+
+# ---- scenes that change
+
+
+@pytest.fixture
+def hasty():
+    """Threads that take turns as often as they can."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(interval)
+
+
+def while_another_changes(change, work, times):
+    """What `work` gives, so often, while a thread calls `change` with 0, 1, 2 and so on."""
+    stop = threading.Event()
+
+    def go_on():
+        for i in itertools.count():
+            if stop.is_set():
+                return
+            change(i)
+
+    with ThreadPoolExecutor(3) as pool:
+        changing = pool.submit(go_on)
+        try:
+            drawing = [pool.submit(lambda: [work() for _ in range(times)]) for _ in range(2)]
+            return [one for job in drawing for one in job.result(SECONDS)]
+        finally:
+            stop.set()
+            changing.result(SECONDS)
+
+
+def test_frames_of_a_scene_that_moves_are_old_or_new(device, hasty):
+    scene, rng = crowd(5), np.random.default_rng(0)
+    poses = [
+        {"positions": rng.normal(size=(40, 3)), "quaternions": rng.normal(size=(40, 4)), "scales": size}
+        for size in (0.5, 1.5)
+    ]
+    expected = set()
+    for pose in poses:
+        scene.move(**pose)
+        expected.add(frame(scene, device))
+    found = while_another_changes(lambda i: scene.move(**poses[i % 2]), lambda: frame(scene, device), 20)
+    assert set(found) <= expected
+
+
+def test_frames_of_a_scene_that_grows_and_shrinks_are_old_or_new(device, hasty):
+    """A bundle that comes in the middle, too; and a cut of what is gone is refused or drawn as it was."""
+    scene, other = crowd(6), crowd(7).bundles[0]
+    cut = v3dg.select(scene, CAMERA, tolerance=2.0, device=device)
+
+    def drawn_as_cut():
+        try:
+            return digest(v3dg.render(scene, CAMERA, cut=cut, device=device).color)
+        except ValueError as error:
+            return str(error)
+
+    def changed(i):
+        if i % 2 == 0:
+            scene.add(other, positions=[[0, 0, 0], [0, 1, 0]])
+        else:
+            scene.remove([40, 41])
+
+    expected = {frame(scene, device), frame_of_grown(scene, other, device)}
+    as_cut, refused = drawn_as_cut(), "cut: expected instances of the scene, got some"
+    found = while_another_changes(changed, lambda: (frame(scene, device), drawn_as_cut()), 20)
+    assert {drawn for drawn, _ in found} <= expected
+    assert all(cut == as_cut or cut.startswith(refused) for _, cut in found)
+
+
+def frame_of_grown(scene, bundle, device):
+    grown = copy.copy(scene)
+    grown.add(bundle, positions=[[0, 0, 0], [0, 1, 0]])
+    assert len(grown) == len(scene) + 2
+    return frame(grown, device)
+
+
+def test_threads_that_change_a_scene_lose_nothing(device, hasty):
+    scene, bundles = v3dg.Scene(), [crowd(seed).bundles[0] for seed in range(4)]
+
+    def fill(k):
+        ids = []
+        for i in range(50):
+            ids += scene.add(bundles[k], positions=[[k, i, 0], [k, i, 1]])
+            scene.set_importance(2.0, [ids[-1]])
+        return ids
+
+    with ThreadPoolExecutor(4) as pool:
+        ids = [job.result(SECONDS) for job in [pool.submit(fill, k) for k in range(4)]]
+    assert sorted(itertools.chain(*ids)) == list(range(400))
+    for k, mine in enumerate(ids):
+        assert all(scene.bundles[b] is bundles[k] for b in scene.instance_bundle[mine])
+        np.testing.assert_array_equal(scene.positions[mine][:, 0], k)
+        np.testing.assert_array_equal(scene.importance[mine], 50 * [1, 2])
+    frame(scene, device)
 
 
 READING = {"ply_read", "ply_write"}

@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core
+from v3dg._numbers import Floats as Floats
+from v3dg._numbers import real, vector, whole
 
-Floats: TypeAlias = npt.NDArray[np.float64]
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
 
@@ -46,7 +47,7 @@ class Camera:
     near: float = 0.01
 
     def __post_init__(self) -> None:
-        viewmat = _floats(self.viewmat, "viewmat", (4, 4))
+        viewmat = vector(self.viewmat, "viewmat", (4, 4))
         rotation = viewmat[:3, :3]
         if not is_rotation(rotation):
             raise ValueError(
@@ -55,21 +56,19 @@ class Camera:
             )
         if not np.array_equal(viewmat[3], [0.0, 0.0, 0.0, 1.0]):
             raise ValueError(f"viewmat: expected the last row 0 0 0 1, got {_text(viewmat[3])}")
-        K = _floats(self.K, "K", (3, 3))
+        K = vector(self.K, "K", (3, 3))
         if not (K[0, 0] > 0 and K[1, 1] > 0):
             raise ValueError(f"K: expected positive focal lengths, got {K[0, 0]:g} and {K[1, 1]:g}")
         if K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0.0, 0.0, 1.0]):
             raise ValueError(
                 "K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got a matrix with skew or scale"
             )
-        near = float(self.near)
-        if not (near > 0 and math.isfinite(near)):
-            raise ValueError(f"near: expected a positive number, got {self.near}")
-        object.__setattr__(self, "viewmat", viewmat)
-        object.__setattr__(self, "K", K)
-        object.__setattr__(self, "width", _positive_int(self.width, "width"))
-        object.__setattr__(self, "height", _positive_int(self.height, "height"))
-        object.__setattr__(self, "near", near)
+        width, height = _side(self.width, "width"), _side(self.height, "height")
+        near = _positive(self.near, "near")
+        for name, value in zip(
+            ("viewmat", "K", "width", "height", "near"), (viewmat, K, width, height, near), strict=True
+        ):
+            object.__setattr__(self, name, value)
 
     @classmethod
     def look_at(
@@ -94,8 +93,8 @@ class Camera:
         Raises:
             ValueError: The target is at the eye, or ``up`` lies along the view direction.
         """
-        position, goal = _floats(eye, "eye", (3,)), _floats(target, "target", (3,))
-        up_vector = _floats(up, "up", (3,))
+        position, goal = vector(eye, "eye"), vector(target, "target")
+        up_vector = vector(up, "up")
         with np.errstate(over="ignore"):
             distance = np.linalg.norm(goal - position)
         if not distance > 0:
@@ -166,7 +165,7 @@ class Camera:
 
     def scaled(self, factor: int) -> Camera:
         """Return this camera with ``factor`` times the resolution, for supersampling."""
-        factor = _positive_int(factor, "factor")
+        factor = _side(factor, "factor")
         K = self.K * np.array([[factor], [factor], [1.0]])
         return replace(self, K=K, width=self.width * factor, height=self.height * factor)
 
@@ -197,13 +196,14 @@ def turntable(
         up: (3,) axis of the turntable.
         fov_x: Horizontal field of view in radians.
     """
-    middle, axis = _floats(center, "center", (3,)), _floats(up, "up", (3,))
-    if not (radius > 0 and math.isfinite(radius)):
-        raise ValueError(f"radius: expected a positive number, got {radius}")
+    middle, axis = vector(center, "center"), vector(up, "up")
+    radius, n = _positive(radius, "radius"), whole(n, "n", 0, "a whole number")
+    elevation = real(elevation, "elevation")
     if not abs(elevation) < math.pi / 2:
         raise ValueError(f"elevation: expected an angle between -pi/2 and pi/2, got {elevation}")
-    if not np.linalg.norm(axis) > 0:
+    if not axis.any():
         raise ValueError(f"up: expected a direction, got {_text(axis)}")
+    axis /= np.abs(axis).max()  # so that squares neither overflow nor vanish
     axis /= np.linalg.norm(axis)
     # The world's axis least along `up`, made perpendicular to it.
     start = np.eye(3)[np.argmin(np.abs(axis))]
@@ -237,7 +237,7 @@ def is_rotation(matrix: Floats) -> bool:
 
 def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
     """(4, 4) world to camera from camera to world in Blender's convention; the nearest rotation is taken."""
-    matrix = _floats(transform_matrix, "transform_matrix", (4, 4))
+    matrix = vector(transform_matrix, "transform_matrix", (4, 4))
     axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
     if not is_rotation(axes):
         raise ValueError(
@@ -250,31 +250,31 @@ def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
 
 def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Floats:
     """(3, 3) K of fields of view in radians, its principal point in the middle; None: square pixels."""
-    width, height = _positive_int(width, "width"), _positive_int(height, "height")
-    for name, fov in (("fov_x", fov_x), ("fov_y", fov_y)):
-        if fov is not None and not 0 < fov < math.pi:
-            raise ValueError(f"{name}: expected radians between 0 and pi, got {fov}")
-    fx = 0.5 * width / math.tan(0.5 * fov_x)
-    fy = fx if fov_y is None else 0.5 * height / math.tan(0.5 * fov_y)
+    width, height = _side(width, "width"), _side(height, "height")
+    fx = _focal(fov_x, "fov_x", width)
+    fy = fx if fov_y is None else _focal(fov_y, "fov_y", height)
     return np.array([[fx, 0.0, 0.5 * width], [0.0, fy, 0.5 * height], [0.0, 0.0, 1.0]])
 
 
-def _floats(value: Any, name: str, shape: tuple[int, ...]) -> Floats:
-    try:
-        array = np.array(value, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: expected numbers of shape {shape}, got {type(value).__name__}") from error
-    if array.shape != shape:
-        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
-    return array
+def _focal(fov: float, name: str, side: int) -> float:
+    """Focal length, px, of a field of view in radians across a side in px."""
+    fov = real(fov, name, what="radians between 0 and pi")
+    tangent = math.tan(0.5 * fov) if 0 < fov < math.pi else 0.0
+    focal = 0.5 * side / tangent if tangent > 0 else math.inf
+    if not focal < math.inf:
+        raise ValueError(f"{name}: expected radians between 0 and pi, got {fov}")
+    return focal
 
 
-def _positive_int(value: Any, name: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"{name}: expected a positive whole number, got {value!r}")
-    return int(value)
+def _positive(value: Any, name: str) -> float:
+    number = real(value, name, what="a positive number")
+    if not 0 < number < math.inf:
+        raise ValueError(f"{name}: expected a positive number, got {number}")
+    return number
+
+
+def _side(value: Any, name: str) -> int:
+    return whole(value, name, 1, "a positive whole number")
 
 
 def _text(vector: Floats) -> str:

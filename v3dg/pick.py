@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import operator
 from dataclasses import dataclass
 
@@ -62,13 +63,13 @@ def pick(
     x, y = operator.index(x), operator.index(y)
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise ValueError(f"x, y: expected a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
-    scene = Scene.of(subject)
+    scene = copy.copy(Scene.of(subject))  # which stays as it is
     if budget is not None:  # which is for the whole picture
         whole = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU)
         tolerance = whole.tolerance
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
     pixel = camera.core.window(x, y, x + 1, y + 1)
-    resident = residency.scene(subject, CPU)
+    resident = residency.scene(scene, CPU)
     cut = resident.core.select(pixel, rule)
     frame = _core.SceneFrame(CPU.number)
     residency.set_models(frame, resident.bundles, CPU, "appearance")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v3dg import _core, _device
+from v3dg._numbers import color, real
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image
@@ -48,21 +49,15 @@ def rasterize(
             on a CUDA device.
         RuntimeError: The gaussians are on a CUDA device, and v3dg was built without CUDA.
     """
-    if not filter_px2 >= 0:
-        raise ValueError(f"filter_px2: expected a variance of at least 0 px², got {filter_px2}")
-    if len(background) != 3:
-        raise ValueError(f"background: expected three numbers, got {len(background)}")
     options: dict[str, Any] = {
-        "filter_px2": float(filter_px2),
+        "filter_px2": real(filter_px2, "filter_px2", 0, "a variance of at least 0 px²"),
         "antialiased": bool(antialiased),
         "with_depth": True,
     }
+    shade = color(background, "background")
     if isinstance(gaussians.means, np.ndarray):
-        shade = [float(b) for b in background]
-        color, alpha, depth, _, _ = _core.rasterize(
-            gaussians.rows, camera.core, background=shade, keep_tape=False, **options
-        )
-        return Image(color, alpha, depth)
+        planes = _core.rasterize(gaussians.rows, camera.core, background=shade, keep_tape=False, **options)
+        return Image(*planes[:3])
     return _rasterize_torch(gaussians, camera, options, background)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
+from v3dg._numbers import color
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.false_color import ColorBy
@@ -202,13 +203,14 @@ class _Frame:
 
     def __init__(self, subject: Scene | Bundle | Gaussians, color_by: ColorBy, device: Device) -> None:
         self._device, self._color_by = device, color_by
-        self._generation: object = None  # of the bundles that it has the gaussians of
+        self._num_models = 0  # of the first bundles, to which a scene only adds
         if isinstance(subject, Gaussians):
             _check_asset(color_by)
             self._asset = _core.AssetFrame(_core.Model(_device.place(subject, device).rows))
         else:
             self._frame = _core.SceneFrame(device.number)
-            self._take_models(residency.scene(subject, device))
+            with residency.reading(subject, device) as resident:
+                self._take_models(resident)
 
     def draw(
         self,
@@ -219,21 +221,21 @@ class _Frame:
         cut: Selection | None,
         **options: Any,
     ) -> RenderedImage:
-        shade = _three(background)
+        shade = color(background, "background")
         if isinstance(subject, Gaussians):
             _check_asset(self._color_by, cut=cut, **options)
             drawing = self._asset.draw(camera.core, shade)
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
         rule = rule_of(**options, footprint="solid_angle", cull=True)
-        resident = residency.scene(subject, self._device)
-        self._take_models(resident)
-        if cut is None:
-            drawing = self._frame.draw(resident.core, camera.core, rule, shade)
-        else:
-            selection = _checked(cut, subject, **options)
-            pairs = self._here(selection.instance_ids), self._here(selection.cluster_ids)
-            drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade)
-        resident.add_drawing(drawing)
+        with residency.reading(subject, self._device) as resident:
+            self._take_models(resident)
+            if cut is None:
+                drawing = self._frame.draw(resident.core, camera.core, rule, shade)
+            else:
+                _check_cut(cut, subject, resident, **options)
+                pairs = self._here(cut.instance_ids), self._here(cut.cluster_ids)
+                drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade)
+            resident.add_drawing(drawing)
         budget = options["budget"]
 
         def finish() -> Stats:
@@ -248,26 +250,22 @@ class _Frame:
         return RenderedImage(drawing, finish)
 
     def _take_models(self, resident: ResidentScene) -> None:
-        if self._generation is not resident.generation:
-            residency.set_models(self._frame, resident.bundles, self._device, self._color_by)
-            self._generation = resident.generation
+        with residency.lock:
+            bundles = resident.bundles
+            if self._num_models < len(bundles):
+                residency.set_models(self._frame, bundles, self._device, self._color_by)
+                self._num_models = len(bundles)
 
     def _here(self, ids: Any) -> Any:
         if not self._device.is_cuda:
             return ids
         import torch
 
-        return torch.from_numpy(ids).to(str(self._device))
+        return torch.tensor(ids, device=str(self._device))
 
 
 def _stats(stats: _core.FrameStats, tolerance: float) -> Stats:
     return Stats(stats.gaussians, stats.in_frustum, tolerance, stats.select_ms, stats.draw_ms)
-
-
-def _three(background: Sequence[float]) -> list[float]:
-    if len(background) != 3:
-        raise ValueError(f"background: expected three numbers, got {len(background)}")
-    return [float(b) for b in background]
 
 
 def _check_asset(color_by: ColorBy, **options: Any) -> None:
@@ -282,17 +280,16 @@ def _check_asset(color_by: ColorBy, **options: Any) -> None:
     rule_of(options.get("tolerance"), None, 0, "solid_angle", True)
 
 
-def _checked(cut: Selection, subject: Scene | Bundle, **options: Any) -> Selection:
-    """The cut, if it is one of this scene and nothing else is asked for."""
+def _check_cut(cut: Selection, subject: Scene | Bundle, resident: ResidentScene, **options: Any) -> None:
+    """Refuse a cut that is not of this scene as it is, and whatever else is asked for."""
     for name, value in options.items():
         if value:
             raise ValueError(f"{name}: expected nothing beside a cut, which has been chosen, got {value}")
     mine = cut.scene is subject or (isinstance(subject, Bundle) and cut.scene.bundles == (subject,))
     if not mine:
         raise ValueError("cut: expected a selection from this scene, got one from another")
-    if (cut.instance_ids >= len(cut.scene)).any():
-        raise ValueError("cut: expected instances of the scene, got some that were removed since")
-    return cut
+    if isinstance(subject, Scene):
+        cut.check(resident.revision)
 
 
 def _frame_of(subject: Scene | Bundle | Gaussians, color_by: ColorBy, device: Device) -> _Frame:

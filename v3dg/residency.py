@@ -6,10 +6,12 @@ What is there is freed with its bundle or scene, or by `residency.clear()`.
 from __future__ import annotations
 
 import atexit
+import copy
 import os
 import threading
 import weakref
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from typing import Any, TypeVar
 
 from v3dg import _core, _device
@@ -23,11 +25,11 @@ _Frame = TypeVar("_Frame")
 
 
 class ResidentScene:
-    """What selection and frames read of a scene on one device, as the scene is now.
+    """What selection and frames read of a scene on one device. On the CPU it stays as it is.
 
     Attributes:
         core: The compiled module's part.
-        generation: Another object whenever the bundles change.
+        revision: The scene's that is there.
     """
 
     def __init__(self, device: Device) -> None:
@@ -37,17 +39,12 @@ class ResidentScene:
         self._bundles: tuple[weakref.ref[Bundle], ...] = ()
         self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()  # that may be under way
         self._lock = threading.Lock()  # of that set
-        self._seen: tuple[int, int] | None = None
-        self.generation = object()
+        self.revision = (-1, -1, -1)
 
     @property
     def bundles(self) -> tuple[Bundle, ...]:
         """The bundles whose tables are there."""
         return tuple(bundle for reference in self._bundles if (bundle := reference()) is not None)
-
-    def is_current(self, scene: Scene) -> bool:
-        """Whether nothing has changed since the last update."""
-        return self._seen == scene.revision
 
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
         """Take over what has changed since the last time: the poses, or all instances.
@@ -66,14 +63,12 @@ class ResidentScene:
         if self.bundles != scene.bundles:
             self.core.set_bundles(tables)
             self._bundles = tuple(map(weakref.ref, scene.bundles))
-            self.generation = object()
-        revision = scene.revision
         poses = [self._here(rows) for rows in self._poses_of(scene)]
-        if self._seen is not None and self._seen[0] == revision[0]:
+        if self.revision[0] == scene.revision[0]:
             self.core.set_poses(*poses)
         else:
             self.core.set_instances(scene.instance_bundle, scene.importance, *poses)
-        self._seen = revision
+        self.revision = scene.revision
 
     def add_drawing(self, drawing: _core.Drawing) -> None:
         """Remember a frame that may be under way."""
@@ -105,7 +100,7 @@ class Residency:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
         self._tables: weakref.WeakKeyDictionary[Bundle, _core.ClusterTable] = weakref.WeakKeyDictionary()
         self._gaussians: weakref.WeakKeyDictionary[Bundle, dict[Device, Gaussians]] = (
             weakref.WeakKeyDictionary()
@@ -123,7 +118,7 @@ class Residency:
 
     def table(self, bundle: Bundle) -> _core.ClusterTable:
         """What selection and drawing read of the bundle's clusters, on the host."""
-        with self._lock:
+        with self.lock:
             if bundle not in self._tables:
                 clusters, groups = bundle.clusters, bundle.groups
                 self._tables[bundle] = _core.ClusterTable(
@@ -141,24 +136,30 @@ class Residency:
 
     def scene(self, subject: Scene | Bundle, device: Device) -> ResidentScene:
         """The scene on a device as it is now; a bundle as a scene of one."""
-        with self._lock:
+        with self.lock:
             known = self._scenes.setdefault(_checked(subject), {})
             resident = known.get(device)
             if resident is not None and isinstance(subject, Bundle):
                 return resident  # a bundle stays as it is
-            if resident is None:
-                resident = ResidentScene(device)
-            scene = Scene.of(subject)
-            if not resident.is_current(scene):
+            scene = copy.copy(Scene.of(subject))
+            if resident is None or resident.revision != scene.revision:
+                if resident is None or not device.is_cuda:
+                    resident = ResidentScene(device)
                 resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
-            known[device] = resident
+                known[device] = resident
             return resident
+
+    @contextmanager
+    def reading(self, subject: Scene | Bundle, device: Device) -> Iterator[ResidentScene]:
+        """As `scene`; it stays so meanwhile, for which on CUDA other threads have to wait."""
+        with self.lock if device.is_cuda else nullcontext():
+            yield self.scene(subject, device)
 
     def gaussians(self, bundle: Bundle, device: Device) -> Gaussians:
         """All gaussians of the bundle on a device."""
         if not device.is_cuda:
             return bundle.gaussians
-        with self._lock:
+        with self.lock:
             known = self._gaussians.setdefault(bundle, {})
             if device not in known:
                 known[device] = bundle.gaussians.torch(str(device))
@@ -166,7 +167,7 @@ class Residency:
 
     def model(self, bundle: Bundle, device: Device) -> _core.Model:
         """The bundle's gaussians as frames of a device read them."""
-        with self._lock:
+        with self.lock:
             known = self._models.setdefault(bundle, {})
             if device not in known:
                 known[device] = _core.Model(self.gaussians(bundle, device).rows)
@@ -186,7 +187,7 @@ class Residency:
 
     def frame(self, subject: Scene | Bundle, key: Hashable, make: Callable[[], _Frame]) -> _Frame:
         """The buffers that pictures of a subject are drawn with, of which each key has its own."""
-        with self._lock:
+        with self.lock:
             known = self._frames.setdefault(_checked(subject), {})
             if key not in known:
                 known[key] = make()
@@ -195,19 +196,19 @@ class Residency:
 
     def num_bytes(self, device: Device) -> int:
         """Memory that gaussians and tables of all bundles take on a device beside the bundles themselves."""
-        with self._lock:
+        with self.lock:
             models = sum(known[device].bytes for known in self._models.values() if device in known)
             return models + sum(table.bytes_on(device.number) for table in self._tables.values())
 
     def clear(self) -> None:
         """Give everything back; what is asked for later is made again."""
-        with self._lock:
+        with self.lock:
             for known in (self._frames, self._scenes, self._models, self._gaussians, self._tables):
                 known.clear()
 
     def _renew_lock(self) -> None:
         # Another thread of the parent may have held it when the child was made.
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
 
 
 def _checked(subject: Scene | Bundle) -> Scene | Bundle:

@@ -2,24 +2,44 @@
 
 from __future__ import annotations
 
-from typing import Any
+import os
+import threading
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core
+from v3dg._numbers import Floats, floats
 from v3dg.bundle import Bundle
-from v3dg.cameras import Floats
 from v3dg.rotations import rotation_from_quaternion
 
 _NO_ROTATION = (1.0, 0.0, 0.0, 0.0)
+# Held by whoever changes a scene, and by fork(), so that a child finds it free.
+_changing = threading.RLock()
+os.register_at_fork(
+    before=_changing.acquire, after_in_parent=_changing.release, after_in_child=_changing.release
+)
+
+
+class _State(NamedTuple):
+    """A scene at one moment, which nobody writes to: a change makes another."""
+
+    bundles: tuple[Bundle, ...]
+    bundle: npt.NDArray[np.int32]
+    importance: npt.NDArray[np.float32]
+    positions: Any  # poses are NumPy arrays or tensors on a CUDA device
+    quaternions: Any
+    scales: Any
+    revision: tuple[int, int, int]
 
 
 class Scene:
     """Instances of bundles: each bundle is stored once, an instance takes p to scale * rotation p + position.
 
     Instances are numbered from 0 in the order in which they were added; `remove` closes the gaps. What is
-    added, removed or moved counts from the next picture on.
+    added, removed or moved counts from the next picture on. Any threads may change a scene and draw it: each
+    change happens at once. A copy has the same bundles and goes its own way.
 
     Poses may be given as NumPy arrays, or as torch tensors on the host or on a CUDA device. Those of a device
     stay there, without a look at their values: an instance whose pose is not finite, or of no size, is not
@@ -27,16 +47,13 @@ class Scene:
     """
 
     def __init__(self) -> None:
-        self._bundles: list[Bundle] = []
-        self._bundle: npt.NDArray[np.int32] = np.zeros(0, np.int32)
-        self._importance: npt.NDArray[np.float32] = np.zeros(0, np.float32)
-        # NumPy arrays or tensors on a CUDA device.
-        self._poses: dict[str, Any] = {
-            "positions": np.zeros((0, 3)),
-            "quaternions": np.zeros((0, 4)),
-            "scales": np.zeros(0),
-        }
-        self._num_changes = self._num_moves = 0
+        poses = np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)
+        self._state = _State((), np.zeros(0, np.int32), np.zeros(0, np.float32), *poses, (0, 0, 0))
+        self._publish()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._publish()  # for arrays that were unpickled can be written to
 
     @classmethod
     def of(cls, subject: Scene | Bundle) -> Scene:
@@ -49,7 +66,7 @@ class Scene:
 
     def add(
         self,
-        bundle: Bundle,
+        bundle: Bundle | Sequence[Bundle],
         positions: Any = (0.0, 0.0, 0.0),
         quaternions: Any = None,
         scales: Any = None,
@@ -58,6 +75,7 @@ class Scene:
         """Place a bundle I times and return the ids of the new instances.
 
         Args:
+            bundle: One for all, or a sequence of I.
             positions: (I, 3), or (3,) for one instance; world units.
             quaternions: (I, 4) or (4,) w x y z of any length but zero; no rotation if None.
             scales: (I,) or one number for all, > 0; 1 if None.
@@ -68,41 +86,43 @@ class Scene:
             TypeError: ``bundle`` is not a bundle.
             ValueError: A shape or a value is not as above.
         """
-        if not isinstance(bundle, Bundle):
-            raise TypeError(f"bundle: expected a Bundle, got {type(bundle).__name__}")
-        if not hasattr(positions, "shape"):
-            positions = _finite(positions, "positions")
+        given = bundle if isinstance(bundle, list | tuple) else [bundle]
+        for one in given:
+            if not isinstance(one, Bundle):
+                raise TypeError(f"bundle: expected a Bundle, got {type(one).__name__}")
+        if not getattr(positions, "is_cuda", False):
+            positions = floats(positions, "positions")
         if len(positions.shape) == 1:
             positions = positions[None]
         if len(positions.shape) != 2 or positions.shape[1] != 3:
             raise ValueError(f"positions: expected shape (I, 3), got {tuple(positions.shape)}")
         count = len(positions)
+        if len(given) != count and given is bundle:
+            raise ValueError(f"bundle: expected one for all or {count}, got {len(given)}")
         new = {
             "positions": _rows(positions, "positions", count),
             "quaternions": _rows(_NO_ROTATION if quaternions is None else quaternions, "quaternions", count),
             "scales": _rows(1.0 if scales is None else scales, "scales", count),
+            "importance": _importances(importance, count),
         }
-        weights = _importances(importance, count)
-
-        index = next((b for b, known in enumerate(self.bundles) if known is bundle), len(self.bundles))
-        if index == len(self.bundles):
-            self._bundles.append(bundle)
-        first = len(self)
-        self._bundle = np.concatenate([self._bundle, np.full(count, index, np.int32)])
-        self._importance = np.concatenate([self._importance, weights])
-        for name, rows in new.items():
-            self._poses[name] = _joined(self._poses[name], rows)
-        self._num_changes += 1
+        with _changing:
+            place = {known: b for b, known in enumerate(dict.fromkeys((*self.bundles, *given)))}
+            new["bundle"] = np.broadcast_to(np.array([place[one] for one in given], np.int32), count)
+            first = len(self)
+            joined = {name: _joined(getattr(self._state, name), rows) for name, rows in new.items()}
+            self._publish(bundles=tuple(place), changes=1, **joined)
         return range(first, first + count)
 
     def remove(self, ids: Any) -> None:
         """Take instances away; those that follow move down, as `numpy.delete` does it."""
-        keep = np.ones(len(self), bool)
-        keep[self._ids(ids)] = False
-        self._bundle, self._importance = self._bundle[keep], self._importance[keep]
-        for name, rows in self._poses.items():
-            self._poses[name] = rows[keep if isinstance(rows, np.ndarray) else _like(rows, keep)]
-        self._num_changes += 1
+        with _changing:
+            keep = np.ones(len(self), bool)
+            keep[self._ids(ids)] = False
+            left = {}
+            for name in ("bundle", "importance", *_ROW):
+                rows = getattr(self._state, name)
+                left[name] = rows[keep if isinstance(rows, np.ndarray) else _like(rows, keep)]
+            self._publish(changes=1, removals=int(not keep.all()), **left)
 
     def move(
         self, ids: Any = None, *, positions: Any = None, quaternions: Any = None, scales: Any = None
@@ -119,74 +139,73 @@ class Scene:
             IndexError: There is no such instance.
             ValueError: A shape or a value is not as in `add`.
         """
-        rows = None if ids is None else self._ids(ids)
-        count = len(self) if rows is None else len(rows)
         given = {"positions": positions, "quaternions": quaternions, "scales": scales}
-        checked = {name: _rows(values, name, count) for name, values in given.items() if values is not None}
-        for name, values in checked.items():
-            if rows is None:
-                self._poses[name] = values
-                continue
-            here = self._poses[name]
-            if isinstance(here, np.ndarray) and isinstance(values, np.ndarray):
-                here = here.copy()
-                here[rows] = values
-            else:  # on a device, where one of them is
-                there = values if isinstance(here, np.ndarray) else here
-                here = _like(there, here).clone()
-                here[_like(there, rows)] = _like(there, values)
-            self._poses[name] = here
-        self._num_moves += 1
+        with _changing:
+            rows = self._ids(ids)
+            moved = {name: _rows(of, name, len(rows)) for name, of in given.items() if of is not None}
+            if ids is not None:
+                moved = {name: _replaced(getattr(self._state, name), rows, of) for name, of in moved.items()}
+            self._publish(moves=1, **moved)
 
     def set_importance(self, importance: npt.ArrayLike, ids: Any = None) -> None:
         """Give instances another importance, as in `add`; all of them if ``ids`` is None."""
-        rows = np.arange(len(self)) if ids is None else self._ids(ids)
-        changed = self._importance.copy()
-        changed[rows] = _importances(importance, len(rows))
-        self._importance = changed
-        self._num_changes += 1
+        with _changing:
+            rows = self._ids(ids)
+            weights = _replaced(self.importance, rows, _importances(importance, len(rows)))
+            self._publish(importance=weights, changes=1)
+
+    def _publish(self, changes: int = 0, moves: int = 0, removals: int = 0, **new: Any) -> None:
+        """Put what is new in place of what was, all at once."""
+        before = self.revision
+        revision = before[0] + changes, before[1] + moves, before[2] + removals
+        state = self._state._replace(revision=revision, **new)
+        for rows in state:
+            if isinstance(rows, np.ndarray):
+                rows.flags.writeable = False
+        self._state = state
 
     @property
     def bundles(self) -> tuple[Bundle, ...]:
         """The bundles, in the order in which they were first added."""
-        return tuple(self._bundles)
+        return self._state.bundles
 
     @property
-    def revision(self) -> tuple[int, int]:
-        """Counted up when instances come, go or get another importance, and when they move.
+    def revision(self) -> tuple[int, int, int]:
+        """Counted up when instances come, go or get another importance; when they move; and when they go.
 
         Whoever keeps a copy of the scene knows by it when to look again.
         """
-        return self._num_changes, self._num_moves
+        return self._state.revision
 
     @property
     def instance_bundle(self) -> npt.NDArray[np.int32]:
         """(I,) int32, which bundle an instance shows; not to be written to."""
-        return _read_only(self._bundle)
+        return self._state.bundle
 
     @property
     def importance(self) -> npt.NDArray[np.float32]:
         """(I,) float32; not to be written to."""
-        return _read_only(self._importance)
+        return self._state.importance
 
     @property
     def positions(self) -> Floats:
         """(I, 3) float64, world units; a copy if they are on a device. Use `move` to change them."""
-        return self._on_host("positions")
+        return _on_host(self._state.positions)
 
     @property
     def quaternions(self) -> Floats:
         """(I, 4) float64, w x y z, unit length."""
-        quaternions = self._on_host("quaternions")
-        if isinstance(self._poses["quaternions"], np.ndarray):
-            return quaternions
+        rows = self._state.quaternions
+        if isinstance(rows, np.ndarray):
+            return rows
+        quaternions = _on_host(rows)
         with np.errstate(invalid="ignore"):  # what is no rotation becomes no number, and is not drawn
             return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
 
     @property
     def scales(self) -> Floats:
         """(I,) float64."""
-        return self._on_host("scales")
+        return _on_host(self._state.scales)
 
     @property
     def rotations(self) -> Floats:
@@ -196,24 +215,14 @@ class Scene:
     @property
     def poses(self) -> tuple[Any, Any, Any]:
         """Positions, quaternions and scales where they are: NumPy arrays, or tensors on a CUDA device."""
-        return self._poses["positions"], self._poses["quaternions"], self._poses["scales"]
-
-    @property
-    def core(self) -> _core.Instances:
-        """The same instances as the compiled operations take them, on the host."""
-        return _core.Instances(
-            bundle=self.instance_bundle,
-            positions=self.positions,
-            quaternions=self.quaternions,
-            scales=self.scales,
-            importance=self.importance,
-        )
-
-    def _on_host(self, name: str) -> Floats:
-        rows = self._poses[name]
-        return _read_only(rows if isinstance(rows, np.ndarray) else rows.cpu().numpy())
+        state = self._state
+        return state.positions, state.quaternions, state.scales
 
     def _ids(self, ids: Any) -> npt.NDArray[np.int64]:
+        """Ids of instances; of all where it is None."""
+        count = len(self)
+        if ids is None:
+            return np.arange(count)
         if hasattr(ids, "detach"):
             ids = ids.detach().cpu().numpy()
         rows = np.atleast_1d(np.asarray(ids if len(np.shape(ids)) == 0 else np.array(ids)))
@@ -221,13 +230,13 @@ class Scene:
             return np.zeros(0, np.int64)
         if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
             raise ValueError(f"ids: expected whole numbers (M,), got {rows.dtype} of shape {rows.shape}")
-        wrong = (rows < 0) | (rows >= len(self))
+        wrong = (rows < 0) | (rows >= count)
         if wrong.any():
-            raise IndexError(f"ids: expected 0 to {len(self) - 1}, got {rows[wrong][0]}")
+            raise IndexError(f"ids: expected 0 to {count - 1}, got {rows[wrong][0]}")
         return rows.astype(np.int64)
 
     def __len__(self) -> int:
-        return len(self._bundle)
+        return len(self._state.bundle)
 
     def __repr__(self) -> str:
         return f"Scene({len(self)} instances of {len(self.bundles)} bundles)"
@@ -245,7 +254,7 @@ def _rows(values: Any, name: str, count: int) -> Any:
 
         array = values.detach().to(torch.float64, copy=True)
     else:
-        array = _finite(values.detach().numpy() if hasattr(values, "detach") else values, name)
+        array = floats(values, name)
     if name != "positions" and tuple(array.shape) == row:
         array = array.expand(count, *row) if is_on_device else np.broadcast_to(array, (count, *row))
     if tuple(array.shape) != (count, *row):
@@ -271,45 +280,66 @@ def _unit(quaternions: Floats) -> Floats:
     return np.asarray(quaternions / np.sqrt(length2)[:, None])
 
 
-def _finite(values: npt.ArrayLike, name: str) -> Floats:
-    try:
-        array = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: expected numbers, got {type(values).__name__}") from error
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
-    return array
-
-
 def _importances(importance: npt.ArrayLike, count: int) -> npt.NDArray[np.float32]:
-    weights = _finite(importance, "importance").astype(np.float32)
-    if weights.ndim == 0:
-        weights = np.full(count, weights)
-    if weights.shape != (count,):
-        raise ValueError(f"importance: expected shape ({count},), got {weights.shape}")
-    if not ((weights > 0) & np.isfinite(weights)).all():
-        raise ValueError(f"importance: expected positive numbers, got {weights[~(weights > 0)][:1]}")
+    given = floats(importance, "importance")
+    if given.ndim == 0:
+        given = np.full(count, given)
+    if given.shape != (count,):
+        raise ValueError(f"importance: expected shape ({count},), got {given.shape}")
+    with np.errstate(over="ignore", under="ignore"):
+        weights = given.astype(np.float32)
+    wrong = ~((weights > 0) & np.isfinite(weights))
+    if wrong.any():
+        expected = "positive numbers that a float32 can hold"
+        raise ValueError(f"importance: expected {expected}, got {given[wrong][0]:g}")
     return weights
 
 
 def _like(tensor: Any, values: Any) -> Any:
-    """The values as a tensor on the device of another."""
+    """The values on the device of a tensor, which warns of arrays that are not to be written to."""
     import torch
 
-    return torch.as_tensor(values, device=tensor.device)
+    return (
+        torch.tensor(values, device=tensor.device)
+        if isinstance(values, np.ndarray)
+        else values.to(tensor.device)
+    )
+
+
+def _alike(first: Any, second: Any) -> tuple[Any, Any]:
+    """Both as they are on the host, or on a device where one of them is."""
+    if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
+        return first, second
+    there = second if isinstance(first, np.ndarray) else first
+    return _like(there, first), _like(there, second)
 
 
 def _joined(first: Any, second: Any) -> Any:
-    """One after the other; on a device where one of them is."""
-    if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
+    """One after the other."""
+    first, second = _alike(first, second)
+    if isinstance(first, np.ndarray):
         return np.concatenate([first, second])
     import torch
 
-    there = second if isinstance(first, np.ndarray) else first
-    return torch.cat([_like(there, first), _like(there, second)])
+    return torch.cat([first, second])
 
 
-def _read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    view: npt.NDArray[Any] = array.view()
-    view.flags.writeable = False
-    return view
+def _replaced(values: Any, rows: npt.NDArray[np.int64], new: Any) -> Any:
+    """A copy with other values in some rows."""
+    values, new = _alike(values, new)
+    if isinstance(values, np.ndarray):
+        values = values.copy()
+        values[rows] = new
+    else:
+        values = values.clone()
+        values[_like(values, rows)] = new
+    return values
+
+
+def _on_host(rows: Any) -> Floats:
+    """The same array where it is NumPy's, else a copy."""
+    if isinstance(rows, np.ndarray):
+        return rows
+    host: Floats = rows.cpu().numpy()
+    host.flags.writeable = False
+    return host

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
-import operator
+import copy
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, overload
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import Device
+from v3dg._numbers import MOST_FLOAT, real, vector, whole
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, VectorLike
 from v3dg.gaussians import Gaussians
@@ -33,12 +33,14 @@ class Selection:
     """Clusters that one view needs, in ascending order of instance, then cluster.
 
     Attributes:
-        scene: The scene that was selected from.
-        instance_ids: (S,) int32.
-        cluster_ids: (S,) int32, within the instance's bundle.
+        scene: The scene that was selected from. It may have moved and grown since; once instances of it were
+            removed, the cut is of no use, and drawing it is a ValueError.
+        instance_ids: (S,) int32, not to be written to.
+        cluster_ids: (S,) int32, within the instance's bundle, not to be written to.
         num_gaussians: Gaussians in all selected clusters.
         tolerance: px² that were used; with a budget, those that it came to.
         seconds: Wall time of the selection.
+        revision: Of the scene, when its instances were looked at; as it is now if None.
     """
 
     scene: Scene
@@ -47,6 +49,24 @@ class Selection:
     num_gaussians: int
     tolerance: float
     seconds: float
+    revision: tuple[int, int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.revision is None:
+            object.__setattr__(self, "revision", self.scene.revision)
+        for ids in (self.instance_ids, self.cluster_ids):
+            ids.flags.writeable = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Selection, tuple(getattr(self, field.name) for field in fields(self))
+
+    def check(self, revision: tuple[int, int, int]) -> None:
+        """Raise ValueError unless the scene of a revision still has the instances of the cut."""
+        assert self.revision is not None
+        if revision[2] != self.revision[2]:
+            raise ValueError(
+                "cut: expected instances of the scene, got some of before others were removed; select again"
+            )
 
     def __len__(self) -> int:
         return len(self.instance_ids)
@@ -64,26 +84,17 @@ class Selection:
                 where CUDA works. Both hold the same numbers.
         """
         where = _device.resolve(device)
-        shift = np.asarray(origin, np.float64)
-        if shift.shape != (3,):
-            raise ValueError(f"origin: expected shape (3,), got {shift.shape}")
-        scene = self.scene
+        shift = vector(origin, "origin")
+        scene = copy.copy(self.scene)  # which stays as it is
         ids, instance = np.unique(self.instance_ids, return_inverse=True)
+        first_row = self._per_pair([bundle.clusters.offset[:-1] for bundle in scene.bundles])
         used, bundle = np.unique(scene.instance_bundle[ids], return_inverse=True)
         with where.current():
             world = _core.gather(
                 bundles=[residency.gaussians(scene.bundles[b], where).rows for b in used],
-                instances=_core.Instances(
-                    bundle=bundle.astype(np.int32),
-                    positions=scene.positions[ids] - shift,
-                    quaternions=scene.quaternions[ids],
-                    scales=scene.scales[ids],
-                    importance=scene.importance[ids],
-                ),
+                instances=_instances(scene, bundle.astype(np.int32), ids, shift),
                 instance=instance.astype(np.int32),
-                first_row=self._per_pair([table.clusters.offset[:-1] for table in scene.bundles]).astype(
-                    np.int64
-                ),
+                first_row=first_row.astype(np.int64),
                 offset=self._first(),
                 device=where.number,
             )
@@ -111,7 +122,9 @@ class Selection:
     def _per_pair(self, tables: list[npt.NDArray[Any]]) -> npt.NDArray[Any]:
         """(S,) values of the selected clusters from one (C,) table a bundle."""
         values = np.zeros(len(self), np.result_type(*tables) if tables else np.int64)
-        bundle_of_pair = self.scene.instance_bundle[self.instance_ids]
+        scene = copy.copy(self.scene)
+        self.check(scene.revision)
+        bundle_of_pair = scene.instance_bundle[self.instance_ids]
         for b, table in enumerate(tables):
             mine = bundle_of_pair == b
             values[mine] = table[self.cluster_ids[mine]]
@@ -193,28 +206,38 @@ def _select(
     subject: Scene | Bundle, camera: Camera, rule: _core.Rule, budget: int | None, device: Device
 ) -> Selection:
     start = time.perf_counter()
-    cut = residency.scene(subject, device).core.select(camera.core, rule)
+    with residency.reading(subject, device) as resident:
+        cut = resident.core.select(camera.core, rule)
     if not cut.fits_budget:
         assert budget is not None
         raise over_budget(budget, cut.num_gaussians)
     seconds = time.perf_counter() - start
-    return Selection(
-        Scene.of(subject), cut.instance_ids, cut.cluster_ids, cut.num_gaussians, cut.tolerance_px2, seconds
-    )
+    pairs = cut.instance_ids, cut.cluster_ids
+    scene, revision = Scene.of(subject), resident.revision
+    return Selection(scene, *pairs, cut.num_gaussians, cut.tolerance_px2, seconds, revision)
 
 
 def group_metrics(
     subject: Scene | Bundle, camera: Camera, *, footprint: Footprint = "solid_angle"
 ) -> list[npt.NDArray[np.float32]]:
     """Return for each instance what tolerance is compared with: its groups' metrics, (G,) in px²."""
-    scene = Scene.of(subject)
+    scene = copy.copy(Scene.of(subject))
     rule = rule_of(0.0, None, 0, footprint, False)
     tables = [residency.table(bundle) for bundle in scene.bundles]
-    metric, offset = _core.group_metrics(tables, scene.core, camera.core, rule)
+    instances = _instances(scene, scene.instance_bundle)
+    metric, offset = _core.group_metrics(tables, instances, camera.core, rule)
     return np.split(metric, offset[1:-1]) if len(scene) else []
 
 
-_LARGEST = float(np.finfo(np.float32).max)
+def _instances(scene: Scene, bundle: Any, ids: Any = slice(None), origin: Any = 0.0) -> _core.Instances:
+    """Instances of a scene that nobody changes, which show these bundles."""
+    return _core.Instances(
+        bundle=bundle,
+        positions=scene.positions[ids] - origin,
+        quaternions=scene.quaternions[ids],
+        scales=scene.scales[ids],
+        importance=scene.importance[ids],
+    )
 
 
 def rule_of(
@@ -227,16 +250,15 @@ def rule_of(
     """
     if tolerance is None:
         tolerance = DEFAULT_TOLERANCE if budget is None else 0.0
-    tolerance = float(tolerance)
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance: expected 0 px² or more, got {tolerance}")
-    if budget is not None and operator.index(budget) < 0:
-        raise ValueError(f"budget: expected 0 gaussians or more, got {budget}")
-    if not 0 <= operator.index(min_level) < 1 << 31:
-        raise ValueError(f"min_level: expected a level, 0 or more, got {min_level}")
-    tolerance = min(tolerance, _LARGEST) if math.isfinite(tolerance) else tolerance
+    tolerance = real(tolerance, "tolerance", 0, "0 px² or more")
+    if budget is not None:
+        budget = whole(budget, "budget", 0, "0 gaussians or more", most=(1 << 63) - 1)
     return _core.Rule(
-        tolerance_px2=tolerance, budget=budget, min_level=min_level, footprint=footprint, culls=cull
+        tolerance_px2=tolerance if tolerance == np.inf else min(tolerance, MOST_FLOAT),
+        budget=budget,
+        min_level=whole(min_level, "min_level", 0, "a level, 0 or more"),
+        footprint=footprint,
+        culls=cull,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import time
 from dataclasses import dataclass
@@ -253,7 +254,7 @@ class SceneView:
             planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
             color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
             return color, alpha, depth, image.stats.gaussians_in_frustum
-        frame, scene = self._frame(color_by), residency.scene(self.scene, CPU).core
+        frame, scene = self._frame(color_by, cut)
         drawing = frame.draw_cut(
             scene, camera.core.window(*window), cut.instance_ids, cut.cluster_ids, (0.0, 0.0, 0.0), stop
         )
@@ -264,21 +265,25 @@ class SceneView:
         self, cut: Selection, camera: Camera, window: Window, stop: _core.Stop | None
     ) -> tuple[npt.NDArray[np.float32], int]:
         """(H, W) gaussians that each pixel is blended of; drawn on the CPU on any device."""
-        frame, scene = self._frame("appearance"), residency.scene(self.scene, CPU).core
+        frame, scene = self._frame("appearance", cut)
         drawing = frame.count_cut(scene, camera.core.window(*window), cut.instance_ids, cut.cluster_ids, stop)
         _check(stop)
         return drawing.depth, drawing.finish().in_frustum
 
-    def _frame(self, color_by: ColorBy) -> _core.SceneFrame:
-        frame = _core.SceneFrame(CPU.number)
-        residency.set_models(frame, self.scene.bundles, CPU, color_by)
-        return frame
+    def _frame(self, color_by: ColorBy, cut: Selection) -> tuple[_core.SceneFrame, _core.ResidentScene]:
+        """A frame, and the scene as it is, which still has the instances of the cut."""
+        frame, resident = _core.SceneFrame(CPU.number), residency.scene(self.scene, CPU)
+        cut.check(resident.revision)
+        residency.set_models(frame, resident.bundles, CPU, color_by)
+        return frame, resident.core
 
     def _levels(self, cut: Selection) -> npt.NDArray[np.int64]:
         """(L,) selected gaussians by level."""
         levels = np.zeros(self.num_levels, np.int64)
-        bundle_of_pair = self.scene.instance_bundle[cut.instance_ids]
-        for b, bundle in enumerate(self.scene.bundles):
+        scene = copy.copy(self.scene)  # which stays as it is
+        cut.check(scene.revision)
+        bundle_of_pair = scene.instance_bundle[cut.instance_ids]
+        for b, bundle in enumerate(scene.bundles):
             clusters = cut.cluster_ids[bundle_of_pair == b]
             sizes = np.diff(bundle.clusters.offset)[clusters]
             here = np.bincount(bundle.clusters.level[clusters], sizes, self.num_levels)

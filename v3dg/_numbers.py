@@ -1,0 +1,90 @@
+"""Numbers that users pass: as the core takes them, or an error of one line that names them."""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Floats: TypeAlias = npt.NDArray[np.float64]
+
+MOST_INT = (1 << 31) - 1
+MOST_FLOAT = float(np.finfo(np.float32).max)
+
+
+def floats(values: Any, name: str, expected: str = "numbers") -> Floats:
+    """A new array of finite doubles, also of torch's tensors.
+
+    Raises:
+        ValueError: They are not numbers, not finite, or too large for a double.
+    """
+    try:
+        array = np.asarray(values.numpy(force=True) if hasattr(values, "detach") else values)
+        if array.dtype.kind not in "biufO":
+            raise TypeError
+        with np.errstate(over="ignore"):
+            array = np.array(array, dtype=np.float64, order="C")
+    except OverflowError:
+        raise ValueError(f"{name}: expected {expected} that a double can hold, got a larger one") from None
+    except (TypeError, ValueError, RuntimeError):
+        dtype = getattr(values, "dtype", None)
+        kind = type(values).__name__ + ("" if dtype is None else f" of {dtype}")
+        raise ValueError(f"{name}: expected {expected}, got {kind}") from None
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: expected finite numbers, got {array[~np.isfinite(array)][0]}")
+    return array
+
+
+def vector(values: Any, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
+    """As `floats`, of this shape."""
+    array = floats(values, name, f"numbers of shape {shape}")
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+    return array
+
+
+def color(values: Any, name: str) -> list[float]:
+    """Three numbers that the core can hold."""
+    array = floats(values, name, "three numbers")
+    if array.shape != (3,):
+        raise ValueError(f"{name}: expected three numbers, got {array.size}")
+    if not (np.abs(array) <= MOST_FLOAT).all():
+        raise ValueError(f"{name}: expected numbers that a float32 can hold, got {np.abs(array).max()}")
+    return [float(value) for value in array]
+
+
+def real(value: Any, name: str, least: float = -math.inf, what: str = "a number") -> float:
+    """One number of at least ``least``, which may be infinite; ValueError otherwise."""
+    try:
+        number = math.nan if getattr(value, "ndim", 0) else float(value)
+    except OverflowError:
+        number = math.inf if value > 0 else -math.inf
+    except (TypeError, ValueError, RuntimeError):
+        number = math.nan
+    if not number >= least:
+        raise ValueError(f"{name}: expected {what}, got {shown(value)}")
+    return number
+
+
+def whole(value: Any, name: str, least: int, what: str, most: int = MOST_INT) -> int:
+    """One whole number of ``least`` to ``most``; ValueError otherwise."""
+    try:
+        number = least - 1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = least - 1
+    if number < least:
+        raise ValueError(f"{name}: expected {what}, got {shown(value)}")
+    if number > most:
+        raise ValueError(f"{name}: expected at most {most}, got {shown(value)}")
+    return number
+
+
+def shown(value: Any) -> str:
+    """A value as a message of one line shows it."""
+    if isinstance(value, int) and value.bit_length() > 128:
+        return f"a whole number of {value.bit_length()} bits"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."
