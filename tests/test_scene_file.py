@@ -76,6 +76,20 @@ def put(path, document):
     return path
 
 
+def test_instances_are_added_at_once_whatever_their_order(tmp_path, monkeypatch):
+    """So that time grows with their number, and not with its square."""
+    instances = [{"bundle": "ab"[i % 2], "position": [i, 0, 0]} for i in range(100)]
+    document = {"format": "v3dg-scene", "version": 1, "bundles": {"a": "a", "b": "b"}, "instances": instances}
+    path = tmp_path / "scene.json"
+    path.write_text(json.dumps(document))
+    calls, add = [], Scene.add
+    monkeypatch.setattr(Scene, "add", lambda *given: calls.append(given) or add(*given))
+    scene, _ = read_scene(path, bundles={"a": BUNDLE, "b": OTHER})
+    assert len(calls) == 1
+    np.testing.assert_array_equal(scene.instance_bundle, np.arange(100) % 2)
+    np.testing.assert_array_equal(scene.positions[:, 0], np.arange(100))
+
+
 def test_bundles_are_opened_beside_the_file(tmp_path):
     (tmp_path / "sub").mkdir()
     BUNDLE.write(tmp_path / "sub" / "donut.v3dg")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 from collections.abc import Iterable, Mapping
@@ -67,6 +68,7 @@ def write_scene(
     """
     if len(bundle_paths) != len(scene.bundles):
         raise ValueError(f"bundle_paths: expected {len(scene.bundles)} paths, got {len(bundle_paths)}")
+    scene = copy.copy(scene)  # which stays as it is
     names = [f"bundle_{b}" for b in range(len(bundle_paths))]
     poses = (scene.positions, scene.quaternions, scene.scales)
     columns = [column.tolist() for column in (scene.instance_bundle, *poses, scene.importance)]
@@ -152,15 +154,11 @@ def _importance(node: Node) -> float:
 
 
 def _scene_of(instances: list[_Instance], bundles: Mapping[str, Bundle]) -> Scene:
-    """Adds neighbours of the same bundle together, so that instance ids are the places in the file."""
+    """Instance ids are the places in the file."""
     scene = Scene()
-    first = 0
-    for last in range(1, len(instances) + 1):
-        if last < len(instances) and instances[last].bundle == instances[first].bundle:
-            continue
-        names, positions, quaternions, scales, importances = zip(*instances[first:last], strict=True)
-        scene.add(bundles[names[0]], positions, quaternions, scales, importances)
-        first = last
+    if instances:
+        names, *columns = zip(*instances, strict=True)
+        scene.add([bundles[name] for name in names], *columns)
     return scene
 
 
