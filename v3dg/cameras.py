@@ -100,7 +100,7 @@ class Camera:
         if not distance > 0:
             raise ValueError(f"target: expected a point away from the eye, got {_text(goal)} for both")
         if not np.isfinite(distance):
-            raise ValueError(f"target: expected a distance that a double can hold, got {_text(goal)}")
+            raise ValueError(f"eye, target: expected a distance that a double can hold, got {_text(goal)}")
         forward = (goal - position) / distance
         upwards = up_vector / (np.abs(up_vector).max() or 1.0)  # so that squares neither overflow nor vanish
         right = np.cross(forward, upwards)
@@ -198,6 +198,9 @@ def turntable(
     """
     middle, axis = vector(center, "center"), vector(up, "up")
     radius, n = _positive(radius, "radius"), whole(n, "n", 0, "a whole number")
+    if not max(1e-150, 1e-12 * np.abs(middle).max()) < radius < 1e150:
+        expected = "a circle that double precision resolves"
+        raise ValueError(f"center, radius: expected {expected}, got {radius} around {_text(middle)}")
     elevation = real(elevation, "elevation")
     if not abs(elevation) < math.pi / 2:
         raise ValueError(f"elevation: expected an angle between -pi/2 and pi/2, got {elevation}")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-import operator
 from dataclasses import dataclass
 
 import numpy as np
 
 from v3dg import _core
 from v3dg._device import CPU
+from v3dg._numbers import whole
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.residency import residency
@@ -60,24 +60,24 @@ def pick(
     Raises:
         ValueError: The pixel is not in the image, or another argument is not as in `v3dg.render`.
     """
-    x, y = operator.index(x), operator.index(y)
-    if not (0 <= x < camera.width and 0 <= y < camera.height):
+    x, y = whole(x, "x", 0, "a column"), whole(y, "y", 0, "a row")
+    if not (x < camera.width and y < camera.height):
         raise ValueError(f"x, y: expected a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
     scene = copy.copy(Scene.of(subject))  # which stays as it is
     if budget is not None:  # which is for the whole picture
-        whole = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU)
-        tolerance = whole.tolerance
+        cut = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU)
+        tolerance = cut.tolerance
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
     pixel = camera.core.window(x, y, x + 1, y + 1)
     resident = residency.scene(scene, CPU)
-    cut = resident.core.select(pixel, rule)
+    pairs = resident.core.select(pixel, rule)
     frame = _core.SceneFrame(CPU.number)
     residency.set_models(frame, resident.bundles, CPU, "appearance")
-    found = frame.pick_cut(resident.core, pixel, cut.instance_ids, cut.cluster_ids)
+    found = frame.pick_cut(resident.core, pixel, pairs.instance_ids, pairs.cluster_ids)
     if found is None:
         return None
     place, weight, depth = found
-    instance, cluster = int(cut.instance_ids[place]), int(cut.cluster_ids[place])
+    instance, cluster = int(pairs.instance_ids[place]), int(pairs.cluster_ids[place])
     level = int(scene.bundles[scene.instance_bundle[instance]].clusters.level[cluster])
     ray = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
     position = camera.position + depth * ray @ camera.viewmat[:3, :3]

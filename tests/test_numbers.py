@@ -1,0 +1,172 @@
+"""Every number that users pass: used, or refused in one line that names it; no cast, crash or warning."""
+
+import inspect
+import math
+import re
+
+import numpy as np
+import pytest
+
+import scenes
+import v3dg
+from random_bundle import random_bundle
+
+CAMERA = v3dg.Camera.look_at((0.5, -9, 4), (3, 4, 5), width=24, height=16)
+BUNDLE = random_bundle(1)
+ASSET = scenes.gaussians([[0, 0, 2.0]])
+EYE4, EYE3 = np.eye(4), np.diag([20.0, 20.0, 1.0])
+
+
+def scene_of_two():
+    scene = v3dg.Scene()
+    scene.add(BUNDLE, positions=np.zeros((2, 3)))
+    return scene
+
+
+def options(**more):
+    return {"tolerance": 1.0, "budget": 10**6, "min_level": 0, **more}
+
+
+def selection():
+    return v3dg.select(scene_of_two(), CAMERA, device="cpu")
+
+
+# Each function with arguments that are right; those that are numbers, or arrays of them, are tried.
+CALLS = {
+    "Camera": (v3dg.Camera, {"viewmat": EYE4, "K": EYE3, "width": 8, "height": 8, "near": 0.01}),
+    "Camera.look_at": (
+        v3dg.Camera.look_at,
+        {
+            "eye": (0, -5, 1),
+            "target": (0, 0, 0),
+            "up": (0, 0, 1),
+            "fov_x": 0.9,
+            "width": 8,
+            "height": 8,
+            "near": 1,
+        },
+    ),
+    "Camera.from_blender": (
+        v3dg.Camera.from_blender,
+        {"transform_matrix": EYE4, "fov_x": 0.9, "width": 8, "height": 8, "fov_y": 0.9, "near": 1},
+    ),
+    "Camera.scaled": (CAMERA.scaled, {"factor": 2}),
+    "turntable": (
+        v3dg.turntable,
+        {
+            **{"center": (0, 0, 0), "radius": 2.0, "n": 2, "elevation": 0.1, "up": (0, 0, 1)},
+            **{"fov_x": 0.9, "width": 8, "height": 8, "near": 0.1},
+        },
+    ),
+    "Scene.add": (
+        lambda **given: v3dg.Scene().add(BUNDLE, **given),
+        {"positions": (1, 2, 3), "quaternions": (1, 0, 0, 0), "scales": 1.0, "importance": 1.0},
+    ),
+    "Scene.move": (
+        lambda **given: scene_of_two().move(**given),
+        {"ids": [0], "positions": [(1, 2, 3)], "quaternions": (1, 0, 0, 0), "scales": 1.0},
+    ),
+    "Scene.remove": (lambda **given: scene_of_two().remove(**given), {"ids": [1]}),
+    "Scene.set_importance": (
+        lambda **given: scene_of_two().set_importance(**given),
+        {"importance": 1.0, "ids": [0]},
+    ),
+    "select": (lambda **given: v3dg.select(BUNDLE, CAMERA, device="cpu", **given), options()),
+    "render": (
+        lambda **given: v3dg.render(BUNDLE, CAMERA, device="cpu", **given).stats,
+        options(background=(0, 0, 0)),
+    ),
+    "Renderer.render": (
+        lambda **given: v3dg.Renderer(BUNDLE, device="cpu").render(CAMERA, **given).stats,
+        options(background=(0, 0, 0)),
+    ),
+    "render of an asset": (
+        lambda **given: v3dg.render(ASSET, CAMERA, device="cpu", **given).stats,
+        {"tolerance": 1.0, "background": (0, 0, 0)},
+    ),
+    "pick": (lambda **given: v3dg.pick(BUNDLE, CAMERA, **given), options(x=3, y=4)),
+    "rasterize": (
+        lambda **given: v3dg.rasterize(ASSET, CAMERA, **given),
+        {"filter_px2": 0.3, "background": (0, 0, 0)},
+    ),
+    "Selection.gaussians": (
+        lambda **given: selection().gaussians(device="cpu", **given),
+        {"origin": (0, 0, 0)},
+    ),
+}
+VALUES = [
+    *(2**31, 2**32, 2**63, 2**64, 2**128, 10**400, -(2**64), -(10**400)),
+    *(1e39, 1e300, -1e300, 5e-324, math.inf, -math.inf, math.nan),
+    *(1j, "many", b"\n", np.float64(1e300), np.array([1.0, 2.0]), np.ones((2, 2)) + 1j, None, object()),
+]
+
+
+def replaced(good, value):
+    """The value itself, or an array with it somewhere."""
+    if np.ndim(good) == 0:
+        return value
+    rows = np.array(good, object)
+    rows.reshape(-1)[0] = value
+    return rows.tolist()
+
+
+@pytest.mark.parametrize(
+    ("name", "argument"), [(name, a) for name, (_, given) in CALLS.items() for a in given]
+)
+def test_number_is_used_or_named(name, argument):
+    call, arguments = CALLS[name]
+    call(**arguments)
+    for value in VALUES:
+        given = {**arguments, argument: replaced(arguments[argument], value)}
+        try:
+            with np.errstate(all="warn", under="ignore"):
+                call(**given)
+        except (ValueError, IndexError) as error:
+            text = str(error)
+            problem = None if re.search(rf"\b{argument}\b", text.split(": expected")[0]) else "is not named"
+            problem = "has many lines" if "\n" in text else problem
+        except Exception as error:
+            problem, text = f"ends in {type(error).__name__}", str(error)
+        else:
+            continue
+        if problem:
+            raise AssertionError(f"{name}({argument}={given[argument]!r}) {problem}: {text}")
+
+
+def test_every_public_function_with_numbers_is_tried():
+    tried = {name.split(" ")[0] for name in CALLS}
+    kinds = (v3dg.Camera, v3dg.Scene, v3dg.Selection, v3dg.Renderer)
+    public = {name: getattr(v3dg, name) for name in v3dg.__all__}
+    functions = {name: f for name, f in public.items() if inspect.isfunction(f)} | {
+        f"{kind.__name__}.{name}": f
+        for kind in kinds
+        for name, f in inspect.getmembers(kind, callable)
+        if not name.startswith("_")
+    }
+    number = re.compile(r"\b(int|float|VectorLike|MatrixLike|Any|ArrayLike|Sequence\[float\])\b")
+    with_numbers = {
+        name
+        for name, f in functions.items()
+        if any(
+            number.search(str(p.annotation)) and not re.search(r"PathLike|Mapping", str(p.annotation))
+            for p in inspect.signature(f).parameters.values()
+        )
+    }
+    others = {
+        "build_bundle",
+        "read_cameras",
+        "Selection.check",
+    }  # a seed of any size; files have tests of their own
+    assert with_numbers - others - tried == set()
+
+
+@pytest.mark.parametrize(
+    "setting", [{"px2_per_gaussian": 1e20}, {"px2_per_gaussian": 1e300}, {"distance": 1e300}]
+)
+def test_views_that_no_picture_can_hold_are_refused(setting):
+    config = v3dg.BuildConfig(cluster_size=16, steps=1, num_views=2, **setting)
+    asset = scenes.gaussians(np.random.default_rng(0).normal(size=(40, 3)))
+    with pytest.raises(
+        ValueError, match="px2_per_gaussian, distance, supersample: expected pictures of at most"
+    ):
+        v3dg.build_bundle(asset, config=config, device="cpu", progress=False)
