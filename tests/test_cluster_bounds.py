@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from random_bundle import random_bundle
-from scenes_lod import blob, lod_bundle, random_camera, random_scene
+from scenes_lod import blob, group_metrics, instances_of, lod_bundle, random_camera, random_scene
 from v3dg import _core, select
 from v3dg.residency import residency
-from v3dg.select import group_metrics, rule_of
+from v3dg.select import rule_of
 
 seeds = st.integers(0, 2**32 - 1)
 TOGETHER = 8
@@ -19,7 +19,7 @@ def may_draw(scene, camera, *, tolerance, min_level=0, footprint="solid_angle", 
     """For each instance, whether its clusters may be drawn, cluster by cluster."""
     rule = rule_of(tolerance, None, min_level, footprint, cull)
     tables = [residency.table(bundle) for bundle in scene.bundles]
-    flags, first = _core.bounds_may_draw(tables, scene.core, camera.core, rule, and_coarser)
+    flags, first = _core.bounds_may_draw(tables, instances_of(scene), camera.core, rule, and_coarser)
     counts = [len(scene.bundles[b].clusters.level) for b in scene.instance_bundle]
     return [
         np.repeat(flags[first[i] : first[i + 1]].astype(bool), TOGETHER)[:count]

@@ -10,9 +10,17 @@ import exact_cut
 from command_line import TESTS_ENVIRONMENT
 from random_bundle import random_bundle
 from reference import select as reference
-from scenes_lod import blob, covariances, lod_bundle, random_camera, random_scene, rotation_matrices, turned
+from scenes_lod import (
+    blob,
+    covariances,
+    group_metrics,
+    lod_bundle,
+    random_camera,
+    random_scene,
+    rotation_matrices,
+    turned,
+)
 from v3dg import Bundle, Camera, Gaussians, Scene, _core, select
-from v3dg.select import group_metrics
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 seeds = st.integers(0, 2**32 - 1)

@@ -21,7 +21,7 @@ from v3dg.false_color import ColorBy, palette_of
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene
 
-_Frame = TypeVar("_Frame")
+_Kept = TypeVar("_Kept")
 
 
 class ResidentScene:
@@ -59,11 +59,18 @@ class ResidentScene:
                 "scene: expected no change while a CUDA graph is captured, got a new or changed scene; "
                 "draw it once before the capture"
             )
-        self.finish_drawings()
+        with self._lock:
+            under_way = list(self._drawings)
+            self._drawings.clear()
+        for drawing in under_way:
+            drawing.finish()
         if self.bundles != scene.bundles:
             self.core.set_bundles(tables)
             self._bundles = tuple(map(weakref.ref, scene.bundles))
-        poses = [self._here(rows) for rows in self._poses_of(scene)]
+        if self.device.is_cuda:
+            poses = tuple(self._here(rows) for rows in scene.poses)
+        else:
+            poses = scene.positions, scene.quaternions, scene.scales
         if self.revision[0] == scene.revision[0]:
             self.core.set_poses(*poses)
         else:
@@ -75,17 +82,6 @@ class ResidentScene:
         if self.device.is_cuda:
             with self._lock:
                 self._drawings.add(drawing)
-
-    def finish_drawings(self) -> None:
-        """Wait for the frames that are under way."""
-        with self._lock:
-            under_way = list(self._drawings)
-            self._drawings.clear()
-        for drawing in under_way:
-            drawing.finish()
-
-    def _poses_of(self, scene: Scene) -> tuple[Any, Any, Any]:
-        return scene.poses if self.device.is_cuda else (scene.positions, scene.quaternions, scene.scales)
 
     def _here(self, rows: Any) -> Any:
         is_elsewhere = getattr(rows, "is_cuda", False) and rows.device.index != self.device.number
@@ -101,52 +97,43 @@ class Residency:
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self._tables: weakref.WeakKeyDictionary[Bundle, _core.ClusterTable] = weakref.WeakKeyDictionary()
-        self._gaussians: weakref.WeakKeyDictionary[Bundle, dict[Device, Gaussians]] = (
-            weakref.WeakKeyDictionary()
-        )
-        self._models: weakref.WeakKeyDictionary[Bundle, dict[Device, _core.Model]] = (
-            weakref.WeakKeyDictionary()
-        )
-        self._scenes: weakref.WeakKeyDictionary[Scene | Bundle, dict[Device, ResidentScene]] = (
-            weakref.WeakKeyDictionary()
-        )
-        self._frames: weakref.WeakKeyDictionary[Scene | Bundle, dict[Hashable, Any]] = (
+        self._kept: weakref.WeakKeyDictionary[Scene | Bundle, dict[Hashable, Any]] = (
             weakref.WeakKeyDictionary()
         )
         os.register_at_fork(after_in_child=self._renew_lock)
 
     def table(self, bundle: Bundle) -> _core.ClusterTable:
         """What selection and drawing read of the bundle's clusters, on the host."""
-        with self.lock:
-            if bundle not in self._tables:
-                clusters, groups = bundle.clusters, bundle.groups
-                self._tables[bundle] = _core.ClusterTable(
-                    ball=groups.ball,
-                    weight=groups.weight,
-                    level=groups.level,
-                    own_group=clusters.own_group,
-                    parent_group=clusters.parent_group,
-                    box=clusters.box,
-                    filter_px2=clusters.filter_px2,
-                    antialiased=clusters.antialiased,
-                    offset=clusters.offset,
-                )
-            return self._tables[bundle]
+        clusters, groups = bundle.clusters, bundle.groups
+        return self._once(
+            bundle,
+            "table",
+            lambda: _core.ClusterTable(
+                ball=groups.ball,
+                weight=groups.weight,
+                level=groups.level,
+                own_group=clusters.own_group,
+                parent_group=clusters.parent_group,
+                box=clusters.box,
+                filter_px2=clusters.filter_px2,
+                antialiased=clusters.antialiased,
+                offset=clusters.offset,
+            ),
+        )
 
     def scene(self, subject: Scene | Bundle, device: Device) -> ResidentScene:
         """The scene on a device as it is now; a bundle as a scene of one."""
         with self.lock:
-            known = self._scenes.setdefault(_checked(subject), {})
-            resident = known.get(device)
-            if resident is not None and isinstance(subject, Bundle):
+            resident = self._once(subject, ("scene", device), lambda: ResidentScene(device))
+            is_new = resident.revision[0] < 0
+            if not is_new and isinstance(subject, Bundle):
                 return resident  # a bundle stays as it is
             scene = copy.copy(Scene.of(subject))
-            if resident is None or resident.revision != scene.revision:
-                if resident is None or not device.is_cuda:
+            if resident.revision != scene.revision:
+                if not is_new and not device.is_cuda:
                     resident = ResidentScene(device)
                 resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
-                known[device] = resident
+                self._kept[subject]["scene", device] = resident
             return resident
 
     @contextmanager
@@ -159,19 +146,11 @@ class Residency:
         """All gaussians of the bundle on a device."""
         if not device.is_cuda:
             return bundle.gaussians
-        with self.lock:
-            known = self._gaussians.setdefault(bundle, {})
-            if device not in known:
-                known[device] = bundle.gaussians.torch(str(device))
-            return known[device]
+        return self._once(bundle, ("gaussians", device), lambda: bundle.gaussians.torch(str(device)))
 
     def model(self, bundle: Bundle, device: Device) -> _core.Model:
         """The bundle's gaussians as frames of a device read them."""
-        with self.lock:
-            known = self._models.setdefault(bundle, {})
-            if device not in known:
-                known[device] = _core.Model(self.gaussians(bundle, device).rows)
-            return known[device]
+        return self._once(bundle, ("model", device), lambda: _core.Model(self.gaussians(bundle, device).rows))
 
     def set_models(
         self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy
@@ -185,26 +164,31 @@ class Residency:
         ]
         frame.set_models([self.model(bundle, device) for bundle in bundles], palettes)
 
-    def frame(self, subject: Scene | Bundle, key: Hashable, make: Callable[[], _Frame]) -> _Frame:
+    def frame(self, subject: Scene | Bundle, key: Hashable, make: Callable[[], _Kept]) -> _Kept:
         """The buffers that pictures of a subject are drawn with, of which each key has its own."""
-        with self.lock:
-            known = self._frames.setdefault(_checked(subject), {})
-            if key not in known:
-                known[key] = make()
-            frame: _Frame = known[key]
-            return frame
+        return self._once(subject, ("frame", key), make)
 
     def num_bytes(self, device: Device) -> int:
         """Memory that gaussians and tables of all bundles take on a device beside the bundles themselves."""
         with self.lock:
-            models = sum(known[device].bytes for known in self._models.values() if device in known)
-            return models + sum(table.bytes_on(device.number) for table in self._tables.values())
+            kept = list(self._kept.values())
+        models: list[_core.Model] = [of["model", device] for of in kept if ("model", device) in of]
+        tables: list[_core.ClusterTable] = [of["table"] for of in kept if "table" in of]
+        return sum(m.bytes for m in models) + sum(t.bytes_on(device.number) for t in tables)
 
     def clear(self) -> None:
         """Give everything back; what is asked for later is made again."""
         with self.lock:
-            for known in (self._frames, self._scenes, self._models, self._gaussians, self._tables):
-                known.clear()
+            self._kept.clear()
+
+    def _once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _Kept]) -> _Kept:
+        """What is kept for a bundle or scene, made where it is not there."""
+        with self.lock:
+            kept = self._kept.setdefault(_checked(owner), {})
+            if key not in kept:
+                kept[key] = make()
+            found: _Kept = kept[key]
+            return found
 
     def _renew_lock(self) -> None:
         # Another thread of the parent may have held it when the child was made.

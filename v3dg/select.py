@@ -13,14 +13,14 @@ import numpy.typing as npt
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import MOST_FLOAT, real, vector, whole
-from v3dg.bundle import Bundle
+from v3dg.bundle import Bundle, Clusters
 from v3dg.cameras import Camera, VectorLike
 from v3dg.gaussians import Gaussians
 from v3dg.residency import residency
 from v3dg.scene import Scene
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
 
@@ -87,14 +87,20 @@ class Selection:
         shift = vector(origin, "origin")
         scene = copy.copy(self.scene)  # which stays as it is
         ids, instance = np.unique(self.instance_ids, return_inverse=True)
-        first_row = self._per_pair([bundle.clusters.offset[:-1] for bundle in scene.bundles])
+        first_row = self._per_pair(lambda clusters: clusters.offset[:-1])
         used, bundle = np.unique(scene.instance_bundle[ids], return_inverse=True)
         with where.current():
             world = _core.gather(
                 bundles=[residency.gaussians(scene.bundles[b], where).rows for b in used],
-                instances=_instances(scene, bundle.astype(np.int32), ids, shift),
+                instances=_core.Instances(
+                    bundle=bundle.astype(np.int32),
+                    positions=scene.positions[ids] - shift,
+                    quaternions=scene.quaternions[ids],
+                    scales=scene.scales[ids],
+                    importance=scene.importance[ids],
+                ),
                 instance=instance.astype(np.int32),
-                first_row=first_row.astype(np.int64),
+                first_row=first_row,
                 offset=self._first(),
                 device=where.number,
             )
@@ -103,35 +109,31 @@ class Selection:
     @property
     def filters_px2(self) -> npt.NDArray[np.float32]:
         """(N,) variance of the screen-space filter that each gaussian is drawn with."""
-        return self._per_gaussian([bundle.clusters.filter_px2 for bundle in self.scene.bundles]).astype(
-            np.float32
-        )
+        return self._per_gaussian(lambda clusters: clusters.filter_px2).astype(np.float32)
 
     @property
     def antialiased(self) -> npt.NDArray[np.bool_]:
         """(N,) whether each gaussian's opacity is compensated for its filter."""
-        return self._per_gaussian([bundle.clusters.antialiased for bundle in self.scene.bundles]).astype(
-            np.bool_
-        )
+        return self._per_gaussian(lambda clusters: clusters.antialiased).astype(np.bool_)
 
     def _first(self) -> npt.NDArray[np.int64]:
         """(S + 1,) where each selected cluster's gaussians begin."""
-        sizes = self._per_pair([np.diff(bundle.clusters.offset) for bundle in self.scene.bundles])
-        return np.concatenate([[0], np.cumsum(sizes.astype(np.int64))])
+        return np.concatenate([[0], np.cumsum(self._per_pair(lambda clusters: np.diff(clusters.offset)))])
 
-    def _per_pair(self, tables: list[npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """(S,) values of the selected clusters from one (C,) table a bundle."""
-        values = np.zeros(len(self), np.result_type(*tables) if tables else np.int64)
+    def _per_pair(self, column: Callable[[Clusters], npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """(S,) values of the selected clusters from a column of (C,) of their bundle."""
         scene = copy.copy(self.scene)
         self.check(scene.revision)
+        values = np.zeros(len(self), np.int64)
         bundle_of_pair = scene.instance_bundle[self.instance_ids]
-        for b, table in enumerate(tables):
-            mine = bundle_of_pair == b
+        for b, bundle in enumerate(scene.bundles):
+            mine, table = bundle_of_pair == b, column(bundle.clusters)
+            values = values.astype(table.dtype, copy=False)
             values[mine] = table[self.cluster_ids[mine]]
         return values
 
-    def _per_gaussian(self, tables: list[npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        return np.repeat(self._per_pair(tables), np.diff(self._first()))
+    def _per_gaussian(self, column: Callable[[Clusters], npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        return np.repeat(self._per_pair(column), np.diff(self._first()))
 
 
 @overload
@@ -215,29 +217,6 @@ def _select(
     pairs = cut.instance_ids, cut.cluster_ids
     scene, revision = Scene.of(subject), resident.revision
     return Selection(scene, *pairs, cut.num_gaussians, cut.tolerance_px2, seconds, revision)
-
-
-def group_metrics(
-    subject: Scene | Bundle, camera: Camera, *, footprint: Footprint = "solid_angle"
-) -> list[npt.NDArray[np.float32]]:
-    """Return for each instance what tolerance is compared with: its groups' metrics, (G,) in px²."""
-    scene = copy.copy(Scene.of(subject))
-    rule = rule_of(0.0, None, 0, footprint, False)
-    tables = [residency.table(bundle) for bundle in scene.bundles]
-    instances = _instances(scene, scene.instance_bundle)
-    metric, offset = _core.group_metrics(tables, instances, camera.core, rule)
-    return np.split(metric, offset[1:-1]) if len(scene) else []
-
-
-def _instances(scene: Scene, bundle: Any, ids: Any = slice(None), origin: Any = 0.0) -> _core.Instances:
-    """Instances of a scene that nobody changes, which show these bundles."""
-    return _core.Instances(
-        bundle=bundle,
-        positions=scene.positions[ids] - origin,
-        quaternions=scene.quaternions[ids],
-        scales=scene.scales[ids],
-        importance=scene.importance[ids],
-    )
 
 
 def rule_of(

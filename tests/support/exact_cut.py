@@ -10,9 +10,8 @@ import time
 import numpy as np
 
 from random_bundle import random_bundle
-from scenes_lod import blob, lod_bundle
+from scenes_lod import blob, group_metrics, lod_bundle
 from v3dg import Camera, Scene, select
-from v3dg.select import group_metrics
 
 BATCH = 10_000  # instances that share a camera and a tolerance
 

@@ -5,6 +5,8 @@ import itertools
 import numpy as np
 
 from v3dg import Bundle, Camera, Clusters, Gaussians, Groups, Scene, _core
+from v3dg.residency import residency
+from v3dg.select import rule_of
 
 REACH = 3.33  # standard deviations until an opaque gaussian falls below 1/255
 
@@ -148,3 +150,23 @@ def turned(camera, rng):
     return Camera.look_at(
         camera.position, camera.position + axis, rng.normal(size=3), width=camera.width, height=camera.height
     )
+
+
+def instances_of(scene):
+    """As the core's functions take them on the host."""
+    return _core.Instances(
+        bundle=scene.instance_bundle,
+        positions=scene.positions,
+        quaternions=scene.quaternions,
+        scales=scene.scales,
+        importance=scene.importance,
+    )
+
+
+def group_metrics(subject, camera, *, footprint="solid_angle"):
+    """For each instance what tolerance is compared with: its groups' metrics, (G,) in px²."""
+    scene = Scene.of(subject)
+    tables = [residency.table(bundle) for bundle in scene.bundles]
+    rule = rule_of(0.0, None, 0, footprint, False)
+    metric, offset = _core.group_metrics(tables, instances_of(scene), camera.core, rule)
+    return np.split(metric, offset[1:-1]) if len(scene) else []
