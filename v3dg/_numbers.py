@@ -12,7 +12,7 @@ import numpy.typing as npt
 Floats: TypeAlias = npt.NDArray[np.float64]
 
 MOST_INT = (1 << 31) - 1
-MOST_FLOAT = float(np.finfo(np.float32).max)
+LEAST_FLOAT, MOST_FLOAT = 1.4e-45, float(np.finfo(np.float32).max)  # positive float32
 
 
 def floats(values: Any, name: str, expected: str = "numbers") -> Floats:

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from v3dg._numbers import Floats, floats
+from v3dg import _device
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, floats
 from v3dg.bundle import Bundle
 from v3dg.rotations import rotation_from_quaternion
 
-_NO_ROTATION = (1.0, 0.0, 0.0, 0.0)
 # Held by whoever changes a scene, and by fork(), so that a child finds it free.
 _changing = threading.RLock()
 os.register_at_fork(
@@ -99,12 +99,13 @@ class Scene:
         count = len(positions)
         if len(given) != count and given is bundle:
             raise ValueError(f"bundle: expected one for all or {count}, got {len(given)}")
-        new = {
-            "positions": _rows(positions, "positions", count),
-            "quaternions": _rows(_NO_ROTATION if quaternions is None else quaternions, "quaternions", count),
-            "scales": _rows(1.0 if scales is None else scales, "scales", count),
-            "importance": _importances(importance, count),
+        columns = {
+            "positions": positions,
+            "quaternions": (1.0, 0.0, 0.0, 0.0) if quaternions is None else quaternions,
+            "scales": 1.0 if scales is None else scales,
+            "importance": importance,
         }
+        new = {name: _rows(values, name, count) for name, values in columns.items()}
         with _changing:
             place = {known: b for b, known in enumerate(dict.fromkeys((*self.bundles, *given)))}
             new["bundle"] = np.broadcast_to(np.array([place[one] for one in given], np.int32), count)
@@ -119,7 +120,7 @@ class Scene:
             keep = np.ones(len(self), bool)
             keep[self._ids(ids)] = False
             left = {}
-            for name in ("bundle", "importance", *_ROW):
+            for name in ("bundle", *_ROW):
                 rows = getattr(self._state, name)
                 left[name] = rows[keep if isinstance(rows, np.ndarray) else _like(rows, keep)]
             self._publish(changes=1, removals=int(not keep.all()), **left)
@@ -151,8 +152,8 @@ class Scene:
         """Give instances another importance, as in `add`; all of them if ``ids`` is None."""
         with _changing:
             rows = self._ids(ids)
-            weights = _replaced(self.importance, rows, _importances(importance, len(rows)))
-            self._publish(importance=weights, changes=1)
+            new = _rows(importance, "importance", len(rows))
+            self._publish(importance=_replaced(self.importance, rows, new), changes=1)
 
     def _publish(self, changes: int = 0, moves: int = 0, removals: int = 0, **new: Any) -> None:
         """Put what is new in place of what was, all at once."""
@@ -190,7 +191,7 @@ class Scene:
     @property
     def positions(self) -> Floats:
         """(I, 3) float64, world units; a copy if they are on a device. Use `move` to change them."""
-        return _on_host(self._state.positions)
+        return _device.to_host(self._state.positions)
 
     @property
     def quaternions(self) -> Floats:
@@ -198,14 +199,14 @@ class Scene:
         rows = self._state.quaternions
         if isinstance(rows, np.ndarray):
             return rows
-        quaternions = _on_host(rows)
+        quaternions = _device.to_host(rows)
         with np.errstate(invalid="ignore"):  # what is no rotation becomes no number, and is not drawn
             return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
 
     @property
     def scales(self) -> Floats:
         """(I,) float64."""
-        return _on_host(self._state.scales)
+        return _device.to_host(self._state.scales)
 
     @property
     def rotations(self) -> Floats:
@@ -223,9 +224,7 @@ class Scene:
         count = len(self)
         if ids is None:
             return np.arange(count)
-        if hasattr(ids, "detach"):
-            ids = ids.detach().cpu().numpy()
-        rows = np.atleast_1d(np.asarray(ids if len(np.shape(ids)) == 0 else np.array(ids)))
+        rows = np.atleast_1d(ids.numpy(force=True) if hasattr(ids, "detach") else np.asarray(ids))
         if rows.size == 0:
             return np.zeros(0, np.int64)
         if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
@@ -242,13 +241,17 @@ class Scene:
         return f"Scene({len(self)} instances of {len(self.bundles)} bundles)"
 
 
-_ROW = {"positions": (3,), "quaternions": (4,), "scales": ()}
+_ROW = {"positions": (3,), "quaternions": (4,), "scales": (), "importance": ()}
+_POSITIVE = {
+    "scales": (5e-324, np.inf, "positive numbers"),
+    "importance": (LEAST_FLOAT, MOST_FLOAT, "positive numbers that a float32 can hold"),
+}
 
 
 def _rows(values: Any, name: str, count: int) -> Any:
-    """(count, ...) in double precision, contiguous, ours alone; one row stands for all but of positions."""
+    """(count, ...) as scenes keep them, contiguous, ours alone; one row stands for all but of positions."""
     row = _ROW[name]
-    is_on_device = getattr(values, "is_cuda", False)
+    is_on_device = getattr(values, "is_cuda", False) and name != "importance"
     if is_on_device:
         import torch
 
@@ -262,47 +265,27 @@ def _rows(values: Any, name: str, count: int) -> Any:
         raise ValueError(f"{name}: expected shape ({shown}), got {tuple(array.shape)}")
     if is_on_device:
         return array.contiguous()
-    if name == "scales" and (array <= 0).any():
-        raise ValueError(f"scales: expected positive numbers, got {array[array <= 0][0]:g}")
+    if name in _POSITIVE:
+        least, most, expected = _POSITIVE[name]
+        wrong = (array < least) | (array > most)
+        if wrong.any():
+            raise ValueError(f"{name}: expected {expected}, got {array[wrong][0]:g}")
     if name == "quaternions":
-        array = _unit(array)
-    return np.ascontiguousarray(array)
-
-
-def _unit(quaternions: Floats) -> Floats:
-    length2 = np.einsum("ij,ij->i", quaternions, quaternions)
-    if not ((length2 > 1e-200) & (length2 < 1e200)).all():  # squares overflow or vanish
-        largest = np.abs(quaternions).max(axis=1, keepdims=True)
-        if (largest == 0).any():
+        largest = np.abs(array).max(axis=1, keepdims=True)
+        if not largest.all():
             raise ValueError("quaternions: expected a rotation, got a quaternion of zeros")
-        quaternions = quaternions / largest
-        length2 = np.einsum("ij,ij->i", quaternions, quaternions)
-    return np.asarray(quaternions / np.sqrt(length2)[:, None])
-
-
-def _importances(importance: npt.ArrayLike, count: int) -> npt.NDArray[np.float32]:
-    given = floats(importance, "importance")
-    if given.ndim == 0:
-        given = np.full(count, given)
-    if given.shape != (count,):
-        raise ValueError(f"importance: expected shape ({count},), got {given.shape}")
-    with np.errstate(over="ignore", under="ignore"):
-        weights = given.astype(np.float32)
-    wrong = ~((weights > 0) & np.isfinite(weights))
-    if wrong.any():
-        expected = "positive numbers that a float32 can hold"
-        raise ValueError(f"importance: expected {expected}, got {given[wrong][0]:g}")
-    return weights
+        array = array / largest  # so that squares neither overflow nor vanish
+        array /= np.linalg.norm(array, axis=1, keepdims=True)
+    return np.ascontiguousarray(array, np.float32 if name == "importance" else np.float64)
 
 
 def _like(tensor: Any, values: Any) -> Any:
-    """The values on the device of a tensor, which warns of arrays that are not to be written to."""
+    """The values on the device of a tensor."""
     import torch
 
-    return (
-        torch.tensor(values, device=tensor.device)
-        if isinstance(values, np.ndarray)
-        else values.to(tensor.device)
+    # Copied, for torch warns of arrays that are not to be written to.
+    return torch.as_tensor(
+        np.array(values) if isinstance(values, np.ndarray) else values, device=tensor.device
     )
 
 
@@ -317,29 +300,13 @@ def _alike(first: Any, second: Any) -> tuple[Any, Any]:
 def _joined(first: Any, second: Any) -> Any:
     """One after the other."""
     first, second = _alike(first, second)
-    if isinstance(first, np.ndarray):
-        return np.concatenate([first, second])
-    import torch
-
-    return torch.cat([first, second])
+    return _device.library_of(first).concatenate([first, second])
 
 
 def _replaced(values: Any, rows: npt.NDArray[np.int64], new: Any) -> Any:
     """A copy with other values in some rows."""
     values, new = _alike(values, new)
-    if isinstance(values, np.ndarray):
-        values = values.copy()
-        values[rows] = new
-    else:
-        values = values.clone()
-        values[_like(values, rows)] = new
+    is_on_host = isinstance(values, np.ndarray)
+    values = values.copy() if is_on_host else values.clone()
+    values[rows if is_on_host else _like(values, rows)] = new
     return values
-
-
-def _on_host(rows: Any) -> Floats:
-    """The same array where it is NumPy's, else a copy."""
-    if isinstance(rows, np.ndarray):
-        return rows
-    host: Floats = rows.cpu().numpy()
-    host.flags.writeable = False
-    return host

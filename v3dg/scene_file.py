@@ -14,6 +14,7 @@ import numpy as np
 
 from v3dg import _files
 from v3dg._json import Node, read_json
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT
 from v3dg.bundle import Bundle
 from v3dg.cameras import DEFAULT_FOV_X, Camera
 from v3dg.scene import Scene
@@ -23,11 +24,27 @@ VERSION = 1
 
 
 class _Instance(NamedTuple):
-    bundle: str
+    bundle: Bundle
     position: list[float]
     quaternion: list[float]
     scale: float
-    importance: float = 1.0
+    importance: float
+
+    @classmethod
+    def read(
+        cls,
+        bundle: Bundle,
+        fields: Mapping[str, Node],
+        position: str = "position",
+        quaternion: str = "quaternion",
+    ) -> _Instance:
+        return cls(
+            bundle,
+            fields[position].vector(3),
+            _quaternion(fields[quaternion]) if quaternion in fields else [1.0, 0.0, 0.0, 0.0],
+            fields["scale"].positive() if "scale" in fields else 1.0,
+            _importance(fields["importance"]) if "importance" in fields else 1.0,
+        )
 
 
 def read_scene(
@@ -117,15 +134,7 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
         fields = node.fields(("bundle", "position"), ("quaternion", "scale", "importance"))
         if fields["bundle"].text() not in bundles:
             raise fields["bundle"].error("a name from bundles")
-        instances.append(
-            _Instance(
-                fields["bundle"].text(),
-                fields["position"].vector(3),
-                _quaternion(fields["quaternion"]) if "quaternion" in fields else [1.0, 0.0, 0.0, 0.0],
-                fields["scale"].positive() if "scale" in fields else 1.0,
-                _importance(fields["importance"]) if "importance" in fields else 1.0,
-            )
-        )
+        instances.append(_Instance.read(bundles[fields["bundle"].text()], fields))
     cameras: dict[str, Camera] = {}
     for node in top["cameras"].items() if "cameras" in top else []:
         optional = ("near", "viewmat", "K", "eye", "target", "up", "fov_x")
@@ -134,7 +143,7 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
         if name in cameras:
             raise fields["name"].error("a name that no other camera has")
         cameras[name] = _read_camera(node, fields)
-    return _scene_of(instances, bundles), cameras
+    return _scene_of(instances), cameras
 
 
 def _quaternion(node: Node) -> list[float]:
@@ -146,19 +155,16 @@ def _quaternion(node: Node) -> list[float]:
 
 def _importance(node: Node) -> float:
     importance = node.positive()
-    with np.errstate(over="ignore"):
-        is_kept = 0 < np.float32(importance) < np.inf  # in which scenes keep it
-    if not is_kept:
+    if not LEAST_FLOAT <= importance <= MOST_FLOAT:  # in which scenes keep it
         raise node.error("a positive number that a float32 can hold")
     return importance
 
 
-def _scene_of(instances: list[_Instance], bundles: Mapping[str, Bundle]) -> Scene:
+def _scene_of(instances: list[_Instance]) -> Scene:
     """Instance ids are the places in the file."""
     scene = Scene()
     if instances:
-        names, *columns = zip(*instances, strict=True)
-        scene.add([bundles[name] for name in names], *columns)
+        scene.add(*zip(*instances, strict=True))
     return scene
 
 
@@ -186,7 +192,7 @@ def _read_layouts(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[S
             f"expected one layout, got {len(layouts)}; each layout is a scene, so make a file of each"
         )
     top = layouts[0].some_fields(("assets", "cameras"))
-    bundles, instances = {}, []
+    instances = []
     for node in top["assets"].items():
         fields = node.some_fields(("asset_kind", "asset_name", "ply_suffix", "instances"))
         kind, name, suffix = (fields[key].text() for key in ("asset_kind", "asset_name", "ply_suffix"))
@@ -195,19 +201,13 @@ def _read_layouts(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[S
             # Where `v3dg build` puts it, in a copy of the published code's folders.
             os.path.join("..", "_3dgs-assets", kind, name, os.path.splitext(suffix)[0] + ".v3dg"),
         ]
-        bundles[node.path] = _open_bundle(fields["asset_name"], name, places, folder, known)
+        bundle = _open_bundle(fields["asset_name"], name, places, folder, known)
         for instance in fields["instances"].items():
-            pose = instance.some_fields(("positions", "quaternions", "scale"))
-            instances.append(
-                _Instance(
-                    node.path,
-                    pose["positions"].vector(3),
-                    _quaternion(pose["quaternions"]),
-                    pose["scale"].positive(),
-                )
-            )
+            required = "positions", "quaternions", "scale"
+            pose = {name: node for name, node in instance.some_fields(required).items() if name in required}
+            instances.append(_Instance.read(bundle, pose, "positions", "quaternions"))
     keys = ("camera_name", "camera_width", "camera_height", "camera_angle_x", "camera_angle_y")
-    return _scene_of(instances, bundles), _read_blender_cameras(top["cameras"].items(), keys)
+    return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
 
 def _read_flat_layout(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
@@ -217,14 +217,9 @@ def _read_flat_layout(root: Node, folder: Path, known: dict[str, Bundle]) -> tup
     bundle = _open_bundle(top["asset"], asset, [os.path.splitext(asset)[0] + ".v3dg"], folder, known)
     instances = []
     for node in top["instances"].items():
-        pose = node.fields(("position", "quaternion", "scale"))
-        instances.append(
-            _Instance(
-                asset, pose["position"].vector(3), _quaternion(pose["quaternion"]), pose["scale"].positive()
-            )
-        )
+        instances.append(_Instance.read(bundle, node.fields(("position", "quaternion", "scale"))))
     keys = ("name", "width", "height", "fov_x", "fov_y")
-    return _scene_of(instances, {asset: bundle}), _read_blender_cameras(top["cameras"].items(), keys)
+    return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
 
 def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[str, Camera]:
