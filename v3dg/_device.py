@@ -120,13 +120,6 @@ def current_device() -> int:
     return int(torch.cuda.current_device())
 
 
-def is_capturing() -> bool:
-    """Whether a CUDA graph is being captured on torch's current stream."""
-    import torch
-
-    return bool(torch.cuda.is_current_stream_capturing())
-
-
 def library_of(array: Array) -> Any:
     """numpy or torch; many functions have the same names and arguments in both."""
     if isinstance(array, np.ndarray):
@@ -134,15 +127,6 @@ def library_of(array: Array) -> Any:
     import torch
 
     return torch
-
-
-def like(values: Any, array: Array) -> Array:
-    """Values as an array of the same kind, type and device as another."""
-    if isinstance(array, np.ndarray):
-        return np.asarray(values, array.dtype)
-    import torch
-
-    return torch.as_tensor(values, dtype=array.dtype, device=array.device)
 
 
 def to_host(array: Array) -> npt.NDArray[Any]:

@@ -139,14 +139,15 @@ def render(
             CUDA that is raised where the picture is looked at.
         RuntimeError: `device` is "cuda" and something is missing for it.
     """
-    frame = _frame_of(subject, color_by, _device.resolve(device))
-
-    def one(view: Camera) -> RenderedImage:
-        return frame.draw(
-            subject, view, background, tolerance=tolerance, budget=budget, min_level=min_level, cut=cut
-        )
-
-    return one(camera) if isinstance(camera, Camera) else [one(view) for view in camera]
+    where = _device.resolve(device)
+    if isinstance(subject, Gaussians):
+        frame = _Frame(subject, color_by, where)
+    else:
+        frame = residency.frame(subject, (color_by, where), lambda: _Frame(subject, color_by, where))
+    options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
+    if isinstance(camera, Camera):
+        return frame.draw(subject, camera, background, **options)
+    return [frame.draw(subject, view, background, **options) for view in camera]
 
 
 class Renderer:
@@ -187,15 +188,8 @@ class Renderer:
         background: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> RenderedImage:
         """Draw as `v3dg.render` does."""
-        return self._frame.draw(
-            self._subject,
-            camera,
-            background,
-            tolerance=tolerance,
-            budget=budget,
-            min_level=min_level,
-            cut=cut,
-        )
+        options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
+        return self._frame.draw(self._subject, camera, background, **options)
 
 
 class _Frame:
@@ -217,7 +211,6 @@ class _Frame:
         subject: Scene | Bundle | Gaussians,
         camera: Camera,
         background: Sequence[float],
-        *,
         cut: Selection | None,
         **options: Any,
     ) -> RenderedImage:
@@ -290,9 +283,3 @@ def _check_cut(cut: Selection, subject: Scene | Bundle, resident: ResidentScene,
         raise ValueError("cut: expected a selection from this scene, got one from another")
     if isinstance(subject, Scene):
         cut.check(resident.revision)
-
-
-def _frame_of(subject: Scene | Bundle | Gaussians, color_by: ColorBy, device: Device) -> _Frame:
-    if isinstance(subject, Gaussians):
-        return _Frame(subject, color_by, device)
-    return residency.frame(subject, (color_by, device), lambda: _Frame(subject, color_by, device))

@@ -14,7 +14,7 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Any, TypeVar
 
-from v3dg import _core, _device
+from v3dg import _core
 from v3dg._device import Device
 from v3dg.bundle import Bundle
 from v3dg.false_color import ColorBy, palette_of
@@ -54,11 +54,14 @@ class ResidentScene:
         Raises:
             RuntimeError: Something has changed, and a CUDA graph is being captured.
         """
-        if self.device.is_cuda and _device.is_capturing():
-            raise RuntimeError(
-                "scene: expected no change while a CUDA graph is captured, got a new or changed scene; "
-                "draw it once before the capture"
-            )
+        if self.device.is_cuda:
+            import torch
+
+            if torch.cuda.is_current_stream_capturing():
+                raise RuntimeError(
+                    "scene: expected no change while a CUDA graph is captured, got a new or changed scene; "
+                    "draw it once before the capture"
+                )
         with self._lock:
             under_way = list(self._drawings)
             self._drawings.clear()

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.evaluation.measure import like
 from v3dg import _core, _device
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
@@ -143,7 +144,7 @@ class HierarchyScene:
         self._first_leaf = len(hierarchy.parent) - hierarchy.num_leaves
 
     def _place(self, values: Any) -> Any:
-        return _device.like(values, self._nodes.means)
+        return like(values, self._nodes.means)
 
     def cut(self, camera: Camera, target_px: float) -> tuple[Any, Any, Any]:
         """Instances, nodes and how far each is on its way to its parent, for nodes at most so large."""

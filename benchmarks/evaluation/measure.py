@@ -112,6 +112,15 @@ def _bisect(fits: Callable[[float], bool], low: float, high: float) -> float:
     return high
 
 
+def like(values: Any, array: Any) -> Any:
+    """Values as an array of the same kind, type and device as another."""
+    if isinstance(array, np.ndarray):
+        return np.asarray(values, array.dtype)
+    import torch
+
+    return torch.as_tensor(values, dtype=array.dtype, device=array.device)
+
+
 def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
     """(N,) px: half the larger side of the box in which gsplat 1.5 draws each gaussian; 0 outside of it.
 
@@ -119,7 +128,7 @@ def screen_radii(gaussians: Gaussians, camera: Camera) -> Any:
     any count, and to choose among what is of one size.
     """
     library = _device.library_of(gaussians.means)
-    viewmat = _device.like(camera.viewmat, gaussians.means)
+    viewmat = like(camera.viewmat, gaussians.means)
     world_to_view = viewmat[:3, :3]
     view = gaussians.means @ world_to_view.T + viewmat[:3, 3]
     depth = view[:, 2].clip(camera.near)
