@@ -194,3 +194,22 @@ def test_up_may_have_any_length(length):
 def test_blender_camera_refuses_a_scale():
     with pytest.raises(ValueError, match="transform_matrix: expected a rotation"):
         Camera.from_blender(np.diag([2.0, 2.0, 2.0, 1.0]), 0.8, 8, 8)
+
+
+def test_matrices_may_be_tensors_but_not_complex():
+    torch = pytest.importorskip("torch")
+    for dtype in (torch.float32, torch.float64, torch.int64):
+        camera = Camera(torch.eye(4, dtype=dtype), torch.eye(3, dtype=dtype), 8, 8)
+        np.testing.assert_array_equal(camera.viewmat, np.eye(4))
+    learnt = torch.eye(4, requires_grad=True)
+    np.testing.assert_array_equal(Camera(learnt, torch.eye(3), 8, 8).K, np.eye(3))
+    with pytest.raises(
+        ValueError, match=r"viewmat: expected numbers of shape \(4, 4\), got ndarray of complex128"
+    ):
+        Camera(np.eye(4) + 0j, np.eye(3), 8, 8)
+    with pytest.raises(
+        ValueError, match=r"K: expected numbers of shape \(3, 3\), got Tensor of torch.complex64"
+    ):
+        Camera(np.eye(4), torch.eye(3) + 0j, 8, 8)
+    with pytest.raises(ValueError, match="viewmat: expected numbers of shape"):
+        Camera(torch.eye(4).to_sparse(), np.eye(3), 8, 8)

@@ -345,8 +345,8 @@ def test_inputs_are_left_as_they_were(torch, device):
     [
         ({"filter_px2": -0.1}, "filter_px2: expected"),
         ({"filter_px2": math.nan}, "filter_px2: expected"),
-        ({"background": (1.0, 2.0)}, "background: expected three"),
-        ({"background": (1.0, 2.0, 3.0, 4.0)}, "background: expected three"),
+        ({"background": (1.0, 2.0)}, "background: expected shape"),
+        ({"background": (1.0, 2.0, 3.0, 4.0)}, "background: expected shape"),
     ],
 )
 def test_wrong_arguments_are_refused(mode, message):

@@ -48,28 +48,33 @@ def vector(values: Any, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
 
 def color(values: Any, name: str) -> list[float]:
     """Three numbers that the core can hold."""
-    array = floats(values, name, "three numbers")
-    if array.shape != (3,):
-        raise ValueError(f"{name}: expected three numbers, got {array.size}")
+    array = vector(values, name)
     if not (np.abs(array) <= MOST_FLOAT).all():
         raise ValueError(f"{name}: expected numbers that a float32 can hold, got {np.abs(array).max()}")
     return [float(value) for value in array]
 
 
-def real(value: Any, name: str, least: float = -math.inf, what: str = "a number") -> float:
-    """One number of at least ``least``, which may be infinite; ValueError otherwise."""
+def real(
+    value: Any, name: str, what: str = "a number", least: float = -math.inf, most: float = math.inf
+) -> float:
+    """One number of ``least`` to ``most``; ValueError otherwise."""
     try:
         number = math.nan if getattr(value, "ndim", 0) else float(value)
     except OverflowError:
         number = math.inf if value > 0 else -math.inf
     except (TypeError, ValueError, RuntimeError):
         number = math.nan
-    if not number >= least:
+    if not least <= number <= most:
         raise ValueError(f"{name}: expected {what}, got {shown(value)}")
     return number
 
 
-def whole(value: Any, name: str, least: int, what: str, most: int = MOST_INT) -> int:
+def positive(value: Any, name: str) -> float:
+    """One positive number that is finite; ValueError otherwise."""
+    return real(value, name, "a positive number", least=5e-324, most=1.7976931348623157e308)
+
+
+def whole(value: Any, name: str, what: str, least: int, most: int = MOST_INT) -> int:
     """One whole number of ``least`` to ``most``; ValueError otherwise."""
     try:
         number = least - 1 if isinstance(value, bool) else operator.index(value)

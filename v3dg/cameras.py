@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from v3dg import _core
 from v3dg._numbers import Floats as Floats
-from v3dg._numbers import real, vector, whole
+from v3dg._numbers import positive, real, vector, whole
 
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
@@ -64,11 +64,8 @@ class Camera:
                 "K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got a matrix with skew or scale"
             )
         width, height = _side(self.width, "width"), _side(self.height, "height")
-        near = _positive(self.near, "near")
-        for name, value in zip(
-            ("viewmat", "K", "width", "height", "near"), (viewmat, K, width, height, near), strict=True
-        ):
-            object.__setattr__(self, name, value)
+        near = positive(self.near, "near")
+        self.__dict__.update(viewmat=viewmat, K=K, width=width, height=height, near=near)
 
     @classmethod
     def look_at(
@@ -197,7 +194,7 @@ def turntable(
         fov_x: Horizontal field of view in radians.
     """
     middle, axis = vector(center, "center"), vector(up, "up")
-    radius, n = _positive(radius, "radius"), whole(n, "n", 0, "a whole number")
+    radius, n = positive(radius, "radius"), whole(n, "n", "a whole number", 0)
     if not max(1e-150, 1e-12 * np.abs(middle).max()) < radius < 1e150:
         expected = "a circle that double precision resolves"
         raise ValueError(f"center, radius: expected {expected}, got {radius} around {_text(middle)}")
@@ -261,7 +258,7 @@ def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Fl
 
 def _focal(fov: float, name: str, side: int) -> float:
     """Focal length, px, of a field of view in radians across a side in px."""
-    fov = real(fov, name, what="radians between 0 and pi")
+    fov = real(fov, name, "radians between 0 and pi")
     tangent = math.tan(0.5 * fov) if 0 < fov < math.pi else 0.0
     focal = 0.5 * side / tangent if tangent > 0 else math.inf
     if not focal < math.inf:
@@ -269,15 +266,8 @@ def _focal(fov: float, name: str, side: int) -> float:
     return focal
 
 
-def _positive(value: Any, name: str) -> float:
-    number = real(value, name, what="a positive number")
-    if not 0 < number < math.inf:
-        raise ValueError(f"{name}: expected a positive number, got {number}")
-    return number
-
-
 def _side(value: Any, name: str) -> int:
-    return whole(value, name, 1, "a positive whole number")
+    return whole(value, name, "a positive whole number", 1)
 
 
 def _text(vector: Floats) -> str:

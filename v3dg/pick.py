@@ -60,7 +60,7 @@ def pick(
     Raises:
         ValueError: The pixel is not in the image, or another argument is not as in `v3dg.render`.
     """
-    x, y = whole(x, "x", 0, "a column"), whole(y, "y", 0, "a row")
+    x, y = whole(x, "x", "a column", 0), whole(y, "y", "a row", 0)
     if not (x < camera.width and y < camera.height):
         raise ValueError(f"x, y: expected a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
     scene = copy.copy(Scene.of(subject))  # which stays as it is

@@ -50,7 +50,7 @@ def rasterize(
         RuntimeError: The gaussians are on a CUDA device, and v3dg was built without CUDA.
     """
     options: dict[str, Any] = {
-        "filter_px2": real(filter_px2, "filter_px2", 0, "a variance of at least 0 px²"),
+        "filter_px2": real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0),
         "antialiased": bool(antialiased),
         "with_depth": True,
     }

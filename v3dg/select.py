@@ -229,13 +229,13 @@ def rule_of(
     """
     if tolerance is None:
         tolerance = DEFAULT_TOLERANCE if budget is None else 0.0
-    tolerance = real(tolerance, "tolerance", 0, "0 px² or more")
+    tolerance = real(tolerance, "tolerance", "0 px² or more", 0)
     if budget is not None:
-        budget = whole(budget, "budget", 0, "0 gaussians or more", most=(1 << 63) - 1)
+        budget = whole(budget, "budget", "0 gaussians or more", 0, most=(1 << 63) - 1)
     return _core.Rule(
         tolerance_px2=tolerance if tolerance == np.inf else min(tolerance, MOST_FLOAT),
         budget=budget,
-        min_level=whole(min_level, "min_level", 0, "a level, 0 or more"),
+        min_level=whole(min_level, "min_level", "a level, 0 or more", 0),
         footprint=footprint,
         culls=cull,
     )
