@@ -11,13 +11,14 @@ import scenes
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 from v3dg import BuildConfig, Gaussians, _core, build_bundle
+from v3dg._device import CPU
 from v3dg._files import replacing
 from v3dg.build import build_file, levels_path
 from v3dg.build.assemble import assemble
 from v3dg.build.fit import fit_config
 from v3dg.build.plan import Plan
 from v3dg.build.simplify import Level, LevelTables, build_levels
-from v3dg.build.whole import _in_split_order
+from v3dg.build.whole import Job, SplitAsset
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import writing
 from v3dg.bundle.pages import PageLayout
@@ -40,6 +41,11 @@ def asset():
     return make_asset(num_gaussians=1100, seed=2)
 
 
+def in_split_order(asset, config):
+    leaves = SplitAsset(Job.of(asset, config, SEED, "refuse"), CPU)
+    return leaves.read(0, len(leaves))
+
+
 def arrays_of(level):
     """All of a level by name."""
     rows = {name: getattr(level.gaussians, name) for name in scenes.NAMES}
@@ -54,7 +60,7 @@ def part_of(level, plan, part):
     tables = level.tables
     return Level(
         level.gaussians.subset(slice(plan.offset[clusters.start], plan.offset[clusters.stop])),
-        LevelTables(tables.box[clusters], tables.ball[groups], tables.error[groups]),
+        LevelTables(tables.box[clusters], tables.ball[groups], tables.fit_ball[groups], tables.error[groups]),
     )
 
 
@@ -120,7 +126,7 @@ def test_plan_of_a_subtree_is_a_part_of_the_plan():
 def test_a_subtree_alone_is_that_of_the_whole(asset, name):
     """Whatever is built beside it, below which level, and in which order."""
     config = CONFIGS[name]
-    leaves, plan = _in_split_order(asset, config), Plan.of(len(asset), config)
+    leaves, plan = in_split_order(asset, config), Plan.of(len(asset), config)
     whole = list(build_levels(leaves, plan, config, SEED))
     num_compared = 0
     for level in (3, 1, 2):
@@ -141,7 +147,7 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
     config = CONFIGS[name]
     build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu").write(tmp_path / "whole.v3dg")
     made_with = v3dg.Bundle.open(tmp_path / "whole.v3dg").config
-    leaves, plan = _in_split_order(asset, config), Plan.of(len(asset), config)
+    leaves, plan = in_split_order(asset, config), Plan.of(len(asset), config)
     level = 2
     num_groups = plan.levels[level].num_groups
     subtrees = {}
@@ -160,6 +166,50 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
             writer.write(first_page[number], first_page[number + 1], whole[number].gaussians)
         writer.finish(*assemble(plan, [level.tables for level in whole], config))
     assert (tmp_path / "parts.v3dg").read_bytes() == (tmp_path / "whole.v3dg").read_bytes()
+
+
+# ---- units
+
+
+@pytest.mark.parametrize("name", ["ours", "previous", "groups_of_4"])
+def test_units_are_the_same_on_any_number_of_threads(asset, name, monkeypatch, tmp_path):
+    """And an interrupted build goes on to the same bytes, whichever units were finished."""
+    config = CONFIGS[name]
+    monkeypatch.setattr("v3dg.build.whole.UNIT_LEAVES", 160)
+    whole = build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu")
+    whole.write(tmp_path / "one.v3dg")
+    monkeypatch.setattr("v3dg._device.all_like", lambda device: [device] * 3)
+    three = {"config": config, "seed": SEED, "progress": False}
+    monkeypatch.setattr("v3dg._device.missing_for_cuda", lambda: "none wanted")
+    build_bundle(asset, **three).write(tmp_path / "three.v3dg")
+    assert (tmp_path / "three.v3dg").read_bytes() == (tmp_path / "one.v3dg").read_bytes()
+
+    fits = []
+
+    def some(*arguments):
+        fits.append(arguments)
+        if len(fits) > 9:
+            raise KeyboardInterrupt
+        return simplify(*arguments)
+
+    simplify = v3dg.build.simplify._simplify
+    with monkeypatch.context() as patch:
+        patch.setattr("v3dg.build.simplify._simplify", some)
+        with pytest.raises(KeyboardInterrupt):
+            build_bundle(asset, resume_path=tmp_path / "levels", **three)
+    build_bundle(asset, resume_path=tmp_path / "levels", **three).write(tmp_path / "resumed.v3dg")
+    assert (tmp_path / "resumed.v3dg").read_bytes() == (tmp_path / "one.v3dg").read_bytes()
+
+
+def test_units_hold_all_leaves_and_no_more_than_asked():
+    for count in (1, 2, 255, 1000, 1_000_003):
+        for most in (300, 10_000, 1 << 20):
+            plan = Plan.of(count, BuildConfig())
+            units = plan.units(most)
+            sizes = [part.levels[0].num_gaussians for part in units.plans]
+            assert sum(sizes) == count
+            assert max(sizes) <= max(most, 256)
+            assert all(len(part.levels) == units.level + 1 for part in units.plans)
 
 
 # ---- files
@@ -240,7 +290,7 @@ def test_an_unfinished_file_never_gets_its_name(asset, tmp_path):
 # Those of the build itself.
 OF_THE_BUILD = {
     *("cluster_size", "group_size", "min_clusters", "min_gaussians", "init", "prune_growth", "targets"),
-    *("asset_filter_px2", "asset_antialiased"),
+    *("asset_filter_px2", "asset_antialiased", "first_steps"),
 }
 
 
@@ -248,7 +298,7 @@ def test_every_setting_of_the_fit_reaches_it(monkeypatch):
     config = BuildConfig.paper(num_views=7, px2_per_gaussian=1.5)
     monkeypatch.setattr(_core, "FitConfig", dict)
     expected = {name: value for name, value in asdict(config).items() if name not in OF_THE_BUILD}
-    assert fit_config(config, 3, 2) == expected | {"antialiased": True, "seed": 3 * 64 + 2}
+    assert fit_config(config, 3, 2) == expected | {"antialiased": True, "seed": 3}
 
 
 def test_a_forgotten_setting_of_the_fit_is_an_error(monkeypatch):

@@ -21,15 +21,15 @@ from random_bundle import random_gaussians
 from v3dg import BuildConfig, build_bundle
 from v3dg.build.checkpoint import _open_locked, digest_of
 
-CONFIG = BuildConfig(cluster_size=32, steps=400)
+CONFIG = BuildConfig(cluster_size=32, steps=400, first_steps=400)
 # Runs for days; only the first level's checkpoint would end it.
-ENDLESS = replace(CONFIG, steps=2_000_000_000)
+ENDLESS = replace(CONFIG, steps=2_000_000_000, first_steps=2_000_000_000)
 SCRIPT = """
 import sys
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 asset = make_asset(num_gaussians=1000, seed=0)
-config = v3dg.BuildConfig(cluster_size=32, steps=int(sys.argv[1]))
+config = v3dg.BuildConfig(cluster_size=32, steps=int(sys.argv[1]), first_steps=int(sys.argv[1]))
 if sys.argv[4] == "cuda":
     import torch
     torch.zeros(1, device="cuda")  # so that the device is up

@@ -113,6 +113,25 @@ def place(gaussians: Gaussians, device: Device) -> Gaussians:
     return Gaussians(*(getattr(there, field.name).detach() for field in fields(there)))
 
 
+def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Array:
+    """Those rows of an array as NumPy's (on the CPU) or as a tensor on a CUDA device, without gradients."""
+    if isinstance(array, np.ndarray) and not device.is_cuda:
+        return array[rows]
+    import torch
+
+    there = torch.as_tensor(array, device=str(device)).detach()
+    there = there[torch.from_numpy(rows).to(there.device)]
+    return there if device.is_cuda else there.numpy()
+
+
+def all_like(device: Device) -> list[Device]:
+    """All CUDA devices of the kind of one, which is the first; the CPU alone."""
+    if not device.is_cuda:
+        return [device]
+    others = (Device(number) for number in range(_core.num_cuda_devices()) if number != device.number)
+    return [device, *(other for other in others if describe(other) == describe(device))]
+
+
 def current_device() -> int:
     """Torch's current CUDA device."""
     import torch
@@ -154,6 +173,19 @@ def memory_errors() -> Iterator[None]:
         if type(error).__name__ != "OutOfMemoryError":
             raise
         raise MemoryError(str(error)) from error
+
+
+@contextmanager
+def own_stream(device: Device) -> Iterator[None]:
+    """Make a device current, and on it a stream that no other thread uses."""
+    if not device.is_cuda:
+        yield
+        return
+    import torch
+
+    stream: Any = torch.cuda.Stream
+    with torch.cuda.stream(stream(device.number)):
+        yield
 
 
 def with_this_stream(work: Callable[[_T], None], device: Device) -> Callable[[_T], None]:

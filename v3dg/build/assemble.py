@@ -29,7 +29,7 @@ def assemble(plan: Plan, tables: Sequence[LevelTables], config: BuildConfig) -> 
         filter_px2=np.where(is_fine, config.asset_filter_px2, config.filter_px2).astype(np.float32),
         antialiased=np.where(is_fine, config.asset_antialiased, True).astype(np.uint8),
     )
-    none = LevelTables(*(np.zeros((0, *shape), np.float32) for shape in ((2, 3), (4,), (2,))))
+    none = LevelTables(*(np.zeros((0, *shape), np.float32) for shape in ((2, 3), (4,), (4,), (2,))))
     coarse = [none, *tables[1:]]
     groups = Groups(
         ball=np.concatenate([table.ball for table in coarse]),

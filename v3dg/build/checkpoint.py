@@ -8,7 +8,9 @@ import json
 import math
 import os
 import stat
-from collections.abc import Iterator, Sequence
+import struct
+import threading
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from io import FileIO
@@ -21,40 +23,43 @@ import numpy.typing as npt
 from v3dg import _device, _files
 from v3dg._device import Device
 from v3dg._version import __version__
-from v3dg.build.plan import LevelPlan, Plan
+from v3dg.build.plan import LevelPlan
 from v3dg.build.simplify import Level, LevelTables
 from v3dg.bundle.format import HASH_BYTES, page_hash
 from v3dg.gaussians import Gaussians
 
 _FLOATS_AT_ONCE = 4 << 20
+_RECORD = struct.Struct("<II")  # in front of a level: its part, its number
 _GAUSSIANS_AT_ONCE = 1 << 16  # of this the digest of an asset depends
 
 
 class Checkpoint:
-    """Finished levels in a file that grows by one after each; the first, the leaves, is quicker to make anew.
+    """Finished levels in a file that grows by one after each; level 0, the leaves, is quicker to make anew.
 
     A level whose writing was cut off does not count; one that is whole but damaged is an error. The file is
-    locked while a build uses it, and is gone after one that finished no level.
+    locked while a build uses it, and is gone after one that finished no level. Any thread may load and save.
 
     Args:
+        parts: What is built alone, by its number: the plans of its levels by theirs.
         made_with: What the bundle will say of how it was built, its asset's digest with it.
     """
 
     def __init__(
         self,
         path: str | os.PathLike[str] | None,
-        plan: Plan,
+        parts: Sequence[Mapping[int, LevelPlan]],
         sh_degree: int,
         made_with: dict[str, Any],
         device: Device,
     ) -> None:
-        self.num_levels = 0  # that are in the file, beside the leaves
         self._path = None if path is None else Path(path)
-        self._levels = plan.levels
+        self._parts = parts
         what = json.dumps([made_with, _device.describe(device), __version__], sort_keys=True).encode()
-        self._head = b"v3dg levels 3\n" + page_hash([np.frombuffer(what, np.uint8)])
+        self._head = b"v3dg levels 4\n" + page_hash([np.frombuffer(what, np.uint8)])
         self._num_bases = (sh_degree + 1) ** 2
         self._num_bytes = 0  # of the file that are good
+        self._places: dict[tuple[int, int], int] = {}  # of parts' levels in the file
+        self._lock = threading.Lock()
 
     def __enter__(self) -> Checkpoint:
         if self._path is not None:
@@ -69,6 +74,8 @@ class Checkpoint:
                         f"{self._path}: holds something else, or levels of another asset, config, seed, "
                         "device or version; remove it to start again"
                     )
+                with self._reading():
+                    self._find_levels()
             except BaseException:
                 self._file.close()
                 raise
@@ -80,18 +87,21 @@ class Checkpoint:
                 self._path.unlink(missing_ok=True)
             self._file.close()
 
-    def load(self) -> Iterator[Level]:
-        """The finished levels but the leaves, one after another."""
-        if self._path is None:
-            return
-        for plan in self._levels[1:]:
-            with self._reading():
-                level = self._read(plan)
-            if level is None:
-                return
-            self._num_bytes = self._file.tell()
-            self.num_levels += 1
-            yield level
+    @property
+    def num_gaussians(self) -> int:
+        """Of the finished levels."""
+        return sum(self._parts[part][number].num_gaussians for part, number in self._places)
+
+    def load(self, part: int) -> Iterator[Level]:
+        """The finished levels of a part but the leaves, one after another."""
+        for number in sorted(self._parts[part]):
+            if number > 0:
+                with self._lock:
+                    if (part, number) not in self._places:
+                        return
+                    with self._reading():
+                        level = self._read(self._places[part, number], self._parts[part][number])
+                yield level
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -103,39 +113,61 @@ class Checkpoint:
                 f"({error}); remove it to start again"
             ) from error
 
-    def _read(self, plan: LevelPlan) -> Level | None:
-        """The next level; None where the file ends before it does."""
+    def _find_levels(self) -> None:
+        """Note where levels are, up to the one that was cut off."""
+        size = os.fstat(self._file.fileno()).st_size
+        self._num_bytes = place = len(self._head) if size >= len(self._head) else 0
+        if place == 0:
+            return
+        while place + _RECORD.size + HASH_BYTES <= size:
+            self._file.seek(place)
+            part, number = _RECORD.unpack(self._file.read(_RECORD.size))
+            if not (part < len(self._parts) and number in self._parts[part]):
+                raise ValueError("a level is damaged")
+            num_floats = sum(map(math.prod, self._shapes(self._parts[part][number])))
+            end = place + _RECORD.size + HASH_BYTES + 4 * num_floats
+            if end > size:
+                return
+            self._places[part, number] = place + _RECORD.size
+            self._num_bytes = place = end
+
+    def _shapes(self, plan: LevelPlan) -> list[tuple[int, ...]]:
+        """Of the arrays of a level, in order; all are float32."""
         n, clusters, groups = plan.num_gaussians, plan.num_clusters, plan.num_groups
-        shapes: list[tuple[int, ...]] = [(n, 3), (n, 4), (n, 3), (n,), (n, self._num_bases, 3)]
-        shapes += [(clusters, 2, 3), (groups, 4), (groups, 2)]
-        left = os.fstat(self._file.fileno()).st_size - self._file.tell()
-        if HASH_BYTES + 4 * sum(map(math.prod, shapes)) > left:
-            return None
+        rows: list[tuple[int, ...]] = [(n, 3), (n, 4), (n, 3), (n,), (n, self._num_bases, 3)]
+        return [*rows, (clusters, 2, 3), (groups, 4), (groups, 4), (groups, 2)]
+
+    def _read(self, place: int, plan: LevelPlan) -> Level:
+        self._file.seek(place)
         digest = self._file.read(HASH_BYTES)
-        arrays = [np.fromfile(self._file, np.float32, math.prod(shape)).reshape(shape) for shape in shapes]
+        arrays = [
+            np.fromfile(self._file, np.float32, math.prod(shape)).reshape(shape)
+            for shape in self._shapes(plan)
+        ]
         if _digest_of_arrays(arrays) != digest:
             raise ValueError("a level is damaged")
         return Level(Gaussians(*arrays[:5]), LevelTables(*arrays[5:]))
 
-    def save(self, level: Level) -> None:
-        """Add a level that is on the host; what a full disk cuts off is removed again."""
-        if self._path is None:
+    def save(self, part: int, number: int, level: Level) -> None:
+        """Add a level that is on the host, if it is new; what a full disk cuts off is removed again."""
+        if self._path is None or (part, number) in self._places:
             return
         arrays = [*vars(level.gaussians).values(), *vars(level.tables).values()]
-        descriptor, end = self._file.fileno(), self._num_bytes
-        os.ftruncate(descriptor, end)
-        with _files.naming_errors(self._path):
+        head = _RECORD.pack(part, number) + _digest_of_arrays(arrays)
+        with self._lock, _files.naming_errors(self._path):
+            descriptor, end = self._file.fileno(), self._num_bytes
+            os.ftruncate(descriptor, end)
+            head = (self._head if end == 0 else b"") + head
+            pieces = [memoryview(head), *(array.reshape(-1).view(np.uint8).data for array in arrays)]
             try:
-                head = (self._head if end == 0 else b"") + _digest_of_arrays(arrays)
-                pieces = [memoryview(head), *(array.reshape(-1).view(np.uint8).data for array in arrays)]
                 for data in pieces:
                     _files.write_at(descriptor, data, end)
                     end += len(data)
             except OSError:
                 os.ftruncate(descriptor, self._num_bytes)
                 raise
-        self._num_bytes = end
-        self.num_levels += 1
+            self._places[part, number] = end - sum(map(len, pieces[1:])) - HASH_BYTES
+            self._num_bytes = end
 
 
 def discard_levels(resume_path: str | os.PathLike[str]) -> None:

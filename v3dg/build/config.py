@@ -21,8 +21,10 @@ class BuildConfig:
         min_gaussians: ... or fewer gaussians than this.
         init: Start of a coarser cluster: "merge" alike gaussians in pairs, or "prune" the lesser half.
         prune_growth: Factor for the scales of gaussians that survive pruning.
-        targets: What a level is fitted to: the "leaves" under it or the "previous" level.
-        steps: Steps of Adam for each group; 0 keeps the start.
+        targets: What a level is fitted to: the "finest" level below that its views can show, or the
+            "previous" one.
+        steps: Most steps of Adam for each group; 0 keeps the start.
+        first_steps: Steps at level 1; each level takes twice as many as the one below, up to `steps`.
         views_per_step: Views that one step looks at.
         num_views: Views of a group, drawn once; 0 draws a fresh random one each time.
         supersample: Targets are drawn this much larger and box-averaged.
@@ -44,8 +46,9 @@ class BuildConfig:
     min_gaussians: int = 4
     init: Literal["merge", "prune"] = "merge"
     prune_growth: float = 2 ** (1 / 6)
-    targets: Literal["leaves", "previous"] = "leaves"
+    targets: Literal["finest", "previous"] = "finest"
     steps: int = 800
+    first_steps: int = 200
     views_per_step: int = 2
     num_views: int = 64
     supersample: int = 4
@@ -58,10 +61,10 @@ class BuildConfig:
     loss_l1: float = 1.0
     loss_dssim: float = 0.0
     loss_alpha: float = 0.5
-    step_position: float = 0.005
+    step_position: float = 0.0035
     position_in_world: bool = False
     step_log_scale: float = 0.04
-    step_quat: float = 0.02
+    step_quat: float = 0.014
     step_logit: float = 0.05
     step_sh0: float = 0.04
     step_sh_rest: float = 0.01
@@ -86,7 +89,7 @@ class BuildConfig:
         require("cluster_size", self.cluster_size >= 2, "at least 2")
         for name in ("min_clusters", "min_gaussians", "views_per_step", "supersample"):
             require(name, getattr(self, name) >= 1, "at least 1")
-        for name in ("steps", "num_views", "image_size"):
+        for name in ("steps", "first_steps", "num_views", "image_size"):
             require(name, getattr(self, name) >= 0, "at least 0")
         for name in ("px2_per_gaussian", "prune_growth", "final_step"):
             require(name, 0 < getattr(self, name) < math.inf, "a positive number")
@@ -101,10 +104,43 @@ class BuildConfig:
         size = self.group_size
         require("group_size", size >= 2 and size & (size - 1) == 0, "a power of two of at least 2")
         require("init", self.init in ("merge", "prune"), "'merge' or 'prune'")
-        require("targets", self.targets in ("leaves", "previous"), "'leaves' or 'previous'")
+        require("targets", self.targets in ("finest", "previous"), "'finest' or 'previous'")
         require(
             "distance", self.distance > 1.1, "more than 1.1 radii, so that the camera is outside the ball"
         )
+
+    def steps_at(self, level: int) -> int:
+        """Steps of the groups of a level."""
+        return min(self.steps, self.first_steps << min(max(level - 1, 0), 32))
+
+    def target_of(self, level: int) -> int:
+        """The level that the groups of a level are fitted to.
+
+        A level finer than one with two gaussians for each sample of a target picture shows no more.
+        """
+        return max(0, level - (1 if self.targets == "previous" else self._visible_levels))
+
+    def levels_at_once(self, first: int, end: int) -> range:
+        """Which levels before `end` are fitted together with level `first`.
+
+        The lowest, of which most is seen, start from the fit below; those above, which have few groups and
+        would be waited for one after another, from what is merged of the fit below them all.
+        """
+        last = first + 1
+        if self.target_of(first) > 0 and self.targets == "finest":
+            while last < min(end, first + self._visible_levels) and self.steps_at(last) == self.steps_at(
+                first
+            ):
+                last += 1
+        return range(first, last)
+
+    @property
+    def _visible_levels(self) -> int:
+        """How far below a level gaussians are about as small as half a sample of its target pictures."""
+        px2 = self.px2_per_gaussian
+        if self.image_size > 0:  # of which the ball covers about 0.4
+            px2 = 0.4 * self.image_size**2 / (self.cluster_size * self.group_size / 2)
+        return 1 + max(1, math.ceil(math.log2(px2 * self.supersample**2)))
 
     @staticmethod
     def paper(**changes: Any) -> BuildConfig:
@@ -122,6 +158,7 @@ class BuildConfig:
                 init="prune",
                 targets="previous",
                 steps=640,
+                first_steps=640,
                 views_per_step=1,
                 num_views=0,
                 supersample=1,

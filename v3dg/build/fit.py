@@ -26,6 +26,7 @@ _OF_LEVELS = {
     "init",
     "prune_growth",
     "targets",
+    "first_steps",
     "asset_filter_px2",
     "asset_antialiased",
 }
@@ -34,8 +35,7 @@ _OF_LEVELS = {
 def fit_config(config: BuildConfig, seed: int, level: int) -> _core.FitConfig:
     """The settings of the core's fit, which refuses one that it does not know or misses."""
     settings = {name: value for name, value in asdict(config).items() if name not in _OF_LEVELS}
-    # Every level has views of its own.
-    return _core.FitConfig(**settings, antialiased=True, seed=seed * 64 + level)
+    return _core.FitConfig(**settings | {"steps": config.steps_at(level)}, antialiased=True, seed=seed)
 
 
 def run_fit(

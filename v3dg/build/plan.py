@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,6 +93,15 @@ class Plan:
             )
         )
 
+    def units(self, most_leaves: int) -> Units:
+        """Cut the plan into runs of groups of one level, each above no more leaves than so many."""
+        num_leaves = self.levels[0].num_gaussians
+        num_units = 1 << max(0, math.ceil(num_leaves / most_leaves) - 1).bit_length()
+        level = max(n for n, here in enumerate(self.levels) if here.num_groups >= num_units)
+        each = self.levels[level].num_groups // num_units
+        plans = tuple(self.subtree(level, i * each, (i + 1) * each) for i in range(num_units))
+        return Units(level, plans)
+
     @property
     def first_page(self) -> list[int]:
         """Of each level, and the number of pages: a group's page is that of the clusters that it replaces."""
@@ -110,6 +120,14 @@ class Plan:
             clusters.append(np.full(count, each, np.int64))
             gaussians.append(np.diff(level.offset[::each]))
         return PageLayout(_offset_of(np.concatenate(clusters)), _offset_of(np.concatenate(gaussians)))
+
+
+@dataclass(frozen=True, eq=False)
+class Units:
+    """The parts of a plan that are built alone: the subtrees under equal runs of the groups of one level."""
+
+    level: int
+    plans: tuple[Plan, ...]
 
 
 def _next_shape(below: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:

@@ -2,46 +2,76 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
-
-import numpy as np
 
 from v3dg import _core
 from v3dg.build.plan import Plan
+from v3dg.build.simplify import Show
+
+
+class Stopped(Exception):
+    """Another thread of the build has failed."""
 
 
 class Bar:
-    """One bar over all levels; it advances by fitted gaussians, which is what time goes with."""
+    """One bar over all levels; it advances by fitted gaussians, which is what time goes with.
 
-    def __init__(self, plan: Plan, is_visible: bool) -> None:
-        self._levels = plan.levels
+    Parts of the plan may be built on threads of their own.
+
+    Args:
+        initial: Gaussians of levels that were built before.
+    """
+
+    def __init__(self, plan: Plan, initial: int, is_visible: bool) -> None:
+        self._total = sum(level.num_gaussians for level in plan.levels[1:])
+        self._last_level = len(plan.levels) - 1
+        self._initial = initial
         self._is_visible = is_visible
-        # Gaussians of the levels from 1 on up to each.
-        self._before = np.cumsum([0, 0, *(level.num_gaussians for level in plan.levels[1:])]).tolist()
+        self._fitted: dict[tuple[int, int], float] = {}  # by part and first level
+        self._lock = threading.Lock()
         self._bar: Any = None
+        self._is_stopped = False
 
-    def show(self, level: int, state: _core.FitProgress) -> None:
-        """Show how many groups of the level are done."""
+    def __enter__(self) -> Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def stop(self) -> None:
+        """Let every thread that shows something find out that the build has failed."""
+        self._is_stopped = True
+
+    def show_of(self, part: int) -> Show:
+        """What shows how far the fits of a part are."""
+
+        def show(levels: range, num_groups: int, num_gaussians: int, state: _core.FitProgress) -> None:
+            if self._is_stopped:
+                raise Stopped
+            with self._lock:
+                self._fitted[part, levels[0]] = num_gaussians * state.groups_done / num_groups
+                self._show(levels, num_groups, state)
+
+        return show
+
+    def _show(self, levels: range, num_groups: int, state: _core.FitProgress) -> None:
         from tqdm import tqdm
 
         if self._bar is None:
             self._bar = tqdm(
-                total=self._before[-1],
-                initial=self._before[level],
+                total=self._total,
+                initial=self._initial,
                 unit=" gaussians",
                 unit_scale=True,
                 smoothing=0.1,
                 dynamic_ncols=True,
                 disable=not self._is_visible,
             )
-        self._bar.set_description(f"level {level}/{len(self._levels) - 1}", refresh=False)
+        self._bar.set_description(f"level {levels[-1]}/{self._last_level}", refresh=False)
         done = state.groups_done
         if done > 0:
-            here = self._levels[level]
-            text = f"groups {done}/{here.num_groups}, loss {state.loss_sum / done:.4f}"
+            text = f"groups {done}/{num_groups}, loss {state.loss_sum / done:.4f}"
             self._bar.set_postfix_str(text, refresh=False)
-            self._bar.update(self._before[level] + here.num_gaussians * done // here.num_groups - self._bar.n)
-
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
+            self._bar.update(self._initial + int(sum(self._fitted.values())) - self._bar.n)

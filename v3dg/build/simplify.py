@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import islice
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +19,8 @@ from v3dg.gaussians import Array, Gaussians
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
 _GROUPS_AT_ONCE = 256
 
-Show = Callable[[int, _core.FitProgress], None]
-"""Is told now and then how far the fit of a level, given by its number, has come."""
+Show = Callable[[range, int, int, _core.FitProgress], None]
+"""Is told now and then of a fit: its levels, groups and gaussians, and how far it has come."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +30,13 @@ class LevelTables:
     Attributes:
         box: (C, 2, 3) float32, of what the clusters draw.
         ball: (G, 4) float32, nested, for selection.
+        fit_ball: (G, 4) float32, as small as is known, which the fit looks at.
         error: (G, 2) float32, residual of the fits.
     """
 
     box: npt.NDArray[np.float32]
     ball: npt.NDArray[np.float32]
+    fit_ball: npt.NDArray[np.float32]
     error: npt.NDArray[np.float32]
 
 
@@ -52,7 +55,7 @@ def build_levels(
     seed: int,
     *,
     finished: Iterable[Level] = (),
-    show: Show = lambda level, state: None,
+    show: Show = lambda levels, num_groups, num_gaussians, state: None,
 ) -> Iterator[Level]:
     """Yield all levels of a plan, one after another: the leaves first, as level 0.
 
@@ -65,89 +68,153 @@ def build_levels(
         leaves: The gaussians of level 0 in the order of the median split, where the work is to be done.
         finished: Levels from 1 on that need not be built again.
     """
-    where = _device.of(leaves.means)
-    target = _Leaves(leaves, config)
-    level = target.level(leaves, plan.levels[0])
-    del leaves  # in which memory they are from now on is for `level` and `target` to say
+    here = plan.levels[0]
+    ball = _core.bound_spheres(_spheres(leaves), here.leaf_offset)
+    box, ball = (_device.to_host(array) for array in (_core.bound_by_boxes(leaves.rows, here.offset), ball))
+    level = Level(leaves, LevelTables(box, ball, ball, np.zeros((here.num_groups, 2), np.float32)))
+    del leaves
     yield level
+    below = {0: level}
+    del level
+    yield from build_above(below, plan, config, seed, finished=finished, show=show)
+
+
+def build_above(
+    below: dict[int, Level],
+    plan: Plan,
+    config: BuildConfig,
+    seed: int,
+    *,
+    finished: Iterable[Level] = (),
+    show: Show = lambda levels, num_groups, num_gaussians, state: None,
+) -> Iterator[Level]:
+    """Yield the levels of a plan above others, one after another; as `build_levels` for the rest.
+
+    Args:
+        below: Levels by number, where the work is to be done: the last, and those before it that the next
+            ones are fitted to. Those that are no longer needed are taken out.
+    """
     saved = iter(finished)
-    for number in range(1, len(plan.levels)):
-        known = next(saved, None)
-        if known is None:
-            below = Level(_device.place(level.gaussians, where), level.tables)
-            del level
-            known = _simplify(below, target, plan, number, config, seed, show)
-            del below
-        level = known
-        yield level
-
-
-class _Leaves:
-    """The gaussians of level 0, as those that groups are made to look like and that their balls hold."""
-
-    def __init__(self, leaves: Gaussians, config: BuildConfig) -> None:
-        library = _device.library_of(leaves.means)
-        radius = library.amax(leaves.scales, axis=1, keepdims=True)
-        self._spheres: Array = library.concatenate([leaves.means, radius], axis=1)
-        self.target = _target(leaves, config, is_asset=True) if config.targets == "leaves" else None
-        self._last_balls: tuple[Offsets, npt.NDArray[np.float32]] | None = None
-
-    def level(self, leaves: Gaussians, plan: LevelPlan) -> Level:
-        """Level 0."""
-        box = _device.to_host(_core.bound_by_boxes(leaves.rows, plan.offset))
-        error = np.zeros((plan.num_groups, 2), np.float32)
-        return Level(leaves, LevelTables(box, self.balls(plan.leaf_offset), error))
-
-    def balls(self, leaf_offset: Offsets) -> npt.NDArray[np.float32]:
-        """Balls around the leaves under each group, which are what the fit looks at."""
-        # Past the root, every level stands for all leaves.
-        if self._last_balls is None or not np.array_equal(self._last_balls[0], leaf_offset):
-            balls = _device.to_host(_core.bound_spheres(self._spheres, leaf_offset))
-            self._last_balls = leaf_offset, balls
-        return self._last_balls[1]
+    last = max(below)
+    where = _device.of(below[last].gaussians.means)
+    while last + 1 < len(plan.levels):
+        levels = config.levels_at_once(last + 1, len(plan.levels))
+        made = list(islice(saved, len(levels)))
+        if len(made) < len(levels):
+            made = _simplify(below, plan, levels, config, seed, show)
+        for number, level in zip(levels, made, strict=True):
+            below[number] = Level(_device.place(level.gaussians, where), level.tables)
+        last = levels[-1]
+        for number in [number for number in below if number < min(last, config.target_of(last + 1))]:
+            del below[number]
+        while made:
+            yield made.pop(0)
 
 
 def _simplify(
-    below: Level, leaves: _Leaves, plan: Plan, number: int, config: BuildConfig, seed: int, show: Show
-) -> Level:
-    """Make a level from the one below."""
-    under, here = plan.levels[number - 1], plan.levels[number]
-    offset = np.ascontiguousarray(under.offset[:: under.num_clusters // here.num_groups])
-    gaussians = _start(below.gaussians, offset, here.group_offset, config)
+    below: Mapping[int, Level], plan: Plan, levels: range, config: BuildConfig, seed: int, show: Show
+) -> list[Level]:
+    """Make the next levels, whose groups are fitted together."""
+    plans = [plan.levels[number] for number in levels]
+    starts, chain = [], below[levels[0] - 1].gaussians
+    for number, here in zip(levels, plans, strict=True):
+        under = plan.levels[number - 1]
+        offset = np.ascontiguousarray(under.offset[:: under.num_clusters // here.num_groups])
+        chain = _start(chain, offset, here.group_offset, config)
+        starts.append(chain)
+    gaussians = starts[0] if len(starts) == 1 else Gaussians.concatenate(starts)
+    del starts, chain
+    targets = range(config.target_of(levels[0]), config.target_of(levels[-1]) + 1)
+    target = _target(below, targets, config)
+    views = [_View.of(below[config.target_of(number)], plan, number, config) for number in levels]
+    rows, groups = (
+        np.cumsum([0, *counts])
+        for counts in ([here.num_gaussians for here in plans], [here.num_groups for here in plans])
+    )
     where = _device.of(gaussians.means)
-    from_leaves = config.targets == "leaves"
-    ball = leaves.balls(here.leaf_offset)
-    target = leaves.target or _target(below.gaussians, config, is_asset=number == 1)
     _device.spare_memory(where)
     error = run_fit(
         lambda progress: _core.fit_level(
-            fit_config(config, seed, number),
+            fit_config(config, seed, levels[0]),
             target,
-            _ranges(here.leaf_offset if from_leaves else offset),
+            _ranges([view.offset for view in views], [len(below[number].gaussians) for number in targets]),
             gaussians.rows,
-            _ranges(here.group_offset),
-            ball,
-            np.arange(here.first_group, here.first_group + here.num_groups, dtype=np.int64),
+            _ranges([here.group_offset for here in plans], np.diff(rows)),
+            np.concatenate([view.ball for view in views]),
+            np.concatenate([_streams(number, here) for number, here in zip(levels, plans, strict=True)]),
             progress,
         ),
         where,
-        lambda state: show(number, state),
+        lambda state: show(levels, int(groups[-1]), len(gaussians), state),
     )
-    clusters_made = here.num_clusters // here.num_groups
+    made: list[Level] = []
+    ball = below[levels[0] - 1].tables.ball
+    for i, number in enumerate(levels):
+        ball = _core.bound_spheres(ball, _children(plan, number - 1, number))
+        part = gaussians.subset(slice(int(rows[i]), int(rows[i + 1])))
+        made.append(_level(part, plans[i], ball, views[i].ball, error[groups[i] : groups[i + 1]]))
+    return made
+
+
+def _streams(number: int, plan: LevelPlan) -> npt.NDArray[np.int64]:
+    """(G,) streams of random numbers: every group of the asset has one of its own."""
+    return (number << 40) + np.arange(plan.first_group, plan.first_group + plan.num_groups, dtype=np.int64)
+
+
+def _level(gaussians: Gaussians, plan: LevelPlan, *tables: npt.NDArray[np.float32]) -> Level:
+    """A level of fitted groups, each split into its clusters."""
+    clusters_made = plan.num_clusters // plan.num_groups
     if clusters_made > 1:
         depth = clusters_made.bit_length() - 1
-        order, _ = _core.median_split(gaussians.means, here.group_offset, depth)
+        order, _ = _core.median_split(gaussians.means, plan.group_offset, depth)
         gaussians = gaussians.subset(order)
-    box = _device.to_host(_core.bound_by_boxes(gaussians.rows, here.offset))
-    children = np.arange(here.num_groups + 1, dtype=np.int64) * (under.num_groups // here.num_groups)
-    return Level(gaussians, LevelTables(box, _core.bound_spheres(below.tables.ball, children), error))
+    box = _device.to_host(_core.bound_by_boxes(gaussians.rows, plan.offset))
+    return Level(gaussians, LevelTables(box, *tables))
 
 
-def _target(gaussians: Gaussians, config: BuildConfig, *, is_asset: bool) -> _core.FitTarget:
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What the groups of a level are fitted to, in the level that is their target.
+
+    Attributes:
+        offset: (G + 1,) gaussians of the target under each group.
+        ball: (G, 4) float32, which they are seen in.
+    """
+
+    offset: Offsets
+    ball: npt.NDArray[np.float32]
+
+    @staticmethod
+    def of(target: Level, plan: Plan, number: int, config: BuildConfig) -> _View:
+        source, here = config.target_of(number), plan.levels[number]
+        if source == 0:
+            ball = _device.to_host(_core.bound_spheres(_spheres(target.gaussians), here.leaf_offset))
+            return _View(here.leaf_offset, ball)
+        children = _children(plan, source, number)
+        ball = _core.bound_spheres(target.tables.fit_ball, children)
+        return _View(plan.levels[source].group_offset[children], ball)
+
+
+def _children(plan: Plan, below: int, number: int) -> Offsets:
+    """(G + 1,) groups of a level below that are under each of a level."""
+    num_groups = plan.levels[number].num_groups
+    return np.arange(num_groups + 1, dtype=np.int64) * (plan.levels[below].num_groups // num_groups)
+
+
+def _spheres(gaussians: Gaussians) -> Array:
+    library = _device.library_of(gaussians.means)
+    radius = library.amax(gaussians.scales, axis=1, keepdims=True)
+    spheres: Array = library.concatenate([gaussians.means, radius], axis=1)
+    return spheres
+
+
+def _target(below: Mapping[int, Level], numbers: range, config: BuildConfig) -> _core.FitTarget:
     """What groups are to look like, drawn as it is drawn when it is selected."""
-    if is_asset:
-        return _core.FitTarget(gaussians.rows, config.asset_filter_px2, config.asset_antialiased)
-    return _core.FitTarget(gaussians.rows, config.filter_px2, True)
+    parts = [below[number].gaussians for number in numbers]
+    rows = (parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)).rows
+    if numbers[0] == 0:
+        return _core.FitTarget(rows, config.asset_filter_px2, config.asset_antialiased)
+    return _core.FitTarget(rows, config.filter_px2, True)
 
 
 def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig) -> Gaussians:
@@ -171,6 +238,8 @@ def _halved(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: 
     return replace(kept, scales=kept.scales * np.float32(config.prune_growth))
 
 
-def _ranges(offset: Offsets) -> npt.NDArray[np.int64]:
-    """(S, 2) first and end of each segment."""
-    return np.stack([offset[:-1], offset[1:]], axis=1)
+def _ranges(offsets: Sequence[Offsets], counts: Sequence[int] | Offsets) -> npt.NDArray[np.int64]:
+    """(S, 2) first and end of each segment of arrays that lie one after another, with so many elements."""
+    first = np.cumsum([0, *counts])
+    moved = [offset + start for offset, start in zip(offsets, first[:-1], strict=True)]
+    return np.concatenate([np.stack([offset[:-1], offset[1:]], axis=1) for offset in moved])
