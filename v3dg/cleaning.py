@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,8 @@ SMALLEST_OPACITY = float(np.float32(_core.min_alpha))
 """A gaussian is drawn where its alpha is this or more, so one whose opacity is below is never drawn."""
 OUTLIER_DISTANCE = 20.0
 """From the median of the positions, in median distances; sky and floaters lie there, and slips."""
+
+_GAUSSIANS_AT_ONCE = 1 << 16
 
 # Kinds of gaussians that cannot be drawn: those with wrong values, then those that no pixel can show.
 _TEXT = {
@@ -73,6 +76,40 @@ def describe(counts: Mapping[str, int]) -> str:
 
 def examine(asset: Gaussians) -> Findings:
     """Find the gaussians that cannot be drawn."""
+    if _device.of(asset.means).is_cuda:
+        return _examine(asset)
+    drawable = np.ones(len(asset), bool)
+    counts: Counter[str] = Counter()
+    num_wrong = 0
+    host = asset.numpy()
+    for first in range(0, len(host), _GAUSSIANS_AT_ONCE):
+        rows = slice(first, first + _GAUSSIANS_AT_ONCE)
+        block = host.subset(rows)
+        if not _is_plainly_drawable(block):
+            found = _examine(block)
+            drawable[rows] = found.drawable
+            counts.update(found.counts)
+            num_wrong += found.num_wrong
+    return Findings(drawable, {kind: counts[kind] for kind in _TEXT if kind in counts}, num_wrong)
+
+
+def _is_plainly_drawable(asset: Gaussians) -> bool:
+    """Whether least and greatest values tell that all can be drawn; no comparison holds for NaN."""
+
+    def lie(values: npt.NDArray[np.float32], least: float, most: float) -> bool:
+        return bool(values.min() >= least and values.max() <= most)
+
+    finite = float(np.finfo(np.float32).max)
+    return (
+        lie(asset.means, -LARGEST, LARGEST)
+        and lie(asset.quats, -finite, finite)
+        and lie(asset.scales, 0, LARGEST)
+        and lie(asset.opacities, SMALLEST_OPACITY, 1)
+        and lie(asset.sh, -finite, finite)
+    )
+
+
+def _examine(asset: Gaussians) -> Findings:
     isfinite = _device.library_of(asset.means).isfinite
     finite = {
         name: isfinite(getattr(asset, name)) for name in ("means", "quats", "scales", "opacities", "sh")
