@@ -30,8 +30,8 @@ from v3dg.gaussians import Gaussians
 
 # Leaves of a unit: enough to keep a GPU busy, and little memory. The last bits of a bundle depend on it.
 UNIT_LEAVES = 1 << 20
-# Units that a GPU works on at once, so that one fills what the other's smallest levels leave idle.
-_UNITS_ON_GPU = 2
+# Units that a GPU works on at once, so that others fill what the smallest levels of one leave idle.
+_UNITS_ON_GPU = 4
 
 
 class Sink(Protocol):
