@@ -40,8 +40,8 @@ def build_bundle(
         config: Settings; ours by default.
         seed: Of the views that groups are fitted to.
         progress: Show a bar with the level, its groups done, the time left and their mean loss.
-        device: Where to compute; the bundle is on the host in any case. "auto" is the asset's or the current
-            CUDA device where there is one and torch can use it, else the CPU.
+        device: Where to compute; the bundle is on the host in any case. "auto" and "cuda" are the asset's or
+            the current CUDA device and all others of its kind, where torch can use it; "auto" else the CPU.
         resume_path: Where to keep finished levels; a build of the same asset, config, seed and device that
             finds them there goes on from them. The file stays: remove it once the bundle is saved.
         unusable: Whether gaussians with wrong values (not finite, negative scales, opacities outside 0 to 1)
