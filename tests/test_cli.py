@@ -300,7 +300,8 @@ def test_wrong_usage(folder):
     fails(2, "--config", "build", "tuft.ply", "--config", "best", cwd=folder)
     fails(2, "--seed", "build", "tuft.ply", "--seed", "many", cwd=folder)
     fails(2, "--cluster-sise", "build", "tuft.ply", "--cluster-sise", "3", cwd=folder)
-    fails(2, "--threads: expected at least 1", "build", "tuft.ply", "--threads", "0", cwd=folder)
+    for number in (0, 2**32):
+        fails(2, "--threads: expected 1 to 1,024", "build", "tuft.ply", "--threads", number, cwd=folder)
     fails(2, "--camera", "render", "tuft.ply", "--camera", "near", cwd=folder)
 
 
@@ -314,7 +315,7 @@ def test_failures(folder):
     fails(1, ".png", "render", "tuft.ply", "-o", "tuft.gif", cwd=folder)
     fails(1, "tolerance", "render", "tuft.v3dg", "--tolerance", "-1", cwd=folder)
     fails(1, "near, far away", "render", "scene.json", "--camera", "left", cwd=folder)
-    fails(1, "num_gaussians", "demo", "--gaussians", "3", cwd=folder)
+    fails(2, "--gaussians: expected 1,000 to", "demo", "--gaussians", "3", cwd=folder)
 
 
 def test_interrupt_leaves_no_bundle_and_says_so(tmp_path):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
 import statistics
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -20,27 +22,71 @@ class Judges:
 
     def __init__(self) -> None:
         self._cores = len(os.sched_getaffinity(0))
-        self._pool: ProcessPoolExecutor | None = None
+        self._processes: list[Any] = []
+        self._pipes: list[Any] = []
 
     def measured(self, items: Iterable[T], measure: Callable[[T], R]) -> Iterator[tuple[T, R]]:
         """Items with what a function of a module says of each, in order; later ones are made meanwhile."""
-        if self._pool is None:
-            # A forked process would inherit CUDA and OpenMP in a state that neither survives.
-            # Ctrl-C is for this process alone.
-            context, ignore = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)
-            self._pool = ProcessPoolExecutor(self._cores, context, signal.signal, ignore)
-        waiting: deque[tuple[T, Future[R]]] = deque()
-        for item in items:
-            waiting.append((item, self._pool.submit(measure, item)))
-            if len(waiting) > self._cores:
-                first, found = waiting.popleft()
-                yield first, found.result()
-        for item, found in waiting:
-            yield item, found.result()
+        waiting: deque[tuple[T, Any]] = deque()
+        try:
+            for number, item in enumerate(items):
+                if len(waiting) == self._cores:
+                    yield _answered(*waiting.popleft())
+                pipe = self._pipe(number % self._cores)
+                pipe.send((measure, item))
+                waiting.append((item, pipe))
+            while waiting:
+                yield _answered(*waiting.popleft())
+        except BaseException:  # answers that nobody waits for would be taken for the next ones
+            self.close()
+            raise
+
+    def _pipe(self, number: int) -> Any:
+        """The pipe to a process, which is started if it is the next one."""
+        if number == len(self._pipes):
+            resource_tracker.ensure_running()  # which hears signals again once it has started
+            # Ctrl-C is for this process alone: one that is started has no time for it, even to ignore it.
+            heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGALRM})
+            try:
+                # A forked process would inherit CUDA and OpenMP in a state that neither survives.
+                context = multiprocessing.get_context("spawn")
+                ours, theirs = context.Pipe()
+                process = context.Process(target=_judge, args=(theirs,), daemon=True)
+                process.start()
+                theirs.close()
+                self._processes.append(process)
+                self._pipes.append(ours)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, heard)
+        return self._pipes[number]
 
     def close(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
+        for process in self._processes:
+            process.kill()
+        for process in self._processes:
+            process.join()
+        self._processes, self._pipes = [], []
+
+
+def _judge(pipe: Connection) -> None:
+    """Measure what comes, until whoever asks has gone."""
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            measure, item = pipe.recv()
+            try:
+                pipe.send((measure(item), None))
+            except Exception as error:
+                pipe.send((None, error))
+
+
+def _answered(item: T, pipe: Any) -> tuple[T, Any]:
+    try:
+        result, error = pipe.recv()
+    except (EOFError, ConnectionError):
+        raise RuntimeError("a process that measures pictures was ended from outside") from None
+    if error is not None:
+        raise error
+    return item, result
 
 
 def mean_of(rows: Sequence[dict[str, Any]], *names: str) -> dict[str, Any]:

@@ -89,16 +89,21 @@ def ssim(reference: Any, test: Any) -> float:
 
     Source: Wang et al., Image quality assessment: from error visibility to structural similarity, 2004.
     """
-    a, b = (x.astype(np.float64) for x in _pair(reference, test))
-    if min(a.shape[:2]) <= _SSIM_REACH_PX:
-        raise ValueError(f"reference: expected at least {_SSIM_REACH_PX + 1} px a side, got {a.shape}")
+    pair = _pair(reference, test)
+    if min(pair[0].shape[:2]) <= _SSIM_REACH_PX:
+        raise ValueError(f"reference: expected at least {_SSIM_REACH_PX + 1} px a side, got {pair[0].shape}")
+    # A channel after the other, because this takes ten pictures' memory.
+    return float(np.mean([_ssim(*(x[..., c].astype(np.float64) for x in pair)) for c in range(3)]))
+
+
+def _ssim(a: NDArray[np.float64], b: NDArray[np.float64]) -> np.floating[Any]:
     mean_a, mean_b = _gaussian_blur(a), _gaussian_blur(b)
     variance_a = np.maximum(_gaussian_blur(a * a) - mean_a * mean_a, 0)
     variance_b = np.maximum(_gaussian_blur(b * b) - mean_b * mean_b, 0)
     covariance = _gaussian_blur(a * b) - mean_a * mean_b
     luminance = (2 * mean_a * mean_b + _SSIM_C1) / (mean_a**2 + mean_b**2 + _SSIM_C1)
     structure = (2 * covariance + _SSIM_C2) / (variance_a + variance_b + _SSIM_C2)
-    return float(np.mean(luminance * structure))
+    return np.mean(luminance * structure)
 
 
 def has_flip() -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,6 +18,12 @@ Picture: TypeAlias = NDArray[np.uint8]
 """(H, W, 3)"""
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+MOST_SIDE = 65_500
+"""Of a picture, in px: that of JPEG."""
+MOST_PIXELS_DRAWN = 1 << 27
+"""Which takes 20 bytes each."""
+MOST_PIXELS_COMPARED = 1 << 25
+"""A screen of 8K; measuring takes 200 bytes each."""
 
 _GAP_PX, _TEXT_PX = 6, 18
 _PAPER, _INK = (16, 18, 22), (238, 240, 243)
@@ -64,6 +72,51 @@ def check_picture_path(path: str | os.PathLike[str]) -> Path:
         raise ValueError(f"{path}: expected a file name ending in {', '.join(SUFFIXES)}; choose one of them")
     _files.check_folder(path)
     return path
+
+
+def check_size(name: str, width: int, height: int, most_pixels: int = MOST_PIXELS_DRAWN) -> None:
+    """Refuse, before anything is decoded or drawn, a picture that is too large.
+
+    Raises:
+        ValueError: A side has more than ``MOST_SIDE`` px, or the picture more than ``most_pixels``.
+    """
+    if max(width, height) > MOST_SIDE or width * height > most_pixels:
+        raise ValueError(
+            f"{name}: expected a picture of at most {MOST_SIDE:,} px a side and {most_pixels:,} px in all, "
+            f"got {width} x {height}"
+        )
+
+
+def read_picture(path: str | os.PathLike[str]) -> Picture:
+    """Read a PNG or a JPEG to compare it, whatever its name says; transparency is left out.
+
+    Raises:
+        ValueError: It is none, is damaged or too large, or has more than 8 bits a channel.
+        OSError: It cannot be read.
+    """
+    from PIL import Image
+
+    name = os.fspath(path)
+    with warnings.catch_warnings(), open(_files.open_regular(path), "rb") as file:
+        warnings.simplefilter("ignore")  # about what else the file holds, such as more pictures
+        with _naming_damage(name):
+            image = Image.open(file, formats=("PNG", "JPEG"))  # of others, Pillow starts programs
+        check_size(name, *image.size, MOST_PIXELS_COMPARED)
+        if image.mode.startswith("I"):
+            raise ValueError(f"{name}: expected 8 bits a channel, got 16; convert it first")
+        with _naming_damage(name):
+            return np.asarray(image.convert("RGB"))
+
+
+@contextlib.contextmanager
+def _naming_damage(name: str) -> Iterator[None]:
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # Pillow raises many kinds
+        text = f"{name}: expected a PNG or a JPEG, got one that cannot be read: {error}"
+        raise ValueError(text) from error
 
 
 def write_picture(path: str | os.PathLike[str], image: Any) -> None:

@@ -70,4 +70,4 @@ def run(options: Evaluate) -> None:
         ]
         return "\n\n".join([*sections, f"Plots and a page: python -m benchmarks report {options.output}"])
 
-    print_result(options.json, results, text)
+    print_result(options.json, results, text().splitlines())

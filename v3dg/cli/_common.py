@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import tyro
 
@@ -26,14 +28,24 @@ FAILURES = (OSError, MemoryError, ValueError, RuntimeError, ImportError)
 
 def failure_text(error: BaseException) -> str:
     """One line that says what failed."""
-    if isinstance(error, OSError) and error.filename:
-        text = f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     elif isinstance(error, MemoryError):
         numbers = f" ({error})" if str(error) else ""
         text = f"not enough memory{numbers}; use smaller pictures or a smaller asset"
     else:
         text = str(error)
-    return " ".join(text.split())
+    return text
+
+
+def printable(line: str) -> str:
+    """A line with escapes for what a terminal would obey: text of files and their names may hold anything."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
+def tell(text: str) -> None:
+    """Print one line on stderr."""
+    print(printable(" ".join(text.split())), file=sys.stderr)
 
 
 def option(metavar: str, *aliases: str) -> Any:
@@ -43,6 +55,27 @@ def option(metavar: str, *aliases: str) -> Any:
 
 Flag: TypeAlias = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 Threads: TypeAlias = Annotated[int | None, option("N")]
+
+
+@dataclass(kw_only=True)
+class Common:
+    """Options of every command that takes long."""
+
+    threads: Threads = None
+    """CPU threads; all if not given."""
+    json: Flag = False
+    """Print the result as JSON."""
+
+
+@dataclass(kw_only=True)
+class OnDevice(Common):
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto is a CUDA device where there is one and torch can use it."""
+
+
+def check_range(name: str, value: int, least: int, most: int) -> None:
+    if not least <= value <= most:
+        raise UsageError(f"{name}: expected {least:,} to {most:,}, got {value}")
 
 
 def load_asset_or_bundle(path: Path) -> Gaussians | Bundle:
@@ -69,19 +102,30 @@ def level_size(bundle: Bundle, level: int) -> int:
     return int(bundle.clusters.offset[clusters.stop] - bundle.clusters.offset[clusters.start])
 
 
-def print_result(as_json: bool, result: dict[str, Any], text: Callable[[], str]) -> None:
-    print(json.dumps(result, indent=1) if as_json else text())
+def print_result(as_json: bool, result: dict[str, Any], lines: Iterable[str]) -> None:
+    print(json.dumps(result, indent=1) if as_json else "\n".join(map(printable, lines)))
 
 
-def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table: the first column to the left, the others to the right."""
-    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+def table_lines(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Lines of a table: by each column's head, how its cells show a row; `-` where that lacks a value.
+
+    The first column is to the left, the others to the right.
+    """
+    cells = [[_cell(form, row) for form in columns.values()] for row in rows]
+    table = [list(columns), *cells]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    aligned = [[cell.rjust(w) for cell, w in zip(row, widths, strict=True)] for row in table]
     return [
-        "  ".join(
-            cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in (header, *rows)
+        "  ".join([row[0].ljust(widths[0]), *right[1:]]).rstrip()
+        for row, right in zip(table, aligned, strict=True)
     ]
+
+
+def _cell(form: str, row: Mapping[str, Any]) -> str:
+    try:
+        return printable(form.format_map(row))
+    except (KeyError, TypeError):  # there is none, or None, which has no format
+        return "-"
 
 
 def bytes_text(count: int) -> str:

@@ -7,18 +7,26 @@ import functools
 import io
 import operator
 import os
+import signal
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
 import tyro
 
+from v3dg import _start
 from v3dg._version import __version__
-from v3dg.cli._common import FAILURES, UsageError, failure_text
+from v3dg.cli._common import FAILURES, UsageError, check_range, failure_text, tell
 
 # Options and what runs on them, by the command's name, in the order of the help.
 Commands: TypeAlias = Mapping[str, tuple[type[Any], Callable[[Any], None]]]
+
+INTERRUPTED = 130  # exit code
+
+# More than any machine has cores; where the system refuses one, OpenMP ends the process.
+_MOST_THREADS = 1024
 
 
 @dataclass(frozen=True)
@@ -61,24 +69,42 @@ class Program:
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """Run one command, by default the one this program was started with, and return its exit code."""
-        is_program = arguments is None
-        arguments = sys.argv[1:] if arguments is None else arguments
-        if list(arguments) == ["--version"]:
-            print(f"v3dg {__version__}")
-            return 0
+        if arguments is None:
+            warnings.showwarning = _warn
+        code = self._run(arguments)
         try:
-            options = self.parse(arguments)
-            if is_program:
+            sys.stdout.flush()
+        except OSError as error:
+            # Python flushes once more at its end, and has to find a place for it.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            # Where the reader of our output has gone, nobody is left to tell.
+            is_to_tell = code == 0 and not isinstance(error, BrokenPipeError)
+            code = _fail(f"stdout: {error.strerror}", 1) if is_to_tell else code or 1
+        if arguments is None:
+            _start.ignore_interrupts()
+            if code == INTERRUPTED:
+                os._exit(code)  # whatever threads are still at
+        return code
+
+    def _run(self, arguments: Sequence[str] | None) -> int:
+        given = sys.argv[1:] if arguments is None else list(arguments)
+        try:
+            if given == ["--version"]:
+                print(f"v3dg {__version__}")
+                return 0
+            options = self.parse(given)
+            if arguments is None:
                 _set_threads(getattr(options, "threads", None))
+                _start.raise_interrupts()
             run = next(run for kind, run in self.commands.values() if isinstance(options, kind))
             run(options)
-            sys.stdout.flush()
+        except SystemExit:  # after the help
+            return 0
         except UsageError as error:
             return _fail(str(error), 2)
         except KeyboardInterrupt as stop:
-            return _fail(str(stop) or "interrupted", 130)
-        except BrokenPipeError:  # the reader of our output has gone: nobody is left to tell
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return _fail(str(stop) or "interrupted", INTERRUPTED)
+        except BrokenPipeError:
             return 1
         except FAILURES as error:
             return _fail(failure_text(error), 1)
@@ -89,13 +115,18 @@ def _set_threads(threads: int | None) -> None:
     """Start this process anew with that many threads: OpenMP reads the number once, when it is loaded."""
     if threads is None:
         return
-    if threads < 1:
-        raise UsageError(f"--threads: expected at least 1, got {threads}")
+    check_range("--threads", threads, 1, _MOST_THREADS)
     if os.environ.get("OMP_NUM_THREADS") != str(threads):
         os.environ["OMP_NUM_THREADS"] = str(threads)
+        # Until the next process is ready to hear Ctrl-C, it waits.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"v3dg: error: {' '.join(message.split())}", file=sys.stderr)
+    tell(f"v3dg: error: {message}")
     return code
+
+
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    tell(f"v3dg: warning: {message}")

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import tyro
 
-from v3dg.cli._common import UsageError, level_size, load_asset_or_bundle, option
+from v3dg.cli._common import UsageError, check_range, level_size, load_asset_or_bundle, option
 from v3dg.io import SUFFIXES
+from v3dg.pictures import MOST_SIDE, check_size
 
 if TYPE_CHECKING:
     from v3dg.bundle import Bundle
@@ -24,6 +26,9 @@ Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 # Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
 _ENOUGH_TO_FRAME = 50_000
+
+# All cameras are made before the first picture is drawn.
+_MOST_VIEWS = 10_000
 
 
 @dataclass
@@ -47,8 +52,11 @@ class ViewOptions:
 
     def check(self, *subjects: Path) -> None:
         """Refuse, before anything is read, what cannot be meant for these subjects."""
-        if min(self.views, *self.size) < 1:
-            raise UsageError("--views, --size: expected at least 1")
+        check_range("--views", self.views, 1, _MOST_VIEWS)
+        for side in self.size:
+            check_range("--size", side, 1, MOST_SIDE)
+        if not -90 <= self.elevation <= 90:
+            raise UsageError(f"--elevation: expected -90 to 90 degrees, got {self.elevation}")
         is_from_file = self.cameras is not None or any(map(is_scene, subjects))
         if self.camera is not None and not is_from_file:
             raise UsageError("--camera: expected --cameras or a scene (.json) to take it from; leave it out")
@@ -81,12 +89,16 @@ def choose_cameras(
 
         own = read_cameras(options.cameras, size=options.size, distortion=options.distortion)
     if own is None:
-        return _turntable(subject, options)
+        own = _turntable(subject, options)
     if not own:
         raise ValueError(
             f"{options.cameras or path}: expected cameras, got a file without any; add some to it"
         )
-    return own if options.camera is None else _one_camera(own, options.camera)
+    if options.camera is not None:
+        own = _one_camera(own, options.camera)
+    for name, camera in own.items():
+        check_size(f"camera {name}", camera.width, camera.height)
+    return own
 
 
 def _one_camera(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
@@ -139,9 +151,14 @@ def direction_of(axis: Axis) -> tuple[float, float, float]:
     return x, y, z
 
 
-def picture_path(output: Path, name: str, count: int) -> Path:
-    """Where the picture of a camera goes; of several, each has its camera's name in its own."""
-    if count == 1:
-        return output
-    safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in name)
-    return output.with_name(f"{output.stem}_{safe}{output.suffix}")
+def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
+    """Where the pictures of cameras go: of several, each has its camera's name in its own.
+
+    Where two would have the same, all have their camera's place in the file instead, from 0.
+    """
+    if len(cameras) == 1:
+        return [output]
+    names = ["".join(c if c.isalnum() or c in "-_." else "_" for c in name)[:100] for name in cameras]
+    if len(set(names)) < len(names):
+        names = [str(place) for place in range(len(names))]
+    return [output.with_name(f"{output.stem}_{name}{output.suffix}") for name in names]

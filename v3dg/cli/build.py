@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 import time
 import warnings
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from v3dg.cli._common import (
     FAILURES,
     Flag,
-    Threads,
+    OnDevice,
     UsageError,
     bytes_text,
     failure_text,
@@ -23,18 +22,15 @@ from v3dg.cli._common import (
     print_result,
     require_file,
     table_lines,
+    tell,
 )
 from v3dg.io import SUFFIXES
-
-if TYPE_CHECKING:
-    from v3dg.build import BuildConfig
-    from v3dg.bundle import Bundle
 
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
 
 @dataclass
-class Build:
+class Build(OnDevice):
     """Build a bundle from a trained asset, or from each of many; one that fails does not stop the others."""
 
     assets: Annotated[tuple[Path, ...], tyro.conf.Positional, _SEVERAL]
@@ -46,17 +42,11 @@ class Build:
     cluster_size: Annotated[int | None, option("N")] = None
     """Most gaussians in a cluster; the config's own if not given."""
     seed: int = 0
-    """The same seed gives the same file, byte for byte, on the same kind of device."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute; auto is a CUDA device where there is one and torch can use it."""
+    """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
     strict: Flag = False
     """Refuse an asset with wrong values, instead of leaving out the gaussians that have them."""
     resume: Flag = False
     """Continue after the last finished level; keep bundles of these gaussians and settings."""
-    threads: Threads = None
-    """CPU threads; all if not given. The result does not depend on it."""
-    json: Flag = False
-    """Print the result as JSON."""
     quiet: Flag = False
     """Show no progress."""
 
@@ -69,7 +59,7 @@ def run(options: Build) -> None:
     if len(options.assets) == 1 and not options.assets[0].is_dir():
         asset = options.assets[0]
         result = _build(options, asset, options.output or asset.with_suffix(".v3dg"))
-        print_result(options.json, result, lambda: _text(result))
+        print_result(options.json, result, _lines(result))
     else:
         _run_many(options)
 
@@ -80,13 +70,13 @@ def _run_many(options: Build) -> None:
     results: list[dict[str, Any]] = []
     for asset, output in outputs.items():
         if not options.quiet:
-            print(f"[{len(results) + 1}/{len(outputs)}] {asset}", file=sys.stderr)
+            tell(f"[{len(results) + 1}/{len(outputs)}] {asset}")
         try:
             results.append(_build(options, asset, output))
         except FAILURES as error:
             results.append({"asset": str(asset), "status": "failed", "error": failure_text(error)})
             if not options.quiet:
-                print(f"failed: {results[-1]['error']}", file=sys.stderr)
+                tell(f"failed: {results[-1]['error']}")
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"interrupted with {len(results)} of {len(outputs)} assets done; `--resume` continues"
@@ -94,18 +84,24 @@ def _run_many(options: Build) -> None:
     counts = Counter(result["status"] for result in results)
     summary = {name: counts[name] for name in ("built", "kept", "failed")}
     seconds = time.perf_counter() - start
+    columns = {
+        "asset": "{asset}",
+        "bundle": "{status}",
+        "levels": "{levels}",
+        "gaussians": "{gaussians:,}",
+        "left out": "{left_out:,}",
+        "size": "{size}",
+        "time": "{seconds:.1f} s",
+    }
+    shown = [
+        {**r, "left_out": sum(r["dropped"].values()), "size": bytes_text(r["bytes"])} if "bytes" in r else r
+        for r in results
+    ]
+    last = ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
     print_result(
         options.json,
         {**summary, "seconds": seconds, "assets": results},
-        lambda: "\n".join(
-            [
-                *table_lines(
-                    ("asset", "bundle", "levels", "gaussians", "left out", "size", "time"), _rows(results)
-                ),
-                "",
-                ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s",
-            ]
-        ),
+        [*table_lines(columns, shown), "", last],
     )
     failed = [result for result in results if result["status"] == "failed"]
     if failed:
@@ -130,7 +126,6 @@ def _outputs(options: Build) -> dict[Path, Path]:
         assets += found
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    outputs: dict[Path, Path] = {}
     asset_of: dict[Path, Path] = {}
     for asset in dict.fromkeys(assets):
         output = (asset if folder is None else folder / asset.name).with_suffix(".v3dg")
@@ -138,26 +133,34 @@ def _outputs(options: Build) -> dict[Path, Path]:
             raise ValueError(
                 f"{output}: expected one asset for it, got {asset_of[output]} and {asset}; rename one"
             )
-        outputs[asset], asset_of[output] = output, asset
-    return outputs
+        asset_of[output] = asset
+    return {asset: output for output, asset in asset_of.items()}
 
 
 def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
     """Build and write one bundle; what was done, as JSON values."""
     require_file(asset_path, *SUFFIXES)
-    from v3dg.build import build_file
+    from v3dg.build import BuildConfig, build_file, levels_path
     from v3dg.cleaning import AssetWarning
 
     if output.suffix != ".v3dg":
         raise ValueError(f"{output}: expected a file name ending in .v3dg")
     start = time.perf_counter()
+    config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
+    if options.cluster_size is not None:
+        config = replace(config, cluster_size=options.cluster_size)
+    levels = levels_path(output)
+
+    def to_resume() -> str:
+        return f"; `--resume` continues from {levels}" if levels.exists() else ""
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AssetWarning)  # the result says it
             bundle, is_built = build_file(
                 asset_path,
                 output,
-                config=_config(options),
+                config=config,
                 seed=options.seed,
                 progress=not options.quiet,
                 device=options.device,
@@ -165,17 +168,13 @@ def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
                 unusable="refuse" if options.strict else "drop",
             )
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted{_to_resume(output)}") from None
+        raise KeyboardInterrupt(f"interrupted{to_resume()}") from None
     except OSError as error:  # a full disk, say
-        raise OSError(error.errno, f"{error.strerror}{_to_resume(output)}", error.filename) from None
-    return _result(asset_path, output, bundle, "built" if is_built else "kept", start)
-
-
-def _result(asset: Path, output: Path, bundle: Bundle, status: str, start: float) -> dict[str, Any]:
+        raise OSError(error.errno, f"{error.strerror}{to_resume()}", error.filename) from None
     return {
-        "asset": str(asset),
+        "asset": str(asset_path),
         "output": str(output),
-        "status": status,
+        "status": "built" if is_built else "kept",
         "asset_gaussians": bundle.config["asset_gaussians"],
         "dropped": bundle.config["dropped"],
         "gaussians": bundle.num_gaussians,
@@ -186,44 +185,13 @@ def _result(asset: Path, output: Path, bundle: Bundle, status: str, start: float
     }
 
 
-def _config(options: Build) -> BuildConfig:
-    from v3dg.build import BuildConfig
-
-    config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
-    return config if options.cluster_size is None else replace(config, cluster_size=options.cluster_size)
-
-
-def _to_resume(output: Path) -> str:
-    from v3dg.build import levels_path
-
-    partial = levels_path(output)
-    return f"; `--resume` continues from {partial}" if partial.exists() else ""
-
-
-def _text(result: dict[str, Any]) -> str:
+def _lines(result: dict[str, Any]) -> list[str]:
     from v3dg.cleaning import describe
 
-    text = (
+    how = "kept as it was" if result["status"] == "kept" else f"{result['seconds']:.1f} s"
+    line = (
         f"{result['output']}: {result['levels']} levels, {result['clusters']:,} clusters, "
         f"{result['gaussians']:,} gaussians ({result['asset_gaussians']:,} in the asset), "
-        f"{bytes_text(result['bytes'])}, "
+        f"{bytes_text(result['bytes'])}, {how}"
     )
-    text += "kept as it was" if result["status"] == "kept" else f"{result['seconds']:.1f} s"
-    return text + ("\nleft out: " + describe(result["dropped"]) if result["dropped"] else "")
-
-
-def _rows(results: list[dict[str, Any]]) -> list[tuple[str, ...]]:
-    return [
-        (r["asset"], "failed", "-", "-", "-", "-", "-")
-        if r["status"] == "failed"
-        else (
-            r["asset"],
-            r["status"],
-            str(r["levels"]),
-            f"{r['gaussians']:,}",
-            f"{sum(r['dropped'].values()):,}",
-            bytes_text(r["bytes"]),
-            f"{r['seconds']:.1f} s",
-        )
-        for r in results
-    ]
+    return [line, *(["left out: " + describe(result["dropped"])] if result["dropped"] else [])]

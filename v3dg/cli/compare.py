@@ -13,15 +13,17 @@ import tyro
 
 from v3dg.cli._common import (
     Flag,
-    Threads,
+    OnDevice,
     UsageError,
+    check_range,
     level_size,
     option,
     print_result,
+    printable,
     require_subject,
     table_lines,
 )
-from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_path
+from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 from v3dg.pictures import SUFFIXES as PICTURE_SUFFIXES
 
 if TYPE_CHECKING:
@@ -35,7 +37,7 @@ _LEAST_WIDTH = 300
 
 
 @dataclass
-class Compare:
+class Compare(OnDevice):
     """Draw two subjects from the same cameras, or take two pictures, and measure how far apart they look.
 
     By PSNR and SSIM, and by FLIP where the extra `flip` is installed.
@@ -55,12 +57,6 @@ class Compare:
     """Most gaussians of the test to draw in one picture."""
     supersample: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Draw the reference this many times larger and average it; with 2, aliasing is not taken for detail."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to draw; auto is a CUDA device where there is one and torch can use it."""
-    threads: Threads = None
-    """CPU threads; all if not given."""
-    json: Flag = False
-    """Print the numbers as JSON."""
     quiet: Flag = False
     """Show no progress."""
     view: Views = field(default_factory=lambda: ViewOptions(views=8))
@@ -85,31 +81,36 @@ def run(options: Compare) -> None:
     from v3dg.pictures import check_picture_path
 
     output = check_picture_path(options.output)
-    are_pictures = [p.suffix.lower() in PICTURE_SUFFIXES for p in (options.reference, options.test)]
+    subjects = (options.reference, options.test)
+    if output.resolve() in [path.resolve() for path in subjects]:
+        raise UsageError(f"--output: expected another file than those to compare, got {output}")
+    are_pictures = [path.suffix.lower() in PICTURE_SUFFIXES for path in subjects]
     if any(are_pictures) and not all(are_pictures):
         raise UsageError("PATH: expected two pictures, or two subjects to draw, got one of each")
-    count, pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
-    rows, worst, is_finest = [], None, True
+    names, pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
+    paths = picture_paths(output, names) if options.pictures == "all" else [output] * len(names)
+    rows: list[dict[str, Any]] = []
+    worst: tuple[_Pair, dict[str, Any]] | None = None
+    is_finest = True
     with contextlib.closing(Judges()) as judges:
         judged = (
             judges.measured(pairs, _errors)
-            if count >= _ENOUGH_TO_SHARE
+            if len(names) >= _ENOUGH_TO_SHARE
             else ((pair, _errors(pair)) for pair in pairs)
         )
-        for pair, errors in tqdm(judged, total=count, unit="view", leave=False, disable=options.quiet):
+        for pair, errors in tqdm(judged, total=len(names), unit="view", leave=False, disable=options.quiet):
             row = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
             if options.pictures == "all":
-                path = picture_path(output, pair.name, count)
-                _write(options, path, pair, row["flip"])
-                row["picture"] = str(path)
+                row["picture"] = str(paths[len(rows)])
+                _write(options, pair, row)
             if worst is None or _difference(row) > _difference(worst[1]):
                 worst = (pair, row)
             rows.append(row)
             is_finest = is_finest and pair.is_finest
     assert worst is not None
     if options.pictures == "worst":
-        _write(options, output, worst[0], worst[1]["flip"])
         worst[1]["picture"] = str(output)
+        _write(options, *worst)
     mean = mean_of(rows, "flip", "psnr", "ssim", "gaussians_selected")
     result = {
         "reference": str(options.reference),
@@ -118,12 +119,16 @@ def run(options: Compare) -> None:
         "worst": worst[1]["camera"],
         "views": rows,
     }
-    table = [_cells(row) for row in rows]
-    if count > 1:
-        table.append(_cells({"camera": "mean", **mean}))
+    columns = {
+        "view": "{camera}",
+        "FLIP": "{flip:.4f}",
+        "PSNR": "{psnr:.2f}",
+        "SSIM": "{ssim:.4f}",
+        "gaussians": "{gaussians_selected:,.0f}",
+    }
     shown = "reference and test" if mean["flip"] is None else "reference, test and FLIP"
     lines = [
-        *table_lines(("view", "FLIP", "PSNR", "SSIM", "gaussians"), table),
+        *table_lines(columns, rows if len(rows) == 1 else [*rows, {"camera": "mean", **mean}]),
         "",
         f"{worst[1]['picture']}: {shown} of view {worst[1]['camera']}, which differs most",
     ]
@@ -131,38 +136,33 @@ def run(options: Compare) -> None:
         lines.append(FLIP_MISSING)
     if is_finest:
         lines.append("every view needs the finest level; `--size 100 100` shows the test as from far away")
-    print_result(options.json, result, lambda: "\n".join(lines))
+    print_result(options.json, result, lines)
 
 
-def _read_pictures(options: Compare) -> tuple[int, Iterator[_Pair]]:
-    import numpy as np
-    from PIL import Image
+def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
+    from v3dg.pictures import read_picture
 
-    def read(path: Path) -> Picture:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
-
-    reference, test = read(options.reference), read(options.test)
+    reference, test = read_picture(options.reference), read_picture(options.test)
     if reference.shape != test.shape:
         (height, width, _), (test_height, test_width, _) = reference.shape, test.shape
         raise ValueError(
             f"{options.test}: expected {width} x {height} px like {options.reference}, "
             f"got {test_width} x {test_height}"
         )
-    return 1, iter([_Pair(options.test.stem, reference, test)])
+    name = options.test.stem
+    return [name], iter([_Pair(name, reference, test)])
 
 
-def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
-    """How many views there are, and pictures of one after the other."""
+def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
+    """The names of the views, and pictures of one after the other."""
     for path in (options.reference, options.test):
         require_subject(path)
     options.view.check(options.reference, options.test)
-    if options.supersample < 1:
-        raise UsageError(f"--supersample: expected at least 1, got {options.supersample}")
+    check_range("--supersample", options.supersample, 1, 16)
     from v3dg import _device
     from v3dg.bundle import Bundle
     from v3dg.metrics import draw_truth
-    from v3dg.pictures import to_8bit
+    from v3dg.pictures import MOST_PIXELS_COMPARED, check_size, to_8bit
     from v3dg.render import render
 
     device = _device.resolve(options.device)
@@ -172,6 +172,10 @@ def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
     if own is None and test_cameras is not None:
         own, path = test_cameras, options.test
     cameras = choose_cameras(options.view, path, reference, own)
+    for name, camera in cameras.items():
+        check_size(f"camera {name}", camera.width, camera.height, MOST_PIXELS_COMPARED)
+        sides = (side * options.supersample for side in (camera.width, camera.height))
+        check_size(f"camera {name}, supersampled", *sides)
 
     finest = level_size(test, 0) if isinstance(test, Bundle) and test.num_levels else None
 
@@ -182,7 +186,7 @@ def _draw(options: Compare) -> tuple[int, Iterator[_Pair]]:
             count = image.stats.gaussians_selected
             yield _Pair(name, truth, to_8bit(image.color), count, count == finest)
 
-    return len(cameras), pairs()
+    return list(cameras), pairs()
 
 
 def _errors(pair: _Pair) -> dict[str, float | None]:
@@ -211,26 +215,14 @@ def _shown(pair: _Pair) -> list[Any]:
     return [picture.astype(np.float32) / np.float32(255) for picture in (pair.reference, pair.test)]
 
 
-def _write(options: Compare, path: Path, pair: _Pair, flip: float | None) -> None:
+def _write(options: Compare, pair: _Pair, row: dict[str, Any]) -> None:
     from v3dg import metrics
     from v3dg.pictures import contact_sheet, to_8bit, write_picture
 
     pictures = [(options.reference.name, pair.reference), (options.test.name, pair.test)]
-    if flip is not None:
-        pictures.append((f"FLIP {flip:.4f}", to_8bit(metrics.error_image(*_shown(pair)))))
+    pictures = [(printable(name), picture) for name, picture in pictures]
+    if row["flip"] is not None:
+        pictures.append((f"FLIP {row['flip']:.4f}", to_8bit(metrics.error_image(*_shown(pair)))))
     zoom = max(1, _LEAST_WIDTH // pair.test.shape[1])
-    row = [(text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1)) for text, picture in pictures]
-    write_picture(path, contact_sheet([row]))
-
-
-def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    def text(name: str, form: str) -> str:
-        return "-" if row[name] is None else format(row[name], form)
-
-    return (
-        row["camera"],
-        text("flip", ".4f"),
-        text("psnr", ".2f"),
-        text("ssim", ".4f"),
-        text("gaussians_selected", ",.0f"),
-    )
+    cells = [(text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1)) for text, picture in pictures]
+    write_picture(Path(row["picture"]), contact_sheet([cells]))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from v3dg import _files
-from v3dg.cli._common import Flag, Threads, UsageError, bytes_text, option, print_result, require_subject
+from v3dg.cli._common import Common, UsageError, bytes_text, option, print_result, require_subject
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, is_scene, load_subject
 from v3dg.io import WRITE_SUFFIXES
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Convert:
+class Convert(Common):
     """Write an asset, a level of a bundle, or its cut for a camera, in another format."""
 
     subject: tyro.conf.Positional[Path]
@@ -37,10 +37,6 @@ class Convert:
     """Write the cut with at most this many gaussians."""
     outside: Literal["drop", "keep"] = "drop"
     """What becomes of the part of the cut that the camera does not see."""
-    threads: Threads = None
-    """CPU threads; all if not given."""
-    json: Flag = False
-    """Print the result as JSON."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -78,7 +74,7 @@ def run(options: Convert) -> None:
     text = (
         f"{options.output}: {len(gaussians):,} gaussians, SH degree {gaussians.sh_degree}, {bytes_text(size)}"
     )
-    print_result(options.json, result, lambda: text)
+    print_result(options.json, result, [text])
 
 
 def _check(options: Convert) -> None:

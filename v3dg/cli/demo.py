@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from v3dg.cli._common import Flag, Threads, option, print_result
+from v3dg.cli._common import Common, Flag, check_range, print_result
+from v3dg.select import DEFAULT_TOLERANCE
 
 
 @dataclass
-class Demo:
+class Demo(Common):
     """Build an asset that v3dg makes itself, place it 2,000 times, draw it from near to far, and measure."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("v3dg_demo.png")
@@ -23,33 +24,29 @@ class Demo:
     """Number of instances of it."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (380, 440)
     """Width and height of one panel in px."""
-    tolerance: Annotated[float | None, option("PX2")] = None
+    tolerance: float = DEFAULT_TOLERANCE
     """Screen area in px² that one gaussian of a coarser cluster may stand for."""
     seed: int = 0
     """Seed of the asset, of the field and of the build."""
-    threads: Threads = None
-    """CPU threads; all if not given."""
-    json: Flag = False
-    """Print the numbers as JSON."""
     quiet: Flag = False
     """Show no progress."""
 
 
 def run(options: Demo) -> None:
     from v3dg.demo import run_demo, table_text
-    from v3dg.select import DEFAULT_TOLERANCE
 
+    check_range("--gaussians", options.gaussians, 1000, 10_000_000)
+    check_range("--instances", options.instances, 1, 1_000_000)
+    for side in options.size:
+        check_range("--size", side, 16, 4096)
     result = run_demo(
         options.output,
         num_gaussians=options.gaussians,
         instances=options.instances,
         size=options.size,
-        tolerance=DEFAULT_TOLERANCE if options.tolerance is None else options.tolerance,
+        tolerance=options.tolerance,
         seed=options.seed,
         progress=not options.quiet,
     )
-    print_result(
-        options.json,
-        result.as_dict(),
-        lambda: f"{table_text(result)}\n\nwrote {result.picture} in {result.seconds:.0f} s",
-    )
+    lines = [*table_text(result), "", f"wrote {result.picture} in {result.seconds:.0f} s"]
+    print_result(options.json, asdict(result), lines)

@@ -10,46 +10,38 @@ from typing import Annotated
 import tyro
 
 from v3dg import _files
-from v3dg.cli._common import Flag, Threads, UsageError, bytes_text, option, print_result, require_file
+from v3dg.cli._common import Common, Flag, UsageError, bytes_text, option, print_result, require_file
 from v3dg.cli._views import Axis
 
 
 @dataclass
-class Export:
+class Export(Common):
     """Write a bundle as streamed SOG, for the web viewers of PlayCanvas and SuperSplat (docs/formats.md)."""
 
     bundle: tyro.conf.Positional[Path]
     """A bundle (.v3dg)."""
     output: Annotated[Path | None, option("FOLDER", "-o")] = None
     """Folder to write, whose lod-meta.json viewers open; the bundle's name with _web if not given."""
-    chunk: Annotated[int | None, option("N")] = None
-    """Most gaussians of the asset in a chunk, for which the viewer chooses a level; 16384 if not given."""
+    chunk: int = 16384
+    """Most gaussians of the asset in a chunk, for which the viewer chooses a level."""
     up: Axis = "-y"
     """Direction that is up in the asset; viewers assume -y, as in most trained assets."""
-    threads: Threads = None
-    """CPU threads; all if not given."""
-    json: Flag = False
-    """Print the result as JSON."""
     quiet: Flag = False
     """Show no progress."""
 
 
 def run(options: Export) -> None:
     require_file(options.bundle, ".v3dg")
-    if options.chunk is not None and options.chunk < 1:
+    if options.chunk < 1:
         raise UsageError(f"--chunk: expected at least 1, got {options.chunk}")
     from v3dg.bundle import Bundle
-    from v3dg.export import DEFAULT_CHUNK, INDEX, write_streamed_sog
+    from v3dg.export import INDEX, write_streamed_sog
 
     folder = options.output or options.bundle.with_name(f"{options.bundle.stem}_web")
     _files.check_folder(folder)
     start = time.perf_counter()
     done = write_streamed_sog(
-        Bundle.open(options.bundle),
-        folder,
-        chunk=DEFAULT_CHUNK if options.chunk is None else options.chunk,
-        up=options.up,
-        progress=not options.quiet,
+        Bundle.open(options.bundle), folder, chunk=options.chunk, up=options.up, progress=not options.quiet
     )
     result = {
         "output": str(folder / INDEX),
@@ -64,4 +56,4 @@ def run(options: Export) -> None:
         f"{folder / INDEX}: {len(done.counts)} levels, {done.chunks:,} chunks, "
         f"{sum(done.counts):,} gaussians, {bytes_text(done.bytes)}, {result['seconds']:.1f} s"
     )
-    print_result(options.json, result, lambda: text)
+    print_result(options.json, result, [text])

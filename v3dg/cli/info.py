@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -17,6 +17,7 @@ from v3dg.cli._common import (
     level_size,
     load_asset_or_bundle,
     print_result,
+    printable,
     require_subject,
     table_lines,
 )
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from v3dg.cameras import Camera
     from v3dg.gaussians import Gaussians
     from v3dg.scene import Scene
+
+# JSON values, and lines of text.
+_Description = tuple[dict[str, Any], list[str]]
 
 
 @dataclass
@@ -41,18 +45,22 @@ class Info:
 
 def run(options: Info) -> None:
     require_subject(options.file)
+    from v3dg.bundle import Bundle
+
     if is_scene(options.file):
         from v3dg.scene_file import read_scene
 
-        result, text = _scene_info(options.file, *read_scene(options.file))
+        description = _scene_info(options.file, *read_scene(options.file))
     else:
         loaded = load_asset_or_bundle(options.file)
-        describe = _bundle_info if options.file.suffix == ".v3dg" else _asset_info
-        result, text = describe(options.file, cast(Any, loaded))
-    print_result(options.json, result, lambda: text)
+        if isinstance(loaded, Bundle):
+            description = _bundle_info(options.file, loaded)
+        else:
+            description = _asset_info(options.file, loaded)
+    print_result(options.json, *description)
 
 
-def _asset_info(path: Path, asset: Gaussians) -> tuple[dict[str, Any], str]:
+def _asset_info(path: Path, asset: Gaussians) -> _Description:
     import numpy as np
 
     from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
@@ -100,7 +108,7 @@ def _asset_info(path: Path, asset: Gaussians) -> tuple[dict[str, Any], str]:
     for name, (p5, p50, p95) in spread.items():
         name = name.replace("_", " ")
         lines.append(f"{name}: 5 % below {p5:.3g}, half below {p50:.3g}, 95 % below {p95:.3g}")
-    return result, "\n".join(lines)
+    return result, lines
 
 
 def _box(means: Any) -> list[list[float]]:
@@ -108,33 +116,31 @@ def _box(means: Any) -> list[list[float]]:
     return [means.min(axis=0).tolist(), means.max(axis=0).tolist()] if len(means) else []
 
 
-def _point(values: Sequence[float]) -> str:
+def _point(values: list[float]) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
 
 
-def _bundle_info(path: Path, bundle: Bundle) -> tuple[dict[str, Any], str]:
+def _bundle_info(path: Path, bundle: Bundle) -> _Description:
     from v3dg.build import BuildConfig
 
     result = {**bundle.info(), "path": str(path), "kind": "bundle"}
-    rows = [
-        (
-            str(level["level"]),
-            f"{level['clusters']:,}",
-            f"{level['gaussians']:,}",
-            bytes_text(level["bytes"]),
-            number_text(level["error_color"]),
-            number_text(level["error_alpha"]),
-        )
-        for level in result["levels"]
-    ]
+    columns = {
+        "level": "{level}",
+        "clusters": "{clusters:,}",
+        "gaussians": "{gaussians:,}",
+        "size": "{size}",
+        "colour error": "{error_color:.4f}",
+        "alpha error": "{error_alpha:.4f}",
+    }
     lines = [
         f"{path}: bundle, version {result['version']}, {bytes_text(result['bytes'])}",
         f"{bundle.num_gaussians:,} gaussians, SH degree {bundle.sh_degree}, "
         f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, {result['num_pages']:,} pages",
         "",
-        *table_lines(("level", "clusters", "gaussians", "size", "colour error", "alpha error"), rows),
+        *table_lines(columns, [{**level, "size": bytes_text(level["bytes"])} for level in result["levels"]]),
+        "",
+        "errors: what the fits were left with, a pixel, at the size at which a level is drawn",
     ]
-    lines += ["", "errors: what the fits were left with, a pixel, at the size at which a level is drawn"]
     if bundle.config:
         usual = asdict(BuildConfig())
         others = [
@@ -143,42 +149,40 @@ def _bundle_info(path: Path, bundle: Bundle) -> tuple[dict[str, Any], str]:
             if name not in usual or value != usual[name]
         ]
         text = f"built with {', '.join(others)}, all else by default" if others else "built by default"
-        lines += textwrap.wrap(text, 100, break_on_hyphens=False)
-    return result, "\n".join(lines)
+        lines += textwrap.wrap(printable(text), 100, break_on_hyphens=False)
+    return result, lines
 
 
-def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> tuple[dict[str, Any], str]:
-    counts = [int((scene.instance_bundle == b).sum()) for b in range(len(scene.bundles))]
-    full = [int(len(bundle.level_range(0)) and level_size(bundle, 0)) for bundle in scene.bundles]
-    total = sum(n * m for n, m in zip(counts, full, strict=True))
+def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Description:
+    bundles: list[dict[str, Any]] = [
+        {
+            "path": bundle.path,
+            "instances": int((scene.instance_bundle == number).sum()),
+            "asset_gaussians": level_size(bundle, 0) if len(bundle.level_range(0)) else 0,
+        }
+        for number, bundle in enumerate(scene.bundles)
+    ]
+    total = sum(bundle["instances"] * bundle["asset_gaussians"] for bundle in bundles)
+    sizes = [
+        {"name": name, "width": camera.width, "height": camera.height} for name, camera in cameras.items()
+    ]
     result = {
         "path": str(path),
         "kind": "scene",
         "instances": len(scene),
         "gaussians_at_full_detail": total,
-        "bundles": [
-            {"path": bundle.path, "instances": n, "asset_gaussians": m}
-            for bundle, n, m in zip(scene.bundles, counts, full, strict=True)
-        ],
-        "cameras": [
-            {"name": name, "width": camera.width, "height": camera.height} for name, camera in cameras.items()
-        ],
+        "bundles": bundles,
+        "cameras": sizes,
     }
+    columns = {"bundle": "{path}", "instances": "{instances:,}", "asset gaussians": "{asset_gaussians:,}"}
     lines = [
         f"{path}: scene, {len(scene):,} instances, {total:,} gaussians at full detail",
         "",
-        *table_lines(
-            ("bundle", "instances", "asset gaussians"),
-            [
-                (str(b.path or "-"), f"{n:,}", f"{m:,}")
-                for b, n, m in zip(scene.bundles, counts, full, strict=True)
-            ],
-        ),
+        *table_lines(columns, bundles),
     ]
-    if cameras:
-        rows = [(name, f"{camera.width} x {camera.height}") for name, camera in cameras.items()]
-        lines += ["", *table_lines(("camera", "size"), rows)]
-    return result, "\n".join(lines)
+    if sizes:
+        lines += ["", *table_lines({"camera": "{name}", "size": "{width} x {height}"}, sizes)]
+    return result, lines
 
 
 def _settings(config: dict[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -188,7 +192,3 @@ def _settings(config: dict[str, Any]) -> Iterator[tuple[str, Any]]:
             yield from _settings(value)
         else:
             yield name, value
-
-
-def number_text(value: float | None) -> str:
-    return "-" if value is None or value != value else f"{value:.4f}"

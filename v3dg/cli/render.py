@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from v3dg.cli._common import Flag, Threads, option, print_result, require_subject, table_lines
-from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_path
+from v3dg.cli._common import OnDevice, option, print_result, require_subject, table_lines
+from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 
 
 @dataclass
-class Render:
+class Render(OnDevice):
     """Draw a scene from its cameras, a bundle or an asset from a turntable, or any from a camera file."""
 
     subject: tyro.conf.Positional[Path]
@@ -31,12 +31,6 @@ class Render:
     """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Red, green and blue of the background, each 0 to 1."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to draw; auto is a CUDA device where there is one and torch can use it."""
-    threads: Threads = None
-    """CPU threads; all if not given."""
-    json: Flag = False
-    """Print the numbers as JSON."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -51,8 +45,8 @@ def run(options: Render) -> None:
     device = _device.resolve(options.device)
     subject, own_cameras = load_subject(options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
-    results = []
-    for name, camera in cameras.items():
+    pictures: list[dict[str, Any]] = []
+    for path, (name, camera) in zip(picture_paths(output, cameras), cameras.items(), strict=True):
         image = render(
             subject,
             camera,
@@ -63,10 +57,9 @@ def run(options: Render) -> None:
             background=options.background,
             device=device,
         )
-        path = picture_path(output, name, len(cameras))
         write_picture(path, _device.to_host(image.color))
         stats = image.stats
-        results.append(
+        pictures.append(
             {
                 "picture": str(path),
                 "camera": name,
@@ -80,20 +73,13 @@ def run(options: Render) -> None:
                 "draw_ms": stats.draw_ms,
             }
         )
-    rows = [
-        (
-            str(r["picture"]),
-            f"{r['width']} x {r['height']}",
-            f"{r['gaussians_selected']:,}",
-            f"{r['gaussians_in_frustum']:,}",
-            f"{r['select_ms']:.1f}",
-            f"{r['draw_ms']:.1f}",
-        )
-        for r in results
-    ]
-    header = ("picture", "size", "selected", "in frustum", "select ms", "draw ms")
-    print_result(
-        options.json,
-        {"subject": str(options.subject), "pictures": results},
-        lambda: "\n".join(table_lines(header, rows)),
-    )
+    columns = {
+        "picture": "{picture}",
+        "size": "{width} x {height}",
+        "selected": "{gaussians_selected:,}",
+        "in frustum": "{gaussians_in_frustum:,}",
+        "select ms": "{select_ms:.1f}",
+        "draw ms": "{draw_ms:.1f}",
+    }
+    result = {"subject": str(options.subject), "pictures": pictures}
+    print_result(options.json, result, table_lines(columns, pictures))
