@@ -1,6 +1,10 @@
 import json
 import os
+import struct
+import subprocess
 import sys
+import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
@@ -10,7 +14,7 @@ import v3dg
 from benchmarks.worlds.procedural import make_asset
 from command_line import fails, run
 from v3dg import cli, metrics
-from v3dg.pictures import write_picture
+from v3dg.pictures import read_picture, write_picture
 
 
 @pytest.fixture(scope="module")
@@ -153,8 +157,81 @@ def test_errors(folder, tmp_path):
     fails(1, "nowhere.ply", "compare", "nowhere.ply", "tuft.v3dg", cwd=folder)
     fails(1, "c.gif", "compare", "tuft.ply", "tuft.v3dg", "-o", "c.gif", cwd=folder)
     fails(2, "--supersample", "compare", "tuft.ply", "tuft.ply", "--supersample", 0, cwd=folder)
-    (tmp_path / "c.png").write_bytes(b"not a picture")
-    fails(1, "c.png", "compare", "a.png", "c.png", cwd=tmp_path)
+    (tmp_path / "compare.png").symlink_to("a.png")
+    fails(2, "expected another file than those to compare", "compare", "a.png", "b.png", cwd=tmp_path)
+
+
+def chunk(kind, data):
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def grey_png(side, *chunks, depth=8, rows=1):
+    """A grey PNG of any side with so few rows of data."""
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, depth, 0, 0, 0, 0))
+    data = zlib.compress(bytes((1 + side * depth // 8) * rows))
+    return b"\x89PNG\r\n\x1a\n" + b"".join([header, *chunks, chunk(b"IDAT", data), chunk(b"IEND", b"")])
+
+
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"not a picture", "expected a PNG or a JPEG, got another file"),
+        (b"", "expected a PNG or a JPEG, got another file"),
+        (POSTSCRIPT, "expected a PNG or a JPEG, got another file"),
+        (grey_png(8)[:50], "expected a PNG or a JPEG, got one that cannot be read"),
+        (grey_png(12_000), "expected a picture of at most 65,500 px a side and 33,554,432 px in all"),
+        (grey_png(20_000), "expected a PNG or a JPEG, got one that cannot be read: Image size"),
+        (grey_png(2**31 - 1), "expected a PNG or a JPEG, got one that cannot be read: Image size"),
+        (grey_png(8, depth=16, rows=8), "expected 8 bits a channel, got 16"),
+    ],
+)
+def test_pictures_that_users_hand_in_are_refused_before_they_cost(tmp_path, content, message):
+    write_picture(tmp_path / "a.png", np.zeros((8, 8, 3)))
+    (tmp_path / "c.png").write_bytes(content)
+    for path in ("c.png", tmp_path / "c.png"):
+        fails(1, f"{path}: {message}", "compare", "a.png", path, cwd=tmp_path)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"c\.png: expected"):
+        read_picture(tmp_path / "c.png")
+    assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    tracemalloc.stop()
+
+
+def test_no_program_is_started_for_a_picture(tmp_path, monkeypatch):
+    def refuse(*arguments, **options):
+        raise AssertionError(f"starts {arguments}")
+
+    (tmp_path / "c.png").write_bytes(POSTSCRIPT)
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    with pytest.raises(ValueError, match="expected a PNG or a JPEG"):
+        read_picture(tmp_path / "c.png")
+
+
+def test_more_pictures_in_a_file_are_not_looked_at(tmp_path):
+    """As in an animation, whose first picture is the one that is compared."""
+    animated = grey_png(8, chunk(b"acTL", bytes(8)), rows=8)
+    (tmp_path / "a.png").write_bytes(grey_png(8, rows=8))
+    (tmp_path / "b.png").write_bytes(animated)
+    done = run("compare", "a.png", "b.png", "--quiet", "--json", cwd=tmp_path)
+    assert done.stderr == ""
+    assert json.loads(done.stdout)["mean"]["psnr"] is None
+
+
+def test_pictures_of_all_views_have_names_of_their_own(folder, tmp_path):
+    scene = json.loads((folder / "scene.json").read_text())
+    scene["bundles"] = {name: str(folder / path) for name, path in scene["bundles"].items()}
+    first, second = scene["cameras"]
+    first["name"], second["name"] = "a/b", "a:b"
+    (tmp_path / "scene.json").write_text(json.dumps(scene))
+    for command in (["compare", "scene.json", "scene.json", "--pictures", "all"], ["render", "scene.json"]):
+        done = run(*command, "-o", "c.png", "--json", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        result = json.loads(done.stdout)
+        rows = result.get("views") or result["pictures"]
+        assert [(row["camera"], row["picture"]) for row in rows] == [("a/b", "c_0.png"), ("a:b", "c_1.png")]
 
 
 def test_without_flip_views_are_compared_by_psnr(folder, tmp_path, monkeypatch, capsys):

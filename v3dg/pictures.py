@@ -110,10 +110,14 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
 
 @contextlib.contextmanager
 def _naming_damage(name: str) -> Iterator[None]:
+    from PIL import UnidentifiedImageError
+
     try:
         yield
     except MemoryError:
         raise
+    except UnidentifiedImageError:
+        raise ValueError(f"{name}: expected a PNG or a JPEG, got another file") from None
     except Exception as error:  # Pillow raises many kinds
         text = f"{name}: expected a PNG or a JPEG, got one that cannot be read: {error}"
         raise ValueError(text) from error

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from v3dg.cli._common import OnDevice, option, print_result, require_subject, table_lines
+from v3dg.cli._common import OnDevice, UsageError, option, print_result, require_subject, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 
 
@@ -41,6 +41,8 @@ def run(options: Render) -> None:
     from v3dg.render import render
 
     options.view.check(options.subject)
+    if not all(0 <= part <= 1 for part in options.background):
+        raise UsageError(f"--background: expected three numbers from 0 to 1, got {options.background}")
     output = check_picture_path(options.output or Path(options.subject.with_suffix(".png").name))
     device = _device.resolve(options.device)
     subject, own_cameras = load_subject(options.subject)
