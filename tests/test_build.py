@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ import v3dg
 from benchmarks.worlds.procedural import make_asset
 from reference import project as reference_project
 from v3dg import BuildConfig, Camera, Gaussians, build_bundle, metrics, rasterize, render, select
+from v3dg.build.config import _RANGES
 
 SMALL = BuildConfig(cluster_size=32, steps=10)
 TABLES = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
@@ -355,33 +356,67 @@ def test_unknown_choice_for_unusable_gaussians_is_refused(asset):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"cluster_size": 1}, "cluster_size: expected at least 2, got 1"),
+        ({"cluster_size": 1}, "cluster_size: expected 2 to 1,073,741,824, got 1"),
         ({"cluster_size": 64.0}, "cluster_size: expected a whole number, got 64.0"),
-        ({"steps": -1}, "steps: expected at least 0, got -1"),
+        ({"cluster_size": 2**62}, "cluster_size: expected 2 to 1,073,741,824, got 4611686018427387904"),
+        ({"steps": -1}, "steps: expected 0 to 1,000,000, got -1"),
         ({"steps": True}, "steps: expected a whole number, got True"),
-        ({"views_per_step": 0}, "views_per_step: expected at least 1, got 0"),
-        ({"num_views": -1}, "num_views: expected at least 0, got -1"),
-        ({"supersample": 0}, "supersample: expected at least 1, got 0"),
-        ({"image_size": 20_000}, "image_size: expected at most 65535 px with `supersample` times as many"),
-        ({"min_gaussians": 0}, "min_gaussians: expected at least 1, got 0"),
-        ({"group_size": 1}, "group_size: expected a power of two of at least 2, got 1"),
-        ({"group_size": 6}, "group_size: expected a power of two of at least 2, got 6"),
+        ({"steps": 2**31 - 1}, "steps: expected 0 to 1,000,000, got 2147483647"),
+        ({"views_per_step": 0}, "views_per_step: expected 1 to 1,024, got 0"),
+        ({"views_per_step": 2**31 - 1}, "views_per_step: expected 1 to 1,024, got 2147483647"),
+        ({"num_views": -1}, "num_views: expected 0 to 65,536, got -1"),
+        ({"supersample": 0}, "supersample: expected 1 to 64, got 0"),
+        ({"supersample": 2**16}, "supersample: expected 1 to 64, got 65536"),
+        ({"image_size": 2**31}, "image_size: expected 0 to 8,192, got 2147483648"),
+        ({"image_size": 8000}, "image_size: expected views of at most 8192 px a side with `supersample`"),
+        ({"image_size": 2000, "num_views": 64}, "image_size: expected views of at most 8192 px"),
+        ({"min_gaussians": 0}, "min_gaussians: expected 1 to 4,611,686,018,427,387,904, got 0"),
+        ({"group_size": 1}, "group_size: expected 2 to 1,073,741,824, got 1"),
+        ({"group_size": 6}, "group_size: expected a power of two, got 6"),
         ({"init": "best"}, "init: expected 'merge' or 'prune', got 'best'"),
+        ({"init": ["merge"]}, "init: expected a name, got ['merge']"),
         ({"targets": "root"}, "targets: expected 'finest' or 'previous', got 'root'"),
-        ({"distance": 1.0}, "distance: expected more than 1.1 radii"),
-        ({"distance": math.nan}, "distance: expected more than 1.1 radii"),
-        ({"filter_px2": -0.1}, "filter_px2: expected a number of at least 0, got -0.1"),
-        ({"asset_filter_px2": math.inf}, "asset_filter_px2: expected a number of at least 0, got inf"),
+        ({"distance": 1.0}, "distance: expected 1.1 to 1,000, got 1.0"),
+        ({"distance": math.nan}, "distance: expected 1.1 to 1,000, got nan"),
+        ({"distance": 1e300}, "distance: expected 1.1 to 1,000, got 1e+300"),
+        ({"filter_px2": -0.1}, "filter_px2: expected 0 to 1,000,000, got -0.1"),
+        ({"asset_filter_px2": math.inf}, "asset_filter_px2: expected 0 to 1,000,000, got inf"),
         ({"loss_l1": "1"}, "loss_l1: expected a number, got '1'"),
-        ({"step_quat": math.nan}, "step_quat: expected a number of at least 0, got nan"),
-        ({"px2_per_gaussian": 0}, "px2_per_gaussian: expected a positive number, got 0"),
-        ({"final_step": 0.0}, "final_step: expected a positive number, got 0.0"),
+        ({"loss_dssim": 10**400}, "loss_dssim: expected 0 to 1,000,000, got 1000"),
+        ({"step_quat": math.nan}, "step_quat: expected 0 to 1,000,000,000, got nan"),
+        ({"px2_per_gaussian": 0}, "px2_per_gaussian: expected 0.001 to 1,000,000, got 0"),
+        ({"px2_per_gaussian": 1e20}, "px2_per_gaussian: expected 0.001 to 1,000,000, got 1e+20"),
+        ({"px2_per_gaussian": 1e6}, "px2_per_gaussian: expected views of at most 8192 px"),
+        ({"final_step": 0.0}, "final_step: expected 1e-06 to 1,000,000, got 0.0"),
         ({"position_in_world": 1}, "position_in_world: expected True or False, got 1"),
     ],
 )
 def test_wrong_settings_are_named(changes, message):
-    with pytest.raises(ValueError, match="^" + message.replace(".", "\\.")):
+    with pytest.raises(ValueError, match="^" + re.escape(message)):
         BuildConfig(**changes)
+
+
+def test_every_number_has_a_range_in_which_a_build_ends(asset):
+    """At either end of each, with the rest as it is: built, or refused before anything is allocated."""
+    small = BuildConfig(cluster_size=32, steps=1, num_views=2)
+    numbers = [field.name for field in fields(BuildConfig) if field.type in ("int", "float")]
+    assert sorted(_RANGES) == sorted(numbers)
+    for name, ends in _RANGES.items():
+        for value in {*ends} - {1_000_000 if name.endswith("steps") else None, 1 << 16}:
+            kind = type(getattr(small, name))
+            try:
+                config = replace(small, **{name: kind(value)})
+                built = build(asset, config, device="cpu")
+            except ValueError as error:
+                assert "expected views of at most" in str(error)  # noqa: PT017
+            else:
+                parts = [getattr(built.gaussians, part) for part in scenes.NAMES]
+                assert all(np.isfinite(part).all() for part in parts), (name, value)
+
+
+def test_views_that_are_too_large_for_the_clusters_are_refused(asset):
+    with pytest.raises(ValueError, match="px2_per_gaussian: expected views of at most 8192 px a side"):
+        build(asset, BuildConfig(cluster_size=1 << 20, px2_per_gaussian=1e4), device="cpu")
 
 
 def test_wrong_options_are_named(asset):

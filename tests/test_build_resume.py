@@ -23,7 +23,7 @@ from v3dg.build.checkpoint import _open_locked, digest_of
 
 CONFIG = BuildConfig(cluster_size=32, steps=400, first_steps=400)
 # Runs for days; only the first level's checkpoint would end it.
-ENDLESS = replace(CONFIG, steps=2_000_000_000, first_steps=2_000_000_000)
+ENDLESS = replace(CONFIG, steps=1_000_000, first_steps=1_000_000)
 SCRIPT = """
 import sys
 import v3dg

@@ -6,8 +6,34 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
-# Of a side of a picture, in pixels.
-_MAX_IMAGE_SIZE = 65535
+# A target is drawn in one go that cannot be interrupted: in about a second.
+_MOST_SIDE = 8192
+# Of all views of a group: they are kept, by each thread that fits one, in 16 bytes each.
+_MOST_PIXELS_KEPT = 1 << 26
+
+# What a setting may be. Whole numbers are 32 bits wide in the core, other numbers float32, whose squares and
+# products with each other must be finite, and not 0 where they are divided by.
+_RANGES: dict[str, tuple[float, float]] = {
+    "cluster_size": (2, 1 << 30),
+    "group_size": (2, 1 << 30),
+    "min_clusters": (1, 1 << 62),  # counts that the core does not see; so many make level 0 the only one
+    "min_gaussians": (1, 1 << 62),
+    "prune_growth": (0.001, 1000),  # of scales, once a level
+    "steps": (0, 1_000_000),  # some hours
+    "first_steps": (0, 1_000_000),
+    "views_per_step": (1, 1024),  # a step is not interrupted
+    "num_views": (0, 1 << 16),  # all are drawn before the first step
+    "supersample": (1, 64),  # more samples than a pixel has values
+    "image_size": (0, _MOST_SIDE),
+    "px2_per_gaussian": (0.001, 1_000_000),  # a picture for each, at most
+    "distance": (1.1, 1000),  # outside the ball; from farther, float32 depths are coarser than gaussians
+    "filter_px2": (0, 1_000_000),
+    "asset_filter_px2": (0, 1_000_000),
+    **dict.fromkeys(("loss_l1", "loss_dssim", "loss_alpha"), (0, 1_000_000)),
+    **dict.fromkeys(("step_position", "step_log_scale", "step_quat", "step_logit"), (0, 1_000_000_000)),
+    **dict.fromkeys(("step_sh0", "step_sh_rest"), (0, 1_000_000_000)),
+    "final_step": (1e-6, 1_000_000),
+}
 
 
 @dataclass(frozen=True)
@@ -38,6 +64,10 @@ class BuildConfig:
         step_position: Step size of positions, in radii of the group, or in world units if
             `position_in_world`; the others are of log scales, quaternions, logits and SH coefficients.
         final_step: What the step sizes have fallen to in the end, exponentially.
+
+    Raises:
+        ValueError: A setting is of another kind or out of its range, or all views of a group have too many
+            pixels to be kept.
     """
 
     cluster_size: int = 256
@@ -71,43 +101,47 @@ class BuildConfig:
     final_step: float = 0.1
 
     def __post_init__(self) -> None:
-        def require(name: str, good: bool, expected: str) -> None:
-            if not good:
-                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
-
         kinds: dict[Any, tuple[Any, str]] = {
             "int": (int, "a whole number"),
             "float": ((int, float), "a number"),
             "bool": (bool, "True or False"),
         }
         for field in fields(self):
-            if field.type in kinds:
-                kind, expected = kinds[field.type]
-                value = getattr(self, field.name)
-                is_flag = isinstance(value, bool)
-                require(field.name, isinstance(value, kind) and is_flag == (kind is bool), expected)
-        require("cluster_size", self.cluster_size >= 2, "at least 2")
-        for name in ("min_clusters", "min_gaussians", "views_per_step", "supersample"):
-            require(name, getattr(self, name) >= 1, "at least 1")
-        for name in ("steps", "first_steps", "num_views", "image_size"):
-            require(name, getattr(self, name) >= 0, "at least 0")
-        for name in ("px2_per_gaussian", "prune_growth", "final_step"):
-            require(name, 0 < getattr(self, name) < math.inf, "a positive number")
-        for field in fields(self):
-            if field.name.startswith(("loss_", "step_")) or field.name.endswith("filter_px2"):
-                require(field.name, 0 <= getattr(self, field.name) < math.inf, "a number of at least 0")
-        require(
-            "image_size",
-            self.image_size * self.supersample <= _MAX_IMAGE_SIZE,
-            f"at most {_MAX_IMAGE_SIZE} px with `supersample` times as many pixels",
-        )
+            value = getattr(self, field.name)
+            kind, expected = kinds.get(field.type, (str, "a name"))
+            self._require(
+                field.name, isinstance(value, kind) and isinstance(value, bool) == (kind is bool), expected
+            )
+        for name, (least, most) in _RANGES.items():
+            self._require(name, least <= getattr(self, name) <= most, f"{least:,} to {most:,}")
         size = self.group_size
-        require("group_size", size >= 2 and size & (size - 1) == 0, "a power of two of at least 2")
-        require("init", self.init in ("merge", "prune"), "'merge' or 'prune'")
-        require("targets", self.targets in ("finest", "previous"), "'finest' or 'previous'")
-        require(
-            "distance", self.distance > 1.1, "more than 1.1 radii, so that the camera is outside the ball"
-        )
+        self._require("group_size", size & (size - 1) == 0, "a power of two")
+        self._require("init", self.init in ("merge", "prune"), "'merge' or 'prune'")
+        self._require("targets", self.targets in ("finest", "previous"), "'finest' or 'previous'")
+        self.check_views(1)
+
+    def _require(self, name: str, is_good: bool, expected: str) -> None:
+        if not is_good:
+            raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
+
+    def check_views(self, most_gaussians: int) -> None:
+        """Refuse views that are too large, where groups are simplified to at most so many gaussians.
+
+        Raises:
+            ValueError: A view, or all that are kept of a group, have too many pixels.
+        """
+        side, name = self.image_size, "image_size"
+        if side == 0:  # as fit_view() of the core has it
+            name, x2 = "px2_per_gaussian", self.distance**-2
+            footprint_of_focal = 2 * math.pi * (1 - math.sqrt(1 - x2))
+            radius2 = most_gaussians * self.px2_per_gaussian / footprint_of_focal * x2 / (1 - x2)
+            side = math.ceil(2 * math.sqrt(radius2)) + 8
+        if side * self.supersample > _MOST_SIDE or side * side * self.num_views > _MOST_PIXELS_KEPT:
+            raise ValueError(
+                f"{name}: expected views of at most {_MOST_SIDE} px a side with `supersample`, and "
+                f"{_MOST_PIXELS_KEPT} px in all `num_views`, got {side} px a side; reduce one of them, "
+                "or `cluster_size`"
+            )
 
     def steps_at(self, level: int) -> int:
         """Steps of the groups of a level."""

@@ -133,6 +133,7 @@ def build_into(
     with _device.memory_errors():
         leaves = SplitAsset(job, where)
         plan = Plan.of(len(leaves), job.config)
+        job.config.check_views(max((np.diff(made.group_offset).max() for made in plan.levels[1:]), default=1))
         units = plan.units(UNIT_LEAVES)
         codec = Codec(job.asset.sh_degree)
         parts = [dict(enumerate(part.levels)) for part in units.plans]
