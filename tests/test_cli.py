@@ -1,6 +1,7 @@
 import errno
 import json
 import os
+import re
 import resource
 import shlex
 import shutil
@@ -342,6 +343,49 @@ def test_closed_pipe_is_quiet(folder):
     command = f"{sys.executable} -m v3dg info tuft.v3dg --json | head -c 1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=folder, env=ENVIRONMENT)
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-", "> /dev/full"])
+@pytest.mark.parametrize(
+    "command", ["--help", "info tuft.v3dg", "info nowhere.ply", "convert tuft.ply {}/a.ply"]
+)
+def test_closed_and_full_streams_end_with_one_line_and_take_no_file(folder, tmp_path, closed, command):
+    command = f"{sys.executable} -m v3dg {command.format(tmp_path)} {closed}"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=folder, env=ENVIRONMENT)
+    assert done.returncode in (0, 1)
+    assert done.stderr.count("\n") <= 1
+    assert done.stderr.startswith("v3dg: error: " if done.stderr else "")
+    for path in tmp_path.iterdir():  # all that is printed goes elsewhere
+        np.testing.assert_array_equal(v3dg.read_asset(path).means, v3dg.read_asset(folder / "tuft.ply").means)
+
+
+def test_text_of_files_reaches_no_terminal_as_it_is(folder, tmp_path):
+    """Names of files, and what a bundle says of itself."""
+    evil = "\x1b]0;owned\x07\x1b[2J\r\n\u202e\x9b\udcff"
+    for name in ("{}.ply", "{}.v3dg"):
+        shutil.copy(folder / name.format("tuft"), tmp_path / name.format(evil))
+    bundle = v3dg.Bundle.open(folder / "tuft.v3dg")
+    config = {**bundle.config, evil: evil, "nested": {evil: [evil]}}
+    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, config).write(tmp_path / "told.v3dg")
+    for command in (
+        ("info", f"{evil}.ply"),
+        ("info", f"{evil}.v3dg"),
+        ("info", "told.v3dg"),
+        ("info", f"{evil}.json"),
+        ("build", f"{evil}.ply"),
+        ("build", f"{evil}.ply", f"{evil}.ply", "told.v3dg", "-o", "folder"),
+        ("render", f"{evil}.v3dg", "--size", 32, 32),
+        ("compare", f"{evil}.ply", f"{evil}.v3dg", "--size", 32, 32, "--views", 1, "--quiet"),
+        ("convert", f"{evil}.ply", f"{evil}.spz"),
+        ("export", f"{evil}.v3dg", "--quiet"),
+        ("render", f"{evil}.v3dg", "--up", evil),
+    ):
+        done = run(*command, cwd=tmp_path)
+        shown = done.stdout + done.stderr
+        assert "owned" in shown or done.returncode == 2, command
+        if command[0] == "build":
+            shown = re.sub(r"\r[^\n]*it[^\n]*", "", shown)  # the bar
+        assert all(c.isprintable() for c in shown.replace("\n", "")), (command, shown)
 
 
 def test_main_returns_the_exit_code(capsys):

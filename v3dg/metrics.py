@@ -163,12 +163,27 @@ def box_downsample(image: Any, factor: int) -> Any:
     return blocks.mean((1, 3))
 
 
+def errors_of(reference: Picture, test: Picture) -> dict[str, float | None]:
+    """FLIP (None without its extra), PSNR (None for equal pictures) and SSIM of pictures in 8 bits."""
+    a, b = (picture.astype(np.float32) / np.float32(255) for picture in (reference, test))
+    return {
+        "flip": flip(a, b) if has_flip() else None,
+        "psnr": psnr(a, b) if (reference != test).any() else None,
+        "ssim": ssim(a, b),
+    }
+
+
 def draw_truth(
-    subject: Any, camera: Camera, device: str | Device = "auto", supersampling: int = 2
+    subject: Any,
+    camera: Camera,
+    device: str | Device = "auto",
+    supersampling: int = 2,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Picture:
     """Draw what the others are compared with, in 8 bits: all gaussians, with so many samples a pixel's side.
 
     Each sample is clipped to [0,1] as a screen does, before it is averaged over its pixel.
     """
-    color = render(subject, camera.scaled(supersampling), tolerance=0.0, device=device).color
+    larger = camera.scaled(supersampling)
+    color = render(subject, larger, tolerance=0.0, background=background, device=device).color
     return to_8bit(box_downsample(color.clip(0, 1), supersampling))

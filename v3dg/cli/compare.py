@@ -190,16 +190,9 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
 
 
 def _errors(pair: _Pair) -> dict[str, float | None]:
-    """FLIP (None without its extra), PSNR (None for equal pictures) and SSIM of what a screen shows."""
-    from v3dg import metrics
+    from v3dg.metrics import errors_of
 
-    shown = _shown(pair)
-    psnr = metrics.psnr(*shown)
-    return {
-        "flip": metrics.flip(*shown) if metrics.has_flip() else None,
-        "psnr": psnr if math.isfinite(psnr) else None,
-        "ssim": metrics.ssim(*shown),
-    }
+    return errors_of(pair.reference, pair.test)
 
 
 def _difference(row: dict[str, Any]) -> float:
@@ -209,20 +202,17 @@ def _difference(row: dict[str, Any]) -> float:
     return -math.inf if row["psnr"] is None else -float(row["psnr"])
 
 
-def _shown(pair: _Pair) -> list[Any]:
+def _write(options: Compare, pair: _Pair, row: dict[str, Any]) -> None:
     import numpy as np
 
-    return [picture.astype(np.float32) / np.float32(255) for picture in (pair.reference, pair.test)]
-
-
-def _write(options: Compare, pair: _Pair, row: dict[str, Any]) -> None:
     from v3dg import metrics
     from v3dg.pictures import contact_sheet, to_8bit, write_picture
 
     pictures = [(options.reference.name, pair.reference), (options.test.name, pair.test)]
     pictures = [(printable(name), picture) for name, picture in pictures]
     if row["flip"] is not None:
-        pictures.append((f"FLIP {row['flip']:.4f}", to_8bit(metrics.error_image(*_shown(pair)))))
+        floats = (picture / np.float32(255) for _, picture in pictures)
+        pictures.append((f"FLIP {row['flip']:.4f}", to_8bit(metrics.error_image(*floats))))
     zoom = max(1, _LEAST_WIDTH // pair.test.shape[1])
     cells = [(text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1)) for text, picture in pictures]
     write_picture(Path(row["picture"]), contact_sheet([cells]))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from v3dg.cli._common import Common, Flag, check_range, print_result
+from v3dg.cli._common import Common, Flag, check_range, print_result, table_lines
 from v3dg.select import DEFAULT_TOLERANCE
 
 
@@ -33,7 +33,7 @@ class Demo(Common):
 
 
 def run(options: Demo) -> None:
-    from v3dg.demo import run_demo, table_text
+    from v3dg.demo import run_demo
 
     check_range("--gaussians", options.gaussians, 1000, 10_000_000)
     check_range("--instances", options.instances, 1, 1_000_000)
@@ -48,5 +48,25 @@ def run(options: Demo) -> None:
         seed=options.seed,
         progress=not options.quiet,
     )
-    lines = [*table_text(result), "", f"wrote {result.picture} in {result.seconds:.0f} s"]
-    print_result(options.json, asdict(result), lines)
+    columns = {
+        "drawn": "{name}, distance {distance:g}",
+        "gaussians": "{gaussians:,}",
+        "select ms": "{select_ms:.1f}",
+        "draw ms": "{draw_ms:.1f}",
+        "FLIP": "{flip:.4f}",
+        "PSNR": "{psnr:.2f}",
+    }
+    panels = [
+        {"name": name, "distance": column["distance"], **column[name]}
+        for column in result["columns"]
+        for name in ("full", "bundle")
+    ]
+    lines = [
+        f"{options.instances:,} instances of {options.gaussians:,} gaussians, {result['levels']} levels "
+        f"built in {result['build_seconds']:.1f} s, tolerance {options.tolerance:g} px²",
+        "",
+        *table_lines(columns, panels),
+        "",
+        f"wrote {result['picture']} in {result['seconds']:.0f} s",
+    ]
+    print_result(options.json, result, lines)
