@@ -1,7 +1,6 @@
 import errno
 import json
 import os
-import re
 import resource
 import shlex
 import shutil
@@ -372,8 +371,8 @@ def test_text_of_files_reaches_no_terminal_as_it_is(folder, tmp_path):
         ("info", f"{evil}.v3dg"),
         ("info", "told.v3dg"),
         ("info", f"{evil}.json"),
-        ("build", f"{evil}.ply"),
-        ("build", f"{evil}.ply", f"{evil}.ply", "told.v3dg", "-o", "folder"),
+        ("build", f"{evil}.ply", "--quiet"),
+        ("build", f"{evil}.ply", f"{evil}.ply", "told.v3dg", "-o", "folder", "--quiet"),
         ("render", f"{evil}.v3dg", "--size", 32, 32),
         ("compare", f"{evil}.ply", f"{evil}.v3dg", "--size", 32, 32, "--views", 1, "--quiet"),
         ("convert", f"{evil}.ply", f"{evil}.spz"),
@@ -382,9 +381,7 @@ def test_text_of_files_reaches_no_terminal_as_it_is(folder, tmp_path):
     ):
         done = run(*command, cwd=tmp_path)
         shown = done.stdout + done.stderr
-        assert "owned" in shown or done.returncode == 2, command
-        if command[0] == "build":
-            shown = re.sub(r"\r[^\n]*it[^\n]*", "", shown)  # the bar
+        assert shown.endswith("\n"), command
         assert all(c.isprintable() for c in shown.replace("\n", "")), (command, shown)
 
 
