@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 from itertools import permutations, product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -191,6 +192,33 @@ def test_an_earlier_export_is_replaced_and_kept_on_failure(tmp_path, bundle, mon
     write_streamed_sog(bundle, folder, chunk=10**9)
     assert sorted(os.listdir(folder)) != before
     assert os.listdir(tmp_path) == ["web"]
+
+
+@pytest.mark.parametrize("moment", range(3))
+def test_an_export_that_is_interrupted_as_it_takes_its_place_is_whole(tmp_path, bundle, monkeypatch, moment):
+    folder, calls = tmp_path / "web", []
+    write_streamed_sog(bundle, folder, chunk=200)
+    sizes = {len(os.listdir(folder))}
+    rename, rmtree = Path.rename, shutil.rmtree
+
+    def interrupted(act):
+        def acts(*arguments, **options):
+            calls.append(act)
+            act(*arguments, **options)
+            if len(calls) == moment + 1:
+                raise KeyboardInterrupt
+
+        return acts
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", interrupted(rename))
+        patch.setattr(shutil, "rmtree", interrupted(rmtree))
+        with pytest.raises(KeyboardInterrupt):
+            write_streamed_sog(bundle, folder, chunk=10**9)
+    write_streamed_sog(bundle, tmp_path / "other", chunk=10**9)
+    sizes.add(len(os.listdir(tmp_path / "other")))
+    assert sorted(os.listdir(tmp_path)) == ["other", "web"]
+    assert len(os.listdir(folder)) in sizes
 
 
 def test_a_viewer_starts_where_it_sees_the_asset(tmp_path, bundle):

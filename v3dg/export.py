@@ -98,11 +98,15 @@ def write_streamed_sog(
         raise ValueError("bundle: expected gaussians to export, got none")
     if up not in _TO_UPRIGHT:
         raise ValueError(f"up: expected one of {', '.join(_TO_UPRIGHT)}, got {up!r}")
+    from tqdm import tqdm
+
     turn = _Turn(_TO_UPRIGHT[up])
     plan = _Plan.of(bundle, chunk)
     with _replacing_folder(Path(folder)) as place:
-        with _bar(plan.num_gaussians, progress) as advance:
-            names, lods, counts = _write_folders(place, bundle, plan, turn, advance)
+        with tqdm(
+            total=plan.num_gaussians, unit=" gaussians", unit_scale=True, desc="export", disable=not progress
+        ) as bar:
+            names, lods, counts = _write_folders(place, plan, turn, bar.update)
         index = {
             "version": 1,
             "asset": {"generator": f"v3dg {__version__}"},
@@ -120,25 +124,29 @@ def write_streamed_sog(
 
 
 def _write_folders(
-    place: Path, bundle: Bundle, plan: _Plan, turn: _Turn, advance: Callable[[int], None]
+    place: Path, plan: _Plan, turn: _Turn, advance: Callable[[int], Any]
 ) -> tuple[list[str], list[dict[str, dict[str, int]]], list[int]]:
     """Write a folder of SOG after another: their names, where each chunk's levels are, gaussians by level."""
     names: list[str] = []
     lods: list[dict[str, dict[str, int]]] = [{} for _ in range(plan.num_chunks)]
     counts = [0] * plan.num_levels
     for level in range(plan.num_levels):
-        for i, (first, parts) in enumerate(_folders(bundle, plan, level, turn)):
-            gaussians = Gaussians.concatenate(parts)
-            offset = 0
-            for number, part in enumerate(parts, first):
-                lods[number][str(level)] = {"file": len(names), "offset": offset, "count": len(part)}
-                offset += len(part)
-            names.append(f"{level}_{i}")
-            (place / names[-1]).mkdir()
-            for file, content in sog.encode(gaussians).items():
-                (place / names[-1] / file).write_bytes(content)
-            counts[level] += len(gaussians)
-            advance(len(gaussians))
+        parts: list[Gaussians] = []
+        first, size = len(names), 0
+        for number, clusters in enumerate(plan.clusters_of(level)):
+            chunk = Gaussians.concatenate([plan.bundle.cluster_gaussians(int(c)) for c in clusters])
+            chunk = turn.gaussians(check_writable(chunk))
+            lods[number][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
+            parts.append(chunk.subset(morton_order(chunk.means)))
+            size += len(chunk)
+            if size >= _FOLDER_GAUSSIANS or number == plan.num_chunks - 1:
+                names.append(f"{level}_{len(names) - first}")
+                (place / names[-1]).mkdir()
+                for file, content in sog.encode(Gaussians.concatenate(parts)).items():
+                    (place / names[-1] / file).write_bytes(content)
+                counts[level] += size
+                advance(size)
+                parts, size = [], 0
     return names, lods, counts
 
 
@@ -220,28 +228,22 @@ class _Plan:
         clusters, groups = bundle.clusters, bundle.groups
         if bundle.num_levels == 1:
             return cls(bundle, 0, 1, np.zeros(len(clusters), np.int64), np.zeros(0, np.int64))
-        sizes = np.diff(clusters.offset)
         leaves = bundle.level_range(0)
-        owner = clusters.parent_group[leaves.start : leaves.stop].astype(np.int64)
-        top = 0
+        sizes = np.diff(clusters.offset[: leaves.stop + 1])
+        top, ancestor = 0, np.arange(len(groups))
         for level in range(1, bundle.num_levels):
-            largest = int(np.bincount(owner, sizes[leaves.start : leaves.stop]).max())
+            above = np.where(groups.level[ancestor] < level, groups.parent[ancestor], ancestor)
+            largest = int(np.bincount(above[clusters.parent_group[: leaves.stop]], sizes).max())
             if largest > chunk:
-                if level == 1:
-                    raise ValueError(
-                        f"chunk: expected at least {largest} gaussians, the size of a group of the asset, "
-                        f"got {chunk}"
-                    )
                 break
-            top = level
-            owner = groups.parent[owner].astype(np.int64)
+            top, ancestor = level, above
+        if top == 0:
+            raise ValueError(
+                f"chunk: expected at least {largest} gaussians, the size of a group of the asset, got {chunk}"
+            )
         number = np.full(len(groups), -1, np.int64)
         tops = np.flatnonzero(groups.level == top)
         number[tops] = np.arange(len(tops))
-        ancestor = np.arange(len(groups))
-        for _ in range(top):
-            below = groups.level[ancestor] < top
-            ancestor[below] = groups.parent[ancestor[below]]
         # A cluster belongs to the group that replaces it; those at the top to the group that made them.
         group = np.where(clusters.level < top, clusters.parent_group, clusters.own_group)
         chunk_of_cluster = np.where(clusters.level <= top, number[ancestor[group]], -1)
@@ -298,28 +300,6 @@ class _Plan:
         return joined(list(of_group.values()))
 
 
-def _folders(bundle: Bundle, plan: _Plan, level: int, turn: _Turn) -> Iterator[tuple[int, list[Gaussians]]]:
-    """The gaussians of a level by chunk, as many as go into a folder, and the number of the first chunk."""
-    first, parts = 0, []
-    for number, clusters in enumerate(plan.clusters_of(level)):
-        chunk = Gaussians.concatenate([bundle.cluster_gaussians(int(c)) for c in clusters])
-        chunk = turn.gaussians(check_writable(chunk))
-        parts.append(chunk.subset(morton_order(chunk.means)))
-        if sum(map(len, parts)) >= _FOLDER_GAUSSIANS:
-            yield first, parts
-            first, parts = number + 1, []
-    if parts:
-        yield first, parts
-
-
-@contextlib.contextmanager
-def _bar(total: int, progress: bool) -> Iterator[Any]:
-    from tqdm import tqdm
-
-    with tqdm(total=total, unit=" gaussians", unit_scale=True, desc="export", disable=not progress) as bar:
-        yield bar.update
-
-
 @contextlib.contextmanager
 def _replacing_folder(folder: Path) -> Iterator[Path]:
     """Give a new folder beside `folder` to fill; at the end it takes its place, on failure it is removed."""
@@ -334,15 +314,16 @@ def _replacing_folder(folder: Path) -> Iterator[Path]:
         target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.{end}") for end in ("tmp", "old")
     )
     with _files.naming_errors(folder, os.fspath(temporary)):
-        temporary.mkdir()
         try:
+            temporary.mkdir()
             yield temporary
             if target.exists():
                 target.rename(old)
             temporary.rename(target)
+            shutil.rmtree(old, ignore_errors=True)
         except BaseException:
-            if old.exists():
+            if old.exists() and not target.exists():
                 old.rename(target)
-            shutil.rmtree(temporary, ignore_errors=True)
+            for rest in (temporary, old):
+                shutil.rmtree(rest, ignore_errors=True)
             raise
-        shutil.rmtree(old, ignore_errors=True)
