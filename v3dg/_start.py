@@ -1,17 +1,20 @@
 """What makes a process a command: streams that are open, and Ctrl-C that ends it with one line, however often
 it comes.
 
-The package imports this before all that takes long, so it imports little itself. Until a command runs, Ctrl-C
-has nothing to clean up and ends the process at once; from then on it raises KeyboardInterrupt.
+The package imports this before all that takes long, so it imports next to nothing itself. Until a command
+runs, Ctrl-C has nothing to clean up and ends the process at once; from then on it raises KeyboardInterrupt.
 """
 
 from __future__ import annotations
 
+import _signal as signal  # type: ignore[import-not-found] # all but enumerations of its names
 import os
-import signal
 import sys
-import types
-import weakref
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    import types
+    import weakref
 
 _AGAIN_AFTER_S = 0.02
 
@@ -65,6 +68,9 @@ class _Interrupts:
     """Raises one interrupt, and no other while that is on its way: whoever cleans up is not disturbed."""
 
     def __init__(self) -> None:
+        import weakref
+
+        self._refer = weakref.ref
         self._raised: weakref.ref[_Interrupt] | None = None
 
     def hear(self, number: int, frame: types.FrameType | None) -> None:
@@ -76,7 +82,7 @@ class _Interrupts:
     def _interrupt(self) -> _Interrupt:
         # Not in `hear`, where the exception would hold a frame that holds the exception, and never go.
         interrupt = _Interrupt()
-        self._raised = weakref.ref(interrupt)
+        self._raised = self._refer(interrupt)
         return interrupt
 
     def unraisable(self, what: sys.UnraisableHookArgs) -> None:

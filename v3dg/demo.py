@@ -12,6 +12,7 @@ import time
 from typing import Any
 
 from v3dg import _device
+from v3dg._device import Device
 from v3dg.build import build_bundle
 from v3dg.cameras import Camera
 from v3dg.donut import make_donut, place_field
@@ -59,34 +60,20 @@ def run_demo(
     where = _device.resolve(device)
     start = time.perf_counter()
     asset = make_donut(num_gaussians, seed=seed)
-    built = time.perf_counter()
     bundle = build_bundle(asset, seed=seed, progress=progress, device=where)
-    build_seconds = time.perf_counter() - built
-    scene = Scene()
+    build_seconds = time.perf_counter() - start
     positions, quaternions, scales = place_field(instances, seed=seed)
+    scene = Scene()
     scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
-
-    columns = []
+    columns: list[dict[str, Any]] = []
     rows: tuple[list[tuple[str, Picture]], ...] = ([], [])
     for distance, elevation in tqdm(views, "draw", unit="distance", leave=False, disable=not progress):
         camera = _camera(distance, elevation, *size)
         truth = draw_truth(scene, camera, where, background=_SKY)
-        column: dict[str, Any] = {"distance": distance}
+        columns.append({"distance": distance})
         for name, row, px2 in (("full", rows[0], 0.0), ("bundle", rows[1], tolerance)):
-            image = render(scene, camera, tolerance=px2, background=_SKY, device=where)
-            picture = to_8bit(image.color)
-            column[name] = panel = {
-                "gaussians": image.stats.gaussians_in_frustum,
-                "gaussians_selected": image.stats.gaussians_selected,
-                "select_ms": image.stats.select_ms,
-                "draw_ms": image.stats.draw_ms,
-                **errors_of(truth, picture),
-            }
-            error = f"SSIM {panel['ssim']:.3f}" if panel["flip"] is None else f"FLIP {panel['flip']:.3f}"
-            milliseconds = image.stats.select_ms + image.stats.draw_ms
-            cost = f"{panel['gaussians']:,} gaussians, {milliseconds:,.0f} ms, {error}"
-            row.append((f"{name}, distance {distance:g}: {cost}", picture))
-        columns.append(column)
+            columns[-1][name], text, picture = _drawn(scene, camera, px2, truth, where)
+            row.append((f"{name}, distance {distance:g}: {text}", picture))
     write_picture(path, contact_sheet(rows))
     return {
         "picture": str(path),
@@ -107,3 +94,22 @@ def _camera(distance: float, elevation: float, width: int, height: int) -> Camer
     across, target = distance * math.cos(elevation), 0.42 / (1 + (distance / 12) ** 2)
     x, y, z = math.sin(_AZIMUTH) * across, -math.cos(_AZIMUTH) * across, distance * math.sin(elevation)
     return Camera.look_at((x, y, target + z), (0, 0, target), width=width, height=height)
+
+
+def _drawn(
+    scene: Scene, camera: Camera, tolerance: float, truth: Picture, device: Device
+) -> tuple[dict[str, Any], str, Picture]:
+    """Numbers and text of one picture, and the picture."""
+    image = render(scene, camera, tolerance=tolerance, background=_SKY, device=device)
+    picture, stats = to_8bit(image.color), image.stats
+    numbers = {
+        "gaussians": stats.gaussians_in_frustum,
+        "gaussians_selected": stats.gaussians_selected,
+        "select_ms": stats.select_ms,
+        "draw_ms": stats.draw_ms,
+        **errors_of(truth, picture),
+    }
+    name = "SSIM" if numbers["flip"] is None else "FLIP"
+    cost = f"{stats.gaussians_in_frustum:,} gaussians, {stats.select_ms + stats.draw_ms:,.0f} ms"
+    text = f"{cost}, {name} {numbers[name.lower()]:.3f}"
+    return numbers, text, picture

@@ -7,15 +7,13 @@ import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import tyro
 
-from v3dg.io import SUFFIXES
-
-if TYPE_CHECKING:
-    from v3dg.bundle import Bundle
-    from v3dg.gaussians import Gaussians
+from v3dg.bundle import Bundle
+from v3dg.gaussians import Gaussians
+from v3dg.io import SUFFIXES, read_asset
 
 
 class UsageError(Exception):
@@ -79,9 +77,6 @@ def check_range(name: str, value: int, least: int, most: int) -> None:
 
 
 def load_asset_or_bundle(path: Path) -> Gaussians | Bundle:
-    from v3dg.bundle import Bundle
-    from v3dg.io import read_asset
-
     return Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path)
 
 

@@ -6,22 +6,23 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
+import numpy as np
 import tyro
 
+from v3dg.bundle import Bundle
+from v3dg.camera_file import read_cameras
+from v3dg.cameras import DEFAULT_FOV_X, Camera, turntable
+from v3dg.cleaning import ball_of_most
 from v3dg.cli._common import UsageError, check_range, level_size, load_asset_or_bundle, option
+from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES
 from v3dg.pictures import MOST_SIDE, check_size
+from v3dg.scene import Scene
+from v3dg.scene_file import read_scene
 
-if TYPE_CHECKING:
-    from v3dg.bundle import Bundle
-    from v3dg.cameras import Camera
-    from v3dg.gaussians import Gaussians
-    from v3dg.scene import Scene
-
-    Subject: TypeAlias = Scene | Bundle | Gaussians
-
+Subject: TypeAlias = Scene | Bundle | Gaussians
 Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 # Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
@@ -75,8 +76,6 @@ def load_subject(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
     """A scene with its cameras, or a bundle or an asset, which have none."""
     if not is_scene(path):
         return load_asset_or_bundle(path), None
-    from v3dg.scene_file import read_scene
-
     return read_scene(path)
 
 
@@ -85,8 +84,6 @@ def choose_cameras(
 ) -> dict[str, Camera]:
     """The cameras of --cameras, else the subject's own, else a turntable around it."""
     if options.cameras is not None:
-        from v3dg.camera_file import read_cameras
-
         own = read_cameras(options.cameras, size=options.size, distortion=options.distortion)
     if own is None:
         own = _turntable(subject, options)
@@ -114,13 +111,6 @@ def _one_camera(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
 
 def _turntable(subject: Subject, options: ViewOptions) -> dict[str, Camera]:
     """Cameras around where most of the gaussians are, at a distance that shows nearly all of it."""
-    import numpy as np
-
-    from v3dg.bundle import Bundle
-    from v3dg.cameras import DEFAULT_FOV_X, turntable
-    from v3dg.cleaning import ball_of_most
-    from v3dg.gaussians import Gaussians
-
     if isinstance(subject, Gaussians):
         means = subject.means
     else:

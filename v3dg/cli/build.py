@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from v3dg.build import BuildConfig, build_file, levels_path
+from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli._common import (
     FAILURES,
     Flag,
@@ -140,9 +142,6 @@ def _outputs(options: Build) -> dict[Path, Path]:
 def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
     """Build and write one bundle; what was done, as JSON values."""
     require_file(asset_path, *SUFFIXES)
-    from v3dg.build import BuildConfig, build_file, levels_path
-    from v3dg.cleaning import AssetWarning
-
     if output.suffix != ".v3dg":
         raise ValueError(f"{output}: expected a file name ending in .v3dg")
     start = time.perf_counter()
@@ -186,8 +185,6 @@ def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
 
 
 def _lines(result: dict[str, Any]) -> list[str]:
-    from v3dg.cleaning import describe
-
     how = "kept as it was" if result["status"] == "kept" else f"{result['seconds']:.1f} s"
     line = (
         f"{result['output']}: {result['levels']} levels, {result['clusters']:,} clusters, "

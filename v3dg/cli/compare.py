@@ -7,10 +7,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
+from v3dg import _device
+from v3dg._judges import Judges, mean_of
+from v3dg.bundle import Bundle
 from v3dg.cli._common import (
     Flag,
     OnDevice,
@@ -24,10 +28,19 @@ from v3dg.cli._common import (
     table_lines,
 )
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
+from v3dg.metrics import FLIP_MISSING, draw_truth, error_image, errors_of
+from v3dg.pictures import (
+    MOST_PIXELS_COMPARED,
+    Picture,
+    check_picture_path,
+    check_size,
+    contact_sheet,
+    read_picture,
+    to_8bit,
+    write_picture,
+)
 from v3dg.pictures import SUFFIXES as PICTURE_SUFFIXES
-
-if TYPE_CHECKING:
-    from v3dg.pictures import Picture
+from v3dg.render import render
 
 # Views from which on starting processes to measure them is quicker than doing without.
 _ENOUGH_TO_SHARE = 6
@@ -75,10 +88,6 @@ class _Pair:
 
 def run(options: Compare) -> None:
     from tqdm import tqdm
-
-    from v3dg._judges import Judges, mean_of
-    from v3dg.metrics import FLIP_MISSING
-    from v3dg.pictures import check_picture_path
 
     output = check_picture_path(options.output)
     subjects = (options.reference, options.test)
@@ -140,8 +149,6 @@ def run(options: Compare) -> None:
 
 
 def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
-    from v3dg.pictures import read_picture
-
     reference, test = read_picture(options.reference), read_picture(options.test)
     if reference.shape != test.shape:
         (height, width, _), (test_height, test_width, _) = reference.shape, test.shape
@@ -159,12 +166,6 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
         require_subject(path)
     options.view.check(options.reference, options.test)
     check_range("--supersample", options.supersample, 1, 16)
-    from v3dg import _device
-    from v3dg.bundle import Bundle
-    from v3dg.metrics import draw_truth
-    from v3dg.pictures import MOST_PIXELS_COMPARED, check_size, to_8bit
-    from v3dg.render import render
-
     device = _device.resolve(options.device)
     reference, reference_cameras = load_subject(options.reference)
     test, test_cameras = load_subject(options.test)
@@ -190,8 +191,6 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
 
 
 def _errors(pair: _Pair) -> dict[str, float | None]:
-    from v3dg.metrics import errors_of
-
     return errors_of(pair.reference, pair.test)
 
 
@@ -203,16 +202,11 @@ def _difference(row: dict[str, Any]) -> float:
 
 
 def _write(options: Compare, pair: _Pair, row: dict[str, Any]) -> None:
-    import numpy as np
-
-    from v3dg import metrics
-    from v3dg.pictures import contact_sheet, to_8bit, write_picture
-
     pictures = [(options.reference.name, pair.reference), (options.test.name, pair.test)]
     pictures = [(printable(name), picture) for name, picture in pictures]
     if row["flip"] is not None:
         floats = (picture / np.float32(255) for _, picture in pictures)
-        pictures.append((f"FLIP {row['flip']:.4f}", to_8bit(metrics.error_image(*floats))))
+        pictures.append((f"FLIP {row['flip']:.4f}", to_8bit(error_image(*floats))))
     zoom = max(1, _LEAST_WIDTH // pair.test.shape[1])
     cells = [(text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1)) for text, picture in pictures]
     write_picture(Path(row["picture"]), contact_sheet([cells]))

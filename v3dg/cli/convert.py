@@ -6,19 +6,19 @@ import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from v3dg import _files
+from v3dg._device import CPU
+from v3dg.bundle import Bundle
 from v3dg.cli._common import Common, UsageError, bytes_text, option, print_result, require_subject
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, is_scene, load_subject
-from v3dg.io import WRITE_SUFFIXES
-
-if TYPE_CHECKING:
-    from v3dg.bundle import Bundle
-    from v3dg.gaussians import Gaussians
-    from v3dg.scene import Scene
+from v3dg.gaussians import Gaussians
+from v3dg.io import WRITE_SUFFIXES, write_asset
+from v3dg.scene import Scene
+from v3dg.select import select
 
 
 @dataclass
@@ -43,10 +43,6 @@ class Convert(Common):
 def run(options: Convert) -> None:
     require_subject(options.subject)
     _check(options)
-    from v3dg.bundle import Bundle
-    from v3dg.gaussians import Gaussians
-    from v3dg.io import write_asset
-
     start = time.perf_counter()
     subject, own_cameras = load_subject(options.subject)
     told: dict[str, Any] = {}
@@ -104,11 +100,6 @@ def _level(bundle: Bundle, level: int) -> tuple[Gaussians, dict[str, Any]]:
 def _cut(
     options: Convert, subject: Scene | Bundle, cameras: dict[str, Any]
 ) -> tuple[Gaussians, dict[str, Any]]:
-    from v3dg._device import CPU
-    from v3dg.bundle import Bundle
-    from v3dg.gaussians import Gaussians
-    from v3dg.select import select
-
     ((name, camera),) = cameras.items()
     keep = options.outside == "keep"
     selection = select(

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from v3dg.cli._common import Common, Flag, check_range, print_result, table_lines
+from v3dg.demo import run_demo
 from v3dg.select import DEFAULT_TOLERANCE
 
 
@@ -33,8 +34,6 @@ class Demo(Common):
 
 
 def run(options: Demo) -> None:
-    from v3dg.demo import run_demo
-
     check_range("--gaussians", options.gaussians, 1000, 10_000_000)
     check_range("--instances", options.instances, 1, 1_000_000)
     for side in options.size:

@@ -10,8 +10,10 @@ from typing import Annotated
 import tyro
 
 from v3dg import _files
+from v3dg.bundle import Bundle
 from v3dg.cli._common import Common, Flag, UsageError, bytes_text, option, print_result, require_file
 from v3dg.cli._views import Axis
+from v3dg.export import DEFAULT_CHUNK, INDEX, write_streamed_sog
 
 
 @dataclass
@@ -22,7 +24,7 @@ class Export(Common):
     """A bundle (.v3dg)."""
     output: Annotated[Path | None, option("FOLDER", "-o")] = None
     """Folder to write, whose lod-meta.json viewers open; the bundle's name with _web if not given."""
-    chunk: int = 16384
+    chunk: int = DEFAULT_CHUNK
     """Most gaussians of the asset in a chunk, for which the viewer chooses a level."""
     up: Axis = "-y"
     """Direction that is up in the asset; viewers assume -y, as in most trained assets."""
@@ -34,9 +36,6 @@ def run(options: Export) -> None:
     require_file(options.bundle, ".v3dg")
     if options.chunk < 1:
         raise UsageError(f"--chunk: expected at least 1, got {options.chunk}")
-    from v3dg.bundle import Bundle
-    from v3dg.export import INDEX, write_streamed_sog
-
     folder = options.output or options.bundle.with_name(f"{options.bundle.stem}_web")
     _files.check_folder(folder)
     start = time.perf_counter()

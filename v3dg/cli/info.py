@@ -7,10 +7,15 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 import tyro
 
+from v3dg.build import BuildConfig
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
+from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
 from v3dg.cli._common import (
     Flag,
     bytes_text,
@@ -22,12 +27,10 @@ from v3dg.cli._common import (
     table_lines,
 )
 from v3dg.cli._views import is_scene
-
-if TYPE_CHECKING:
-    from v3dg.bundle import Bundle
-    from v3dg.cameras import Camera
-    from v3dg.gaussians import Gaussians
-    from v3dg.scene import Scene
+from v3dg.gaussians import Gaussians
+from v3dg.io import asset_bytes
+from v3dg.scene import Scene
+from v3dg.scene_file import read_scene
 
 # JSON values, and lines of text.
 _Description = tuple[dict[str, Any], list[str]]
@@ -45,11 +48,7 @@ class Info:
 
 def run(options: Info) -> None:
     require_subject(options.file)
-    from v3dg.bundle import Bundle
-
     if is_scene(options.file):
-        from v3dg.scene_file import read_scene
-
         description = _scene_info(options.file, *read_scene(options.file))
     else:
         loaded = load_asset_or_bundle(options.file)
@@ -61,11 +60,6 @@ def run(options: Info) -> None:
 
 
 def _asset_info(path: Path, asset: Gaussians) -> _Description:
-    import numpy as np
-
-    from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
-    from v3dg.io import asset_bytes
-
     num_bytes = asset_bytes(path)
     findings = examine(asset)
     drawable = asset.subset(findings.drawable)
@@ -121,8 +115,6 @@ def _point(values: list[float]) -> str:
 
 
 def _bundle_info(path: Path, bundle: Bundle) -> _Description:
-    from v3dg.build import BuildConfig
-
     result = {**bundle.info(), "path": str(path), "kind": "bundle"}
     columns = {
         "level": "{level}",
