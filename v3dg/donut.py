@@ -13,11 +13,8 @@ from v3dg.gaussians import Gaussians
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_RING, _DOUGH, _TUBE = (
-    0.63,
-    0.34,
-    0.37,
-)  # radii: of the circle in the tube's middle, of the tube without and with icing
+# Radii: of the circle in the tube's middle, of the tube without and with icing.
+_RING, _DOUGH, _TUBE = 0.63, 0.34, 0.37
 _SPRINKLES, _SPRINKLE_RADIUS, _SPRINKLE_HALF = 200, 0.013, 0.05
 _SPRINKLE_COLORS = np.array(
     [[0.95, 0.95, 0.9], [0.9, 0.6, 0.03], [0.05, 0.3, 0.8], [0.02, 0.5, 0.3], [0.8, 0.05, 0.04]]

@@ -13,7 +13,16 @@ import tyro
 from v3dg import _files
 from v3dg._device import CPU
 from v3dg.bundle import Bundle
-from v3dg.cli._common import Common, UsageError, bytes_text, option, print_result, require_subject
+from v3dg.cameras import Camera
+from v3dg.cli._common import (
+    Common,
+    UsageError,
+    bytes_text,
+    check_range,
+    option,
+    print_result,
+    require_subject,
+)
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, is_scene, load_subject
 from v3dg.gaussians import Gaussians
 from v3dg.io import WRITE_SUFFIXES, write_asset
@@ -42,68 +51,53 @@ class Convert(Common):
 
 def run(options: Convert) -> None:
     require_subject(options.subject)
-    _check(options)
+    view = options.view
+    view.check(options.subject)
+    if not options.output.name.lower().endswith(WRITE_SUFFIXES):
+        raise ValueError(f"{options.output}: expected a file name that ends in {', '.join(WRITE_SUFFIXES)}")
+    _files.check_folder(options.output)
+    given = (options.tolerance, options.budget, view.cameras, view.camera)
+    is_cut = is_scene(options.subject) or any(value is not None for value in given)
+    if options.level is not None and is_cut:
+        raise UsageError(
+            "--level: expected no scene, camera, tolerance or budget with it; leave out one or the other"
+        )
     start = time.perf_counter()
     subject, own_cameras = load_subject(options.subject)
     told: dict[str, Any] = {}
     if isinstance(subject, Gaussians):
-        if _wants_cut(options) or options.level is not None:
+        if is_cut or options.level is not None:
             raise UsageError("--level, --tolerance, --budget: expected a bundle or a scene; build one first")
         gaussians = subject
-    elif isinstance(subject, Bundle) and not _wants_cut(options):
-        gaussians, told = _level(subject, options.level or 0)
+    elif isinstance(subject, Bundle) and not is_cut:
+        level = options.level or 0
+        check_range("--level", level, 0, max(0, subject.num_levels - 1))
+        gaussians, told = subject.level_gaussians(level), {"level": level}
     else:
-        cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
+        cameras = choose_cameras(view, options.subject, subject, own_cameras)
         if len(cameras) != 1:
             raise UsageError(f"--camera: expected one of {len(cameras)} cameras; give its name or its place")
-        gaussians, told = _cut(options, subject, cameras)
+        gaussians, told = _cut(options, subject, *cameras.items())
     write_asset(options.output, gaussians)
-    size = options.output.stat().st_size
     result = {
         "output": str(options.output),
         "gaussians": len(gaussians),
         "sh_degree": gaussians.sh_degree,
-        "bytes": size,
+        "bytes": options.output.stat().st_size,
         "seconds": time.perf_counter() - start,
         **told,
     }
-    text = (
-        f"{options.output}: {len(gaussians):,} gaussians, SH degree {gaussians.sh_degree}, {bytes_text(size)}"
-    )
-    print_result(options.json, result, [text])
-
-
-def _check(options: Convert) -> None:
-    """Refuse, before anything is read, what cannot be meant."""
-    options.view.check(options.subject)
-    if not options.output.name.lower().endswith(WRITE_SUFFIXES):
-        raise ValueError(f"{options.output}: expected a file name that ends in {', '.join(WRITE_SUFFIXES)}")
-    _files.check_folder(options.output)
-    if options.level is not None and _wants_cut(options):
-        raise UsageError(
-            "--level: expected no scene, camera, tolerance or budget with it; leave out one or the other"
-        )
-
-
-def _wants_cut(options: Convert) -> bool:
-    view = options.view
-    given = (options.tolerance, options.budget, view.cameras, view.camera)
-    return is_scene(options.subject) or any(value is not None for value in given)
-
-
-def _level(bundle: Bundle, level: int) -> tuple[Gaussians, dict[str, Any]]:
-    if not 0 <= level < max(1, bundle.num_levels):
-        raise UsageError(f"--level: expected 0 to {bundle.num_levels - 1}, got {level}")
-    return bundle.level_gaussians(level), {"level": level}
+    text = f"{len(gaussians):,} gaussians, SH degree {gaussians.sh_degree}, {bytes_text(result['bytes'])}"
+    print_result(options.json, result, [f"{options.output}: {text}"])
 
 
 def _cut(
-    options: Convert, subject: Scene | Bundle, cameras: dict[str, Any]
+    options: Convert, subject: Scene | Bundle, named_camera: tuple[str, Camera]
 ) -> tuple[Gaussians, dict[str, Any]]:
-    ((name, camera),) = cameras.items()
-    keep = options.outside == "keep"
+    name, camera = named_camera
+    is_all = options.outside == "keep"
     selection = select(
-        subject, camera, tolerance=options.tolerance, budget=options.budget, cull=not keep, device=CPU
+        subject, camera, tolerance=options.tolerance, budget=options.budget, cull=not is_all, device=CPU
     )
     if isinstance(subject, Bundle) and len(selection):  # its clusters alone are read
         gaussians = Gaussians.concatenate([subject.cluster_gaussians(int(c)) for c in selection.cluster_ids])
