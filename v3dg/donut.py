@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _core
 from v3dg.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 # Radii: of the circle in the tube's middle, of the tube without and with icing.
 _RING, _DOUGH, _TUBE = 0.63, 0.34, 0.37

@@ -7,17 +7,15 @@ NumPy arrays or torch tensors, and are means over the whole picture. Nothing is 
 from __future__ import annotations
 
 import importlib.util
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg._device import Device
 from v3dg.cameras import Camera
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 FLIP_PIXELS_PER_DEGREE = 67.0
 """A 0.7 m wide 4K display seen from 0.7 m: the viewing condition that FLIP's authors use."""
