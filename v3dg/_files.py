@@ -30,6 +30,7 @@ def replacing(path: str | os.PathLike[str], *, is_locked: bool = False) -> Itera
         ValueError: `path` is a device or a pipe.
         OSError: As writing raised it, with `path` for the file's name.
     """
+    path = os.fspath(path)  # a number would stand for an open file
     replaced = _status_of_file(path)
     target = os.path.realpath(path)
     folder, name = os.path.split(target)

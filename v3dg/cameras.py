@@ -19,6 +19,7 @@ VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
 
 DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
+_MOST_CAMERAS = 1_000_000  # of a turntable; more is a slip that would take minutes
 # How far the rows of a rotation may be from orthonormal: matrices are often stored as float32 text.
 ROTATION_TOLERANCE = 1e-4
 
@@ -194,7 +195,7 @@ def turntable(
         fov_x: Horizontal field of view in radians.
     """
     middle, axis = vector(center, "center"), vector(up, "up")
-    radius, n = positive(radius, "radius"), whole(n, "n", "a whole number", 0)
+    radius, n = positive(radius, "radius"), whole(n, "n", "a whole number", 0, _MOST_CAMERAS)
     if not max(1e-150, 1e-12 * np.abs(middle).max()) < radius < 1e150:
         expected = "a circle that double precision resolves"
         raise ValueError(f"center, radius: expected {expected}, got {radius} around {_text(middle)}")

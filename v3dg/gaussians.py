@@ -159,8 +159,19 @@ class Gaussians:
         """Return the same gaussians as torch tensors on `device` (None: where they are, NumPy's on the CPU).
 
         Copied only when they move or when a NumPy array is read-only; gradients flow through a move.
+
+        Raises:
+            ValueError: torch knows no such device.
+            RuntimeError: The device is not there.
         """
         import torch
+
+        try:
+            torch.empty(0, device=device)
+        except (AssertionError, RuntimeError, TypeError) as error:
+            kind = RuntimeError if isinstance(error, AssertionError) else ValueError
+            reason = str(error).partition("\n")[0][:100]
+            raise kind(f"device: expected one that torch can use, got {device!r} ({reason})") from None
 
         def tensor(array: Any) -> Any:
             if isinstance(array, np.ndarray):
@@ -205,6 +216,8 @@ def _checked_index(index: Any) -> Array:
             f"index: expected a slice, integers or booleans, got {_kind(index)}"
             + (f" of dtype {dtype}" if array.ndim else "; for one gaussian use a slice of length 1")
         )
+    if _is_tensor(array) and array.is_meta:
+        raise ValueError("index: expected a tensor with data, got one on the device meta")
     if array.ndim != 1:
         raise ValueError(f"index: expected one dimension, got shape {tuple(array.shape)}")
     if _is_tensor(array):

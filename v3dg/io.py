@@ -102,6 +102,8 @@ def write_asset(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "bi
         raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}")
     write = _by_name(path, _WRITERS)
     if write is ply.write:
+        if not isinstance(encoding, str):
+            raise TypeError(f"encoding: expected text, got {encoding!r}")
         ply.write(path, gaussians, encoding)
     elif encoding == "binary_little_endian":
         write(path, gaussians)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -83,6 +83,8 @@ def write_scene(
     Args:
         bundle_paths: One path for each of ``scene.bundles``, relative to the file's folder.
     """
+    if isinstance(bundle_paths, str) or not isinstance(bundle_paths, Sequence):
+        raise TypeError(f"bundle_paths: expected a list of paths, got {type(bundle_paths).__name__}")
     if len(bundle_paths) != len(scene.bundles):
         raise ValueError(f"bundle_paths: expected {len(scene.bundles)} paths, got {len(bundle_paths)}")
     scene = copy.copy(scene)  # which stays as it is

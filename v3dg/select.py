@@ -237,7 +237,7 @@ def rule_of(
         budget=budget,
         min_level=whole(min_level, "min_level", "a level, 0 or more", 0),
         footprint=footprint,
-        culls=cull,
+        culls=bool(cull),
     )
 
 
