@@ -10,6 +10,8 @@ import pytest
 import scenes
 import v3dg
 from random_bundle import random_bundle
+from v3dg import _core
+from v3dg.build.fit import fit_config
 
 CAMERA = v3dg.Camera.look_at((0.5, -9, 4), (3, 4, 5), width=24, height=16)
 BUNDLE = random_bundle(1)
@@ -164,9 +166,29 @@ def test_every_public_function_with_numbers_is_tried():
     "setting", [{"px2_per_gaussian": 1e20}, {"px2_per_gaussian": 1e300}, {"distance": 1e300}]
 )
 def test_views_that_no_picture_can_hold_are_refused(setting):
-    config = v3dg.BuildConfig(cluster_size=16, steps=1, num_views=2, **setting)
+    (name,) = setting
+    with pytest.raises(ValueError, match=f"^{name}: expected .* to .*, got "):
+        v3dg.BuildConfig(**setting)
+
+
+@pytest.mark.parametrize("setting", [{"px2_per_gaussian": 1e20}, {"distance": 1e300}])
+def test_the_core_refuses_them_too(setting):
+    """Where nothing has looked at the settings before."""
+    config = v3dg.BuildConfig(cluster_size=16, steps=1, num_views=2)
+    for name, value in setting.items():
+        object.__setattr__(config, name, value)
     asset = scenes.gaussians(np.random.default_rng(0).normal(size=(40, 3)))
+    progress, arguments = _core.FitProgress(), np.array([[0, 40]])
     with pytest.raises(
         ValueError, match="px2_per_gaussian, distance, supersample: expected pictures of at most"
     ):
-        v3dg.build_bundle(asset, config=config, device="cpu", progress=False)
+        _core.fit_level(
+            fit_config(config, 0, 1),
+            _core.FitTarget(asset.rows, 0.0, False),
+            arguments,
+            asset.rows,
+            arguments,
+            np.array([[0, 0, 0, 4]], np.float32),
+            np.zeros(1, np.int64),
+            progress,
+        )
