@@ -216,7 +216,7 @@ def test_threads_that_change_a_scene_lose_nothing(device, hasty):
     frame(scene, device)
 
 
-READING = {"ply_read", "ply_write"}
+READING = {"PlyFile.read", "ply_write"}
 DRAWING = {
     *("rasterize", "rasterize_backward", "gather"),
     *("ResidentScene.select", "SceneFrame.draw", "SceneFrame.draw_cut", "AssetFrame.draw"),

@@ -75,7 +75,16 @@ class Rows:
 Columns: TypeAlias = tuple[Array, Array, Array, Array, Array]
 
 # ply
-def ply_read(path: str | PathLike[str]) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
+class PlyFile:
+    """A .ply file of gaussians, read in runs of rows."""
+
+    def __init__(self, path: str | PathLike[str]) -> None: ...
+    @property
+    def num_gaussians(self) -> int: ...
+    @property
+    def sh_degree(self) -> int: ...
+    def read(self, first: int, last: int) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
+
 def ply_write(
     path: str | PathLike[str],
     means: Float32,

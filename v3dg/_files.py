@@ -10,6 +10,10 @@ import secrets
 import stat
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 _PIECE_BYTES = 16 << 20
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
@@ -99,6 +103,17 @@ def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int)
     while view:
         count = os.pwrite(descriptor, view[:_PIECE_BYTES], offset)
         view, offset = view[count:], offset + count
+
+
+def read_at(descriptor: int, out: npt.NDArray[Any], offset: int) -> bool:
+    """Fill an array with the bytes at one place of a file; False where the file ends before."""
+    view = out.reshape(-1).view(np.uint8).data
+    while view:
+        count = os.preadv(descriptor, [view[:_PIECE_BYTES]], offset)
+        if count == 0:
+            return False
+        view, offset = view[count:], offset + count
+    return True
 
 
 def check_folder(path: Path) -> None:

@@ -5,26 +5,27 @@ from __future__ import annotations
 import os
 import pathlib
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from v3dg.formats import checkpoint, compressed_ply, ksplat, ply, sog, splat, spz, streamed_sog
+from v3dg.formats._asset_file import AssetFile
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
 Path = str | os.PathLike[str]
-Format = TypeVar("Format", bound=Callable[..., Any])
+Format = TypeVar("Format")
 
-# By the end of a file's name. The first that fits counts.
-_READERS: dict[str, Callable[[Path], Gaussians]] = {
-    ".ply": ply.read,
-    ".splat": splat.read,
-    ".ksplat": ksplat.read,
-    ".spz": spz.read,
-    ".sog": sog.read,
-    "lod-meta.json": streamed_sog.read,
-    "meta.json": sog.read,
-    ".ckpt": checkpoint.read,
-    ".pt": checkpoint.read,
+# By the end of a file's name: what reads it whole, and what opens it. The first that fits counts.
+_READERS: dict[str, tuple[Callable[[Path], Gaussians], Callable[[Path], AssetFile]]] = {
+    ".ply": (ply.read, ply.open_file),
+    ".splat": (splat.read, splat.open_file),
+    ".ksplat": (ksplat.read, ksplat.open_file),
+    ".spz": (spz.read, spz.open_file),
+    ".sog": (sog.read, sog.open_file),
+    "lod-meta.json": (streamed_sog.read, streamed_sog.open_file),
+    "meta.json": (sog.read, sog.open_file),
+    ".ckpt": (checkpoint.read, checkpoint.open_file),
+    ".pt": (checkpoint.read, checkpoint.open_file),
 }
 _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
     ".compressed.ply": compressed_ply.write,
@@ -68,7 +69,18 @@ def read_asset(path: Path) -> Gaussians:
         ValueError: Another name, or the content is not of its kind; says what was expected and found.
         OSError: The file cannot be opened or read (FileNotFoundError, IsADirectoryError, ...).
     """
-    return _by_name(path, _READERS)(path)
+    read, _ = _by_name(path, _READERS)
+    return read(path)
+
+
+def open_asset(path: Path) -> AssetFile:
+    """Open an asset of any kind that `read_asset` reads, to read it in parts; errors as there.
+
+    `.ply`, `.splat` and `.compressed.ply` are read row by row. Of the others, reading the first rows takes
+    the memory for all.
+    """
+    _, open_file = _by_name(path, _READERS)
+    return open_file(path)
 
 
 def asset_bytes(path: Path) -> int:

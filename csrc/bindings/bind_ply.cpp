@@ -1,4 +1,5 @@
 #include <cerrno>
+#include <cmath>
 #include <system_error>
 
 #include "bindings/operations.h"
@@ -38,17 +39,36 @@ auto with_path(const Path& path, const Body& body) {
     }
 }
 
-py::tuple ply_read(const py::object& path_object) {
-    const Path path(path_object);
-    const PlyFile ply = with_path(path, open_ply);
-    const auto n = static_cast<py::ssize_t>(ply.num_gaussians());
-    const auto k = static_cast<py::ssize_t>(ply.num_sh);
-    const NewArray<float> means({}, {n, 3}), quats({}, {n, 4}), scales({}, {n, 3}), opacities({}, {n}),
-        sh({}, {n, k, 3});
-    const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span, sh.span};
-    with_path(path, [&](const char*) { read_ply(ply, out); });
-    return py::make_tuple(means.object, quats.object, scales.object, opacities.object, sh.object);
-}
+// A file that is read in runs of rows; it remembers where the last one ended.
+class BoundPlyFile {
+  public:
+    explicit BoundPlyFile(const py::object& path)
+        : path_(path), ply_(with_path(path_, open_ply)), next_(ply_.begin()) {}
+
+    size_t num_gaussians() const { return ply_.num_gaussians(); }
+    int sh_degree() const { return static_cast<int>(std::lround(std::sqrt(ply_.num_sh))) - 1; }
+
+    py::tuple read(int64_t first, int64_t last) {
+        if (first < 0 || last < first || static_cast<size_t>(last) > ply_.num_gaussians())
+            throw py::value_error(
+                "rows: expected 0 <= first <= last <= " + std::to_string(ply_.num_gaussians()) + ", got " +
+                std::to_string(first) + " to " + std::to_string(last));
+        const auto n = static_cast<py::ssize_t>(last - first), k = static_cast<py::ssize_t>(ply_.num_sh);
+        const NewArray<float> means({}, {n, 3}), quats({}, {n, 4}), scales({}, {n, 3}), opacities({}, {n}),
+            sh({}, {n, k, 3});
+        const PlyGaussians<float> out = {means.span, quats.span, scales.span, opacities.span, sh.span};
+        // Read and set under the interpreter's lock, so that several threads may read.
+        const PlyPlace known = next_;
+        next_ = with_path(
+            path_, [&](const char*) { return read_ply(ply_, static_cast<size_t>(first), known, out); });
+        return py::make_tuple(means.object, quats.object, scales.object, opacities.object, sh.object);
+    }
+
+  private:
+    Path path_;
+    PlyFile ply_;
+    PlyPlace next_;
+};
 
 PlyEncoding encoding_of(const std::string& name) {
     if (name == "ascii") return PlyEncoding::ascii;
@@ -76,7 +96,11 @@ void ply_write(const py::object& path, const py::array& means, const py::array& 
 }  // namespace
 
 void bind_ply(py::module_& m) {
-    m.def("ply_read", ply_read, "path"_a);
+    py::class_<BoundPlyFile>(m, "PlyFile", "A .ply file of gaussians, read in runs of rows.")
+        .def(py::init<const py::object&>(), "path"_a)
+        .def_property_readonly("num_gaussians", &BoundPlyFile::num_gaussians)
+        .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
+        .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
     m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
           "encoding"_a);
 }

@@ -26,6 +26,11 @@ struct PlyGaussians {
     Span<T> sh;         // [N * K * 3]
 };
 
+// Where the bytes of a gaussian begin. In text and in rows with lists, only reading finds that out.
+struct PlyPlace {
+    size_t row, offset;
+};
+
 // An opened file whose header, and its claims against the file's size, have been checked.
 struct PlyFile {
     PosixFile file;
@@ -36,15 +41,18 @@ struct PlyFile {
     size_t num_sh;         // K
 
     size_t num_gaussians() const { return vertex.count; }
+    PlyPlace begin() const { return {0, vertex_offset}; }
 };
 
 // Throws std::system_error when the file cannot be read, PlyError when it is not a 3DGS file.
 PlyFile open_ply(const char* path);
 
-// Reads all gaussians. Quaternions are normalised, but those of length zero or not finite stay as stored, as
-// do those of length one up to rounding (so that reading what was written changes nothing). Besides `out` it
-// needs a few megabytes. Throws like open_ply; `out` is then partly written.
-void read_ply(const PlyFile& ply, const PlyGaussians<float>& out);
+// Reads gaussians `first` and on, as many as `out` holds, and returns where the next one begins. `known` is
+// the place of any gaussian, best of `first` itself. Quaternions are normalised, but those of length zero or
+// not finite stay as stored, as do those of length one up to rounding (so that reading what was written
+// changes nothing). Besides `out` it needs a few megabytes. Throws like open_ply; `out` is then partly
+// written.
+PlyPlace read_ply(const PlyFile& ply, size_t first, PlyPlace known, const PlyGaussians<float>& out);
 
 // Creates `path`, which must not exist yet. Opacity 1 is written as logit 20, opacity 0 as logit -110, scale
 // 0 as log -110: finite, and read back as exactly 1, 0 and 0. Throws std::system_error, or

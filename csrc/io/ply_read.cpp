@@ -421,11 +421,11 @@ size_t skip_element(const PlyFile& ply, const PlyElement& element, size_t offset
     return reader.offset();
 }
 
-void read_fixed_rows(const PlyFile& ply, const PlyGaussians<float>& out) {
+PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace at, const PlyGaussians<float>& out) {
     const RowDecoder decoder(ply, out);
     const size_t row_bytes = decoder.row_bytes();
     const size_t block_rows = std::max<size_t>(1, kBlockBytes / row_bytes);
-    const size_t num_rows = ply.num_gaussians();
+    const size_t num_rows = out.opacities.size;
     const size_t num_blocks = (num_rows + block_rows - 1) / block_rows;
     const int num_threads = static_cast<int>(std::min<size_t>(omp_get_max_threads(), num_blocks));
     // Not value-initialised, so a thread that gets no block costs no memory.
@@ -438,44 +438,49 @@ void read_fixed_rows(const PlyFile& ply, const PlyGaussians<float>& out) {
             const size_t first = block * block_rows;
             const size_t count = std::min(block_rows, num_rows - first);
             const size_t size = count * row_bytes;
-            if (ply.file.read_at(ply.vertex_offset + first * row_bytes, rows, size) != size)
+            if (ply.file.read_at(at.offset + first * row_bytes, rows, size) != size)
                 throw PlyError("expected the file not to change while it is read, got a shorter one");
             decoder.decode(rows, count, first);
         });
     }
     error.rethrow();
+    return {at.row + num_rows, at.offset + num_rows * row_bytes};
 }
 
-void read_rows_with_lists(const PlyFile& ply, const PlyGaussians<float>& out) {
+PlyPlace read_rows_with_lists(const PlyFile& ply, PlyPlace at, const PlyGaussians<float>& out) {
     const RowDecoder decoder(ply, out);
     const size_t row_bytes = decoder.row_bytes();
+    const size_t num_rows = out.opacities.size;
     const size_t chunk_rows = std::max<size_t>(1, kChunkBytes / row_bytes);
-    std::vector<char> packed(std::min<size_t>(chunk_rows, ply.num_gaussians()) * row_bytes);
-    ByteReader reader(ply.file, ply.vertex_offset, ply.file_bytes);
-    for (size_t first = 0; first < ply.num_gaussians(); first += chunk_rows) {
-        const size_t count = std::min(chunk_rows, ply.num_gaussians() - first);
+    std::vector<char> packed(std::min<size_t>(chunk_rows, num_rows) * row_bytes);
+    ByteReader reader(ply.file, at.offset, ply.file_bytes);
+    for (size_t first = 0; first < num_rows; first += chunk_rows) {
+        const size_t count = std::min(chunk_rows, num_rows - first);
         for (size_t r = 0; r < count; ++r)
-            walk_row(reader, ply.vertex, first + r, is_swapped(ply.encoding), packed.data() + r * row_bytes);
+            walk_row(reader, ply.vertex, at.row + first + r, is_swapped(ply.encoding),
+                     packed.data() + r * row_bytes);
 #pragma omp parallel for schedule(static)
         for (size_t r = 0; r < count; ++r) decoder.decode(packed.data() + r * row_bytes, 1, first + r);
     }
+    return {at.row + num_rows, reader.offset()};
 }
 
-void read_text(const PlyFile& ply, const PlyGaussians<float>& out) {
+PlyPlace read_text(const PlyFile& ply, PlyPlace at, const PlyGaussians<float>& out) {
     constexpr size_t kLinesPerTask = 256;
     const std::vector<Field> fields = fields_of(ply.vertex, ply.num_sh);
     const size_t num_properties = ply.vertex.properties.size();
+    const size_t num_rows = out.opacities.size;
     std::vector<double> values(omp_get_max_threads() * num_properties);
-    LineReader reader(ply.file, ply.vertex_offset, ply.file_bytes);
-    for (size_t first = 0; first < ply.num_gaussians();) {
-        const std::vector<Line>& lines = reader.next(ply.num_gaussians() - first);
-        if (lines.empty()) throw_too_few(ply.vertex, first);
+    LineReader reader(ply.file, at.offset, ply.file_bytes);
+    for (size_t first = 0; first < num_rows;) {
+        const std::vector<Line>& lines = reader.next(num_rows - first);
+        if (lines.empty()) throw_too_few(ply.vertex, at.row + first);
         FirstError error;
 #pragma omp parallel for schedule(dynamic, kLinesPerTask)
         for (size_t r = 0; r < lines.size(); ++r) {
             error.run(r, [&] {
                 double* row = values.data() + omp_get_thread_num() * num_properties;
-                parse_row(lines[r], first + r, ply.vertex, row);
+                parse_row(lines[r], at.row + first + r, ply.vertex, row);
                 store_gaussian([&](size_t slot) { return row[fields[slot].property]; }, first + r, ply.num_sh,
                                out);
             });
@@ -483,6 +488,7 @@ void read_text(const PlyFile& ply, const PlyGaussians<float>& out) {
         error.rethrow();
         first += lines.size();
     }
+    return {at.row + num_rows, reader.offset()};
 }
 
 }  // namespace
@@ -508,14 +514,15 @@ PlyFile open_ply(const char* path) {
     return ply;
 }
 
-void read_ply(const PlyFile& ply, const PlyGaussians<float>& out) {
-    if (ply.num_gaussians() == 0) return;
-    if (ply.encoding == PlyEncoding::ascii)
-        read_text(ply, out);
-    else if (ply.vertex.has_lists())
-        read_rows_with_lists(ply, out);
-    else
-        read_fixed_rows(ply, out);
+PlyPlace read_ply(const PlyFile& ply, size_t first, PlyPlace known, const PlyGaussians<float>& out) {
+    assert(first + out.opacities.size <= ply.num_gaussians());
+    if (out.opacities.size == 0) return known;
+    const PlyPlace from = known.row <= first ? known : ply.begin();
+    PlyElement skipped = ply.vertex;
+    skipped.count = first - from.row;
+    const PlyPlace at = {first, skip_element(ply, skipped, from.offset)};
+    if (ply.encoding == PlyEncoding::ascii) return read_text(ply, at, out);
+    return ply.vertex.has_lists() ? read_rows_with_lists(ply, at, out) : read_fixed_rows(ply, at, out);
 }
 
 }  // namespace v3dg

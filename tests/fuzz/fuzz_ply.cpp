@@ -37,7 +37,7 @@ void read(const char* path, size_t file_bytes) {
     };
     const v3dg::PlyGaussians<float> out = {span(3 * n), span(4 * n), span(3 * n), span(n),
                                            span(3 * n * ply.num_sh)};
-    v3dg::read_ply(ply, out);
+    v3dg::read_ply(ply, 0, ply.begin(), out);
 }
 
 }  // namespace

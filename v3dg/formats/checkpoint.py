@@ -9,12 +9,14 @@ that it names is imported or called, and only the numbers of the gaussians are r
 from __future__ import annotations
 
 import math
+import os
 import pickletools
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._packing import DEGREES, Floats, assemble, normalised
 from v3dg.formats._reading import Archive, Claims, Path, check, telling
 from v3dg.gaussians import Gaussians
@@ -46,25 +48,23 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
 
+def open_file(path: Path) -> AssetFile:
+    """Open a checkpoint; the gaussians are all read with the first rows."""
+    claims = Claims()
+    with claims.open(path) as file:
+        fields = _fields_of(path, Archive(path, file))[0]
+    count, num_higher = _size(path, fields, claims)
+    return whole_file(path, count, DEGREES[num_higher], read, os.stat(path).st_size)
+
+
 def read(path: Path) -> Gaussians:
     """Read the gaussians of a checkpoint."""
     claims = Claims()
     with claims.open(path) as file:
         archive = Archive(path, file)
-        root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
-        pickle = archive.read(f"{root}data.pkl")
-        size = len(pickle)
-        check(path, size <= _MAX_PICKLE, f"a pickle of at most {_MAX_PICKLE} bytes, got {size}")
-        is_little = f"{root}byteorder" not in archive.names or archive.read(f"{root}byteorder") == b"little"
-        check(path, is_little, "little-endian numbers, got a checkpoint of another byte order")
-        with telling(path, "a checkpoint of tensors and plain values"):
-            content = _followed(pickle)
-        fields = _fields(path, content)
-        claims.add(path, fields["means"].shape[0])
+        fields, root = _fields_of(path, archive)
+        count, num_higher = _size(path, fields, claims)
         arrays = {name: _array(path, name, field, archive, root) for name, field in fields.items()}
-    count = len(arrays["means"])
-    num_higher = arrays["shN"].size // max(1, 3 * count)
-    check(path, num_higher in DEGREES, f"SH degree 0 to 3, got shN of shape {fields['shN'].shape}")
     wanted = ((count, 3), (count, 3), (count, 4), (count,), (count, 1, 3), (count, num_higher, 3))
     for name, shape in zip(_FIELDS, wanted, strict=True):
         fits = arrays[name].size == math.prod(shape)
@@ -77,6 +77,29 @@ def read(path: Path) -> Gaussians:
         return means, normalised(quats), np.exp(scales), opacities, np.concatenate(sh, axis=1)
 
     return assemble(count, DEGREES[num_higher], decode)
+
+
+def _fields_of(path: Path, archive: Archive) -> tuple[dict[str, _Tensor], str]:
+    """Where the tensors of the gaussians are, and in which folder of the zip."""
+    root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
+    pickle = archive.read(f"{root}data.pkl")
+    size = len(pickle)
+    check(path, size <= _MAX_PICKLE, f"a pickle of at most {_MAX_PICKLE} bytes, got {size}")
+    is_little = f"{root}byteorder" not in archive.names or archive.read(f"{root}byteorder") == b"little"
+    check(path, is_little, "little-endian numbers, got a checkpoint of another byte order")
+    with telling(path, "a checkpoint of tensors and plain values"):
+        content = _followed(pickle)
+    return _fields(path, content), root
+
+
+def _size(path: Path, fields: dict[str, _Tensor], claims: Claims) -> tuple[int, int]:
+    """How many gaussians there are, and how many coefficients a channel past the first."""
+    count = fields["means"].shape[0]
+    claims.add(path, count)
+    shape = fields["shN"].shape
+    num_higher = math.prod(shape) // max(1, 3 * count)
+    check(path, num_higher in DEGREES, f"SH degree 0 to 3, got shN of shape {shape}")
+    return count, num_higher
 
 
 def _doubles(values: NDArray[Any]) -> Floats:

@@ -9,12 +9,14 @@ coefficient, channel by channel, for -4 to 4. See docs/formats.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
+from v3dg.formats._asset_file import AssetFile, File
 from v3dg.formats._packing import (
     DEGREES,
     SH_C0,
@@ -30,7 +32,7 @@ from v3dg.formats._packing import (
     three_of_quats,
     to_integers,
 )
-from v3dg.formats._reading import Claims, Path, check, read_bytes
+from v3dg.formats._reading import Claims, Path, check
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
@@ -44,6 +46,22 @@ _THREE_SHIFT, _THREE_MAX = (20, 10, 0), (1023, 1023, 1023)
 _RGBA_SHIFT, _RGBA_MAX = (24, 16, 8, 0), (255, 255, 255, 255)
 
 
+@dataclass(frozen=True)
+class _Element:
+    """Where its rows are in the file."""
+
+    dtype: np.dtype[Any]
+    count: int
+    offset: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.dtype.names or ()
+
+    def rows(self, file: File, first: int, last: int) -> NDArray[Any]:
+        return file.rows(self.dtype, self.offset + first * self.dtype.itemsize, last - first)
+
+
 def is_compressed(path: Path) -> bool:
     """Whether a `.ply` has packed positions. What is wrong with other files is for their reader to say."""
     try:
@@ -54,23 +72,51 @@ def is_compressed(path: Path) -> bool:
     return any(line.split()[-1:] == [b"packed_position"] for line in header.splitlines())
 
 
-def read(path: Path) -> Gaussians:
-    """Read a `.compressed.ply` file."""
-    elements = _elements(path, read_bytes(path))
+def open_file(path: Path) -> AssetFile:
+    """Open a `.compressed.ply` file."""
+    file = File(path)
+    elements = _elements(file)
     for name in ("chunk", "vertex"):
         is_there = name in elements
         check(path, is_there, f"the elements chunk and vertex of a compressed .ply, got no {name}")
     chunk, vertex, sh = elements["chunk"], elements["vertex"], elements.get("sh")
-    count = len(vertex)
-    ranges = _ranges(path, chunk)
+    count = vertex.count
+    kinds = [kind for kind in _RANGES if kind != "color" or set(_range_names(kind)) & set(chunk.names)]
+    for kind in kinds:
+        _require(path, "chunk", chunk, _range_names(kind), "float")
     _require(path, "vertex", vertex, _PACKED, "uint")
     num_chunks = -(-count // _CHUNK)
-    check(path, len(chunk) >= num_chunks, f"{num_chunks} chunks for {count} gaussians, got {len(chunk)}")
-    rest, degree = _rest(path, sh, count)
+    check(path, chunk.count >= num_chunks, f"{num_chunks} chunks for {count} gaussians, got {chunk.count}")
+    degree = _degree(path, sh, count)
 
+    def read_rows(first: int, last: int) -> Gaussians:
+        first_chunk = first // _CHUNK
+        ranges = _ranges(chunk.rows(file, first_chunk, max(first_chunk, -(-last // _CHUNK))), kinds)
+        rest = np.zeros((last - first, 0), np.uint8)
+        if sh is not None:
+            columns = sh.rows(file, first, last)
+            rest = np.stack([columns[f"f_rest_{i}"] for i in range(len(sh.names))], axis=1)
+        chunk_from_row = np.arange(first, last) // _CHUNK - first_chunk
+        return _decoded(vertex.rows(file, first, last), rest, degree, ranges, chunk_from_row)
+
+    return AssetFile(path, count, degree, read_rows)
+
+
+def read(path: Path) -> Gaussians:
+    """Read a `.compressed.ply` file."""
+    return open_file(path).read_all()
+
+
+def _decoded(
+    vertex: NDArray[Any],
+    rest: NDArray[np.uint8],
+    degree: int,
+    ranges: dict[str, tuple[Floats, Floats]],
+    chunk_from_row: NDArray[np.int64],
+) -> Gaussians:
     def decode(rows: slice) -> tuple[Floats, ...]:
         block = vertex[rows]
-        chunks = np.arange(rows.start, rows.stop) // _CHUNK
+        chunks = chunk_from_row[rows]
 
         def within(kind: str, fractions: Floats) -> Floats:
             low, high = ranges[kind][0][chunks], ranges[kind][1][chunks]
@@ -86,7 +132,7 @@ def read(path: Path) -> Gaussians:
         higher = _REST_VALUE[rest[rows]].reshape(len(block), 3, -1).transpose(0, 2, 1)
         return means, quats, scales, rgba[:, 3], np.concatenate([color[:, None], higher], axis=1)
 
-    return assemble(count, degree, decode)
+    return assemble(len(vertex), degree, decode)
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
@@ -156,44 +202,42 @@ def _range_names(kind: str) -> list[str]:
     return [f"{end}_{prefix}{axis}" for end in ("min", "max") for axis in _RANGES[kind]]
 
 
-def _ranges(path: Path, chunk: NDArray[Any]) -> dict[str, tuple[Floats, Floats]]:
+def _ranges(chunk: NDArray[Any], kinds: Sequence[str]) -> dict[str, tuple[Floats, Floats]]:
     """Lowest and highest of each chunk, (C, 3) each; files without ranges of colour mean 0 to 1."""
     ranges: dict[str, tuple[Floats, Floats]] = {
         "color": (np.zeros((len(chunk), 3)), np.ones((len(chunk), 3)))
     }
-    for kind in _RANGES:
-        names = _range_names(kind)
-        if kind != "color" or set(names) & set(chunk.dtype.names or ()):
-            _require(path, "chunk", chunk, names, "float")
-            with np.errstate(invalid="ignore"):  # signalling NaN
-                values = np.stack([chunk[name] for name in names], axis=1).astype(np.float64)
-            ranges[kind] = (values[:, :3], values[:, 3:])
+    for kind in kinds:
+        with np.errstate(invalid="ignore"):  # signalling NaN
+            values = np.stack([chunk[name] for name in _range_names(kind)], axis=1).astype(np.float64)
+        ranges[kind] = (values[:, :3], values[:, 3:])
     return ranges
 
 
-def _rest(path: Path, sh: NDArray[Any] | None, count: int) -> tuple[NDArray[Any], int]:
-    """(N, 3 K) bytes, channel by channel, and the degree."""
+def _degree(path: Path, sh: _Element | None, count: int) -> int:
     if sh is None:
-        return np.zeros((count, 0), np.uint8), 0
-    names = [f"f_rest_{i}" for i in range(len(sh.dtype.names or ()))]
+        return 0
+    names = [f"f_rest_{i}" for i in range(len(sh.names))]
     degree = DEGREES.get(len(names) // 3, -1) if len(names) % 3 == 0 else -1
     check(path, degree >= 0, f"0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {len(names)}")
     _require(path, "sh", sh, names, "uchar")
-    check(path, len(sh) == count, f"{count} rows of element sh like vertex, got {len(sh)}")
-    return np.stack([sh[name] for name in names], axis=1), degree
+    check(path, sh.count == count, f"{count} rows of element sh like vertex, got {sh.count}")
+    return degree
 
 
-def _require(path: Path, element: str, rows: NDArray[Any], names: Sequence[str], kind: str) -> None:
+def _require(path: Path, shown: str, element: _Element, names: Sequence[str], kind: str) -> None:
     for name in names:
-        is_there = name in (rows.dtype.names or ()) and rows.dtype[name] == np.dtype(_PLY_TYPES[kind])
-        check(path, is_there, f"'property {kind} {name}' in element {element}, got none")
+        is_there = name in element.names and element.dtype[name] == np.dtype(_PLY_TYPES[kind])
+        check(path, is_there, f"'property {kind} {name}' in element {shown}, got none")
 
 
-def _elements(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
-    """The rows of each element, as the header lists them."""
-    head, mark, _ = content[:_MAX_HEADER].partition(b"end_header\n")
+def _elements(file: File) -> dict[str, _Element]:
+    """Where the rows of each element are, as the header lists them."""
+    path, given = file.path, file.num_bytes
+    start = file.rows(np.dtype(np.uint8), 0, min(_MAX_HEADER, given)).tobytes()
+    head, mark, _ = start.partition(b"end_header\n")
     if not mark:
-        head, mark, _ = content[:_MAX_HEADER].partition(b"end_header\r\n")
+        head, mark, _ = start.partition(b"end_header\r\n")
     check(path, mark, f"end_header within the first {_MAX_HEADER} bytes, got none")
     lines = head.decode("ascii", "replace").splitlines()
     check(path, lines[:1] == ["ply"], "a first line 'ply'")
@@ -213,15 +257,15 @@ def _elements(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
             is_known = len(words) == 3 and words[1] in _PLY_TYPES and elements
             check(path, is_known, f"'property float|uint|uchar NAME', got {shown}")
             fields.append((words[2], _PLY_TYPES[words[1]]))
-    rows: dict[str, NDArray[Any]] = {}
+    found: dict[str, _Element] = {}
     offset = len(head) + len(mark)
     for name, (count, fields) in elements.items():
         shown = f"element {name[:40]!a}"
         check(path, 0 < len(dict(fields)) == len(fields), f"properties of {shown}, each once")
-        dtype, left = np.dtype(fields), len(content) - offset
+        dtype, left = np.dtype(fields), given - offset
         wanted = f"{count} rows of {shown} with {dtype.itemsize} bytes each"
         check(path, count * dtype.itemsize <= left, f"{wanted}, got {left} bytes")
-        rows[name] = np.frombuffer(content, dtype, count, offset)
-        offset += rows[name].nbytes
-    check(path, offset == len(content), f"the end of the file after {offset} bytes, got {len(content)}")
-    return rows
+        found[name] = _Element(dtype, count, offset)
+        offset += count * dtype.itemsize
+    check(path, offset == given, f"the end of the file after {offset} bytes, got {given}")
+    return found

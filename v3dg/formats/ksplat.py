@@ -10,14 +10,16 @@ bytes for the range in the header), band by band and there channel by channel. S
 from __future__ import annotations
 
 import math
+import os
 import struct
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
-from v3dg.formats._reading import Path, check, read_bytes
+from v3dg.formats._reading import Claims, Path, check, read_bytes
 from v3dg.gaussians import Gaussians
 
 _HEADER_BYTES = 4096
@@ -32,9 +34,30 @@ _SECTION = struct.Struct("<IIIIfH2xI4xIIH")
 _Centers: TypeAlias = tuple[NDArray[Any], float, int]
 
 
+def open_file(path: Path) -> AssetFile:
+    """Open a `.ksplat` file; all of it is read with its first rows."""
+    with Claims().open(path) as file:
+        start = file.read(_HEADER_BYTES + _MAX_SECTIONS * _SECTION_BYTES)
+    headers, degree, _ = _headers(path, start)
+    return whole_file(path, sum(header[0] for header in headers), degree, read, os.stat(path).st_size)
+
+
 def read(path: Path) -> Gaussians:
     """Read a `.ksplat` file of version 0.1 and later, of SH degree 0 to 2."""
     content = read_bytes(path)
+    headers, degree, compression = _headers(path, content)
+    low, high = struct.unpack_from("<ff", content, 36)
+    sh_range = (low, high) if low < high else _SH_RANGE
+    offset = _HEADER_BYTES + len(headers) * _SECTION_BYTES
+    parts = []
+    for i, header in enumerate(headers):
+        rows, centers, offset = _section(path, content, i, header, offset, compression)
+        parts.append(_decoded(rows, centers, degree, sh_range))
+    return parts[0] if len(parts) == 1 else Gaussians.concatenate(parts or [assemble(0, 0, lambda rows: ())])
+
+
+def _headers(path: Path, content: bytes) -> tuple[list[tuple[Any, ...]], int, int]:
+    """Those of the sections, which are at the start; the SH degree, and the compression."""
     given = len(content)
     check(path, given >= _HEADER_BYTES, f"a header of {_HEADER_BYTES} bytes, got {given}")
     major, minor, num_sections, count, compression = struct.unpack_from("<BB2xI8xIH", content)
@@ -42,18 +65,12 @@ def read(path: Path) -> Gaussians:
     check(path, is_known, f".ksplat 0.1 or later and compression 0 to 2, got {found}")
     has_headers = num_sections <= min(_MAX_SECTIONS, (given - _HEADER_BYTES) // _SECTION_BYTES)
     check(path, has_headers, f"headers of {num_sections} sections, got {given} bytes")
-    low, high = struct.unpack_from("<ff", content, 36)
-    sh_range = (low, high) if low < high else _SH_RANGE
-    offset = _HEADER_BYTES + num_sections * _SECTION_BYTES
-    headers = [_SECTION.unpack_from(content, start) for start in range(_HEADER_BYTES, offset, _SECTION_BYTES)]
+    end = _HEADER_BYTES + num_sections * _SECTION_BYTES
+    headers = [_SECTION.unpack_from(content, start) for start in range(_HEADER_BYTES, end, _SECTION_BYTES)]
     total, degree = sum(header[0] for header in headers), max((header[-1] for header in headers), default=0)
     check(path, total == count, f"{count} gaussians in the sections, got {total}")
     check(path, degree <= 2, f"SH degree 0 to 2, got {degree}")
-    parts = []
-    for i, header in enumerate(headers):
-        rows, centers, offset = _section(path, content, i, header, offset, compression)
-        parts.append(_decoded(rows, centers, degree, sh_range))
-    return parts[0] if len(parts) == 1 else Gaussians.concatenate(parts or [assemble(0, 0, lambda rows: ())])
+    return headers, degree, compression
 
 
 def _section(

@@ -7,17 +7,26 @@ from typing import Literal
 
 from v3dg import _core, _files
 from v3dg.formats import compressed_ply
+from v3dg.formats._asset_file import AssetFile
 from v3dg.formats._reading import Path
 from v3dg.gaussians import Gaussians
 
 PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 
 
-def read(path: Path) -> Gaussians:
-    """Read a `.ply` file; one that has packed positions as a compressed one, whatever its name."""
+def open_file(path: Path) -> AssetFile:
+    """A `.ply` file; one that has packed positions as a compressed one, whatever its name."""
     if compressed_ply.is_compressed(path):
-        return compressed_ply.read(path)
-    return Gaussians(*_core.ply_read(os.fspath(path)))
+        return compressed_ply.open_file(path)
+    file = _core.PlyFile(os.fspath(path))
+    return AssetFile(
+        path, file.num_gaussians, file.sh_degree, lambda first, last: Gaussians(*file.read(first, last))
+    )
+
+
+def read(path: Path) -> Gaussians:
+    """Read a `.ply` file."""
+    return open_file(path).read_all()
 
 
 def write(path: Path, gaussians: Gaussians, encoding: PlyEncoding = "binary_little_endian") -> None:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from v3dg import _files
 from v3dg._json import Node, parse_json
 from v3dg._version import __version__
+from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._codebook import nearest, palette_of, table_of
 from v3dg.formats._packing import (
     SQRT2,
@@ -49,6 +50,16 @@ _MAX_LOG = 88.0  # of a float32
 _PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
 
 
+def open_file(path: str | os.PathLike[str]) -> AssetFile:
+    """Open a `.sog` file or a `meta.json`; all is read with its first rows."""
+    path, claims = Path(path), Claims()
+    with claims.open(path) as file:
+        text = file.read() if path.suffix == ".json" else Archive(path, file).read("meta.json")
+    count, degree = _size(_meta(path, text))
+    num_bytes = sum(file.stat().st_size for file in files(path) if file.exists())
+    return whole_file(path, count, degree, read, num_bytes)
+
+
 def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussians:
     """Read a `.sog` file, or the `meta.json` of a folder with its pictures."""
     path, claims = Path(path), claims or Claims()
@@ -70,7 +81,7 @@ def files(path: Path) -> list[Path]:
 
 def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims) -> Gaussians:
     meta = _meta(path, text)
-    count = whole(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
+    count, degree = _size(meta)
     names = _names(meta)
     pictures = {name: load(name) for part in names.values() for name in part}
     claims.add(path, count)  # all that it has on disk is known now
@@ -87,14 +98,12 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     tags = quats[:, 3]
     smallest = tags.min(initial=255)
     check(path, smallest >= 252, f"quaternions tagged 252 to 255, got {smallest}")
-    degree = 0
     table: Floats = np.zeros(1)
     palette: NDArray[Any] = np.zeros((1, 0, 3), np.uint8)
     labels: NDArray[Any] = np.zeros(count, np.uint8)
     if "shN" in meta:
-        fields = meta["shN"].some_fields(("count", "bands"))
-        degree = whole(fields["bands"], "1 to 3", 1, 3)
-        num_entries = whole(fields["count"], "1 to 65536 entries", 1, 65536)
+        entries = meta["shN"].some_fields(("count",))["count"]
+        num_entries = whole(entries, "1 to 65536 entries", 1, 65536)
         table = _codebook(meta["shN"])
         num_rows, width = -(-num_entries // _PALETTE_COLUMNS), _PALETTE_COLUMNS * _COEFFICIENTS[degree]
         centroids = _decoded(path, names["shN"][0], pictures[names["shN"][0]], num_rows * width, width)
@@ -125,6 +134,14 @@ def _meta(path: Path, text: bytes) -> dict[str, Node]:
     if meta.value["version"] != 2:
         raise meta.child("version").error("SOG version 2")
     return meta.some_fields(("count", "means", "scales", "quats", "sh0"))
+
+
+def _size(meta: dict[str, Node]) -> tuple[int, int]:
+    """How many gaussians there are, and their SH degree."""
+    count = whole(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
+    if "shN" not in meta:
+        return count, 0
+    return count, whole(meta["shN"].some_fields(("bands",))["bands"], "1 to 3", 1, 3)
 
 
 def _names(meta: dict[str, Node]) -> dict[str, list[str]]:

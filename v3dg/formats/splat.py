@@ -6,22 +6,38 @@ and the quaternion w x y z (a byte each, 128 for 0). There is no header.
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from v3dg.formats._asset_file import AssetFile, File
 from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
-from v3dg.formats._reading import Path, check, read_bytes
+from v3dg.formats._reading import Path, check
 from v3dg.gaussians import Gaussians
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
+def open_file(path: Path) -> AssetFile:
+    """Open a `.splat` file."""
+    file, size = File(path), _RECORD.itemsize
+    is_whole = file.num_bytes % size == 0
+    check(path, is_whole, f"a multiple of 32 bytes, got {file.num_bytes}; is the file complete?")
+    return AssetFile(
+        path,
+        file.num_bytes // size,
+        0,
+        lambda first, last: _decoded(file.rows(_RECORD, first * size, last - first)),
+    )
+
+
 def read(path: Path) -> Gaussians:
     """Read a `.splat` file."""
-    content = read_bytes(path)
-    is_whole = len(content) % _RECORD.itemsize == 0
-    check(path, is_whole, f"a multiple of 32 bytes, got {len(content)}; is the file complete?")
-    records = np.frombuffer(content, _RECORD)
+    return open_file(path).read_all()
 
+
+def _decoded(records: NDArray[Any]) -> Gaussians:
     def decode(rows: slice) -> tuple[Floats, ...]:
         block = records[rows]
         rgba = block["rgba"] / 255.0

@@ -9,6 +9,7 @@ Coordinates are passed on as they are stored. See docs/formats.md.
 from __future__ import annotations
 
 import math
+import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
+from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._packing import (
     SQRT2,
     Floats,
@@ -39,8 +41,22 @@ _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
 _MAX_TRAILER = 1 << 20  # bytes after the attributes, which vendors' extensions may take
+_MAX_START = 1 << 16  # bytes in which the header is found, also behind the fields of a gzip stream
 _COLOR_SCALE = 0.15
 _LARGEST_FIXED = (1 << 23) - 1
+
+
+def open_file(path: Path) -> AssetFile:
+    """Open a `.spz` file; all of it is read with its first rows."""
+    claims = Claims()
+    with claims.open(path) as file:
+        header = file.read(_MAX_START)
+    if header[:2] == b"\x1f\x8b":
+        with telling(path, "a gzip stream that is not damaged"):
+            header = zlib.decompressobj(31).decompress(header, _HEADER.size)
+    check(path, len(header) >= _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
+    _, degree, _, sizes = _checked_header(path, header, claims)
+    return whole_file(path, sizes[1], degree, read, os.stat(path).st_size)
 
 
 def read(path: Path) -> Gaussians:

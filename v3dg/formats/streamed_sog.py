@@ -14,21 +14,32 @@ import numpy as np
 
 from v3dg._json import Node, parse_json
 from v3dg.formats import sog
+from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._reading import Claims, check, telling, whole
 from v3dg.gaussians import Gaussians
 
 _LEVEL = re.compile(r"[0-9]{1,9}")
 
 
+def open_file(path: str | os.PathLike[str]) -> AssetFile:
+    """Open a `lod-meta.json`; all is read with its first rows."""
+    path = Path(path)
+    finest, environment = _used(path, Claims())
+    parts = [sog.open_file(path.parent / name) for name in finest]
+    count = sum(len(rows) for runs in finest.values() for rows in runs)
+    if environment is not None:
+        parts.append(sog.open_file(path.parent / environment))
+        count += parts[-1].num_gaussians
+    num_bytes = sum(file.stat().st_size for file in files(path) if file.exists())
+    return whole_file(path, count, parts[0].sh_degree, read, num_bytes)
+
+
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read the finest level of each leaf, and the environment, of a `lod-meta.json`."""
     path, claims = Path(path), Claims()
-    tree, names, environment = _index(path, claims.read(path))
-    finest = _finest(tree, names)
-    check(path, finest or environment is not None, "gaussians in the tree, got none")
+    finest, environment = _used(path, claims)
     parts = []
-    for name in filter(finest.__contains__, dict.fromkeys(names)):  # a name that is there twice is read once
-        rows = finest[name]
+    for name, rows in finest.items():
         gaussians = sog.read(path.parent / name, claims)
         # No more than it has: else a small file could ask for any number.
         count = len(gaussians)
@@ -47,6 +58,15 @@ def files(path: Path) -> list[Path]:
     _, names, environment = _index(path, Claims().read(path))
     parts = [path.parent / name for name in dict.fromkeys([*names, environment]) if name is not None]
     return [path, *(file for part in parts if part.exists() for file in sog.files(part))]
+
+
+def _used(path: Path, claims: Claims) -> tuple[dict[PurePosixPath, list[range]], PurePosixPath | None]:
+    """The rows of each file, in their order, that are read, and the file of the environment."""
+    tree, names, environment = _index(path, claims.read(path))
+    finest = _finest(tree, names)
+    check(path, finest or environment is not None, "gaussians in the tree, got none")
+    # A name that is there twice is read once.
+    return {name: finest[name] for name in dict.fromkeys(names) if name in finest}, environment
 
 
 def _index(path: Path, text: bytes) -> tuple[Node, list[PurePosixPath], PurePosixPath | None]:
