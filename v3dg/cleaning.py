@@ -35,6 +35,7 @@ _TEXT = {
     "opacity_out_of_range": "with an opacity outside 0 to 1",
     "transparent": "with an opacity below 1/255, which no pixel shows",
 }
+KINDS = tuple(_TEXT)
 _VALID = ("transparent",)
 
 
@@ -65,8 +66,12 @@ class Findings:
     @property
     def text(self) -> str:
         """One line that says how many cannot be drawn and why."""
-        total = f"{self.num_dropped:,} of {len(self.drawable):,} gaussians cannot be drawn"
-        return f"{total}: {describe(self.counts)}"
+        return summary(self.num_dropped, len(self.drawable), self.counts)
+
+
+def summary(num_dropped: int, num_gaussians: int, counts: Mapping[str, int]) -> str:
+    """One line that says how many of an asset cannot be drawn and why."""
+    return f"{num_dropped:,} of {num_gaussians:,} gaussians cannot be drawn: {describe(counts)}"
 
 
 def describe(counts: Mapping[str, int]) -> str:

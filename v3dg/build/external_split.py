@@ -1,0 +1,119 @@
+"""The median split of more points than memory holds.
+
+A node that does not fit in memory is split in passes over its points: for the longest side of its box, twice
+for the median of that axis (the upper and the lower half of its bits), and once to move the points. That is
+64 bytes read and 16 written for each point of the node. A node that fits is read once and split by the core.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _core
+from v3dg.build.scratch import RowFile
+
+Points = npt.NDArray[np.uint32]
+"""(N, 4): the bits of x, y and z, and the index."""
+
+Words = npt.NDArray[np.uint32]
+
+FITTING_BYTES = 48
+"""Memory, for each of its points, that a node takes that is split in memory."""
+
+_AT_ONCE = 1 << 18  # points that are read at a time: with what is computed of them, 16 MB
+
+
+def points_of(means: npt.NDArray[np.float32], index: npt.NDArray[np.integer]) -> Points:
+    points = np.empty((len(means), 4), np.uint32)
+    points[:, :3] = means.view(np.uint32)
+    points[:, 3] = index
+    return points
+
+
+def split(files: tuple[RowFile, RowFile], count: int, depth: int, num_fitting: int, order: RowFile) -> None:
+    """Write the indices of points in the order of `_core.median_split`, with which it agrees in every bit.
+
+    Args:
+        files: Of points: the first `count` rows of one, by ascending index, finite; the other is for passes.
+        num_fitting: Most points of a node that is split in memory.
+        order: Of indices, to write to.
+    """
+    todo = [(0, count, depth, 0)]
+    while todo:
+        first, last, left, number = todo.pop()
+        here = files[number]
+        if left > 0 and last - first > num_fitting:
+            middle = first + (last - first + 1) // 2
+            _partition(here, first, middle, last, files[1 - number])
+            todo += [(first, middle, left - 1, 1 - number), (middle, last, left - 1, 1 - number)]
+        elif left > 0:
+            order.write(first, _split_in_memory(here.read(first, last), left))
+        else:
+            for start in range(first, last, _AT_ONCE):
+                order.write(start, here.read(start, min(start + _AT_ONCE, last))[:, 3])
+
+
+def _split_in_memory(points: Points, depth: int) -> Words:
+    index = points[:, 3].copy()
+    means = np.ascontiguousarray(points[:, :3]).view(np.float32)
+    del points
+    order, _ = _core.median_split(means, np.array([0, len(means)]), depth)
+    result: Words = index[order]
+    return result
+
+
+def _partition(source: RowFile, first: int, middle: int, last: int, target: RowFile) -> None:
+    """Bring the lesser half of a node to `first`, the others to `middle`; both keep their order."""
+    axis = _longest_axis(source, first, last)
+    median, num_ties = _median(source, first, middle, last, axis)
+    ends = [first, middle]
+    for points in source.blocks(first, last, _AT_ONCE):
+        key = _ordered(points[:, axis])
+        is_left = key < median
+        ties = np.flatnonzero(key == median)[:num_ties]
+        num_ties -= len(ties)
+        is_left[ties] = True
+        for side, half in enumerate((points[is_left], points[~is_left])):
+            target.write(ends[side], half)
+            ends[side] += len(half)
+
+
+def _longest_axis(source: RowFile, first: int, last: int) -> int:
+    low, high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
+    for points in source.blocks(first, last, _AT_ONCE):
+        means = points[:, :3].view(np.float32)
+        low, high = np.minimum(low, means.min(axis=0)), np.maximum(high, means.max(axis=0))
+    return int(np.argmax(high - low))  # the lowest of equals; in float32, as the core
+
+
+def _median(source: RowFile, first: int, middle: int, last: int, axis: int) -> tuple[int, int]:
+    """The greatest value of the lesser half, as of `_ordered`, and how many of the lesser half have it."""
+
+    def keys() -> Iterator[Words]:
+        return (_ordered(points[:, axis]) for points in source.blocks(first, last, _AT_ONCE))
+
+    half = np.uint32(16)
+    upper, left = _bin_of(middle - first, (key >> half for key in keys()))
+    lower, left = _bin_of(left, (key[key >> half == upper] & np.uint32(0xFFFF) for key in keys()))
+    return upper << 16 | lower, left
+
+
+def _bin_of(rank: int, values: Iterator[Words]) -> tuple[int, int]:
+    """The value of 16 bits that is the so-many-th, counted from 1, and its rank among those equal to it."""
+    counts = np.zeros(1 << 16, np.int64)
+    for block in values:
+        counts += np.bincount(block, minlength=1 << 16)
+    ends = np.cumsum(counts)
+    found = int(np.searchsorted(ends, rank))
+    return found, rank - int(ends[found] - counts[found])
+
+
+def _ordered(bits: Words) -> Words:
+    """Numbers that compare as the floats with these bits do; zeros of either sign are the same."""
+    bits = (bits.view(np.float32) + np.float32(0)).view(np.uint32)
+    sign = bits >> 31
+    result: Words = bits ^ ((np.uint32(0) - sign) | np.uint32(1 << 31))
+    return result

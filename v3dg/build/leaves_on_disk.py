@@ -1,0 +1,370 @@
+"""The leaves of an asset in files, one or many, that need not fit in memory.
+
+An asset that does not fit in memory is read twice, in blocks. The first time its means go to scratch files,
+where they are split (`external_split`) as far as into *buckets*, nodes that are small enough to be sorted
+when they are read. The second time every gaussian goes to its bucket. Of P bytes a gaussian in memory (56 at
+SH degree 0, 236 at degree 3) and F in the input, that reads 2 F and writes P + 16. For the split and the way
+to the buckets it reads 24 and writes 4, and for each halving of a node that does not fit in memory it reads
+64 and writes 16. The scratch folder takes up to P + 4 bytes a gaussian.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _core
+from v3dg.build import external_split
+from v3dg.build.config import BuildConfig
+from v3dg.build.leaves import PIECE, Leaves, MemoryLeaves, Tally, Unusable, parts_of
+from v3dg.build.scratch import RowFile, scratch_folder
+from v3dg.bundle.codec import Codec
+from v3dg.bundle.format import page_hash
+from v3dg.formats._asset_file import AssetFile, gaussian_bytes
+from v3dg.gaussians import Gaussians
+from v3dg.io import open_asset
+
+_MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few are read in vain
+_MOST_IN_BLOCK_BYTES = 1 << 28  # more would not be faster: rows are taken from all over a block
+_OVERHEAD_BYTES = 24 << 20
+_NAMES = ("points", "spare", "order", "rows")
+
+
+@dataclass(frozen=True, eq=False)
+class DiskLeaves:
+    """Leaves in a scratch folder, for as long as that is there; can be pickled and read by many at once.
+
+    A read needs memory for what it returns and for about two buckets: `bucket_bytes`.
+    """
+
+    path: Path
+    num_gaussians: int
+    asset_gaussians: int
+    sh_degree: int
+    dropped: dict[str, int]
+    digest: str
+    _bucket_offset: npt.NDArray[np.int64]
+    _depth_left: int  # of the split inside of each bucket
+
+    @property
+    def bucket_bytes(self) -> int:
+        return int(np.diff(self._bucket_offset).max()) * _bytes_in_bucket(self.sh_degree)
+
+    def read(self, first: int, last: int) -> Gaussians:
+        result = Codec(self.sh_degree).empty(last - first)
+        offset = self._bucket_offset
+        buckets = range(
+            int(np.searchsorted(offset, first, "right")) - 1, int(np.searchsorted(offset, last, "left"))
+        )
+        with RowFile(self.path, gaussian_bytes(self.sh_degree) // 4, np.float32) as file:
+            for begin, end in ((int(offset[b]), int(offset[b + 1])) for b in buckets):
+                low, high = max(first, begin), min(last, end)
+                if self._depth_left == 0:
+                    _put_rows(file.read(low, high), result, low - first)
+                    continue
+                rows = file.read(begin, end)
+                means = np.ascontiguousarray(rows[:, :3])
+                order, _ = _core.median_split(means, np.array([0, end - begin]), self._depth_left)
+                _put_rows(rows[order[low - begin : high - begin]], result, low - first)
+        return result
+
+
+@contextmanager
+def leaves_on_disk(
+    paths: Sequence[str | os.PathLike[str]],
+    folder: str | os.PathLike[str],
+    *,
+    memory: int,
+    config: BuildConfig,
+    unusable: Unusable = "drop",
+    progress: bool = False,
+) -> Iterator[Leaves]:
+    """The leaves of the asset that some files make together, one after the other, within so much memory.
+
+    Their order is that of the median split of all of them, whatever the memory. Files of a lower SH degree
+    than others get zeros for the coefficients that they lack, which changes no colour.
+
+    Args:
+        paths: Of at least one file of any kind that `read_asset` reads.
+        folder: For scratch, where the asset does not fit in memory: made, and removed at the end. What a
+            killed build left there is removed first.
+        memory: Bytes beside what the process already has, until the leaves are there. Reading leaves then
+            takes what `DiskLeaves` says.
+        unusable: As for `build_bundle`.
+        progress: Show a bar with the gaussians read.
+
+    Raises:
+        ValueError: A file is none of these; nothing in them can be drawn; or memory is too little, and the
+            message says how much is needed.
+        OSError: A file cannot be read; or the disk of `folder` is too small for the scratch, which is told
+            before work begins, or full.
+        RuntimeError: Another build is using the folder.
+    """
+    tiles = [_Tile.of(path) for path in paths]
+    count = sum(tile.num_gaussians for tile in tiles)
+    if count == 0:
+        raise ValueError("asset: expected at least one gaussian, got none")
+    if count >= 1 << 32:
+        raise ValueError(f"asset: expected fewer than 2^32 gaussians, got {count:,}")
+    degree = max(tile.sh_degree for tile in tiles)
+    sizes = _Sizes.of(memory, degree, tiles)
+    folder = Path(folder)
+    fits = count <= sizes.in_memory
+    with scratch_folder(folder, _NAMES), _bar(progress, count if fits else 2 * count) as bar:
+        if fits:
+            buffer = Codec(degree).empty(count)
+            for _ in _blocks(tiles, buffer, bar):
+                pass
+            bar.close()
+            yield MemoryLeaves(buffer, config, unusable)
+        else:
+            _check_disk(folder, count, degree)
+            yield _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """What the header of one file says."""
+
+    path: str | os.PathLike[str]
+    num_gaussians: int
+    sh_degree: int
+    whole_bytes: int
+
+    @staticmethod
+    def of(path: str | os.PathLike[str]) -> _Tile:
+        file = open_asset(path)
+        return _Tile(path, file.num_gaussians, file.sh_degree, file.whole_bytes)
+
+    def open(self) -> AssetFile:
+        file = open_asset(self.path)
+        if (file.num_gaussians, file.sh_degree) != (self.num_gaussians, self.sh_degree):
+            raise _changed(self.path)
+        return file
+
+
+def _changed(path: str | os.PathLike[str]) -> ValueError:
+    return ValueError(f"{os.fspath(path)}: expected the file not to change while it is read, got another one")
+
+
+@dataclass(frozen=True)
+class _Sizes:
+    """Most gaussians that fit: of the asset in memory at once, in a block of the input, and in the splits.
+
+    Attributes:
+        in_node: Of a node that is split in memory.
+        in_bucket: Of a node that is sorted when it is read.
+    """
+
+    in_memory: int
+    in_block: int
+    in_node: int
+    in_bucket: int
+
+    @staticmethod
+    def of(memory: int, degree: int, tiles: Sequence[_Tile]) -> _Sizes:
+        """What fits in so much memory.
+
+        Raises:
+            ValueError: Too little does.
+        """
+        gaussian = gaussian_bytes(degree)
+        # Beside the block, a piece of it as it is decoded, in double precision.
+        overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
+        largest = max(tiles, key=lambda tile: tile.whole_bytes)
+        least = overhead + largest.whole_bytes + PIECE * gaussian
+        if memory < least:
+            why = (
+                f" for {os.fspath(largest.path)}, whose format can only be read whole (or convert it to .ply)"
+                if largest.whole_bytes
+                else ""
+            )
+            raise ValueError(f"memory: expected at least {_in_mib(least)}{why}, got {_in_mib(memory)}")
+        for_block = memory - overhead - largest.whole_bytes
+        for_split = memory - _OVERHEAD_BYTES
+        return _Sizes(
+            in_memory=for_block // (gaussian + external_split.FITTING_BYTES),
+            in_block=min(for_block, _MOST_IN_BLOCK_BYTES) // gaussian // PIECE * PIECE,
+            in_node=for_split // external_split.FITTING_BYTES,
+            in_bucket=min(_MOST_IN_BUCKET, for_split // _bytes_in_bucket(degree)),
+        )
+
+
+def _bytes_in_bucket(degree: int) -> int:
+    """Memory, for each gaussian of a bucket, to sort it: as they are in the file, in order, and the split."""
+    return 2 * gaussian_bytes(degree) + external_split.FITTING_BYTES
+
+
+def _in_mib(num_bytes: int) -> str:
+    return f"{-(-num_bytes >> 20):,} MiB"
+
+
+def _check_disk(folder: Path, count: int, degree: int) -> None:
+    needed = count * (4 + max(gaussian_bytes(degree), 2 * 16))
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(
+            f"{folder}: expected {_in_mib(needed)} free for scratch, got {_in_mib(free)}; "
+            "free some, write to another disk, or give so much memory that none is needed"
+        )
+
+
+def _bar(is_visible: bool, total: int) -> Any:
+    """Of gaussians read."""
+    from tqdm import tqdm
+
+    disable = not is_visible
+    return tqdm(
+        desc="reading", total=total, unit=" gaussians", unit_scale=True, dynamic_ncols=True, disable=disable
+    )
+
+
+def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Any) -> Iterator[tuple[int, Gaussians]]:
+    """The asset in blocks as large as the buffer, each with its first row, valid until the next."""
+    first = filled = 0
+    for tile in tiles:
+        file = tile.open()
+        row = 0
+        while row < tile.num_gaussians:
+            last = min(row + PIECE, tile.num_gaussians, row + len(buffer) - filled)
+            _put(file.read(row, last), buffer, filled)
+            bar.update(last - row)
+            filled += last - row
+            row = last
+            if filled == len(buffer):
+                yield first, buffer
+                first, filled = first + filled, 0
+        del file  # what was read whole is gone before the next is opened
+    if filled:
+        yield first, buffer.subset(slice(0, filled))
+
+
+def _put(part: Gaussians, out: Gaussians, at: int) -> None:
+    """Put gaussians into others of the same SH degree or a higher one."""
+    for name, values in vars(part).items():
+        target = getattr(out, name)[at : at + len(part)]
+        if name == "sh":
+            target[:, values.shape[1] :] = 0
+            target = target[:, : values.shape[1]]
+        target[:] = values
+
+
+def _put_rows(rows: npt.NDArray[np.float32], out: Gaussians, at: int) -> None:
+    """Put gaussians that are rows of a file into others."""
+    column = 0
+    for array in vars(out).values():
+        width = math.prod(array.shape[1:])
+        array[at : at + len(rows)] = rows[:, column : column + width].reshape(-1, *array.shape[1:])
+        column += width
+
+
+def _sort_on_disk(
+    tiles: Sequence[_Tile], folder: Path, sizes: _Sizes, config: BuildConfig, unusable: Unusable, bar: Any
+) -> DiskLeaves:
+    degree = max(tile.sh_degree for tile in tiles)
+    points, spare, order, rows = (folder / name for name in _NAMES)
+    tally = Tally()
+    with ExitStack() as stack:
+        files = [
+            stack.enter_context(RowFile(path, 4, np.uint32, must_be_new=True)) for path in (points, spare)
+        ]
+        order_file = stack.enter_context(RowFile(order, 1, np.uint32, must_be_new=True))
+        digest = _write_points(tiles, Codec(degree).empty(sizes.in_block), files[0], tally, bar)
+        tally.check(unusable)
+        count = tally.num_drawable
+        depth = _core.num_halvings(count, config.cluster_size)
+        bucket_depth = min(depth, _core.num_halvings(count, sizes.in_bucket))
+        external_split.split((files[0], files[1]), count, bucket_depth, sizes.in_node, order_file)
+        points.unlink()
+        spare.unlink()
+        offset = _halved(count, bucket_depth)
+        row_file = stack.enter_context(
+            RowFile(rows, gaussian_bytes(degree) // 4, np.float32, must_be_new=True)
+        )
+        block = Codec(degree).empty(sizes.in_block)
+        again = _write_rows(tiles, block, order_file, offset, tally.num_gaussians, row_file, bar)
+    order.unlink()
+    if again != digest:
+        raise _changed(tiles[0].path if len(tiles) == 1 else f"one of {len(tiles)} files")
+    bar.close()
+    return DiskLeaves(
+        rows, count, tally.num_gaussians, degree, tally.counts, digest, offset, depth - bucket_depth
+    )
+
+
+def _halved(count: int, depth: int) -> npt.NDArray[np.int64]:
+    """Where the nodes of this depth begin, and the end."""
+    sizes = np.array([count])
+    for _ in range(depth):
+        sizes = np.stack([(sizes + 1) // 2, sizes // 2], axis=1).reshape(-1)
+    return np.concatenate([[0], np.cumsum(sizes)])
+
+
+def _hash(part: Gaussians) -> bytes:
+    return page_hash(vars(part).values())
+
+
+def _write_points(tiles: Sequence[_Tile], buffer: Gaussians, points: RowFile, tally: Tally, bar: Any) -> str:
+    """The first pass: the means of all that can be drawn, with their rows in the asset; the digest."""
+    hashes: list[bytes] = []
+    with _pool() as pool:
+        for first, block in _blocks(tiles, buffer, bar):
+            parts = parts_of(block)
+            hashes += pool.map(_hash, parts)
+            for number, part in enumerate(parts):
+                end = tally.num_drawable
+                row = np.flatnonzero(tally.add(part))
+                index = first + number * PIECE + row
+                points.write(end, external_split.points_of(part.means[row], index))
+    return page_hash([np.frombuffer(b"".join(hashes), np.uint8)]).hex()
+
+
+def _write_rows(
+    tiles: Sequence[_Tile],
+    buffer: Gaussians,
+    order: RowFile,
+    offset: npt.NDArray[np.int64],
+    asset_gaussians: int,
+    rows: RowFile,
+    bar: Any,
+) -> str:
+    """The second pass: every gaussian to its bucket, where they keep the order of the asset; the digest."""
+    ends = _ends_in_buckets(order, offset, len(buffer), asset_gaussians)
+    hashes: list[bytes] = []
+    at = offset[:-1].copy()
+    with _pool() as pool:
+        for number, (first, block) in enumerate(_blocks(tiles, buffer, bar)):
+            hashes += pool.map(_hash, parts_of(block))
+            for bucket in np.flatnonzero(ends[:, number] > at):
+                begin, end = int(at[bucket]), int(ends[bucket, number])
+                for start in range(begin, end, PIECE):
+                    index = order.read(start, min(start + PIECE, end)).astype(np.int64) - first
+                    columns = [array[index].reshape(len(index), -1) for array in vars(block).values()]
+                    rows.write(start, np.concatenate(columns, axis=1))
+                at[bucket] = end
+    return page_hash([np.frombuffer(b"".join(hashes), np.uint8)]).hex()
+
+
+def _ends_in_buckets(
+    order: RowFile, offset: npt.NDArray[np.int64], block: int, asset_gaussians: int
+) -> npt.NDArray[np.int64]:
+    """(B, blocks): in the order, where what each bucket has of each block of the asset ends."""
+    counts = np.zeros((len(offset) - 1, -(-asset_gaussians // block)), np.int64)
+    for bucket, (begin, end) in enumerate(zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)):
+        for index in order.blocks(begin, end, _MOST_IN_BUCKET):
+            counts[bucket] += np.bincount(index // np.uint32(block), minlength=counts.shape[1])
+    return offset[:-1, None] + np.cumsum(counts, axis=1)
+
+
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(min(os.cpu_count() or 1, 16))

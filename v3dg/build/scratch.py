@@ -1,0 +1,111 @@
+"""Scratch: a folder of files of rows that is gone when the work is done."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _files
+
+
+class RowFile:
+    """A file of rows of one width, float32 or uint32, in the byte order of the machine.
+
+    Args:
+        must_be_new: Make the file, to write to; else open it, to read.
+    """
+
+    def __init__(self, path: Path, width: int, dtype: npt.DTypeLike, *, must_be_new: bool = False) -> None:
+        self.path = path
+        self._width, self._dtype = width, np.dtype(dtype)
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL if must_be_new else os.O_RDONLY
+        self._descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+
+    def __enter__(self) -> RowFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._descriptor)
+
+    def read(self, first: int, last: int) -> npt.NDArray[Any]:
+        """Rows `first` to `last`, (M, width); (M,) where the width is 1.
+
+        Raises:
+            OSError: They are not there, or cannot be read.
+        """
+        rows = np.empty((last - first, self._width)[: 1 + (self._width > 1)], self._dtype)
+        with _files.naming_errors(self.path):
+            if not _files.read_at(self._descriptor, rows, first * self._row_bytes):
+                raise OSError(f"{self.path}: expected rows {first} to {last} of scratch, got fewer")
+        return rows
+
+    def blocks(self, first: int, last: int, size: int) -> Iterator[npt.NDArray[Any]]:
+        """Rows `first` to `last`, so many at a time."""
+        for start in range(first, last, size):
+            yield self.read(start, min(start + size, last))
+
+    def write(self, first: int, rows: npt.NDArray[Any]) -> None:
+        """Write rows from row `first` on.
+
+        Raises:
+            OSError: The disk is full, or cannot be written to.
+        """
+        data = np.ascontiguousarray(rows, self._dtype).reshape(-1).view(np.uint8).data
+        with _files.naming_errors(self.path):
+            _files.write_at(self._descriptor, data, first * self._row_bytes)
+
+    @property
+    def _row_bytes(self) -> int:
+        return self._width * self._dtype.itemsize
+
+
+@contextmanager
+def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
+    """Make a folder for files of these names, empty at first and gone in the end, also after a killed run's.
+
+    Raises:
+        RuntimeError: Another run is using it.
+        ValueError: It has other files.
+        OSError: It cannot be made, or is a link.
+    """
+    folder.mkdir(mode=0o700, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        _lock(descriptor, folder)
+        others = sorted(set(os.listdir(folder)) - set(names))
+        if others:
+            raise ValueError(f"{folder}: expected scratch of a build, got {others[0]!a}; move it elsewhere")
+        try:
+            _remove(folder, names)
+            yield
+        finally:
+            _remove(folder, names)
+            with suppress(OSError):
+                folder.rmdir()
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RuntimeError(
+            f"{folder}: another build is using it; wait for it, or use another place"
+        ) from None
+    except OSError as error:  # network file systems without locks
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+            raise
+
+
+def _remove(folder: Path, names: Collection[str]) -> None:
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
