@@ -6,6 +6,7 @@ Damage that only one format can have is in the tests of that format.
 import ast
 import contextlib
 import gzip
+import itertools
 import json
 import os
 import pickle
@@ -24,6 +25,8 @@ from test_formats import FIXTURES, gsplat_tensors
 from test_ply import HOSTILE, Element, ply_bytes, random_columns, vertex_lines
 from test_ply import header as ply_header
 from test_scene_file import GOOD, flat_layout, published_layout
+from v3dg import Gaussians
+from v3dg.io import open_asset
 from v3dg.pictures import write_picture
 
 BUNDLE = random_bundle(1)
@@ -32,6 +35,28 @@ BUNDLES = {"sub/donut.v3dg": BUNDLE, "donut.ply": BUNDLE, "oak": BUNDLE, "donut"
 
 def read_scene(path):
     return v3dg.read_scene(path, bundles=BUNDLES)
+
+
+def read_asset(path):
+    """All at once; in parts it is the same gaussians or an error just as good."""
+
+    def read_in_parts(path):
+        file = open_asset(path)
+        cuts = [0, file.num_gaussians // 2, file.num_gaussians]
+        return Gaussians.concatenate([file.read(first, last) for first, last in itertools.pairwise(cuts)])
+
+    try:
+        whole = v3dg.read_asset(path)
+    except (ValueError, OSError) as expected:
+        with pytest.raises((ValueError, OSError)) as error:
+            read_in_parts(path)
+        for text in (str(error.value), str(expected)):
+            assert text.isprintable()
+            assert os.path.basename(path) in text or "\0" in os.fspath(path)
+        raise
+    parts = read_in_parts(path)
+    for name, array in vars(whole).items():
+        np.testing.assert_array_equal(array, getattr(parts, name))
 
 
 def read_bundle(path):
@@ -58,18 +83,18 @@ READERS = {
     "ply": (
         "a.ply",
         lambda _: ply_bytes([Element("vertex", random_columns(2, 0))], "ascii"),
-        v3dg.read_asset,
+        read_asset,
     ),
     "bundle": ("a.v3dg", bundle_content, read_bundle),
     "scene": ("a.json", lambda _: json.dumps(GOOD).encode(), read_scene),
     "layout": ("a.json", lambda _: json.dumps(published_layout()).encode(), read_scene),
     "flat layout": ("a.json", lambda _: json.dumps(flat_layout()).encode(), read_scene),
-    "compressed ply": ("a.ply", lambda folder: written(folder / "w.compressed.ply"), v3dg.read_asset),
-    "spz": ("a.spz", lambda folder: written(folder / "w.spz"), v3dg.read_asset),
-    "spz 4": ("a.spz", lambda _: (FIXTURES / "sh3_v4.spz").read_bytes(), v3dg.read_asset),
-    "ksplat": ("a.ksplat", lambda _: (FIXTURES / "sh3_mkkellogg_2.ksplat").read_bytes(), v3dg.read_asset),
-    "sog": ("a.sog", lambda _: (FIXTURES / "sh3.sog").read_bytes(), v3dg.read_asset),
-    "checkpoint": ("a.pt", lambda folder: checkpoint(folder / "w.pt"), v3dg.read_asset),
+    "compressed ply": ("a.ply", lambda folder: written(folder / "w.compressed.ply"), read_asset),
+    "spz": ("a.spz", lambda folder: written(folder / "w.spz"), read_asset),
+    "spz 4": ("a.spz", lambda _: (FIXTURES / "sh3_v4.spz").read_bytes(), read_asset),
+    "ksplat": ("a.ksplat", lambda _: (FIXTURES / "sh3_mkkellogg_2.ksplat").read_bytes(), read_asset),
+    "sog": ("a.sog", lambda _: (FIXTURES / "sh3.sog").read_bytes(), read_asset),
+    "checkpoint": ("a.pt", lambda folder: checkpoint(folder / "w.pt"), read_asset),
     "cameras": ("a.json", lambda _: json.dumps(CAPTURE).encode(), v3dg.read_cameras),
 }
 

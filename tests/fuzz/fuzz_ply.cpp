@@ -1,6 +1,7 @@
 // Coverage-guided fuzzer of the .ply reader, for libFuzzer (tests/fuzz/run builds and starts it).
 #include <cstdint>
 #include <cstdlib>
+#include <cstring>
 #include <string>
 #include <system_error>
 #include <vector>
@@ -22,13 +23,10 @@ bool is_printable(const std::string& text) {
     return !text.empty();
 }
 
-void read(const char* path, size_t file_bytes) {
-    const v3dg::PlyFile ply = v3dg::open_ply(path);
-    const size_t n = ply.num_gaussians();
-    const size_t floats = n * (11 + 3 * ply.num_sh);
-    // A number takes at least one byte in the file, and four in memory.
-    require(n == 0 || (floats / n == 11 + 3 * ply.num_sh && floats <= file_bytes));
-    std::vector<float> memory(floats);
+// Means, quaternions and so on of gaussians first .. last.
+std::vector<float> read(const v3dg::PlyFile& ply, size_t first, size_t last, v3dg::PlyPlace& place) {
+    const size_t n = last - first;
+    std::vector<float> memory(n * (11 + 3 * ply.num_sh));
     float* next = memory.data();
     const auto span = [&](size_t size) {
         const v3dg::Span<float> result = {next, size};
@@ -37,7 +35,23 @@ void read(const char* path, size_t file_bytes) {
     };
     const v3dg::PlyGaussians<float> out = {span(3 * n), span(4 * n), span(3 * n), span(n),
                                            span(3 * n * ply.num_sh)};
-    v3dg::read_ply(ply, 0, ply.begin(), out);
+    place = v3dg::read_ply(ply, first, place, out);
+    return memory;
+}
+
+void read(const char* path, size_t file_bytes) {
+    const v3dg::PlyFile ply = v3dg::open_ply(path);
+    const size_t n = ply.num_gaussians();
+    const size_t floats = n * (11 + 3 * ply.num_sh);
+    // A number takes at least one byte in the file, and four in memory.
+    require(n == 0 || (floats / n == 11 + 3 * ply.num_sh && floats <= file_bytes));
+    v3dg::PlyPlace end = ply.begin(), start = ply.begin(), middle = ply.begin();
+    read(ply, 0, n, end);
+    // The second half is the same whether the first was read before it or skipped.
+    read(ply, 0, n / 2, middle);
+    const std::vector<float> after = read(ply, n / 2, n, middle), skipped = read(ply, n / 2, n, start);
+    require(after.size() == skipped.size() && middle.offset == end.offset && start.offset == end.offset);
+    require(after.empty() || std::memcmp(after.data(), skipped.data(), after.size() * sizeof(float)) == 0);
 }
 
 }  // namespace

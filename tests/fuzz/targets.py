@@ -15,7 +15,7 @@ from v3dg._json import is_one_line
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
 from v3dg.formats import sog
-from v3dg.io import read_asset
+from v3dg.io import open_asset, read_asset
 from v3dg.scene_file import read_scene
 
 BUNDLES = {"a": random_bundle(0), "a.v3dg": random_bundle(1), "sub/b.v3dg": random_bundle(2)}
@@ -24,7 +24,8 @@ BUNDLES = {"a": random_bundle(0), "a.v3dg": random_bundle(1), "sub/b.v3dg": rand
 def read_ply(content, folder):
     path = put(folder / "fuzz.ply", content)
     with only_errors_that_name(path):
-        assert len(read_asset(path)) <= len(content)
+        asset = read_asset(path)
+        assert len(asset) == open_asset(path).num_gaussians <= len(content)
 
 
 def read_bundle(content, folder):
@@ -51,7 +52,9 @@ def read_format(content, folder):
     suffix, packed = FORMATS[content[0] % len(FORMATS)] if content else FORMATS[0]
     path = put(folder / f"fuzz{suffix}", packed(content[1:]))
     with only_errors_that_name(path):
-        assert len(read_asset(path)) <= (1 << 18) + path.stat().st_size  # docs/robustness.md
+        asset = read_asset(path)
+        assert len(asset) == open_asset(path).num_gaussians
+        assert len(asset) <= (1 << 18) + path.stat().st_size  # docs/robustness.md
 
 
 def zipped(files):
