@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -36,6 +37,7 @@ from v3dg.io import open_asset
 
 _MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few are read in vain
 _MOST_IN_BLOCK_BYTES = 1 << 28  # more would not be faster: rows are taken from all over a block
+_SENT_AT_ONCE = 1 << 12  # gaussians that a thread brings to a bucket
 _OVERHEAD_BYTES = 24 << 20
 _NAMES = ("points", "spare", "order", "rows")
 
@@ -341,28 +343,30 @@ def _write_rows(
     """The second pass: every gaussian to its bucket, where they keep the order of the asset; the digest."""
     ends = _ends_in_buckets(order, offset, len(buffer), asset_gaussians)
     hashes: list[bytes] = []
-    at = offset[:-1].copy()
     with _pool() as pool:
         for number, (first, block) in enumerate(_blocks(tiles, buffer, bar)):
             hashes += pool.map(_hash, parts_of(block))
-            for bucket in np.flatnonzero(ends[:, number] > at):
-                begin, end = int(at[bucket]), int(ends[bucket, number])
-                for start in range(begin, end, PIECE):
-                    index = order.read(start, min(start + PIECE, end)).astype(np.int64) - first
-                    columns = [array[index].reshape(len(index), -1) for array in vars(block).values()]
+            arrays = [array.reshape(len(block), -1) for array in vars(block).values()]
+
+            def send(begin: int, end: int, first: int = first, arrays: Any = arrays) -> None:
+                for start in range(begin, end, _SENT_AT_ONCE):
+                    index = order.read(start, min(start + _SENT_AT_ONCE, end)).astype(np.int64) - first
+                    # `take`, other than an index in brackets, lets other threads go on.
+                    columns = [array.take(index, axis=0) for array in arrays]
                     rows.write(start, np.concatenate(columns, axis=1))
-                at[bucket] = end
+
+            deque(pool.map(send, ends[:, number].tolist(), ends[:, number + 1].tolist()), maxlen=0)
     return page_hash([np.frombuffer(b"".join(hashes), np.uint8)]).hex()
 
 
 def _ends_in_buckets(
     order: RowFile, offset: npt.NDArray[np.int64], block: int, asset_gaussians: int
 ) -> npt.NDArray[np.int64]:
-    """(B, blocks): in the order, where what each bucket has of each block of the asset ends."""
-    counts = np.zeros((len(offset) - 1, -(-asset_gaussians // block)), np.int64)
+    """(B, blocks + 1): in the order, where each bucket begins and what it has of each block ends."""
+    counts = np.zeros((len(offset) - 1, 1 - (-asset_gaussians // block)), np.int64)
     for bucket, (begin, end) in enumerate(zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)):
         for index in order.blocks(begin, end, _MOST_IN_BUCKET):
-            counts[bucket] += np.bincount(index // np.uint32(block), minlength=counts.shape[1])
+            counts[bucket, 1:] += np.bincount(index // np.uint32(block), minlength=counts.shape[1] - 1)
     return offset[:-1, None] + np.cumsum(counts, axis=1)
 
 
