@@ -11,14 +11,13 @@ import scenes
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 from v3dg import BuildConfig, Gaussians, _core, build_bundle
-from v3dg._device import CPU
 from v3dg._files import replacing
 from v3dg.build import build_file, levels_path
 from v3dg.build.assemble import assemble
 from v3dg.build.fit import fit_config
+from v3dg.build.leaves import MemoryLeaves
 from v3dg.build.plan import Plan
 from v3dg.build.simplify import Level, LevelTables, build_levels
-from v3dg.build.whole import Job, SplitAsset
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import writing
 from v3dg.bundle.pages import PageLayout
@@ -42,8 +41,8 @@ def asset():
 
 
 def in_split_order(asset, config):
-    leaves = SplitAsset(Job.of(asset, config, SEED, "refuse"), CPU)
-    return leaves.read(0, len(leaves))
+    leaves = MemoryLeaves(asset, config, "refuse")
+    return leaves.read(0, leaves.num_gaussians)
 
 
 def arrays_of(level):

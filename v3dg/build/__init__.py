@@ -7,11 +7,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
 
+from v3dg import _device
 from v3dg._device import Device
 from v3dg.build.checkpoint import discard_levels
 from v3dg.build.config import BuildConfig
 from v3dg.build.files import build_file, levels_path
-from v3dg.build.whole import Job, build_into
+from v3dg.build.leaves import MemoryLeaves
+from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.pages import MemoryPages, PageLayout
@@ -57,14 +59,12 @@ def build_bundle(
         MemoryError: The device has too little memory; the message has the numbers.
         KeyboardInterrupt: Ctrl-C; threads have stopped, finished levels are at `resume_path`.
     """
+    config = config or BuildConfig()
+    devices = devices_for(device, asset)
+    with _device.memory_errors():
+        leaves = MemoryLeaves(asset, config, unusable, devices[0])
     memory = _Memory()
-    build_into(
-        memory.open,
-        Job.of(asset, config, seed, unusable),
-        progress=progress,
-        device=device,
-        resume_path=resume_path,
-    )
+    build_into(memory.open, leaves, config, seed, devices=devices, progress=progress, resume_path=resume_path)
     return memory.bundle
 
 

@@ -1,26 +1,31 @@
-"""From an asset's file to a bundle's: built if need be, and gone on with after an interrupt."""
+"""From files of an asset to a bundle's: built if need be, and gone on with after an interrupt."""
 
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from v3dg import _device, _files
 from v3dg._device import Device
 from v3dg.build.checkpoint import discard_levels
 from v3dg.build.config import BuildConfig
-from v3dg.build.whole import Job, build_into
+from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
+from v3dg.build.leaves_on_disk import leaves_on_disk, size_of
+from v3dg.build.memory import for_leaves, in_bytes, most_units
+from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle
 from v3dg.bundle.file import writing
 from v3dg.gaussians import Gaussians
-from v3dg.io import read_asset
+
+AssetPath = str | os.PathLike[str]
 
 
 def build_file(
-    asset_path: str | os.PathLike[str],
+    asset_path: AssetPath | Sequence[AssetPath],
     bundle_path: str | os.PathLike[str],
     *,
     asset: Gaussians | None = None,
@@ -30,52 +35,94 @@ def build_file(
     device: str | Device = "auto",
     resume: bool = False,
     unusable: Literal["drop", "refuse"] = "drop",
+    memory: int | str | None = None,
 ) -> tuple[Bundle, bool]:
-    """Build the bundle of an asset's file, straight into a file.
+    """Build the bundle of an asset's file, or of several that make one asset, straight into a file.
 
-    Beside the asset, memory holds no more than level 0 and the level at work. Until the bundle is there,
-    finished levels are kept at `levels_path`.
+    Until the bundle is there, finished levels are kept at `levels_path`. An asset that does not fit in memory
+    is brought into order in a scratch folder beside the bundle, which is removed.
 
     Args:
         asset: What is in the asset's file, where it is in memory already.
         resume: Keep a bundle that says that it was made of these gaussians with these settings, and go on
             from the levels of a build that was interrupted; otherwise all is made anew.
+        memory: Of the host, for the build beside what the process has: bytes, or text like "8GiB". By default
+            half of what is free.
         config, seed, progress, device, unusable: As for `build_bundle`.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
 
     Raises:
+        ValueError: Memory is too little, and the message says how much is needed.
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As `read_asset` and `build_bundle`.
     """
-    asset_path, bundle_path = Path(asset_path), Path(bundle_path)
+    paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
+    bundle_path = Path(bundle_path)
+    config = config or BuildConfig()
     levels = levels_path(bundle_path)
     _files.check_folder(bundle_path)
-    _device.resolve(device)  # before anything is read
+    devices = devices_for(device, asset)  # before anything is read
+    num_bytes = in_bytes(memory)
     if not resume:
         discard_levels(levels)
-    if asset is None:
-        asset = read_asset(asset_path)
     try:
-        job = Job.of(asset, config, seed, unusable)
-        del asset
-        is_kept = resume and _is_of(bundle_path, job)
-        if not is_kept:
-            # The levels beside the bundle are locked, so no other build writes to it.
-            open_sink = partial(writing, bundle_path, is_locked=True)
-            build_into(open_sink, job, progress=progress, device=device, resume_path=levels)
+        with _leaves(paths, asset, bundle_path, num_bytes, config, unusable, devices[0], progress) as leaves:
+            del asset
+            is_kept = resume and _is_made_with(bundle_path, made_with(leaves, config, seed))
+            if not is_kept:
+                build_into(
+                    # The levels beside the bundle are locked, so no other build writes to it.
+                    partial(writing, bundle_path, is_locked=True),
+                    leaves,
+                    config,
+                    seed,
+                    devices=devices,
+                    progress=progress,
+                    resume_path=levels,
+                    most_units=most_units(num_bytes, leaves),
+                )
     except ValueError as error:
-        place = f"{asset_path}: " if str(error).startswith("asset: ") else ""
+        place = f"{os.fspath(paths[0])}: " if str(error).startswith("asset: ") else ""
         raise ValueError(f"{place}{error}") from None
     with suppress(RuntimeError):  # another build to the same place has begun
         discard_levels(levels)
     return Bundle.open(bundle_path), not is_kept
 
 
-def _is_of(bundle_path: Path, job: Job) -> bool:
-    """Whether a bundle is there and says that it was made by this job."""
+@contextmanager
+def _leaves(
+    paths: Sequence[AssetPath],
+    asset: Gaussians | None,
+    bundle_path: Path,
+    memory: int,
+    config: BuildConfig,
+    unusable: Literal["drop", "refuse"],
+    device: Device,
+    progress: bool,
+) -> Iterator[Leaves]:
+    if asset is not None:
+        with _device.memory_errors():
+            leaves = MemoryLeaves(asset, config, unusable, device)
+        del asset
+        yield leaves
+        return
+    with leaves_on_disk(
+        paths,
+        bundle_path.with_name(bundle_path.name + ".scratch"),
+        memory=for_leaves(memory, *size_of(paths)),
+        config=config,
+        unusable=unusable,
+        device=device,
+        progress=progress,
+    ) as leaves_:
+        yield leaves_
+
+
+def _is_made_with(bundle_path: Path, how: dict[str, Any]) -> bool:
+    """Whether a bundle is there and says that it was made so."""
     try:
-        return Bundle.open(bundle_path).config == job.made_with
+        return Bundle.open(bundle_path).config == how
     except (ValueError, OSError):  # none, damaged, or of another version: build it
         return False
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import operator
+import threading
 import warnings
 from collections import Counter
-from typing import Literal, Protocol
+from dataclasses import asdict
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core, _device, cleaning
+from v3dg._device import Device
 from v3dg.build.checkpoint import digest_of
 from v3dg.build.config import BuildConfig
 from v3dg.gaussians import Gaussians
@@ -28,6 +32,8 @@ class Leaves(Protocol):
         asset_gaussians: Those of the asset, with those that cannot be drawn.
         dropped: How many of each kind cannot be drawn, as `cleaning` counts them.
         digest: Of the asset; docs/format.md has the definition.
+        gaussian_bytes: Of one in memory.
+        resident_bytes: Memory of the host that they take as long as they are read.
     """
 
     @property
@@ -40,40 +46,80 @@ class Leaves(Protocol):
     def dropped(self) -> dict[str, int]: ...
     @property
     def digest(self) -> str: ...
+    @property
+    def gaussian_bytes(self) -> int: ...
+    @property
+    def resident_bytes(self) -> int: ...
     def read(self, first: int, last: int) -> Gaussians:
-        """Leaves `first` to `last`, on the host, in arrays of their own."""
+        """Leaves `first` to `last`, in arrays of their own."""
 
 
 class MemoryLeaves:
-    """The leaves of an asset in memory, on any device.
+    """The leaves of an asset in memory, on any device, that are split on another when they are first read.
 
     Raises:
         ValueError: The asset has no gaussian that can be drawn; or wrong ones, and they are to be refused.
     """
 
-    def __init__(self, asset: Gaussians, config: BuildConfig, unusable: Unusable = "drop") -> None:
+    def __init__(
+        self,
+        asset: Gaussians,
+        config: BuildConfig,
+        unusable: Unusable = "drop",
+        device: Device = _device.CPU,
+    ) -> None:
+        if str(asset.means.dtype).endswith("64"):
+            raise ValueError("asset: expected float32 arrays, got float64; convert them first")
+        if unusable not in ("drop", "refuse"):
+            raise ValueError(f"unusable: expected 'drop' or 'refuse', got {unusable!r}")
         asset = _device.place(asset, _device.of(asset.means))
         tally = Tally()
-        drawable = np.concatenate([np.zeros(0, bool), *map(tally.add, parts_of(asset))])
+        self._drawable = np.concatenate([np.zeros(0, bool), *map(tally.add, parts_of(asset))])
         tally.check(unusable)
         self.num_gaussians = tally.num_drawable
         self.asset_gaussians = len(asset)
         self.sh_degree = asset.sh_degree
         self.dropped = tally.counts
         self.digest = digest_of(asset)
-        self._asset = asset
-        is_whole = self.num_gaussians == len(asset)
-        depth = _core.num_halvings(self.num_gaussians, config.cluster_size)
-        order, _ = _core.median_split(
-            asset.means if is_whole else asset.means[drawable],
-            np.array([0, self.num_gaussians]),
-            depth,
-        )
-        order = _device.to_host(order).astype(np.int32 if len(asset) < 1 << 31 else np.int64)
-        self._order = order if is_whole else np.flatnonzero(drawable).astype(order.dtype)[order]
+        self.gaussian_bytes = sum(array[:1].nbytes for array in vars(asset).values())
+        self.resident_bytes = len(asset) * (self.gaussian_bytes + 4)
+        self._asset, self._config, self._device = asset, config, device
+        self._order: npt.NDArray[np.integer[Any]] | None = None
+        self._lock = threading.Lock()
 
     def read(self, first: int, last: int) -> Gaussians:
-        return self._asset.subset(self._order[first:last]).numpy()
+        """Leaves `first` to `last`, where the asset is."""
+        with self._lock:
+            if self._order is None:
+                self._order = self._split()
+        return self._asset.subset(self._order[first:last])
+
+    def _split(self) -> npt.NDArray[np.integer[Any]]:
+        means = _device.place_rows(self._asset.means, self._drawable, self._device)
+        depth = _core.num_halvings(self.num_gaussians, self._config.cluster_size)
+        order, _ = _core.median_split(means, np.array([0, self.num_gaussians]), depth)
+        kind: Any = np.int32 if self.asset_gaussians < 1 << 31 else np.int64
+        rows: npt.NDArray[np.integer[Any]] = np.flatnonzero(self._drawable).astype(kind)
+        sorted_: npt.NDArray[np.integer[Any]] = rows[_device.to_host(order)]
+        return sorted_
+
+
+def made_with(leaves: Leaves, config: BuildConfig, seed: int) -> dict[str, Any]:
+    """What the config of a bundle says of how it was made.
+
+    Raises:
+        ValueError: The seed is out of range.
+    """
+    seed = operator.index(seed)
+    if not 0 <= seed < 2**58:
+        raise ValueError(f"seed: expected 0 to 2^58 - 1, got {seed}")
+    return {
+        "build": asdict(config),
+        "seed": seed,
+        "asset_gaussians": leaves.asset_gaussians,
+        "asset_digest": leaves.digest,
+        "dropped": leaves.dropped,
+    }
 
 
 def parts_of(gaussians: Gaussians) -> list[Gaussians]:
@@ -111,4 +157,4 @@ class Tally:
         if self.num_drawable == 0:
             raise ValueError(f"asset: expected a gaussian that can be drawn, got none: {text}")
         if self.num_wrong:
-            warnings.warn(f"asset: {text}; they are left out", cleaning.AssetWarning, stacklevel=3)
+            warnings.warn(f"asset: {text}; they are left out", cleaning.AssetWarning, stacklevel=4)

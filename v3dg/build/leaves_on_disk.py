@@ -16,7 +16,7 @@ import shutil
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,11 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core
+from v3dg._device import CPU, Device
 from v3dg.build import external_split
 from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import PIECE, Leaves, MemoryLeaves, Tally, Unusable, parts_of
+from v3dg.build.memory import in_mib
 from v3dg.build.scratch import RowFile, scratch_folder
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.format import page_hash
@@ -57,6 +59,15 @@ class DiskLeaves:
     digest: str
     _bucket_offset: npt.NDArray[np.int64]
     _depth_left: int  # of the split inside of each bucket
+
+    @property
+    def gaussian_bytes(self) -> int:
+        return gaussian_bytes(self.sh_degree)
+
+    @property
+    def resident_bytes(self) -> int:
+        """Of the bucket that is being read."""
+        return self.bucket_bytes
 
     @property
     def bucket_bytes(self) -> int:
@@ -89,6 +100,7 @@ def leaves_on_disk(
     memory: int,
     config: BuildConfig,
     unusable: Unusable = "drop",
+    device: Device = CPU,
     progress: bool = False,
 ) -> Iterator[Leaves]:
     """The leaves of the asset that some files make together, one after the other, within so much memory.
@@ -102,6 +114,7 @@ def leaves_on_disk(
             killed build left there is removed first.
         memory: Bytes beside what the process already has, until the leaves are there. Reading leaves then
             takes what `DiskLeaves` says.
+        device: Where an asset that fits in memory is split.
         unusable: As for `build_bundle`.
         progress: Show a bar with the gaussians read.
 
@@ -122,16 +135,27 @@ def leaves_on_disk(
     sizes = _Sizes.of(memory, degree, tiles)
     folder = Path(folder)
     fits = count <= sizes.in_memory
-    with scratch_folder(folder, _NAMES), _bar(progress, count if fits else 2 * count) as bar:
+    # Where none is needed, what a killed build left is removed.
+    scratch = nullcontext() if fits and not os.path.lexists(folder) else scratch_folder(folder, _NAMES)
+    with scratch, _bar(progress, count if fits else 2 * count) as bar:
         if fits:
             buffer = Codec(degree).empty(count)
             for _ in _blocks(tiles, buffer, bar):
                 pass
             bar.close()
-            yield MemoryLeaves(buffer, config, unusable)
+            leaves = MemoryLeaves(buffer, config, unusable, device)
+            del buffer
+            yield leaves
         else:
             _check_disk(folder, count, degree)
             yield _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
+
+
+def size_of(paths: Sequence[str | os.PathLike[str]]) -> tuple[int, int]:
+    """Gaussians of the asset that some files make together, and bytes of one in memory, as headers say."""
+    tiles = [_Tile.of(path) for path in paths]
+    degree = max((tile.sh_degree for tile in tiles), default=0)
+    return sum(tile.num_gaussians for tile in tiles), gaussian_bytes(degree)
 
 
 @dataclass(frozen=True)
@@ -191,7 +215,7 @@ class _Sizes:
                 if largest.whole_bytes
                 else ""
             )
-            raise ValueError(f"memory: expected at least {_in_mib(least)}{why}, got {_in_mib(memory)}")
+            raise ValueError(f"memory: expected at least {in_mib(least)}{why}, got {in_mib(memory)}")
         for_block = memory - overhead - largest.whole_bytes
         for_split = memory - _OVERHEAD_BYTES
         return _Sizes(
@@ -207,16 +231,12 @@ def _bytes_in_bucket(degree: int) -> int:
     return 2 * gaussian_bytes(degree) + external_split.FITTING_BYTES
 
 
-def _in_mib(num_bytes: int) -> str:
-    return f"{-(-num_bytes >> 20):,} MiB"
-
-
 def _check_disk(folder: Path, count: int, degree: int) -> None:
     needed = count * (4 + max(gaussian_bytes(degree), 2 * 16))
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise OSError(
-            f"{folder}: expected {_in_mib(needed)} free for scratch, got {_in_mib(free)}; "
+            f"{folder}: expected {in_mib(needed)} free for scratch, got {in_mib(free)}; "
             "free some, write to another disk, or give so much memory that none is needed"
         )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -36,7 +37,8 @@ class Build(OnDevice):
     """Build a bundle from a trained asset, or from each of many; one that fails does not stop the others."""
 
     assets: Annotated[tuple[Path, ...], tyro.conf.Positional, _SEVERAL]
-    """Files of trained gaussians, or folders of such files."""
+    """Files of trained gaussians, or folders of such files. With an --output that ends in .v3dg they make
+    one asset together."""
     output: Annotated[Path | None, option("PATH", "-o")] = None
     """Bundle to write, or the folder for those of many assets; if not given, beside each asset."""
     config: Literal["default", "paper"] = "default"
@@ -49,6 +51,9 @@ class Build(OnDevice):
     """Refuse an asset with wrong values, instead of leaving out the gaussians that have them."""
     resume: Flag = False
     """Continue after the last finished level; keep bundles of these gaussians and settings."""
+    memory: Annotated[str | None, option("SIZE")] = None
+    """Memory of the host for the build, as 8GiB; half of what is free if not given. An asset that does not
+    fit is brought into order on the disk of the output."""
     quiet: Flag = False
     """Show no progress."""
 
@@ -58,9 +63,10 @@ def run(options: Build) -> None:
         raise UsageError(
             "PATH: expected one or more assets, or a folder of them, got nothing; run v3dg build --help"
         )
-    if len(options.assets) == 1 and not options.assets[0].is_dir():
-        asset = options.assets[0]
-        result = _build(options, asset, options.output or asset.with_suffix(".v3dg"))
+    is_one = options.output is not None and options.output.suffix == ".v3dg"
+    if is_one or (len(options.assets) == 1 and not options.assets[0].is_dir()):
+        assets = _files_of(options.assets)
+        result = _build(options, assets, options.output or assets[0].with_suffix(".v3dg"))
         print_result(options.json, result, _lines(result))
     else:
         _run_many(options)
@@ -74,7 +80,7 @@ def _run_many(options: Build) -> None:
         if not options.quiet:
             tell(f"[{len(results) + 1}/{len(outputs)}] {asset}")
         try:
-            results.append(_build(options, asset, output))
+            results.append(_build(options, [asset], output))
         except FAILURES as error:
             results.append({"asset": str(asset), "status": "failed", "error": failure_text(error)})
             if not options.quiet:
@@ -111,13 +117,10 @@ def _run_many(options: Build) -> None:
         raise RuntimeError(f"{len(failed)} of {len(results)} assets failed: {failed[0]['error']}{others}")
 
 
-def _outputs(options: Build) -> dict[Path, Path]:
-    """Where the bundle of each asset goes, by asset."""
-    folder = options.output
-    if folder is not None and folder.suffix == ".v3dg":
-        raise UsageError(f"--output: expected a folder for the bundles of many assets, got {folder}")
+def _files_of(paths: Sequence[Path]) -> list[Path]:
+    """Files as they are, and those of folders; each once."""
     assets: list[Path] = []
-    for path in options.assets:
+    for path in paths:
         found = [path]
         if path.is_dir():
             found = sorted(p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file())
@@ -126,10 +129,17 @@ def _outputs(options: Build) -> dict[Path, Path]:
                     f"{path}: expected a folder with assets ({', '.join(SUFFIXES)}), got one without"
                 )
         assets += found
+    return list(dict.fromkeys(assets))
+
+
+def _outputs(options: Build) -> dict[Path, Path]:
+    """Where the bundle of each asset goes, by asset."""
+    folder = options.output
+    assets = _files_of(options.assets)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     asset_of: dict[Path, Path] = {}
-    for asset in dict.fromkeys(assets):
+    for asset in assets:
         output = (asset if folder is None else folder / asset.name).with_suffix(".v3dg")
         if output in asset_of:
             raise ValueError(
@@ -139,9 +149,10 @@ def _outputs(options: Build) -> dict[Path, Path]:
     return {asset: output for output, asset in asset_of.items()}
 
 
-def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
+def _build(options: Build, asset_paths: Sequence[Path], output: Path) -> dict[str, Any]:
     """Build and write one bundle; what was done, as JSON values."""
-    require_file(asset_path, *SUFFIXES)
+    for path in asset_paths:
+        require_file(path, *SUFFIXES)
     if output.suffix != ".v3dg":
         raise ValueError(f"{output}: expected a file name ending in .v3dg")
     start = time.perf_counter()
@@ -157,7 +168,7 @@ def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AssetWarning)  # the result says it
             bundle, is_built = build_file(
-                asset_path,
+                asset_paths,
                 output,
                 config=config,
                 seed=options.seed,
@@ -165,13 +176,14 @@ def _build(options: Build, asset_path: Path, output: Path) -> dict[str, Any]:
                 device=options.device,
                 resume=options.resume,
                 unusable="refuse" if options.strict else "drop",
+                memory=options.memory,
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{to_resume()}") from None
     except OSError as error:  # a full disk, say
         raise OSError(error.errno, f"{error.strerror}{to_resume()}", error.filename) from None
     return {
-        "asset": str(asset_path),
+        "asset": str(asset_paths[0]) if len(asset_paths) == 1 else [str(path) for path in asset_paths],
         "output": str(output),
         "status": "built" if is_built else "kept",
         "asset_gaussians": bundle.config["asset_gaussians"],

@@ -1,0 +1,75 @@
+"""How much memory of the host a build may use, and what that is enough for."""
+
+from __future__ import annotations
+
+import os
+import re
+from contextlib import suppress
+from pathlib import Path
+
+from v3dg.build.leaves import Leaves
+from v3dg.build.whole import UNIT_LEAVES
+
+_UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+# What a leaf of a unit takes until its levels are written: arrays of its size, whatever the SH degree, and
+# copies of it. A unit of 1,048,576 leaves took 380 bytes a leaf at SH degree 0, where a gaussian has 56, and
+# 870 at degree 3, where it has 236.
+_LEAF_BYTES, _LEAF_COPIES = 320, 2.5
+
+
+def in_bytes(memory: int | str | None) -> int:
+    """An amount of memory: bytes, or text like "8GiB"; None is half of what is free.
+
+    Raises:
+        ValueError: It is neither.
+    """
+    if memory is None:
+        return _free_bytes() // 2
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", str(memory), re.IGNORECASE)
+    if isinstance(memory, bool) or match is None or not float(match[1]) > 0:
+        raise ValueError(f"memory: expected bytes, or text like '8GiB', got {memory!r}")
+    return int(min(float(match[1]) * _UNITS[match[2].upper()], 2.0**62))
+
+
+def for_leaves(memory: int, num_gaussians: int, gaussian_bytes: int) -> int:
+    """What a unit leaves of the memory to the leaves.
+
+    Raises:
+        ValueError: Nothing.
+    """
+    least = unit_bytes(num_gaussians, gaussian_bytes)
+    if memory <= least:
+        raise ValueError(
+            f"memory: expected at least {in_mib(least)} for a unit of the build, got {in_mib(memory)}"
+        )
+    return memory - least
+
+
+def most_units(memory: int, leaves: Leaves) -> int:
+    """Units that may be in memory at once, beside the leaves; at least one."""
+    each = unit_bytes(leaves.num_gaussians, leaves.gaussian_bytes)
+    return max(1, (memory - leaves.resident_bytes) // each)
+
+
+def unit_bytes(num_gaussians: int, gaussian_bytes: int) -> int:
+    """What a unit of an asset takes."""
+    leaf = _LEAF_BYTES + _LEAF_COPIES * gaussian_bytes
+    return int(min(num_gaussians, UNIT_LEAVES) * leaf)
+
+
+def in_mib(num_bytes: int) -> str:
+    """As messages say it."""
+    return f"{-(-num_bytes >> 20):,} MiB"
+
+
+def _free_bytes() -> int:
+    """Memory that the system, and the container around the process, can give."""
+    free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    with suppress(OSError, ValueError, AttributeError, TypeError):
+        text = Path("/proc/meminfo").read_text(encoding="ascii")
+        free = int(re.search(r"MemAvailable:\s*(\d+)", text)[1]) << 10  # type: ignore[index]
+    with suppress(OSError, ValueError):  # "max" is no number
+        group = Path("/sys/fs/cgroup")
+        most, used = (int((group / name).read_text()) for name in ("memory.max", "memory.current"))
+        free = min(free, max(most - used, 0))
+    return free
