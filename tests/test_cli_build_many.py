@@ -157,10 +157,43 @@ def test_an_interrupt_says_how_far_it_got(folder):
 
 def test_errors_before_anything_is_built(folder):
     fails(2, "PATH: expected one or more assets", "build", cwd=folder)
-    fails(2, "expected a folder for the bundles", "build", ".", "-o", "all.v3dg", cwd=folder)
     (folder / "empty").mkdir()
     fails(1, "empty: expected a folder with assets (.ply", "build", "empty", cwd=folder)
     v3dg.write_asset(folder / "empty" / "a.ply", tiny())
     message = "out/a.v3dg: expected one asset for it, got a.ply and empty/a.ply"
     (folder / "out").mkdir()
     fails(1, message, "build", "a.ply", "empty", "-o", "out", cwd=folder)
+
+
+def test_several_files_make_one_asset(tmp_path):
+    """Whatever the memory, and whether they are named or their folder."""
+    parts = [tiny(), tiny()]
+    (tmp_path / "tiles").mkdir()
+    for name, part in zip("ab", parts, strict=True):
+        v3dg.write_asset(tmp_path / "tiles" / f"{name}.ply", part)
+    done = run("build", "tiles/a.ply", "tiles/b.ply", "-o", "city.v3dg", *FAST, "--json", cwd=tmp_path)
+    result = json.loads(done.stdout)
+    assert result["asset"] == ["tiles/a.ply", "tiles/b.ply"]
+    assert result["asset_gaussians"] == sum(map(len, parts))
+    assert run("build", "tiles", "-o", "again.v3dg", *FAST, "--memory", "1GiB", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "city.v3dg").read_bytes() == (tmp_path / "again.v3dg").read_bytes()
+    for amount, message in (
+        ("much", "expected bytes, or text like '8GiB', got 'much'"),
+        ("1", "expected at least 7"),
+    ):
+        fails(1, f"memory: {message}", "build", "tiles", "-o", "x.v3dg", "--memory", amount, cwd=tmp_path)
+
+
+def test_an_asset_larger_than_memory_makes_the_same_bundle(tmp_path, monkeypatch):
+    from v3dg.build import leaves_on_disk
+
+    asset = make_asset(num_gaussians=3000, seed=1)
+    v3dg.write_asset(tmp_path / "a.ply", asset)
+    options = {"config": v3dg.BuildConfig(steps=2, num_views=2), "progress": False, "device": "cpu"}
+    build_file(tmp_path / "a.ply", tmp_path / "whole.v3dg", **options)
+    sizes = leaves_on_disk._Sizes(in_memory=100, in_block=1 << 16, in_node=700, in_bucket=300)
+    monkeypatch.setattr(leaves_on_disk._Sizes, "of", lambda *_: sizes)
+    monkeypatch.setattr("v3dg.build.whole.UNIT_LEAVES", 1 << 20)
+    build_file(tmp_path / "a.ply", tmp_path / "disk.v3dg", **options)
+    assert (tmp_path / "disk.v3dg").read_bytes() == (tmp_path / "whole.v3dg").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "disk.v3dg", "whole.v3dg"]

@@ -61,13 +61,14 @@ def files(tmp_path_factory):
     config = v3dg.BuildConfig(steps=10, cluster_size=64)
     bundle = v3dg.build_bundle(asset, config=config, progress=False, device="cpu")
     bundle.write(folder / "donut.v3dg")
-    for name in ("plants", "assets", "trees"):
+    for name in ("plants", "assets", "trees", "tiles"):
         (folder / name).mkdir()
     bundle.write(folder / "plants" / "tree.v3dg")
     for i in range(8):
         tree = asset.subset(slice(100 * i, 100 * i + 100))
         v3dg.write_asset(folder / "trees" / f"tree{i}.ply", tree)
         v3dg.write_asset(folder / "assets" / f"asset{i}.ply", tree)
+        v3dg.write_asset(folder / "tiles" / f"tile{i}.ply", tree)
     scene = v3dg.Scene()
     scene.add(bundle, positions=[[0, 0, 0], [1, 0, 0]])
     around = v3dg.turntable((0, 0, 0), 3, 6, width=64, height=48)

@@ -15,7 +15,7 @@ from v3dg.build.checkpoint import discard_levels
 from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.build.leaves_on_disk import leaves_on_disk, size_of
-from v3dg.build.memory import for_leaves, in_bytes, most_units
+from v3dg.build.memory import in_bytes, most_units, unit_bytes
 from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle
 from v3dg.bundle.file import writing
@@ -110,7 +110,8 @@ def _leaves(
     with leaves_on_disk(
         paths,
         bundle_path.with_name(bundle_path.name + ".scratch"),
-        memory=for_leaves(memory, *size_of(paths)),
+        memory=memory,
+        reserved=unit_bytes(*size_of(paths)),
         config=config,
         unusable=unusable,
         device=device,

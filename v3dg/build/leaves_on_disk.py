@@ -100,6 +100,7 @@ def leaves_on_disk(
     memory: int,
     config: BuildConfig,
     unusable: Unusable = "drop",
+    reserved: int = 0,
     device: Device = CPU,
     progress: bool = False,
 ) -> Iterator[Leaves]:
@@ -114,6 +115,7 @@ def leaves_on_disk(
             killed build left there is removed first.
         memory: Bytes beside what the process already has, until the leaves are there. Reading leaves then
             takes what `DiskLeaves` says.
+        reserved: Of the memory, what is for others from the beginning.
         device: Where an asset that fits in memory is split.
         unusable: As for `build_bundle`.
         progress: Show a bar with the gaussians read.
@@ -132,12 +134,12 @@ def leaves_on_disk(
     if count >= 1 << 32:
         raise ValueError(f"asset: expected fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
-    sizes = _Sizes.of(memory, degree, tiles)
+    sizes = _Sizes.of(memory, reserved, degree, tiles)
     folder = Path(folder)
     fits = count <= sizes.in_memory
     # Where none is needed, what a killed build left is removed.
     scratch = nullcontext() if fits and not os.path.lexists(folder) else scratch_folder(folder, _NAMES)
-    with scratch, _bar(progress, count if fits else 2 * count) as bar:
+    with scratch, _bar(progress and not fits, 2 * count) as bar:
         if fits:
             buffer = Codec(degree).empty(count)
             for _ in _blocks(tiles, buffer, bar):
@@ -198,7 +200,7 @@ class _Sizes:
     in_bucket: int
 
     @staticmethod
-    def of(memory: int, degree: int, tiles: Sequence[_Tile]) -> _Sizes:
+    def of(memory: int, reserved: int, degree: int, tiles: Sequence[_Tile]) -> _Sizes:
         """What fits in so much memory.
 
         Raises:
@@ -208,7 +210,7 @@ class _Sizes:
         # Beside the block, a piece of it as it is decoded, in double precision.
         overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
         largest = max(tiles, key=lambda tile: tile.whole_bytes)
-        least = overhead + largest.whole_bytes + PIECE * gaussian
+        least = reserved + overhead + largest.whole_bytes + PIECE * gaussian
         if memory < least:
             why = (
                 f" for {os.fspath(largest.path)}, whose format can only be read whole (or convert it to .ply)"
@@ -216,6 +218,7 @@ class _Sizes:
                 else ""
             )
             raise ValueError(f"memory: expected at least {in_mib(least)}{why}, got {in_mib(memory)}")
+        memory -= reserved
         for_block = memory - overhead - largest.whole_bytes
         for_split = memory - _OVERHEAD_BYTES
         return _Sizes(
@@ -245,9 +248,14 @@ def _bar(is_visible: bool, total: int) -> Any:
     """Of gaussians read."""
     from tqdm import tqdm
 
-    disable = not is_visible
     return tqdm(
-        desc="reading", total=total, unit=" gaussians", unit_scale=True, dynamic_ncols=True, disable=disable
+        desc="reading",
+        total=total,
+        unit=" gaussians",
+        unit_scale=True,
+        dynamic_ncols=True,
+        leave=False,
+        disable=not is_visible,
     )
 
 

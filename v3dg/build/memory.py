@@ -31,20 +31,6 @@ def in_bytes(memory: int | str | None) -> int:
     return int(min(float(match[1]) * _UNITS[match[2].upper()], 2.0**62))
 
 
-def for_leaves(memory: int, num_gaussians: int, gaussian_bytes: int) -> int:
-    """What a unit leaves of the memory to the leaves.
-
-    Raises:
-        ValueError: Nothing.
-    """
-    least = unit_bytes(num_gaussians, gaussian_bytes)
-    if memory <= least:
-        raise ValueError(
-            f"memory: expected at least {in_mib(least)} for a unit of the build, got {in_mib(memory)}"
-        )
-    return memory - least
-
-
 def most_units(memory: int, leaves: Leaves) -> int:
     """Units that may be in memory at once, beside the leaves; at least one."""
     each = unit_bytes(leaves.num_gaussians, leaves.gaussian_bytes)
