@@ -49,30 +49,30 @@ def add_button(gui: Any, label: str, act: Callable[[], None]) -> None:
 
 
 class BrowserCamera:
-    """What a browser tab looks from, which both its user and the viewer move."""
+    """What a browser tab, its client, looks from at a scene; both its user and the viewer move it."""
 
     def __init__(self, client: viser.ClientHandle, scene_view: SceneView) -> None:
-        self._client, self._scene_view = client, scene_view
+        self.client, self.scene_view = client, scene_view
 
     @property
     def view(self) -> View:
-        camera = self._client.camera
+        camera = self.client.camera
         w, x, y, z = (float(v) for v in camera.wxyz)
         px, py, pz = (float(v) for v in camera.position)
         return View((w, x, y, z), (px, py, pz), float(camera.fov), float(camera.aspect))
 
     def size(self, scale: float) -> Size:
         """Width and height of the tab's picture in px, multiplied by ``scale`` or what keeps it drawable."""
-        width, height = self._client.camera.image_width, self._client.camera.image_height
+        width, height = self.client.camera.image_width, self.client.camera.image_height
         return scaled((width, height), min(scale, _MOST_PIXELS / max(width, height)))
 
     def look(self, view: View) -> None:
         """Move to a view, to turn about what is in its middle, as far away as the scene."""
-        camera, eye = self._client.camera, np.asarray(view.position)
-        forward = view.camera(1, 1, self._scene_view.near).viewmat[2, :3]
-        distance = max(float((self._scene_view.center - eye) @ forward), 0.05 * self._scene_view.radius)
+        camera, eye = self.client.camera, np.asarray(view.position)
+        forward = view.camera(1, 1, self.scene_view.near).viewmat[2, :3]
+        distance = max(float((self.scene_view.center - eye) @ forward), 0.05 * self.scene_view.radius)
         # From where a page claims to be there may be no way.
-        with contextlib.suppress(ValueError), self._client.atomic():
+        with contextlib.suppress(ValueError), self.client.atomic():
             camera.position = eye
             camera.look_at = eye + distance * forward
             camera.wxyz = np.asarray(view.wxyz)  # whose roll the point alone leaves open
@@ -80,25 +80,13 @@ class BrowserCamera:
 
 
 class Controls:
-    """Adds the controls to the tab's panel, and tells what they are set to.
+    """Adds the controls to the tab's panel, and tells what they are set to, and that it has ``changed``."""
 
-    Args:
-        settings: What they begin with.
-        changed: Called after each change.
-    """
-
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        scene_view: SceneView,
-        camera: BrowserCamera,
-        settings: Settings,
-        changed: Callable[[], None],
-    ) -> None:
-        self._client, self._scene_view, self._camera, self._changed = client, scene_view, camera, changed
+    def __init__(self, camera: BrowserCamera, settings: Settings, changed: Callable[[], None]) -> None:
+        self.camera, self._changed = camera, changed
         self._frozen: View | None = None
-        self._gui: Any = client.gui  # whose types let no value be set
-        has_levels = scene_view.num_levels > 1
+        self._gui: Any = camera.client.gui  # whose types let no value be set
+        has_levels = camera.scene_view.num_levels > 1
         names = [name for name, shows in _SHOWS.items() if has_levels or shows not in _WANTS_LEVELS]
         self._shows = self._gui.add_dropdown("Show", names)
         self._shows.on_update(in_order(self._choose_shows))
@@ -122,7 +110,7 @@ class Controls:
     @property
     def size(self) -> Size:
         """Width and height of the picture at rest, px."""
-        return self._camera.size(value_of(self._resolution) / 100)
+        return self.camera.size(value_of(self._resolution) / 100)
 
     def _slider(self, *args: Any, **options: Any) -> Any:
         """As viser's; its values are of the type of the first."""
@@ -145,7 +133,7 @@ class Controls:
         millions = 2.0 if budget is None else budget / 1e6
         least, most = min(0.01, millions), max(20.0, millions)
         self._budget = self._slider("Millions", least, most, 0.01, millions, visible=visible and limits)
-        last_level = max(self._scene_view.num_levels - 1, 1)
+        last_level = max(self.camera.scene_view.num_levels - 1, 1)
         self._min_level = self._slider("Finest level", 0, last_level, 1, 0, visible=visible)
         hint = "All gaussians on the left, the cut on the right."
         self._split = self._slider("Split", 0.0, 1.0, 0.01, 0.0, visible=visible, hint=hint)
@@ -166,15 +154,15 @@ class Controls:
         self._changed()
 
     def _choose_freeze(self) -> None:
-        self._frozen = self._camera.view if self._freeze.value else None
+        self._frozen = self.camera.view if self._freeze.value else None
         if self._frozen is None:
-            self._client.scene.remove_by_name("/frozen")
+            self.camera.client.scene.remove_by_name("/frozen")
         else:
-            self._client.scene.add_camera_frustum(
+            self.camera.client.scene.add_camera_frustum(
                 "/frozen",
                 self._frozen.fov_y,
                 self._frozen.aspect,
-                scale=0.05 * self._scene_view.radius,
+                scale=0.05 * self.camera.scene_view.radius,
                 thickness=2.0,
                 thickness_units="screen",
                 color=(255, 190, 60),

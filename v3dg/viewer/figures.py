@@ -2,38 +2,12 @@
 
 from __future__ import annotations
 
-import html
-import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from v3dg.false_color import LEVEL_COLORS
 from v3dg.viewer.frame import MOST_COUNTED, Frame, ramp
-
-if TYPE_CHECKING:
-    import viser
-
-_SECONDS_BETWEEN_FIGURES = 0.2
-
-
-class FiguresPanel:
-    """The figures of the picture that the tab shows, or why there is none."""
-
-    def __init__(self, client: viser.ClientHandle) -> None:
-        self._html = client.gui.add_html(_box("drawing ..."))
-        self._last = 0.0
-
-    def show(self, frame: Frame, is_final: bool) -> None:
-        """Show a picture's figures; those of pictures that pass by only now and then."""
-        now = time.monotonic()
-        if is_final or now - self._last > _SECONDS_BETWEEN_FIGURES:
-            self._last = now
-            self._html.content = figures_html(frame)
-
-    def explain(self, reason: str) -> None:
-        """Show why there is no picture."""
-        self._html.content = _box(f"<b>Not drawn.</b> {html.escape(reason)}")
 
 
 def figures_html(frame: Frame) -> str:
@@ -54,7 +28,7 @@ def figures_html(frame: Frame) -> str:
         for name, value in rows
     )
     table = f'<table style="width:100%;border-spacing:0">{cells}</table>'
-    return _box(table + _legend(frame) + _levels(frame))
+    return box(table + _legend(frame) + _levels(frame))
 
 
 def _legend(frame: Frame) -> str:
@@ -96,7 +70,8 @@ def _levels(frame: Frame) -> str:
     )
 
 
-def _box(content: str) -> str:
+def box(content: str) -> str:
+    """Return what the panel shows, in the letters that it has for figures."""
     return (
         f'<div style="font-size:.8em;padding:0 .9em .4em;font-variant-numeric:tabular-nums">{content}</div>'
     )

@@ -237,12 +237,9 @@ class SceneView:
             return np.minimum(settings.gain * difference, np.float32(1)), None, in_view
         return color, None, in_view
 
-    def _all_gaussians(
-        self, camera: Camera, window: Window, stop: _core.Stop | None
-    ) -> npt.NDArray[np.float32]:
+    def _all_gaussians(self, camera: Camera, window: Window, stop: _core.Stop | None) -> Any:
         cut = select(self.scene, camera, tolerance=0.0, device=self.device)
-        color: npt.NDArray[np.float32] = self._draw(cut, camera, window, "appearance", stop)[0]
-        return color
+        return self._draw(cut, camera, window, "appearance", stop)[0]
 
     def _draw(
         self, cut: Selection, camera: Camera, window: Window, color_by: ColorBy, stop: _core.Stop | None
@@ -286,8 +283,7 @@ class SceneView:
         for b, bundle in enumerate(scene.bundles):
             clusters = cut.cluster_ids[bundle_of_pair == b]
             sizes = np.diff(bundle.clusters.offset)[clusters]
-            here = np.bincount(bundle.clusters.level[clusters], sizes, self.num_levels)
-            levels += here.astype(np.int64)
+            np.add.at(levels, bundle.clusters.level[clusters], sizes)
         return levels
 
 

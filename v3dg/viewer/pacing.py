@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from v3dg import _core
 from v3dg.select import DEFAULT_TOLERANCE
@@ -90,8 +91,7 @@ def finer_sizes(drawn: Size, full: Size) -> list[Size]:
     return sizes
 
 
-@dataclass(frozen=True)
-class Request:
+class Request(NamedTuple):
     """What a tab wants to see: full size in px, a view, settings."""
 
     view: View
@@ -183,12 +183,10 @@ class RenderLoop:
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
         """What of the settings there is time for."""
-        if self._scene_view.draws_all_while_moving:
-            least = 0.0 if draft.coarser == 1 else DEFAULT_TOLERANCE
-        else:
-            least = DEFAULT_TOLERANCE
-            if settings.compares:
-                settings = replace(settings, shows="appearance", split=0.0)
+        draws_all = self._scene_view.draws_all_while_moving
+        if settings.compares and not draws_all:
+            settings = replace(settings, shows="appearance", split=0.0)
+        least = 0.0 if draws_all and draft.coarser == 1 else DEFAULT_TOLERANCE
         return replace(settings, tolerance=max(settings.tolerance, least) * draft.coarser)
 
     def _has_news(self) -> bool:

@@ -6,48 +6,33 @@ import functools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from v3dg import _core
 from v3dg.camera_file import write_cameras
 from v3dg.cameras import Camera
 from v3dg.scene_file import write_scene
 from v3dg.video import write_video
-from v3dg.viewer.controls import BrowserCamera, Controls, add_button, in_order, value_of
+from v3dg.viewer.controls import Controls, add_button, in_order, value_of
 from v3dg.viewer.exports import Exporter, bundle_names
-from v3dg.viewer.frame import Pixels, SceneView, Settings
+from v3dg.viewer.frame import Pixels, Settings
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View
-
-if TYPE_CHECKING:
-    import viser
 
 _FILM_SIZES = {"1280 x 720": (1280, 720), "1920 x 1080": (1920, 1080), "as the window": None}
 _FPS = 30
 
 
 class PathControls:
-    """Adds the controls of a path to the tab's panel; each tab has a path of its own.
+    """Adds the controls of a path to the tab's panel; each tab has a path, and films show what it shows."""
 
-    Args:
-        name: Of the files that are saved.
-        controls: What films show.
-    """
-
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        scene_view: SceneView,
-        name: str,
-        camera: BrowserCamera,
-        controls: Controls,
-        exporter: Exporter,
-    ) -> None:
-        self._scene_view, self._name = scene_view, name
-        self._camera, self._controls, self._exporter = camera, controls, exporter
+    def __init__(self, name: str, controls: Controls, exporter: Exporter) -> None:
+        self._name, self._controls, self._exporter = name, controls, exporter
+        self._camera, self._scene_view = controls.camera, controls.camera.scene_view
         self._path, self._recording = CameraPath(), False
-        with client.gui.add_folder("Path", expand_by_default=False):
-            self._add_controls(client.gui)
+        gui = self._camera.client.gui
+        with gui.add_folder("Path", expand_by_default=False):
+            self._add_controls(gui)
         self._tell()
 
     def camera_moved(self) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +13,7 @@ from v3dg import _core
 from v3dg.cameras import Camera
 from v3dg.viewer.controls import BrowserCamera, Controls, add_button, in_order
 from v3dg.viewer.exports import Exporter
-from v3dg.viewer.figures import FiguresPanel
+from v3dg.viewer.figures import box, figures_html
 from v3dg.viewer.frame import Frame, SceneView, Settings
 from v3dg.viewer.pacing import RenderLoop, Request
 from v3dg.viewer.path_controls import PathControls
@@ -23,17 +25,11 @@ if TYPE_CHECKING:
 _NO_CAMERA = ""
 # Pictures that pass by, and those that stay.
 _DRAFT_QUALITY, _FINAL_QUALITY = 75, 94
+_SECONDS_BETWEEN_FIGURES = 0.2
 
 
 class Tab:
-    """One browser tab, until `close`.
-
-    Args:
-        name: Of the files that are saved.
-        cameras: Named cameras to jump to.
-        settings: What the controls begin with.
-        home: The view of the button that shows all.
-    """
+    """One browser tab of a `Site`, until `close`; ``home`` is the view of the button that shows all."""
 
     def __init__(
         self,
@@ -48,11 +44,11 @@ class Tab:
         self._camera = BrowserCamera(client, scene_view)
         self._exporter = Exporter(client, scene_view)
         # The panel shows them in the order in which they are made.
-        self._figures = FiguresPanel(client)
-        self._controls = Controls(client, scene_view, self._camera, settings, self._ask)
+        self._figures, self._last_figures = client.gui.add_html(box("drawing ...")), 0.0
+        self._controls = Controls(self._camera, settings, self._ask)
         add_button(client.gui, "Save picture", lambda: self._exporter.begin(self._save_picture))
         self._add_camera_controls(cameras, home)
-        path = PathControls(client, scene_view, name, self._camera, self._controls, self._exporter)
+        path = PathControls(name, self._controls, self._exporter)
         self._loop = RenderLoop(scene_view, self._show, self._fail)
         client.camera.on_update(in_order(path.camera_moved))
         client.camera.on_update(in_order(self._ask))
@@ -72,10 +68,13 @@ class Tab:
         quality = _FINAL_QUALITY if is_final else _DRAFT_QUALITY
         self._client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=quality)
         self._client.flush()  # which viser would wait for a sixtieth of a second with
-        self._figures.show(frame, is_final)
+        now = time.monotonic()
+        if is_final or now - self._last_figures > _SECONDS_BETWEEN_FIGURES:
+            self._figures.content, self._last_figures = figures_html(frame), now
 
     def _fail(self, error: Exception) -> None:
-        self._figures.explain(self._scene_view.explain(error))
+        reason = html.escape(self._scene_view.explain(error))
+        self._figures.content = box(f"<b>Not drawn.</b> {reason}")
 
     def _add_camera_controls(self, cameras: Mapping[str, Camera], home: View) -> None:
         gui: Any = self._client.gui  # whose types let no value be set
@@ -91,6 +90,5 @@ class Tab:
             self._camera.look(View.of_camera(camera))
 
     def _save_picture(self, stop: _core.Stop) -> None:
-        request = self._wanted()
-        frame = self._scene_view.frame(request.view, request.size, request.settings, stop)
+        frame = self._scene_view.frame(*self._wanted(), stop)
         self._exporter.save(f"{self._name}.png", Image.fromarray(frame.pixels).save)
