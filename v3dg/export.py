@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from v3dg import _core, _device, _files
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
+from v3dg.cameras import Floats
 from v3dg.cleaning import ball_of_most
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable, morton_order
@@ -100,23 +101,22 @@ def write_streamed_sog(
         raise ValueError(f"up: expected one of {', '.join(_TO_UPRIGHT)}, got {up!r}")
     from tqdm import tqdm
 
-    turn = _Turn(_TO_UPRIGHT[up])
+    turn = np.array([_TO_UPRIGHT[up]])
     plan = _Plan.of(bundle, chunk)
+    total = int(bundle.clusters.offset[bundle.level_range(plan.top).stop])
     with _replacing_folder(Path(folder)) as place:
-        with tqdm(
-            total=plan.num_gaussians, unit=" gaussians", unit_scale=True, desc="export", disable=not progress
-        ) as bar:
+        with tqdm(None, "export", total, unit=" gaussians", unit_scale=True, disable=not progress) as bar:
             names, lods, counts = _write_folders(place, plan, turn, bar.update)
         index = {
             "version": 1,
             "asset": {"generator": f"v3dg {__version__}"},
             "count": sum(counts),
             "counts": counts,
-            "lodLevels": plan.num_levels,
+            "lodLevels": len(counts),
             "filenames": [f"{name}/meta.json" for name in names],
             "tree": plan.tree(lods, turn),
         }
-        settings = _viewer_settings(turn.gaussians(bundle.level_gaussians(plan.top)))
+        settings = _viewer_settings(_turned(bundle.level_gaussians(plan.top), turn))
         for file, document in ((INDEX, index), ("settings.json", settings)):
             (place / file).write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
         size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
@@ -124,18 +124,18 @@ def write_streamed_sog(
 
 
 def _write_folders(
-    place: Path, plan: _Plan, turn: _Turn, advance: Callable[[int], Any]
+    place: Path, plan: _Plan, turn: Floats, advance: Callable[[int], Any]
 ) -> tuple[list[str], list[dict[str, dict[str, int]]], list[int]]:
     """Write a folder of SOG after another: their names, where each chunk's levels are, gaussians by level."""
     names: list[str] = []
     lods: list[dict[str, dict[str, int]]] = [{} for _ in range(plan.num_chunks)]
-    counts = [0] * plan.num_levels
-    for level in range(plan.num_levels):
+    counts = [0] * (plan.top + 1)
+    for level in range(plan.top + 1):
         parts: list[Gaussians] = []
         first, size = len(names), 0
         for number, clusters in enumerate(plan.clusters_of(level)):
             chunk = Gaussians.concatenate([plan.bundle.cluster_gaussians(int(c)) for c in clusters])
-            chunk = turn.gaussians(check_writable(chunk))
+            chunk = _turned(check_writable(chunk), turn)
             lods[number][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
             parts.append(chunk.subset(morton_order(chunk.means)))
             size += len(chunk)
@@ -178,34 +178,23 @@ def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
     }
 
 
-class _Turn:
-    """A rotation about the origin."""
-
-    def __init__(self, quaternion: tuple[float, float, float, float]) -> None:
-        self._quaternion = np.array([quaternion])
-        self._rotation = rotation_from_quaternion(self._quaternion)
-
-    def gaussians(self, gaussians: Gaussians) -> Gaussians:
-        turned = _core.gather(
-            bundles=[gaussians.rows],
-            instances=_core.Instances(
-                bundle=np.zeros(1, np.int32),
-                positions=np.zeros((1, 3)),
-                quaternions=self._quaternion,
-                scales=np.ones(1),
-                importance=np.ones(1, np.float32),
-            ),
-            instance=np.zeros(1, np.int32),
-            first_row=np.zeros(1, np.int64),
-            offset=np.array([0, len(gaussians)]),
-            device=_device.of(gaussians.means).number,
-        )
-        return Gaussians(*turned)
-
-    def boxes(self, boxes: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(N, 2, 3) lower and upper corners, of boxes that stay along the axes."""
-        corners = boxes.astype(np.float64) @ self._rotation[0].T
-        return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
+def _turned(gaussians: Gaussians, quaternion: Floats) -> Gaussians:
+    """Gaussians turned about the origin, by a quaternion (1, 4)."""
+    turned = _core.gather(
+        bundles=[gaussians.rows],
+        instances=_core.Instances(
+            bundle=np.zeros(1, np.int32),
+            positions=np.zeros((1, 3)),
+            quaternions=quaternion,
+            scales=np.ones(1),
+            importance=np.ones(1, np.float32),
+        ),
+        instance=np.zeros(1, np.int32),
+        first_row=np.zeros(1, np.int64),
+        offset=np.array([0, len(gaussians)]),
+        device=_device.of(gaussians.means).number,
+    )
+    return Gaussians(*turned)
 
 
 @dataclass(frozen=True)
@@ -249,14 +238,6 @@ class _Plan:
         chunk_of_cluster = np.where(clusters.level <= top, number[ancestor[group]], -1)
         return cls(bundle, top, len(tops), chunk_of_cluster, number)
 
-    @property
-    def num_levels(self) -> int:
-        return self.top + 1
-
-    @property
-    def num_gaussians(self) -> int:
-        return int(np.diff(self.bundle.clusters.offset)[self.chunk_of_cluster >= 0].sum())
-
     def clusters_of(self, level: int) -> list[NDArray[np.int64]]:
         """Ids of a level's clusters, by chunk."""
         clusters = self.bundle.level_range(level)
@@ -265,39 +246,35 @@ class _Plan:
         ends = np.cumsum(np.bincount(chunks, minlength=self.num_chunks))[:-1]
         return np.split(order + clusters.start, ends)
 
-    def tree(self, lods: list[dict[str, dict[str, int]]], turn: _Turn) -> dict[str, Any]:
-        """The spatial index: the groups above the chunks, with bounds."""
-        low = np.full((self.num_chunks, 3), np.inf)
-        high = np.full((self.num_chunks, 3), -np.inf)
-        clusters = self.bundle.clusters
+    def tree(self, lods: list[dict[str, dict[str, int]]], turn: Floats) -> dict[str, Any]:
+        """The spatial index: the groups above the chunks, with bounds, in boxes that stay along the axes."""
+        clusters, parent = self.bundle.clusters, self.bundle.groups.parent
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
-        boxes = turn.boxes(clusters.box[used])
-        np.minimum.at(low, self.chunk_of_cluster[used], boxes[:, 0])
-        np.maximum.at(high, self.chunk_of_cluster[used], boxes[:, 1])
-
-        def joined(nodes: list[dict[str, Any]]) -> dict[str, Any]:
-            if len(nodes) == 1:
-                return nodes[0]
-            bounds = [node["bound"] for node in nodes]
-            low = np.min([bound["min"] for bound in bounds], axis=0).tolist()
-            high = np.max([bound["max"] for bound in bounds], axis=0).tolist()
-            return {"bound": {"min": low, "max": high}, "children": nodes}
-
-        nodes = {}
-        for chunk, chunk_lods in enumerate(lods):
-            if any(lod["count"] for lod in chunk_lods.values()):
-                bound = {"min": low[chunk].tolist(), "max": high[chunk].tolist()}
-                nodes[chunk] = {"bound": bound, "lods": chunk_lods}
-        groups = self.bundle.groups
+        chunks = self.chunk_of_cluster[used]
+        corners = clusters.box[used].astype(np.float64) @ rotation_from_quaternion(turn[0]).T
+        order = np.argsort(chunks, kind="stable")
+        numbers, starts = np.unique(chunks[order], return_index=True)
+        parts = zip(numbers.tolist(), np.split(corners[order], starts[1:]), strict=True)
+        nodes = {number: _node(part.reshape(-1, 3), lods=lods[number]) for number, part in parts}
         of_group = {g: nodes[c] for g, c in enumerate(self.chunk_of_group.tolist()) if c in nodes}
-        if not of_group:
-            return nodes[0]
-        while set(groups.parent[list(of_group)].tolist()) != {-1}:
+        of_group = of_group or {-1: nodes[0]}
+        while of_group.keys() != {-1}:
             children: dict[int, list[dict[str, Any]]] = {}
             for group, node in of_group.items():
-                children.setdefault(int(groups.parent[group]), []).append(node)
-            of_group = {group: joined(nodes) for group, nodes in children.items()}
-        return joined(list(of_group.values()))
+                children.setdefault(int(parent[group]), []).append(node)
+            of_group = {
+                group: nodes[0]
+                if len(nodes) == 1
+                else _node([corner for node in nodes for corner in node["bound"].values()], children=nodes)
+                for group, nodes in children.items()
+            }
+        return of_group[-1]
+
+
+def _node(points: Any, **content: Any) -> dict[str, Any]:
+    """A node of the tree that bounds points."""
+    bound = {"min": np.min(points, axis=0).tolist(), "max": np.max(points, axis=0).tolist()}
+    return {"bound": bound, **content}
 
 
 @contextlib.contextmanager
