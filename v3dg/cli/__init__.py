@@ -6,9 +6,6 @@ stdout.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 from v3dg.cli import build, compare, completion, convert, demo, export, info, render, view
 from v3dg.cli._program import Commands, Program
 
@@ -36,13 +33,4 @@ No asset at hand? `v3dg demo` makes one.
 """
 
 _PROGRAM = Program("v3dg", _DESCRIPTION, COMMANDS)
-
-
-def parse(arguments: Sequence[str]) -> Any:
-    """Parse the arguments of `v3dg`."""
-    return _PROGRAM.parse(arguments)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command, by default the one this program was started with, and return its exit code."""
-    return _PROGRAM.main(arguments)
+parse, main = _PROGRAM.parse, _PROGRAM.main

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -12,8 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import tyro
 
 from v3dg.bundle import Bundle
-from v3dg.gaussians import Gaussians
-from v3dg.io import SUFFIXES, read_asset
+from v3dg.io import SUFFIXES
 
 
 class UsageError(Exception):
@@ -27,13 +27,11 @@ FAILURES = (OSError, MemoryError, ValueError, RuntimeError, ImportError)
 def failure_text(error: BaseException) -> str:
     """One line that says what failed."""
     if isinstance(error, OSError) and error.strerror:
-        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    elif isinstance(error, MemoryError):
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, MemoryError):
         numbers = f" ({error})" if str(error) else ""
-        text = f"not enough memory{numbers}; use smaller pictures or a smaller asset"
-    else:
-        text = str(error)
-    return text
+        return f"not enough memory{numbers}; use smaller pictures or a smaller asset"
+    return str(error)
 
 
 def printable(line: str) -> str:
@@ -76,10 +74,6 @@ def check_range(name: str, value: int, least: int, most: int) -> None:
         raise UsageError(f"{name}: expected {least:,} to {most:,}, got {value}")
 
 
-def load_asset_or_bundle(path: Path) -> Gaussians | Bundle:
-    return Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path)
-
-
 def require_file(path: Path, *suffixes: str) -> None:
     if not path.exists():
         raise ValueError(f"{path}: expected a file, got a path where there is none; check it")
@@ -97,6 +91,11 @@ def level_size(bundle: Bundle, level: int) -> int:
     return int(bundle.clusters.offset[clusters.stop] - bundle.clusters.offset[clusters.start])
 
 
+def finite(number: float) -> float | None:
+    """A number as JSON has it, which knows no infinity: a budget can come to that."""
+    return number if math.isfinite(number) else None
+
+
 def print_result(as_json: bool, result: dict[str, Any], lines: Iterable[str]) -> None:
     print(json.dumps(result, indent=1) if as_json else "\n".join(map(printable, lines)))
 
@@ -106,14 +105,10 @@ def table_lines(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -
 
     The first column is to the left, the others to the right.
     """
-    cells = [[_cell(form, row) for form in columns.values()] for row in rows]
-    table = [list(columns), *cells]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    aligned = [[cell.rjust(w) for cell, w in zip(row, widths, strict=True)] for row in table]
-    return [
-        "  ".join([row[0].ljust(widths[0]), *right[1:]]).rstrip()
-        for row, right in zip(table, aligned, strict=True)
-    ]
+    table = [list(columns), *([_cell(form, row) for form in columns.values()] for row in rows)]
+    first, *others = (max(map(len, column)) for column in zip(*table, strict=True))
+    line = "  ".join([f"{{:<{first}}}", *(f"{{:>{width}}}" for width in others)])
+    return [line.format(*row).rstrip() for row in table]
 
 
 def _cell(form: str, row: Mapping[str, Any]) -> str:

@@ -15,15 +15,15 @@ from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import DEFAULT_FOV_X, Camera, turntable
 from v3dg.cleaning import ball_of_most
-from v3dg.cli._common import UsageError, check_range, level_size, load_asset_or_bundle, option
+from v3dg.cli._common import UsageError, check_range, level_size, option
+from v3dg.export import Axis
 from v3dg.gaussians import Gaussians
-from v3dg.io import SUFFIXES
+from v3dg.io import SUFFIXES, read_asset
 from v3dg.pictures import MOST_SIDE, check_size
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene
 
 Subject: TypeAlias = Scene | Bundle | Gaussians
-Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 # Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
 _ENOUGH_TO_FRAME = 50_000
@@ -74,9 +74,9 @@ def is_scene(path: Path) -> bool:
 
 def load_subject(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
     """A scene with its cameras, or a bundle or an asset, which have none."""
-    if not is_scene(path):
-        return load_asset_or_bundle(path), None
-    return read_scene(path)
+    if is_scene(path):
+        return read_scene(path)
+    return Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path), None
 
 
 def choose_cameras(
@@ -115,9 +115,9 @@ def _turntable(subject: Subject, options: ViewOptions) -> dict[str, Camera]:
         means = subject.means
     else:
         assert isinstance(subject, Bundle)
-        sizes = [level_size(subject, level) for level in range(subject.num_levels)]
-        level = next((i for i, size in enumerate(sizes) if size <= _ENOUGH_TO_FRAME), len(sizes) - 1)
-        means = subject.level_gaussians(level).means if sizes else np.zeros((0, 3), np.float32)
+        levels = range(subject.num_levels)
+        level = next((i for i in levels if level_size(subject, i) <= _ENOUGH_TO_FRAME), len(levels) - 1)
+        means = subject.level_gaussians(level).means if levels else np.zeros((0, 3), np.float32)
     centre, radius = ball_of_most(means) if len(means) else (np.zeros(3), 1.0)
     narrow = math.tan(DEFAULT_FOV_X / 2) * min(1.0, options.size[1] / options.size[0])
     distance = 0.9 * radius / math.sin(math.atan(narrow))

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from v3dg import _device
+from v3dg import _device, pictures
 from v3dg._judges import Judges, mean_of
 from v3dg.bundle import Bundle
 from v3dg.cli._common import (
@@ -29,17 +29,7 @@ from v3dg.cli._common import (
 )
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 from v3dg.metrics import FLIP_MISSING, draw_truth, error_image, errors_of
-from v3dg.pictures import (
-    MOST_PIXELS_COMPARED,
-    Picture,
-    check_picture_path,
-    check_size,
-    contact_sheet,
-    read_picture,
-    to_8bit,
-    write_picture,
-)
-from v3dg.pictures import SUFFIXES as PICTURE_SUFFIXES
+from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 
 # Views from which on starting processes to measure them is quicker than doing without.
@@ -89,11 +79,11 @@ class _Pair:
 def run(options: Compare) -> None:
     from tqdm import tqdm
 
-    output = check_picture_path(options.output)
+    output = pictures.check_picture_path(options.output)
     subjects = (options.reference, options.test)
     if output.resolve() in [path.resolve() for path in subjects]:
         raise UsageError(f"--output: expected another file than those to compare, got {output}")
-    are_pictures = [path.suffix.lower() in PICTURE_SUFFIXES for path in subjects]
+    are_pictures = [path.suffix.lower() in pictures.SUFFIXES for path in subjects]
     if any(are_pictures) and not all(are_pictures):
         raise UsageError("PATH: expected two pictures, or two subjects to draw, got one of each")
     names, pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
@@ -149,7 +139,7 @@ def run(options: Compare) -> None:
 
 
 def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
-    reference, test = read_picture(options.reference), read_picture(options.test)
+    reference, test = map(pictures.read_picture, (options.reference, options.test))
     if reference.shape != test.shape:
         (height, width, _), (test_height, test_width, _) = reference.shape, test.shape
         raise ValueError(
@@ -174,9 +164,9 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
         own, path = test_cameras, options.test
     cameras = choose_cameras(options.view, path, reference, own)
     for name, camera in cameras.items():
-        check_size(f"camera {name}", camera.width, camera.height, MOST_PIXELS_COMPARED)
+        pictures.check_size(f"camera {name}", camera.width, camera.height, pictures.MOST_PIXELS_COMPARED)
         sides = (side * options.supersample for side in (camera.width, camera.height))
-        check_size(f"camera {name}, supersampled", *sides)
+        pictures.check_size(f"camera {name}, supersampled", *sides)
 
     finest = level_size(test, 0) if isinstance(test, Bundle) and test.num_levels else None
 
@@ -202,11 +192,11 @@ def _difference(row: dict[str, Any]) -> float:
 
 
 def _write(options: Compare, pair: _Pair, row: dict[str, Any]) -> None:
-    pictures = [(options.reference.name, pair.reference), (options.test.name, pair.test)]
-    pictures = [(printable(name), picture) for name, picture in pictures]
+    named = ((options.reference, pair.reference), (options.test, pair.test))
+    shown = [(printable(path.name), picture) for path, picture in named]
     if row["flip"] is not None:
-        floats = (picture / np.float32(255) for _, picture in pictures)
-        pictures.append((f"FLIP {row['flip']:.4f}", to_8bit(error_image(*floats))))
+        floats = (picture / np.float32(255) for _, picture in shown)
+        shown.append((f"FLIP {row['flip']:.4f}", to_8bit(error_image(*floats))))
     zoom = max(1, _LEAST_WIDTH // pair.test.shape[1])
-    cells = [(text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1)) for text, picture in pictures]
-    write_picture(Path(row["picture"]), contact_sheet([cells]))
+    cells = [(text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1)) for text, picture in shown]
+    pictures.write_picture(row["picture"], pictures.contact_sheet([cells]))

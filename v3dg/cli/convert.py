@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from v3dg.cli._common import (
     UsageError,
     bytes_text,
     check_range,
+    finite,
     option,
     print_result,
     require_subject,
@@ -103,6 +103,5 @@ def _cut(
         gaussians = Gaussians.concatenate([subject.cluster_gaussians(int(c)) for c in selection.cluster_ids])
     else:
         gaussians = selection.gaussians(device=CPU)
-    # JSON has no infinity, which a budget can come to.
-    tolerance = selection.tolerance if math.isfinite(selection.tolerance) else None
-    return gaussians, {"camera": name, "tolerance": tolerance, "clusters": len(selection)}
+    told = {"camera": name, "tolerance": finite(selection.tolerance), "clusters": len(selection)}
+    return gaussians, told

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,8 +12,7 @@ import tyro
 from v3dg import _files
 from v3dg.bundle import Bundle
 from v3dg.cli._common import Common, Flag, UsageError, bytes_text, option, print_result, require_file
-from v3dg.cli._views import Axis
-from v3dg.export import DEFAULT_CHUNK, INDEX, write_streamed_sog
+from v3dg.export import DEFAULT_CHUNK, INDEX, Axis, write_streamed_sog
 
 
 @dataclass
@@ -45,10 +44,7 @@ def run(options: Export) -> None:
     result = {
         "output": str(folder / INDEX),
         "levels": len(done.counts),
-        "counts": done.counts,
-        "chunks": done.chunks,
-        "files": done.files,
-        "bytes": done.bytes,
+        **asdict(done),
         "seconds": time.perf_counter() - start,
     }
     text = (

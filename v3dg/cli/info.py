@@ -20,17 +20,15 @@ from v3dg.cli._common import (
     Flag,
     bytes_text,
     level_size,
-    load_asset_or_bundle,
     print_result,
     printable,
     require_subject,
     table_lines,
 )
-from v3dg.cli._views import is_scene
+from v3dg.cli._views import load_subject
 from v3dg.gaussians import Gaussians
 from v3dg.io import asset_bytes
 from v3dg.scene import Scene
-from v3dg.scene_file import read_scene
 
 # JSON values, and lines of text.
 _Description = tuple[dict[str, Any], list[str]]
@@ -48,14 +46,13 @@ class Info:
 
 def run(options: Info) -> None:
     require_subject(options.file)
-    if is_scene(options.file):
-        description = _scene_info(options.file, *read_scene(options.file))
+    subject, cameras = load_subject(options.file)
+    if isinstance(subject, Scene):
+        description = _scene_info(options.file, subject, cameras or {})
+    elif isinstance(subject, Bundle):
+        description = _bundle_info(options.file, subject)
     else:
-        loaded = load_asset_or_bundle(options.file)
-        if isinstance(loaded, Bundle):
-            description = _bundle_info(options.file, loaded)
-        else:
-            description = _asset_info(options.file, loaded)
+        description = _asset_info(options.file, subject)
     print_result(options.json, *description)
 
 
@@ -65,15 +62,8 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
     drawable = asset.subset(findings.drawable)
     far = outliers(drawable.means)
     boxes = {"box": _box(drawable.means), "box_without_outliers": _box(drawable.means[~far])}
-    spread = {}
-    if len(drawable):
-        spread = {
-            name: [float(q) for q in np.percentile(values, (5, 50, 95))]
-            for name, values in (
-                ("longest_scale", drawable.scales.max(axis=1)),
-                ("opacity", drawable.opacities),
-            )
-        }
+    values = {"longest_scale": drawable.scales.max(axis=1), "opacity": drawable.opacities}
+    spread = {name: np.percentile(of, (5, 50, 95)).tolist() for name, of in values.items() if len(of)}
     result = {
         "path": str(path),
         "kind": "asset",

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from v3dg import _device
-from v3dg.cli._common import OnDevice, UsageError, option, print_result, require_subject, table_lines
+from v3dg.cli._common import OnDevice, UsageError, finite, option, print_result, require_subject, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 from v3dg.pictures import check_picture_path, write_picture
 from v3dg.render import render
@@ -59,19 +58,14 @@ def run(options: Render) -> None:
             device=device,
         )
         write_picture(path, _device.to_host(image.color))
-        stats = image.stats
         pictures.append(
             {
                 "picture": str(path),
                 "camera": name,
                 "width": camera.width,
                 "height": camera.height,
-                "gaussians_selected": stats.gaussians_selected,
-                "gaussians_in_frustum": stats.gaussians_in_frustum,
-                # JSON has no infinity, which a budget can come to.
-                "tolerance": stats.tolerance if math.isfinite(stats.tolerance) else None,
-                "select_ms": stats.select_ms,
-                "draw_ms": stats.draw_ms,
+                **asdict(image.stats),
+                "tolerance": finite(image.stats.tolerance),
             }
         )
     columns = {

@@ -17,7 +17,8 @@ from typing import Annotated, Literal
 import tyro
 
 from v3dg.cli._common import Threads, UsageError, option, require_subject
-from v3dg.cli._views import Axis, direction_of, load_subject
+from v3dg.cli._views import direction_of, load_subject
+from v3dg.export import Axis
 
 # Between looks for a signal: a wait without an end misses one that comes just before it.
 _SECONDS = 0.1
