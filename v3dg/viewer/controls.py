@@ -57,9 +57,8 @@ class BrowserCamera:
     @property
     def view(self) -> View:
         camera = self.client.camera
-        w, x, y, z = (float(v) for v in camera.wxyz)
-        px, py, pz = (float(v) for v in camera.position)
-        return View((w, x, y, z), (px, py, pz), float(camera.fov), float(camera.aspect))
+        wxyz, position = tuple(camera.wxyz.tolist()), tuple(camera.position.tolist())
+        return View(wxyz, position, float(camera.fov), float(camera.aspect))
 
     def size(self, scale: float) -> Size:
         """Width and height of the tab's picture in px, multiplied by ``scale`` or what keeps it drawable."""

@@ -70,11 +70,6 @@ class Settings:
     split: float = 0.0
     frozen: View | None = None
 
-    @property
-    def compares(self) -> bool:
-        """Whether all gaussians have to be drawn, too."""
-        return self.split > 0 or self.shows == "difference"
-
 
 @dataclass(frozen=True)
 class Figures:
@@ -155,8 +150,7 @@ class SceneView:
         self.near = min(0.01, 1e-3 * self.radius)
         self.num_levels = max((bundle.num_levels for bundle in self.scene.bundles), default=1)
         sizes = [bundle.clusters.offset[bundle.level_range(0).stop] for bundle in self.scene.bundles]
-        instances = np.bincount(self.scene.instance_bundle, minlength=len(sizes))
-        self.num_gaussians = int(np.dot(np.asarray(sizes, np.int64), instances)) if sizes else 0
+        self.num_gaussians = int(np.array(sizes, np.int64)[self.scene.instance_bundle].sum())
 
     @property
     def draws_all_while_moving(self) -> bool:

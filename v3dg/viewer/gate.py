@@ -92,10 +92,13 @@ class Gate:
     """Decides about requests to the server at one address of this machine.
 
     Args:
+        host: Address to listen at; ``"0.0.0.0"`` for all that this machine has.
         port: Where to listen; the next free one where it is taken.
 
     Attributes:
-        url: What a browser is to open. Where other machines can connect, a secret follows the port.
+        port: The one that was free.
+        url: What a browser is to open. Where other machines can connect, a secret that lets in who has it
+            follows the port.
 
     Raises:
         ValueError: ``host`` is not an address of this machine, or no port is free.

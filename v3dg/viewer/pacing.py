@@ -37,22 +37,12 @@ class Draft:
     size: Size
     coarser: float = 1.0
 
-    @property
-    def is_least(self) -> bool:
-        """Whether no draft is quicker."""
-        return self.coarser >= _COARSEST
-
-    @property
-    def work(self) -> float:
-        """What its time is taken to be proportional to: pixels over the factor of the tolerance."""
-        return self.size[0] * self.size[1] / self.coarser
-
 
 class Pacer:
     """Chooses how to draw a picture in time, from how long earlier ones took.
 
-    Time is taken to be proportional to work, measured with the picture that was drawn last: where it is not,
-    the choice still settles at the one that takes the target.
+    Time is taken to be proportional to work, pixels over the factor of the tolerance, measured with the
+    picture that was drawn last: where it is not, the choice still settles at the one that takes the target.
     """
 
     def __init__(self, target_ms: float = TARGET_MS) -> None:
@@ -61,7 +51,7 @@ class Pacer:
 
     def draft(self, full: Size) -> Draft:
         """Return a size with about the shape of ``full``, not larger, at first a quarter of its width."""
-        whole = full[0] * full[1]
+        whole = math.prod(full)
         share = (self._target_ms * self._work_per_ms or whole / 16) / whole
         # A little more, so that rounding refuses no step that fits.
         scale = 2 ** (math.floor(_STEPS_AN_OCTAVE * math.log2(share) / 2 + 1e-6) / _STEPS_AN_OCTAVE)
@@ -70,7 +60,7 @@ class Pacer:
 
     def drew(self, draft: Draft, milliseconds: float) -> None:
         """Take note of how long a picture took."""
-        speed = draft.work / max(milliseconds, 0.1)
+        speed = math.prod(draft.size) / draft.coarser / max(milliseconds, 0.1)
         # Slower counts at once, faster only where it lasts.
         share = 0.3 if speed > self._work_per_ms > 0 else 1.0
         self._work_per_ms += share * (speed - self._work_per_ms)
@@ -162,7 +152,7 @@ class RenderLoop:
     def _draw(self, request: Request) -> None:
         draft = self._pacer.draft(request.size)
         settings = self._while_moving(request.settings, draft)
-        stop = self._begin(math.inf if draft.is_least else PATIENCE_SECONDS)
+        stop = self._begin(PATIENCE_SECONDS if draft.coarser < _COARSEST else math.inf)
         start = time.perf_counter()
         try:
             frame = self._scene_view.frame(request.view, draft.size, settings, stop)
@@ -184,7 +174,7 @@ class RenderLoop:
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
         """What of the settings there is time for."""
         draws_all = self._scene_view.draws_all_while_moving
-        if settings.compares and not draws_all:
+        if not draws_all and (settings.split > 0 or settings.shows == "difference"):
             settings = replace(settings, shows="appearance", split=0.0)
         least = 0.0 if draws_all and draft.coarser == 1 else DEFAULT_TOLERANCE
         return replace(settings, tolerance=max(settings.tolerance, least) * draft.coarser)

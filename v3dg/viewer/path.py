@@ -39,9 +39,6 @@ class CameraPath:
             self.times.append(now)
             self.views.append(view)
 
-    def copy(self) -> CameraPath:
-        return CameraPath(self.times.copy(), self.views.copy())
-
     def at(self, seconds: float) -> View:
         """Return the view so long after the first; errors are those of `views_at`."""
         return self.views_at(np.array([seconds]))[0]

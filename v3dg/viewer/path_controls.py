@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import time
 from collections.abc import Callable, Iterator
@@ -58,7 +59,7 @@ class PathControls:
 
     def _begin(self, work: Callable[[CameraPath, _core.Stop], None]) -> None:
         """Start work on the path as it is now."""
-        self._exporter.begin(functools.partial(work, self._path.copy()))
+        self._exporter.begin(functools.partial(work, copy.deepcopy(self._path)))
 
     def _tell(self) -> None:
         count = len(self._path)

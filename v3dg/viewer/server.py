@@ -30,22 +30,14 @@ class Site:
     """The viewer as a web server, from when it is made until `close`.
 
     Args:
-        scene_view: What to show.
         name: Title of the tabs, and of the files that they save.
         cameras: Named cameras to jump to.
-        host: Address to listen at. Where other machines can connect, as at ``"0.0.0.0"``, a secret in the URL
-            lets in who has it.
-        port: Where to listen; the next free one where it is taken.
+        host, port: As of its `Gate`, whose port and URL it has, and whose errors it raises.
         tolerance, budget: What a tab begins with.
         up: (3,) direction in the world.
 
-    Attributes:
-        port: The one that was free.
-        url: What a browser is to open.
-
     Raises:
         ImportError: The extra is not installed.
-        ValueError: ``host`` is not an address of this machine.
     """
 
     def __init__(

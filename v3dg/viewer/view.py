@@ -30,10 +30,9 @@ class View:
     @classmethod
     def of_camera(cls, camera: Camera) -> View:
         """Take over pose and field of view; a principal point off the middle is lost."""
-        x, y, z = camera.position.tolist()
         half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
         wxyz = quaternion_from_rotation(camera.viewmat[:3, :3].T)
-        return cls(wxyz, (x, y, z), 2 * math.atan(half_y), half_x / half_y)
+        return cls(wxyz, tuple(camera.position.tolist()), 2 * math.atan(half_y), half_x / half_y)
 
     def camera(self, width: int, height: int, near: float) -> Camera:
         """Return the camera whose picture of that size fills the view; its pixels need not be square."""
