@@ -22,8 +22,7 @@ class Judges:
 
     def __init__(self) -> None:
         self._cores = len(os.sched_getaffinity(0))
-        self._processes: list[Any] = []
-        self._pipes: list[Any] = []
+        self._processes: list[tuple[Any, Any]] = []  # each with the pipe to it
 
     def measured(self, items: Iterable[T], measure: Callable[[T], R]) -> Iterator[tuple[T, R]]:
         """Items with what a function of a module says of each, in order; later ones are made meanwhile."""
@@ -43,7 +42,7 @@ class Judges:
 
     def _pipe(self, number: int) -> Any:
         """The pipe to a process, which is started if it is the next one."""
-        if number == len(self._pipes):
+        if number == len(self._processes):
             resource_tracker.ensure_running()  # which hears signals again once it has started
             # Ctrl-C is for this process alone: one that is started has no time for it, even to ignore it.
             heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGALRM})
@@ -54,18 +53,17 @@ class Judges:
                 process = context.Process(target=_judge, args=(theirs,), daemon=True)
                 process.start()
                 theirs.close()
-                self._processes.append(process)
-                self._pipes.append(ours)
+                self._processes.append((process, ours))
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, heard)
-        return self._pipes[number]
+        return self._processes[number][1]
 
     def close(self) -> None:
-        for process in self._processes:
+        for process, _ in self._processes:
             process.kill()
-        for process in self._processes:
+        for process, _ in self._processes:
             process.join()
-        self._processes, self._pipes = [], []
+        self._processes = []
 
 
 def _judge(pipe: Connection) -> None:

@@ -55,11 +55,6 @@ def raise_interrupts() -> None:
         sys.unraisablehook = interrupts.unraisable
 
 
-def ignore_interrupts() -> None:
-    """Have Ctrl-C do nothing: what was to be done is done."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 class _Interrupt(KeyboardInterrupt):
     """Unlike its base, one that can be referred to weakly."""
 

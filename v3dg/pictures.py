@@ -119,8 +119,7 @@ def _naming_damage(name: str) -> Iterator[None]:
     except UnidentifiedImageError:
         raise ValueError(f"{name}: expected a PNG or a JPEG, got another file") from None
     except Exception as error:  # Pillow raises many kinds
-        text = f"{name}: expected a PNG or a JPEG, got one that cannot be read: {error}"
-        raise ValueError(text) from error
+        raise ValueError(f"{name}: expected a PNG or a JPEG, got one that cannot be read: {error}") from error
 
 
 def write_picture(path: str | os.PathLike[str], image: Any) -> None:

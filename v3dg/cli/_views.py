@@ -15,7 +15,7 @@ from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import DEFAULT_FOV_X, Camera, turntable
 from v3dg.cleaning import ball_of_most
-from v3dg.cli._common import UsageError, check_range, level_size, option
+from v3dg.cli._common import UsageError, check_range, level_size, option, require_subject
 from v3dg.export import Axis
 from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, read_asset
@@ -52,7 +52,9 @@ class ViewOptions:
     """The turntable's axis."""
 
     def check(self, *subjects: Path) -> None:
-        """Refuse, before anything is read, what cannot be meant for these subjects."""
+        """Refuse, before anything is read, subjects that are none, and what cannot be meant for them."""
+        for path in subjects:
+            require_subject(path)
         check_range("--views", self.views, 1, _MOST_VIEWS)
         for side in self.size:
             check_range("--size", side, 1, MOST_SIDE)

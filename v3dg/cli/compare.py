@@ -24,7 +24,6 @@ from v3dg.cli._common import (
     option,
     print_result,
     printable,
-    require_subject,
     table_lines,
 )
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
@@ -152,8 +151,6 @@ def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
 
 def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
     """The names of the views, and pictures of one after the other."""
-    for path in (options.reference, options.test):
-        require_subject(path)
     options.view.check(options.reference, options.test)
     check_range("--supersample", options.supersample, 1, 16)
     device = _device.resolve(options.device)

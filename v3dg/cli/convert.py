@@ -21,7 +21,6 @@ from v3dg.cli._common import (
     finite,
     option,
     print_result,
-    require_subject,
 )
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, is_scene, load_subject
 from v3dg.gaussians import Gaussians
@@ -50,7 +49,6 @@ class Convert(Common):
 
 
 def run(options: Convert) -> None:
-    require_subject(options.subject)
     view = options.view
     view.check(options.subject)
     if not options.output.name.lower().endswith(WRITE_SUFFIXES):

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from v3dg import _device
-from v3dg.cli._common import OnDevice, UsageError, finite, option, print_result, require_subject, table_lines
+from v3dg.cli._common import OnDevice, UsageError, finite, option, print_result, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 from v3dg.pictures import check_picture_path, write_picture
 from v3dg.render import render
@@ -37,7 +37,6 @@ class Render(OnDevice):
 
 
 def run(options: Render) -> None:
-    require_subject(options.subject)
     options.view.check(options.subject)
     if not all(0 <= part <= 1 for part in options.background):
         raise UsageError(f"--background: expected three numbers from 0 to 1, got {options.background}")
