@@ -45,7 +45,7 @@ class Program:
         caught = io.StringIO()
         try:
             with contextlib.redirect_stderr(caught):
-                parsed = tyro.cli(
+                return tyro.cli(
                     functools.reduce(operator.or_, subcommands),
                     prog=self.name,
                     description=self.description,
@@ -56,7 +56,6 @@ class Program:
             if not stop.code:
                 raise
             raise UsageError(self._one_line(caught.getvalue())) from None
-        return parsed
 
     def _one_line(self, boxed: str) -> str:
         """The text of the first box that tyro drew, without its rules and its title."""

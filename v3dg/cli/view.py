@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import math
-import os
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -87,10 +85,7 @@ def run(options: View) -> None:
             while not interrupts:
                 time.sleep(_SECONDS)
         finally:
-            has_ended = site.close()
-    if not has_ended:  # Python cannot end beneath threads that are in C++
-        print("v3dg: error: interrupted", file=sys.stderr, flush=True)
-        os._exit(130)
+            site.close()
     raise KeyboardInterrupt
 
 
