@@ -133,7 +133,7 @@ def _write_folders(
     for level in range(plan.top + 1):
         parts: list[Gaussians] = []
         first, size = len(names), 0
-        for number, clusters in enumerate(plan.clusters_of(level)):
+        for number, clusters in enumerate(plan.by_chunk(np.array(plan.bundle.level_range(level)))):
             chunk = Gaussians.concatenate([plan.bundle.cluster_gaussians(int(c)) for c in clusters])
             chunk = _turned(check_writable(chunk), turn)
             lods[number][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
@@ -238,24 +238,19 @@ class _Plan:
         chunk_of_cluster = np.where(clusters.level <= top, number[ancestor[group]], -1)
         return cls(bundle, top, len(tops), chunk_of_cluster, number)
 
-    def clusters_of(self, level: int) -> list[NDArray[np.int64]]:
-        """Ids of a level's clusters, by chunk."""
-        clusters = self.bundle.level_range(level)
-        chunks = self.chunk_of_cluster[clusters.start : clusters.stop]
-        order = np.argsort(chunks, kind="stable")
+    def by_chunk(self, clusters: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+        """Ids of clusters, by the chunk that they are in."""
+        chunks = self.chunk_of_cluster[clusters]
         ends = np.cumsum(np.bincount(chunks, minlength=self.num_chunks))[:-1]
-        return np.split(order + clusters.start, ends)
+        return np.split(clusters[np.argsort(chunks, kind="stable")], ends)
 
     def tree(self, lods: list[dict[str, dict[str, int]]], turn: Floats) -> dict[str, Any]:
         """The spatial index: the groups above the chunks, with bounds, in boxes that stay along the axes."""
         clusters, parent = self.bundle.clusters, self.bundle.groups.parent
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
-        chunks = self.chunk_of_cluster[used]
-        corners = clusters.box[used].astype(np.float64) @ rotation_from_quaternion(turn[0]).T
-        order = np.argsort(chunks, kind="stable")
-        numbers, starts = np.unique(chunks[order], return_index=True)
-        parts = zip(numbers.tolist(), np.split(corners[order], starts[1:]), strict=True)
-        nodes = {number: _node(part.reshape(-1, 3), lods=lods[number]) for number, part in parts}
+        corners = clusters.box.astype(np.float64) @ rotation_from_quaternion(turn[0]).T
+        chunks = enumerate(self.by_chunk(used))
+        nodes = {c: _node(corners[ids].reshape(-1, 3), lods=lods[c]) for c, ids in chunks if len(ids)}
         of_group = {g: nodes[c] for g, c in enumerate(self.chunk_of_group.tolist()) if c in nodes}
         of_group = of_group or {-1: nodes[0]}
         while of_group.keys() != {-1}:

@@ -129,6 +129,5 @@ def write_picture(path: str | os.PathLike[str], image: Any) -> None:
     path = check_picture_path(path)
     pixels = image if getattr(image, "dtype", None) == np.uint8 else to_8bit(image)
     kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
-    options: dict[str, Any] = {"quality": 90} if kind == "JPEG" else {}
     with _files.replacing(path) as temporary:
-        Image.fromarray(pixels).save(temporary, kind, **options)
+        Image.fromarray(pixels).save(temporary, kind, quality=90)  # of JPEG

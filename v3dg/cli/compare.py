@@ -72,7 +72,6 @@ class _Pair:
     reference: Picture
     test: Picture
     gaussians: int | None = None  # of the test that were selected
-    is_finest: bool = False  # whether those are all of a bundle's finest level
 
 
 def run(options: Compare) -> None:
@@ -85,11 +84,10 @@ def run(options: Compare) -> None:
     are_pictures = [path.suffix.lower() in pictures.SUFFIXES for path in subjects]
     if any(are_pictures) and not all(are_pictures):
         raise UsageError("PATH: expected two pictures, or two subjects to draw, got one of each")
-    names, pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
+    names, pairs, finest = _read_pictures(options) if all(are_pictures) else _draw(options)
     paths = picture_paths(output, names) if options.pictures == "all" else [output] * len(names)
     rows: list[dict[str, Any]] = []
     worst: tuple[_Pair, dict[str, Any]] | None = None
-    is_finest = True
     with contextlib.closing(Judges()) as judges:
         judged = (
             judges.measured(pairs, _errors)
@@ -104,7 +102,6 @@ def run(options: Compare) -> None:
             if worst is None or _difference(row) > _difference(worst[1]):
                 worst = (pair, row)
             rows.append(row)
-            is_finest = is_finest and pair.is_finest
     assert worst is not None
     if options.pictures == "worst":
         worst[1]["picture"] = str(output)
@@ -132,12 +129,12 @@ def run(options: Compare) -> None:
     ]
     if mean["flip"] is None:
         lines.append(FLIP_MISSING)
-    if is_finest:
+    if finest is not None and all(row["gaussians_selected"] == finest for row in rows):
         lines.append("every view needs the finest level; `--size 100 100` shows the test as from far away")
     print_result(options.json, result, lines)
 
 
-def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
+def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair], None]:
     reference, test = map(pictures.read_picture, (options.reference, options.test))
     if reference.shape != test.shape:
         (height, width, _), (test_height, test_width, _) = reference.shape, test.shape
@@ -146,11 +143,11 @@ def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
             f"got {test_width} x {test_height}"
         )
     name = options.test.stem
-    return [name], iter([_Pair(name, reference, test)])
+    return [name], iter([_Pair(name, reference, test)]), None
 
 
-def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
-    """The names of the views, and pictures of one after the other."""
+def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair], int | None]:
+    """The names of the views, pictures of one after the other, gaussians of the test's finest level."""
     options.view.check(options.reference, options.test)
     check_range("--supersample", options.supersample, 1, 16)
     device = _device.resolve(options.device)
@@ -171,10 +168,9 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair]]:
         for name, camera in cameras.items():
             truth = draw_truth(reference, camera, device, options.supersample)
             image = render(test, camera, tolerance=options.tolerance, budget=options.budget, device=device)
-            count = image.stats.gaussians_selected
-            yield _Pair(name, truth, to_8bit(image.color), count, count == finest)
+            yield _Pair(name, truth, to_8bit(image.color), image.stats.gaussians_selected)
 
-    return list(cameras), pairs()
+    return list(cameras), pairs(), finest
 
 
 def _errors(pair: _Pair) -> dict[str, float | None]:

@@ -7,14 +7,10 @@ import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from v3dg import _core
 from v3dg.scene import Scene
-from v3dg.viewer.frame import SceneView
-
-if TYPE_CHECKING:
-    import viser
+from v3dg.viewer.controls import BrowserCamera
 
 
 def bundle_names(scene: Scene) -> list[str]:
@@ -27,8 +23,8 @@ def bundle_names(scene: Scene) -> list[str]:
 class Exporter:
     """Does one thing at a time, in a thread, until it is done or stopped."""
 
-    def __init__(self, client: viser.ClientHandle, scene_view: SceneView) -> None:
-        self._client, self._scene_view = client, scene_view
+    def __init__(self, camera: BrowserCamera) -> None:
+        self._client, self._scene_view = camera.client, camera.scene_view
         self._lock, self._is_closed = threading.Lock(), False
         self._thread: threading.Thread | None = None
         self._stop = _core.Stop()

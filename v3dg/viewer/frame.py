@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import time
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from v3dg import _core, _device
 from v3dg._device import CPU, Device
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera, Floats
+from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
@@ -270,15 +269,8 @@ class SceneView:
 
     def _levels(self, cut: Selection) -> npt.NDArray[np.int64]:
         """(L,) selected gaussians by level."""
-        levels = np.zeros(self.num_levels, np.int64)
-        scene = copy.copy(self.scene)  # which stays as it is
-        cut.check(scene.revision)
-        bundle_of_pair = scene.instance_bundle[cut.instance_ids]
-        for b, bundle in enumerate(scene.bundles):
-            clusters = cut.cluster_ids[bundle_of_pair == b]
-            sizes = np.diff(bundle.clusters.offset)[clusters]
-            np.add.at(levels, bundle.clusters.level[clusters], sizes)
-        return levels
+        level, size = cut._per_pair(lambda c: c.level), cut._per_pair(lambda c: np.diff(c.offset))
+        return np.bincount(level, size, self.num_levels).astype(np.int64)
 
 
 def _check(stop: _core.Stop | None) -> None:
@@ -286,7 +278,7 @@ def _check(stop: _core.Stop | None) -> None:
         raise Stopped("it was stopped")
 
 
-def _bounds(scene: Scene) -> tuple[Floats, float]:
+def _bounds(scene: Scene) -> tuple[Any, float]:
     """Centre and radius of a ball around nearly all of the scene: trained assets have a few far outliers."""
     corners = [np.zeros((0, 3))]
     for b, bundle in enumerate(scene.bundles):
@@ -300,10 +292,7 @@ def _bounds(scene: Scene) -> tuple[Floats, float]:
         placed = scene.scales[mine, None, None] * turned + scene.positions[mine, None]
         corners.append(placed.reshape(-1, 3))
     points = np.concatenate(corners)
-    if not len(points):
-        return np.zeros(3), 1.0
-    center, radius = ball_of_most(points)
-    return np.asarray(center, np.float64), radius
+    return ball_of_most(points) if len(points) else (np.zeros(3), 1.0)
 
 
 def _resident_bytes() -> int:

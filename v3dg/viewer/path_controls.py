@@ -16,9 +16,8 @@ from v3dg.scene_file import write_scene
 from v3dg.video import write_video
 from v3dg.viewer.controls import Controls, add_button, in_order, value_of
 from v3dg.viewer.exports import Exporter, bundle_names
-from v3dg.viewer.frame import Pixels, Settings
+from v3dg.viewer.frame import Pixels
 from v3dg.viewer.path import CameraPath
-from v3dg.viewer.view import View
 
 _FILM_SIZES = {"1280 x 720": (1280, 720), "1920 x 1080": (1920, 1080), "as the window": None}
 _FPS = 30
@@ -96,21 +95,19 @@ class PathControls:
     def _save_film(self, path: CameraPath, stop: _core.Stop) -> None:
         width, height = _FILM_SIZES.get(self._film_size.value) or self._controls.size
         size = width // 2 * 2, height // 2 * 2  # as H.264 wants it
-        pictures = self._film(path.film(_FPS), size, self._controls.settings, stop)
-        self._progress.value, self._progress.visible = 0.0, True
+        views, settings = path.film(_FPS), self._controls.settings
+
+        def pictures() -> Iterator[Pixels]:
+            for place, view in enumerate(views):
+                self._progress.value = 100 * place / len(views)
+                view = replace(view, aspect=size[0] / size[1])
+                yield self._scene_view.frame(view, size, settings, stop).pixels
+
+        self._progress.visible = True
         try:
-            self._exporter.save(f"{self._name}.mp4", lambda file: write_video(file, pictures, fps=_FPS))
+            self._exporter.save(f"{self._name}.mp4", lambda file: write_video(file, pictures(), fps=_FPS))
         finally:
             self._progress.visible = False
-
-    def _film(
-        self, views: list[View], size: tuple[int, int], settings: Settings, stop: _core.Stop
-    ) -> Iterator[Pixels]:
-        """The pictures of a film, each drawn when it is asked for."""
-        for place, view in enumerate(views):
-            view = replace(view, aspect=size[0] / size[1])
-            yield self._scene_view.frame(view, size, settings, stop).pixels
-            self._progress.value = 100 * (place + 1) / len(views)
 
     def _cameras(self, path: CameraPath) -> dict[str, Camera]:
         return path.cameras(_FPS, *self._controls.size, self._scene_view.near)

@@ -42,7 +42,7 @@ class Tab:
     ) -> None:
         self._client, self._scene_view, self._name = client, scene_view, name
         self._camera = BrowserCamera(client, scene_view)
-        self._exporter = Exporter(client, scene_view)
+        self._exporter = Exporter(self._camera)
         # The panel shows them in the order in which they are made.
         self._figures, self._last_figures = client.gui.add_html(box("drawing ...")), 0.0
         self._controls = Controls(self._camera, settings, self._ask)
