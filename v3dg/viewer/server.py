@@ -14,6 +14,7 @@ import numpy as np
 
 from v3dg.cameras import Camera, VectorLike
 from v3dg.select import DEFAULT_TOLERANCE
+from v3dg.viewer.controls import BrowserCamera
 from v3dg.viewer.frame import SceneView, Settings
 from v3dg.viewer.tab import Tab
 from v3dg.viewer.view import View, look_at
@@ -79,7 +80,8 @@ class Site:
 
         # Both are called on the event loop, one after the other.
         async def connect(client: viser.ClientHandle) -> None:
-            self._tabs[client.client_id] = Tab(client, scene_view, name, cameras or {}, settings, start)
+            camera = BrowserCamera(client, scene_view)
+            self._tabs[client.client_id] = Tab(camera, name, cameras or {}, settings, start)
 
         async def disconnect(client: viser.ClientHandle) -> None:
             tabs = (*self._ending, self._tabs.pop(client.client_id))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from PIL import Image
 
@@ -14,13 +14,10 @@ from v3dg.cameras import Camera
 from v3dg.viewer.controls import BrowserCamera, Controls, add_button, in_order
 from v3dg.viewer.exports import Exporter
 from v3dg.viewer.figures import box, figures_html
-from v3dg.viewer.frame import Frame, SceneView, Settings
+from v3dg.viewer.frame import Frame, Settings
 from v3dg.viewer.pacing import RenderLoop, Request
 from v3dg.viewer.path_controls import PathControls
 from v3dg.viewer.view import View
-
-if TYPE_CHECKING:
-    import viser
 
 _NO_CAMERA = ""
 # Pictures that pass by, and those that stay.
@@ -32,20 +29,14 @@ class Tab:
     """One browser tab of a `Site`, until `close`; ``home`` is the view of the button that shows all."""
 
     def __init__(
-        self,
-        client: viser.ClientHandle,
-        scene_view: SceneView,
-        name: str,
-        cameras: Mapping[str, Camera],
-        settings: Settings,
-        home: View,
+        self, camera: BrowserCamera, name: str, cameras: Mapping[str, Camera], settings: Settings, home: View
     ) -> None:
-        self._client, self._scene_view, self._name = client, scene_view, name
-        self._camera = BrowserCamera(client, scene_view)
-        self._exporter = Exporter(self._camera)
+        self._camera, self._name = camera, name
+        self._client, self._scene_view = client, scene_view = camera.client, camera.scene_view
+        self._exporter = Exporter(camera)
         # The panel shows them in the order in which they are made.
         self._figures, self._last_figures = client.gui.add_html(box("drawing ...")), 0.0
-        self._controls = Controls(self._camera, settings, self._ask)
+        self._controls = Controls(camera, settings, self._ask)
         add_button(client.gui, "Save picture", lambda: self._exporter.begin(self._save_picture))
         self._add_camera_controls(cameras, home)
         path = PathControls(name, self._controls, self._exporter)
