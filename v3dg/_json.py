@@ -6,7 +6,7 @@ import json
 import math
 import os
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -92,30 +92,29 @@ class Node:
             place = f"{self.path}." if self.path else ""
             raise ValueError(f"{self.file}: {place}{error}") from error
 
-    def child(self, key: str) -> Node:
-        return Node(self.value[key], self.file, self._at(key))
-
-    def _at(self, key: str) -> str:
-        key = key if is_one_line(key) and len(key) <= 60 else shown(key)
-        return f"{self.path}.{key}" if self.path else key
+    def field(self, key: str) -> Node:
+        """One of an object's fields."""
+        if not isinstance(self.value, dict):
+            raise self.error("an object")
+        if key not in self.value:
+            raise self.problem(f"expected the field {key}, got an object without it")
+        name = key if is_one_line(key) and len(key) <= 60 else shown(key)
+        return Node(self.value[key], self.file, f"{self.path}.{name}" if self.path else name)
 
     def has(self, key: str) -> bool:
         return isinstance(self.value, dict) and key in self.value
 
-    def items(self) -> list[Node]:
-        """An array's values."""
-        if not isinstance(self.value, list):
-            raise self.error("an array")
-        return [Node(value, self.file, f"{self.path}[{i}]") for i, value in enumerate(self.value)]
+    def items(self, expected: str = "an array", least: int = 0, most: float = math.inf) -> Iterator[Node]:
+        """An array's values, one at a time: the places of all of a large one take far more than the file."""
+        if not isinstance(self.value, list) or not least <= len(self.value) <= most:
+            raise self.error(expected)
+        return (Node(value, self.file, f"{self.path}[{i}]") for i, value in enumerate(self.value))
 
     def some_fields(self, required: tuple[str, ...]) -> dict[str, Node]:
         """An object's fields, among them the required ones."""
         if not isinstance(self.value, dict):
             raise self.error("an object")
-        for key in required:
-            if key not in self.value:
-                raise self.problem(f"expected the field {key}, got an object without it")
-        return {key: self.child(key) for key in self.value}
+        return {key: self.field(key) for key in dict.fromkeys((*required, *self.value))}
 
     def fields(self, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, Node]:
         """An object's fields, none of them unknown."""
@@ -133,28 +132,24 @@ class Node:
             raise self.error("a string without control characters")
         return self.value
 
-    def number(self) -> float:
+    def number(
+        self, expected: str = "a finite number", above: float = -math.inf, below: float = math.inf
+    ) -> float:
         if isinstance(self.value, bool) or not isinstance(self.value, int | float):
             raise self.error("a number")
         try:
             number = float(self.value)
         except OverflowError:
             number = math.inf
-        if not math.isfinite(number):
-            raise self.error("a finite number")
+        if not above < number < below:
+            raise self.error(expected)
         return number
 
     def positive(self) -> float:
-        number = self.number()
-        if number <= 0:
-            raise self.error("a positive number")
-        return number
+        return self.number("a positive number", 0)
 
     def field_of_view(self) -> float:
-        angle = self.number()
-        if not 0 < angle < math.pi:
-            raise self.error("radians between 0 and pi")
-        return angle
+        return self.number("radians between 0 and pi", 0, math.pi)
 
     def size(self) -> int:
         """A side of a picture in px; some programs write it as 1920.0."""
@@ -166,11 +161,8 @@ class Node:
         return int(side)
 
     def vector(self, length: int) -> list[float]:
-        if not isinstance(self.value, list) or len(self.value) != length:
-            raise self.error(f"{length} numbers")
-        return [item.number() for item in self.items()]
+        return [item.number() for item in self.items(f"{length} numbers", length, length)]
 
     def matrix(self, num_rows: int, num_columns: int) -> list[list[float]]:
-        if not isinstance(self.value, list) or len(self.value) != num_rows:
-            raise self.error(f"{num_rows} rows of {num_columns} numbers")
-        return [row.vector(num_columns) for row in self.items()]
+        expected = f"{num_rows} rows of {num_columns} numbers"
+        return [row.vector(num_columns) for row in self.items(expected, num_rows, num_rows)]

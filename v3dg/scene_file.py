@@ -188,9 +188,9 @@ def _read_camera(node: Node, fields: dict[str, Node]) -> Camera:
 
 def _read_layouts(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
     """The layouts of the paper's published code; what only its authors' programs use is passed over."""
-    layouts = root.child("layouts").items()
+    layouts = list(root.field("layouts").items())
     if len(layouts) != 1:
-        raise root.child("layouts").problem(
+        raise root.field("layouts").problem(
             f"expected one layout, got {len(layouts)}; each layout is a scene, so make a file of each"
         )
     top = layouts[0].some_fields(("assets", "cameras"))

@@ -132,7 +132,7 @@ def _meta(path: Path, text: bytes) -> dict[str, Node]:
     advice = "convert it with splat-transform first"
     check(path, "version" in meta.some_fields(()), f"SOG version 2, got an older file; {advice}")
     if meta.value["version"] != 2:
-        raise meta.child("version").error("SOG version 2")
+        raise meta.field("version").error("SOG version 2")
     return meta.some_fields(("count", "means", "scales", "quats", "sh0"))
 
 
@@ -149,10 +149,8 @@ def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
     names = {}
     for part, count in _PARTS.items():
         if part in meta:
-            node = meta[part].some_fields(("files",))["files"]
-            if not isinstance(node.value, list) or len(node.value) != count:
-                raise node.error(f"{count} file names")
-            names[part] = [_beside(item) for item in node.items()]
+            files = meta[part].field("files").items(f"{count} file names", count, count)
+            names[part] = [_beside(item) for item in files]
     return names
 
 
@@ -165,10 +163,7 @@ def _beside(node: Node) -> str:
 
 def _codebook(part: Node) -> Floats:
     """A table of 256 values."""
-    node = part.some_fields(("codebook",))["codebook"]
-    if not isinstance(node.value, list) or not 1 <= len(node.value) <= 256:
-        raise node.error("1 to 256 numbers")
-    entries = node.items()
+    entries = list(part.field("codebook").items("1 to 256 numbers", 1, 256))
     # Some versions of splat-transform wrote null for the first value, which continues the others.
     has_null = entries[0].value is None and len(entries) == 256
     values = [entry.number() for entry in entries[has_null:]]

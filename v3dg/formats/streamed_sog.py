@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -73,27 +72,12 @@ def _index(path: Path, text: bytes) -> tuple[Node, list[PurePosixPath], PurePosi
     """The tree, the names of the files, and of the environment."""
     with telling(path, "JSON"):
         index = Node(parse_json(text.decode("utf-8")), os.fspath(path), "")
-    if index.has("version") and index.child("version").value != 1:
-        raise index.child("version").error("streamed SOG version 1")
-    names = [_inside(name) for name in _each(_field(index, "filenames"))]
-    has_environment = index.has("environment") and index.child("environment").value is not None
-    environment = _inside(index.child("environment")) if has_environment else None
-    return _field(index, "tree"), names, environment
-
-
-def _field(node: Node, name: str) -> Node:
-    if not isinstance(node.value, dict):
-        raise node.error("an object")
-    if name not in node.value:
-        raise node.problem(f"expected the field {name}, got an object without it")
-    return node.child(name)
-
-
-def _each(node: Node) -> Iterator[Node]:
-    """An array's values, one at a time: the places of all, in a deep tree, take far more than the file."""
-    if not isinstance(node.value, list):
-        raise node.error("an array")
-    return (Node(value, node.file, f"{node.path}[{i}]") for i, value in enumerate(node.value))
+    if index.has("version") and index.field("version").value != 1:
+        raise index.field("version").error("streamed SOG version 1")
+    names = [_inside(name) for name in index.field("filenames").items()]
+    has_environment = index.has("environment") and index.field("environment").value is not None
+    environment = _inside(index.field("environment")) if has_environment else None
+    return index.field("tree"), names, environment
 
 
 def _inside(node: Node) -> PurePosixPath:
@@ -116,16 +100,16 @@ def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[
         if not isinstance(node.value, dict):
             raise node.error("an object")
         if node.has("children"):
-            todo.append(_each(node.child("children")))
+            todo.append(node.field("children").items())
         if not node.has("lods"):
             continue
-        levels = node.child("lods")
+        levels = node.field("lods")
         if not isinstance(levels.value, dict) or not all(map(_LEVEL.fullmatch, levels.value)):
             raise levels.error("levels by number")
         for level in sorted(levels.value, key=int):
-            lod = levels.child(level)
-            file = whole(_field(lod, "file"), f"0 to {len(names) - 1}", 0, len(names) - 1)
-            run = (_field(lod, name) for name in ("offset", "count"))
+            lod = levels.field(level)
+            file = whole(lod.field("file"), f"0 to {len(names) - 1}", 0, len(names) - 1)
+            run = (lod.field(name) for name in ("offset", "count"))
             offset, count = (whole(number, "a whole number, 0 or more", 0, 1 << 32) for number in run)
             if count:
                 found.setdefault(names[file], []).append(range(offset, offset + count))
