@@ -87,6 +87,14 @@ def whole(value: Any, name: str, what: str, least: int, most: int = MOST_INT) ->
     return number
 
 
+def check_all(name: str, values: npt.NDArray[Any], good: npt.NDArray[np.bool_], expected: Any) -> None:
+    """Name the first row that is not good; ``expected`` is a text, or makes one from the row."""
+    if not good.all():
+        row = int(np.argmin(good.reshape(len(good), -1).all(1)))
+        text = expected(row) if callable(expected) else expected
+        raise ValueError(f"{name}[{row}]: expected {text}, got {values[row].tolist()}")
+
+
 def shown(value: Any) -> str:
     """A value as a message of one line shows it."""
     if isinstance(value, int) and value.bit_length() > 128:

@@ -184,6 +184,12 @@ class Gaussians:
         return Gaussians(*(function(getattr(self, name)) for name in _NAMES))
 
 
+def empty(count: int, sh_degree: int) -> Gaussians:
+    """Gaussians on the host with any values, to be filled."""
+    shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (sh_degree + 1) ** 2, 3)]
+    return Gaussians(*(np.empty(shape, np.float32) for shape in shapes))
+
+
 def _check_kind(name: str, array: Any, like: Any) -> None:
     """Raise unless `array` is contiguous, float32 (tensors: or float64), of the kind and device of `like`."""
     if not isinstance(array, np.ndarray) and not _is_tensor(array):

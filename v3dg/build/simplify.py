@@ -13,8 +13,7 @@ from v3dg import _core, _device
 from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
 from v3dg.build.plan import LevelPlan, Offsets, Plan
-from v3dg.bundle.codec import Codec
-from v3dg.gaussians import Array, Gaussians
+from v3dg.gaussians import Array, Gaussians, empty
 
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
 _GROUPS_AT_ONCE = 256
@@ -221,7 +220,7 @@ def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: B
     """What groups start from: their gaussians halved, from `offset` to `out_offset`."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
-    result = Codec(gaussians.sh_degree).empty(int(out_offset[-1]))
+    result = empty(int(out_offset[-1]), gaussians.sh_degree)
     for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
         cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
         part = gaussians.subset(slice(cuts[0], cuts[-1]))

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v3dg._json import parse_json
+from v3dg._numbers import check_all
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundleFile, writing
 from v3dg.bundle.format import VERSION, config_to_json, file_bytes, page_file_bytes, page_tables
 from v3dg.bundle.pages import FilePages, MemoryPages, PageLayout, runs_of_pages
-from v3dg.bundle.tables import Clusters, Groups, check_all, check_index, check_tables
+from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:

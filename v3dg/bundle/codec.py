@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from v3dg.gaussians import Gaussians
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
+
+    from v3dg.gaussians import Gaussians
 
 
 class Codec:
@@ -37,8 +36,3 @@ class Codec:
     def decode(self, read: Callable[[Sequence[NDArray[Any]]], None], out: Gaussians, rows: slice) -> None:
         """Fill the rows with a page, whose bytes `read` reads into the arrays that it is given."""
         read(self.encode(out, rows))
-
-    def empty(self, count: int) -> Gaussians:
-        """Gaussians on the host to decode to, with any values."""
-        shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (self.sh_degree + 1) ** 2, 3)]
-        return Gaussians(*(np.empty(shape, np.float32) for shape in shapes))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from v3dg._numbers import check_all
 from v3dg.bundle.format import DTYPES, SCHEMA
 
 if TYPE_CHECKING:
@@ -101,17 +102,9 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
             object.__setattr__(part, name.removeprefix(prefix), own)
 
 
-def check_all(name: str, values: NDArray[Any], good: NDArray[np.bool_], expected: Any) -> None:
-    """Name the first row that is not good; ``expected`` is a text, or makes one from the row."""
-    if not good.all():
-        row = int(np.argmin(good.reshape(len(good), -1).all(1)))
-        text = expected(row) if callable(expected) else expected
-        raise ValueError(f"{name}[{row}]: expected {text}, got {values[row].tolist()}")
-
-
-def _after_first(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Conditions on neighbours as conditions on rows: the first row meets them."""
-    return np.concatenate([np.ones(1, bool), good])
+def _ascends(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which rows are at least all before them."""
+    return np.asarray(values >= np.maximum.accumulate(values))
 
 
 def check_tables(clusters: Clusters, groups: Groups, num_gaussians: int) -> None:
@@ -132,17 +125,13 @@ def _check_offsets(clusters: Clusters, num_gaussians: int) -> None:
         raise ValueError(f"clusters: expected fewer than 2^31, got {len(clusters)}")
     if offset[0] != 0:
         raise ValueError(f"clusters.offset[0]: expected 0, got {offset[0]}")
-    check_all(
-        "clusters.offset", offset, _after_first(offset[1:] >= offset[:-1]), "offsets that never decrease"
-    )
+    check_all("clusters.offset", offset, _ascends(offset), "offsets that never decrease")
     if offset[-1] != num_gaussians:
         raise ValueError(f"clusters.offset[-1]: expected {num_gaussians} gaussians, got {offset[-1]}")
     if len(clusters) and level[0] != 0:
         raise ValueError(f"clusters.level[0]: expected 0, got {level[0]}")
-    step = np.diff(level.astype(np.int64))
-    check_all(
-        "clusters.level", level, _after_first((step == 0) | (step == 1)), "the level before, or one more"
-    )
+    step = np.diff(level.astype(np.int64), prepend=level[:1])
+    check_all("clusters.level", level, (step == 0) | (step == 1), "the level before, or one more")
 
 
 def _check_tree(clusters: Clusters, groups: Groups) -> None:
@@ -172,7 +161,7 @@ def _check_tree(clusters: Clusters, groups: Groups) -> None:
     # The last level's clusters count as having a parent of their own past the others.
     order = np.where(level == last_level, num_groups, parent)
     expected = "parents in ascending order, so that groups are in the order of the clusters they replace"
-    check_all("clusters.parent_group", parent, _after_first(order[1:] >= order[:-1]), expected)
+    check_all("clusters.parent_group", parent, _ascends(order), expected)
     for name, links in (("own_group", own), ("parent_group", parent)):
         num_clusters = np.bincount(links[links >= 0], minlength=num_groups)
         check_all("groups", np.arange(num_groups), num_clusters > 0, f"a cluster with it as {name}")

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
-from v3dg.gaussians import Gaussians
+from v3dg._numbers import check_all
+from v3dg.gaussians import Gaussians, empty
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 
@@ -37,18 +38,12 @@ def blocks(count: int) -> Iterator[slice]:
 
 def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ...]]) -> Gaussians:
     """Gaussians of what ``decode`` gives for a block: means, quats, scales, opacities and sh."""
-    arrays = (
-        np.empty((count, 3), np.float32),
-        np.empty((count, 4), np.float32),
-        np.empty((count, 3), np.float32),
-        np.empty(count, np.float32),
-        np.empty((count, (degree + 1) ** 2, 3), np.float32),
-    )
+    gaussians = empty(count, degree)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is passed on
         for block in blocks(count):
-            for array, values in zip(arrays, decode(block), strict=True):
+            for array, values in zip(vars(gaussians).values(), decode(block), strict=True):
                 array[block] = values
-    return Gaussians(*arrays)
+    return gaussians
 
 
 def quats_from_three(three: Floats, left_out: NDArray[Any]) -> Floats:
@@ -102,19 +97,12 @@ def check_writable(gaussians: Gaussians) -> Gaussians:
     if not isinstance(gaussians, Gaussians):
         raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}")
     host = gaussians.numpy()
-    for name in ("means", "quats", "scales", "opacities", "sh"):
-        values = getattr(host, name)
-        _check_all(name, values, np.isfinite(values), "finite values")
-    _check_all("quats", host.quats, (host.quats != 0).any(axis=1), "a length above 0")
-    _check_all("scales", host.scales, host.scales >= 0, "values >= 0")
-    _check_all("opacities", host.opacities, abs(host.opacities - 0.5) <= 0.5, "values in [0, 1]")
+    for name, values in vars(host).items():
+        check_all(name, values, np.isfinite(values), "finite values")
+    check_all("quats", host.quats, (host.quats != 0).any(axis=1), "a length above 0")
+    check_all("scales", host.scales, host.scales >= 0, "values >= 0")
+    check_all("opacities", host.opacities, abs(host.opacities - 0.5) <= 0.5, "values in [0, 1]")
     return host
-
-
-def _check_all(name: str, values: Floats, good: NDArray[np.bool_], expected: str) -> None:
-    if not good.all():
-        row = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
-        raise ValueError(f"{name}[{row}]: expected {expected}, got {values[row].tolist()}")
 
 
 def morton_order(means: Floats) -> NDArray[np.intp]:
