@@ -13,6 +13,7 @@ import re
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import InitVar, dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 _THREADS = 8
 
 
+@dataclass(eq=False, repr=False)
 class BundleWriter:
     """A bundle's file in the making: takes pages as they are finished, in any order, then the tables.
 
@@ -56,23 +58,18 @@ class BundleWriter:
     there will be. `writing` makes one.
     """
 
-    def __init__(
-        self,
-        descriptor: int,
-        pool: ThreadPoolExecutor,
-        layout: PageLayout,
-        codec: Codec,
-        config: dict[str, Any],
-    ) -> None:
-        self._fd = descriptor
-        self._pool = pool
-        self._layout = layout
-        self._codec = codec
-        self._entries = entries_of_layout(layout, codec)
-        self._header = header_of(self._entries, codec.sh_degree, config)
-        self._page_tables = page_tables(layout, codec)
-        self._hashes = np.zeros((layout.num_pages, HASH_BYTES), np.uint8)
-        self._is_written = np.zeros(layout.num_pages, bool)
+    _fd: int
+    _pool: ThreadPoolExecutor
+    _layout: PageLayout
+    _codec: Codec
+    config: InitVar[dict[str, Any]]
+
+    def __post_init__(self, config: dict[str, Any]) -> None:
+        self._entries = entries_of_layout(self._layout, self._codec)
+        self._header = header_of(self._entries, self._codec.sh_degree, config)
+        self._page_tables = page_tables(self._layout, self._codec)
+        self._hashes = np.zeros((self._layout.num_pages, HASH_BYTES), np.uint8)
+        self._is_written = np.zeros(self._layout.num_pages, bool)
         self.is_finished = False
 
     def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
@@ -106,12 +103,8 @@ class BundleWriter:
         tables = self._page_tables | {"pages.hash": self._hashes}
         for prefix, part in (("clusters", clusters), ("groups", groups)):
             tables |= {f"{prefix}.{name}": array for name, array in vars(part).items()}
-        digest = hashlib.blake2b(self._header, digest_size=HASH_BYTES)
-        end = bytearray()
-        for name, dtype, _, _ in SCHEMA:
-            end += tables[name].astype(DTYPES[dtype], copy=False).tobytes()
-        digest.update(end)
-        end += digest.digest()
+        end = b"".join(tables[name].astype(DTYPES[kind], copy=False).tobytes() for name, kind, _, _ in SCHEMA)
+        end += hashlib.blake2b(self._header + end, digest_size=HASH_BYTES).digest()
         _files.write_at(self._fd, self._header, 0)
         start, last = (self._entries[name]["data_offsets"][1] for name in ("pages", "hash"))
         assert start + len(end) == last
@@ -189,13 +182,7 @@ class BundleFile:
             )
         text = np.empty(header_bytes, np.uint8)
         self._read([text], 8)
-        try:
-            header = parse_json(text.tobytes())
-        except ValueError as error:
-            self._fail(f"header: expected JSON (safetensors), got {error}")
-        if not isinstance(header, dict):
-            self._fail(f"header: expected a JSON object (safetensors), got {shown(header)}")
-
+        header = self._object("header", text.tobytes())
         self._read_metadata(header.pop("__metadata__", None))
         self._data_start = 8 + header_bytes
         entries = self._check_entries(header)
@@ -217,12 +204,16 @@ class BundleFile:
         config = metadata.get("config")
         if not isinstance(config, str):
             self._fail(f"config: expected a string of JSON, got {shown(config)}")
+        self.config = self._object("config", config)
+
+    def _object(self, name: str, text: str | bytes) -> dict[str, Any]:
         try:
-            self.config = parse_json(config)
+            value = parse_json(text)
         except ValueError as error:
-            self._fail(f"config: expected JSON, got {error}")
-        if not isinstance(self.config, dict):
-            self._fail(f"config: expected a JSON object, got {shown(self.config)}")
+            self._fail(f"{name}: expected JSON, got {error}")
+        if not isinstance(value, dict):
+            self._fail(f"{name}: expected a JSON object, got {shown(value)}")
+        return value
 
     def _check_entries(self, header: dict[str, Any]) -> dict[str, Any]:
         """Compare the header with the one that its own counts and the file's size call for."""

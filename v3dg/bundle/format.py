@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -79,21 +80,12 @@ def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
 def entries_of(num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int) -> dict[str, Any]:
     """Every tensor of the file, in file order, as the header describes it."""
     rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
+    tables = ((name, dtype, [rows[count], *rest]) for name, dtype, count, rest in SCHEMA)
     entries: dict[str, Any] = {}
     end = 0
-
-    def append(name: str, dtype: str, shape: list[int]) -> None:
-        nonlocal end
-        num_bytes = np.dtype(DTYPES[dtype]).itemsize
-        for side in shape:
-            num_bytes *= side
-        entries[name] = {"dtype": dtype, "shape": shape, "data_offsets": [end, end + num_bytes]}
-        end += num_bytes
-
-    append("pages", "U8", [pages_bytes])
-    for name, dtype, count, rest in SCHEMA:
-        append(name, dtype, [rows[count], *rest])
-    append("hash", "U8", [HASH_BYTES])
+    for name, dtype, shape in (("pages", "U8", [pages_bytes]), *tables, ("hash", "U8", [HASH_BYTES])):
+        start, end = end, end + math.prod(shape) * np.dtype(DTYPES[dtype]).itemsize
+        entries[name] = {"dtype": dtype, "shape": shape, "data_offsets": [start, end]}
     return entries
 
 
