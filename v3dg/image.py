@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 
@@ -15,16 +16,20 @@ class Image:
     """
 
     def __init__(self, color: Any, alpha: Any, depth: Any) -> None:
-        self._color, self._alpha, self._depth = color, alpha, depth
+        self._own = SimpleNamespace(color=color, alpha=alpha, depth=depth)
+
+    @property
+    def _planes(self) -> Any:
+        return self._own
 
     @property
     def color(self) -> Any:
-        return self._color
+        return self._planes.color
 
     @property
     def alpha(self) -> Any:
-        return self._alpha
+        return self._planes.alpha
 
     @property
     def depth(self) -> Any:
-        return self._depth
+        return self._planes.depth

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
@@ -15,10 +15,14 @@ from v3dg.gaussians import Gaussians
 from v3dg.image import Image
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
-from v3dg.select import Selection, over_budget, rule_of
+from v3dg.select import CutOptions, Selection, over_budget, rule_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
+    from typing_extensions import Unpack
+
+_Subject: TypeAlias = Scene | Bundle | Gaussians
 
 
 @dataclass(frozen=True)
@@ -56,50 +60,28 @@ class RenderedImage(Image):
         self._drawing, self._finish = drawing, finish
 
     @property
-    def color(self) -> Any:
+    def _planes(self) -> Any:
         self._finish()
-        return self._drawing.color
-
-    @property
-    def alpha(self) -> Any:
-        self._finish()
-        return self._drawing.alpha
-
-    @property
-    def depth(self) -> Any:
-        self._finish()
-        return self._drawing.depth
+        return self._drawing
 
     @property
     def stats(self) -> Stats:
         return self._finish()
 
 
+class _Options(CutOptions, total=False):
+    cut: Selection | None
+    color_by: ColorBy
+    background: Sequence[float]
+
+
 @overload
 def render(
-    subject: Scene | Bundle | Gaussians,
-    camera: Camera,
-    *,
-    tolerance: float | None = ...,
-    budget: int | None = ...,
-    min_level: int = ...,
-    cut: Selection | None = ...,
-    color_by: ColorBy = ...,
-    background: Sequence[float] = ...,
-    device: str | Device = ...,
+    subject: Scene | Bundle | Gaussians, camera: Camera, **options: Unpack[_Options]
 ) -> RenderedImage: ...
 @overload
 def render(
-    subject: Scene | Bundle | Gaussians,
-    camera: Sequence[Camera],
-    *,
-    tolerance: float | None = ...,
-    budget: int | None = ...,
-    min_level: int = ...,
-    cut: Selection | None = ...,
-    color_by: ColorBy = ...,
-    background: Sequence[float] = ...,
-    device: str | Device = ...,
+    subject: Scene | Bundle | Gaussians, camera: Sequence[Camera], **options: Unpack[_Options]
 ) -> list[RenderedImage]: ...
 def render(
     subject: Scene | Bundle | Gaussians,
@@ -122,10 +104,7 @@ def render(
     Args:
         subject: What to draw, in world space.
         camera: Pinhole camera. With several, each has its own cut and its own picture, as if drawn alone.
-        tolerance: px² of screen per gaussian; 0 draws level 0 everywhere. `DEFAULT_TOLERANCE` if None; with a
-            budget, 0.
-        budget: Most gaussians to draw in one picture, as in `v3dg.select`.
-        min_level: No finer level is drawn, except where an asset has no coarser one.
+        tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
         cut: Draw what was selected before from this scene, whatever the camera: a cut to walk around. Takes
             the place of `tolerance`, `budget` and `min_level`.
         color_by: "level" or "cluster" colours gaussians by the one that they belong to.
@@ -195,7 +174,7 @@ class Renderer:
 class _Frame:
     """Buffers that pictures of one subject are drawn with; it does not keep the subject alive."""
 
-    def __init__(self, subject: Scene | Bundle | Gaussians, color_by: ColorBy, device: Device) -> None:
+    def __init__(self, subject: _Subject, color_by: ColorBy, device: Device) -> None:
         self._device, self._color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
         if isinstance(subject, Gaussians):
@@ -208,7 +187,7 @@ class _Frame:
 
     def draw(
         self,
-        subject: Scene | Bundle | Gaussians,
+        subject: _Subject,
         camera: Camera,
         background: Sequence[float],
         cut: Selection | None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,8 @@ from v3dg.scene import Scene
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
+    from typing_extensions import Unpack
 
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
 
@@ -136,29 +138,25 @@ class Selection:
         return np.repeat(self._per_pair(column), np.diff(self._first()))
 
 
+class CutOptions(TypedDict, total=False):
+    """What tells a cut of a view."""
+
+    tolerance: float | None
+    budget: int | None
+    min_level: int
+    device: str | Device
+
+
+class _Options(CutOptions, total=False):
+    footprint: Footprint
+    cull: bool
+
+
+@overload
+def select(subject: Scene | Bundle, camera: Camera, **options: Unpack[_Options]) -> Selection: ...
 @overload
 def select(
-    subject: Scene | Bundle,
-    camera: Camera,
-    *,
-    tolerance: float | None = ...,
-    budget: int | None = ...,
-    min_level: int = ...,
-    footprint: Footprint = ...,
-    cull: bool = ...,
-    device: str | Device = ...,
-) -> Selection: ...
-@overload
-def select(
-    subject: Scene | Bundle,
-    camera: Sequence[Camera],
-    *,
-    tolerance: float | None = ...,
-    budget: int | None = ...,
-    min_level: int = ...,
-    footprint: Footprint = ...,
-    cull: bool = ...,
-    device: str | Device = ...,
+    subject: Scene | Bundle, camera: Sequence[Camera], **options: Unpack[_Options]
 ) -> list[Selection]: ...
 def select(
     subject: Scene | Bundle,
