@@ -49,12 +49,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         viewmat = vector(self.viewmat, "viewmat", (4, 4))
-        rotation = viewmat[:3, :3]
-        if not is_rotation(rotation):
-            raise ValueError(
-                "viewmat: expected a rotation in the upper left 3x3, got a matrix that scales, "
-                "shears or mirrors; put scale into the scene instead"
-            )
+        _check_rotation(viewmat[:3, :3], "viewmat", "; put scale into the scene instead")
         if not np.array_equal(viewmat[3], [0.0, 0.0, 0.0, 1.0]):
             raise ValueError(f"viewmat: expected the last row 0 0 0 1, got {_text(viewmat[3])}")
         K = vector(self.K, "K", (3, 3))
@@ -236,15 +231,17 @@ def is_rotation(matrix: Floats) -> bool:
     return bool(off <= ROTATION_TOLERANCE and np.linalg.det(matrix) > 0)
 
 
+def _check_rotation(matrix: Floats, name: str, advice: str = "") -> None:
+    if not is_rotation(matrix):
+        found = f"a matrix that scales, shears or mirrors{advice}"
+        raise ValueError(f"{name}: expected a rotation in the upper left 3x3, got {found}")
+
+
 def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
     """(4, 4) world to camera from camera to world in Blender's convention; the nearest rotation is taken."""
     matrix = vector(transform_matrix, "transform_matrix", (4, 4))
     axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
-    if not is_rotation(axes):
-        raise ValueError(
-            "transform_matrix: expected a rotation in the upper left 3x3, got a matrix that scales, "
-            "shears or mirrors"
-        )
+    _check_rotation(axes, "transform_matrix")
     left, _, right = np.linalg.svd(axes)
     return _rigid((left @ right).T, matrix[:3, 3])
 

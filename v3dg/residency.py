@@ -107,22 +107,10 @@ class Residency:
 
     def table(self, bundle: Bundle) -> _core.ClusterTable:
         """What selection and drawing read of the bundle's clusters, on the host."""
-        clusters, groups = bundle.clusters, bundle.groups
-        return self._once(
-            bundle,
-            "table",
-            lambda: _core.ClusterTable(
-                ball=groups.ball,
-                weight=groups.weight,
-                level=groups.level,
-                own_group=clusters.own_group,
-                parent_group=clusters.parent_group,
-                box=clusters.box,
-                filter_px2=clusters.filter_px2,
-                antialiased=clusters.antialiased,
-                offset=clusters.offset,
-            ),
-        )
+        groups = bundle.groups
+        of_groups = {"ball": groups.ball, "weight": groups.weight, "level": groups.level}
+        columns: dict[str, Any] = vars(bundle.clusters) | of_groups  # the level is that of the groups
+        return self._once(bundle, "table", lambda: _core.ClusterTable(**columns))
 
     def scene(self, subject: Scene | Bundle, device: Device) -> ResidentScene:
         """The scene on a device as it is now; a bundle as a scene of one."""

@@ -122,7 +122,7 @@ class Scene:
             left = {}
             for name in ("bundle", *_ROW):
                 rows = getattr(self._state, name)
-                left[name] = rows[keep if isinstance(rows, np.ndarray) else _like(rows, keep)]
+                left[name] = rows[_like(rows, keep)]
             self._publish(changes=1, removals=int(not keep.all()), **left)
 
     def move(
@@ -279,20 +279,20 @@ def _rows(values: Any, name: str, count: int) -> Any:
     return np.ascontiguousarray(array, np.float32 if name == "importance" else np.float64)
 
 
-def _like(tensor: Any, values: Any) -> Any:
-    """The values on the device of a tensor."""
+def _like(array: Any, values: Any) -> Any:
+    """The values on the device of a tensor; as they are, on the host, for an array of NumPy's."""
+    if isinstance(array, np.ndarray):
+        return values
     import torch
 
     # Copied, for torch warns of arrays that are not to be written to.
     return torch.as_tensor(
-        np.array(values) if isinstance(values, np.ndarray) else values, device=tensor.device
+        np.array(values) if isinstance(values, np.ndarray) else values, device=array.device
     )
 
 
 def _alike(first: Any, second: Any) -> tuple[Any, Any]:
     """Both as they are on the host, or on a device where one of them is."""
-    if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
-        return first, second
     there = second if isinstance(first, np.ndarray) else first
     return _like(there, first), _like(there, second)
 
@@ -306,7 +306,6 @@ def _joined(first: Any, second: Any) -> Any:
 def _replaced(values: Any, rows: npt.NDArray[np.int64], new: Any) -> Any:
     """A copy with other values in some rows."""
     values, new = _alike(values, new)
-    is_on_host = isinstance(values, np.ndarray)
-    values = values.copy() if is_on_host else values.clone()
-    values[rows if is_on_host else _like(values, rows)] = new
+    values = values.copy() if isinstance(values, np.ndarray) else values.clone()
+    values[_like(values, rows)] = new
     return values

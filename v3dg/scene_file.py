@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -23,28 +23,8 @@ FORMAT = "v3dg-scene"
 VERSION = 1
 
 
-class _Instance(NamedTuple):
-    bundle: Bundle
-    position: list[float]
-    quaternion: list[float]
-    scale: float
-    importance: float
-
-    @classmethod
-    def read(
-        cls,
-        bundle: Bundle,
-        fields: Mapping[str, Node],
-        position: str = "position",
-        quaternion: str = "quaternion",
-    ) -> _Instance:
-        return cls(
-            bundle,
-            fields[position].vector(3),
-            _quaternion(fields[quaternion]) if quaternion in fields else [1.0, 0.0, 0.0, 0.0],
-            fields["scale"].positive() if "scale" in fields else 1.0,
-            _importance(fields["importance"]) if "importance" in fields else 1.0,
-        )
+# Bundle, position, quaternion, scale and importance, as `Scene.add` takes them.
+_Instance: TypeAlias = tuple[Bundle, list[float], list[float], float, float]
 
 
 def read_scene(
@@ -136,7 +116,7 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
         fields = node.fields(("bundle", "position"), ("quaternion", "scale", "importance"))
         if fields["bundle"].text() not in bundles:
             raise fields["bundle"].error("a name from bundles")
-        instances.append(_Instance.read(bundles[fields["bundle"].text()], fields))
+        instances.append(_instance(bundles[fields["bundle"].text()], fields))
     cameras: dict[str, Camera] = {}
     for node in top["cameras"].items() if "cameras" in top else []:
         optional = ("near", "viewmat", "K", "eye", "target", "up", "fov_x")
@@ -146,6 +126,16 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
             raise fields["name"].error("a name that no other camera has")
         cameras[name] = _read_camera(node, fields)
     return _scene_of(instances), cameras
+
+
+def _instance(bundle: Bundle, fields: Mapping[str, Node]) -> _Instance:
+    return (
+        bundle,
+        fields["position"].vector(3),
+        _quaternion(fields["quaternion"]) if "quaternion" in fields else [1.0, 0.0, 0.0, 0.0],
+        fields["scale"].positive() if "scale" in fields else 1.0,
+        _importance(fields["importance"]) if "importance" in fields else 1.0,
+    )
 
 
 def _quaternion(node: Node) -> list[float]:
@@ -206,8 +196,8 @@ def _read_layouts(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[S
         bundle = _open_bundle(fields["asset_name"], name, places, folder, known)
         for instance in fields["instances"].items():
             required = "positions", "quaternions", "scale"
-            pose = {name: node for name, node in instance.some_fields(required).items() if name in required}
-            instances.append(_Instance.read(bundle, pose, "positions", "quaternions"))
+            pose = instance.some_fields(required)
+            instances.append(_instance(bundle, {name.removesuffix("s"): pose[name] for name in required}))
     keys = ("camera_name", "camera_width", "camera_height", "camera_angle_x", "camera_angle_y")
     return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
@@ -217,9 +207,8 @@ def _read_flat_layout(root: Node, folder: Path, known: dict[str, Bundle]) -> tup
     top = root.fields(("asset", "instances", "cameras"), ("name", "convention"))
     asset = top["asset"].text()
     bundle = _open_bundle(top["asset"], asset, [os.path.splitext(asset)[0] + ".v3dg"], folder, known)
-    instances = []
-    for node in top["instances"].items():
-        instances.append(_Instance.read(bundle, node.fields(("position", "quaternion", "scale"))))
+    required = "position", "quaternion", "scale"
+    instances = [_instance(bundle, node.fields(required)) for node in top["instances"].items()]
     keys = ("name", "width", "height", "fov_x", "fov_y")
     return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
@@ -231,14 +220,10 @@ def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[
         fields = node.some_fields((*keys, "transform_matrix"))
         name, width, height, fov_x, fov_y = (fields[key] for key in keys)
         names.append(name.text())
-        arguments = (
-            np.array(fields["transform_matrix"].matrix(4, 4)),
-            fov_x.field_of_view(),
-            width.size(),
-            height.size(),
-            fov_y.field_of_view(),
-        )
-        cameras.append(node.attempt(partial(Camera.from_blender, *arguments)))
+        matrix, angle = fields["transform_matrix"].matrix(4, 4), fov_x.field_of_view()
+        size = width.size(), height.size()
+        make = partial(Camera.from_blender, matrix, angle, *size, fov_y.field_of_view())
+        cameras.append(node.attempt(make))
     if len(set(names)) < len(names):
         names = [f"{i:03}_{name}" for i, name in enumerate(names)]
     return dict(zip(names, cameras, strict=True))
