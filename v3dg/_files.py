@@ -117,22 +117,13 @@ def read_at(descriptor: int, out: npt.NDArray[Any], offset: int) -> bool:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a place to write to whose folder is not there.
-
-    Raises:
-        ValueError: It is not there.
-    """
+    """Refuse, with ValueError, a place to write to whose folder is not there."""
     if not path.parent.is_dir():
         raise ValueError(f"{path}: expected an existing folder, got {path.parent}; create it first")
 
 
 def open_regular(path: str | os.PathLike[str]) -> int:
-    """Open a file for reading and return its descriptor.
-
-    Raises:
-        ValueError: It is a directory, a device or a pipe; nothing was waited for.
-        OSError: It cannot be opened (FileNotFoundError, PermissionError, ...).
-    """
+    """A descriptor of a file to read; a directory, a device or a pipe is a ValueError, without waiting."""
     # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):

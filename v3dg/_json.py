@@ -55,12 +55,7 @@ def is_one_line(text: str) -> bool:
 
 
 def read_json(path: str | os.PathLike[str]) -> Node:
-    """Read a JSON file.
-
-    Raises:
-        ValueError: It is no regular file, or not strict JSON in UTF-8.
-        OSError: It cannot be read.
-    """
+    """Read a JSON file; ValueError where it is no regular file, or not strict JSON in UTF-8."""
     path = Path(path)
     with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
         content = file.read()

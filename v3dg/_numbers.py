@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import os
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,11 +17,7 @@ LEAST_FLOAT, MOST_FLOAT = 1.4e-45, float(np.finfo(np.float32).max)  # positive f
 
 
 def floats(values: Any, name: str, expected: str = "numbers") -> Floats:
-    """A new array of finite doubles, also of torch's tensors.
-
-    Raises:
-        ValueError: They are not numbers, not finite, or too large for a double.
-    """
+    """A new array of doubles, also of torch's tensors; ValueError for what is no number, or not finite."""
     try:
         array = np.asarray(values.numpy(force=True) if hasattr(values, "detach") else values)
         if array.dtype.kind not in "biufO":
@@ -85,6 +82,12 @@ def whole(value: Any, name: str, what: str, least: int, most: int = MOST_INT) ->
     if number > most:
         raise ValueError(f"{name}: expected at most {most}, got {shown(value)}")
     return number
+
+
+def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
+    """Raise ValueError, which names the value and says what was expected and found, unless it holds."""
+    if not holds:
+        raise ValueError(f"{os.fspath(name)}: expected {expected}")
 
 
 def check_all(name: str, values: npt.NDArray[Any], good: npt.NDArray[np.bool_], expected: Any) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from v3dg import _files
 from v3dg._json import Node, read_json
+from v3dg._numbers import check
 from v3dg.cameras import Camera, Floats, intrinsics, is_rotation, viewmat_from_blender
 
 # Names of COLMAP's models that are pinholes but for the distortion, which is looked at by itself.
@@ -48,8 +49,7 @@ def read_cameras(
         ("distortion", distortion, ("refuse", "ignore")),
         ("applied_transform", applied_transform, ("keep", "undo")),
     ):
-        if value not in choices:
-            raise ValueError(f"{name}: expected '{choices[0]}' or '{choices[1]}', got {value!r}")
+        check(name, value in choices, f"'{choices[0]}' or '{choices[1]}', got {value!r}")
     root = read_json(path)
     top = root.some_fields(("frames",))
     undo_transform = _applied(top) if applied_transform == "undo" else None

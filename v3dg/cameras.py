@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from v3dg import _core
 from v3dg._numbers import Floats as Floats
-from v3dg._numbers import positive, real, vector, whole
+from v3dg._numbers import check, positive, real, vector, whole
 
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
@@ -50,15 +50,12 @@ class Camera:
     def __post_init__(self) -> None:
         viewmat = vector(self.viewmat, "viewmat", (4, 4))
         _check_rotation(viewmat[:3, :3], "viewmat", "; put scale into the scene instead")
-        if not np.array_equal(viewmat[3], [0.0, 0.0, 0.0, 1.0]):
-            raise ValueError(f"viewmat: expected the last row 0 0 0 1, got {_text(viewmat[3])}")
+        last = viewmat[3]
+        check("viewmat", np.array_equal(last, [0, 0, 0, 1]), f"the last row 0 0 0 1, got {_text(last)}")
         K = vector(self.K, "K", (3, 3))
-        if not (K[0, 0] > 0 and K[1, 1] > 0):
-            raise ValueError(f"K: expected positive focal lengths, got {K[0, 0]:g} and {K[1, 1]:g}")
-        if K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0.0, 0.0, 1.0]):
-            raise ValueError(
-                "K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got a matrix with skew or scale"
-            )
+        check("K", K[0, 0] > 0 and K[1, 1] > 0, f"positive focal lengths, got {K[0, 0]:g} and {K[1, 1]:g}")
+        is_plain = K[0, 1] == 0 == K[1, 0] and np.array_equal(K[2], [0, 0, 1])
+        check("K", is_plain, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got a matrix with skew or scale")
         width, height = _side(self.width, "width"), _side(self.height, "height")
         near = positive(self.near, "near")
         self.__dict__.update(viewmat=viewmat, K=K, width=width, height=height, near=near)
@@ -90,16 +87,14 @@ class Camera:
         up_vector = vector(up, "up")
         with np.errstate(over="ignore"):
             distance = np.linalg.norm(goal - position)
-        if not distance > 0:
-            raise ValueError(f"target: expected a point away from the eye, got {_text(goal)} for both")
-        if not np.isfinite(distance):
-            raise ValueError(f"eye, target: expected a distance that a double can hold, got {_text(goal)}")
+        check("target", distance > 0, f"a point away from the eye, got {_text(goal)} for both")
+        check("eye, target", np.isfinite(distance), f"a distance that a double can hold, got {_text(goal)}")
         forward = (goal - position) / distance
         upwards = up_vector / (np.abs(up_vector).max() or 1.0)  # so that squares neither overflow nor vanish
         right = np.cross(forward, upwards)
         length = np.linalg.norm(right)
-        if not length > 1e-9 * np.linalg.norm(upwards):
-            raise ValueError(f"up: expected a direction that is not along the view, got {_text(up_vector)}")
+        is_aside = length > 1e-9 * np.linalg.norm(upwards)
+        check("up", is_aside, f"a direction that is not along the view, got {_text(up_vector)}")
         right /= length
         rotation = np.stack([right, np.cross(forward, right), forward])
         return cls(_rigid(rotation, position), intrinsics(fov_x, None, width, height), width, height, near)
@@ -195,10 +190,8 @@ def turntable(
         expected = "a circle that double precision resolves"
         raise ValueError(f"center, radius: expected {expected}, got {radius} around {_text(middle)}")
     elevation = real(elevation, "elevation")
-    if not abs(elevation) < math.pi / 2:
-        raise ValueError(f"elevation: expected an angle between -pi/2 and pi/2, got {elevation}")
-    if not axis.any():
-        raise ValueError(f"up: expected a direction, got {_text(axis)}")
+    check("elevation", abs(elevation) < math.pi / 2, f"an angle between -pi/2 and pi/2, got {elevation}")
+    check("up", axis.any(), f"a direction, got {_text(axis)}")
     axis /= np.abs(axis).max()  # so that squares neither overflow nor vanish
     axis /= np.linalg.norm(axis)
     # The world's axis least along `up`, made perpendicular to it.
@@ -232,9 +225,8 @@ def is_rotation(matrix: Floats) -> bool:
 
 
 def _check_rotation(matrix: Floats, name: str, advice: str = "") -> None:
-    if not is_rotation(matrix):
-        found = f"a matrix that scales, shears or mirrors{advice}"
-        raise ValueError(f"{name}: expected a rotation in the upper left 3x3, got {found}")
+    expected = "a rotation in the upper left 3x3, got a matrix that scales, shears or mirrors"
+    check(name, is_rotation(matrix), expected + advice)
 
 
 def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
@@ -259,8 +251,7 @@ def _focal(fov: float, name: str, side: int) -> float:
     fov = real(fov, name, "radians between 0 and pi")
     tangent = math.tan(0.5 * fov) if 0 < fov < math.pi else 0.0
     focal = 0.5 * side / tangent if tangent > 0 else math.inf
-    if not focal < math.inf:
-        raise ValueError(f"{name}: expected radians between 0 and pi, got {fov}")
+    check(name, focal < math.inf, f"radians between 0 and pi, got {fov}")
     return focal
 
 

@@ -116,9 +116,7 @@ def _is_plainly_drawable(asset: Gaussians) -> bool:
 
 def _examine(asset: Gaussians) -> Findings:
     isfinite = _device.library_of(asset.means).isfinite
-    finite = {
-        name: isfinite(getattr(asset, name)) for name in ("means", "quats", "scales", "opacities", "sh")
-    }
+    finite = {name: isfinite(values) for name, values in vars(asset).items()}
     masks: dict[str, Any] = {f"{name}_not_finite": _any(~good) for name, good in finite.items()}
     too_far, too_wide = (finite[name] & (abs(getattr(asset, name)) > LARGEST) for name in ("means", "scales"))
     masks["too_large"] = _any(too_far) | _any(too_wide)

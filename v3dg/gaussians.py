@@ -10,10 +10,10 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 
 from v3dg import _core
+from v3dg._numbers import check
 
 Array: TypeAlias = Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
 
-_NAMES = ("means", "quats", "scales", "opacities", "sh")
 _NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients a channel -> degree
 
 
@@ -57,18 +57,17 @@ class Gaussians:
     sh: Array
 
     def __post_init__(self) -> None:
-        for name in _NAMES:
-            _check_kind(name, getattr(self, name), self.means)
-        if self.means.ndim != 2 or self.means.shape[1] != 3:
-            raise ValueError(f"means: expected shape (N, 3), got {tuple(self.means.shape)}")
-        num = self.means.shape[0]
+        for name, array in vars(self).items():
+            _check_kind(name, array, self.means)
+        got = tuple(self.means.shape)
+        check("means", got[1:] == (3,), f"shape (N, 3), got {got}")
+        num = got[0]
         for name, shape in (("quats", (num, 4)), ("scales", (num, 3)), ("opacities", (num,))):
             got = tuple(getattr(self, name).shape)
-            if got != shape:
-                raise ValueError(f"{name}: expected shape {shape} to go with means {(num, 3)}, got {got}")
+            check(name, got == shape, f"shape {shape} to go with means {(num, 3)}, got {got}")
         got = tuple(self.sh.shape)
-        if len(got) != 3 or got[0] != num or got[1] not in _NUM_SH or got[2] != 3:
-            raise ValueError(f"sh: expected shape ({num}, K, 3) with K 1, 4, 9 or 16, got {got}")
+        fits = any(got == (num, count, 3) for count in _NUM_SH)
+        check("sh", fits, f"shape ({num}, K, 3) with K 1, 4, 9 or 16, got {got}")
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -88,7 +87,7 @@ class Gaussians:
 
         Tensors on a CUDA device that do not begin where it can be read in words of 16 bytes are copied.
         """
-        arrays = [getattr(self, name) for name in _NAMES]
+        arrays = list(vars(self).values())
         if _is_tensor(self.means):
             arrays = [tensor.detach() for tensor in arrays]
             if self.means.is_cuda:
@@ -132,22 +131,19 @@ class Gaussians:
             TypeError: a part is not Gaussians, or NumPy and torch are mixed.
         """
         parts = list(parts)
-        if not parts:
-            raise ValueError("parts: expected at least one Gaussians, got none")
+        check("parts", parts, "at least one Gaussians, got none")
         for i, part in enumerate(parts):
             if not isinstance(part, Gaussians):
                 raise TypeError(f"parts[{i}]: expected Gaussians, got {type(part).__name__}")
             _check_kind(f"parts[{i}].means", part.means, parts[0].means)
-            if part.sh_degree != parts[0].sh_degree:
-                raise ValueError(
-                    f"parts[{i}]: expected SH degree {parts[0].sh_degree} like parts[0], got {part.sh_degree}"
-                )
+            degree, first = part.sh_degree, parts[0].sh_degree
+            check(f"parts[{i}]", degree == first, f"SH degree {first} like parts[0], got {degree}")
         join: Any = np.concatenate
         if _is_tensor(parts[0].means):
             import torch
 
             join = torch.cat
-        return Gaussians(*(join([getattr(part, name) for part in parts]) for name in _NAMES))
+        return Gaussians(*map(join, zip(*(vars(part).values() for part in parts), strict=True)))
 
     def numpy(self) -> Gaussians:
         """Return the same gaussians as NumPy arrays, without gradients; copied only from another device."""
@@ -181,7 +177,7 @@ class Gaussians:
         return self._map(tensor)
 
     def _map(self, function: Any) -> Gaussians:
-        return Gaussians(*(function(getattr(self, name)) for name in _NAMES))
+        return Gaussians(*map(function, vars(self).values()))
 
 
 def empty(count: int, sh_degree: int) -> Gaussians:
@@ -198,17 +194,13 @@ def _check_kind(name: str, array: Any, like: Any) -> None:
         raise TypeError(f"{name}: expected {_kind(like)} like the others, got {_kind(array)}")
     dtype, first = (str(a.dtype).removeprefix("torch.") for a in (array, like))
     wanted = "float64" if _is_tensor(array) and first == "float64" else "float32"
-    if dtype != wanted:
-        raise ValueError(f"{name}: expected dtype {wanted}, got {dtype}; convert it first")
+    check(name, dtype == wanted, f"dtype {wanted}, got {dtype}; convert it first")
     if _is_tensor(array):
-        if array.device != like.device:
-            raise ValueError(f"{name}: expected device {like.device} like the others, got {array.device}")
-        if not array.is_contiguous():
-            raise ValueError(f"{name}: expected a contiguous tensor, got a strided one; call .contiguous()")
-    elif not array.flags.c_contiguous:
-        raise ValueError(
-            f"{name}: expected a C-contiguous array, got a strided one; call numpy.ascontiguousarray"
-        )
+        check(name, array.device == like.device, f"device {like.device} like the others, got {array.device}")
+        check(name, array.is_contiguous(), "a contiguous tensor, got a strided one; call .contiguous()")
+    else:
+        expected = "a C-contiguous array, got a strided one; call numpy.ascontiguousarray"
+        check(name, array.flags.c_contiguous, expected)
 
 
 def _checked_index(index: Any) -> Array:
@@ -222,10 +214,9 @@ def _checked_index(index: Any) -> Array:
             f"index: expected a slice, integers or booleans, got {_kind(index)}"
             + (f" of dtype {dtype}" if array.ndim else "; for one gaussian use a slice of length 1")
         )
-    if _is_tensor(array) and array.is_meta:
-        raise ValueError("index: expected a tensor with data, got one on the device meta")
-    if array.ndim != 1:
-        raise ValueError(f"index: expected one dimension, got shape {tuple(array.shape)}")
+    is_meta = _is_tensor(array) and array.is_meta
+    check("index", not is_meta, "a tensor with data, got one on the device meta")
+    check("index", array.ndim == 1, f"one dimension, got shape {tuple(array.shape)}")
     if _is_tensor(array):
         return array if dtype == "bool" else array.long()
     return np.ascontiguousarray(array, bool if dtype == "bool" else np.int64)

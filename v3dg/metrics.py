@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg._device import Device
+from v3dg._numbers import check
 from v3dg.cameras import Camera
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
@@ -33,19 +34,16 @@ def _picture(name: str, image: Any) -> NDArray[np.floating[Any]]:
         image = image.detach().cpu().numpy()
     if not isinstance(image, np.ndarray):
         raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {type(image).__name__}")
-    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise ValueError(f"{name}: expected shape (H, W, 3) with at least one pixel, got {image.shape}")
-    if not np.issubdtype(image.dtype, np.floating):
-        raise ValueError(
-            f"{name}: expected floats in [0, 1], got {image.dtype}; divide 8-bit pictures by 255"
-        )
+    fits = image.ndim == 3 and image.shape[2] == 3 and 0 not in image.shape
+    check(name, fits, f"shape (H, W, 3) with at least one pixel, got {image.shape}")
+    is_float = np.issubdtype(image.dtype, np.floating)
+    check(name, is_float, f"floats in [0, 1], got {image.dtype}; divide 8-bit pictures by 255")
     return image
 
 
 def _pair(reference: Any, test: Any) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
     a, b = _picture("reference", reference), _picture("test", test)
-    if a.shape != b.shape:
-        raise ValueError(f"test: expected the reference's shape {a.shape}, got {b.shape}")
+    check("test", a.shape == b.shape, f"the reference's shape {a.shape}, got {b.shape}")
     return a, b
 
 
@@ -88,8 +86,8 @@ def ssim(reference: Any, test: Any) -> float:
     Source: Wang et al., Image quality assessment: from error visibility to structural similarity, 2004.
     """
     pair = _pair(reference, test)
-    if min(pair[0].shape[:2]) <= _SSIM_REACH_PX:
-        raise ValueError(f"reference: expected at least {_SSIM_REACH_PX + 1} px a side, got {pair[0].shape}")
+    shape, least = pair[0].shape, _SSIM_REACH_PX + 1
+    check("reference", min(shape[:2]) >= least, f"at least {least} px a side, got {shape}")
     # A channel after the other, because this takes ten pictures' memory.
     return float(np.mean([_ssim(*(x[..., c].astype(np.float64) for x in pair)) for c in range(3)]))
 
@@ -152,11 +150,10 @@ def box_downsample(image: Any, factor: int) -> Any:
     Raises:
         ValueError: ``factor`` is not positive, or does not divide the height and the width.
     """
-    if factor < 1:
-        raise ValueError(f"factor: expected at least 1, got {factor}")
+    check("factor", factor >= 1, f"at least 1, got {factor}")
     height, width = image.shape[0], image.shape[1]
-    if height % factor or width % factor:
-        raise ValueError(f"image: expected a height and width divisible by {factor}, got {height} x {width}")
+    is_divisible = height % factor == 0 == width % factor
+    check("image", is_divisible, f"a height and width divisible by {factor}, got {height} x {width}")
     blocks = image.reshape(height // factor, factor, width // factor, factor, *image.shape[2:])
     return blocks.mean((1, 3))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from v3dg import _core
 from v3dg._device import CPU
-from v3dg._numbers import whole
+from v3dg._numbers import check, whole
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.residency import residency
@@ -61,8 +61,8 @@ def pick(
         ValueError: The pixel is not in the image, or another argument is not as in `v3dg.render`.
     """
     x, y = whole(x, "x", "a column", 0), whole(y, "y", "a row", 0)
-    if not (x < camera.width and y < camera.height):
-        raise ValueError(f"x, y: expected a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
+    is_inside = x < camera.width and y < camera.height
+    check("x, y", is_inside, f"a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
     scene = copy.copy(Scene.of(subject))  # which stays as it is
     if budget is not None:  # which is for the whole picture
         cut = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU)

@@ -68,9 +68,8 @@ def _rasterize_torch(gaussians: Gaussians, camera: Camera, options: dict[str, An
     if means.is_cuda and not _core.has_cuda:
         raise RuntimeError(f"gaussians: {_device.missing_for_cuda()}; or call gaussians.torch('cpu')")
     if means.is_cuda and means.dtype == torch.float64:
-        raise ValueError(
-            "gaussians: float64 is computed on the CPU only; call gaussians.torch('cpu'), or use float32"
-        )
+        advice = "call gaussians.torch('cpu'), or use float32"
+        raise ValueError(f"gaussians: float64 is computed on the CPU only; {advice}")
     arrays = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
     shade = torch.as_tensor(background, dtype=means.dtype)
     keep_tape = torch.is_grad_enabled() and any(t.requires_grad for t in (*arrays, shade))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import color
+from v3dg._numbers import check, color
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.false_color import ColorBy
@@ -243,22 +243,17 @@ def _stats(stats: _core.FrameStats, tolerance: float) -> Stats:
 def _check_asset(color_by: ColorBy, **options: Any) -> None:
     """An asset has no levels: refuse what asks for them."""
     for name, value in options.items():
-        if name != "tolerance" and value:
-            raise ValueError(f"{name}: expected a scene or a bundle to choose from, got an asset")
-    if color_by != "appearance":
-        raise ValueError(
-            f"color_by: expected 'appearance' for an asset, which has no levels, got {color_by!r}"
-        )
+        check(name, name == "tolerance" or not value, "a scene or a bundle to choose from, got an asset")
+    expected = f"'appearance' for an asset, which has no levels, got {color_by!r}"
+    check("color_by", color_by == "appearance", expected)
     rule_of(options.get("tolerance"), None, 0, "solid_angle", True)
 
 
 def _check_cut(cut: Selection, subject: Scene | Bundle, resident: ResidentScene, **options: Any) -> None:
     """Refuse a cut that is not of this scene as it is, and whatever else is asked for."""
     for name, value in options.items():
-        if value:
-            raise ValueError(f"{name}: expected nothing beside a cut, which has been chosen, got {value}")
+        check(name, not value, f"nothing beside a cut, which has been chosen, got {value}")
     mine = cut.scene is subject or (isinstance(subject, Bundle) and cut.scene.bundles == (subject,))
-    if not mine:
-        raise ValueError("cut: expected a selection from this scene, got one from another")
+    check("cut", mine, "a selection from this scene, got one from another")
     if isinstance(subject, Scene):
         cut.check(resident.revision)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _device
-from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, floats
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, floats
 from v3dg.bundle import Bundle
 from v3dg.rotations import rotation_from_quaternion
 
@@ -94,11 +94,11 @@ class Scene:
             positions = floats(positions, "positions")
         if len(positions.shape) == 1:
             positions = positions[None]
-        if len(positions.shape) != 2 or positions.shape[1] != 3:
-            raise ValueError(f"positions: expected shape (I, 3), got {tuple(positions.shape)}")
-        count = len(positions)
-        if len(given) != count and given is bundle:
-            raise ValueError(f"bundle: expected one for all or {count}, got {len(given)}")
+        shape = tuple(positions.shape)
+        check("positions", shape[1:] == (3,), f"shape (I, 3), got {shape}")
+        count = shape[0]
+        fits = len(given) == count or given is not bundle
+        check("bundle", fits, f"one for all or {count}, got {len(given)}")
         columns = {
             "positions": positions,
             "quaternions": (1.0, 0.0, 0.0, 0.0) if quaternions is None else quaternions,
@@ -227,8 +227,8 @@ class Scene:
         rows = np.atleast_1d(ids.numpy(force=True) if hasattr(ids, "detach") else np.asarray(ids))
         if rows.size == 0:
             return np.zeros(0, np.int64)
-        if rows.ndim != 1 or not np.issubdtype(rows.dtype, np.integer):
-            raise ValueError(f"ids: expected whole numbers (M,), got {rows.dtype} of shape {rows.shape}")
+        fits = rows.ndim == 1 and np.issubdtype(rows.dtype, np.integer)
+        check("ids", fits, f"whole numbers (M,), got {rows.dtype} of shape {rows.shape}")
         wrong = (rows < 0) | (rows >= count)
         if wrong.any():
             raise IndexError(f"ids: expected 0 to {count - 1}, got {rows[wrong][0]}")
@@ -272,8 +272,7 @@ def _rows(values: Any, name: str, count: int) -> Any:
             raise ValueError(f"{name}: expected {expected}, got {array[wrong][0]:g}")
     if name == "quaternions":
         largest = np.abs(array).max(axis=1, keepdims=True)
-        if not largest.all():
-            raise ValueError("quaternions: expected a rotation, got a quaternion of zeros")
+        check("quaternions", largest.all(), "a rotation, got a quaternion of zeros")
         array = array / largest  # so that squares neither overflow nor vanish
         array /= np.linalg.norm(array, axis=1, keepdims=True)
     return np.ascontiguousarray(array, np.float32 if name == "importance" else np.float64)

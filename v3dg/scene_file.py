@@ -14,7 +14,7 @@ import numpy as np
 
 from v3dg import _files
 from v3dg._json import Node, read_json
-from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check
 from v3dg.bundle import Bundle
 from v3dg.cameras import DEFAULT_FOV_X, Camera
 from v3dg.scene import Scene
@@ -65,8 +65,8 @@ def write_scene(
     """
     if isinstance(bundle_paths, str) or not isinstance(bundle_paths, Sequence):
         raise TypeError(f"bundle_paths: expected a list of paths, got {type(bundle_paths).__name__}")
-    if len(bundle_paths) != len(scene.bundles):
-        raise ValueError(f"bundle_paths: expected {len(scene.bundles)} paths, got {len(bundle_paths)}")
+    count, given = len(scene.bundles), len(bundle_paths)
+    check("bundle_paths", given == count, f"{count} paths, got {given}")
     scene = copy.copy(scene)  # which stays as it is
     names = [f"bundle_{b}" for b in range(len(bundle_paths))]
     poses = (scene.positions, scene.quaternions, scene.scales)

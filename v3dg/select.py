@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import MOST_FLOAT, real, vector, whole
+from v3dg._numbers import MOST_FLOAT, check, real, vector, whole
 from v3dg.bundle import Bundle, Clusters
 from v3dg.cameras import Camera, VectorLike
 from v3dg.gaussians import Gaussians
@@ -65,10 +65,8 @@ class Selection:
     def check(self, revision: tuple[int, int, int]) -> None:
         """Raise ValueError unless the scene of a revision still has the instances of the cut."""
         assert self.revision is not None
-        if revision[2] != self.revision[2]:
-            raise ValueError(
-                "cut: expected instances of the scene, got some of before others were removed; select again"
-            )
+        expected = "instances of the scene, got some of before others were removed; select again"
+        check("cut", revision[2] == self.revision[2], expected)
 
     def __len__(self) -> int:
         return len(self.instance_ids)
@@ -220,11 +218,7 @@ def _select(
 def rule_of(
     tolerance: float | None, budget: int | None, min_level: int, footprint: Footprint, cull: bool
 ) -> _core.Rule:
-    """What to choose, as the core takes it.
-
-    Raises:
-        ValueError: A number is not as `select` has it.
-    """
+    """What to choose, as the core takes it; ValueError where a number is not as `select` has it."""
     if tolerance is None:
         tolerance = DEFAULT_TOLERANCE if budget is None else 0.0
     tolerance = real(tolerance, "tolerance", "0 px² or more", 0)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v3dg._json import parse_json
-from v3dg._numbers import check_all
+from v3dg._numbers import check, check_all
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundleFile, writing
 from v3dg.bundle.format import VERSION, config_to_json, file_bytes, page_file_bytes, page_tables
@@ -91,10 +91,9 @@ class Bundle:
             groups = Groups(**{f.name: tables[f"groups.{f.name}"] for f in fields(Groups)})
             num_gaussians = int(clusters.offset[-1])
             most = file.codec.most_gaussians(file.pages_bytes)
-            if num_gaussians > most:  # before anything is computed from it
-                raise ValueError(
-                    f"clusters.offset[-1]: expected at most {most} gaussians, got {num_gaussians}"
-                )
+            # Before anything is computed from it.
+            expected = f"at most {most} gaussians, got {num_gaussians}"
+            check("clusters.offset[-1]", num_gaussians <= most, expected)
             check_tables(clusters, groups, num_gaussians)
             pages = FilePages(PageLayout.of(clusters), file)
             _check_page_tables(tables, page_tables(pages.layout, file.codec), file.pages_bytes)
@@ -236,13 +235,11 @@ def _check_page_tables(
     tables: dict[str, NDArray[Any]], expected: dict[str, NDArray[Any]], pages_bytes: int
 ) -> None:
     num_pages, expected_num_pages = len(tables["pages.bytes"]), len(expected["pages.bytes"])
-    if num_pages != expected_num_pages:
-        raise ValueError(f"pages: expected {expected_num_pages} for the clusters, got {num_pages}")
+    check("pages", num_pages == expected_num_pages, f"{expected_num_pages} for the clusters, got {num_pages}")
     for name, values in expected.items():
         check_all(name, tables[name], tables[name] == values, lambda i, v=values: f"{v[i]} for its clusters")
     total = int(page_file_bytes(expected["pages.bytes"]).sum())
-    if total != pages_bytes:
-        raise ValueError(f"pages: expected {total} bytes for the gaussians, got {pages_bytes}")
+    check("pages", total == pages_bytes, f"{total} bytes for the gaussians, got {pages_bytes}")
 
 
 def _mean(values: NDArray[np.float32]) -> float | None:

@@ -20,6 +20,7 @@ import numpy as np
 
 from v3dg import _files
 from v3dg._json import parse_json, shown
+from v3dg._numbers import check
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.format import (
     ALIGNMENT_BYTES,
@@ -90,12 +91,7 @@ class BundleWriter:
         self._is_written[first_page:last_page] = True
 
     def finish(self, clusters: Clusters, groups: Groups) -> None:
-        """Write the header and the tables; all pages have been written, which are those of the clusters.
-
-        Raises:
-            ValueError: The tables do not guarantee an exact cut.
-            RuntimeError: Pages are missing.
-        """
+        """Write the header and the tables, which are checked; all pages of the clusters are written."""
         if not self._is_written.all():
             missing = np.flatnonzero(~self._is_written)
             raise RuntimeError(f"expected all pages, got none of {len(missing)}; the first is {missing[0]}")
@@ -121,11 +117,7 @@ def writing(
     *,
     is_locked: bool = False,
 ) -> Iterator[BundleWriter]:
-    """Write a bundle's file, which appears at ``path`` when all is done; a failure leaves nothing behind.
-
-    Args:
-        is_locked: No other writes to ``path`` meanwhile, as `replacing` wants to know.
-    """
+    """Write a bundle's file, which appears at ``path`` when all is done; a failure leaves nothing behind."""
     with (
         _files.replacing(path, is_locked=is_locked) as temporary,
         open(temporary, "wb", buffering=0) as file,
@@ -141,8 +133,6 @@ class BundleFile:
     """An open bundle file: header and tables are read and checked against the file's own hash, pages are not.
 
     Attributes:
-        path: As given.
-        num_bytes: Size of the file.
         pages_bytes: Size of all pages with their padding.
         codec: What the bytes of its pages are.
         config: The JSON object that was saved.
@@ -168,6 +158,9 @@ class BundleFile:
     def _fail(self, problem: str) -> NoReturn:
         raise ValueError(f"{self.path}: {problem}")
 
+    def _check(self, name: str, holds: object, expected: str) -> None:
+        check(f"{self.path}: {name}", holds, expected)
+
     def _read_header_and_tables(self) -> None:
         self.num_bytes = os.fstat(self._fd).st_size
         if self.num_bytes < 8:
@@ -191,19 +184,15 @@ class BundleFile:
 
     def _read_metadata(self, metadata: Any) -> None:
         metadata = metadata if isinstance(metadata, dict) else {}
-        if metadata.get("format") != FORMAT:
-            self._fail(f"format: expected '{FORMAT}', got {shown(metadata.get('format'))}; not a bundle")
-        version = metadata.get("version")
-        if not isinstance(version, str) or not re.fullmatch("[1-9][0-9]{0,8}", version):
-            self._fail(f"version: expected a number of 1 or more, got {shown(version)}")
+        kind, version, degree, config = map(metadata.get, ("format", "version", "sh_degree", "config"))
+        self._check("format", kind == FORMAT, f"'{FORMAT}', got {shown(kind)}; not a bundle")
+        is_number = isinstance(version, str) and re.fullmatch("[1-9][0-9]{0,8}", version)
+        self._check("version", is_number, f"a number of 1 or more, got {shown(version)}")
         if int(version) > VERSION:
             self._fail(f"version {int(version)}, this build reads up to {VERSION}; update v3dg")
-        if metadata.get("sh_degree") not in ("0", "1", "2", "3"):
-            self._fail(f"sh_degree: expected '0' to '3', got {shown(metadata.get('sh_degree'))}")
-        self.codec = Codec(int(metadata["sh_degree"]))
-        config = metadata.get("config")
-        if not isinstance(config, str):
-            self._fail(f"config: expected a string of JSON, got {shown(config)}")
+        self._check("sh_degree", degree in ("0", "1", "2", "3"), f"'0' to '3', got {shown(degree)}")
+        self.codec = Codec(int(degree))
+        self._check("config", isinstance(config, str), f"a string of JSON, got {shown(config)}")
         self.config = self._object("config", config)
 
     def _object(self, name: str, text: str | bytes) -> dict[str, Any]:
@@ -211,38 +200,33 @@ class BundleFile:
             value = parse_json(text)
         except ValueError as error:
             self._fail(f"{name}: expected JSON, got {error}")
-        if not isinstance(value, dict):
-            self._fail(f"{name}: expected a JSON object, got {shown(value)}")
-        return value
+        self._check(name, isinstance(value, dict), f"a JSON object, got {shown(value)}")
+        return dict(value)
 
     def _check_entries(self, header: dict[str, Any]) -> dict[str, Any]:
         """Compare the header with the one that its own counts and the file's size call for."""
         counts = []
         for name in ("clusters.level", "groups.parent", "pages.bytes", "pages"):
             entry = header.get(name)
-            shape = entry.get("shape") if isinstance(entry, dict) else None
-            if not isinstance(shape, list) or len(shape) != 1 or type(shape[0]) is not int or shape[0] < 0:
-                self._fail(f"{name}: expected a tensor with one side, got {shown(entry)}")
+            shape: Any = entry.get("shape") if isinstance(entry, dict) else None
+            has_side = isinstance(shape, list) and len(shape) == 1 and type(shape[0]) is int and shape[0] >= 0
+            self._check(name, has_side, f"a tensor with one side, got {shown(entry)}")
             counts.append(shape[0])
-        if max(counts) > self.num_bytes:
-            self._fail(
-                f"size: expected more than {shown(max(counts))} bytes for tensors, got {self.num_bytes}; "
-                "the file is truncated"
-            )
+        wanted, given = max(counts), self.num_bytes
+        found = f"got {given}; the file is truncated"
+        self._check("size", wanted <= given, f"more than {shown(wanted)} bytes for tensors, {found}")
         expected = entries_of(*counts)
         for name, entry in expected.items():
-            if header.get(name) != entry:
-                self._fail(f"{name}: expected {entry}, got {shown(header.get(name))}")
+            self._check(name, header.get(name) == entry, f"{entry}, got {shown(header.get(name))}")
         unknown = sorted(set(header) - set(expected))
         if unknown:
             self._fail(f"{shown(unknown[0])}: expected only the tensors of version {VERSION}")
         for name, value in (("header", self._data_start), ("pages", counts[3])):
-            if value % ALIGNMENT_BYTES:
-                self._fail(f"{name}: expected to end at a multiple of {ALIGNMENT_BYTES}, got {value}")
-        num_bytes = self._data_start + expected["hash"]["data_offsets"][1]
-        if num_bytes != self.num_bytes:
-            problem = "truncated" if num_bytes > self.num_bytes else "followed by other data"
-            self._fail(f"size: expected {num_bytes} bytes, got {self.num_bytes}; the file is {problem}")
+            is_aligned = value % ALIGNMENT_BYTES == 0
+            self._check(name, is_aligned, f"to end at a multiple of {ALIGNMENT_BYTES}, got {value}")
+        wanted = self._data_start + expected["hash"]["data_offsets"][1]
+        problem = "truncated" if wanted > given else "followed by other data"
+        self._check("size", wanted == given, f"{wanted} bytes, got {given}; the file is {problem}")
         return expected
 
     def _read_tables(self, entries: dict[str, Any], header: tuple[NDArray[Any], NDArray[Any]]) -> None:
@@ -276,11 +260,7 @@ class BundleFile:
                 remaining[0] = remaining[0][num_read:]
 
     def read_page(self, page: int, arrays: Sequence[NDArray[Any]]) -> None:
-        """Read a page's bytes into the arrays, one after another, and verify its hash.
-
-        Raises:
-            ValueError: The page is damaged, or the file was truncated after it was opened.
-        """
+        """Read a page's bytes into the arrays, one after another; ValueError unless its hash fits."""
         num_bytes = int(self.tables["pages.bytes"][page])
         padding = np.empty(padding_bytes(num_bytes), np.uint8)
         first = int(self.tables["pages.first_cluster"][page])

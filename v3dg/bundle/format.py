@@ -108,11 +108,7 @@ def header_of(entries: dict[str, Any], sh_degree: int, config: dict[str, Any]) -
 
 
 def config_to_json(config: dict[str, Any]) -> str:
-    """The text that a bundle keeps of its config.
-
-    Raises:
-        TypeError, ValueError: It is not a dict, or has values that JSON cannot hold.
-    """
+    """The text that a bundle keeps of its config; TypeError or ValueError where JSON cannot hold it."""
     if not isinstance(config, dict):
         raise TypeError(f"config: expected a dict, got {type(config).__name__}")
     try:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from v3dg._numbers import check_all
+from v3dg._numbers import check, check_all
 from v3dg.bundle.format import DTYPES, SCHEMA
 
 if TYPE_CHECKING:
@@ -78,8 +78,7 @@ class Groups:
 
 
 def check_index(name: str, index: int, count: int) -> None:
-    if not 0 <= operator.index(index) < count:
-        raise ValueError(f"{name}: expected 0 to {count - 1}, got {index}")
+    check(name, 0 <= operator.index(index) < count, f"0 to {count - 1}, got {index}")
 
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
@@ -92,10 +91,9 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
     count = part.level.size
     for (name, kind, rows, rest), array in zip(columns, arrays, strict=True):
         dtype, shape = np.dtype(DTYPES[kind]), (count + (rows == "C+1"), *rest)
-        if array.dtype != dtype or array.shape != shape:
-            raise ValueError(f"{name}: expected {dtype} {shape}, got {array.dtype} {array.shape}")
-        if not array.flags.c_contiguous:
-            raise ValueError(f"{name}: expected a C-contiguous array; use np.ascontiguousarray")
+        fits = array.dtype == dtype and array.shape == shape
+        check(name, fits, f"{dtype} {shape}, got {array.dtype} {array.shape}")
+        check(name, array.flags.c_contiguous, "a C-contiguous array; use np.ascontiguousarray")
         if array.flags.writeable:
             own = array.copy()
             own.flags.writeable = False
@@ -108,11 +106,7 @@ def _ascends(values: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def check_tables(clusters: Clusters, groups: Groups, num_gaussians: int) -> None:
-    """Check that the tables fit each other and the gaussians, and that the cut will be exact.
-
-    Raises:
-        ValueError: Names the table, its first wrong row and what was expected.
-    """
+    """Raise ValueError unless the tables fit each other and the gaussians, and the cut will be exact."""
     _check_offsets(clusters, num_gaussians)
     _check_tree(clusters, groups)
     _check_values(clusters, groups)
@@ -121,15 +115,12 @@ def check_tables(clusters: Clusters, groups: Groups, num_gaussians: int) -> None
 
 def _check_offsets(clusters: Clusters, num_gaussians: int) -> None:
     offset, level = clusters.offset, clusters.level
-    if len(clusters) >= 1 << 31:
-        raise ValueError(f"clusters: expected fewer than 2^31, got {len(clusters)}")
-    if offset[0] != 0:
-        raise ValueError(f"clusters.offset[0]: expected 0, got {offset[0]}")
+    check("clusters", len(clusters) < 1 << 31, f"fewer than 2^31, got {len(clusters)}")
+    check("clusters.offset[0]", offset[0] == 0, f"0, got {offset[0]}")
     check_all("clusters.offset", offset, _ascends(offset), "offsets that never decrease")
-    if offset[-1] != num_gaussians:
-        raise ValueError(f"clusters.offset[-1]: expected {num_gaussians} gaussians, got {offset[-1]}")
-    if len(clusters) and level[0] != 0:
-        raise ValueError(f"clusters.level[0]: expected 0, got {level[0]}")
+    check("clusters.offset[-1]", offset[-1] == num_gaussians, f"{num_gaussians} gaussians, got {offset[-1]}")
+    first = level[0] if len(level) else 0
+    check("clusters.level[0]", first == 0, f"0, got {first}")
     step = np.diff(level.astype(np.int64), prepend=level[:1])
     check_all("clusters.level", level, (step == 0) | (step == 1), "the level before, or one more")
 

@@ -88,12 +88,7 @@ def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
 
 
 def check_writable(gaussians: Gaussians) -> Gaussians:
-    """The gaussians on the host.
-
-    Raises:
-        TypeError: They are not Gaussians.
-        ValueError: They have values that a quantised format cannot hold; names the first.
-    """
+    """The gaussians on the host; ValueError names the first value that a quantised format cannot hold."""
     if not isinstance(gaussians, Gaussians):
         raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}")
     host = gaussians.numpy()

@@ -10,18 +10,13 @@ from typing import IO, TypeAlias
 
 from v3dg import _files
 from v3dg._json import Node
+from v3dg._numbers import check as check
 
 _FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: that many may all be equal, in a file of any size
 _FREE_BYTES = 1 << 20  # that a member of a zip may have whatever the size of the zip
 
 
 Path: TypeAlias = str | os.PathLike[str]
-
-
-def check(path: Path, holds: object, expected: str) -> None:
-    """Raise ValueError, which names the file and says what was expected and found, unless it holds."""
-    if not holds:
-        raise ValueError(f"{os.fspath(path)}: expected {expected}")
 
 
 @contextlib.contextmanager
