@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
@@ -30,16 +30,14 @@ class Device:
     def __str__(self) -> str:
         return f"cuda:{self.number}" if self.is_cuda else "cpu"
 
-    @contextmanager
-    def current(self) -> Iterator[None]:
+    def current(self) -> AbstractContextManager[Any]:
         """Make it torch's current device meanwhile; the CPU always is one."""
         if not self.is_cuda:
-            yield
-            return
+            return nullcontext()
         import torch
 
-        with torch.cuda.device(self.number):
-            yield
+        context: AbstractContextManager[Any] = torch.cuda.device(self.number)
+        return context
 
 
 CPU = Device()
@@ -66,7 +64,9 @@ def resolve(device: str | Device) -> Device:
             raise RuntimeError(
                 f"device: expected one of {_core.num_cuda_devices()} CUDA devices, got {name!r}"
             )
-        return Device(int(number)) if number else Device(current_device())
+        import torch
+
+        return Device(int(number) if number else int(torch.cuda.current_device()))
     if kind == "cuda":
         raise RuntimeError(f"device: {missing}; or use 'cpu'")
     return CPU
@@ -132,13 +132,6 @@ def all_like(device: Device) -> list[Device]:
     return [device, *(other for other in others if describe(other) == describe(device))]
 
 
-def current_device() -> int:
-    """Torch's current CUDA device."""
-    import torch
-
-    return int(torch.cuda.current_device())
-
-
 def library_of(array: Array) -> Any:
     """numpy or torch; many functions have the same names and arguments in both."""
     if isinstance(array, np.ndarray):
@@ -175,17 +168,14 @@ def memory_errors() -> Iterator[None]:
         raise MemoryError(str(error)) from error
 
 
-@contextmanager
-def own_stream(device: Device) -> Iterator[None]:
+def own_stream(device: Device) -> AbstractContextManager[Any]:
     """Make a device current, and on it a stream that no other thread uses."""
     if not device.is_cuda:
-        yield
-        return
+        return nullcontext()
     import torch
 
     stream: Any = torch.cuda.Stream
-    with torch.cuda.stream(stream(device.number)):
-        yield
+    return torch.cuda.stream(stream(device.number))
 
 
 def with_this_stream(work: Callable[[_T], None], device: Device) -> Callable[[_T], None]:

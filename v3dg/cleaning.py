@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core, _device
+from v3dg._numbers import MOST_FLOAT
 from v3dg.gaussians import Array, Gaussians
 
 LARGEST = 1e18
@@ -100,18 +101,10 @@ def examine(asset: Gaussians) -> Findings:
 
 def _is_plainly_drawable(asset: Gaussians) -> bool:
     """Whether least and greatest values tell that all can be drawn; no comparison holds for NaN."""
-
-    def lie(values: npt.NDArray[np.float32], least: float, most: float) -> bool:
-        return bool(values.min() >= least and values.max() <= most)
-
-    finite = float(np.finfo(np.float32).max)
-    return (
-        lie(asset.means, -LARGEST, LARGEST)
-        and lie(asset.quats, -finite, finite)
-        and lie(asset.scales, 0, LARGEST)
-        and lie(asset.opacities, SMALLEST_OPACITY, 1)
-        and lie(asset.sh, -finite, finite)
-    )
+    least = -LARGEST, -MOST_FLOAT, 0, SMALLEST_OPACITY, -MOST_FLOAT
+    most = LARGEST, MOST_FLOAT, LARGEST, 1, MOST_FLOAT
+    arrays = zip(vars(asset).values(), least, most, strict=True)
+    return all(array.min() >= low and array.max() <= high for array, low, high in arrays)
 
 
 def _examine(asset: Gaussians) -> Findings:
