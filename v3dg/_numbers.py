@@ -90,6 +90,12 @@ def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
         raise ValueError(f"{os.fspath(name)}: expected {expected}")
 
 
+def check_type(name: str, value: object, kind: type, expected: str) -> None:
+    """Raise TypeError unless a value is of a kind, as which it is expected."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}")
+
+
 def check_all(name: str, values: npt.NDArray[Any], good: npt.NDArray[np.bool_], expected: Any) -> None:
     """Name the first row that is not good; ``expected`` is a text, or makes one from the row."""
     if not good.all():

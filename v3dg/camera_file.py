@@ -45,11 +45,9 @@ def read_cameras(
         ValueError: The file is not such a file, or has other cameras than pinholes; names the place in it.
         OSError: The file cannot be read.
     """
-    for name, value, choices in (
-        ("distortion", distortion, ("refuse", "ignore")),
-        ("applied_transform", applied_transform, ("keep", "undo")),
-    ):
-        check(name, value in choices, f"'{choices[0]}' or '{choices[1]}', got {value!r}")
+    check("distortion", distortion in ("refuse", "ignore"), f"'refuse' or 'ignore', got {distortion!r}")
+    is_known = applied_transform in ("keep", "undo")
+    check("applied_transform", is_known, f"'keep' or 'undo', got {applied_transform!r}")
     root = read_json(path)
     top = root.some_fields(("frames",))
     undo_transform = _applied(top) if applied_transform == "undo" else None

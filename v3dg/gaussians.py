@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 
 from v3dg import _core
-from v3dg._numbers import check
+from v3dg._numbers import check, check_type
 
 Array: TypeAlias = Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
 
@@ -133,8 +133,7 @@ class Gaussians:
         parts = list(parts)
         check("parts", parts, "at least one Gaussians, got none")
         for i, part in enumerate(parts):
-            if not isinstance(part, Gaussians):
-                raise TypeError(f"parts[{i}]: expected Gaussians, got {type(part).__name__}")
+            check_type(f"parts[{i}]", part, Gaussians, "Gaussians")
             _check_kind(f"parts[{i}].means", part.means, parts[0].means)
             degree, first = part.sh_degree, parts[0].sh_degree
             check(f"parts[{i}]", degree == first, f"SH degree {first} like parts[0], got {degree}")

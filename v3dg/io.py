@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
+from v3dg._numbers import check_type
 from v3dg.formats import checkpoint, compressed_ply, ksplat, ply, sog, splat, spz, streamed_sog
 from v3dg.formats._asset_file import AssetFile
 from v3dg.formats.ply import PlyEncoding
@@ -110,8 +111,7 @@ def write_asset(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "bi
             length zero.
         OSError: The file cannot be written.
     """
-    if not isinstance(gaussians, Gaussians):
-        raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}")
+    check_type("gaussians", gaussians, Gaussians, "Gaussians")
     write = _by_name(path, _WRITERS)
     if write is ply.write:
         if not isinstance(encoding, str):

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _device
-from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, floats
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, check_type, floats
 from v3dg.bundle import Bundle
 from v3dg.rotations import rotation_from_quaternion
 
@@ -88,8 +88,7 @@ class Scene:
         """
         given = bundle if isinstance(bundle, list | tuple) else [bundle]
         for one in given:
-            if not isinstance(one, Bundle):
-                raise TypeError(f"bundle: expected a Bundle, got {type(one).__name__}")
+            check_type("bundle", one, Bundle, "a Bundle")
         if not getattr(positions, "is_cuda", False):
             positions = floats(positions, "positions")
         if len(positions.shape) == 1:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from v3dg._json import parse_json
-from v3dg._numbers import check, check_all
+from v3dg._numbers import check, check_all, check_type
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundleFile, writing
 from v3dg.bundle.format import VERSION, config_to_json, file_bytes, page_file_bytes, page_tables
@@ -35,6 +35,8 @@ class Bundle:
             ``config`` is not JSON.
     """
 
+    _file: BundleFile | None = None
+
     def __init__(
         self,
         clusters: Clusters,
@@ -42,18 +44,14 @@ class Bundle:
         gaussians: Gaussians,
         config: dict[str, Any] | None = None,
     ) -> None:
-        for name, value, kind in (
-            ("clusters", clusters, Clusters),
-            ("groups", groups, Groups),
-            ("gaussians", gaussians, Gaussians),
-        ):
-            if not isinstance(value, kind):
-                raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+        check_type("clusters", clusters, Clusters, "Clusters")
+        check_type("groups", groups, Groups, "Groups")
+        check_type("gaussians", gaussians, Gaussians, "Gaussians")
         # Made anew, because unpickling leaves out what making does: checks, and that arrays are read-only.
         clusters, groups = replace(clusters), replace(groups)
         check_tables(clusters, groups, len(gaussians))
         pages = MemoryPages(PageLayout.of(clusters), gaussians.numpy())
-        self._set(clusters, groups, config or {}, Codec(gaussians.sh_degree), pages, None)
+        self._set(clusters, groups, config or {}, Codec(gaussians.sh_degree), pages)
 
     def _set(
         self,
@@ -62,7 +60,6 @@ class Bundle:
         config: dict[str, Any],
         codec: Codec,
         pages: MemoryPages | FilePages,
-        file: BundleFile | None,
     ) -> None:
         self.config: dict[str, Any] = parse_json(config_to_json(config))
         self._clusters = clusters
@@ -71,7 +68,6 @@ class Bundle:
         self._codec = codec
         self._layout = pages.layout
         self._pages: MemoryPages | FilePages = pages
-        self._file = file
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Bundle:
@@ -98,7 +94,8 @@ class Bundle:
             pages = FilePages(PageLayout.of(clusters), file)
             _check_page_tables(tables, page_tables(pages.layout, file.codec), file.pages_bytes)
             bundle = cls.__new__(cls)
-            bundle._set(clusters, groups, file.config, file.codec, pages, file)
+            bundle._set(clusters, groups, file.config, file.codec, pages)
+            bundle._file = file
         except ValueError as error:
             file.close()
             raise ValueError(f"{file.path}: {error}") from None

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from v3dg._numbers import check_type
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -92,7 +94,8 @@ def entries_of(num_clusters: int, num_groups: int, num_pages: int, pages_bytes: 
 def entries_of_layout(layout: PageLayout, codec: Codec) -> dict[str, Any]:
     """The same from what is in each page: a group for each but the last."""
     pages_bytes = int(page_file_bytes(codec.page_bytes(layout.num_gaussians)).sum())
-    return entries_of(layout.num_clusters, max(layout.num_pages - 1, 0), layout.num_pages, pages_bytes)
+    num_clusters, num_pages = int(layout.first_cluster[-1]), layout.num_pages
+    return entries_of(num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
 
 
 def header_of(entries: dict[str, Any], sh_degree: int, config: dict[str, Any]) -> bytes:
@@ -109,8 +112,7 @@ def header_of(entries: dict[str, Any], sh_degree: int, config: dict[str, Any]) -
 
 def config_to_json(config: dict[str, Any]) -> str:
     """The text that a bundle keeps of its config; TypeError or ValueError where JSON cannot hold it."""
-    if not isinstance(config, dict):
-        raise TypeError(f"config: expected a dict, got {type(config).__name__}")
+    check_type("config", config, dict, "a dict")
     try:
         return json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:

@@ -51,10 +51,6 @@ class PageLayout:
         return len(self.first_cluster) - 1
 
     @property
-    def num_clusters(self) -> int:
-        return int(self.first_cluster[-1])
-
-    @property
     def num_gaussians(self) -> NDArray[np.int64]:
         """(P,) of each page."""
         return np.diff(self.first_gaussian)

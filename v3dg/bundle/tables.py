@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from v3dg._numbers import check, check_all
+from v3dg._numbers import check, check_all, check_type
 from v3dg.bundle.format import DTYPES, SCHEMA
 
 if TYPE_CHECKING:
@@ -86,8 +86,7 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
     columns = [column for column in SCHEMA if column[0].startswith(prefix)]
     arrays = [getattr(part, name.removeprefix(prefix)) for name, _, _, _ in columns]
     for (name, _, _, _), array in zip(columns, arrays, strict=True):
-        if not isinstance(array, np.ndarray):
-            raise TypeError(f"{name}: expected a NumPy array, got {type(array).__name__}")
+        check_type(name, array, np.ndarray, "a NumPy array")
     count = part.level.size
     for (name, kind, rows, rest), array in zip(columns, arrays, strict=True):
         dtype, shape = np.dtype(DTYPES[kind]), (count + (rows == "C+1"), *rest)

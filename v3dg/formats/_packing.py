@@ -89,8 +89,6 @@ def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
 
 def check_writable(gaussians: Gaussians) -> Gaussians:
     """The gaussians on the host; ValueError names the first value that a quantised format cannot hold."""
-    if not isinstance(gaussians, Gaussians):
-        raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}")
     host = gaussians.numpy()
     for name, values in vars(host).items():
         check_all(name, values, np.isfinite(values), "finite values")
