@@ -9,24 +9,24 @@ from typing import TypeVar
 
 from v3dg._numbers import check_type
 from v3dg.formats import checkpoint, compressed_ply, ksplat, ply, sog, splat, spz, streamed_sog
-from v3dg.formats._asset_file import AssetFile
+from v3dg.formats._asset_file import AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 
 Path = str | os.PathLike[str]
 Format = TypeVar("Format")
 
-# By the end of a file's name: what reads it whole, and what opens it. The first that fits counts.
-_READERS: dict[str, tuple[Callable[[Path], Gaussians], Callable[[Path], AssetFile]]] = {
-    ".ply": (ply.read, ply.open_file),
-    ".splat": (splat.read, splat.open_file),
-    ".ksplat": (ksplat.read, ksplat.open_file),
-    ".spz": (spz.read, spz.open_file),
-    ".sog": (sog.read, sog.open_file),
-    "lod-meta.json": (streamed_sog.read, streamed_sog.open_file),
-    "meta.json": (sog.read, sog.open_file),
-    ".ckpt": (checkpoint.read, checkpoint.open_file),
-    ".pt": (checkpoint.read, checkpoint.open_file),
+# By the end of a file's name. The first that fits counts.
+_READERS: dict[str, Callable[[Path], AssetFile]] = {
+    ".ply": ply.open_file,
+    ".splat": splat.open_file,
+    ".ksplat": ksplat.open_file,
+    ".spz": spz.open_file,
+    ".sog": sog.open_file,
+    "lod-meta.json": streamed_sog.open_file,
+    "meta.json": sog.open_file,
+    ".ckpt": checkpoint.open_file,
+    ".pt": checkpoint.open_file,
 }
 _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
     ".compressed.ply": compressed_ply.write,
@@ -70,8 +70,8 @@ def read_asset(path: Path) -> Gaussians:
         ValueError: Another name, or the content is not of its kind; says what was expected and found.
         OSError: The file cannot be opened or read (FileNotFoundError, IsADirectoryError, ...).
     """
-    read, _ = _by_name(path, _READERS)
-    return read(path)
+    file = open_asset(path)
+    return file.read(0, file.num_gaussians)
 
 
 def open_asset(path: Path) -> AssetFile:
@@ -80,14 +80,12 @@ def open_asset(path: Path) -> AssetFile:
     `.ply`, `.splat` and `.compressed.ply` are read row by row. Of the others, reading the first rows takes
     the memory for all.
     """
-    _, open_file = _by_name(path, _READERS)
-    return open_file(path)
+    return _by_name(path, _READERS)(path)
 
 
 def asset_bytes(path: Path) -> int:
     """Bytes on disk of an asset that can be read: of all files that it names and that are there."""
-    files = set(_by_name(path, _FILES)(pathlib.Path(path)))
-    return sum(file.stat().st_size for file in files if file.exists())
+    return bytes_of(_by_name(path, _FILES)(pathlib.Path(path)))
 
 
 def write_asset(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "binary_little_endian") -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -33,34 +33,29 @@ class AssetFile:
     read: Callable[[int, int], Gaussians]
     whole_bytes: int = 0
 
-    def read_all(self) -> Gaussians:
-        return self.read(0, self.num_gaussians)
-
 
 def gaussian_bytes(sh_degree: int) -> int:
     """Of one gaussian in memory."""
     return 4 * (11 + 3 * (sh_degree + 1) ** 2)
 
 
+def bytes_of(files: Iterable[Path]) -> int:
+    """On disk, of those that are there."""
+    return sum(os.stat(file).st_size for file in set(files) if os.path.exists(file))
+
+
 def whole_file(
-    path: Path, num_gaussians: int, sh_degree: int, read: Callable[[Path], Gaussians], num_bytes: int
+    path: Path, count: int, sh_degree: int, read: Callable[[Path], Gaussians], files: Iterable[Path] = ()
 ) -> AssetFile:
-    """A file, of so many bytes, that can only be read whole: on the first read, and then kept."""
+    """A file, and others that it names, that can only be read whole: on the first read, and then kept."""
     whole = cache(lambda: read(path))
     # While it is read: what is on the disk, and on the way to the gaussians no more than twice those.
-    memory = num_bytes + 2 * num_gaussians * gaussian_bytes(sh_degree)
-    return AssetFile(
-        path, num_gaussians, sh_degree, lambda first, last: whole().subset(slice(first, last)), memory
-    )
+    memory = bytes_of([path, *files]) + 2 * count * gaussian_bytes(sh_degree)
+    return AssetFile(path, count, sh_degree, lambda first, last: whole().subset(slice(first, last)), memory)
 
 
 class File:
-    """A regular file that is read in places; closed when it is dropped.
-
-    Raises:
-        ValueError: It is a directory, a device or a pipe.
-        OSError: It cannot be opened.
-    """
+    """A file that is read in places, closed when it is dropped; ValueError where it is no regular one."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -70,11 +65,7 @@ class File:
         self.num_bytes = os.fstat(self._descriptor).st_size
 
     def rows(self, dtype: np.dtype[Any], offset: int, count: int) -> NDArray[Any]:
-        """`count` records of a kind from an offset on.
-
-        Raises:
-            ValueError: The file has become shorter since it was opened.
-        """
+        """`count` records of a kind from an offset on; ValueError where the file has become shorter."""
         rows = np.empty(count, dtype)
         with _files.naming_errors(self.path):
             is_whole = _files.read_at(self._descriptor, rows, offset)

@@ -31,11 +31,6 @@ def telling(path: Path, expected: str) -> Iterator[None]:
         raise ValueError(f"{os.fspath(path)}: expected {expected}, got {ascii(text[:200])[1:-1]}") from None
 
 
-def read_bytes(path: Path) -> bytes:
-    """All of a file; ValueError where it is no regular one."""
-    return Claims().read(path)
-
-
 def least_bytes(count: int) -> int:
     """Bytes that a file of so many gaussians needs to be believed: one for each, from a number on."""
     return max(0, count - _FREE_GAUSSIANS)

@@ -9,7 +9,6 @@ that it names is imported or called, and only the numbers of the gaussians are r
 from __future__ import annotations
 
 import math
-import os
 import pickletools
 from typing import Any, NamedTuple
 
@@ -54,7 +53,7 @@ def open_file(path: Path) -> AssetFile:
     with claims.open(path) as file:
         fields = _fields_of(path, Archive(path, file))[0]
     count, num_higher = _size(path, fields, claims)
-    return whole_file(path, count, DEGREES[num_higher], read, os.stat(path).st_size)
+    return whole_file(path, count, DEGREES[num_higher], read)
 
 
 def read(path: Path) -> Gaussians:

@@ -102,11 +102,6 @@ def open_file(path: Path) -> AssetFile:
     return AssetFile(path, count, degree, read_rows)
 
 
-def read(path: Path) -> Gaussians:
-    """Read a `.compressed.ply` file."""
-    return open_file(path).read_all()
-
-
 def _decoded(
     vertex: NDArray[Any],
     rest: NDArray[np.uint8],
@@ -204,9 +199,8 @@ def _range_names(kind: str) -> list[str]:
 
 def _ranges(chunk: NDArray[Any], kinds: Sequence[str]) -> dict[str, tuple[Floats, Floats]]:
     """Lowest and highest of each chunk, (C, 3) each; files without ranges of colour mean 0 to 1."""
-    ranges: dict[str, tuple[Floats, Floats]] = {
-        "color": (np.zeros((len(chunk), 3)), np.ones((len(chunk), 3)))
-    }
+    ones: Floats = np.ones((len(chunk), 3))
+    ranges = {"color": (0.0 * ones, ones)}
     for kind in kinds:
         with np.errstate(invalid="ignore"):  # signalling NaN
             values = np.stack([chunk[name] for name in _range_names(kind)], axis=1).astype(np.float64)
@@ -248,9 +242,8 @@ def _elements(file: File) -> dict[str, _Element]:
         words, shown = line.split(), f"{line[:60]!a}"
         if words[:1] == ["element"]:
             is_count = len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 12
-            check(
-                path, is_count and words[1] not in elements, f"'element NAME COUNT', each once, got {shown}"
-            )
+            is_new = is_count and words[1] not in elements
+            check(path, is_new, f"'element NAME COUNT', each once, got {shown}")
             fields: list[tuple[str, str]] = []
             elements[words[1]] = int(words[2]), fields
         elif words[:1] == ["property"]:

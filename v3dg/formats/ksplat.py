@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
-from v3dg.formats._reading import Claims, Path, check, read_bytes
+from v3dg.formats._reading import Claims, Path, check
 from v3dg.gaussians import Gaussians
 
 _HEADER_BYTES = 4096
@@ -37,14 +37,15 @@ _Centers: TypeAlias = tuple[NDArray[Any], float, int]
 def open_file(path: Path) -> AssetFile:
     """Open a `.ksplat` file; all of it is read with its first rows."""
     with Claims().open(path) as file:
-        start = file.read(_HEADER_BYTES + _MAX_SECTIONS * _SECTION_BYTES)
+        size = os.fstat(file.fileno()).st_size
+        start = file.read(min(size, _HEADER_BYTES + _MAX_SECTIONS * _SECTION_BYTES))
     headers, degree, _ = _headers(path, start)
-    return whole_file(path, sum(header[0] for header in headers), degree, read, os.stat(path).st_size)
+    return whole_file(path, sum(header[0] for header in headers), degree, read)
 
 
 def read(path: Path) -> Gaussians:
     """Read a `.ksplat` file of version 0.1 and later, of SH degree 0 to 2."""
-    content = read_bytes(path)
+    content = Claims().read(path)
     headers, degree, compression = _headers(path, content)
     low, high = struct.unpack_from("<ff", content, 36)
     sh_range = (low, high) if low < high else _SH_RANGE

@@ -24,11 +24,6 @@ def open_file(path: Path) -> AssetFile:
     )
 
 
-def read(path: Path) -> Gaussians:
-    """Read a `.ply` file."""
-    return open_file(path).read_all()
-
-
 def write(path: Path, gaussians: Gaussians, encoding: PlyEncoding = "binary_little_endian") -> None:
     """Write a `.ply` file."""
     host = gaussians.numpy()

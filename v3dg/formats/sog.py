@@ -56,8 +56,7 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
     with claims.open(path) as file:
         text = file.read() if path.suffix == ".json" else Archive(path, file).read("meta.json")
     count, degree = _size(_meta(path, text))
-    num_bytes = sum(file.stat().st_size for file in files(path) if file.exists())
-    return whole_file(path, count, degree, read, num_bytes)
+    return whole_file(path, count, degree, read, files(path))
 
 
 def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussians:

@@ -24,17 +24,11 @@ def open_file(path: Path) -> AssetFile:
     file, size = File(path), _RECORD.itemsize
     is_whole = file.num_bytes % size == 0
     check(path, is_whole, f"a multiple of 32 bytes, got {file.num_bytes}; is the file complete?")
-    return AssetFile(
-        path,
-        file.num_bytes // size,
-        0,
-        lambda first, last: _decoded(file.rows(_RECORD, first * size, last - first)),
-    )
 
+    def read(first: int, last: int) -> Gaussians:
+        return _decoded(file.rows(_RECORD, first * size, last - first))
 
-def read(path: Path) -> Gaussians:
-    """Read a `.splat` file."""
-    return open_file(path).read_all()
+    return AssetFile(path, file.num_bytes // size, 0, read)
 
 
 def _decoded(records: NDArray[Any]) -> Gaussians:

@@ -9,7 +9,6 @@ Coordinates are passed on as they are stored. See docs/formats.md.
 from __future__ import annotations
 
 import math
-import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -56,7 +55,7 @@ def open_file(path: Path) -> AssetFile:
             header = zlib.decompressobj(31).decompress(header, _HEADER.size)
     check(path, len(header) >= _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
     _, degree, _, sizes = _checked_header(path, header, claims)
-    return whole_file(path, sizes[1], degree, read, os.stat(path).st_size)
+    return whole_file(path, sizes[1], degree, read)
 
 
 def read(path: Path) -> Gaussians:
@@ -75,8 +74,8 @@ def write(path: Path, gaussians: Gaussians) -> None:
     host = check_writable(gaussians)
     reach = float(np.abs(host.means).max(initial=0.0))
     bits = _fraction_bits(reach)
-    if reach * 2**bits > _LARGEST_FIXED:
-        raise ValueError(f"means: expected coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
+    fits = reach * 2**bits <= _LARGEST_FIXED
+    check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
 
     def fixed(rows: slice) -> bytes:
         numbers = np.rint(host.means[rows].astype(np.float64) * 2**bits).astype("<i4")

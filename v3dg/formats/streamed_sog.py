@@ -29,8 +29,7 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
     if environment is not None:
         parts.append(sog.open_file(path.parent / environment))
         count += parts[-1].num_gaussians
-    num_bytes = sum(file.stat().st_size for file in files(path) if file.exists())
-    return whole_file(path, count, parts[0].sh_degree, read, num_bytes)
+    return whole_file(path, count, parts[0].sh_degree, read, files(path))
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
