@@ -86,7 +86,7 @@ class Bundle:
             clusters = Clusters(**{f.name: tables[f"clusters.{f.name}"] for f in fields(Clusters)})
             groups = Groups(**{f.name: tables[f"groups.{f.name}"] for f in fields(Groups)})
             num_gaussians = int(clusters.offset[-1])
-            most = file.codec.most_gaussians(file.pages_bytes)
+            most = file.pages_bytes // file.codec.gaussian_bytes
             # Before anything is computed from it.
             expected = f"at most {most} gaussians, got {num_gaussians}"
             check("clusters.offset[-1]", num_gaussians <= most, expected)
@@ -97,7 +97,6 @@ class Bundle:
             bundle._set(clusters, groups, file.config, file.codec, pages)
             bundle._file = file
         except ValueError as error:
-            file.close()
             raise ValueError(f"{file.path}: {error}") from None
         return bundle
 

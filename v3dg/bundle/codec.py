@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from v3dg.gaussians import Gaussians, empty
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
-
-    from v3dg.gaussians import Gaussians
 
 
 class Codec:
@@ -19,15 +19,11 @@ class Codec:
     def __init__(self, sh_degree: int) -> None:
         self.sh_degree = sh_degree
         # 3 mean, 4 quaternion, 3 scale, 1 opacity, 3 (d+1)² SH.
-        self._gaussian_bytes = 4 * (11 + 3 * (sh_degree + 1) ** 2)
+        self.gaussian_bytes = 4 * (11 + 3 * (sh_degree + 1) ** 2)
 
     def page_bytes(self, num_gaussians: NDArray[np.int64]) -> NDArray[np.int64]:
         """Sizes of pages of so many gaussians, without what they are filled up with."""
-        return num_gaussians * self._gaussian_bytes
-
-    def most_gaussians(self, num_bytes: int) -> int:
-        """How many gaussians so many bytes can hold."""
-        return num_bytes // self._gaussian_bytes
+        return num_gaussians * self.gaussian_bytes
 
     def encode(self, gaussians: Gaussians, rows: slice) -> list[NDArray[Any]]:
         """Arrays whose bytes, one array after another, are those of the page that has these rows."""
@@ -36,3 +32,7 @@ class Codec:
     def decode(self, read: Callable[[Sequence[NDArray[Any]]], None], out: Gaussians, rows: slice) -> None:
         """Fill the rows with a page, whose bytes `read` reads into the arrays that it is given."""
         read(self.encode(out, rows))
+
+    def empty(self, count: int) -> Gaussians:
+        """Gaussians on the host to decode to, with any values."""
+        return empty(count, self.sh_degree)

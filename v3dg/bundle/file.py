@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from v3dg.gaussians import Gaussians
 
 _THREADS = 8
+_DAMAGED = "the file is damaged, copy or build it again"
 
 
 @dataclass(eq=False, repr=False)
@@ -130,7 +131,9 @@ def writing(
 
 
 class BundleFile:
-    """An open bundle file: header and tables are read and checked against the file's own hash, pages are not.
+    """A bundle file: header and tables are read and checked against the file's own hash, pages are not.
+
+    It is closed when it is dropped.
 
     Attributes:
         pages_bytes: Size of all pages with their padding.
@@ -147,13 +150,9 @@ class BundleFile:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = os.fspath(path)
         self._fd = _files.open_regular(path)
-        self.close = weakref.finalize(self, os.close, self._fd)
-        try:
-            with _files.naming_errors(path):
-                self._read_header_and_tables()
-        except BaseException:
-            self.close()
-            raise
+        weakref.finalize(self, os.close, self._fd)
+        with _files.naming_errors(path):
+            self._read_header_and_tables()
 
     def _fail(self, problem: str) -> NoReturn:
         raise ValueError(f"{self.path}: {problem}")
@@ -237,9 +236,7 @@ class BundleFile:
         stored = np.empty(HASH_BYTES, np.uint8)
         self._read([data, stored], self._data_start + start)
         if page_hash((*header, data)) != stored.tobytes():
-            self._fail(
-                "hash: the header and tables do not match it; the file is damaged, copy or build it again"
-            )
+            self._fail(f"hash: the header and tables do not match it; {_DAMAGED}")
         data.flags.writeable = False
         self.tables: dict[str, NDArray[Any]] = {}
         for name, dtype, _, _ in SCHEMA:
@@ -248,16 +245,10 @@ class BundleFile:
 
     def _read(self, buffers: Sequence[NDArray[Any]], offset: int) -> None:
         """Fill all buffers from one place of the file."""
-        remaining = [memoryview(buffer.reshape(-1).view(np.uint8).data) for buffer in buffers if buffer.size]
-        while remaining:
-            num_read = os.preadv(self._fd, remaining, offset)  # the system stops at about 2 GiB
-            if num_read == 0:
+        for buffer in buffers:
+            if not _files.read_at(self._fd, buffer, offset):
                 self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
-            offset += num_read
-            while remaining and num_read >= len(remaining[0]):
-                num_read -= len(remaining.pop(0))
-            if num_read:
-                remaining[0] = remaining[0][num_read:]
+            offset += buffer.nbytes
 
     def read_page(self, page: int, arrays: Sequence[NDArray[Any]]) -> None:
         """Read a page's bytes into the arrays, one after another; ValueError unless its hash fits."""
@@ -272,7 +263,4 @@ class BundleFile:
                 error.errno, f"{os.strerror(error.errno or errno.EIO)} in page {page}", self.path
             ) from error
         if page_hash((*arrays, padding)) != self.tables["pages.hash"][page].tobytes():
-            self._fail(
-                f"page {page} (clusters {first} to {last}): the hash does not match; the file is damaged, "
-                "copy or build it again"
-            )
+            self._fail(f"page {page} (clusters {first} to {last}): the hash does not match; {_DAMAGED}")

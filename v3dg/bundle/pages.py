@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from v3dg import _device
-from v3dg.gaussians import Gaussians, empty
+from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -103,7 +103,7 @@ class FilePages:
 
     def _read(self, first_page: int, last_page: int) -> Gaussians:
         """Read pages straight into the arrays of the result."""
-        result = empty(len(self.layout.rows(first_page, last_page)), self._file.codec.sh_degree)
+        result = self._file.codec.empty(len(self.layout.rows(first_page, last_page)))
 
         def read(pages: range) -> None:
             for page in pages:

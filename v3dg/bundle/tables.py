@@ -134,8 +134,7 @@ def _check_tree(clusters: Clusters, groups: Groups) -> None:
 
     def check_links(name: str, links: Any, expect_none: Any, link_level: Any) -> None:
         inside = (links >= 0) & (links < num_groups)
-        found = np.zeros(len(links), np.int64)
-        found[inside] = group_level[links[inside]]
+        found = np.append(group_level, 0)[np.where(inside, links, -1)]
         good = np.where(expect_none, links == -1, inside & (found == link_level))
         check_all(
             name, links, good, lambda i: "-1" if expect_none[i] else f"a group of level {link_level[i]}"
@@ -143,9 +142,8 @@ def _check_tree(clusters: Clusters, groups: Groups) -> None:
 
     check_links("clusters.own_group", own, level == 0, level)
     check_links("clusters.parent_group", parent, level == last_level, level + 1)
-    check_all(
-        "groups.level", group_level, (group_level >= 1) & (group_level <= last_level), f"1 to {last_level}"
-    )
+    is_coarse = (group_level >= 1) & (group_level <= last_level)
+    check_all("groups.level", group_level, is_coarse, f"1 to {last_level}")
     check_links("groups.parent", group_parent, group_level == last_level, group_level + 1)
 
     # The last level's clusters count as having a parent of their own past the others.
@@ -155,12 +153,9 @@ def _check_tree(clusters: Clusters, groups: Groups) -> None:
     for name, links in (("own_group", own), ("parent_group", parent)):
         num_clusters = np.bincount(links[links >= 0], minlength=num_groups)
         check_all("groups", np.arange(num_groups), num_clusters > 0, f"a cluster with it as {name}")
-    made = own >= 0
-    agree = np.ones(len(level), bool)
-    agree[made] = parent[made] == group_parent[own[made]]
-    check_all(
-        "clusters.parent_group", parent, agree, lambda c: f"{group_parent[own[c]]}, its own group's parent"
-    )
+    of_own = np.where(own >= 0, np.append(group_parent, -1)[own], parent)
+    agree = parent == of_own
+    check_all("clusters.parent_group", parent, agree, lambda c: f"{of_own[c]}, its own group's parent")
 
 
 def _check_values(clusters: Clusters, groups: Groups) -> None:
@@ -174,9 +169,8 @@ def _check_values(clusters: Clusters, groups: Groups) -> None:
     check_all("clusters.antialiased", clusters.antialiased, clusters.antialiased <= 1, "0 or 1")
     ball, weight = groups.ball, groups.weight
     check_all("groups.ball", ball, np.isfinite(ball), "finite numbers")
-    check_all(
-        "groups.ball", ball, ball[:, 3] >= np.float32(_MIN_RADIUS), f"a radius of {_MIN_RADIUS} or more"
-    )
+    is_wide = ball[:, 3] >= np.float32(_MIN_RADIUS)
+    check_all("groups.ball", ball, is_wide, f"a radius of {_MIN_RADIUS} or more")
     check_all("groups.weight", weight, np.isfinite(weight) & (weight > 0), "a positive number")
     bad_error = (groups.error < 0) | np.isinf(groups.error)
     check_all("groups.error", groups.error, ~bad_error, "0 or more, or not a number where unknown")
@@ -192,14 +186,12 @@ def _check_nesting(groups: Groups) -> None:
     needed[below] = (distance + ball[below, 3]) * (1 + NESTING_MARGIN)
     held = np.ones(len(groups), bool)
     held[below] = ball[above, 3] >= needed[below] * (1 - _ROUNDING)
-    check_all(
-        "groups.ball",
-        groups.ball,
-        held,
-        lambda g: (
-            f"a ball inside that of group {groups.parent[g]}, whose radius must be at least {needed[g]:.9g}"
-        ),
-    )
+
+    def expected(g: int) -> str:
+        radius = f"whose radius must be at least {needed[g]:.9g}"
+        return f"a ball inside that of group {groups.parent[g]}, {radius}"
+
+    check_all("groups.ball", groups.ball, held, expected)
     heavier = np.ones(len(groups), bool)
     heavier[below] = groups.weight[above] >= groups.weight[below]
     check_all("groups.weight", groups.weight, heavier, "at most the weight of the group above")
