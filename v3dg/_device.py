@@ -44,13 +44,10 @@ CPU = Device()
 
 
 def resolve(device: str | Device) -> Device:
-    """The device that "auto", "cpu", "cuda" or "cuda:1" stands for.
+    """The device that "auto", "cpu", "cuda" or "cuda:1" stands for; ValueError where it is none of these.
 
-    "cuda" is torch's current device, "auto" the same where nothing is missing for it, else the CPU.
-
-    Raises:
-        ValueError: It is none of these.
-        RuntimeError: It is a CUDA device, and something is missing; never another device in its place.
+    "cuda" is torch's current device, "auto" the same where nothing is missing for it, else the CPU. Where
+    something is missing for a CUDA device, that is a RuntimeError, never another device in its place.
     """
     name = str(device)
     kind, _, number = name.partition(":")
@@ -60,10 +57,9 @@ def resolve(device: str | Device) -> Device:
         return CPU
     missing = missing_for_cuda()
     if missing is None:
-        if int(number or 0) >= _core.num_cuda_devices():
-            raise RuntimeError(
-                f"device: expected one of {_core.num_cuda_devices()} CUDA devices, got {name!r}"
-            )
+        count = _core.num_cuda_devices()
+        if int(number or 0) >= count:
+            raise RuntimeError(f"device: expected one of {count} CUDA devices, got {name!r}")
         import torch
 
         return Device(int(number) if number else int(torch.cuda.current_device()))
@@ -83,9 +79,8 @@ def missing_for_cuda() -> str | None:
     except ImportError:
         return "expected torch, which owns arrays on CUDA devices; pip install 'v3dg[torch]'"
     if not torch.cuda.is_available():
-        return (
-            f"expected a torch that can use the CUDA device, got {torch.__version__}; install one with CUDA"
-        )
+        found = f"{torch.__version__}; install one with CUDA"
+        return f"expected a torch that can use the CUDA device, got {found}"
     return None
 
 

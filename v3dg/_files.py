@@ -28,11 +28,8 @@ def replacing(path: str | os.PathLike[str], *, is_locked: bool = False) -> Itera
     name beside it, none is followed. Where the caller sees to it that no other writes to `path` meanwhile,
     that name is always the same, and what a killed program left there is removed.
 
-    Raises:
-        IsADirectoryError: `path` is a folder.
-        PermissionError: What is there may not be written to.
-        ValueError: `path` is a device or a pipe.
-        OSError: As writing raised it, with `path` for the file's name.
+    A folder is an IsADirectoryError, what may not be written to a PermissionError, a device or a pipe a
+    ValueError; an OSError of writing has `path` for the file's name.
     """
     path = os.fspath(path)  # a number would stand for an open file
     replaced = _status_of_file(path)

@@ -65,6 +65,12 @@ def read_json(path: str | os.PathLike[str]) -> Node:
         raise ValueError(f"{path.name}: expected JSON, got a file that does not parse: {error}") from error
 
 
+def write_json(path: str | os.PathLike[str], document: Any) -> None:
+    """Write a JSON file, which replaces what is there once it is complete."""
+    with _files.replacing(path) as temporary:
+        Path(temporary).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
 class Node:
     """A JSON value that knows where in the file it stands."""
 

@@ -38,8 +38,7 @@ def floats(values: Any, name: str, expected: str = "numbers") -> Floats:
 def vector(values: Any, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
     """As `floats`, of this shape."""
     array = floats(values, name, f"numbers of shape {shape}")
-    if array.shape != shape:
-        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+    check(name, array.shape == shape, f"shape {shape}, got {array.shape}")
     return array
 
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from v3dg import _files
-from v3dg._json import Node, read_json
+from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import check
 from v3dg.cameras import Camera, Floats, intrinsics, is_rotation, viewmat_from_blender
 
@@ -90,9 +87,7 @@ def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -
                 "transform_matrix": to_world.tolist(),
             }
         )
-    document = {"camera_model": "PINHOLE", "frames": frames}
-    with _files.replacing(path) as temporary:
-        Path(temporary).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_json(path, {"camera_model": "PINHOLE", "frames": frames})
 
 
 def _check_is_pinhole(fields: Mapping[str, Node], distortion: str) -> None:
@@ -138,12 +133,9 @@ def _intrinsics(
     """K, width and height."""
     if "w" in fields and "h" in fields:
         width, height = fields["w"].size(), fields["h"].size()
-    elif "fl_x" in focal:
-        raise frame.problem(
-            "expected w and h, in the frame or at the top, got focal lengths in px and no size"
-        )
-    elif size is None:
-        raise frame.problem("expected w and h, in the frame or at the top, got neither; give the size")
+    elif size is None or "fl_x" in focal:
+        found = "focal lengths in px and no size" if "fl_x" in focal else "neither; give the size"
+        raise frame.problem(f"expected w and h, in the frame or at the top, got {found}")
     else:
         width, height = size
     if "fl_x" in focal:

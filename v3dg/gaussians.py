@@ -209,10 +209,8 @@ def _checked_index(index: Any) -> Array:
         array = np.zeros(0, np.int64)  # an empty list says nothing about its kind
     dtype = str(array.dtype).removeprefix("torch.")
     if array.ndim == 0 or not dtype.startswith(("int", "uint", "bool")):
-        raise TypeError(
-            f"index: expected a slice, integers or booleans, got {_kind(index)}"
-            + (f" of dtype {dtype}" if array.ndim else "; for one gaussian use a slice of length 1")
-        )
+        more = f" of dtype {dtype}" if array.ndim else "; for one gaussian use a slice of length 1"
+        raise TypeError(f"index: expected a slice, integers or booleans, got {_kind(index)}{more}")
     is_meta = _is_tensor(array) and array.is_meta
     check("index", not is_meta, "a tensor with data, got one on the device meta")
     check("index", array.ndim == 1, f"one dimension, got shape {tuple(array.shape)}")

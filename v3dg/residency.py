@@ -49,19 +49,15 @@ class ResidentScene:
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
         """Take over what has changed since the last time: the poses, or all instances.
 
-        Frames under way are finished first: one that found a buffer too small will be drawn again.
-
-        Raises:
-            RuntimeError: Something has changed, and a CUDA graph is being captured.
+        Frames under way are finished first: one that found a buffer too small will be drawn again. It is a
+        RuntimeError while a CUDA graph is captured.
         """
         if self.device.is_cuda:
             import torch
 
             if torch.cuda.is_current_stream_capturing():
-                raise RuntimeError(
-                    "scene: expected no change while a CUDA graph is captured, got a new or changed scene; "
-                    "draw it once before the capture"
-                )
+                expected = "no change while a CUDA graph is captured, got a new or changed scene"
+                raise RuntimeError(f"scene: expected {expected}; draw it once before the capture")
         with self._lock:
             under_way = list(self._drawings)
             self._drawings.clear()
@@ -175,7 +171,8 @@ class Residency:
     def _once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _Kept]) -> _Kept:
         """What is kept for a bundle or scene, made where it is not there."""
         with self.lock:
-            kept = self._kept.setdefault(_checked(owner), {})
+            owner = owner if isinstance(owner, Bundle) else Scene.of(owner)  # which refuses others
+            kept = self._kept.setdefault(owner, {})
             if key not in kept:
                 kept[key] = make()
             found: _Kept = kept[key]
@@ -184,11 +181,6 @@ class Residency:
     def _renew_lock(self) -> None:
         # Another thread of the parent may have held it when the child was made.
         self.lock = threading.RLock()
-
-
-def _checked(subject: Scene | Bundle) -> Scene | Bundle:
-    """The subject, if it is one."""
-    return subject if isinstance(subject, Bundle) else Scene.of(subject)
 
 
 residency = Residency()

@@ -259,9 +259,8 @@ def _rows(values: Any, name: str, count: int) -> Any:
         array = floats(values, name)
     if name != "positions" and tuple(array.shape) == row:
         array = array.expand(count, *row) if is_on_device else np.broadcast_to(array, (count, *row))
-    if tuple(array.shape) != (count, *row):
-        shown = ", ".join(str(length) for length in (count, *row)) + ("," if not row else "")
-        raise ValueError(f"{name}: expected shape ({shown}), got {tuple(array.shape)}")
+    shape, wanted = tuple(array.shape), (count, *row)
+    check(name, shape == wanted, f"shape {wanted}, got {shape}")
     if is_on_device:
         return array.contiguous()
     if name in _POSITIVE:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -12,8 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from v3dg import _files
-from v3dg._json import Node, read_json
+from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check
 from v3dg.bundle import Bundle
 from v3dg.cameras import DEFAULT_FOV_X, Camera
@@ -97,8 +95,7 @@ def write_scene(
             for name, camera in (cameras or {}).items()
         ],
     }
-    with _files.replacing(path) as temporary:
-        Path(temporary).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_json(path, document)
 
 
 def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
@@ -180,9 +177,8 @@ def _read_layouts(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[S
     """The layouts of the paper's published code; what only its authors' programs use is passed over."""
     layouts = list(root.field("layouts").items())
     if len(layouts) != 1:
-        raise root.field("layouts").problem(
-            f"expected one layout, got {len(layouts)}; each layout is a scene, so make a file of each"
-        )
+        advice = "each layout is a scene, so make a file of each"
+        raise root.field("layouts").problem(f"expected one layout, got {len(layouts)}; {advice}")
     top = layouts[0].some_fields(("assets", "cameras"))
     instances = []
     for node in top["assets"].items():

@@ -235,6 +235,5 @@ def rule_of(
 
 def over_budget(budget: int, least: int) -> ValueError:
     """The error that says so."""
-    return ValueError(
-        f"budget: expected at least {least} gaussians, which the coarsest cut of this view has, got {budget}"
-    )
+    expected = f"at least {least} gaussians, which the coarsest cut of this view has"
+    return ValueError(f"budget: expected {expected}, got {budget}")

@@ -17,7 +17,7 @@ from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.pages import MemoryPages, PageLayout
-from v3dg.gaussians import Gaussians, empty
+from v3dg.gaussians import Gaussians
 
 __all__ = ["BuildConfig", "build_bundle", "build_file", "discard_levels", "levels_path"]
 
@@ -73,7 +73,7 @@ class _Memory:
 
     @contextmanager
     def open(self, layout: PageLayout, codec: Codec, made_with: dict[str, Any]) -> Iterator[_Memory]:
-        self._pages = MemoryPages(layout, empty(int(layout.first_gaussian[-1]), codec.sh_degree))
+        self._pages = MemoryPages(layout, codec.empty(int(layout.first_gaussian[-1])))
         self._made_with = made_with
         yield self
 

@@ -13,7 +13,8 @@ from v3dg import _core, _device
 from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
 from v3dg.build.plan import LevelPlan, Offsets, Plan
-from v3dg.gaussians import Array, Gaussians, empty
+from v3dg.bundle.codec import Codec
+from v3dg.gaussians import Array, Gaussians
 
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
 _GROUPS_AT_ONCE = 256
@@ -220,7 +221,7 @@ def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: B
     """What groups start from: their gaussians halved, from `offset` to `out_offset`."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
-    result = empty(int(out_offset[-1]), gaussians.sh_degree)
+    result = Codec(gaussians.sh_degree).empty(int(out_offset[-1]))
     for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
         cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
         part = gaussians.subset(slice(cuts[0], cuts[-1]))
