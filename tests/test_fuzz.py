@@ -1,4 +1,4 @@
-"""Replays what the fuzzers found and kept; fuzz/run.py finds more."""
+"""Replays what fuzzers that are guided by coverage found and kept."""
 
 import zipfile
 from pathlib import Path

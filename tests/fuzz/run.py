@@ -1,9 +1,9 @@
-"""Run a fuzzer for some time, and keep the inputs that reach all it reached.
+"""Fuzz the .ply reader, which is C++, for some time, and keep the inputs that reach all it reached.
 
-    python tests/fuzz/run.py ply|bundle|scene|formats SECONDS
+    python tests/fuzz/run.py SECONDS
 
-The .ply fuzzer is C++ and wants clang++ (CLANG names another one), the others want atheris. They work in
-build/fuzz; what stops one is there as crash-*. Inputs go to tests/fuzz/corpus, which test_fuzz.py replays.
+It is guided by coverage and wants clang++ (CLANG names another one). It works in build/fuzz; what stops it is
+there as crash-*. Inputs go to tests/fuzz/corpus, which test_fuzz.py replays. What is not C++ is attack.py's.
 """
 
 import os
@@ -12,22 +12,40 @@ import sys
 import zipfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+
+import numpy as np
+
+from test_ply import HOSTILE, Element, ply_bytes, random_columns
+
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
-MAX_BYTES = {"ply": 8192, "bundle": 20_000, "scene": 8192, "formats": 4096}
-KEPT_BYTES = {"ply": 1000, "bundle": 10_000, "scene": 3000, "formats": 3000}
+MAX_BYTES, KEPT_BYTES = 8192, 1000
+LARGEST_SEED = 10_000  # bytes; a few of the broken files are made to be large
 
 
-def command_of(name, folder):
-    if name != "ply":
-        return [str(HERE / f"fuzz_{name}.py")]
+def ply_seeds():
+    for encoding in ("ascii", "binary_little_endian", "binary_big_endian"):
+        for degree in (0, 1):
+            columns = random_columns(2, degree)
+            with_list = {"n": [np.arange(2, dtype="i4")] * 2, **columns}
+            wide = {name: column.astype("f8") for name, column in columns.items()}
+            face = Element("face", {"indices": [np.arange(3, dtype="u2")]})
+            yield ply_bytes([Element("vertex", columns)], encoding)
+            yield ply_bytes([Element("vertex", wide)], encoding, "\r\n")
+            yield ply_bytes([face, Element("vertex", with_list), face], encoding)
+    yield from (content for content, _ in HOSTILE.values() if len(content) <= LARGEST_SEED)
+
+
+def compiled(folder):
     sources = [HERE / "fuzz_ply.cpp", *(ROOT / "csrc/io" / f"ply_{part}.cpp" for part in ("header", "read"))]
     checks = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined"]
     program = folder / "fuzz_ply"
     compiler = os.environ.get("CLANG", "clang++")
     options = ["-std=c++17", "-g", "-O1", *checks, "-fopenmp", "-I", str(ROOT / "csrc")]
     subprocess.run([compiler, *options, *map(str, sources), "-o", str(program)], check=True)
-    return [str(program)]
+    return str(program)
 
 
 def keep(corpus, archive, max_bytes):
@@ -39,48 +57,25 @@ def keep(corpus, archive, max_bytes):
 
 
 def main():
-    name, seconds = sys.argv[1:]
-    folder = ROOT / "build" / "fuzz" / name
-    found, kept = folder / "found", folder / "kept"
-    for path in (found, kept):
+    (seconds,) = sys.argv[1:]
+    folder = ROOT / "build" / "fuzz" / "ply"
+    seeds, found, kept = (folder / name for name in ("seeds", "found", "kept"))
+    for path in (seeds, found, kept):
         path.mkdir(parents=True, exist_ok=True)
-    archive = HERE / "corpus" / f"{name}.zip"
-    if archive.exists():
-        zipfile.ZipFile(archive).extractall(found)
-    environment = os.environ | {
-        "OMP_NUM_THREADS": "1",
-        # Each input is a file for a moment: a disk would be most of the time.
-        **({"TMPDIR": "/dev/shm"} if Path("/dev/shm").is_dir() else {}),
-        # Merging starts the program anew by its own name, and with it the interpreter.
-        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
-    }
-    subprocess.run([sys.executable, str(HERE / "make_seeds.py"), str(folder / "seeds")], check=True)
-    command = command_of(name, folder)
-    start = [
-        "-timeout=30",
-        f"-max_len={MAX_BYTES[name]}",
-        "-print_final_stats=1",
-        f"-max_total_time={seconds}",
-    ]
-    words = HERE / f"{name}.dict"
-    start += [f"-dict={words}"] if words.exists() else []
-    seeds = str(folder / "seeds" / name)
-    subprocess.run(
-        [*command, *start, str(found), seeds],
-        cwd=folder,
-        env=environment,
-        check=True,
-    )
+    for i, content in enumerate(ply_seeds()):
+        (seeds / f"seed_{i:02}").write_bytes(content)
+    archive = HERE / "corpus" / "ply.zip"
+    zipfile.ZipFile(archive).extractall(found)
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    program = compiled(folder)
+    options = ["-timeout=30", "-print_final_stats=1", f"-max_len={MAX_BYTES}", f"-max_total_time={seconds}"]
+    start = [program, *options, f"-dict={HERE / 'ply.dict'}", str(found), str(seeds)]
+    subprocess.run(start, cwd=folder, env=environment, check=True)
     for path in kept.iterdir():
         path.unlink()
-    subprocess.run(
-        [*command, "-set_cover_merge=1", f"-max_len={KEPT_BYTES[name]}", str(kept), str(found), seeds],
-        cwd=folder,
-        env=environment,
-        check=True,
-    )
-    archive.parent.mkdir(exist_ok=True)
-    keep(kept, archive, KEPT_BYTES[name])
+    merge = [program, "-set_cover_merge=1", f"-max_len={KEPT_BYTES}", str(kept), str(found), str(seeds)]
+    subprocess.run(merge, cwd=folder, env=environment, check=True)
+    keep(kept, archive, KEPT_BYTES)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What the fuzzers and the replay of what they found call: readers, and what must hold whatever they read."""
+"""Readers, and what must hold whatever they read, for inputs that were kept; and zips for all."""
 
 import gzip
 import hashlib
@@ -57,11 +57,13 @@ def read_format(content, folder):
         assert len(asset) <= (1 << 18) + path.stat().st_size  # docs/robustness.md
 
 
-def zipped(files):
+def zip_bytes(entries, compression=zipfile.ZIP_STORED):
+    """A zip of names and contents; a name may be there twice."""
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as bundle:
-        for name, content in files.items():
-            bundle.writestr(zipfile.ZipInfo(name), content)
+    with zipfile.ZipFile(stream, "w", compression) as archive:
+        for name, content in entries:
+            archive.NameToInfo.pop(name, None)  # zipfile would warn of the second one
+            archive.writestr(zipfile.ZipInfo(name), content, compression)
     return stream.getvalue()
 
 
@@ -81,11 +83,9 @@ FORMATS = (
     (".spz", bytes),
     (".spz", lambda body: gzip.compress(body, mtime=0)),
     (".sog", bytes),
-    (".sog", lambda meta: zipped(SOG | {"meta.json": meta})),
-    (".sog", lambda picture: zipped(SOG | {"shN_centroids.webp": picture})),
+    (".sog", lambda meta: zip_bytes((SOG | {"meta.json": meta}).items())),
+    (".sog", lambda picture: zip_bytes((SOG | {"shN_centroids.webp": picture}).items())),
 )
-META_IN_SOG = 5  # of FORMATS
-
 READERS = {"ply": read_ply, "bundle": read_bundle, "scene": read_json, "formats": read_format}
 
 

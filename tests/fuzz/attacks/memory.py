@@ -1,0 +1,62 @@
+"""Commands with a limit on memory at a random height, set once their modules are there: done, or one line."""
+
+import resource
+import sys
+
+from fuzz.attacks.interrupts import COMMANDS, make_large
+from fuzz.attacks.pool import Outcome
+from fuzz.attacks.program import copied, fault_of, make_files, outcome, run
+
+LIMIT_S = 120
+# Modules are loaded, OpenMP's threads are started and the stack has grown before the limit is set: what fails
+# there ends a process without a word.
+PROGRAM = """
+import contextlib, importlib, json, pkgutil, resource, sys
+import PIL.Image, zstandard
+import v3dg
+for module in pkgutil.walk_packages(v3dg.__path__, "v3dg."):
+    if "viewer" not in module.name and not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+from v3dg.cli import main, parse
+parse(sys.argv[2:])
+camera = v3dg.Camera.look_at((0, -3, 0), (0, 0, 0), width=40, height=30)
+from v3dg.donut import make_donut
+v3dg.rasterize(make_donut(1000, seed=0), camera)
+sys.setrecursionlimit(20_000)
+with contextlib.suppress(RecursionError):
+    json.loads("[" * 15_000 + "]" * 15_000)
+sys.setrecursionlimit(1000)
+with open("/proc/self/status") as file:
+    has = next(int(line.split()[1]) << 10 for line in file if line.startswith("VmSize:"))
+limit = has + int(sys.argv[1])
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+def prepare(shared):
+    (shared / "files").mkdir()
+    make_files(shared / "files")
+    make_large(shared / "files")
+
+
+class Attack:
+    def __init__(self, shared):
+        self._shared = shared
+
+    def plan(self, rng, work):
+        name = rng.choice([name for name in COMMANDS if not name.startswith("view")])
+        more = int(2 ** rng.uniform(14, 29))
+        copied(self._shared, work)
+        program = [sys.executable, "-c", PROGRAM, str(more)]
+
+        def do():
+            ended = run(COMMANDS[name], work, program=program, limit_s=90, most=resource.RLIM_INFINITY)
+            if (
+                "memory for thread-local data" in ended.err
+            ):  # the C library, which no program can ask to go on
+                return Outcome("ended by the C library")
+            fault = fault_of(ended, codes=(0, 1))
+            return outcome(ended, fault and f"with {more >> 10} KiB more: {fault}")
+
+        return name, do

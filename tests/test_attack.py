@@ -1,0 +1,25 @@
+"""A short part of each attack of fuzz/attack.py, which runs for as long as one likes."""
+
+import json
+
+import pytest
+
+from fuzz.attacks.pool import attack
+
+# About a minute of two cores in all: tries of each kind, from seeds that the long runs do not begin with.
+TRIES = {
+    "files": 500,
+    "commands": 24,
+    "misuses": 300,
+    "interrupts": 14,
+    "kills": 8,
+    "threads": 30,
+    "memory": 8,
+}
+
+
+@pytest.mark.parametrize("kind", TRIES)
+def test_nothing_is_found(kind, tmp_path):
+    found = attack(kind, range(TRIES[kind]), seconds=300, seed=2026, kept=tmp_path)
+    assert found["tries"] == TRIES[kind]
+    assert not found["findings"], json.dumps(found["findings"], indent=1)
