@@ -332,7 +332,7 @@ def test_bad_arguments_are_refused():
         select(bundle, camera, tolerance=-1, device="cpu")
     with pytest.raises(ValueError, match="tolerance: expected 0 px² or more, got nan"):
         select(bundle, camera, tolerance=float("nan"), device="cpu")
-    with pytest.raises(ValueError, match="footprint: expected solid_angle or paper, got ball"):
+    with pytest.raises(ValueError, match="footprint: expected 'solid_angle' or 'paper', got 'ball'"):
         select(bundle, camera, tolerance=1, footprint="ball", device="cpu")
     with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'tpu'"):
         select(bundle, camera, tolerance=1, device="tpu")

@@ -103,6 +103,12 @@ def check_all(name: str, values: npt.NDArray[Any], good: npt.NDArray[np.bool_], 
         raise ValueError(f"{name}[{row}]: expected {text}, got {values[row].tolist()}")
 
 
+def one_of(value: Any, name: str, choices: tuple[str, ...]) -> None:
+    """Raise ValueError unless it is one of these texts."""
+    if not (isinstance(value, str) and value in choices):
+        raise ValueError(f"{name}: expected {' or '.join(map(repr, choices))}, got {shown(value)}")
+
+
 def shown(value: Any) -> str:
     """A value as a message of one line shows it."""
     if isinstance(value, int) and value.bit_length() > 128:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from v3dg._json import Node, read_json, write_json
-from v3dg._numbers import check
+from v3dg._numbers import one_of
 from v3dg.cameras import Camera, Floats, intrinsics, is_rotation, viewmat_from_blender
 
 # Names of COLMAP's models that are pinholes but for the distortion, which is looked at by itself.
@@ -42,9 +42,8 @@ def read_cameras(
         ValueError: The file is not such a file, or has other cameras than pinholes; names the place in it.
         OSError: The file cannot be read.
     """
-    check("distortion", distortion in ("refuse", "ignore"), f"'refuse' or 'ignore', got {distortion!r}")
-    is_known = applied_transform in ("keep", "undo")
-    check("applied_transform", is_known, f"'keep' or 'undo', got {applied_transform!r}")
+    one_of(distortion, "distortion", ("refuse", "ignore"))
+    one_of(applied_transform, "applied_transform", ("keep", "undo"))
     root = read_json(path)
     top = root.some_fields(("frames",))
     undo_transform = _applied(top) if applied_transform == "undo" else None

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core
-from v3dg._numbers import check
+from v3dg._numbers import one_of
 from v3dg.bundle import Bundle
 
 ColorBy: TypeAlias = Literal["appearance", "level", "cluster"]
@@ -32,7 +32,7 @@ LEVEL_COLORS = np.array(
 
 def palette_of(bundle: Bundle, by: ColorBy) -> npt.NDArray[np.float32] | None:
     """Constant SH coefficients (C, 3) that clusters are drawn with; None for what they appear as."""
-    check("color_by", by in get_args(ColorBy), f"{', '.join(map(repr, get_args(ColorBy)))}, got {by!r}")
+    one_of(by, "color_by", get_args(ColorBy))
     if by == "appearance":
         return None
     level = bundle.clusters.level

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import pathlib
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import TypeVar, get_args
 
-from v3dg._numbers import check_type
+from v3dg._numbers import check_type, one_of
 from v3dg.formats import checkpoint, compressed_ply, ksplat, ply, sog, splat, spz, streamed_sog
 from v3dg.formats._asset_file import AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
@@ -112,8 +112,7 @@ def write_asset(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "bi
     check_type("gaussians", gaussians, Gaussians, "Gaussians")
     write = _by_name(path, _WRITERS)
     if write is ply.write:
-        if not isinstance(encoding, str):
-            raise TypeError(f"encoding: expected text, got {encoding!r}")
+        one_of(encoding, "encoding", get_args(PlyEncoding))
         ply.write(path, gaussians, encoding)
     elif encoding == "binary_little_endian":
         write(path, gaussians)

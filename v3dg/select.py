@@ -5,14 +5,14 @@ from __future__ import annotations
 import copy
 import time
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, get_args, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import MOST_FLOAT, check, real, vector, whole
+from v3dg._numbers import MOST_FLOAT, check, one_of, real, vector, whole
 from v3dg.bundle import Bundle, Clusters
 from v3dg.cameras import Camera, VectorLike
 from v3dg.gaussians import Gaussians
@@ -224,6 +224,7 @@ def rule_of(
     tolerance = real(tolerance, "tolerance", "0 px² or more", 0)
     if budget is not None:
         budget = whole(budget, "budget", "0 gaussians or more", 0, most=(1 << 63) - 1)
+    one_of(footprint, "footprint", get_args(Footprint))
     return _core.Rule(
         tolerance_px2=tolerance if tolerance == np.inf else min(tolerance, MOST_FLOAT),
         budget=budget,

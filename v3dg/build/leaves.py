@@ -7,13 +7,14 @@ import threading
 import warnings
 from collections import Counter
 from dataclasses import asdict
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core, _device, cleaning
 from v3dg._device import Device
+from v3dg._numbers import one_of
 from v3dg.build.checkpoint import digest_of
 from v3dg.build.config import BuildConfig
 from v3dg.gaussians import Gaussians
@@ -70,8 +71,7 @@ class MemoryLeaves:
     ) -> None:
         if str(asset.means.dtype).endswith("64"):
             raise ValueError("asset: expected float32 arrays, got float64; convert them first")
-        if unusable not in ("drop", "refuse"):
-            raise ValueError(f"unusable: expected 'drop' or 'refuse', got {unusable!r}")
+        one_of(unusable, "unusable", get_args(Unusable))
         asset = _device.place(asset, _device.of(asset.means))
         tally = Tally()
         self._drawable = np.concatenate([np.zeros(0, bool), *map(tally.add, parts_of(asset))])
