@@ -307,13 +307,13 @@ def _change_outputs(rng, work, arguments):
 
 
 def _interrupt_server(process, out):
-    end = time.monotonic() + 30
-    while is_running(process) and time.monotonic() < end:
-        if b"http://" in out.read_bytes():
-            time.sleep(0.1)
-            process.send_signal(signal.SIGINT)
-            return
+    """When it says where it listens; where its stdout leads nowhere, when it has had the time to."""
+    end = time.monotonic() + 10
+    while is_running(process) and time.monotonic() < end and b"http://" not in out.read_bytes():
         time.sleep(0.02)
+    time.sleep(0.1)
+    if is_running(process):
+        process.send_signal(signal.SIGINT)
 
 
 def _fault_of_files(work, command, arguments, ended, modes):
