@@ -173,6 +173,10 @@ BAD = {
         {**without("fl_x"), "camera_angle_x": 3.5},
         "camera_angle_x: expected radians between 0 and pi, got 3.5",
     ),
+    "angle of no focal length": (
+        {**SYNTHETIC, "w": 8, "h": 6, "camera_angle_y": 5e-324},
+        "frames[0].fov_y: expected radians between 0 and pi, got 5e-324",
+    ),
     "principal point of another kind": ({**CAPTURE, "cx": True}, "cx: expected a number, got true"),
     "fisheye": (
         {**CAPTURE, "camera_model": "OPENCV_FISHEYE"},

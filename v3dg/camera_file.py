@@ -144,7 +144,7 @@ def _intrinsics(
     elif "camera_angle_x" in focal:
         fov_x = focal["camera_angle_x"].field_of_view()
         fov_y = focal["camera_angle_y"].field_of_view() if "camera_angle_y" in focal else None
-        K = intrinsics(fov_x, fov_y, width, height)
+        K = frame.attempt(partial(intrinsics, fov_x, fov_y, width, height))
     else:
         raise frame.problem("expected fl_x or camera_angle_x, in the frame or at the top, got neither")
     for axis, name in enumerate(("cx", "cy")):
