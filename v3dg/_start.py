@@ -40,6 +40,7 @@ def begin() -> None:
 
 
 def _end_at_once(number: int, frame: types.FrameType | None) -> None:
+    signal.signal(signal.SIGINT, lambda *_: None)  # another one has nothing to say
     try:
         os.write(2, b"v3dg: error: interrupted\n")
     finally:

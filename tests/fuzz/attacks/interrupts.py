@@ -16,6 +16,7 @@ from PIL import Image
 
 import v3dg
 from fuzz.attacks.program import (
+    ERROR,
     PROGRESS,
     Ended,
     copied,
@@ -177,8 +178,7 @@ def _fault(ended: Ended, name):
         return "did not end by itself" + (f", and left behind: {ended.left}" if ended.left else "")
     if ended.code == -signal.SIGINT and not ended.err:
         return f"left behind: {ended.left}" if ended.left else None  # before Python listened to it
-    frames = [line for line in ended.err.splitlines() if line.lstrip().startswith("File ")]
-    if frames and not any(PACKAGE in line for line in frames):
+    if "KeyboardInterrupt" in ended.err and not any(word in ended.err for word in (PACKAGE, ERROR)):
         return f"left behind: {ended.left}" if ended.left else None  # before any of our code was there
     is_view = name.startswith("view")
     fault = fault_of(ended, codes=(0, 130), is_heard=not is_view)
