@@ -161,6 +161,9 @@ OPTIONS = {
     },
     "completion": {},
 }
+COMMON = {"--threads": "n", "--json": "", "--quiet": ""}
+LACKING = {"info": {"--threads", "--quiet"}, "render": {"--quiet"}, "view": {"--json", "--quiet"}}
+LACKING |= {"convert": {"--quiet"}, "completion": {*COMMON}}
 NUM_SUBJECTS = {"compare": 2, "demo": 0, "completion": 0}
 FITTING = {
     "--size": ("20", "33", "64"),
@@ -222,7 +225,7 @@ class Attack:
     def plan(self, rng, work):
         copied(self._shared, work)
         os.mkfifo(work / "pipe.ply")
-        command = rng.choice(list(OPTIONS))
+        command = rng.choice([*OPTIONS, *(name for name in OPTIONS if name != "completion")])
         arguments = _arguments(rng, command)
         environment = os.environ | (rng.choice(ENVIRONMENTS) if rng.random() < 0.15 else {})
         closed = rng.choice(((0,), (1,), (2,), (1, 2), (0, 1, 2))) if rng.random() < 0.1 else ()
@@ -260,12 +263,18 @@ def _arguments(rng, command):
     arguments = [command]
     for _ in range(NUM_SUBJECTS.get(command, 1)):
         arguments.append(rng.choice(SUBJECTS) if rng.random() < 0.8 else rng.choice(ODD_SUBJECTS))
+    if command == "export" and rng.random() < 0.7:
+        arguments[1] = rng.choice(("a.v3dg", "lying.v3dg"))
+    if command == "compare" and "a.png" in arguments and rng.random() < 0.8:
+        arguments[1:] = ["a.png", "b.png"]
     if command == "convert":
         arguments.append(rng.choice(OUTPUTS[3:7]) if rng.random() < 0.7 else rng.choice(OUTPUTS))
     if command == "completion":
         arguments.append(rng.choice(("bash", "zsh", "fish", *WORDS)))
-    kinds = {**OPTIONS[command], "--threads": "n", "--json": "", "--quiet": ""}
-    if command in ("demo", "render", "compare", "convert"):  # small, unless asked otherwise
+    kinds = {**OPTIONS[command], **COMMON}
+    if rng.random() < 0.9:
+        kinds = {name: kinds[name] for name in kinds if name not in LACKING.get(command, ())}
+    if command in ("demo", "render", "compare") and "b.png" not in arguments:  # small, unless asked otherwise
         arguments += (
             ["--size", "24", "20"]
             if command != "demo"

@@ -86,6 +86,7 @@ def run(
     files = [log.open("wb") for log in logs]
 
     def before():
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs ignore it
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         for descriptor in closed:
             os.close(descriptor)
