@@ -9,16 +9,21 @@ from fuzz.attacks.program import copied, fault_of, make_files, outcome, run
 
 LIMIT_S = 120
 # Modules are loaded, OpenMP's threads are started and the stack has grown before the limit is set: what fails
-# there ends a process without a word.
+# there ends a process without a word. So does NumPy where it finds no memory for the buffers of an operation,
+# 64 kB each (PyErr_NoMemory of npyiter_allocate_buffers, without the GIL, 2.4): they are made small. Pillow
+# would not say why it knows no format whose module could not be loaded.
 PROGRAM = """
 import contextlib, importlib, json, pkgutil, resource, sys
-import PIL.Image, zstandard
+import numpy, PIL.Image, zstandard
 import v3dg
 for module in pkgutil.walk_packages(v3dg.__path__, "v3dg."):
     if "viewer" not in module.name and not module.name.endswith("__main__"):
         importlib.import_module(module.name)
 from v3dg.cli import main, parse
-parse(sys.argv[2:])
+more = int(sys.argv.pop(1))
+parse(sys.argv[1:])
+PIL.Image.init()
+numpy.setbufsize(16)
 camera = v3dg.Camera.look_at((0, -3, 0), (0, 0, 0), width=40, height=30)
 from v3dg.donut import make_donut
 v3dg.rasterize(make_donut(1000, seed=0), camera)
@@ -28,9 +33,9 @@ with contextlib.suppress(RecursionError):
 sys.setrecursionlimit(1000)
 with open("/proc/self/status") as file:
     has = next(int(line.split()[1]) << 10 for line in file if line.startswith("VmSize:"))
-limit = has + int(sys.argv[1])
+limit = has + more
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-sys.exit(main(sys.argv[2:]))
+sys.exit(main())
 """
 
 
