@@ -64,6 +64,29 @@ time.sleep(5)
     assert (done.returncode, done.stderr) == (130, "v3dg: error: interrupted\n")
 
 
+def test_an_interrupt_that_comes_by_another_thread_waits_until_this_one_hears(tmp_path):
+    code = """
+import threading
+threading.Thread(target=time.sleep, args=(6,), daemon=True).start()
+try:
+    heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGALRM})
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.1)
+    print("not disturbed")
+    signal.pthread_sigmask(signal.SIG_SETMASK, heard)
+    time.sleep(5)
+except KeyboardInterrupt:
+    print("heard")
+"""
+    assert run_as_command(code, tmp_path).stdout == "not disturbed\nheard\n"
+
+
+def test_an_interrupt_that_waits_is_forgotten_at_the_end(tmp_path):
+    code = "import slow; _start.ignore_interrupts(); time.sleep(0.1); print('done')"
+    done = run_as_command(code, tmp_path)
+    assert (done.returncode, done.stdout) == (0, "done\n")
+
+
 def test_an_import_is_finished_before_an_interrupt_is_raised(tmp_path):
     code = "try:\n import slow\n time.sleep(5)\nexcept KeyboardInterrupt:\n print(sys.modules['slow'].done)"
     assert run_as_command(code, tmp_path).stdout == "499999500000\n"

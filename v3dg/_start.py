@@ -70,7 +70,8 @@ class _Interrupts:
         self._raised: weakref.ref[_Interrupt] | None = None
 
     def hear(self, number: int, frame: types.FrameType | None) -> None:
-        if _is_importing(frame):  # which would leave half of a module, or make another error of it
+        # Later where half of a module would be left, and where another thread got what this one blocks.
+        if _is_importing(frame) or signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()):
             signal.setitimer(signal.ITIMER_REAL, _AGAIN_AFTER_S)
         elif self._raised is None or self._raised() is None:
             raise self._interrupt()

@@ -80,7 +80,8 @@ class Program:
             is_to_tell = code == 0 and not isinstance(error, BrokenPipeError)
             code = _fail(f"stdout: {error.strerror}", 1) if is_to_tell else code or 1
         if arguments is None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # what was to be done is done
+            for number in (signal.SIGINT, signal.SIGALRM):  # what was to be done is done; _start has both
+                signal.signal(number, signal.SIG_IGN)
             if code == INTERRUPTED:
                 os._exit(code)  # whatever threads are still at
         return code

@@ -6,6 +6,7 @@ file that it writes all or nothing.
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import socket
@@ -32,6 +33,8 @@ from random_bundle import random_gaussians
 
 LIMIT_S = 100
 PACKAGE = os.path.dirname(v3dg.__file__) + os.sep
+# What runs before Ctrl-C is heard is Python's start and the import of one small module of ours.
+OURS = re.compile(re.escape(PACKAGE) + r"(?!__init__\.py\", line 3, |_start\.py)")
 SOON_S = 15  # on a machine with much else to do
 
 SMALL = ["--size", "40", "30", "--quiet"]
@@ -178,7 +181,7 @@ def _fault(ended: Ended, name):
         return "did not end by itself" + (f", and left behind: {ended.left}" if ended.left else "")
     if ended.code == -signal.SIGINT and not ended.err:
         return f"left behind: {ended.left}" if ended.left else None  # before Python listened to it
-    if "KeyboardInterrupt" in ended.err and not any(word in ended.err for word in (PACKAGE, ERROR)):
+    if "KeyboardInterrupt" in ended.err and ERROR not in ended.err and not OURS.search(ended.err):
         return f"left behind: {ended.left}" if ended.left else None  # before any of our code was there
     is_view = name.startswith("view")
     fault = fault_of(ended, codes=(0, 130), is_heard=not is_view)
