@@ -279,13 +279,13 @@ def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
     """A build that has opened the file of one that then ends and removes it would be alone with its lock."""
     path = tmp_path / "levels"
 
-    def lock(file):
+    def lock(descriptor, name):
         if not locked:
             path.unlink()
-        locked.append(file.name)
+        locked.append(name)
 
     locked = []
-    monkeypatch.setattr("v3dg.build.checkpoint._lock", lock)
+    monkeypatch.setattr("v3dg.build.checkpoint.lock", lock)
     with _open_locked(path) as file:
         assert os.path.samestat(os.fstat(file.fileno()), path.stat())
     assert len(locked) == 2

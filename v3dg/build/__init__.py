@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
 
-from v3dg import _device
 from v3dg._device import Device
 from v3dg.build.checkpoint import discard_levels
 from v3dg.build.config import BuildConfig
@@ -61,8 +60,7 @@ def build_bundle(
     """
     config = config or BuildConfig()
     devices = devices_for(device, asset)
-    with _device.memory_errors():
-        leaves = MemoryLeaves(asset, config, unusable, devices[0])
+    leaves = MemoryLeaves(asset, config, unusable, devices[0])
     memory = _Memory()
     build_into(memory.open, leaves, config, seed, devices=devices, progress=progress, resume_path=resume_path)
     return memory.bundle

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import math
 import os
 import stat
 import struct
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from io import FileIO
@@ -24,13 +22,15 @@ from v3dg import _device, _files
 from v3dg._device import Device
 from v3dg._version import __version__
 from v3dg.build.plan import LevelPlan
+from v3dg.build.scratch import lock
 from v3dg.build.simplify import Level, LevelTables
 from v3dg.bundle.format import HASH_BYTES, page_hash
 from v3dg.gaussians import Gaussians
 
 _FLOATS_AT_ONCE = 4 << 20
 _RECORD = struct.Struct("<II")  # in front of a level: its part, its number
-_GAUSSIANS_AT_ONCE = 1 << 16  # of this the digest of an asset depends
+PIECE = 1 << 16
+"""Gaussians that are read, examined and hashed at a time; the digest of an asset depends on it."""
 
 
 class Checkpoint:
@@ -116,9 +116,9 @@ class Checkpoint:
     def _find_levels(self) -> None:
         """Note where levels are, up to the one that was cut off."""
         size = os.fstat(self._file.fileno()).st_size
-        self._num_bytes = place = len(self._head) if size >= len(self._head) else 0
-        if place == 0:
+        if size < len(self._head):
             return
+        self._num_bytes = place = len(self._head)
         while place + _RECORD.size + HASH_BYTES <= size:
             self._file.seek(place)
             part, number = _RECORD.unpack(self._file.read(_RECORD.size))
@@ -194,7 +194,7 @@ def _open_locked(path: str | os.PathLike[str]) -> FileIO:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a device or a pipe")
-            _lock(file)
+            lock(file.fileno(), path)
             # The build that had the lock before may have removed the file.
             with suppress(FileNotFoundError):
                 if os.path.samestat(status, os.lstat(path)):
@@ -205,24 +205,14 @@ def _open_locked(path: str | os.PathLike[str]) -> FileIO:
         file.close()
 
 
-def _lock(file: FileIO) -> None:
-    try:
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise RuntimeError(
-            f"{os.fspath(file.name)}: another build is using it; wait for it, or write to another place"
-        ) from None
-    except OSError as error:
-        # Some network file systems have no locks; there, two builds of one output are the user's to avoid.
-        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
-            raise
-
-
 def digest_of(asset: Gaussians) -> str:
     """What tells an asset from others, wherever it was read from; docs/format.md has the definition."""
-    host = asset.numpy()
-    starts = range(0, len(host), _GAUSSIANS_AT_ONCE)
-    return _digest([[*vars(host.subset(slice(i, i + _GAUSSIANS_AT_ONCE))).values()] for i in starts]).hex()
+    return _digest([[*vars(part).values()] for part in parts_of(asset.numpy())]).hex()
+
+
+def parts_of(gaussians: Gaussians) -> list[Gaussians]:
+    """Pieces of them, sharing their memory."""
+    return [gaussians.subset(slice(start, start + PIECE)) for start in range(0, len(gaussians), PIECE)]
 
 
 def _digest_of_arrays(arrays: Sequence[npt.NDArray[np.float32]]) -> bytes:
@@ -234,6 +224,15 @@ def _digest(blocks: Sequence[Sequence[npt.NDArray[np.float32]]]) -> bytes:
     """Of the digests of the blocks, so that all cores share the work."""
     if sum(array.size for block in blocks for array in block) < _FLOATS_AT_ONCE:
         # Less work than starting threads, which Python does not do safely where memory runs out.
-        return page_hash([np.frombuffer(b"".join(map(page_hash, blocks)), np.uint8)])
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
-        return page_hash([np.frombuffer(b"".join(pool.map(page_hash, blocks)), np.uint8)])
+        return digest_of_hashes(map(page_hash, blocks))
+    with new_pool() as pool:
+        return digest_of_hashes(pool.map(page_hash, blocks))
+
+
+def digest_of_hashes(hashes: Iterable[bytes]) -> bytes:
+    return page_hash([np.frombuffer(b"".join(hashes), np.uint8)])
+
+
+def new_pool() -> ThreadPoolExecutor:
+    """Threads to hash and copy with."""
+    return ThreadPoolExecutor(min(os.cpu_count() or 1, 16))

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from v3dg import _device, _files
+from v3dg import _files
 from v3dg._device import Device
 from v3dg.build.checkpoint import discard_levels
 from v3dg.build.config import BuildConfig
-from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
-from v3dg.build.leaves_on_disk import leaves_on_disk, size_of
+from v3dg.build.leaves import MemoryLeaves, made_with
+from v3dg.build.leaves_on_disk import leaves_on_disk
 from v3dg.build.memory import in_bytes, most_units, unit_bytes
 from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle
@@ -60,14 +60,19 @@ def build_file(
     paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
     bundle_path = Path(bundle_path)
     config = config or BuildConfig()
-    levels = levels_path(bundle_path)
+    levels, scratch = levels_path(bundle_path), bundle_path.with_name(bundle_path.name + ".scratch")
     _files.check_folder(bundle_path)
     devices = devices_for(device, asset)  # before anything is read
     num_bytes = in_bytes(memory)
     if not resume:
         discard_levels(levels)
+    where: dict[str, Any] = {"config": config, "unusable": unusable, "device": devices[0]}
     try:
-        with _leaves(paths, asset, bundle_path, num_bytes, config, unusable, devices[0], progress) as leaves:
+        with (
+            leaves_on_disk(paths, scratch, memory=num_bytes, reserved=unit_bytes, progress=progress, **where)
+            if asset is None
+            else nullcontext(MemoryLeaves(asset, **where))
+        ) as leaves:
             del asset
             is_kept = resume and _is_made_with(bundle_path, made_with(leaves, config, seed))
             if not is_kept:
@@ -88,36 +93,6 @@ def build_file(
     with suppress(RuntimeError):  # another build to the same place has begun
         discard_levels(levels)
     return Bundle.open(bundle_path), not is_kept
-
-
-@contextmanager
-def _leaves(
-    paths: Sequence[AssetPath],
-    asset: Gaussians | None,
-    bundle_path: Path,
-    memory: int,
-    config: BuildConfig,
-    unusable: Literal["drop", "refuse"],
-    device: Device,
-    progress: bool,
-) -> Iterator[Leaves]:
-    if asset is not None:
-        with _device.memory_errors():
-            leaves = MemoryLeaves(asset, config, unusable, device)
-        del asset
-        yield leaves
-        return
-    with leaves_on_disk(
-        paths,
-        bundle_path.with_name(bundle_path.name + ".scratch"),
-        memory=memory,
-        reserved=unit_bytes(*size_of(paths)),
-        config=config,
-        unusable=unusable,
-        device=device,
-        progress=progress,
-    ) as leaves_:
-        yield leaves_
 
 
 def _is_made_with(bundle_path: Path, how: dict[str, Any]) -> bool:

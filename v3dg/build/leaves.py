@@ -5,9 +5,10 @@ from __future__ import annotations
 import operator
 import threading
 import warnings
+from abc import ABC, abstractmethod
 from collections import Counter
-from dataclasses import asdict
-from typing import Any, Literal, Protocol, get_args
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -15,17 +16,16 @@ import numpy.typing as npt
 from v3dg import _core, _device, cleaning
 from v3dg._device import Device
 from v3dg._numbers import one_of
-from v3dg.build.checkpoint import digest_of
+from v3dg.build.checkpoint import digest_of, parts_of
 from v3dg.build.config import BuildConfig
+from v3dg.formats._asset_file import gaussian_bytes
 from v3dg.gaussians import Gaussians
 
 Unusable = Literal["drop", "refuse"]
 
-PIECE = 1 << 16
-"""Gaussians that are read, examined and hashed at a time; the digest of an asset depends on it."""
 
-
-class Leaves(Protocol):
+@dataclass(eq=False)
+class Leaves(ABC):
     """Leaves of a build, wherever they are.
 
     Attributes:
@@ -33,29 +33,22 @@ class Leaves(Protocol):
         asset_gaussians: Those of the asset, with those that cannot be drawn.
         dropped: How many of each kind cannot be drawn, as `cleaning` counts them.
         digest: Of the asset; docs/format.md has the definition.
-        gaussian_bytes: Of one in memory.
         resident_bytes: Memory of the host that they take as long as they are read.
     """
 
-    @property
-    def num_gaussians(self) -> int: ...
-    @property
-    def asset_gaussians(self) -> int: ...
-    @property
-    def sh_degree(self) -> int: ...
-    @property
-    def dropped(self) -> dict[str, int]: ...
-    @property
-    def digest(self) -> str: ...
-    @property
-    def gaussian_bytes(self) -> int: ...
-    @property
-    def resident_bytes(self) -> int: ...
+    num_gaussians: int
+    asset_gaussians: int
+    sh_degree: int
+    dropped: dict[str, int]
+    digest: str
+    resident_bytes: int
+
+    @abstractmethod
     def read(self, first: int, last: int) -> Gaussians:
         """Leaves `first` to `last`, in arrays of their own."""
 
 
-class MemoryLeaves:
+class MemoryLeaves(Leaves):
     """The leaves of an asset in memory, on any device, that are split on another when they are first read.
 
     Raises:
@@ -72,17 +65,14 @@ class MemoryLeaves:
         if str(asset.means.dtype).endswith("64"):
             raise ValueError("asset: expected float32 arrays, got float64; convert them first")
         one_of(unusable, "unusable", get_args(Unusable))
-        asset = _device.place(asset, _device.of(asset.means))
         tally = Tally()
-        self._drawable = np.concatenate([np.zeros(0, bool), *map(tally.add, parts_of(asset))])
+        with _device.memory_errors():
+            asset = _device.place(asset, _device.of(asset.means))
+            self._drawable = np.concatenate([np.zeros(0, bool), *map(tally.add, parts_of(asset))])
         tally.check(unusable)
-        self.num_gaussians = tally.num_drawable
-        self.asset_gaussians = len(asset)
-        self.sh_degree = asset.sh_degree
-        self.dropped = tally.counts
-        self.digest = digest_of(asset)
-        self.gaussian_bytes = sum(array[:1].nbytes for array in vars(asset).values())
-        self.resident_bytes = len(asset) * (self.gaussian_bytes + 4)
+        count, degree = len(asset), asset.sh_degree
+        num_bytes = count * (gaussian_bytes(degree) + 4)
+        super().__init__(tally.num_drawable, count, degree, tally.counts, digest_of(asset), num_bytes)
         self._asset, self._config, self._device = asset, config, device
         self._order: npt.NDArray[np.integer[Any]] | None = None
         self._lock = threading.Lock()
@@ -100,8 +90,7 @@ class MemoryLeaves:
         order, _ = _core.median_split(means, np.array([0, self.num_gaussians]), depth)
         kind: Any = np.int32 if self.asset_gaussians < 1 << 31 else np.int64
         rows: npt.NDArray[np.integer[Any]] = np.flatnonzero(self._drawable).astype(kind)
-        sorted_: npt.NDArray[np.integer[Any]] = rows[_device.to_host(order)]
-        return sorted_
+        return np.take(rows, _device.to_host(order))
 
 
 def made_with(leaves: Leaves, config: BuildConfig, seed: int) -> dict[str, Any]:
@@ -120,11 +109,6 @@ def made_with(leaves: Leaves, config: BuildConfig, seed: int) -> dict[str, Any]:
         "asset_digest": leaves.digest,
         "dropped": leaves.dropped,
     }
-
-
-def parts_of(gaussians: Gaussians) -> list[Gaussians]:
-    """Pieces of them, sharing their memory."""
-    return [gaussians.subset(slice(start, start + PIECE)) for start in range(0, len(gaussians), PIECE)]
 
 
 class Tally:

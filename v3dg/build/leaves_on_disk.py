@@ -14,8 +14,7 @@ import math
 import os
 import shutil
 from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,9 +26,12 @@ import numpy.typing as npt
 from v3dg import _core
 from v3dg._device import CPU, Device
 from v3dg.build import external_split
+from v3dg.build.checkpoint import PIECE, digest_of_hashes, new_pool, parts_of
 from v3dg.build.config import BuildConfig
-from v3dg.build.leaves import PIECE, Leaves, MemoryLeaves, Tally, Unusable, parts_of
+from v3dg.build.leaves import Leaves, MemoryLeaves, Tally, Unusable
 from v3dg.build.memory import in_mib
+from v3dg.build.plan import halved
+from v3dg.build.progress import bar_of_gaussians
 from v3dg.build.scratch import RowFile, scratch_folder
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.format import page_hash
@@ -43,35 +45,19 @@ _SENT_AT_ONCE = 1 << 12  # gaussians that a thread brings to a bucket
 _OVERHEAD_BYTES = 24 << 20
 _NAMES = ("points", "spare", "order", "rows")
 
+_Blocks = Iterator[tuple[int, Gaussians]]
 
-@dataclass(frozen=True, eq=False)
-class DiskLeaves:
+
+@dataclass(eq=False)
+class DiskLeaves(Leaves):
     """Leaves in a scratch folder, for as long as that is there; can be pickled and read by many at once.
 
-    A read needs memory for what it returns and for about two buckets: `bucket_bytes`.
+    A read needs memory for what it returns and for about two buckets: `resident_bytes`.
     """
 
     path: Path
-    num_gaussians: int
-    asset_gaussians: int
-    sh_degree: int
-    dropped: dict[str, int]
-    digest: str
     _bucket_offset: npt.NDArray[np.int64]
     _depth_left: int  # of the split inside of each bucket
-
-    @property
-    def gaussian_bytes(self) -> int:
-        return gaussian_bytes(self.sh_degree)
-
-    @property
-    def resident_bytes(self) -> int:
-        """Of the bucket that is being read."""
-        return self.bucket_bytes
-
-    @property
-    def bucket_bytes(self) -> int:
-        return int(np.diff(self._bucket_offset).max()) * _bytes_in_bucket(self.sh_degree)
 
     def read(self, first: int, last: int) -> Gaussians:
         result = Codec(self.sh_degree).empty(last - first)
@@ -100,7 +86,7 @@ def leaves_on_disk(
     memory: int,
     config: BuildConfig,
     unusable: Unusable = "drop",
-    reserved: int = 0,
+    reserved: Callable[[int, int], int] = lambda num_gaussians, sh_degree: 0,
     device: Device = CPU,
     progress: bool = False,
 ) -> Iterator[Leaves]:
@@ -115,7 +101,7 @@ def leaves_on_disk(
             killed build left there is removed first.
         memory: Bytes beside what the process already has, until the leaves are there. Reading leaves then
             takes what `DiskLeaves` says.
-        reserved: Of the memory, what is for others from the beginning.
+        reserved: Of the memory, what is for others from the beginning, by gaussians and SH degree.
         device: Where an asset that fits in memory is split.
         unusable: As for `build_bundle`.
         progress: Show a bar with the gaussians read.
@@ -134,12 +120,13 @@ def leaves_on_disk(
     if count >= 1 << 32:
         raise ValueError(f"asset: expected fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
-    sizes = _Sizes.of(memory, reserved, degree, tiles)
+    sizes = _Sizes.of(memory, reserved(count, degree), degree, tiles)
     folder = Path(folder)
     fits = count <= sizes.in_memory
     # Where none is needed, what a killed build left is removed.
     scratch = nullcontext() if fits and not os.path.lexists(folder) else scratch_folder(folder, _NAMES)
-    with scratch, _bar(progress and not fits, 2 * count) as bar:
+    is_visible = progress and not fits
+    with scratch, bar_of_gaussians(2 * count, is_visible, desc="reading", leave=False) as bar:
         if fits:
             buffer = Codec(degree).empty(count)
             for _ in _blocks(tiles, buffer, bar):
@@ -151,13 +138,6 @@ def leaves_on_disk(
         else:
             _check_disk(folder, count, degree)
             yield _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
-
-
-def size_of(paths: Sequence[str | os.PathLike[str]]) -> tuple[int, int]:
-    """Gaussians of the asset that some files make together, and bytes of one in memory, as headers say."""
-    tiles = [_Tile.of(path) for path in paths]
-    degree = max((tile.sh_degree for tile in tiles), default=0)
-    return sum(tile.num_gaussians for tile in tiles), gaussian_bytes(degree)
 
 
 @dataclass(frozen=True)
@@ -244,22 +224,7 @@ def _check_disk(folder: Path, count: int, degree: int) -> None:
         )
 
 
-def _bar(is_visible: bool, total: int) -> Any:
-    """Of gaussians read."""
-    from tqdm import tqdm
-
-    return tqdm(
-        desc="reading",
-        total=total,
-        unit=" gaussians",
-        unit_scale=True,
-        dynamic_ncols=True,
-        leave=False,
-        disable=not is_visible,
-    )
-
-
-def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Any) -> Iterator[tuple[int, Gaussians]]:
+def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Any) -> _Blocks:
     """The asset in blocks as large as the buffer, each with its first row, valid until the next."""
     first = filled = 0
     for tile in tiles:
@@ -309,7 +274,7 @@ def _sort_on_disk(
             stack.enter_context(RowFile(path, 4, np.uint32, must_be_new=True)) for path in (points, spare)
         ]
         order_file = stack.enter_context(RowFile(order, 1, np.uint32, must_be_new=True))
-        digest = _write_points(tiles, Codec(degree).empty(sizes.in_block), files[0], tally, bar)
+        digest = _write_points(_blocks(tiles, Codec(degree).empty(sizes.in_block), bar), files[0], tally)
         tally.check(unusable)
         count = tally.num_drawable
         depth = _core.num_halvings(count, config.cluster_size)
@@ -317,38 +282,31 @@ def _sort_on_disk(
         external_split.split((files[0], files[1]), count, bucket_depth, sizes.in_node, order_file)
         points.unlink()
         spare.unlink()
-        offset = _halved(count, bucket_depth)
+        offset = halved(np.array([count]), bucket_depth)
         row_file = stack.enter_context(
             RowFile(rows, gaussian_bytes(degree) // 4, np.float32, must_be_new=True)
         )
-        block = Codec(degree).empty(sizes.in_block)
-        again = _write_rows(tiles, block, order_file, offset, tally.num_gaussians, row_file, bar)
+        ends = _ends_in_buckets(order_file, offset, sizes.in_block, tally.num_gaussians)
+        blocks = _blocks(tiles, Codec(degree).empty(sizes.in_block), bar)
+        again = _write_rows(blocks, order_file, ends, row_file)
     order.unlink()
     if again != digest:
         raise _changed(tiles[0].path if len(tiles) == 1 else f"one of {len(tiles)} files")
     bar.close()
-    return DiskLeaves(
-        rows, count, tally.num_gaussians, degree, tally.counts, digest, offset, depth - bucket_depth
-    )
-
-
-def _halved(count: int, depth: int) -> npt.NDArray[np.int64]:
-    """Where the nodes of this depth begin, and the end."""
-    sizes = np.array([count])
-    for _ in range(depth):
-        sizes = np.stack([(sizes + 1) // 2, sizes // 2], axis=1).reshape(-1)
-    return np.concatenate([[0], np.cumsum(sizes)])
+    bucket_bytes = int(np.diff(offset).max()) * _bytes_in_bucket(degree)
+    about = count, tally.num_gaussians, degree, tally.counts, digest, bucket_bytes
+    return DiskLeaves(*about, rows, offset, depth - bucket_depth)
 
 
 def _hash(part: Gaussians) -> bytes:
     return page_hash(vars(part).values())
 
 
-def _write_points(tiles: Sequence[_Tile], buffer: Gaussians, points: RowFile, tally: Tally, bar: Any) -> str:
+def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
     """The first pass: the means of all that can be drawn, with their rows in the asset; the digest."""
     hashes: list[bytes] = []
-    with _pool() as pool:
-        for first, block in _blocks(tiles, buffer, bar):
+    with new_pool() as pool:
+        for first, block in blocks:
             parts = parts_of(block)
             hashes += pool.map(_hash, parts)
             for number, part in enumerate(parts):
@@ -356,23 +314,14 @@ def _write_points(tiles: Sequence[_Tile], buffer: Gaussians, points: RowFile, ta
                 row = np.flatnonzero(tally.add(part))
                 index = first + number * PIECE + row
                 points.write(end, external_split.points_of(part.means[row], index))
-    return page_hash([np.frombuffer(b"".join(hashes), np.uint8)]).hex()
+    return digest_of_hashes(hashes).hex()
 
 
-def _write_rows(
-    tiles: Sequence[_Tile],
-    buffer: Gaussians,
-    order: RowFile,
-    offset: npt.NDArray[np.int64],
-    asset_gaussians: int,
-    rows: RowFile,
-    bar: Any,
-) -> str:
+def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], rows: RowFile) -> str:
     """The second pass: every gaussian to its bucket, where they keep the order of the asset; the digest."""
-    ends = _ends_in_buckets(order, offset, len(buffer), asset_gaussians)
     hashes: list[bytes] = []
-    with _pool() as pool:
-        for number, (first, block) in enumerate(_blocks(tiles, buffer, bar)):
+    with new_pool() as pool:
+        for number, (first, block) in enumerate(blocks):
             hashes += pool.map(_hash, parts_of(block))
             arrays = [array.reshape(len(block), -1) for array in vars(block).values()]
 
@@ -384,7 +333,7 @@ def _write_rows(
                     rows.write(start, np.concatenate(columns, axis=1))
 
             deque(pool.map(send, ends[:, number].tolist(), ends[:, number + 1].tolist()), maxlen=0)
-    return page_hash([np.frombuffer(b"".join(hashes), np.uint8)]).hex()
+    return digest_of_hashes(hashes).hex()
 
 
 def _ends_in_buckets(
@@ -396,7 +345,3 @@ def _ends_in_buckets(
         for index in order.blocks(begin, end, _MOST_IN_BUCKET):
             counts[bucket, 1:] += np.bincount(index // np.uint32(block), minlength=counts.shape[1] - 1)
     return offset[:-1, None] + np.cumsum(counts, axis=1)
-
-
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(min(os.cpu_count() or 1, 16))

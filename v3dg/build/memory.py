@@ -9,6 +9,7 @@ from pathlib import Path
 
 from v3dg.build.leaves import Leaves
 from v3dg.build.whole import UNIT_LEAVES
+from v3dg.formats._asset_file import gaussian_bytes
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 # What a leaf of a unit takes until its levels are written: arrays of its size, whatever the SH degree, and
@@ -33,13 +34,13 @@ def in_bytes(memory: int | str | None) -> int:
 
 def most_units(memory: int, leaves: Leaves) -> int:
     """Units that may be in memory at once, beside the leaves; at least one."""
-    each = unit_bytes(leaves.num_gaussians, leaves.gaussian_bytes)
+    each = unit_bytes(leaves.num_gaussians, leaves.sh_degree)
     return max(1, (memory - leaves.resident_bytes) // each)
 
 
-def unit_bytes(num_gaussians: int, gaussian_bytes: int) -> int:
+def unit_bytes(num_gaussians: int, sh_degree: int) -> int:
     """What a unit of an asset takes."""
-    leaf = _LEAF_BYTES + _LEAF_COPIES * gaussian_bytes
+    leaf = _LEAF_BYTES + _LEAF_COPIES * gaussian_bytes(sh_degree)
     return int(min(num_gaussians, UNIT_LEAVES) * leaf)
 
 

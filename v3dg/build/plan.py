@@ -51,13 +51,10 @@ class LevelPlan:
     def groups(self, first: int, last: int) -> LevelPlan:
         """A run of the groups, their gaussians counted from 0."""
         made = self.num_clusters // self.num_groups
-        return LevelPlan(
-            self.first_group + first,
-            _from_zero(self.offset[first * made : last * made + 1]),
-            _from_zero(self.group_offset[first : last + 1]),
-            _from_zero(self.leaf_offset[first : last + 1]),
-            self.weight[first:last],
-        )
+        clusters = self.offset[first * made : last * made + 1]
+        offsets = clusters, self.group_offset[first : last + 1], self.leaf_offset[first : last + 1]
+        own, made_of, leaves = (offset - offset[0] for offset in offsets)
+        return LevelPlan(self.first_group + first, own, made_of, leaves, self.weight[first:last])
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +70,9 @@ class Plan:
     @staticmethod
     def of(num_gaussians: int, config: BuildConfig) -> Plan:
         """The plan of an asset with so many gaussians."""
-        sizes = np.array([num_gaussians], np.int64)
-        for _ in range(_core.num_halvings(num_gaussians, config.cluster_size)):
-            sizes = _halved(sizes)
-        offset = _offset_of(sizes)
-        levels = [LevelPlan(0, offset, offset, offset, np.zeros(len(sizes), np.float32))]
+        depth = _core.num_halvings(num_gaussians, config.cluster_size)
+        offset = halved(np.array([num_gaussians]), depth)
+        levels = [LevelPlan(0, offset, offset, offset, np.zeros(1 << depth, np.float32))]
         while (shape := _next_shape(levels[-1], config)) is not None:
             levels.append(_level_above(levels[-1], *shape))
         return Plan(tuple(levels))
@@ -85,13 +80,8 @@ class Plan:
     def subtree(self, level: int, first_group: int, last_group: int) -> Plan:
         """What is under a run of groups of one level, up to that level."""
         top = self.levels[level].num_groups
-        each = [below.num_groups // top for below in self.levels[: level + 1]]
-        return Plan(
-            tuple(
-                below.groups(first_group * count, last_group * count)
-                for below, count in zip(self.levels, each, strict=False)
-            )
-        )
+        levels = ((below, below.num_groups // top) for below in self.levels[: level + 1])
+        return Plan(tuple(below.groups(first_group * n, last_group * n) for below, n in levels))
 
     def units(self, most_leaves: int) -> Units:
         """Cut the plan into runs of groups of one level, each above no more leaves than so many."""
@@ -144,21 +134,16 @@ def _level_above(below: LevelPlan, num_groups: int, clusters_made: int) -> Level
     sizes = (into + 1) // 2
     group_offset = _offset_of(sizes)
     weight = np.maximum((1 / sizes).astype(np.float32), below.weight.reshape(num_groups, -1).max(axis=1))
-    while len(sizes) < num_groups * clusters_made:
-        sizes = _halved(sizes)
     leaf_offset = np.ascontiguousarray(below.leaf_offset[:: below.num_groups // num_groups])
-    return LevelPlan(0, _offset_of(sizes), group_offset, leaf_offset, weight)
+    return LevelPlan(0, halved(sizes, clusters_made.bit_length() - 1), group_offset, leaf_offset, weight)
 
 
-def _halved(sizes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Sizes of the parts when each is split in two, as the median split does it."""
-    return np.stack([(sizes + 1) // 2, sizes // 2], axis=1).ravel()
+def halved(sizes: npt.NDArray[np.int64], depth: int) -> Offsets:
+    """Where parts begin when nodes are split in two so many times, as the median split does it; the end."""
+    for _ in range(depth):
+        sizes = np.stack([(sizes + 1) // 2, sizes // 2], axis=1).ravel()
+    return _offset_of(sizes)
 
 
 def _offset_of(sizes: npt.NDArray[np.int64]) -> Offsets:
     return np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
-
-
-def _from_zero(offset: Offsets) -> Offsets:
-    moved: Offsets = offset - offset[0]
-    return moved

@@ -10,6 +10,20 @@ from v3dg.build.plan import Plan
 from v3dg.build.simplify import Show
 
 
+def bar_of_gaussians(total: int, is_visible: bool, **options: Any) -> Any:
+    """Tqdm's, which counts gaussians."""
+    from tqdm import tqdm
+
+    return tqdm(
+        total=total,
+        unit=" gaussians",
+        unit_scale=True,
+        dynamic_ncols=True,
+        disable=not is_visible,
+        **options,
+    )
+
+
 class Stopped(Exception):
     """Another thread of the build has failed."""
 
@@ -57,18 +71,8 @@ class Bar:
         return show
 
     def _show(self, levels: range, num_groups: int, state: _core.FitProgress) -> None:
-        from tqdm import tqdm
-
         if self._bar is None:
-            self._bar = tqdm(
-                total=self._total,
-                initial=self._initial,
-                unit=" gaussians",
-                unit_scale=True,
-                smoothing=0.1,
-                dynamic_ncols=True,
-                disable=not self._is_visible,
-            )
+            self._bar = bar_of_gaussians(self._total, self._is_visible, initial=self._initial, smoothing=0.1)
         self._bar.set_description(f"level {levels[-1]}/{self._last_level}", refresh=False)
         done = state.groups_done
         if done > 0:

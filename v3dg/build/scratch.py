@@ -79,7 +79,7 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
     folder.mkdir(mode=0o700, exist_ok=True)
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
-        _lock(descriptor, folder)
+        lock(descriptor, folder)
         others = sorted(set(os.listdir(folder)) - set(names))
         if others:
             raise ValueError(f"{folder}: expected scratch of a build, got {others[0]!a}; move it elsewhere")
@@ -94,14 +94,21 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _lock(descriptor: int, folder: Path) -> None:
+def lock(descriptor: int, path: str | os.PathLike[str]) -> None:
+    """Keep other builds from what is open there until it is closed.
+
+    Raises:
+        RuntimeError: Another build is using it.
+    """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
+        place = os.fspath(path)
         raise RuntimeError(
-            f"{folder}: another build is using it; wait for it, or use another place"
+            f"{place}: another build is using it; wait for it, or write to another place"
         ) from None
-    except OSError as error:  # network file systems without locks
+    except OSError as error:
+        # Some network file systems have no locks; there, two builds of one output are the user's to avoid.
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
             raise
 
