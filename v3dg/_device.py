@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,6 @@ import numpy.typing as npt
 from v3dg import _core
 from v3dg.gaussians import Array, Gaussians
 
-_T = TypeVar("_T")
 _MUCH_MEMORY = 1 << 30
 
 
@@ -173,7 +172,7 @@ def own_stream(device: Device) -> AbstractContextManager[Any]:
     return torch.cuda.stream(stream(device.number))
 
 
-def with_this_stream(work: Callable[[_T], None], device: Device) -> Callable[[_T], None]:
+def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], None]:
     """The same work on this thread's stream, whatever thread it will run on."""
     if not device.is_cuda:
         return work
@@ -181,9 +180,9 @@ def with_this_stream(work: Callable[[_T], None], device: Device) -> Callable[[_T
 
     stream = torch.cuda.current_stream(device.number)
 
-    def on_stream(argument: _T) -> None:
+    def on_stream() -> None:
         with torch.cuda.stream(stream):
-            work(argument)
+            work()
 
     return on_stream
 

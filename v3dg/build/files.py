@@ -62,8 +62,7 @@ def build_file(
     config = config or BuildConfig()
     levels, scratch = levels_path(bundle_path), bundle_path.with_name(bundle_path.name + ".scratch")
     _files.check_folder(bundle_path)
-    devices = devices_for(device, asset)  # before anything is read
-    num_bytes = in_bytes(memory)
+    devices, num_bytes = devices_for(device, asset), in_bytes(memory)  # before anything is read
     if not resume:
         discard_levels(levels)
     where: dict[str, Any] = {"config": config, "unusable": unusable, "device": devices[0]}
@@ -76,17 +75,9 @@ def build_file(
             del asset
             is_kept = resume and _is_made_with(bundle_path, made_with(leaves, config, seed))
             if not is_kept:
-                build_into(
-                    # The levels beside the bundle are locked, so no other build writes to it.
-                    partial(writing, bundle_path, is_locked=True),
-                    leaves,
-                    config,
-                    seed,
-                    devices=devices,
-                    progress=progress,
-                    resume_path=levels,
-                    most_units=most_units(num_bytes, leaves),
-                )
+                # The levels beside the bundle are locked, so no other build writes to it.
+                sink, most = partial(writing, bundle_path, is_locked=True), most_units(num_bytes, leaves)
+                build_into(sink, leaves, config, seed, devices, progress, levels, most)
     except ValueError as error:
         place = f"{os.fspath(paths[0])}: " if str(error).startswith("asset: ") else ""
         raise ValueError(f"{place}{error}") from None

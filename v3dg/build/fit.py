@@ -44,18 +44,14 @@ def run_fit(
     """Run `fit` on a thread of its own, and `show` how far it is while it computes; what it returns."""
     state = _core.FitProgress()
     result: list[_T] = []
-
-    def collect(progress: _core.FitProgress) -> None:
-        result.append(fit(progress))
-
-    fit_there = _device.with_this_stream(collect, where)
+    fit_there = _device.with_this_stream(lambda: result.append(fit(state)), where)
     failure: list[BaseException] = []
     done = threading.Event()
 
     def work(token: _Token) -> None:
         del token  # the thread itself still has it
         try:
-            fit_there(state)
+            fit_there()
         except BaseException as error:
             failure.append(error)
         finally:

@@ -115,8 +115,6 @@ def leaves_on_disk(
     """
     tiles = [_Tile.of(path) for path in paths]
     count = sum(tile.num_gaussians for tile in tiles)
-    if count == 0:
-        raise ValueError("asset: expected at least one gaussian, got none")
     if count >= 1 << 32:
         raise ValueError(f"asset: expected fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
@@ -270,22 +268,21 @@ def _sort_on_disk(
     points, spare, order, rows = (folder / name for name in _NAMES)
     tally = Tally()
     with ExitStack() as stack:
-        files = [
-            stack.enter_context(RowFile(path, 4, np.uint32, must_be_new=True)) for path in (points, spare)
-        ]
-        order_file = stack.enter_context(RowFile(order, 1, np.uint32, must_be_new=True))
+
+        def new(path: Path, width: int, dtype: npt.DTypeLike = np.uint32) -> RowFile:
+            return stack.enter_context(RowFile(path, width, dtype, must_be_new=True))
+
+        files, order_file = (new(points, 4), new(spare, 4)), new(order, 1)
         digest = _write_points(_blocks(tiles, Codec(degree).empty(sizes.in_block), bar), files[0], tally)
         tally.check(unusable)
         count = tally.num_drawable
         depth = _core.num_halvings(count, config.cluster_size)
         bucket_depth = min(depth, _core.num_halvings(count, sizes.in_bucket))
-        external_split.split((files[0], files[1]), count, bucket_depth, sizes.in_node, order_file)
+        external_split.split(files, count, bucket_depth, sizes.in_node, order_file)
         points.unlink()
         spare.unlink()
         offset = halved(np.array([count]), bucket_depth)
-        row_file = stack.enter_context(
-            RowFile(rows, gaussian_bytes(degree) // 4, np.float32, must_be_new=True)
-        )
+        row_file = new(rows, gaussian_bytes(degree) // 4, np.float32)
         ends = _ends_in_buckets(order_file, offset, sizes.in_block, tally.num_gaussians)
         blocks = _blocks(tiles, Codec(degree).empty(sizes.in_block), bar)
         again = _write_rows(blocks, order_file, ends, row_file)

@@ -14,14 +14,8 @@ def bar_of_gaussians(total: int, is_visible: bool, **options: Any) -> Any:
     """Tqdm's, which counts gaussians."""
     from tqdm import tqdm
 
-    return tqdm(
-        total=total,
-        unit=" gaussians",
-        unit_scale=True,
-        dynamic_ncols=True,
-        disable=not is_visible,
-        **options,
-    )
+    options |= {"unit": " gaussians", "unit_scale": True, "dynamic_ncols": True}
+    return tqdm(total=total, disable=not is_visible, **options)
 
 
 class Stopped(Exception):
@@ -66,16 +60,14 @@ class Bar:
                 raise Stopped
             with self._lock:
                 self._fitted[part, levels[0]] = num_gaussians * state.groups_done / num_groups
-                self._show(levels, num_groups, state)
+                if self._bar is None:
+                    self._bar = bar_of_gaussians(
+                        self._total, self._is_visible, initial=self._initial, smoothing=0.1
+                    )
+                self._bar.set_description(f"level {levels[-1]}/{self._last_level}", refresh=False)
+                if (done := state.groups_done) > 0:
+                    text = f"groups {done}/{num_groups}, loss {state.loss_sum / done:.4f}"
+                    self._bar.set_postfix_str(text, refresh=False)
+                    self._bar.update(self._initial + int(sum(self._fitted.values())) - self._bar.n)
 
         return show
-
-    def _show(self, levels: range, num_groups: int, state: _core.FitProgress) -> None:
-        if self._bar is None:
-            self._bar = bar_of_gaussians(self._total, self._is_visible, initial=self._initial, smoothing=0.1)
-        self._bar.set_description(f"level {levels[-1]}/{self._last_level}", refresh=False)
-        done = state.groups_done
-        if done > 0:
-            text = f"groups {done}/{num_groups}, loss {state.loss_sum / done:.4f}"
-            self._bar.set_postfix_str(text, refresh=False)
-            self._bar.update(self._initial + int(sum(self._fitted.values())) - self._bar.n)

@@ -26,6 +26,7 @@ class RowFile:
     def __init__(self, path: Path, width: int, dtype: npt.DTypeLike, *, must_be_new: bool = False) -> None:
         self.path = path
         self._width, self._dtype = width, np.dtype(dtype)
+        self._row_bytes = width * self._dtype.itemsize
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL if must_be_new else os.O_RDONLY
         self._descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
 
@@ -61,10 +62,6 @@ class RowFile:
         data = np.ascontiguousarray(rows, self._dtype).reshape(-1).view(np.uint8).data
         with _files.naming_errors(self.path):
             _files.write_at(self._descriptor, data, first * self._row_bytes)
-
-    @property
-    def _row_bytes(self) -> int:
-        return self._width * self._dtype.itemsize
 
 
 @contextmanager

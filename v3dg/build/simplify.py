@@ -76,17 +76,11 @@ def build_levels(
     yield level
     below = {0: level}
     del level
-    yield from build_above(below, plan, config, seed, finished=finished, show=show)
+    yield from build_above(below, plan, config, seed, finished, show)
 
 
 def build_above(
-    below: dict[int, Level],
-    plan: Plan,
-    config: BuildConfig,
-    seed: int,
-    *,
-    finished: Iterable[Level] = (),
-    show: Show = lambda levels, num_groups, num_gaussians, state: None,
+    below: dict[int, Level], plan: Plan, config: BuildConfig, seed: int, finished: Iterable[Level], show: Show
 ) -> Iterator[Level]:
     """Yield the levels of a plan above others, one after another; as `build_levels` for the rest.
 
@@ -126,7 +120,8 @@ def _simplify(
     del starts, chain
     targets = range(config.target_of(levels[0]), config.target_of(levels[-1]) + 1)
     target = _target(below, targets, config)
-    views = [_View.of(below[config.target_of(number)], plan, number, config) for number in levels]
+    views = [_view(below[config.target_of(number)], plan, number, config) for number in levels]
+    offsets, balls = zip(*views, strict=True)
     rows, groups = (
         np.cumsum([0, *counts])
         for counts in ([here.num_gaussians for here in plans], [here.num_groups for here in plans])
@@ -137,10 +132,10 @@ def _simplify(
         lambda progress: _core.fit_level(
             fit_config(config, seed, levels[0]),
             target,
-            _ranges([view.offset for view in views], [len(below[number].gaussians) for number in targets]),
+            _ranges(offsets, [len(below[number].gaussians) for number in targets]),
             gaussians.rows,
             _ranges([here.group_offset for here in plans], np.diff(rows)),
-            np.concatenate([view.ball for view in views]),
+            np.concatenate(balls),
             np.concatenate([_streams(number, here) for number, here in zip(levels, plans, strict=True)]),
             progress,
         ),
@@ -152,7 +147,7 @@ def _simplify(
     for i, number in enumerate(levels):
         ball = _core.bound_spheres(ball, _children(plan, number - 1, number))
         part = gaussians.subset(slice(int(rows[i]), int(rows[i + 1])))
-        made.append(_level(part, plans[i], ball, views[i].ball, error[groups[i] : groups[i + 1]]))
+        made.append(_level(part, plans[i], ball, balls[i], error[groups[i] : groups[i + 1]]))
     return made
 
 
@@ -172,27 +167,16 @@ def _level(gaussians: Gaussians, plan: LevelPlan, *tables: npt.NDArray[np.float3
     return Level(gaussians, LevelTables(box, *tables))
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """What the groups of a level are fitted to, in the level that is their target.
-
-    Attributes:
-        offset: (G + 1,) gaussians of the target under each group.
-        ball: (G, 4) float32, which they are seen in.
-    """
-
-    offset: Offsets
-    ball: npt.NDArray[np.float32]
-
-    @staticmethod
-    def of(target: Level, plan: Plan, number: int, config: BuildConfig) -> _View:
-        source, here = config.target_of(number), plan.levels[number]
-        if source == 0:
-            ball = _device.to_host(_core.bound_spheres(_spheres(target.gaussians), here.leaf_offset))
-            return _View(here.leaf_offset, ball)
-        children = _children(plan, source, number)
-        ball = _core.bound_spheres(target.tables.fit_ball, children)
-        return _View(plan.levels[source].group_offset[children], ball)
+def _view(
+    target: Level, plan: Plan, number: int, config: BuildConfig
+) -> tuple[Offsets, npt.NDArray[np.float32]]:
+    """Of the groups of a level: (G + 1,) gaussians of their target under each; (G, 4) balls to look at."""
+    source, here = config.target_of(number), plan.levels[number]
+    if source == 0:
+        ball = _core.bound_spheres(_spheres(target.gaussians), here.leaf_offset)
+        return here.leaf_offset, _device.to_host(ball)
+    children = _children(plan, source, number)
+    return plan.levels[source].group_offset[children], _core.bound_spheres(target.tables.fit_ball, children)
 
 
 def _children(plan: Plan, below: int, number: int) -> Offsets:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any, Protocol, TypeAlias
 
@@ -61,7 +61,6 @@ def build_into(
     leaves: Leaves,
     config: BuildConfig,
     seed: int,
-    *,
     devices: Sequence[Device],
     progress: bool,
     resume_path: str | os.PathLike[str] | None,
@@ -100,26 +99,24 @@ class _Unit:
     kept: dict[int, Gaussians]
 
 
+@dataclass(frozen=True, eq=False)
 class _Build:
     """The work on all units of a plan, and on what is above them."""
 
-    def __init__(
-        self,
-        config: BuildConfig,
-        seed: int,
-        plan: Plan,
-        units: Units,
-        sink: Sink,
-        checkpoint: Checkpoint,
-        bar: Bar,
-    ) -> None:
-        self._config, self._seed, self._plan, self._units = config, seed, plan, units
-        self._sink, self._checkpoint, self._bar = sink, checkpoint, bar
-        self._first_page = plan.first_page
-        # Levels of the units that the work above them begins with.
-        has_above = units.level + 1 < len(plan.levels)
-        first = min(units.level, config.target_of(units.level + 1)) if has_above else units.level
-        self._kept = range(first, units.level + 1)
+    config: BuildConfig
+    seed: int
+    plan: Plan
+    units: Units
+    sink: Sink
+    checkpoint: Checkpoint
+    bar: Bar
+
+    @property
+    def kept(self) -> range:
+        """Levels of the units that the work above them begins with."""
+        last = self.units.level
+        has_above = last + 1 < len(self.plan.levels)
+        return range(self.config.target_of(last + 1) if has_above else last, last + 1)
 
     def all_levels(
         self, leaves: Leaves, devices: Sequence[Device], most_units: int | None
@@ -128,24 +125,18 @@ class _Build:
         workers = [device for _ in range(_UNITS_ON_GPU) for device in devices if device.is_cuda]
         workers = (workers or list(devices))[:most_units]
         tables, below = self._join(self._build_units(leaves, workers), devices[0])
-        top = len(self._units.plans)
-        above = build_above(
-            below,
-            self._plan,
-            self._config,
-            self._seed,
-            finished=self._checkpoint.load(top),
-            show=self._bar.show_of(top),
-        )
-        for number, level in enumerate(above, self._units.level + 1):
+        top = len(self.units.plans)
+        finished, show = self.checkpoint.load(top), self.bar.show_of(top)
+        above = build_above(below, self.plan, self.config, self.seed, finished, show)
+        for number, level in enumerate(above, self.units.level + 1):
             host = Level(level.gaussians.numpy(), level.tables)
             self._write(number, host.gaussians)
-            self._checkpoint.save(top, number, host)
+            self.checkpoint.save(top, number, host)
             tables.append(host.tables)
         return tables
 
     def _build_units(self, leaves: Leaves, workers: Sequence[Device]) -> list[_Unit]:
-        units: list[Any] = [None] * len(self._units.plans)
+        units: list[Any] = [None] * len(self.units.plans)
         free: SimpleQueue[Device] = SimpleQueue()
         for device in workers:
             free.put(device)
@@ -163,45 +154,39 @@ class _Build:
 
     def _join(self, units: list[_Unit], device: Device) -> tuple[list[LevelTables], dict[int, Level]]:
         """The tables of all levels of the units, and the levels that were kept, whole, on the device."""
-        tables = [
-            _joined_tables([unit.tables[number] for unit in units]) for number in range(self._units.level + 1)
-        ]
-        whole = {n: Gaussians.concatenate([unit.kept[n] for unit in units]) for n in self._kept}
-        self._write(self._units.level, whole[self._units.level])
+        by_level = zip(*(unit.tables for unit in units), strict=True)
+        arrays = [zip(*(vars(part).values() for part in parts), strict=True) for parts in by_level]
+        tables = [LevelTables(*map(np.concatenate, columns)) for columns in arrays]
+        whole = {n: Gaussians.concatenate([unit.kept[n] for unit in units]) for n in self.kept}
+        self._write(self.units.level, whole[self.units.level])
         return tables, {n: Level(_device.place(part, device), tables[n]) for n, part in whole.items()}
 
     def _unit(self, unit: int, leaves: Leaves, device: Device) -> _Unit:
-        plan = self._units.plans[unit]
-        first = self._plan.levels[0].offset[plan.levels[0].first_group]
+        plan = self.units.plans[unit]
+        first = self.plan.levels[0].offset[plan.levels[0].first_group]
         with _device.memory_errors():
             own = _device.place(leaves.read(first, first + plan.levels[0].num_gaussians), device)
-            levels = build_levels(
-                own,
-                plan,
-                self._config,
-                self._seed,
-                finished=self._checkpoint.load(unit),
-                show=self._bar.show_of(unit),
-            )
+            finished, show = self.checkpoint.load(unit), self.bar.show_of(unit)
+            levels = build_levels(own, plan, self.config, self.seed, finished=finished, show=show)
             del own
             tables: list[LevelTables] = []
             kept: dict[int, Gaussians] = {}
             for number, level in enumerate(levels):
                 host = Level(level.gaussians.numpy(), level.tables)
-                if number < self._units.level:
+                if number < self.units.level:
                     above = plan.levels[number + 1]
-                    page = self._first_page[number] + above.first_group
-                    self._sink.write(page, page + above.num_groups, host.gaussians)
+                    page = self.plan.first_page[number] + above.first_group
+                    self.sink.write(page, page + above.num_groups, host.gaussians)
                 if number > 0:
-                    self._checkpoint.save(unit, number, host)
-                if number in self._kept:
+                    self.checkpoint.save(unit, number, host)
+                if number in self.kept:
                     kept[number] = host.gaussians
                 tables.append(host.tables)
                 del level, host  # while the next is made, their memory is free
         return _Unit(tables, kept)
 
     def _write(self, number: int, gaussians: Gaussians) -> None:
-        self._sink.write(self._first_page[number], self._first_page[number + 1], gaussians)
+        self.sink.write(self.plan.first_page[number], self.plan.first_page[number + 1], gaussians)
 
     def _on_threads(self, work: Callable[[int], None], count: int, num_threads: int) -> None:
         """Do the work for all numbers below the count; what fails on one thread ends it on all."""
@@ -215,13 +200,7 @@ class _Build:
                 for future in as_completed(futures):
                     future.result()
             except BaseException:
-                self._bar.stop()
+                self.bar.stop()
                 for future in futures:
                     future.cancel()
                 raise
-
-
-def _joined_tables(parts: Sequence[LevelTables]) -> LevelTables:
-    """The tables of a level of which these are the parts."""
-    names = [field.name for field in fields(LevelTables)]
-    return LevelTables(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
