@@ -22,7 +22,7 @@ from v3dg.build.checkpoint import digest_of
 from v3dg.build.leaves import MemoryLeaves
 from v3dg.build.leaves_on_disk import DiskLeaves, leaves_on_disk
 from v3dg.build.scratch import RowFile
-from v3dg.formats._asset_file import gaussian_bytes
+from v3dg.gaussians import gaussian_bytes
 from v3dg.io import open_asset
 
 CONFIG = BuildConfig(cluster_size=7)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -179,10 +180,19 @@ class Gaussians:
         return Gaussians(*map(function, vars(self).values()))
 
 
+def shapes_of(count: int, sh_degree: int) -> list[tuple[int, ...]]:
+    """Of the arrays of so many gaussians, in order."""
+    return [(count, 3), (count, 4), (count, 3), (count,), (count, (sh_degree + 1) ** 2, 3)]
+
+
 def empty(count: int, sh_degree: int) -> Gaussians:
     """Gaussians on the host with any values, to be filled."""
-    shapes = [(count, 3), (count, 4), (count, 3), (count,), (count, (sh_degree + 1) ** 2, 3)]
-    return Gaussians(*(np.empty(shape, np.float32) for shape in shapes))
+    return Gaussians(*(np.empty(shape, np.float32) for shape in shapes_of(count, sh_degree)))
+
+
+def gaussian_bytes(sh_degree: int) -> int:
+    """Of one gaussian in memory."""
+    return 4 * sum(map(math.prod, shapes_of(1, sh_degree)))
 
 
 def _check_kind(name: str, array: Any, like: Any) -> None:

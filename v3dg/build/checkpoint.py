@@ -25,7 +25,7 @@ from v3dg.build.plan import LevelPlan
 from v3dg.build.scratch import lock
 from v3dg.build.simplify import Level, LevelTables
 from v3dg.bundle.format import HASH_BYTES, page_hash
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Gaussians, shapes_of
 
 _FLOATS_AT_ONCE = 4 << 20
 _RECORD = struct.Struct("<II")  # in front of a level: its part, its number
@@ -56,7 +56,7 @@ class Checkpoint:
         self._parts = parts
         what = json.dumps([made_with, _device.describe(device), __version__], sort_keys=True).encode()
         self._head = b"v3dg levels 4\n" + page_hash([np.frombuffer(what, np.uint8)])
-        self._num_bases = (sh_degree + 1) ** 2
+        self._sh_degree = sh_degree
         self._num_bytes = 0  # of the file that are good
         self._places: dict[tuple[int, int], int] = {}  # of parts' levels in the file
         self._lock = threading.Lock()
@@ -133,8 +133,8 @@ class Checkpoint:
 
     def _shapes(self, plan: LevelPlan) -> list[tuple[int, ...]]:
         """Of the arrays of a level, in order; all are float32."""
-        n, clusters, groups = plan.num_gaussians, plan.num_clusters, plan.num_groups
-        rows: list[tuple[int, ...]] = [(n, 3), (n, 4), (n, 3), (n,), (n, self._num_bases, 3)]
+        clusters, groups = plan.num_clusters, plan.num_groups
+        rows = shapes_of(plan.num_gaussians, self._sh_degree)
         return [*rows, (clusters, 2, 3), (groups, 4), (groups, 4), (groups, 2)]
 
     def _read(self, place: int, plan: LevelPlan) -> Level:

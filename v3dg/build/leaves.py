@@ -18,8 +18,7 @@ from v3dg._device import Device
 from v3dg._numbers import one_of
 from v3dg.build.checkpoint import digest_of, parts_of
 from v3dg.build.config import BuildConfig
-from v3dg.formats._asset_file import gaussian_bytes
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Gaussians, gaussian_bytes
 
 Unusable = Literal["drop", "refuse"]
 

@@ -35,8 +35,8 @@ from v3dg.build.progress import bar_of_gaussians
 from v3dg.build.scratch import RowFile, scratch_folder
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.format import page_hash
-from v3dg.formats._asset_file import AssetFile, gaussian_bytes
-from v3dg.gaussians import Gaussians
+from v3dg.formats._asset_file import AssetFile
+from v3dg.gaussians import Gaussians, gaussian_bytes
 from v3dg.io import open_asset
 
 _MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few are read in vain

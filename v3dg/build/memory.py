@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v3dg.build.leaves import Leaves
 from v3dg.build.whole import UNIT_LEAVES
-from v3dg.formats._asset_file import gaussian_bytes
+from v3dg.gaussians import gaussian_bytes
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 # What a leaf of a unit takes until its levels are written: arrays of its size, whatever the SH degree, and

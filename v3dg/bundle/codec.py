@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from v3dg.gaussians import Gaussians, empty
+from v3dg.gaussians import Gaussians, empty, gaussian_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -18,8 +18,7 @@ class Codec:
 
     def __init__(self, sh_degree: int) -> None:
         self.sh_degree = sh_degree
-        # 3 mean, 4 quaternion, 3 scale, 1 opacity, 3 (d+1)² SH.
-        self.gaussian_bytes = 4 * (11 + 3 * (sh_degree + 1) ** 2)
+        self.gaussian_bytes = gaussian_bytes(sh_degree)
 
     def page_bytes(self, num_gaussians: NDArray[np.int64]) -> NDArray[np.int64]:
         """Sizes of pages of so many gaussians, without what they are filled up with."""

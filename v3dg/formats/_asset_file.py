@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg.formats._reading import Path, check
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Gaussians, gaussian_bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +32,6 @@ class AssetFile:
     sh_degree: int
     read: Callable[[int, int], Gaussians]
     whole_bytes: int = 0
-
-
-def gaussian_bytes(sh_degree: int) -> int:
-    """Of one gaussian in memory."""
-    return 4 * (11 + 3 * (sh_degree + 1) ** 2)
 
 
 def bytes_of(files: Iterable[Path]) -> int:
