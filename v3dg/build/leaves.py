@@ -16,7 +16,7 @@ import numpy.typing as npt
 from v3dg import _core, _device, cleaning
 from v3dg._device import Device
 from v3dg._numbers import one_of
-from v3dg.build.checkpoint import digest_of, parts_of
+from v3dg.build.checkpoint import digest_of
 from v3dg.build.config import BuildConfig
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
@@ -67,7 +67,7 @@ class MemoryLeaves(Leaves):
         tally = Tally()
         with _device.memory_errors():
             asset = _device.place(asset, _device.of(asset.means))
-            self._drawable = np.concatenate([np.zeros(0, bool), *map(tally.add, parts_of(asset))])
+            self._drawable = tally.add(asset)
         tally.check(unusable)
         count, degree = len(asset), asset.sh_degree
         num_bytes = count * (gaussian_bytes(degree) + 4)
