@@ -13,6 +13,8 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
+from v3dg._start import SIGNALS
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -45,7 +47,7 @@ class Judges:
         if number == len(self._processes):
             resource_tracker.ensure_running()  # which hears signals again once it has started
             # Ctrl-C is for this process alone: one that is started has no time for it, even to ignore it.
-            heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGALRM})
+            heard = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
                 # A forked process would inherit CUDA and OpenMP in a state that neither survives.
                 context = multiprocessing.get_context("spawn")

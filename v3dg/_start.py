@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 _AGAIN_AFTER_S = 0.02
 
+SIGNALS = (signal.SIGINT, signal.SIGALRM)
+"""Of Ctrl-C: the second brings one again that could not be heard when it came, in the midst of an import."""
+
 
 def is_command() -> bool:
     """Whether Python was started as `v3dg` or `python -m v3dg`."""
@@ -51,8 +54,8 @@ def raise_interrupts() -> None:
     """Have Ctrl-C raise KeyboardInterrupt from now on, where it has ended the process at once."""
     if signal.getsignal(signal.SIGINT) is _end_at_once:
         interrupts = _Interrupts()
-        signal.signal(signal.SIGALRM, interrupts.hear)
-        signal.signal(signal.SIGINT, interrupts.hear)
+        for number in reversed(SIGNALS):
+            signal.signal(number, interrupts.hear)
         sys.unraisablehook = interrupts.unraisable
 
 

@@ -80,7 +80,7 @@ class Program:
             is_to_tell = code == 0 and not isinstance(error, BrokenPipeError)
             code = _fail(f"stdout: {error.strerror}", 1) if is_to_tell else code or 1
         if arguments is None:
-            for number in (signal.SIGINT, signal.SIGALRM):  # what was to be done is done; _start has both
+            for number in _start.SIGNALS:  # what was to be done is done
                 signal.signal(number, signal.SIG_IGN)
             if code == INTERRUPTED:
                 os._exit(code)  # whatever threads are still at

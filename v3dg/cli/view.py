@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from v3dg._start import SIGNALS
 from v3dg.cli._common import Threads, UsageError, option, require_subject
 from v3dg.cli._views import direction_of, load_subject
 from v3dg.export import Axis
@@ -94,12 +95,12 @@ def _interrupts() -> Iterator[list[int]]:
     """Numbers of the signals that came, Ctrl-C and SIGTERM: exceptions would leave threads half started.
 
     After one they do nothing more, for the process ends. A handler may run inside of any lock's code, so it
-    takes none. An alarm is a Ctrl-C that came in the midst of an import.
+    takes none.
     """
     came: list[int] = []
     before = {
         number: signal.signal(number, lambda number, _: came.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+        for number in (*SIGNALS, signal.SIGTERM)
     }
     try:
         yield came
