@@ -17,7 +17,9 @@ torch = pytest.importorskip("torch")
 from reference import loss as reference  # noqa: E402
 
 # One view size, and nothing that smooths or shifts the pictures.
-PLAIN = BuildConfig(image_size=32, supersample=1, filter_px2=0.0, num_views=16, views_per_step=1)
+PLAIN = BuildConfig(
+    image_size=32, supersample=1, filter_px2=0.0, num_views=16, views_per_step=1, first_steps=1000
+)
 FROZEN = dict.fromkeys(
     ("step_position", "step_log_scale", "step_quat", "step_logit", "step_sh0", "step_sh_rest"), 0.0
 )
@@ -249,7 +251,9 @@ def test_steps_are_those_of_adam(device, weights, views_per_step):
     logit = torch.logit(g.opacities).requires_grad_()
     sh = g.sh.clone().requires_grad_()
     optimizer = torch.optim.Adam(
-        [{"params": [logit], "lr": config.step_logit}, {"params": [sh], "lr": config.step_sh0}], eps=1e-15
+        [{"params": [logit], "lr": config.step_logit}, {"params": [sh], "lr": config.step_sh0}],
+        betas=(0.9, config.beta2),
+        eps=1e-15,
     )
     decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda s: config.final_step ** (s / (steps - 1)))
     for _ in range(steps):

@@ -313,6 +313,7 @@ class FitConfig:
         step_sh_rest: float,
         position_in_world: bool,
         final_step: float,
+        beta2: float,
         seed: int,
     ) -> None: ...
 

@@ -99,7 +99,8 @@ FitConfig make_config(int steps, int views_per_step, int num_views, int supersam
                       float px2_per_gaussian, float distance, float filter_px2, bool antialiased,
                       float loss_l1, float loss_dssim, float loss_alpha, float step_position,
                       float step_log_scale, float step_quat, float step_logit, float step_sh0,
-                      float step_sh_rest, bool position_in_world, float final_step, uint64_t seed) {
+                      float step_sh_rest, bool position_in_world, float final_step, float beta2,
+                      uint64_t seed) {
     FitConfig config{};
     config.steps = steps;
     config.views_per_step = views_per_step;
@@ -119,6 +120,7 @@ FitConfig make_config(int steps, int views_per_step, int num_views, int supersam
     config.step_sh_rest = step_sh_rest;
     config.position_in_world = position_in_world;
     config.final_step = final_step;
+    config.beta2 = beta2;
     config.seed = seed;
     return config;
 }
@@ -144,7 +146,7 @@ void bind_fit_level(py::module_& m) {
              "supersample"_a, "image_size"_a, "px2_per_gaussian"_a, "distance"_a, "filter_px2"_a,
              "antialiased"_a, "loss_l1"_a, "loss_dssim"_a, "loss_alpha"_a, "step_position"_a,
              "step_log_scale"_a, "step_quat"_a, "step_logit"_a, "step_sh0"_a, "step_sh_rest"_a,
-             "position_in_world"_a, "final_step"_a, "seed"_a);
+             "position_in_world"_a, "final_step"_a, "beta2"_a, "seed"_a);
     py::class_<FitProgress>(m, "FitProgress",
                             "How far a fit is, to be looked at and cancelled from any thread.")
         .def(py::init<>())

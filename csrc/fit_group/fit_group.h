@@ -26,10 +26,10 @@ struct FitConfig {
     bool antialiased;
     LossWeights loss;
     // Step sizes of Adam: position in radii or, if `position_in_world`, in world units; the last step takes
-    // `final_step` of them, exponentially.
+    // `final_step` of them, exponentially. `beta2` is the decay of its mean of squared gradients.
     float step_position, step_log_scale, step_quat, step_logit, step_sh0, step_sh_rest;
     bool position_in_world;
-    float final_step;
+    float final_step, beta2;
     uint64_t seed;
 };
 

@@ -193,18 +193,19 @@ class Student {
 
   private:
     size_t adam(size_t begin, size_t count, float step_size, const FitStep& step) {
+        const float beta2 = config_.beta2;
         size_t i = begin;
         const size_t end = begin + count;
         for (; i + kLanes<float> <= end; i += kLanes<float>) {
             Vec<float> m = load(&m_[i]), v = load(&v_[i]);
-            const Vec<float> next = adam_step(load(&value_[i]), load(&gradient_[i]), m, v, step_size,
+            const Vec<float> next = adam_step(load(&value_[i]), load(&gradient_[i]), m, v, step_size, beta2,
                                               step.correction1, step.correction2);
             store(&m_[i], m);
             store(&v_[i], v);
             store(&value_[i], next);
         }
         for (; i < end; ++i)
-            value_[i] = adam_step(value_[i], gradient_[i], m_[i], v_[i], step_size, step.correction1,
+            value_[i] = adam_step(value_[i], gradient_[i], m_[i], v_[i], step_size, beta2, step.correction1,
                                   step.correction2);
         return end;
     }

@@ -192,7 +192,7 @@ V3DG_HD inline FitStep fit_step(const FitConfig& config, int index) {
             decay * config.step_sh0,
             decay * config.step_sh_rest,
             static_cast<float>(1 / (1 - ::pow(kAdamBeta1, index + 1.0))),
-            static_cast<float>(1 / (1 - ::pow(kAdamBeta2, index + 1.0)))};
+            static_cast<float>(1 / (1 - ::pow(static_cast<double>(config.beta2), index + 1.0)))};
 }
 
 V3DG_HD inline float position_step(const FitConfig& config, const FitGroup& group, const FitStep& step) {

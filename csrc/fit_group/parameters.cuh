@@ -78,6 +78,7 @@ __device__ void move_parameters(const Fit& fit, const FitStep& step, int num_vie
     float *value = fit.at(fit.layout.value), *m = fit.at(fit.layout.m), *v = fit.at(fit.layout.v),
           *sum = fit.at(fit.layout.sum);
     const float position = position_step(fit.in.config, fit.job.group, step);
+    const float beta2 = fit.in.config.beta2;
 #pragma unroll 2
     for (uint32_t k = fit.first(); k < fit.num_values; k += fit.stride()) {
         float sum_of_views = is_first ? 0 : sum[k];
@@ -98,7 +99,7 @@ __device__ void move_parameters(const Fit& fit, const FitStep& step, int num_vie
         else if (fit.num_sh > 3 && (k - 11 * fit.n) % fit.num_sh >= 3)
             size = step.sh_rest;
         const float moved =
-            adam_step(value[k], sum_of_views, m[k], v[k], size, step.correction1, step.correction2);
+            adam_step(value[k], sum_of_views, m[k], v[k], size, beta2, step.correction1, step.correction2);
         value[k] = k < 3 * fit.n ? held_in_box(moved) : moved;
     }
 }

@@ -33,6 +33,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("step_position", "step_log_scale", "step_quat", "step_logit"), (0, 1_000_000_000)),
     **dict.fromkeys(("step_sh0", "step_sh_rest"), (0, 1_000_000_000)),
     "final_step": (1e-6, 1_000_000),
+    "beta2": (0, 0.999999),
 }
 
 
@@ -64,6 +65,7 @@ class BuildConfig:
         step_position: Step size of positions, in radii of the group, or in world units if
             `position_in_world`; the others are of log scales, quaternions, logits and SH coefficients.
         final_step: What the step sizes have fallen to in the end, exponentially.
+        beta2: Decay of Adam's running mean of squared gradients.
 
     Raises:
         ValueError: A setting is of another kind or out of its range, or all views of a group have too many
@@ -77,8 +79,8 @@ class BuildConfig:
     init: Literal["merge", "prune"] = "merge"
     prune_growth: float = 2 ** (1 / 6)
     targets: Literal["finest", "previous"] = "finest"
-    steps: int = 800
-    first_steps: int = 200
+    steps: int = 600
+    first_steps: int = 150
     views_per_step: int = 2
     num_views: int = 64
     supersample: int = 4
@@ -91,14 +93,15 @@ class BuildConfig:
     loss_l1: float = 1.0
     loss_dssim: float = 0.0
     loss_alpha: float = 0.5
-    step_position: float = 0.0035
+    step_position: float = 0.0028
     position_in_world: bool = False
-    step_log_scale: float = 0.04
-    step_quat: float = 0.014
-    step_logit: float = 0.05
-    step_sh0: float = 0.04
-    step_sh_rest: float = 0.01
+    step_log_scale: float = 0.032
+    step_quat: float = 0.011
+    step_logit: float = 0.04
+    step_sh0: float = 0.032
+    step_sh_rest: float = 0.008
     final_step: float = 0.1
+    beta2: float = 0.99
 
     def __post_init__(self) -> None:
         kinds: dict[Any, tuple[Any, str]] = {
@@ -209,6 +212,7 @@ class BuildConfig:
                 step_sh0=2.5e-3,
                 step_sh_rest=2.5e-3 / 20,
                 final_step=1.0,
+                beta2=0.999,
             ),
             **changes,
         )
