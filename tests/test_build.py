@@ -143,6 +143,21 @@ def test_asset_may_be_on_the_device(asset):
 
 
 @pytest.mark.gpu
+def test_gpu_memory_that_is_taken_changes_no_byte():
+    """Groups whose pictures do not fit in memory together are fitted in turn, to the same."""
+    import torch
+
+    asset, config = make_asset("crystal", 60_000), BuildConfig(cluster_size=32, steps=8)
+    expected = build(asset, config, device="cuda")
+    torch.cuda.empty_cache()
+    free, _ = torch.cuda.mem_get_info()
+    taken = torch.empty(free - (400 << 20), dtype=torch.uint8, device="cuda")
+    assert same(build(asset, config, device="cuda"), expected)
+    del taken
+    torch.cuda.empty_cache()
+
+
+@pytest.mark.gpu
 def test_build_runs_on_the_callers_stream(asset):
     import torch
 

@@ -100,21 +100,28 @@ struct BlendTargets {
     float2* errors;        // measure
 };
 
-// Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk. What RowSums says of a
-// row is written out: through it nvcc rounds the sums otherwise, and bundles would change in their last bits.
+// Half-warps add up the fragments of a chunk with one lane or, where it has fewer gaussians, two for each.
+template <class Fit>
+constexpr int kLanesOfSum = kCellPixels / (Fit::kChunk < kCellPixels ? Fit::kChunk : kCellPixels);
+
+// Sums over the half-warp's cell, for record r, which is gaussian `i` of the chunk; all lanes come here,
+// those without a gaussian with a null `slot`. What RowSums says of a row is written out: through it nvcc
+// rounds the sums otherwise, and bundles would change in their last bits.
 template <class Fit>
 __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Record<float>& r, float* slot) {
+    constexpr int kLanes = kLanesOfSum<Fit>, kRows = kCell / kLanes;
     const float4 e = *reinterpret_cast<const float4*>(&r.u);
     const float l22 = r.l22;
     const uint32_t half = threadIdx.x % 32 / kCellPixels;
-    const float2* shares = fit.fragments() + 33 * i + half * kCellPixels;
-    const float4* d_colors = fit.d_pixels() + half * kCellPixels;
+    const int part = threadIdx.x % kCellPixels / (kCellPixels / kLanes), first_row = part * kRows;
+    const float2* shares = fit.fragments() + 33 * i + half * kCellPixels + first_row * kCell;
+    const float4* d_colors = fit.d_pixels() + half * kCellPixels + first_row * kCell;
     const float left = static_cast<float>(p.x / kCell * kCell) + 0.5f,
-                top = static_cast<float>(p.y / kCell * kCell) + 0.5f;
+                top = static_cast<float>(p.y / kCell * kCell + first_row) + 0.5f;
     FalloffSums<float> sums{};
     float color[3] = {0, 0, 0};
 #pragma unroll
-    for (int y = 0; y < kCell; ++y) {
+    for (int y = 0; y < kRows; ++y) {
         float exponent = 0, t1 = 0, t1_dx = 0;
         Falloff<float> f;
 #pragma unroll
@@ -137,13 +144,14 @@ __device__ void add_up(const Fit& fit, const CellPixel& p, uint32_t i, const Rec
         sums.t2 -= 2 * f.t2 * exponent;
         sums.t2_dy -= 2 * f.t2 * exponent * f.dy;
     }
-    slot[0] = sums.exponent;
-    slot[1] = sums.t1;
-    slot[2] = sums.t2;
-    slot[3] = sums.t1_dx;
-    slot[4] = sums.t1_dy;
-    slot[5] = sums.t2_dy;
-    for (int c = 0; c < 3; ++c) slot[6 + c] = color[c];
+    float all[kSums] = {sums.exponent, sums.t1,  sums.t2,  sums.t1_dx, sums.t1_dy,
+                        sums.t2_dy,    color[0], color[1], color[2]};
+    if (kLanes == 2)
+        for (float& sum : all) sum += __shfl_xor_sync(kAllLanes, sum, kCellPixels / 2);
+    if (slot == nullptr) return;
+#pragma unroll
+    for (int k = 0; k < kSums; ++k)
+        if (kLanes == 1 || (k < 5) == (part == 0)) slot[k] = all[k];
 }
 
 // A warp takes two cells side by side in view b. `unit` numbers the pair.
@@ -234,12 +242,13 @@ __device__ void blend_cells(const Fit& fit, const FitCameras& cameras, int b, in
             }
         }
         __syncwarp();
-        for (uint32_t i = lane % kCellPixels; i < end - begin; i += kCellPixels) {
-            if (begin + i >= list.length) continue;
-            const uint32_t j = list.entry[begin + i];
-            add_up(fit, p, i,
-                   Fit::kSmall ? fit.ranked()[j] : fit.staged()[lane / kCellPixels * Fit::kChunk + i],
-                   slot_of(j));
+        constexpr uint32_t kTogether = kCellPixels / kLanesOfSum<Fit>;
+        for (uint32_t i = lane % kTogether; i - lane % kTogether < end - begin; i += kTogether) {
+            const bool is_entry = begin + i < min(end, list.length);
+            const uint32_t j = is_entry ? list.entry[begin + i] : fit.nothing();
+            const Record<float>* const staged =
+                Fit::kSmall ? nullptr : fit.staged() + lane / kCellPixels * Fit::kChunk;
+            add_up(fit, p, i, Fit::kSmall ? fit.ranked()[j] : staged[i], is_entry ? slot_of(j) : nullptr);
         }
         __syncwarp();
     }

@@ -100,7 +100,7 @@ __device__ void project_views_backward(const Fit& fit, const FitCameras& cameras
         if (i >= fit.n) continue;
         float* out = fit.gradient(turn, fit.view_rank + b);
         float* d_sh = out + 11 * fit.n + fit.num_sh * i;
-        if (fit.keys()[place] == kHiddenKey) {
+        if (Fit::kSmall ? fit.mask(0)[place] == 0 : fit.keys()[place] == kHiddenKey) {
             for (int k = 0; k < 11; ++k) out[k * fit.n + i] = 0;
             for (int k = 0; k < fit.num_sh; ++k) d_sh[k] = 0;
             continue;
@@ -235,7 +235,7 @@ __device__ void fit_one_group(const Fit& fit) {
     const auto set_cameras = [&](FitCameras& cameras, int64_t first) {
         const int b = static_cast<int>(threadIdx.x) - (Fit::kThreads - 32);  // the warp with least to do
         if (b == kViewsAtOnce && first >= 0 && first < num_visits)
-            cameras.step = fit_step(config, static_cast<int>(first / views_per_step));
+            cameras.step = fit.in.steps[first / views_per_step];
         if (b < 0 || b >= own_of(views_at(first))) return;
         const int64_t visit = first + fit.view_rank + b;
         const bool is_of_step = visit >= 0 && visit < num_visits;
@@ -276,6 +276,12 @@ __device__ void fit_one_group(const Fit& fit) {
     }
     if (fit.view_stride > 1) sum_errors(fit, error);
     if (fit.view_rank == 0) keep_if_better(fit, error);
+}
+
+// Powers take long, and all groups take the same steps.
+__global__ void steps_kernel(const FitConfig config, FitStep* steps) {
+    const unsigned i = blockIdx.x * blockDim.x + threadIdx.x;
+    if (i < static_cast<unsigned>(config.steps)) steps[i] = fit_step(config, static_cast<int>(i));
 }
 
 // Counters of the queue, on the device.
@@ -323,15 +329,16 @@ int attribute(cudaDeviceAttr name) {
     return value;
 }
 
-// Returns whether kBlocks blocks fit on a multiprocessor; nothing happens where they do not.
+// Returns whether so many blocks, at most kBlocks, fit on a multiprocessor; nothing happens where they do
+// not.
 template <class Shape, int kBlocks>
-bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream) {
+bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stream, int blocks = kBlocks) {
     const size_t reserved = sizeof(FitShared) + 1024;  // ours, and the driver's own of each block
     const size_t limit =
         (std::min<size_t>(attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin) - sizeof(FitShared),
-                          attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / kBlocks - reserved)) /
+                          attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor) / blocks - reserved)) /
         16 * 16;
-    const size_t most_blocks = kBlocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
+    const size_t most_blocks = blocks * static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
     // For a group. Together they need to run at the same time.
     size_t num_blocks = 1;
     if (attribute(cudaDevAttrCooperativeLaunch) != 0)
@@ -358,21 +365,39 @@ bool run(const FitGroupsInput& in, uint32_t most, int largest, cudaStream_t stre
 
 }  // namespace
 
-void fit_groups(const FitGroupsInput& in, Span<const FitJob> jobs, cudaStream_t stream) {
-    uint32_t most = 0;
-    int largest = 0;
+void make_steps(const FitConfig& config, FitStep* steps, cudaStream_t stream) {
+    constexpr unsigned kThreads = 128;
+    launch("steps_kernel", steps_kernel, (static_cast<unsigned>(config.steps) + kThreads) / kThreads,
+           kThreads, 0, stream, config, steps);
+}
+
+FitExtent extent_of(Span<const FitJob> jobs) {
+    FitExtent extent{jobs.size, 0, 0};
     for (const FitJob& job : jobs) {
-        most = std::max(most, static_cast<uint32_t>(job.group.count));
-        largest = std::max(largest, job.size);
+        extent.most = std::max(extent.most, static_cast<uint32_t>(job.group.count));
+        extent.largest = std::max(extent.largest, job.size);
     }
-    const bool is_small = most <= kSmallCount && largest <= kRegion;
-    const bool are_many = jobs.size > static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
+    return extent;
+}
+
+void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t stream) {
+    const uint32_t most = level.most;
+    const int largest = level.largest;
+    const auto multiprocessors = static_cast<size_t>(attribute(cudaDevAttrMultiProcessorCount));
+    // Three groups at once on a multiprocessor are quicker than two where it has many in turn.
+    const bool are_many = level.num_groups > multiprocessors,
+               are_most = level.num_groups >= 6 * multiprocessors;
+    const auto run_small = [&] {
+        return (are_most && run<FitShape<256, true, 8>, 3>(in, most, largest, stream)) ||
+               (are_many && run<FitShape<256, true, 16>, 2>(in, most, largest, stream)) ||
+               run<FitShape<512, true, 16>, 1>(in, most, largest, stream) ||
+               run<FitShape<256, true, 8>, 3>(in, most, largest, stream, 1);
+    };
     // Where multiprocessors have less shared memory, with fewer threads.
-    const bool runs = is_small ? (are_many && run<FitShape<256, true, 16>, 2>(in, most, largest, stream)) ||
-                                     run<FitShape<512, true, 16>, 1>(in, most, largest, stream) ||
-                                     run<FitShape<256, true, 16>, 1>(in, most, largest, stream)
-                               : run<FitShape<512, false, 32>, 1>(in, most, largest, stream) ||
-                                     run<FitShape<256, false, 16>, 1>(in, most, largest, stream);
+    const bool runs = most <= kSmallCount && largest <= kRegion
+                          ? run_small()
+                          : run<FitShape<512, false, 32>, 1>(in, most, largest, stream) ||
+                                run<FitShape<256, false, 16>, 1>(in, most, largest, stream);
     if (!runs) throw std::runtime_error("cuda: expected 96 KiB of shared memory in a block, got less");
 }
 

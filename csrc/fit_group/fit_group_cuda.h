@@ -29,6 +29,7 @@ struct FitGroupsInput {
     Span<const FitJob> jobs;
     const float4* targets;  // colour and alpha, picture by picture, row major
     const FitView* views;   // as many as there are pictures
+    const FitStep* steps;   // config.steps
     GaussianRows<float> rows;
     float* error;
     FitSignals* signals;
@@ -47,10 +48,21 @@ V3DG_HD inline uint64_t view_of_picture(const FitConfig& config, uint64_t pictur
     return picture < num_fitted ? picture : held_out_view(config, static_cast<int>(picture - num_fitted));
 }
 
-// As v3dg::fit_group, for all groups at once; jobs are best ordered by falling size. The jobs are read by the
-// host, too. Groups done are counted in the signals; when they say cancel, groups under way stay as they
-// were.
-void fit_groups(const FitGroupsInput& in, Span<const FitJob> jobs, cudaStream_t stream);
+// Writes what each step of Adam takes, on the device.
+void make_steps(const FitConfig& config, FitStep* steps, cudaStream_t stream);
+
+// Groups that have the same fate whatever the memory: how blocks take them follows from all, not from those
+// whose pictures fit into memory together.
+struct FitExtent {
+    size_t num_groups;
+    uint32_t most;  // gaussians of a group
+    int largest;    // px a side of a picture
+};
+FitExtent extent_of(Span<const FitJob> jobs);
+
+// As v3dg::fit_group, for all groups at once; jobs are best ordered by falling size. Groups done are counted
+// in the signals; when they say cancel, groups under way stay as they were.
+void fit_groups(const FitGroupsInput& in, const FitExtent& level, cudaStream_t stream);
 
 }  // namespace cuda
 }  // namespace v3dg

@@ -102,18 +102,23 @@ FitLayout layout_of(const FitSizes& sizes) {
     const size_t cells_across = (largest + kCell - 1) / kCell, cells = cells_across * cells_across;
     l.records = arena.hot((places + 1) * sizeof(Record<float>));
     if (!kSmall) l.sorted = arena.hot((places + 1) * sizeof(Record<float>));
-    l.keys = arena.hot(places * sizeof(uint32_t));
     l.mask = arena.hot(regions * places * sizeof(CellMask));
     l.slot_first = arena.hot(regions * places * sizeof(uint32_t));
+    // A small group's keys are done with when it is in order, before it gets slots.
+    l.keys = kSmall ? l.slot_first : arena.hot(places * sizeof(uint32_t));
     l.order = arena.hot(places * kIndex);
     l.list_size = Arena::rounded((padded + kAtOnce) * kIndex);
     l.lists = arena.hot(2 * kWarps * (kSmall ? 1 : num_blocks) * l.list_size);
-    l.errors = arena.hot(kViewsAtOnce * (cells + largest) * 2 * kFloat);
     l.fragments = arena.in_shared(kFragments);
+    const size_t errors_bytes = kViewsAtOnce * (cells + largest) * 2 * kFloat;
+    l.errors = kSmall && errors_bytes <= kFragments ? l.fragments : arena.hot(errors_bytes);
     if (!kSmall) l.staged = arena.in_shared(kWarps * 2 * Shape::kChunk * sizeof(Record<float>));
-    // Fragments are done with when gradients come, and not begun when keys are sorted.
+    // Fragments, and the lists of small groups in front of them, are done with when gradients come, and not
+    // begun when keys are sorted.
+    const size_t over = kSmall ? l.lists : l.fragments;
     const auto over_fragments = [&](size_t bytes) {
-        return num_blocks == 1 && bytes <= kFragments ? Place{l.fragments, true} : arena.anywhere(bytes);
+        return num_blocks == 1 && bytes <= l.fragments + kFragments - over ? Place{over, true}
+                                                                           : arena.anywhere(bytes);
     };
     if (kSmall && num_blocks > 1)
         l.exchange = arena.in_scratch(2 * kViewsAtOnce * values * kFloat);

@@ -73,13 +73,17 @@ size_t target_bytes(const FitConfig& config, const FitJob& job) {
 class LevelFit {
   public:
     LevelFit(const FitConfig& config, const DeviceFitTarget& target, const GaussianRows<float>& rows,
-             size_t num_groups, FitProgress& progress, cudaStream_t stream)
+             const FitExtent& extent, FitProgress& progress, cudaStream_t stream)
         : config_(config),
           target_(target),
           rows_(rows),
+          extent_(extent),
           progress_(progress),
           stream_(stream),
-          error_(2 * num_groups, stream) {}
+          error_(2 * extent.num_groups, stream),
+          steps_(config.steps, stream) {
+        make_steps(config, steps_.data(), stream);
+    }
 
     const float* error() const { return error_.data(); }
 
@@ -99,9 +103,10 @@ class LevelFit {
         draw_targets(config_, jobs, on_device.data, target_, views, targets, frame_, stream_);
 
         Signals signals;
-        const FitGroupsInput in{config_,       visiting_stride(config_), on_device, targets, views, rows_,
-                                error_.data(), signals.device()};
-        fit_groups(in, jobs, stream_);
+        const FitGroupsInput in{
+            config_,       visiting_stride(config_), on_device, targets, views, steps_.data(), rows_,
+            error_.data(), signals.device()};
+        fit_groups(in, extent_, stream_);
         done_.record(stream_);
         const uint64_t done_before = progress_.groups_done;
         const double loss_before = progress_.loss_sum;
@@ -121,9 +126,11 @@ class LevelFit {
     const FitConfig& config_;
     const DeviceFitTarget& target_;
     const GaussianRows<float>& rows_;
+    const FitExtent extent_;
     FitProgress& progress_;
     const cudaStream_t stream_;
     DeviceBuffer<float> error_;
+    const DeviceBuffer<FitStep> steps_;
     DeviceBuffer<float4> targets_;
     DeviceBuffer<FitView> views_;
     Frame frame_;
@@ -139,7 +146,7 @@ void fit_level(const FitConfig& config, Span<const FitGroup> groups, const Devic
     size_t free_bytes = 0, total_bytes = 0;
     check(cudaMemGetInfo(&free_bytes, &total_bytes), "cudaMemGetInfo");
     size_t budget = std::min(kTargetBytes, free_bytes / 4);
-    LevelFit level(config, target, rows, groups.size, progress, stream);
+    LevelFit level(config, target, rows, extent_of({jobs.data(), jobs.size()}), progress, stream);
     for (size_t first = 0; first < jobs.size() && !progress.cancel;) {
         size_t last = first, bytes = 0;
         while (last < jobs.size() && (last == first || bytes + target_bytes(config, jobs[last]) <= budget))
