@@ -147,7 +147,7 @@ def test_gpu_memory_that_is_taken_changes_no_byte():
     """Groups whose pictures do not fit in memory together are fitted in turn, to the same."""
     import torch
 
-    asset, config = make_asset("crystal", 60_000), BuildConfig(cluster_size=32, steps=8)
+    asset, config = make_asset(num_gaussians=60_000, seed=0), BuildConfig(cluster_size=32, steps=8)
     expected = build(asset, config, device="cuda")
     torch.cuda.empty_cache()
     free, _ = torch.cuda.mem_get_info()
