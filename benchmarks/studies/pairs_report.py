@@ -1,0 +1,194 @@
+"""The page of `pairs`: tables of our error by the best other tool's at equal counts, and plots."""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from benchmarks.evaluation.markdown import Column, count_text, markdown
+
+Row = dict[str, Any]
+
+_OURS = ("ours", "merged")
+_STYLES = {
+    "ours": ("o-", "tab:blue", "ours"),
+    "merged": ("s--", "tab:cyan", "ours, merged only"),
+    "d": ("^-", "tab:orange", "splat-transform -d"),
+    "adaptive": ("v-", "tab:red", "splat-transform --decimate-adaptive"),
+    "spark": ("D-", "tab:green", "Spark"),
+    "published": ("P:", "tab:purple", "published by its makers"),
+    "all": ("-", "0.4", "every gaussian, one sample a pixel"),
+}
+_ABOUT = """# Levels at equal counts and several sizes
+
+Written by `python -m benchmarks.studies.pairs report` from recorded JSON, never by hand.
+
+A level is at home at 2 px² a gaussian: of the footprint of the object's ball, or of a scene's picture for those of
+its gaussians that are in it. Each is drawn at several times that size (along a side), by the same renderer, and compared with
+every gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views} views, windows of at
+most {widest} px. *Ours* is the cut with a budget of as many gaussians as the other level has, so never more. *Merged* is the same
+without the fit. Others are splat-transform 3.7.0 (`-d`, `--decimate-adaptive`) and the levels that an asset's
+makers published, drawn plain; the best of them counts, for each count and size anew.
+"""
+
+
+@dataclass
+class Report:
+    """Make a page with tables, and plots, of what `measure` has recorded."""
+
+    results: tyro.conf.Positional[Path]
+    """A pairs.json."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("pairs.md")
+    plots: Path | None = None
+    """Folder for the plots; without it there are none."""
+
+
+def best_others(rows: Sequence[Row]) -> list[Row]:
+    """One row for each pair of a count and a size that others have, too: ours, merged, the best other."""
+    pairs: dict[tuple[Any, ...], dict[str, Row]] = {}
+    for row in rows:
+        pairs.setdefault((row["asset"], row["level"], row["factor"]), {})[row["method"]] = row
+    out = []
+    for (asset, level, factor), by_method in pairs.items():
+        others = [row for name, row in by_method.items() if name not in (*_OURS, "all")]
+        if not others or "ours" not in by_method:
+            continue
+        best, ours = min(others, key=lambda row: row["flip"]), by_method["ours"]
+        row = {"asset": asset, "level": level, "factor": factor, "count": ours["count"], "best": best["method"]}
+        row |= {"gaussians": ours["gaussians"], "width": ours["width"]}
+        for name in ("flip", "psnr", "ssim"):
+            row |= {f"ours_{name}": ours[name], f"best_{name}": best[name]}
+        row["ratio"] = _ratio(ours["flip"], best["flip"])
+        if "merged" in by_method:
+            row["merged_ratio"] = _ratio(by_method["merged"]["flip"], best["flip"])
+        out.append(row)
+    return out
+
+
+def _ratio(ours: float, theirs: float) -> float:
+    return ours / theirs if theirs > 0 else float(ours > 0) + 1
+
+
+def overview(rows: Sequence[Row]) -> str:
+    """A line for each asset, and one for all of them."""
+    pairs = best_others(rows)
+    names = list(dict.fromkeys(row["asset"] for row in pairs))
+    lines = [_line(name, [row for row in pairs if row["asset"] == name]) for name in names]
+    if len(names) > 1:
+        lines.append(_line("all", pairs))
+    return markdown(_OVERVIEW, lines)
+
+
+_OVERVIEW = (
+    Column("asset", "asset"),
+    Column("pairs", "pairs"),
+    Column("FLIP, ours / best other: mean", "mean", ".3f"),
+    Column("at most 1", "won", ".0%"),
+    Column("at most 1.05", "nearly", ".0%"),
+    Column("worst", "worst", ".2f"),
+    Column("where", "where"),
+    Column("merged / best other: mean", "merged", ".3f"),
+    Column("PSNR, ours less theirs", "psnr", "+.2f"),
+    Column("SSIM", "ssim", "+.4f"),
+)
+
+
+def _line(name: str, pairs: Sequence[Row]) -> Row:
+    def mean(values: list[float]) -> float | None:
+        return statistics.fmean(values) if values else None
+
+    worst = max(pairs, key=lambda row: row["ratio"])
+    line = {"asset": name, "pairs": len(pairs), "worst": worst["ratio"]}
+    line["where"] = f"{_level(worst)} at x{worst['factor']:g}, {worst['best']}"
+    line |= {"mean": mean([row["ratio"] for row in pairs])}
+    line |= {"merged": mean([row["merged_ratio"] for row in pairs if "merged_ratio" in row])}
+    for key, most in (("won", 1.0), ("nearly", 1.05)):
+        line[key] = sum(row["ratio"] <= most for row in pairs) / len(pairs)
+    for key in ("psnr", "ssim"):
+        both = [(row[f"ours_{key}"], row[f"best_{key}"]) for row in pairs]
+        line[key] = mean([ours - theirs for ours, theirs in both if ours is not None and theirs is not None])
+    return line
+
+
+def _level(row: Row) -> str:
+    return row["level"] if isinstance(row["level"], str) else f"{row['level']:g} %"
+
+
+def table(pairs: Sequence[Row]) -> str:
+    """Of one asset: counts down, sizes across, FLIP of ours and of the best other, and their ratio."""
+    factors = sorted({row["factor"] for row in pairs})
+    lines: dict[Any, Row] = {}
+    for row in sorted(pairs, key=lambda row: -row["count"]):
+        line = lines.setdefault(row["level"], {"level": _level(row), "count": row["count"]})
+        line["gaussians"] = row["gaussians"]
+        line[f"{row['factor']:g}"] = f"{row['ours_flip']:.4f} / {row['best_flip']:.4f} = {row['ratio']:.2f}"
+    columns = [Column("kept", "level"), Column("theirs", "count", "count"), Column("ours", "gaussians", "count")]
+    return markdown([*columns, *(Column(f"x{f:g}", f"{f:g}") for f in factors)], list(lines.values()))
+
+
+def report(options: Report) -> None:
+    recorded = json.loads(options.results.read_text(encoding="utf-8"))
+    rows, pairs = recorded["rows"], best_others(recorded["rows"])
+    machine = ", ".join(str(recorded[key]) for key in ("gpu", "processor") if key in recorded)
+    sections = [
+        _ABOUT.format(**recorded["settings"]),
+        f"Measured on {machine}, commit {recorded['commit']}, by `{recorded['command']}`.",
+        "",
+        overview(rows),
+    ]
+    for name in dict.fromkeys(row["asset"] for row in pairs):
+        sections += ["", f"## {name}", "", table([row for row in pairs if row["asset"] == name])]
+        if options.plots is not None:
+            options.plots.mkdir(parents=True, exist_ok=True)
+            path = options.plots / f"pairs_{name}.png"
+            plot([row for row in rows if row["asset"] == name], path)
+            link = Path(os.path.relpath(path, options.output.parent)).as_posix()
+            sections += ["", f"![{name}: count against error at several sizes]({link})"]
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.write_text("\n".join(sections) + "\n", encoding="utf-8")
+
+
+def plot(rows: Sequence[Row], path: Path) -> None:
+    """Count against FLIP and PSNR, a column for each size."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    factors = sorted({row["factor"] for row in rows})
+    figure, axes = pyplot.subplots(
+        2, len(factors), figsize=(2.7 * len(factors), 5.2), sharex=True, sharey="row", squeeze=False
+    )
+    for column, factor in enumerate(factors):
+        for line, key in enumerate(("flip", "psnr")):
+            panel = axes[line][column]
+            for method, (style, color, label) in _STYLES.items():
+                points = sorted(
+                    (row["count"], row[key])
+                    for row in rows
+                    if row["method"] == method and row["factor"] == factor and row[key] is not None
+                )
+                if points:
+                    panel.plot(*zip(*points, strict=True), style, color=color, label=label, markersize=4, lw=1.3)
+            panel.set_xscale("log")
+            panel.grid(alpha=0.3, which="both", lw=0.5)
+        axes[0][column].set_yscale("log")
+        axes[0][column].set_title(f"{factor:g} times its own size", fontsize=10)
+        axes[1][column].set_xlabel("gaussians")
+    axes[0][0].set_ylabel("FLIP (less is better)")
+    axes[1][0].set_ylabel("PSNR, dB (more is better)")
+    total = max((row["gaussians"] for row in rows if row["method"] == "all"), default=0)
+    of = f" of {count_text(total)} gaussians" if total else ""
+    figure.suptitle(f"{rows[0]['asset']}{of}", fontsize=11)
+    handles, labels = axes[0][-1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9, frameon=False)
+    figure.tight_layout(rect=(0, 0.05, 1, 1))
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
