@@ -5,7 +5,8 @@
 
 ASSETS is a folder with assets.json: for each asset by its name a `file` that v3dg reads; `up` for an object,
 which is drawn from four sides, or `cameras`, a transforms.json, and `views`, names of some of them, for a
-scene; and `published`, the files of the levels that its makers gave it. Levels of other tools are
+scene; and `published`, by their names the `file` and number of `gaussians` of the levels that its makers gave
+it. Levels of other tools are
 ASSETS/peers/NAME/TOOL_PERCENT.npz, which `pack_level` makes of what
 
     splat-transform -g cpu -w NAME.ply -d 50% d_50.ply
@@ -27,7 +28,7 @@ import json
 import math
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -52,6 +53,7 @@ OUR_STEPS = {"ours": None, "merged": 0}
 HOME_PX2 = 2.0
 _SAMPLES = 4
 _BALL_SHARE = 0.995  # of the gaussians; the rest may float far away
+_LEAST_PX = 8  # of a side: SSIM needs 6, and below that there is nothing to see
 _DISTANCE = 2.5  # of the camera from an object's centre, in radii
 
 
@@ -70,7 +72,7 @@ class Measure:
     """Recorded results, from which rows are taken that are not measured here."""
     percents: tuple[float, ...] = PERCENTS
     """Counts, in percent of the asset's."""
-    factors: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
+    factors: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
     """Sizes, in those at which a level is at home."""
     widest: int = 512
     """px of a side of the pictures that are compared."""
@@ -80,16 +82,16 @@ class Measure:
 
 @dataclass(frozen=True)
 class Level:
-    """Gaussians that stand for an asset, and who made them; None where a cut of a bundle does."""
+    """Gaussians that stand for an asset, and who made them."""
 
     method: str
-    gaussians: v3dg.Gaussians | None
+    gaussians: v3dg.Gaussians
     count: int
 
 
 @dataclass(frozen=True)
 class Size:
-    """How large a view of a subject is drawn: its camera, which is the whole picture, and the part compared."""
+    """How large a view of a subject is drawn: the camera of the whole picture, and of the part compared."""
 
     camera: v3dg.Camera
     window: v3dg.Camera
@@ -131,7 +133,7 @@ class Subject:
         return px, is_before & ((px >= 0) & (px < [camera.width, camera.height])).all(axis=1)
 
     def budget(self, count: int, view: int) -> int:
-        """Gaussians that a level of so many has for a view: of an object all, of a scene those in the picture."""
+        """Of a level of so many gaussians, those that count for a view: of a scene those in the picture."""
         return round(count * float(self._is_seen[view].mean())) if "cameras" in self._about else count
 
     def sizes(self, count: int, factor: float, widest: int) -> list[Size]:
@@ -162,16 +164,19 @@ class Subject:
         K[:2, 2] -= corner
         return Size(camera, replace(camera, K=K, width=int(size[0]), height=int(size[1])))
 
-    def peers(self, percents: tuple[float, ...]) -> Iterator[tuple[float | str, Level]]:
-        """Other tools' levels and the makers', each with what was asked for: percent, or the level's name."""
+    @property
+    def published_counts(self) -> dict[str, int]:
+        """Gaussians of the levels of the asset's makers."""
+        return {label: level["gaussians"] for label, level in self._about.get("published", {}).items()}
+
+    def peers(self, percents: tuple[float, ...]) -> Iterator[tuple[float | str, str, v3dg.Gaussians]]:
+        """Levels of others: at which percent, or which published one, made by whom, and its gaussians."""
         for path in sorted((self._folder / "peers" / self.name).glob("*_*")):
             tool, _, percent = path.name.removesuffix(path.suffix).rpartition("_")
             if float(percent) in percents:
-                level = read_level(path)
-                yield float(percent), Level(tool, level, len(level))
-        for label, file in self._about.get("published", {}).items():
-            level = v3dg.read_asset(self._folder / file)
-            yield f"published {label}", Level("published", level, len(level))
+                yield float(percent), tool, read_level(path)
+        for label, level in self._about.get("published", {}).items():
+            yield f"published {label}", "published", v3dg.read_asset(self._folder / level["file"])
 
 
 def scaled(camera: v3dg.Camera, scale: float) -> v3dg.Camera:
@@ -233,7 +238,7 @@ class Study:
 
     def __init__(self, config: Measure) -> None:
         self._config = config
-        self._device = "cuda" if _device.resolve(config.device).is_cuda else "cpu"
+        self.device = "cuda" if _device.resolve(config.device).is_cuda else "cpu"
         self.builds: dict[str, Row] = {}
 
     def rows(self, subject: Subject, judges: Judges) -> list[Row]:
@@ -244,39 +249,34 @@ class Study:
             views.setdefault(key, []).append({**about, **found})
         names = ("asset", "method", "level", "count", "factor", "width")
         measured = ("gaussians", "tolerance", "flip", "psnr", "ssim")
-        return [
-            dict(zip(names, key, strict=True)) | mean_of(rows, *measured) for key, rows in views.items()
-        ]
+        return [dict(zip(names, key, strict=True)) | mean_of(rows, *measured) for key, rows in views.items()]
 
     def _drawn(self, subject: Subject) -> Iterator[tuple[Row, Picture, Picture]]:
         """What is to be compared: what it is, the truth, the picture."""
         bundles = {
             name: self._built(subject, name, steps)
             for name, steps in OUR_STEPS.items()
-            if name in self._config.methods
+            if name in set[str](self._config.methods)
         }
+        self._asset = self._placed(subject.asset)
         targets: dict[float | str, tuple[int, list[Level]]] = {
             percent: (round(len(subject.asset) * percent / 100), []) for percent in self._config.percents
         }
+        targets |= {f"published {label}": (count, []) for label, count in subject.published_counts.items()}
         if "peers" in self._config.methods:
-            for wanted, level in subject.peers(self._config.percents):
-                targets.setdefault(wanted, (level.count, []))[1].append(level)
-        else:
-            for label, count in self._published(subject.name).items():
-                targets[label] = (count, [])
+            for wanted, method, level in subject.peers(self._config.percents):
+                targets[wanted][1].append(Level(method, self._placed(level), len(level)))
         for wanted, (count, levels) in targets.items():
             for factor in self._config.factors:
                 yield from self._compared(subject, wanted, count, factor, levels, bundles)
 
-    def _published(self, name: str) -> dict[str, int]:
-        """Counts of published levels in the results that are known."""
-        rows = [row for path in self._config.known for row in json.loads(path.read_text())["rows"]]
-        return {r["level"]: r["count"] for r in rows if r["asset"] == name and isinstance(r["level"], str)}
+    def _placed(self, gaussians: v3dg.Gaussians) -> v3dg.Gaussians:
+        return gaussians.torch("cuda") if self.device == "cuda" else gaussians
 
     def _built(self, subject: Subject, name: str, steps: int | None) -> v3dg.Bundle:
         config = v3dg.BuildConfig() if steps is None else v3dg.BuildConfig(steps=steps)
         start = time.perf_counter()
-        bundle = v3dg.build_bundle(subject.asset, config=config, device=self._device, progress=False)
+        bundle = v3dg.build_bundle(subject.asset, config=config, device=self.device, progress=False)
         seconds = round(time.perf_counter() - start, 2)
         self.builds.setdefault(subject.name, {})[f"{name}_seconds"] = seconds
         return bundle
@@ -291,31 +291,30 @@ class Study:
         bundles: dict[str, v3dg.Bundle],
     ) -> Iterator[tuple[Row, Picture, Picture]]:
         about: Row = {"asset": subject.name, "level": wanted, "count": count, "factor": factor}
-        scenes = {name: v3dg.Scene.of(bundle) for name, bundle in bundles.items()}
-        for view, size in enumerate(subject.sizes(count, factor, self._config.widest)):
-            truth = draw_truth(subject.asset, size.window, self._device, _SAMPLES)
-            about["width"] = size.camera.width
+        sizes = subject.sizes(count, factor, self._config.widest)
+        if min(min(size.window.width, size.window.height) for size in sizes) < _LEAST_PX:
+            return
+        for view, size in enumerate(sizes):
+            truth = draw_truth(self._asset, size.window, self.device, _SAMPLES)
+            budget = subject.budget(count, view)
+            for method, shown, gaussians, tolerance in self._shown(levels, bundles, size.camera, budget):
+                image = v3dg.render(shown, size.window, tolerance=tolerance, device=self.device)
+                row = {**about, "width": size.camera.width, "method": method}
+                yield row | {"gaussians": gaussians, "tolerance": tolerance}, truth, to_8bit(image.color)
 
-            def drawn(
-                method: str,
-                subject: Any,
-                gaussians: int | None = None,
-                tolerance: float | None = None,
-                window: v3dg.Camera = size.window,
-                truth: Picture = truth,
-            ) -> tuple[Row, Picture, Picture]:
-                image = v3dg.render(subject, window, tolerance=tolerance, device=self._device)
-                row = {**about, "method": method, "gaussians": gaussians, "tolerance": tolerance}
-                return row, truth, to_8bit(image.color)
-
-            if "all" in self._config.methods:
-                yield drawn("all", subject.asset, len(subject.asset))
-            for level in levels:
-                yield drawn(level.method, level.gaussians, level.count)
-            for name, scene in scenes.items():
-                tolerance = tolerance_for(scene, size.camera, subject.budget(count, view))
-                cut = v3dg.select(scene, size.camera, tolerance=tolerance, device="cpu")
-                yield drawn(name, bundles[name], cut.num_gaussians, tolerance)
+    def _shown(
+        self, levels: list[Level], bundles: dict[str, v3dg.Bundle], camera: v3dg.Camera, budget: int
+    ) -> Iterator[tuple[str, v3dg.Gaussians | v3dg.Bundle, int, float | None]]:
+        """Each method, what of it is drawn, of how many gaussians, and the tolerance of a cut."""
+        if "all" in self._config.methods:
+            yield "all", self._asset, len(self._asset), None
+        for level in levels:
+            yield level.method, level.gaussians, level.count, None
+        for name, bundle in bundles.items():
+            scene = v3dg.Scene.of(bundle)
+            tolerance = tolerance_for(scene, camera, budget)
+            cut = v3dg.select(scene, camera, tolerance=tolerance, device="cpu")
+            yield name, bundle, cut.num_gaussians, tolerance
 
 
 def measure(config: Measure) -> None:
@@ -323,42 +322,40 @@ def measure(config: Measure) -> None:
     missing = [name for name in config.only if name not in about]
     if missing:
         raise SystemExit(f"--only: expected some of {', '.join(about)}, got {missing[0]}")
+    settings = {"factors": list(config.factors), "widest": config.widest, "views": config.views}
+    rows = known_rows(config.known, settings)
     config.output.mkdir(parents=True, exist_ok=True)
-    settings = {"factors": config.factors, "widest": config.widest, "views": config.views}
-    settings = json.loads(json.dumps(settings))
-    study, judges, rows = Study(config), Judges(), []
+    study, judges = Study(config), Judges()
     try:
         for name in config.only or about:
             start = time.perf_counter()
             subject = Subject(config.assets, name, about[name], config.views)
-            rows += study.rows(subject, judges)
-            seconds = time.perf_counter() - start
-            print(f"{name}: {len(subject.asset)} gaussians, {seconds:.0f} s, {study.builds.get(name)}", flush=True)
-            rows_of_all = with_known(rows, config.known, settings)
-            result = {"settings": settings, "builds": study.builds, "rows": rows_of_all}
-            record.write(config.output / "pairs.json", result, study._device)
+            rows = rows | by_key(study.rows(subject, judges))
+            print(f"{name}: {len(subject.asset)} gaussians, {time.perf_counter() - start:.0f} s", flush=True)
+            result = {"settings": settings, "builds": study.builds, "rows": list(rows.values())}
+            record.write(config.output / "pairs.json", result, study.device)
     finally:
         judges.close()
-    print(pairs_report.overview(with_known(rows, config.known, settings)))
+    print(pairs_report.overview(list(rows.values())))
 
 
-def with_known(rows: list[Row], known: tuple[Path, ...], settings: Row) -> list[Row]:
-    """Rows, and those of recorded results that were measured alike and are not among them."""
+def by_key(rows: list[Row]) -> dict[tuple[Any, ...], Row]:
+    return {(row["asset"], row["method"], row["level"], row["factor"]): row for row in rows}
 
-    def key(row: Row) -> tuple[Any, ...]:
-        return row["asset"], row["method"], row["level"], row["factor"]
 
-    found = {key(row): row for row in rows}
-    for path in known:
+def known_rows(paths: tuple[Path, ...], settings: Row) -> dict[tuple[Any, ...], Row]:
+    """Rows of recorded results, which must have been measured alike."""
+    rows: dict[tuple[Any, ...], Row] = {}
+    for path in paths:
         recorded = json.loads(path.read_text(encoding="utf-8"))
         if recorded["settings"] != settings:
             raise SystemExit(f"{path}: expected results of {settings}, got {recorded['settings']}")
-        for row in recorded["rows"]:
-            found.setdefault(key(row), row)
-    return list(found.values())
+        rows |= by_key(recorded["rows"])
+    return rows
 
 
 if __name__ == "__main__":
+    commands: dict[str, Callable[..., Measure | pairs_report.Report]]
     commands = {"measure": Measure, "report": pairs_report.Report}
     options = tyro.extras.subcommand_cli_from_dict(commands)
     measure(options) if isinstance(options, Measure) else pairs_report.report(options)

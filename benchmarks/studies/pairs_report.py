@@ -30,12 +30,15 @@ _ABOUT = """# Levels at equal counts and several sizes
 
 Written by `python -m benchmarks.studies.pairs report` from recorded JSON, never by hand.
 
-A level is at home at 2 px² a gaussian: of the footprint of the object's ball, or of a scene's picture for those of
-its gaussians that are in it. Each is drawn at several times that size (along a side), by the same renderer, and compared with
-every gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views} views, windows of at
-most {widest} px. *Ours* is the cut with a budget of as many gaussians as the other level has, so never more. *Merged* is the same
-without the fit. Others are splat-transform 3.7.0 (`-d`, `--decimate-adaptive`) and the levels that an asset's
-makers published, drawn plain; the best of them counts, for each count and size anew.
+A level is at home at 2 px² a gaussian: of the footprint of the object's ball, or of a scene's picture for
+those of its gaussians that are in it. (Groups of a bundle are fitted at 2 px² of their own balls, which
+overlap and lie behind each other: they are at home at a quarter to half the size that is called 1 here.)
+Each level is drawn at several times that size, along a side, by the same renderer, and compared with every
+gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views} views,
+windows of at most {widest} px. *Ours* is the cut with a budget of as many gaussians as the other level has,
+so never more; *merged* the same without the fit. Others are splat-transform 3.7.0 (`-d`,
+`--decimate-adaptive`) and the levels that an asset's makers published, drawn plain; the best of them
+counts, for each count and size anew.
 """
 
 
@@ -61,7 +64,13 @@ def best_others(rows: Sequence[Row]) -> list[Row]:
         if not others or "ours" not in by_method:
             continue
         best, ours = min(others, key=lambda row: row["flip"]), by_method["ours"]
-        row = {"asset": asset, "level": level, "factor": factor, "count": ours["count"], "best": best["method"]}
+        row = {
+            "asset": asset,
+            "level": level,
+            "factor": factor,
+            "count": ours["count"],
+            "best": best["method"],
+        }
         row |= {"gaussians": ours["gaussians"], "width": ours["width"]}
         for name in ("flip", "psnr", "ssim"):
             row |= {f"ours_{name}": ours[name], f"best_{name}": best[name]}
@@ -129,7 +138,11 @@ def table(pairs: Sequence[Row]) -> str:
         line = lines.setdefault(row["level"], {"level": _level(row), "count": row["count"]})
         line["gaussians"] = row["gaussians"]
         line[f"{row['factor']:g}"] = f"{row['ours_flip']:.4f} / {row['best_flip']:.4f} = {row['ratio']:.2f}"
-    columns = [Column("kept", "level"), Column("theirs", "count", "count"), Column("ours", "gaussians", "count")]
+    columns = [
+        Column("kept", "level"),
+        Column("theirs", "count", "count"),
+        Column("ours", "gaussians", "count"),
+    ]
     return markdown([*columns, *(Column(f"x{f:g}", f"{f:g}") for f in factors)], list(lines.values()))
 
 
@@ -176,7 +189,9 @@ def plot(rows: Sequence[Row], path: Path) -> None:
                     if row["method"] == method and row["factor"] == factor and row[key] is not None
                 )
                 if points:
-                    panel.plot(*zip(*points, strict=True), style, color=color, label=label, markersize=4, lw=1.3)
+                    panel.plot(
+                        *zip(*points, strict=True), style, color=color, label=label, markersize=4, lw=1.3
+                    )
             panel.set_xscale("log")
             panel.grid(alpha=0.3, which="both", lw=0.5)
         axes[0][column].set_yscale("log")

@@ -1,0 +1,122 @@
+"""The study of levels at equal counts and sizes, on small assets."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import v3dg
+from benchmarks.studies import pairs, pairs_report
+from benchmarks.worlds.procedural import make_person
+from v3dg.metrics import has_flip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """An object with levels of another tool and of its makers, and the same asset as a scene."""
+    folder = tmp_path_factory.mktemp("pairs")
+    asset = make_person(2000, seed=3)
+    v3dg.write_asset(folder / "thing.ply", asset)
+    v3dg.write_asset(folder / "half.ply", asset.subset(np.arange(0, 2000, 2)))
+    (folder / "peers" / "thing").mkdir(parents=True)
+    pairs.pack_level(folder / "peers" / "thing" / "d_12.5.npz", asset.subset(np.arange(0, 2000, 8)))
+    camera = v3dg.Camera.look_at((3, 0, 1), asset.means.mean(axis=0), fov_x=0.5, width=120, height=60)
+    v3dg.write_cameras(folder / "cameras.json", {"near": camera, "other": camera})
+    about = {
+        "thing": {
+            "file": "thing.ply",
+            "up": [0, 0, 1],
+            "published": {"1": {"file": "half.ply", "gaussians": 1000}},
+        },
+        "place": {"file": "thing.ply", "cameras": "cameras.json", "views": ["near"]},
+    }
+    (folder / "assets.json").write_text(json.dumps(about))
+    return folder
+
+
+def subject(folder, name):
+    about = json.loads((folder / "assets.json").read_text())
+    return pairs.Subject(folder, name, about[name], views=2)
+
+
+def test_pictures_too_small_to_see_are_left_out(folder):
+    config = pairs.Measure(folder, percents=(0.7,), factors=(0.25,), methods=("all",), device="cpu")
+    assert list(pairs.Study(config)._drawn(subject(folder, "place"))) == []
+
+
+def test_packed_level_is_what_was_packed(folder, tmp_path):
+    asset = v3dg.read_asset(folder / "thing.ply")
+    pairs.pack_level(tmp_path / "packed_1.npz", asset)
+    read = pairs.read_level(tmp_path / "packed_1.npz")
+    np.testing.assert_allclose(read.means, asset.means, rtol=2.0**-16)
+    np.testing.assert_allclose(read.scales, asset.scales, rtol=5e-3)
+    np.testing.assert_allclose(read.opacities, asset.opacities, atol=1e-5)
+    np.testing.assert_allclose(read.sh, asset.sh, atol=np.abs(asset.sh[:, 1:]).max() / 120)
+    assert np.abs((read.quats * asset.quats).sum(1)).min() > 1 - 1e-6
+
+
+def test_level_is_at_home_at_two_px2_of_the_ball_a_gaussian(folder):
+    thing = subject(folder, "thing")
+    for factor in (1, 4):
+        for size in thing.sizes(300, factor, widest=1 << 20):
+            # The ball touches the sides of the picture: its footprint is the disc in it, seen from near by.
+            half = size.camera.width / 2
+            angle = math.atan(half / size.camera.fx)
+            footprint = 2 * math.pi * (1 - math.cos(angle)) * size.camera.fx**2
+            assert footprint == pytest.approx(2 * 300 * factor**2, rel=0.1 / factor)
+            assert size.window is size.camera
+
+
+def test_scene_is_drawn_at_two_px2_of_the_picture_a_gaussian(folder):
+    place = subject(folder, "place")
+    (size,) = place.sizes(400, 2, widest=1 << 20)
+    in_picture = place.budget(400, 0)
+    assert 0 < in_picture <= 400
+    assert size.camera.width * size.camera.height == pytest.approx(2 * in_picture * 4, rel=0.1)
+
+
+def test_window_shows_a_part_of_the_picture(folder):
+    thing = subject(folder, "thing")
+    for size in thing.sizes(300, 8, widest=40):
+        whole, part = (v3dg.rasterize(thing.asset, camera).color for camera in (size.camera, size.window))
+        x, y = (size.camera.K - size.window.K)[:2, 2].astype(int)
+        assert part.shape[:2] == (40, 40)
+        assert part.max() > 0
+        np.testing.assert_allclose(part, whole[y : y + 40, x : x + 40], atol=2e-3)
+
+
+@pytest.mark.skipif(not has_flip(), reason="FLIP is not installed")
+def test_study_compares_at_equal_counts(folder, tmp_path):
+    config = pairs.Measure(
+        folder, tmp_path / "all", percents=(12.5,), factors=(1, 2), widest=48, views=2, device="cpu"
+    )
+    pairs.measure(config)
+    result = json.loads((tmp_path / "all" / "pairs.json").read_text())
+    rows = {(r["asset"], r["method"], r["level"], r["factor"]): r for r in result["rows"]}
+    # An object's two counts and a scene's one, two sizes each; others have levels of the object alone.
+    assert len(rows) == 2 * (2 * 4 + 3)
+    for (asset, method, level, factor), row in rows.items():
+        assert 0 < row["flip"] < 1
+        assert 0 < row["ssim"] <= 1
+        assert method == "all" or row["gaussians"] <= row["count"] * 1.001
+        if method == "ours":
+            assert row["psnr"] >= rows[asset, "merged", level, factor]["psnr"] - 1
+    best = pairs_report.best_others(result["rows"])
+    assert {(r["level"], r["best"]) for r in best} == {(12.5, "d"), ("published 1", "published")}
+    for row in best:
+        others = rows["thing", row["best"], row["level"], row["factor"]]
+        assert row["ratio"] == row["ours_flip"] / others["flip"]
+    # A second run measures one method again, and takes the others from the first.
+    known = (tmp_path / "all" / "pairs.json",)
+    again = pairs.Measure(folder, tmp_path / "again", methods=("merged",), known=known, only=("thing",))
+    with pytest.raises(SystemExit, match="expected results of"):
+        pairs.measure(again)
+    for name in ("percents", "factors", "widest", "views", "device"):
+        setattr(again, name, getattr(config, name))
+    pairs.measure(again)
+    second = json.loads((tmp_path / "again" / "pairs.json").read_text())
+    assert sorted(map(str, second["rows"])) == sorted(map(str, result["rows"]))
+    pairs_report.report(pairs_report.Report(tmp_path / "again" / "pairs.json", tmp_path / "pairs.md"))
+    text = (tmp_path / "pairs.md").read_text()
+    assert f"{best[0]['ours_flip']:.4f} / {best[0]['best_flip']:.4f} = {best[0]['ratio']:.2f}" in text
