@@ -35,8 +35,9 @@ those of its gaussians that are in it. (Groups of a bundle are fitted at 2 px² 
 overlap and lie behind each other: they are at home at a quarter to half the size that is called 1 here.)
 Each level is drawn at several times that size, along a side, by the same renderer, and compared with every
 gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views} views,
-windows of at most {widest} px. *Ours* is the cut with a budget of as many gaussians as the other level has,
-so never more; *merged* the same without the fit. Others are splat-transform 3.7.0 (`-d`,
+windows of at most {widest} px. *Ours* is the cut with a budget of as many gaussians as the other level has
+(of a scene, of the same share of those in the frustum), interpolated between two cuts where groups are too
+large to meet it; *merged* the same without the fit. Others are splat-transform 3.7.0 (`-d`,
 `--decimate-adaptive`) and the levels that an asset's makers published, drawn plain; the best of them
 counts, for each count and size anew.
 """
