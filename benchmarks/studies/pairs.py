@@ -173,7 +173,9 @@ class Study:
             for shown in self._shown(levels, bundles, size.camera, count):
                 image = v3dg.render(shown.subject, size.window, device=self.device, **shown.cut)
                 row = {**about, "method": shown.method, "gaussians": shown.gaussians, "weight": shown.weight}
-                yield row | {"tolerance": shown.cut.get("tolerance")}, truth, to_8bit(image.color)
+                tolerance = shown.cut.get("tolerance", _COARSEST_PX2)
+                row["tolerance"] = tolerance if tolerance < _COARSEST_PX2 else None
+                yield row, truth, to_8bit(image.color)
 
     def _shown(
         self, levels: list[Level], bundles: dict[str, v3dg.Bundle], camera: v3dg.Camera, count: int
