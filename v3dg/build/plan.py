@@ -21,20 +21,13 @@ class LevelPlan:
     """One level, or a run of its groups: C clusters made by G groups, each of as many clusters.
 
     At level 0 every cluster is a group of its own.
-
-    Attributes:
-        first_group: Number of the first group in the level of the whole asset.
-        offset: (C + 1,) gaussians of each cluster.
-        group_offset: (G + 1,) gaussians that each group is simplified to.
-        leaf_offset: (G + 1,) gaussians of level 0 under each group.
-        weight: (G,) float32, of the footprint.
     """
 
-    first_group: int
-    offset: Offsets
-    group_offset: Offsets
-    leaf_offset: Offsets
-    weight: npt.NDArray[np.float32]
+    first_group: int  # its number in the level of the whole asset
+    offset: Offsets  # (C + 1,) gaussians of each cluster
+    group_offset: Offsets  # (G + 1,) gaussians that each group is simplified to
+    leaf_offset: Offsets  # (G + 1,) gaussians of level 0 under each group
+    weight: npt.NDArray[np.float32]  # (G,) of the footprint
 
     @property
     def num_clusters(self) -> int:

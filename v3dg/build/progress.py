@@ -23,13 +23,7 @@ class Stopped(Exception):
 
 
 class Bar:
-    """One bar over all levels; it advances by fitted gaussians, which is what time goes with.
-
-    Parts of the plan may be built on threads of their own.
-
-    Args:
-        initial: Gaussians of levels that were built before.
-    """
+    """One bar over all levels; it advances by fitted gaussians, which is what time goes with."""
 
     def __init__(self, plan: Plan, initial: int, is_visible: bool) -> None:
         self._total = sum(level.num_gaussians for level in plan.levels[1:])

@@ -1,49 +1,40 @@
-"""The build of a whole asset: its units on all devices, then what is above them, into a sink."""
+"""The build of a whole asset: its units on an executor, then what is above them."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Protocol, TypeAlias
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from v3dg import _device
 from v3dg._device import Device
 from v3dg.build.assemble import assemble
-from v3dg.build.checkpoint import Checkpoint
 from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import Leaves, made_with
 from v3dg.build.plan import Plan, Units
 from v3dg.build.progress import Bar
-from v3dg.build.simplify import Level, LevelTables, build_above, build_levels
-from v3dg.bundle import Clusters, Groups
+from v3dg.build.simplify import Level, LevelTables, build_above
+from v3dg.build.unfinished import FinishedLevel, MemoryStore, Part, Unfinished
+from v3dg.build.unit import UnitTask
+from v3dg.bundle import Bundle
 from v3dg.bundle.codec import Codec
-from v3dg.bundle.pages import PageLayout
+from v3dg.bundle.file import BundlePlan
+from v3dg.bundle.pages import PageRun
 from v3dg.gaussians import Gaussians
 
 # Leaves of a unit: enough to keep a GPU busy, and little memory. The last bits of a bundle depend on it.
 UNIT_LEAVES = 1 << 20
 # Units that a GPU works on at once, so that others fill what the smallest levels of one leave idle.
 _UNITS_ON_GPU = 4
-
-
-class Sink(Protocol):
-    """Where finished pages go: `BundleWriter`, or memory."""
-
-    def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
-        """Take the gaussians of a run of pages."""
-
-    def finish(self, clusters: Clusters, groups: Groups) -> None:
-        """Take the tables, when all pages are there."""
-
-
-OpenSink: TypeAlias = Callable[[PageLayout, Codec, dict[str, Any]], AbstractContextManager[Sink]]
-"""Makes a sink for the pages of this layout and codec; the last argument says how the bundle is built."""
 
 
 def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[Device]:
@@ -57,46 +48,50 @@ def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[De
 
 
 def build_into(
-    open_sink: OpenSink,
+    path: str | os.PathLike[str] | None,
     leaves: Leaves,
     config: BuildConfig,
     seed: int,
     devices: Sequence[Device],
     progress: bool,
-    resume_path: str | os.PathLike[str] | None,
+    *,
+    bundle_path: Path | None = None,
     most_units: int | None = None,
-) -> None:
-    """Build all levels of an asset into a sink; as `build_bundle` for the rest.
-
-    Args:
-        devices: Of one kind; the units are spread over them.
-        most_units: That may be in memory at once.
-    """
+) -> Bundle:
+    """Build all levels of an asset, in memory or in a file that replaces `bundle_path`; as `build_bundle`."""
     if not isinstance(progress, bool):
         raise TypeError(f"progress: expected True or False, got {progress!r}")
     plan = Plan.of(leaves.num_gaussians, config)
     config.check_views(max((np.diff(made.group_offset).max() for made in plan.levels[1:]), default=1))
     units = plan.units(UNIT_LEAVES)
-    codec = Codec(leaves.sh_degree)
-    how = made_with(leaves, config, seed)
-    parts = [dict(enumerate(part.levels)) for part in units.plans]
-    parts.append({n: level for n, level in enumerate(plan.levels) if n > units.level})
+    file = BundlePlan(plan.layout, Codec(leaves.sh_degree), made_with(leaves, config, seed))
+    parts = _parts(plan, units, file)
     with (
         _device.memory_errors(),
-        Checkpoint(resume_path, parts, leaves.sh_degree, how, devices[0]) as checkpoint,
-        open_sink(plan.layout, codec, how) as sink,
-        Bar(plan, checkpoint.num_gaussians, progress) as bar,
+        Unfinished(Path(path), file, parts, devices[0], bundle_path)
+        if path is not None
+        else nullcontext(MemoryStore(file)) as store,
     ):
-        build = _Build(config, how["seed"], plan, units, sink, checkpoint, bar)
-        sink.finish(*assemble(plan, build.all_levels(leaves, devices, most_units), config))
+        if not store.is_whole:
+            build = _Build(config, file.config["seed"], plan, units, parts, file, store)
+            with Bar(plan, build.num_finished, progress) as bar:
+                tables, hashes = build.all_levels(leaves, devices, most_units, bar)
+            store.finish(*assemble(plan, tables, config), hashes)
+        return store.bundle()
 
 
-@dataclass(frozen=True, eq=False)
-class _Unit:
-    """What is left of a unit when its pages are written: all tables, and what the levels above need."""
-
-    tables: list[LevelTables]
-    kept: dict[int, Gaussians]
+def _parts(plan: Plan, units: Units, file: BundlePlan) -> list[Part]:
+    """The units, and last what is above them."""
+    first = plan.first_page
+    parts: list[Part] = []
+    for unit in units.plans:
+        pages = [
+            file.run(first[n] + above.first_group, first[n] + above.first_group + above.num_groups)
+            for n, above in enumerate(unit.levels[1:])
+        ]
+        parts.append(dict(enumerate(zip(unit.levels, [*pages, None], strict=True))))
+    above = range(units.level + 1, len(plan.levels))
+    return [*parts, {n: (plan.levels[n], file.run(first[n], first[n + 1])) for n in above}]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,100 +102,100 @@ class _Build:
     seed: int
     plan: Plan
     units: Units
-    sink: Sink
-    checkpoint: Checkpoint
-    bar: Bar
+    parts: list[Part]
+    file: BundlePlan
+    store: Unfinished | MemoryStore
 
     @property
-    def kept(self) -> range:
-        """Levels of the units that the work above them begins with."""
-        last = self.units.level
-        has_above = last + 1 < len(self.plan.levels)
-        return range(self.config.target_of(last + 1) if has_above else last, last + 1)
+    def num_finished(self) -> int:
+        """Gaussians of finished levels but the leaves."""
+        return sum(self.parts[part][n][0].num_gaussians for part, n in self.store.levels if n > 0)
 
     def all_levels(
-        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None
-    ) -> list[LevelTables]:
-        """Build all levels; their tables."""
+        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None, bar: Bar
+    ) -> tuple[list[LevelTables], npt.NDArray[np.uint8]]:
+        """Build all levels; their tables, and the hashes of all pages."""
+        self._build_units(leaves, devices, most_units, bar)
+        finished = [self._joined(number) for number in range(self.units.level + 1)]
+        top, levels, pages = len(self.units.plans), self.store.levels, self.store.pages
+        saved = (levels[top, n].read(pages, self._run(n)) for n in self.parts[top] if (top, n) in levels)
+        below = self._below(finished, devices[0])
+        above = build_above(below, self.plan, self.config, self.seed, saved, bar.show_of(top))
+        for number, level in enumerate(above, self.units.level + 1):
+            if (top, number) not in levels:
+                hashes = pages.write(self._run(number), level.gaussians)
+                self.store.save(top, number, FinishedLevel(level.tables, hashes))
+            finished.append(levels[top, number])
+        return [level.tables for level in finished], np.concatenate([level.hashes for level in finished])
+
+    def _build_units(
+        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None, bar: Bar
+    ) -> None:
         workers = [device for _ in range(_UNITS_ON_GPU) for device in devices if device.is_cuda]
         workers = (workers or list(devices))[:most_units]
-        tables, below = self._join(self._build_units(leaves, workers), devices[0])
-        top = len(self.units.plans)
-        finished, show = self.checkpoint.load(top), self.bar.show_of(top)
-        above = build_above(below, self.plan, self.config, self.seed, finished, show)
-        for number, level in enumerate(above, self.units.level + 1):
-            host = Level(level.gaussians.numpy(), level.tables)
-            self._write(number, host.gaussians)
-            self.checkpoint.save(top, number, host)
-            tables.append(host.tables)
-        return tables
-
-    def _build_units(self, leaves: Leaves, workers: Sequence[Device]) -> list[_Unit]:
-        units: list[Any] = [None] * len(self.units.plans)
         free: SimpleQueue[Device] = SimpleQueue()
         for device in workers:
             free.put(device)
 
-        def build(number: int) -> None:
+        def work(unit: int, task: UnitTask) -> None:
             device = free.get()
             try:
-                with _device.own_stream(device):
-                    units[number] = self._unit(number, leaves, device)
+                with _device.own_stream(device), _device.memory_errors():
+                    for number, level in task.levels(device, bar.show_of(unit)):
+                        self.store.save(unit, number, level)
             finally:
                 free.put(device)
 
-        self._on_threads(build, len(units), min(len(units), len(workers)))
-        return units
-
-    def _join(self, units: list[_Unit], device: Device) -> tuple[list[LevelTables], dict[int, Level]]:
-        """The tables of all levels of the units, and the levels that were kept, whole, on the device."""
-        by_level = zip(*(unit.tables for unit in units), strict=True)
-        arrays = [zip(*(vars(part).values() for part in parts), strict=True) for parts in by_level]
-        tables = [LevelTables(*map(np.concatenate, columns)) for columns in arrays]
-        whole = {n: Gaussians.concatenate([unit.kept[n] for unit in units]) for n in self.kept}
-        self._write(self.units.level, whole[self.units.level])
-        return tables, {n: Level(_device.place(part, device), tables[n]) for n, part in whole.items()}
-
-    def _unit(self, unit: int, leaves: Leaves, device: Device) -> _Unit:
-        plan = self.units.plans[unit]
-        first = self.plan.levels[0].offset[plan.levels[0].first_group]
-        with _device.memory_errors():
-            own = _device.place(leaves.read(first, first + plan.levels[0].num_gaussians), device)
-            finished, show = self.checkpoint.load(unit), self.bar.show_of(unit)
-            levels = build_levels(own, plan, self.config, self.seed, finished=finished, show=show)
-            del own
-            tables: list[LevelTables] = []
-            kept: dict[int, Gaussians] = {}
-            for number, level in enumerate(levels):
-                host = Level(level.gaussians.numpy(), level.tables)
-                if number < self.units.level:
-                    above = plan.levels[number + 1]
-                    page = self.plan.first_page[number] + above.first_group
-                    self.sink.write(page, page + above.num_groups, host.gaussians)
-                if number > 0:
-                    self.checkpoint.save(unit, number, host)
-                if number in self.kept:
-                    kept[number] = host.gaussians
-                tables.append(host.tables)
-                del level, host  # while the next is made, their memory is free
-        return _Unit(tables, kept)
-
-    def _write(self, number: int, gaussians: Gaussians) -> None:
-        self.sink.write(self.plan.first_page[number], self.plan.first_page[number + 1], gaussians)
-
-    def _on_threads(self, work: Callable[[int], None], count: int, num_threads: int) -> None:
-        """Do the work for all numbers below the count; what fails on one thread ends it on all."""
-        if num_threads == 1:
-            for number in range(count):
-                work(number)
-            return
-        with ThreadPoolExecutor(num_threads) as pool:
-            futures = [pool.submit(work, number) for number in range(count)]
+        last, levels = self.units.level, self.store.levels
+        todo = [unit for unit in range(len(self.units.plans)) if (unit, last) not in levels]
+        num_threads = min(len(todo), len(workers))
+        with ThreadPoolExecutor(num_threads) if num_threads > 1 else _InThisThread() as executor:
+            futures: list[Future[None]] = []
             try:
+                for unit in todo:
+                    futures.append(executor.submit(work, unit, self._task(unit, leaves)))
                 for future in as_completed(futures):
                     future.result()
             except BaseException:
-                self.bar.stop()
+                bar.stop()
                 for future in futures:
                     future.cancel()
                 raise
+
+    def _task(self, unit: int, leaves: Leaves) -> UnitTask:
+        plan = self.units.plans[unit]
+        first = int(self.plan.levels[0].offset[plan.levels[0].first_group])
+        finished = {n: level for (part, n), level in self.store.levels.items() if part == unit}
+        read = partial(leaves.read, first, first + plan.levels[0].num_gaussians)
+        runs = [run for _, run in self.parts[unit].values()]
+        return UnitTask(read, plan, runs, self.config, self.seed, finished, self.store.pages)
+
+    def _joined(self, number: int) -> FinishedLevel:
+        """A level of all units; the pages of the last are written now."""
+        parts = [self.store.levels[unit, number] for unit in range(len(self.units.plans))]
+        columns = zip(*(vars(part.tables).values() for part in parts), strict=True)
+        tables = LevelTables(*map(np.concatenate, columns))
+        if number < self.units.level:
+            return FinishedLevel(tables, np.concatenate([part.hashes for part in parts]))
+        gaussians = Gaussians.concatenate([part.gaussians for part in parts if part.gaussians is not None])
+        return FinishedLevel(tables, self.store.pages.write(self._run(number), gaussians))
+
+    def _below(self, finished: Sequence[FinishedLevel], device: Device) -> dict[int, Level]:
+        """Levels of the units that the work above them begins with, on the device."""
+        last = self.units.level
+        has_above = last + 1 < len(self.plan.levels)
+        numbers = range(self.config.target_of(last + 1) if has_above else last, last + 1)
+        levels = {n: finished[n].read(self.store.pages, self._run(n)) for n in numbers}
+        return {n: Level(_device.place(level.gaussians, device), level.tables) for n, level in levels.items()}
+
+    def _run(self, number: int) -> PageRun:
+        return self.file.run(self.plan.first_page[number], self.plan.first_page[number + 1])
+
+
+class _InThisThread(Executor):
+    """Does work as it comes; what fails is raised at once."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from v3dg import _files
 from v3dg._json import parse_json
 from v3dg._numbers import check, check_all, check_type
 from v3dg.bundle.codec import Codec
-from v3dg.bundle.file import BundleFile, writing
-from v3dg.bundle.format import VERSION, config_to_json, file_bytes, page_file_bytes, page_tables
+from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
+from v3dg.bundle.format import HASH_BYTES, VERSION, config_to_json, page_file_bytes, page_tables
 from v3dg.bundle.pages import FilePages, MemoryPages, PageLayout, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
@@ -107,10 +108,15 @@ class Bundle:
         there stays and nothing else is left.
         """
         page_bytes = self._codec.page_bytes(self._layout.num_gaussians)
-        with writing(path, self._layout, self._codec, self.config) as writer:
+        plan = BundlePlan(self._layout, self._codec, self.config)
+        with _files.replacing(path) as temporary, open(temporary, "wb", buffering=0) as file:
+            hashes = [np.empty((0, HASH_BYTES), np.uint8)]
             for pages in runs_of_pages(0, self.num_pages, page_bytes, _BYTES_AT_ONCE):
-                writer.write(pages.start, pages.stop, self._pages.read(pages.start, pages.stop))
-            writer.finish(self.clusters, self.groups)
+                gaussians = self._pages.read(pages.start, pages.stop)
+                run = plan.run(pages.start, pages.stop)
+                hashes.append(write_pages(file.fileno(), run, self._codec, gaussians))
+            plan.write_tables(file.fileno(), self.clusters, self.groups, np.concatenate(hashes))
+            plan.write_header(file.fileno())
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what is in memory, and of a file its path: the copy opens it again."""
@@ -215,7 +221,7 @@ class Bundle:
         return {
             "path": self.path,
             "version": VERSION,
-            "bytes": file_bytes(self._layout, self._codec, self.config),
+            "bytes": BundlePlan(self._layout, self._codec, self.config).num_bytes,
             "sh_degree": self.sh_degree,
             "num_gaussians": self.num_gaussians,
             "num_clusters": len(self.clusters),

@@ -11,9 +11,6 @@ import hashlib
 import os
 import re
 import weakref
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import InitVar, dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -34,117 +31,107 @@ from v3dg.bundle.format import (
     entries_of_layout,
     header_of,
     padding_bytes,
+    page_file_bytes,
     page_hash,
     page_tables,
 )
+from v3dg.bundle.pages import on_threads
 from v3dg.bundle.tables import check_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from v3dg.bundle.pages import PageLayout
+    from v3dg.bundle.pages import PageLayout, PageRun
     from v3dg.bundle.tables import Clusters, Groups
     from v3dg.gaussians import Gaussians
 
-_THREADS = 8
 _DAMAGED = "the file is damaged, copy or build it again"
 
 
-@dataclass(eq=False, repr=False)
-class BundleWriter:
-    """A bundle's file in the making: takes pages as they are finished, in any order, then the tables.
+class BundlePlan:
+    """Where what is in a bundle's file; the layout, the codec and the config tell before the first page."""
 
-    What goes where is known before the first page: the layout says how many clusters, groups and gaussians
-    there will be. `writing` makes one.
-    """
+    def __init__(self, layout: PageLayout, codec: Codec, config: dict[str, Any]) -> None:
+        self.layout, self.codec, self.config = layout, codec, config
+        entries = entries_of_layout(layout, codec)
+        self._page_tables = page_tables(layout, codec)
+        self.header = header_of(entries, codec.sh_degree, config)
+        ends = (entries[name]["data_offsets"][1] for name in ("pages", "hash"))
+        self._pages_end, self.num_bytes = (len(self.header) + int(end) for end in ends)
 
-    _fd: int
-    _pool: ThreadPoolExecutor
-    _layout: PageLayout
-    _codec: Codec
-    config: InitVar[dict[str, Any]]
+    def run(self, first_page: int, last_page: int) -> PageRun:
+        """A run of the pages."""
+        place = len(self.header)
+        if last_page > first_page:
+            place += int(self._page_tables["pages.offset"][first_page])
+        return self.layout.run(first_page, last_page, place)
 
-    def __post_init__(self, config: dict[str, Any]) -> None:
-        self._entries = entries_of_layout(self._layout, self._codec)
-        self._header = header_of(self._entries, self._codec.sh_degree, config)
-        self._page_tables = page_tables(self._layout, self._codec)
-        self._hashes = np.zeros((self._layout.num_pages, HASH_BYTES), np.uint8)
-        self._is_written = np.zeros(self._layout.num_pages, bool)
-        self.is_finished = False
-
-    def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
-        """Write the gaussians of a run of pages, on any device, to their place."""
-        assert len(gaussians) == len(self._layout.rows(first_page, last_page))
-        host = gaussians.numpy()
-        start = len(self._header) + self._page_tables["pages.offset"]
-
-        def write(page: int) -> None:
-            pieces = self._codec.encode(host, self._layout.slice_in(page, first_page))
-            padding = np.zeros(padding_bytes(sum(piece.nbytes for piece in pieces)), np.uint8)
-            data = np.concatenate([piece.reshape(-1).view(np.uint8) for piece in (*pieces, padding)])
-            self._hashes[page] = np.frombuffer(page_hash((data,)), np.uint8)
-            _files.write_at(self._fd, data.data, int(start[page]))
-
-        for _ in self._pool.map(write, range(first_page, last_page)):
-            pass
-        self._is_written[first_page:last_page] = True
-
-    def finish(self, clusters: Clusters, groups: Groups) -> None:
-        """Write the header and the tables, which are checked; all pages of the clusters are written."""
-        if not self._is_written.all():
-            missing = np.flatnonzero(~self._is_written)
-            raise RuntimeError(f"expected all pages, got none of {len(missing)}; the first is {missing[0]}")
-        check_tables(clusters, groups, int(self._layout.first_gaussian[-1]))
-        tables = self._page_tables | {"pages.hash": self._hashes}
+    def write_tables(
+        self, descriptor: int, clusters: Clusters, groups: Groups, hashes: NDArray[np.uint8]
+    ) -> None:
+        """Write the tables, which are checked, behind the pages; those have these hashes, (P, 16)."""
+        check_tables(clusters, groups, int(self.layout.first_gaussian[-1]))
+        tables = self._page_tables | {"pages.hash": hashes}
         for prefix, part in (("clusters", clusters), ("groups", groups)):
             tables |= {f"{prefix}.{name}": array for name, array in vars(part).items()}
         end = b"".join(tables[name].astype(DTYPES[kind], copy=False).tobytes() for name, kind, _, _ in SCHEMA)
-        end += hashlib.blake2b(self._header + end, digest_size=HASH_BYTES).digest()
-        _files.write_at(self._fd, self._header, 0)
-        start, last = (self._entries[name]["data_offsets"][1] for name in ("pages", "hash"))
-        assert start + len(end) == last
-        _files.write_at(self._fd, end, len(self._header) + start)
-        self.is_finished = True
+        end += hashlib.blake2b(self.header + end, digest_size=HASH_BYTES).digest()
+        assert self._pages_end + len(end) == self.num_bytes
+        _files.write_at(descriptor, end, self._pages_end)
+
+    def write_header(self, descriptor: int) -> None:
+        """Write the header; a file that has the first bytes of it has all."""
+        _files.write_at(descriptor, self.header[ALIGNMENT_BYTES:], ALIGNMENT_BYTES)
+        _files.write_at(descriptor, self.header[:ALIGNMENT_BYTES], 0)
 
 
-@contextmanager
-def writing(
-    path: str | os.PathLike[str],
-    layout: PageLayout,
-    codec: Codec,
-    config: dict[str, Any],
-    *,
-    is_locked: bool = False,
-) -> Iterator[BundleWriter]:
-    """Write a bundle's file, which appears at ``path`` when all is done; a failure leaves nothing behind."""
-    with (
-        _files.replacing(path, is_locked=is_locked) as temporary,
-        open(temporary, "wb", buffering=0) as file,
-        ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool,
-    ):
-        writer = BundleWriter(file.fileno(), pool, layout, codec, config)
-        yield writer
-        if not writer.is_finished:
-            raise RuntimeError(f"{os.fspath(path)}: expected the tables after the pages, got none")
+def write_pages(descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians) -> NDArray[np.uint8]:
+    """Write the gaussians of a run of pages, on any device, to their place; (n, 16) their hashes."""
+    host, (sizes, places) = gaussians.numpy(), _sizes_and_places(run, codec)
+    hashes = np.empty((len(run), HASH_BYTES), np.uint8)
+
+    def write(page: int) -> None:
+        padding = np.zeros(padding_bytes(int(sizes[page])), np.uint8)
+        pieces = (*codec.encode(host, run.rows_of(page)), padding)
+        data = np.concatenate([piece.reshape(-1).view(np.uint8) for piece in pieces])
+        hashes[page] = np.frombuffer(page_hash((data,)), np.uint8)
+        _files.write_at(descriptor, data.data, int(places[page]))
+
+    on_threads(write, range(len(run)))
+    return hashes
+
+
+def read_pages(descriptor: int, run: PageRun, codec: Codec, hashes: NDArray[np.uint8]) -> Gaussians:
+    """The gaussians of a run of pages; ValueError unless they are there and have these hashes."""
+    sizes, places = _sizes_and_places(run, codec)
+
+    def read(page: int, arrays: Sequence[NDArray[Any]]) -> None:
+        pieces = (*arrays, np.empty(padding_bytes(int(sizes[page])), np.uint8))
+        place = int(places[page])
+        for piece in pieces:
+            is_there = _files.read_at(descriptor, piece, place)
+            place += piece.nbytes
+            if not is_there:
+                raise ValueError(f"page {run.first_page + page} is cut off")
+        if page_hash(pieces) != hashes[page].tobytes():
+            raise ValueError(f"page {run.first_page + page} is damaged")
+
+    return run.read(codec, read)
+
+
+def _sizes_and_places(run: PageRun, codec: Codec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(n,) bytes of the pages without what they are filled up with, and where they begin in the file."""
+    sizes = codec.page_bytes(np.diff(run.first_gaussian))
+    ends = run.place + np.cumsum(page_file_bytes(sizes))
+    return sizes, ends - page_file_bytes(sizes)
 
 
 class BundleFile:
     """A bundle file: header and tables are read and checked against the file's own hash, pages are not.
 
-    It is closed when it is dropped.
-
-    Attributes:
-        pages_bytes: Size of all pages with their padding.
-        codec: What the bytes of its pages are.
-        config: The JSON object that was saved.
-        tables: One read-only array for every name in SCHEMA, with the shapes of docs/format.md.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is not a bundle of a known version, or the header, a size or the hash is wrong. Nothing
-            is allocated that is larger than the file.
+    Nothing is allocated that is larger than the file, which is closed when this is dropped.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -167,6 +154,8 @@ class BundleFile:
         length = np.empty(8, np.uint8)
         self._read([length], 0)
         header_bytes = int.from_bytes(length.tobytes(), "little")
+        if header_bytes == 0:
+            self._fail("expected a bundle, got one that is not finished, or another kind of file")
         if header_bytes > min(self.num_bytes - 8, MAX_HEADER_BYTES):
             self._fail(
                 f"header: expected a bundle (safetensors), got a header length of {header_bytes} in a file "

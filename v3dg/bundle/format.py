@@ -117,10 +117,3 @@ def config_to_json(config: dict[str, Any]) -> str:
         return json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"config: expected values that JSON can hold, got {error}") from None
-
-
-def file_bytes(layout: PageLayout, codec: Codec, config: dict[str, Any]) -> int:
-    """Size of the file that this makes."""
-    entries = entries_of_layout(layout, codec)
-    header = header_of(entries, codec.sh_degree, config)
-    return len(header) + int(entries["hash"]["data_offsets"][1])

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -14,28 +15,27 @@ from v3dg import _device
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
+    from v3dg.bundle.codec import Codec
     from v3dg.bundle.file import BundleFile
     from v3dg.bundle.tables import Clusters
 
-_READ_THREADS = 8
+    ReadPage = Callable[[int, Sequence[NDArray[Any]]], None]
+
+_Item = TypeVar("_Item")
+_THREADS = 8
 _BYTES_PER_TASK = 16 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class PageLayout:
-    """P pages in file order: page g is the clusters that group g replaces, the last page is the last level.
+    """P pages in file order: page g is what group g replaces, the last page is the last level."""
 
-    Attributes:
-        first_cluster: (P+1,) int64. First cluster of each page, and the number of clusters.
-        first_gaussian: (P+1,) int64. First gaussian of each page, and the number of gaussians.
-    """
-
-    first_cluster: NDArray[np.int64]
-    first_gaussian: NDArray[np.int64]
+    first_cluster: NDArray[np.int64]  # (P+1,) of each page, and the number of clusters
+    first_gaussian: NDArray[np.int64]  # (P+1,) of each page, and the number of gaussians
 
     @staticmethod
     def of(clusters: Clusters) -> PageLayout:
@@ -55,14 +55,43 @@ class PageLayout:
         """(P,) of each page."""
         return np.diff(self.first_gaussian)
 
-    def rows(self, first_page: int, last_page: int) -> range:
-        """The gaussians of a run of pages."""
-        return range(int(self.first_gaussian[first_page]), int(self.first_gaussian[last_page]))
+    def run(self, first_page: int, last_page: int, place: int = 0) -> PageRun:
+        """A run of the pages, the first of which begins at this byte of a file."""
+        return PageRun(first_page, self.first_gaussian[first_page : last_page + 1], place)
 
-    def slice_in(self, page: int, first_page: int) -> slice:
-        """Where a page's gaussians are among those that begin with the first page's."""
-        rows, before = self.rows(page, page + 1), int(self.first_gaussian[first_page])
-        return slice(rows.start - before, rows.stop - before)
+
+@dataclass(frozen=True, eq=False)
+class PageRun:
+    """Neighbouring pages, as much as is known of them before they are written."""
+
+    first_page: int  # number in the bundle
+    first_gaussian: NDArray[np.int64]  # (n+1,) of each page, in the bundle, and the end
+    place: int  # byte of the file at which the first begins
+
+    def __len__(self) -> int:
+        return len(self.first_gaussian) - 1
+
+    @property
+    def rows(self) -> slice:
+        """Their gaussians in the bundle."""
+        return slice(int(self.first_gaussian[0]), int(self.first_gaussian[-1]))
+
+    def rows_of(self, number: int) -> slice:
+        """The gaussians of one of them, by its place in the run, among those of all."""
+        first, last = (self.first_gaussian[number : number + 2] - self.first_gaussian[0]).tolist()
+        return slice(first, last)
+
+    def read(self, codec: Codec, read_page: ReadPage) -> Gaussians:
+        """Their gaussians; `read_page` fills arrays with the page of a place in the run."""
+        num_gaussians = np.diff(self.first_gaussian)
+        result = codec.empty(int(num_gaussians.sum()))
+
+        def read(pages: range) -> None:
+            for page in pages:
+                codec.decode(partial(read_page, page), result, self.rows_of(page))
+
+        on_threads(read, list(runs_of_pages(0, len(self), codec.page_bytes(num_gaussians), _BYTES_PER_TASK)))
+        return result
 
 
 class MemoryPages:
@@ -74,12 +103,11 @@ class MemoryPages:
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Gaussians of a run of pages; they share memory with `gaussians`."""
-        rows = self.layout.rows(first_page, last_page)
-        return self.gaussians.subset(slice(rows.start, rows.stop))
+        return self.gaussians.subset(self.layout.run(first_page, last_page).rows)
 
-    def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
+    def write(self, run: PageRun, gaussians: Gaussians) -> None:
         """Copy the gaussians of a run of pages, on any device, to their place."""
-        place = vars(self.read(first_page, last_page)).values()
+        place = vars(self.gaussians.subset(run.rows)).values()
         for array, out in zip(vars(gaussians).values(), place, strict=True):
             _device.copy_to_host(array, out)
 
@@ -102,21 +130,17 @@ class FilePages:
         return kept[1]
 
     def _read(self, first_page: int, last_page: int) -> Gaussians:
-        """Read pages straight into the arrays of the result."""
-        result = self._file.codec.empty(len(self.layout.rows(first_page, last_page)))
+        run, file = self.layout.run(first_page, last_page), self._file
+        return run.read(file.codec, lambda page, arrays: file.read_page(first_page + page, arrays))
 
-        def read(pages: range) -> None:
-            for page in pages:
-                read_arrays = partial(self._file.read_page, page)
-                self._file.codec.decode(read_arrays, result, self.layout.slice_in(page, first_page))
 
-        tasks = list(runs_of_pages(first_page, last_page, self._file.tables["pages.bytes"], _BYTES_PER_TASK))
-        if len(tasks) == 1:
-            read(tasks[0])
-        else:
-            with ThreadPoolExecutor(min(_READ_THREADS, os.cpu_count() or 1)) as pool:
-                list(pool.map(read, tasks))
-        return result
+def on_threads(work: Callable[[_Item], None], items: Sequence[_Item]) -> None:
+    """Do work for all items, on threads if there are several."""
+    if len(items) < 2:
+        deque(map(work, items), maxlen=0)
+    else:
+        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+            deque(pool.map(work, items), maxlen=0)
 
 
 def runs_of_pages(
