@@ -212,10 +212,9 @@ def test_units_hold_all_leaves_and_no_more_than_asked():
         for most in (300, 10_000, 1 << 20):
             plan = Plan.of(count, BuildConfig())
             units = plan.units(most)
-            sizes = [part.levels[0].num_gaussians for part in units.plans]
+            sizes = [part.levels[0].num_gaussians for part in units]
             assert sum(sizes) == count
-            assert max(sizes) <= max(most, 256)
-            assert all(len(part.levels) == units.level + 1 for part in units.plans)
+            assert max(sizes) <= max(most, 2 * 256)  # a page is not shared
 
 
 # ---- files

@@ -31,18 +31,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
     ValueError; an OSError of writing has `path` for the file's name.
     """
     path = os.fspath(path)  # a number would stand for an open file
-    replaced = status_of_replaced(path)
-    target = os.path.realpath(path)
-    folder, name = os.path.split(target)
+    status_of_replaced(path)
+    folder, name = os.path.split(os.path.realpath(path))
     # The start of the name only: a name may have 255 bytes, and a character up to four.
     temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
     with naming_errors(path, temporary):
         # Nobody may read what replaces a private file before it has the permissions of that.
-        os.close(os.open(temporary, _NEW_FILE, 0o666 if replaced is None else 0o600))
+        os.close(os.open(temporary, _NEW_FILE, 0o600))
         try:
             yield temporary
-            _finish(temporary, replaced)
-            os.replace(temporary, target)
+            put_in_place(temporary, path)
         except BaseException:
             with contextlib.suppress(FileNotFoundError, NotADirectoryError):
                 os.unlink(temporary)
@@ -50,14 +48,23 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
 
 
 def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Let a file that only its owner may read replace `path`, as `replacing` does it."""
+    """Bring a file that only its owner may read to the disk and to `path`, with what is permitted there."""
     replaced = status_of_replaced(path)
     with naming_errors(path, os.fspath(private)):
-        if replaced is None:
-            status = Path("/proc/self/status").read_text(encoding="ascii")
-            found = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
-            os.chmod(private, 0o666 & ~int(found[1] if found else "077", 8))
-        _finish(private, replaced)
+        descriptor = os.open(private, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            if replaced is None:
+                status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+                found = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
+                os.fchmod(descriptor, 0o666 & ~int(found[1] if found else "077", 8))
+            else:
+                for owner, group in ((-1, replaced.st_gid), (replaced.st_uid, -1)):
+                    with contextlib.suppress(OSError):
+                        os.fchown(descriptor, owner, group)
+                os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
         os.replace(private, os.path.realpath(path))
 
 
@@ -74,20 +81,6 @@ def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
     # Renaming asks the folder alone; that the file itself may be written to, opening it finds out.
     os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
     return status
-
-
-def _finish(path: str | os.PathLike[str], replaced: os.stat_result | None) -> None:
-    """Bring a new file to the disk, with the permissions of what it replaces."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        if replaced is not None:
-            for owner, group in ((-1, replaced.st_gid), (replaced.st_uid, -1)):
-                with contextlib.suppress(OSError):
-                    os.fchown(descriptor, owner, group)
-            os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @contextlib.contextmanager

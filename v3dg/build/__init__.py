@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from concurrent.futures import Executor
 from typing import Literal
 
 from v3dg._device import Device
@@ -26,6 +27,7 @@ def build_bundle(
     device: str | Device = "auto",
     resume_path: str | os.PathLike[str] | None = None,
     unusable: Literal["drop", "refuse"] = "drop",
+    executor: Executor | None = None,
 ) -> Bundle:
     """Build all levels of one asset (V3DG, algorithm 1; what we do differently is in docs/levels.md).
 
@@ -45,11 +47,14 @@ def build_bundle(
             are left out, with a `v3dg.cleaning.AssetWarning`, or are an error. Those that no pixel can show,
             because their opacity is below 1/255, are left out in any case. How many of each kind is kept in
             the bundle's config as "dropped".
+        executor: Whose workers build, as `dask.distributed.Client.get_executor()`; by default, threads of
+            this process. They are to have devices of one kind with this process, which builds the topmost
+            levels, and to reach `resume_path`, where they write their parts (docs/cluster.md).
 
     Raises:
         ValueError: The asset has nothing that can be drawn, or a setting is wrong.
-        RuntimeError: The device is "cuda", and something is missing for it; or another build is using
-            `resume_path`.
+        RuntimeError: The device is "cuda", and something is missing for it; another build is using
+            `resume_path`; or a worker is of another kind, or ended.
         OSError: `resume_path` cannot be written; what is finished stays there.
         MemoryError: The device has too little memory; the message has the numbers.
         KeyboardInterrupt: Ctrl-C; threads have stopped, what is finished is at `resume_path`.
@@ -57,4 +62,6 @@ def build_bundle(
     config = config or BuildConfig()
     devices = devices_for(device, asset)
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
-    return build_into(resume_path, leaves, config, seed, devices, progress)
+    if executor is not None and resume_path is None:
+        raise ValueError("resume_path: expected a file that all workers of the executor reach, got None")
+    return build_into(resume_path, leaves, config, seed, devices, progress, executor=executor)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -34,6 +35,7 @@ def build_file(
     resume: bool = False,
     unusable: Literal["drop", "refuse"] = "drop",
     memory: int | str | None = None,
+    executor: Executor | None = None,
 ) -> tuple[Bundle, bool]:
     """Build the bundle of an asset's file, or of several that make one asset, straight into a file.
 
@@ -46,7 +48,7 @@ def build_file(
             from the levels of a build that was interrupted; otherwise all is made anew.
         memory: Of the host, for the build beside what the process has: bytes, or text like "8GiB". By default
             half of what is free.
-        config, seed, progress, device, unusable: As for `build_bundle`.
+        config, seed, progress, device, unusable, executor: As for `build_bundle`.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
@@ -66,6 +68,8 @@ def build_file(
         discard_levels(levels)
     where: dict[str, Any] = {"config": config, "unusable": unusable, "device": devices[0]}
     bounds: dict[str, Any] = {"memory": num_bytes, "reserved": unit_bytes, "progress": progress}
+    if executor is not None:
+        bounds["most_in_memory"] = 0  # where workers would not find them
     with (
         _naming_asset(paths[0]),
         nullcontext(MemoryLeaves(asset, **where))
@@ -78,7 +82,7 @@ def build_file(
                 discard_levels(levels)
             return Bundle.open(bundle_path), False
         at: dict[str, Any] = {"bundle_path": bundle_path, "most_units": most_units(num_bytes, leaves)}
-        return build_into(levels, leaves, config, seed, devices, progress, **at), True
+        return build_into(levels, leaves, config, seed, devices, progress, executor=executor, **at), True
 
 
 @contextmanager

@@ -43,11 +43,7 @@ class MemoryLeaves(Leaves):
     """The leaves of an asset in memory, on any device, that are split on another when they are first read."""
 
     def __init__(
-        self,
-        asset: Gaussians,
-        config: BuildConfig,
-        unusable: Unusable = "drop",
-        device: Device = _device.CPU,
+        self, asset: Gaussians, config: BuildConfig, unusable: Unusable = "drop", device: Device = _device.CPU
     ) -> None:
         if str(asset.means.dtype).endswith("64"):
             raise ValueError("asset: expected float32 arrays, got float64; convert them first")

@@ -83,6 +83,7 @@ def leaves_on_disk(
     reserved: Callable[[int, int], int] = lambda num_gaussians, sh_degree: 0,
     device: Device = CPU,
     progress: bool = False,
+    most_in_memory: int = 1 << 32,
 ) -> Iterator[Leaves]:
     """The leaves of the asset that some files make together, one after the other, within so much memory.
 
@@ -96,11 +97,10 @@ def leaves_on_disk(
     degree = max(tile.sh_degree for tile in tiles)
     sizes = _Sizes.of(memory, reserved(count, degree), degree, tiles)
     folder = Path(folder)
-    fits = count <= sizes.in_memory
+    fits = count <= min(sizes.in_memory, most_in_memory)
     # Where none is needed, what a killed build left is removed.
     scratch = nullcontext() if fits and not os.path.lexists(folder) else scratch_folder(folder, _NAMES)
-    is_visible = progress and not fits
-    with scratch, bar_of_gaussians(2 * count, is_visible, desc="reading", leave=False) as bar:
+    with scratch, bar_of_gaussians(2 * count, progress and not fits, desc="reading", leave=False) as bar:
         if fits:
             buffer = Codec(degree).empty(count)
             for _ in _blocks(tiles, buffer, bar):
@@ -256,7 +256,7 @@ def _sort_on_disk(
     bar.close()
     bucket_bytes = int(np.diff(offset).max()) * _bytes_in_bucket(degree)
     about = count, tally.num_gaussians, degree, tally.counts, digest, bucket_bytes
-    return DiskLeaves(*about, rows, offset, depth - bucket_depth)
+    return DiskLeaves(*about, rows.absolute(), offset, depth - bucket_depth)
 
 
 def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:

@@ -78,9 +78,8 @@ def lock(descriptor: int, path: str | os.PathLike[str]) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        place = os.fspath(path)
         raise RuntimeError(
-            f"{place}: another build is using it; wait for it, or write to another place"
+            f"{os.fspath(path)}: another build is using it; wait for it, or write to another place"
         ) from None
     except OSError as error:
         # Some network file systems have no locks; there, two builds of one output are the user's to avoid.

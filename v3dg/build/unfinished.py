@@ -2,8 +2,7 @@
 
 It is the file of the bundle, with the pages that are finished at their places. Where the finished file will
 end begins the journal: a record for each finished level of each part, with its tables and the hashes of its
-pages. Only gaussians that share a page with those of another part are in the record, too. The first bytes, a
-header of no length and the digest of what is built, tell it from a bundle.
+pages. The first bytes, a header of no length and the digest of what is built, tell it from a bundle.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,30 +32,26 @@ from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundlePlan, read_pages, write_pages
 from v3dg.bundle.format import HASH_BYTES, page_hash
 from v3dg.bundle.pages import MemoryPages, PageRun
-from v3dg.gaussians import Gaussians, shapes_of
+from v3dg.gaussians import Gaussians
 
 _RECORD = struct.Struct("<II16s")  # in front of a level: its part, its number, the hash of what follows
-NO_HASHES = np.empty((0, HASH_BYTES), np.uint8)
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"
 
 
 @dataclass(frozen=True, eq=False)
 class FinishedLevel:
-    """A level of a part whose pages are written, and `gaussians` where it has no pages of its own."""
+    """A level of a part whose pages are written."""
 
     tables: LevelTables
     hashes: npt.NDArray[np.uint8]  # (n, 16) of the pages
-    gaussians: Gaussians | None = None
 
-    def read(self, pages: PageFile | MemoryStore, run: PageRun | None) -> Level:
+    def read(self, pages: PageFile | MemoryStore, run: PageRun) -> Level:
         """The level, from its pages."""
-        gaussians = pages.read(run, self.hashes) if run is not None else self.gaussians
-        assert gaussians is not None
-        return Level(gaussians, self.tables)
+        return Level(pages.read(run, self.hashes), self.tables)
 
 
-Part = Mapping[int, tuple[LevelPlan, PageRun | None]]
-"""What is built alone: the plans of its levels by number, and their pages, where they share none."""
+Part = Mapping[int, tuple[LevelPlan, PageRun]]
+"""What is built alone: the plans of its levels by number, and their pages."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +70,7 @@ class PageFile:
     def read(self, run: PageRun, hashes: npt.NDArray[np.uint8]) -> Gaussians:
         """The gaussians of a run of pages that have these hashes."""
         with self._opened(os.O_RDONLY) as descriptor:
-            return read_pages(descriptor, run, self.codec, hashes)
+            return read_pages(self.path, descriptor, run, self.codec, hashes)
 
     @contextmanager
     def _opened(self, flags: int) -> Iterator[int]:
@@ -85,9 +79,7 @@ class PageFile:
             descriptor = os.open(self.path, flags | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
                 if os.pread(descriptor, len(self.head), 0) != self.head:
-                    raise ValueError(
-                        f"{self.path}: expected the unfinished bundle of this build, got another"
-                    )
+                    raise ValueError(f"{self.path}: expected the unfinished bundle of this build")
                 yield descriptor
             finally:
                 os.close(descriptor)
@@ -105,7 +97,7 @@ class Unfinished:
     ) -> None:
         self._path, self._bundle_path = path, bundle_path
         self._plan, self._parts = plan, parts
-        what = [plan.header.decode("latin-1"), _device.describe(device), __version__, len(parts)]
+        what = [plan.header.decode("latin-1"), *described(device), len(parts)]
         digest = page_hash([np.frombuffer(json.dumps(what).encode(), np.uint8)])
         self.pages = PageFile(Path(os.path.abspath(path)), _MAGIC + digest, plan.codec)
         self.levels: dict[tuple[int, int], FinishedLevel] = {}
@@ -171,7 +163,11 @@ class Unfinished:
             part, number, digest = _RECORD.unpack(head.tobytes())
             if not (part < len(self._parts) and number in self._parts[part]):
                 raise ValueError("a level is damaged")
-            arrays = self._arrays(part, number)
+            plan, run = self._parts[part][number]
+            clusters, groups = plan.num_clusters, plan.num_groups
+            shapes = (clusters, 2, 3), (groups, 4), (groups, 4), (groups, 2)
+            floats = [np.empty(shape, np.float32) for shape in shapes]
+            arrays = [*floats, np.empty((len(run), HASH_BYTES), np.uint8)]
             place = self._end + _RECORD.size
             for array in arrays:
                 if not _files.read_at(descriptor, array, place):
@@ -179,26 +175,13 @@ class Unfinished:
                 place += array.nbytes
             if page_hash(arrays) != digest:
                 raise ValueError("a level is damaged")
-            run = self._parts[part][number][1]
-            gaussians = Gaussians(*arrays[5:]) if run is None else None
-            self.levels[part, number] = FinishedLevel(LevelTables(*arrays[:4]), arrays[4], gaussians)
-            self.levels[part, number].read(self.pages, run)  # whose pages are as they were
-            self._end = place
-
-    def _arrays(self, part: int, number: int) -> list[npt.NDArray[Any]]:
-        """Those of a record, to be filled."""
-        plan, run = self._parts[part][number]
-        clusters, groups = plan.num_clusters, plan.num_groups
-        shapes = [(clusters, 2, 3), (groups, 4), (groups, 4), (groups, 2)]
-        rows = shapes_of(plan.num_gaussians, self.pages.codec.sh_degree) if run is None else []
-        hashes = np.empty((0 if run is None else len(run), HASH_BYTES), np.uint8)
-        floats = [np.empty(shape, np.float32) for shape in (*shapes, *rows)]
-        return [*floats[:4], hashes, *floats[4:]]
+            level = FinishedLevel(LevelTables(*floats), arrays[4])
+            level.read(self.pages, run)  # its pages are as they were
+            self.levels[part, number], self._end = level, place
 
     def save(self, part: int, number: int, level: FinishedLevel) -> None:
         """Add a level to the journal; what a full disk cuts off is removed again."""
         arrays = [*vars(level.tables).values(), level.hashes]
-        arrays += vars(level.gaussians).values() if level.gaussians is not None else []
         record = _RECORD.pack(part, number, page_hash(arrays))
         with self._lock, _files.naming_errors(self._path):
             descriptor, end = self._file.fileno(), self._end
@@ -242,7 +225,7 @@ class MemoryStore:
 
     def write(self, run: PageRun, gaussians: Gaussians) -> npt.NDArray[np.uint8]:
         self._pages.write(run, gaussians)
-        return NO_HASHES
+        return np.empty((0, HASH_BYTES), np.uint8)
 
     def read(self, run: PageRun, hashes: npt.NDArray[np.uint8]) -> Gaussians:
         return self._pages.gaussians.subset(run.rows)
@@ -257,12 +240,13 @@ class MemoryStore:
         return Bundle(*self._tables, self._pages.gaussians, self._plan.config)
 
 
-def discard_levels(resume_path: str | os.PathLike[str]) -> None:
-    """Remove what an interrupted build left there, if anything.
+def described(device: Device) -> tuple[str, str]:
+    """What the last bits of a build depend on: the kind of a device, and the version."""
+    return _device.describe(device), __version__
 
-    Raises:
-        RuntimeError: A build is using it.
-    """
+
+def discard_levels(resume_path: str | os.PathLike[str]) -> None:
+    """Remove what an interrupted build left there, if anything; RuntimeError where a build is using it."""
     if os.path.lexists(resume_path):
         with _open_locked(resume_path):
             os.unlink(resume_path)

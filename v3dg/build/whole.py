@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,12 +19,11 @@ from v3dg import _device
 from v3dg._device import Device
 from v3dg.build.assemble import assemble
 from v3dg.build.config import BuildConfig
-from v3dg.build.leaves import Leaves, made_with
-from v3dg.build.plan import Plan, Units
+from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
+from v3dg.build.plan import Plan
 from v3dg.build.progress import Bar
-from v3dg.build.simplify import Level, LevelTables, build_above
-from v3dg.build.unfinished import FinishedLevel, MemoryStore, Part, Unfinished
-from v3dg.build.unit import UnitTask
+from v3dg.build.simplify import Level, LevelTables, Show, build_above, build_levels
+from v3dg.build.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 from v3dg.bundle import Bundle
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundlePlan
@@ -35,6 +34,8 @@ from v3dg.gaussians import Gaussians
 UNIT_LEAVES = 1 << 20
 # Units that a GPU works on at once, so that others fill what the smallest levels of one leave idle.
 _UNITS_ON_GPU = 4
+
+_Levels = dict[int, FinishedLevel]
 
 
 def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[Device]:
@@ -57,6 +58,7 @@ def build_into(
     *,
     bundle_path: Path | None = None,
     most_units: int | None = None,
+    executor: Executor | None = None,
 ) -> Bundle:
     """Build all levels of an asset, in memory or in a file that replaces `bundle_path`; as `build_bundle`."""
     if not isinstance(progress, bool):
@@ -73,25 +75,29 @@ def build_into(
         else nullcontext(MemoryStore(file)) as store,
     ):
         if not store.is_whole:
-            build = _Build(config, file.config["seed"], plan, units, parts, file, store)
-            with Bar(plan, build.num_finished, progress) as bar:
-                tables, hashes = build.all_levels(leaves, devices, most_units, bar)
+            done = sum(parts[part][number][0].num_gaussians for part, number in store.levels if number > 0)
+            with Bar(plan, done, progress) as bar:
+                build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
+                tables, hashes = build.all_levels(leaves, devices, most_units, executor)
             store.finish(*assemble(plan, tables, config), hashes)
         return store.bundle()
 
 
-def _parts(plan: Plan, units: Units, file: BundlePlan) -> list[Part]:
+def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:
     """The units, and last what is above them."""
-    first = plan.first_page
-    parts: list[Part] = []
-    for unit in units.plans:
-        pages = [
-            file.run(first[n] + above.first_group, first[n] + above.first_group + above.num_groups)
-            for n, above in enumerate(unit.levels[1:])
-        ]
-        parts.append(dict(enumerate(zip(unit.levels, [*pages, None], strict=True))))
-    above = range(units.level + 1, len(plan.levels))
-    return [*parts, {n: (plan.levels[n], file.run(first[n], first[n + 1])) for n in above}]
+
+    def runs(number: int, count: int) -> list[PageRun]:
+        first, last = plan.first_page[number : number + 2]
+        each = (last - first) // count
+        return [file.run(page, page + each) for page in range(first, last, each)]
+
+    num_low = len(units[0].levels)
+    pages = [runs(n, len(units)) for n in range(num_low)]
+    parts: list[Part] = [
+        {n: (level, pages[n][number]) for n, level in enumerate(unit.levels)}
+        for number, unit in enumerate(units)
+    ]
+    return [*parts, {n: (plan.levels[n], runs(n, 1)[0]) for n in range(num_low, len(plan.levels))}]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,69 +107,105 @@ class _Build:
     config: BuildConfig
     seed: int
     plan: Plan
-    units: Units
+    units: Sequence[Plan]
     parts: list[Part]
     file: BundlePlan
     store: Unfinished | MemoryStore
+    bar: Bar
 
     @property
-    def num_finished(self) -> int:
-        """Gaussians of finished levels but the leaves."""
-        return sum(self.parts[part][n][0].num_gaussians for part, n in self.store.levels if n > 0)
+    def num_low(self) -> int:
+        """Levels of the units."""
+        return len(self.units[0].levels)
 
     def all_levels(
-        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None, bar: Bar
+        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None, executor: Executor | None
     ) -> tuple[list[LevelTables], npt.NDArray[np.uint8]]:
         """Build all levels; their tables, and the hashes of all pages."""
-        self._build_units(leaves, devices, most_units, bar)
-        finished = [self._joined(number) for number in range(self.units.level + 1)]
-        top, levels, pages = len(self.units.plans), self.store.levels, self.store.pages
-        saved = (levels[top, n].read(pages, self._run(n)) for n in self.parts[top] if (top, n) in levels)
-        below = self._below(finished, devices[0])
-        above = build_above(below, self.plan, self.config, self.seed, saved, bar.show_of(top))
-        for number, level in enumerate(above, self.units.level + 1):
+        if executor is None:
+            self._build_here(leaves, devices, most_units)
+        else:
+            self._build_elsewhere(leaves, devices[0], executor)
+        finished = [self._joined(number) for number in range(self.num_low)]
+        top, levels, pages = len(self.units), self.store.levels, self.store.pages
+        runs = {number: run for number, (_, run) in self.parts[top].items()}
+        saved = (levels[top, n].read(pages, run) for n, run in runs.items() if (top, n) in levels)
+        below: dict[int, Level] = {}
+        first = self.config.target_of(self.num_low) if runs else self.num_low - 1
+        for n in range(first, self.num_low):  # what the levels above begin with
+            level = finished[n].read(pages, self.file.run(*self.plan.first_page[n : n + 2]))
+            below[n] = Level(_device.place(level.gaussians, devices[0]), level.tables)
+        above = build_above(below, self.plan, self.config, self.seed, saved, self.bar.show_of(top))
+        for number, level in enumerate(above, self.num_low):
             if (top, number) not in levels:
-                hashes = pages.write(self._run(number), level.gaussians)
+                hashes = pages.write(runs[number], level.gaussians)
                 self.store.save(top, number, FinishedLevel(level.tables, hashes))
             finished.append(levels[top, number])
         return [level.tables for level in finished], np.concatenate([level.hashes for level in finished])
 
-    def _build_units(
-        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None, bar: Bar
-    ) -> None:
+    def _build_here(self, leaves: Leaves, devices: Sequence[Device], most_units: int | None) -> None:
         workers = [device for _ in range(_UNITS_ON_GPU) for device in devices if device.is_cuda]
-        workers = (workers or list(devices))[:most_units]
+        workers = (workers or list(devices))[: min(most_units or len(self.parts), len(self.parts))]
         free: SimpleQueue[Device] = SimpleQueue()
         for device in workers:
             free.put(device)
 
-        def work(unit: int, task: UnitTask) -> None:
+        def work(unit: int) -> _Levels:
             device = free.get()
             try:
                 with _device.own_stream(device), _device.memory_errors():
-                    for number, level in task.levels(device, bar.show_of(unit)):
+                    for number, level in self._task(unit, leaves).levels(device, self.bar.show_of(unit)):
                         self.store.save(unit, number, level)
             finally:
                 free.put(device)
+            return {}
 
-        last, levels = self.units.level, self.store.levels
-        todo = [unit for unit in range(len(self.units.plans)) if (unit, last) not in levels]
-        num_threads = min(len(todo), len(workers))
-        with ThreadPoolExecutor(num_threads) if num_threads > 1 else _InThisThread() as executor:
-            futures: list[Future[None]] = []
-            try:
-                for unit in todo:
-                    futures.append(executor.submit(work, unit, self._task(unit, leaves)))
-                for future in as_completed(futures):
-                    future.result()
-            except BaseException:
-                bar.stop()
-                for future in futures:
-                    future.cancel()
-                raise
+        if len(workers) == 1:
+            for unit in self._todo:
+                work(unit)
+        else:
+            with ThreadPoolExecutor(len(workers)) as executor:
+                self._collect(lambda unit: executor.submit(work, unit))
+
+    def _build_elsewhere(self, leaves: Leaves, device: Device, executor: Executor) -> None:
+        like, nonce = (str(device).partition(":")[0], *described(device)), os.urandom(8)
+
+        def submit(unit: int) -> Future[_Levels]:
+            task = self._task(unit, leaves)
+            if isinstance(leaves, MemoryLeaves):  # those of the unit go along
+                task = replace(task, leaves=task.leaves().numpy)
+            return executor.submit(build_elsewhere, task, like, nonce)
+
+        try:
+            self._collect(submit)
+        except (OSError, ValueError, RuntimeError, MemoryError):
+            raise
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise RuntimeError(f"executor: expected all units to be built, got {reason}") from error
+
+    def _collect(self, submit: Callable[[int], Future[_Levels]]) -> None:
+        """Have units built, and save what comes back; what fails, or an interrupt, ends the others."""
+        units: dict[Future[_Levels], int] = {}
+        try:
+            for unit in self._todo:
+                units[submit(unit)] = unit
+            for future in as_completed(units):
+                for number, level in future.result().items():
+                    self.store.save(units[future], number, level)
+                    self.bar.add(units[future], number, self.parts[units[future]][number][0].num_gaussians)
+        except BaseException:
+            self.bar.stop()
+            for future in units:
+                future.cancel()
+            raise
+
+    @property
+    def _todo(self) -> list[int]:
+        return [n for n in range(len(self.units)) if (n, self.num_low - 1) not in self.store.levels]
 
     def _task(self, unit: int, leaves: Leaves) -> UnitTask:
-        plan = self.units.plans[unit]
+        plan = self.units[unit]
         first = int(self.plan.levels[0].offset[plan.levels[0].first_group])
         finished = {n: level for (part, n), level in self.store.levels.items() if part == unit}
         read = partial(leaves.read, first, first + plan.levels[0].num_gaussians)
@@ -171,31 +213,50 @@ class _Build:
         return UnitTask(read, plan, runs, self.config, self.seed, finished, self.store.pages)
 
     def _joined(self, number: int) -> FinishedLevel:
-        """A level of all units; the pages of the last are written now."""
-        parts = [self.store.levels[unit, number] for unit in range(len(self.units.plans))]
+        """A level of all units."""
+        parts = [self.store.levels[unit, number] for unit in range(len(self.units))]
         columns = zip(*(vars(part.tables).values() for part in parts), strict=True)
         tables = LevelTables(*map(np.concatenate, columns))
-        if number < self.units.level:
-            return FinishedLevel(tables, np.concatenate([part.hashes for part in parts]))
-        gaussians = Gaussians.concatenate([part.gaussians for part in parts if part.gaussians is not None])
-        return FinishedLevel(tables, self.store.pages.write(self._run(number), gaussians))
-
-    def _below(self, finished: Sequence[FinishedLevel], device: Device) -> dict[int, Level]:
-        """Levels of the units that the work above them begins with, on the device."""
-        last = self.units.level
-        has_above = last + 1 < len(self.plan.levels)
-        numbers = range(self.config.target_of(last + 1) if has_above else last, last + 1)
-        levels = {n: finished[n].read(self.store.pages, self._run(n)) for n in numbers}
-        return {n: Level(_device.place(level.gaussians, device), level.tables) for n, level in levels.items()}
-
-    def _run(self, number: int) -> PageRun:
-        return self.file.run(self.plan.first_page[number], self.plan.first_page[number + 1])
+        return FinishedLevel(tables, np.concatenate([part.hashes for part in parts]))
 
 
-class _InThisThread(Executor):
-    """Does work as it comes; what fails is raised at once."""
+@dataclass(frozen=True, eq=False)
+class UnitTask:
+    """All that the work on a unit needs; it can be pickled where `leaves` and `pages` can."""
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        done: Future[Any] = Future()
-        done.set_result(fn(*args, **kwargs))
-        return done
+    leaves: Callable[[], Gaussians]
+    plan: Plan
+    runs: Sequence[PageRun]  # pages of its levels
+    config: BuildConfig
+    seed: int
+    finished: Mapping[int, FinishedLevel]  # levels that are built already
+    pages: PageFile | MemoryStore
+
+    def levels(self, device: Device, show: Show) -> Iterator[tuple[int, FinishedLevel]]:
+        """Build the levels that are not finished, one after another, and write their pages."""
+        finished = (self.finished[n].read(self.pages, self.runs[n]) for n in sorted(self.finished))
+        leaves = next(finished).gaussians if self.finished else self.leaves()
+        own = _device.place(leaves, device)
+        levels = build_levels(own, self.plan, self.config, self.seed, finished=finished, show=show)
+        del leaves, own
+        for number, level in enumerate(levels):
+            if number not in self.finished:
+                hashes = self.pages.write(self.runs[number], level.gaussians)
+                yield number, FinishedLevel(level.tables, hashes)
+            del level  # while the next is made, its memory is free
+
+
+def build_elsewhere(task: UnitTask, like: tuple[str, str, str], _: bytes) -> _Levels:
+    """Build a unit in a worker of an executor, on a device of this kind, which must be described like this.
+
+    The last argument is another in each build: dask gives what it has for the same arguments.
+    """
+    device, here = _device.resolve(like[0]), f"worker on {socket.gethostname()}: expected"
+    if (own := described(device)) != like[1:]:
+        wanted, got = (" with v3dg ".join(pair) for pair in (like[1:], own))
+        raise RuntimeError(f"{here} {wanted} as where the build began, got {got}; the last bits would differ")
+    assert isinstance(task.pages, PageFile)
+    if not task.pages.path.exists():
+        raise RuntimeError(f"{here} {task.pages.path}, got none; share its folder")
+    with _device.own_stream(device), _device.memory_errors():
+        return dict(task.levels(device, lambda *_: None))

@@ -11,6 +11,7 @@ import hashlib
 import os
 import re
 import weakref
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -28,14 +29,12 @@ from v3dg.bundle.format import (
     SCHEMA,
     VERSION,
     entries_of,
-    entries_of_layout,
     header_of,
-    padding_bytes,
     page_file_bytes,
     page_hash,
     page_tables,
 )
-from v3dg.bundle.pages import on_threads
+from v3dg.bundle.pages import on_threads, runs_of_pages
 from v3dg.bundle.tables import check_tables
 
 if TYPE_CHECKING:
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from v3dg.bundle.tables import Clusters, Groups
     from v3dg.gaussians import Gaussians
 
+_BYTES_PER_TASK = 16 << 20
 _DAMAGED = "the file is damaged, copy or build it again"
 
 
@@ -55,18 +55,18 @@ class BundlePlan:
 
     def __init__(self, layout: PageLayout, codec: Codec, config: dict[str, Any]) -> None:
         self.layout, self.codec, self.config = layout, codec, config
-        entries = entries_of_layout(layout, codec)
         self._page_tables = page_tables(layout, codec)
+        pages_bytes = int(page_file_bytes(self._page_tables["pages.bytes"]).sum())
+        num_clusters, num_pages = int(layout.first_cluster[-1]), layout.num_pages
+        entries = entries_of(num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
         self.header = header_of(entries, codec.sh_degree, config)
         ends = (entries[name]["data_offsets"][1] for name in ("pages", "hash"))
         self._pages_end, self.num_bytes = (len(self.header) + int(end) for end in ends)
+        self._places = np.append(len(self.header) + self._page_tables["pages.offset"], self._pages_end)
 
     def run(self, first_page: int, last_page: int) -> PageRun:
         """A run of the pages."""
-        place = len(self.header)
-        if last_page > first_page:
-            place += int(self._page_tables["pages.offset"][first_page])
-        return self.layout.run(first_page, last_page, place)
+        return self.layout.run(first_page, last_page, self._places)
 
     def write_tables(
         self, descriptor: int, clusters: Clusters, groups: Groups, hashes: NDArray[np.uint8]
@@ -89,43 +89,51 @@ class BundlePlan:
 
 def write_pages(descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians) -> NDArray[np.uint8]:
     """Write the gaussians of a run of pages, on any device, to their place; (n, 16) their hashes."""
-    host, (sizes, places) = gaussians.numpy(), _sizes_and_places(run, codec)
+    host, sizes = gaussians.numpy(), np.diff(run.places)
     hashes = np.empty((len(run), HASH_BYTES), np.uint8)
 
     def write(page: int) -> None:
-        padding = np.zeros(padding_bytes(int(sizes[page])), np.uint8)
-        pieces = (*codec.encode(host, run.rows_of(page)), padding)
-        data = np.concatenate([piece.reshape(-1).view(np.uint8) for piece in pieces])
+        data = np.zeros(int(sizes[page]), np.uint8)
+        end = 0
+        for piece in codec.encode(host, run.rows_of(page)):
+            end += piece.nbytes
+            data[end - piece.nbytes : end] = piece.reshape(-1).view(np.uint8)
         hashes[page] = np.frombuffer(page_hash((data,)), np.uint8)
-        _files.write_at(descriptor, data.data, int(places[page]))
+        _files.write_at(descriptor, data.data, int(run.places[page]))
 
     on_threads(write, range(len(run)))
     return hashes
 
 
-def read_pages(descriptor: int, run: PageRun, codec: Codec, hashes: NDArray[np.uint8]) -> Gaussians:
+def read_pages(
+    path: str | os.PathLike[str], descriptor: int, run: PageRun, codec: Codec, hashes: NDArray[np.uint8]
+) -> Gaussians:
     """The gaussians of a run of pages; ValueError unless they are there and have these hashes."""
-    sizes, places = _sizes_and_places(run, codec)
-
-    def read(page: int, arrays: Sequence[NDArray[Any]]) -> None:
-        pieces = (*arrays, np.empty(padding_bytes(int(sizes[page])), np.uint8))
-        place = int(places[page])
-        for piece in pieces:
-            is_there = _files.read_at(descriptor, piece, place)
-            place += piece.nbytes
-            if not is_there:
-                raise ValueError(f"page {run.first_page + page} is cut off")
-        if page_hash(pieces) != hashes[page].tobytes():
-            raise ValueError(f"page {run.first_page + page} is damaged")
-
-    return run.read(codec, read)
-
-
-def _sizes_and_places(run: PageRun, codec: Codec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(n,) bytes of the pages without what they are filled up with, and where they begin in the file."""
     sizes = codec.page_bytes(np.diff(run.first_gaussian))
-    ends = run.place + np.cumsum(page_file_bytes(sizes))
-    return sizes, ends - page_file_bytes(sizes)
+    result = codec.empty(run.rows.stop - run.rows.start)
+
+    def read_page(page: int, arrays: Sequence[NDArray[Any]]) -> None:
+        place, end = run.places[page : page + 2].tolist()
+        pieces = (*arrays, np.empty(end - place - int(sizes[page]), np.uint8))
+        first, last = run.first_gaussian[page : page + 2].tolist()
+        name = f"page {run.first_page + page} (gaussians {first} to {last - 1})"
+        try:
+            for piece in pieces:
+                if not _files.read_at(descriptor, piece, place):
+                    raise ValueError(f"{os.fspath(path)}: {name} is not there; the file was truncated")
+                place += piece.nbytes
+        except OSError as error:
+            problem = f"{os.strerror(error.errno or errno.EIO)} in {name}"
+            raise OSError(error.errno, problem, os.fspath(path)) from error
+        if page_hash(pieces) != hashes[page].tobytes():
+            raise ValueError(f"{os.fspath(path)}: {name}: the hash does not match; {_DAMAGED}")
+
+    def read(pages: range) -> None:
+        for page in pages:
+            codec.decode(partial(read_page, page), result, run.rows_of(page))
+
+    on_threads(read, list(runs_of_pages(0, len(run), sizes, _BYTES_PER_TASK)))
+    return result
 
 
 class BundleFile:
@@ -239,17 +247,11 @@ class BundleFile:
                 self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
             offset += buffer.nbytes
 
-    def read_page(self, page: int, arrays: Sequence[NDArray[Any]]) -> None:
-        """Read a page's bytes into the arrays, one after another; ValueError unless its hash fits."""
-        num_bytes = int(self.tables["pages.bytes"][page])
-        padding = np.empty(padding_bytes(num_bytes), np.uint8)
-        first = int(self.tables["pages.first_cluster"][page])
-        last = first + int(self.tables["pages.num_clusters"][page]) - 1
-        try:
-            self._read((*arrays, padding), self._data_start + int(self.tables["pages.offset"][page]))
-        except OSError as error:
-            raise OSError(
-                error.errno, f"{os.strerror(error.errno or errno.EIO)} in page {page}", self.path
-            ) from error
-        if page_hash((*arrays, padding)) != self.tables["pages.hash"][page].tobytes():
-            self._fail(f"page {page} (clusters {first} to {last}): the hash does not match; {_DAMAGED}")
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """(P+1,) first byte of each page in the file, and the end."""
+        return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
+
+    def read_pages(self, run: PageRun) -> Gaussians:
+        """The gaussians of a run of pages, verified."""
+        return read_pages(self.path, self._fd, run, self.codec, self.tables["pages.hash"][run.first_page :])

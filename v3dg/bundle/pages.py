@@ -6,12 +6,12 @@ import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from v3dg import _device
+from v3dg.bundle.codec import Codec
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -19,15 +19,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from v3dg.bundle.codec import Codec
     from v3dg.bundle.file import BundleFile
     from v3dg.bundle.tables import Clusters
 
-    ReadPage = Callable[[int, Sequence[NDArray[Any]]], None]
-
 _Item = TypeVar("_Item")
 _THREADS = 8
-_BYTES_PER_TASK = 16 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +51,10 @@ class PageLayout:
         """(P,) of each page."""
         return np.diff(self.first_gaussian)
 
-    def run(self, first_page: int, last_page: int, place: int = 0) -> PageRun:
-        """A run of the pages, the first of which begins at this byte of a file."""
-        return PageRun(first_page, self.first_gaussian[first_page : last_page + 1], place)
+    def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> PageRun:
+        """A run of the pages, of which all begin at these bytes of a file, and end."""
+        gaussians, places = (a[first_page : last_page + 1] for a in (self.first_gaussian, places))
+        return PageRun(first_page, gaussians, places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +63,7 @@ class PageRun:
 
     first_page: int  # number in the bundle
     first_gaussian: NDArray[np.int64]  # (n+1,) of each page, in the bundle, and the end
-    place: int  # byte of the file at which the first begins
+    places: NDArray[np.int64]  # (n+1,) first byte of each page in the file, and the end
 
     def __len__(self) -> int:
         return len(self.first_gaussian) - 1
@@ -81,29 +78,18 @@ class PageRun:
         first, last = (self.first_gaussian[number : number + 2] - self.first_gaussian[0]).tolist()
         return slice(first, last)
 
-    def read(self, codec: Codec, read_page: ReadPage) -> Gaussians:
-        """Their gaussians; `read_page` fills arrays with the page of a place in the run."""
-        num_gaussians = np.diff(self.first_gaussian)
-        result = codec.empty(int(num_gaussians.sum()))
-
-        def read(pages: range) -> None:
-            for page in pages:
-                codec.decode(partial(read_page, page), result, self.rows_of(page))
-
-        on_threads(read, list(runs_of_pages(0, len(self), codec.page_bytes(num_gaussians), _BYTES_PER_TASK)))
-        return result
-
 
 class MemoryPages:
     """Pages whose gaussians are all in memory, on the host."""
 
     def __init__(self, layout: PageLayout, gaussians: Gaussians) -> None:
-        self.layout = layout
+        self.layout, self.codec = layout, Codec(gaussians.sh_degree)
         self.gaussians = gaussians
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Gaussians of a run of pages; they share memory with `gaussians`."""
-        return self.gaussians.subset(self.layout.run(first_page, last_page).rows)
+        first, last = self.layout.first_gaussian[[first_page, last_page]].tolist()
+        return self.gaussians.subset(slice(first, last))
 
     def write(self, run: PageRun, gaussians: Gaussians) -> None:
         """Copy the gaussians of a run of pages, on any device, to their place."""
@@ -116,7 +102,7 @@ class FilePages:
     """Pages that are read from a file when they are asked for; a single one is kept until the next."""
 
     def __init__(self, layout: PageLayout, file: BundleFile) -> None:
-        self.layout = layout
+        self.layout, self.codec = layout, file.codec
         self._file = file
         self._last_page: tuple[int, Gaussians] | None = None
 
@@ -130,8 +116,7 @@ class FilePages:
         return kept[1]
 
     def _read(self, first_page: int, last_page: int) -> Gaussians:
-        run, file = self.layout.run(first_page, last_page), self._file
-        return run.read(file.codec, lambda page, arrays: file.read_page(first_page + page, arrays))
+        return self._file.read_pages(self.layout.run(first_page, last_page, self._file.places))
 
 
 def on_threads(work: Callable[[_Item], None], items: Sequence[_Item]) -> None:
