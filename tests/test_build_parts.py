@@ -2,7 +2,6 @@
 
 from dataclasses import asdict, fields, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import scenes
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 from v3dg import BuildConfig, Gaussians, _core, build_bundle
-from v3dg._files import replacing
 from v3dg.build import build_file, levels_path
 from v3dg.build.assemble import assemble
 from v3dg.build.fit import fit_config
@@ -19,7 +17,8 @@ from v3dg.build.leaves import MemoryLeaves
 from v3dg.build.plan import Plan
 from v3dg.build.simplify import Level, LevelTables, build_levels
 from v3dg.bundle.codec import Codec
-from v3dg.bundle.file import writing
+from v3dg.bundle.file import BundlePlan, write_pages
+from v3dg.bundle.format import HASH_BYTES
 from v3dg.bundle.pages import PageLayout
 
 SMALL = BuildConfig(cluster_size=32, steps=4, num_views=4, supersample=2)
@@ -150,20 +149,28 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
     level = 2
     num_groups = plan.levels[level].num_groups
     subtrees = {}
-    layout, codec, first_page = plan.layout, Codec(asset.sh_degree), plan.first_page
-    with writing(tmp_path / "parts.v3dg", layout, codec, made_with) as writer:
+    codec, first_page = Codec(asset.sh_degree), plan.first_page
+    file = BundlePlan(plan.layout, codec, made_with)
+    hashes = np.zeros((first_page[-1], HASH_BYTES), np.uint8)
+    with open(tmp_path / "parts.v3dg", "wb") as output:
+
+        def write(first, last, gaussians):
+            hashes[first:last] = write_pages(output.fileno(), file.run(first, last), codec, gaussians)
+
         for group in np.random.default_rng(0).permutation(num_groups):
             levels, part = build_subtree(leaves, plan, config, level, group, group + 1)
             for number, above in enumerate(part.levels[1:]):
                 page = first_page[number] + above.first_group
-                writer.write(page, page + above.num_groups, levels[number].gaussians)
+                write(page, page + above.num_groups, levels[number].gaussians)
             subtrees[group] = levels
         in_order = zip(*(subtrees[group] for group in range(num_groups)), strict=True)
         finished = [joined(levels) for levels in in_order][1:]
         whole = list(build_levels(leaves, plan, config, SEED, finished=finished))
         for number in range(level, len(whole)):
-            writer.write(first_page[number], first_page[number + 1], whole[number].gaussians)
-        writer.finish(*assemble(plan, [level.tables for level in whole], config))
+            write(first_page[number], first_page[number + 1], whole[number].gaussians)
+        tables = assemble(plan, [level.tables for level in whole], config)
+        file.write_tables(output.fileno(), *tables, hashes)
+        file.write_header(output.fileno())
     assert (tmp_path / "parts.v3dg").read_bytes() == (tmp_path / "whole.v3dg").read_bytes()
 
 
@@ -205,10 +212,9 @@ def test_units_hold_all_leaves_and_no_more_than_asked():
         for most in (300, 10_000, 1 << 20):
             plan = Plan.of(count, BuildConfig())
             units = plan.units(most)
-            sizes = [part.levels[0].num_gaussians for part in units.plans]
+            sizes = [part.levels[0].num_gaussians for part in units]
             assert sum(sizes) == count
-            assert max(sizes) <= max(most, 256)
-            assert all(len(part.levels) == units.level + 1 for part in units.plans)
+            assert max(sizes) <= max(most, 2 * 256)  # a page is not shared
 
 
 # ---- files
@@ -228,21 +234,34 @@ def test_a_file_is_built_as_a_bundle_is(asset, tmp_path):
 
 
 def test_what_a_killed_build_left_of_a_file_is_written_over(asset, tmp_path):
-    """And not of another file, whose name begins alike."""
+    """Where it is not to be gone on with; what was left of another file stays."""
     v3dg.write_asset(tmp_path / "asset.ply", asset)
-    names = [f"{'long' * 20}_{end}.v3dg" for end in "ab"]
-    left = []
-    for name in names:
-        with replacing(tmp_path / name, is_locked=True) as temporary:
-            Path(temporary).touch()
-        left.append(Path(temporary))
-        (tmp_path / name).unlink()
+    left = [levels_path(tmp_path / f"{name}.v3dg") for name in "ab"]
     for path in left:
         path.write_bytes(bytes(10_000_000))
     options = {"config": SMALL, "progress": False, "device": "cpu"}
-    bundle, _ = build_file(tmp_path / "asset.ply", tmp_path / names[0], **options)
-    assert bundle.info()["bytes"] == (tmp_path / names[0]).stat().st_size
-    assert {path.name for path in tmp_path.iterdir()} == {"asset.ply", names[0], left[1].name}
+    bundle, _ = build_file(tmp_path / "asset.ply", tmp_path / "a.v3dg", **options)
+    assert bundle.info()["bytes"] == (tmp_path / "a.v3dg").stat().st_size
+    assert {path.name for path in tmp_path.iterdir()} == {"asset.ply", "a.v3dg", left[1].name}
+
+
+@pytest.mark.parametrize("mode", [None, 0o640])
+def test_a_built_file_has_the_permissions_of_a_written_one(asset, tmp_path, mode):
+    """Also behind a link, which stays one; until then, its owner alone may read it."""
+    v3dg.write_asset(tmp_path / "asset.ply", asset)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "out.v3dg").symlink_to(tmp_path / "folder" / "target.v3dg")
+    assert levels_path(tmp_path / "out.v3dg") == tmp_path / "folder" / "target.v3dg.partial"
+    if mode is not None:
+        (tmp_path / "folder" / "target.v3dg").touch()
+        (tmp_path / "folder" / "target.v3dg").chmod(mode)
+    options = {"config": SMALL, "progress": False, "device": "cpu"}
+    build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
+    assert (tmp_path / "out.v3dg").is_symlink()
+    assert [path.name for path in (tmp_path / "folder").iterdir()] == ["target.v3dg"]
+    (tmp_path / "like_this").touch()
+    expected = (tmp_path / "like_this").stat().st_mode & 0o777 if mode is None else mode
+    assert (tmp_path / "out.v3dg").stat().st_mode & 0o777 == expected
 
 
 def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatch):
@@ -261,26 +280,6 @@ def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatc
     bundle, is_built = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
     assert is_built
     assert bundle.num_levels == len(Plan.of(len(asset), SMALL).levels)
-
-
-def test_an_unfinished_file_never_gets_its_name(asset, tmp_path):
-    bundle = build_bundle(asset, config=replace(SMALL, steps=0), progress=False, device="cpu")
-    layout, codec = PageLayout.of(bundle.clusters), Codec(bundle.sh_degree)
-
-    def write(first_page, finish):
-        with writing(tmp_path / "out.v3dg", layout, codec, {}) as writer:
-            rest = bundle.gaussians.subset(slice(layout.first_gaussian[first_page], None))
-            writer.write(first_page, layout.num_pages, rest)
-            if finish:
-                writer.finish(bundle.clusters, bundle.groups)
-
-    with pytest.raises(RuntimeError, match="expected all pages, got none of 1; the first is 0"):
-        write(1, finish=True)
-    with pytest.raises(RuntimeError, match="expected the tables after the pages"):
-        write(0, finish=False)
-    assert list(tmp_path.iterdir()) == []
-    write(0, finish=True)
-    assert v3dg.Bundle.open(tmp_path / "out.v3dg").info()["levels"] == bundle.info()["levels"]
 
 
 # ---- settings

@@ -1,4 +1,4 @@
-"""Builds that are interrupted, killed, gone on with; and the checkpoints that they leave."""
+"""Builds that are interrupted, killed, gone on with; and the unfinished bundles that they leave."""
 
 import hashlib
 import os
@@ -18,8 +18,10 @@ import v3dg
 import v3dg.build
 from benchmarks.worlds.procedural import make_asset
 from random_bundle import random_gaussians
-from v3dg import BuildConfig, build_bundle
-from v3dg.build.checkpoint import _open_locked, digest_of
+from v3dg import BuildConfig, _files, build_bundle
+from v3dg.build.digest import digest_of
+from v3dg.build.unfinished import _open_locked
+from v3dg.bundle.file import BundlePlan
 
 CONFIG = BuildConfig(cluster_size=32, steps=400, first_steps=400)
 # Runs for days; only the first level's checkpoint would end it.
@@ -42,6 +44,8 @@ except KeyboardInterrupt:
     sys.exit(130)
 bundle.write(sys.argv[3])
 """
+# Bytes of the journal with less than which only leaves may be finished.
+TWO_RECORDS = 3700
 # Generous: a build that did not listen would take days.
 PATIENCE = 60
 
@@ -111,7 +115,7 @@ def test_ctrl_c_ends_a_build_at_once(tmp_path, device):
 
 def test_interrupted_build_resumes_to_the_same_bytes(asset, whole, tmp_path, device):
     with started_build(CONFIG, device, tmp_path) as process:
-        assert wait_for_growth(tmp_path / "levels", process)
+        assert wait_for_growth(tmp_path / "levels", process, len(whole) + TWO_RECORDS)
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE) == 130
     assert names_in(tmp_path) == ["levels"]
@@ -124,7 +128,7 @@ def test_interrupted_build_resumes_to_the_same_bytes(asset, whole, tmp_path, dev
 
 def test_killed_builds_resume_to_the_same_bytes(asset, whole, tmp_path, device):
     levels = tmp_path / "levels"
-    seen = 0
+    seen = len(whole) + TWO_RECORDS
     for _ in range(3):
         with started_build(CONFIG, device, tmp_path) as process:
             seen = wait_for_growth(levels, process, seen) or seen
@@ -153,6 +157,12 @@ def checkpoint(asset, tmp_path, monkeypatch):
     return tmp_path / "levels"
 
 
+@pytest.fixture(scope="module")
+def expected(asset, tmp_path_factory):
+    """The bytes of a build that nothing interrupts."""
+    return bytes_of(build_bundle(asset, config=QUICK, progress=False), tmp_path_factory.mktemp("expected"))
+
+
 def test_finished_levels_are_not_built_again(asset, checkpoint, monkeypatch):
     def fail(*_):
         raise AssertionError("built a level again")
@@ -161,14 +171,62 @@ def test_finished_levels_are_not_built_again(asset, checkpoint, monkeypatch):
     assert build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint).num_levels > 3
 
 
-def test_level_that_was_cut_off_is_built_again(asset, checkpoint, tmp_path):
-    whole = checkpoint.read_bytes()
-    expected = bytes_of(build_bundle(asset, config=QUICK, progress=False), tmp_path)
-    for num_bytes in (0, 1, 20, 100, len(whole) // 2, len(whole) - 1):
-        checkpoint.write_bytes(whole[:num_bytes])
+def test_level_that_was_cut_off_is_built_again(asset, checkpoint, expected):
+    left = checkpoint.read_bytes()
+    journal = np.linspace(len(expected), len(left) - 1, 9).astype(int)
+    for num_bytes in (0, 1, 20, 100, len(expected) // 2, len(expected) - 1, *journal):
+        checkpoint.write_bytes(left[:num_bytes])
         bundle = build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
-        assert bytes_of(bundle, tmp_path) == expected
-        assert checkpoint.read_bytes() == whole
+        assert bundle.path == str(checkpoint)
+        assert checkpoint.read_bytes() == expected
+
+
+FINISHING = {
+    "tables": ("v3dg.bundle.file.BundlePlan.write_tables", 1),
+    "the end of the header": ("v3dg._files.write_at", 2),
+    "the header": ("v3dg.bundle.file.BundlePlan.write_header", 1),
+    "the journal": ("os.ftruncate", 1),
+}
+
+
+@pytest.mark.parametrize("place", FINISHING)
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_a_kill_while_it_becomes_a_bundle_loses_nothing(
+    asset, checkpoint, expected, place, moment, monkeypatch
+):
+    """Before or after any of the steps; nothing is built again."""
+    target, calls = FINISHING[place]
+    *_, name = target.split(".")
+    original = {
+        "write_tables": BundlePlan.write_tables,
+        "write_header": BundlePlan.write_header,
+        "write_at": _files.write_at,
+        "ftruncate": os.ftruncate,
+    }[name]
+    left = [calls]
+
+    def killed(*arguments):
+        left[0] -= 1
+        if left[0] > 0 or moment == "after":
+            original(*arguments)
+        if left[0] == 0:
+            raise KeyboardInterrupt
+
+    def fail(*_):
+        raise AssertionError("built a level again")
+
+    monkeypatch.setattr("v3dg.build.simplify._simplify", fail)
+    with monkeypatch.context() as patch:
+        patch.setattr(target, killed)
+        with pytest.raises(KeyboardInterrupt):
+            build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
+    build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
+    assert checkpoint.read_bytes() == expected
+
+
+def test_what_is_unfinished_is_no_bundle(asset, checkpoint):
+    with pytest.raises(ValueError, match="levels: expected a bundle, got one that is not finished"):
+        v3dg.Bundle.open(checkpoint)
 
 
 @pytest.mark.parametrize("changed", ["asset", "config", "seed", "device", "version"])
@@ -184,19 +242,19 @@ def test_checkpoint_of_another_build_is_refused(asset, checkpoint, changed, monk
     elif changed == "device":
         monkeypatch.setattr("v3dg._device.describe", lambda _: "another")
     else:
-        monkeypatch.setattr("v3dg.build.checkpoint.__version__", "0.0.0")
+        monkeypatch.setattr("v3dg.build.unfinished.__version__", "0.0.0")
     with pytest.raises(ValueError, match="another asset, config, seed, device or version; remove it"):
         build_bundle(asset, config=config, seed=seed, progress=False, resume_path=checkpoint)
     assert checkpoint.read_bytes() == before
 
 
-def test_damaged_checkpoint_is_named(asset, checkpoint, tmp_path):
+def test_damaged_checkpoint_is_named(asset, checkpoint, expected):
     good = checkpoint.read_bytes()
-    expected = bytes_of(build_bundle(asset, config=QUICK, progress=False), tmp_path)
     rng = np.random.default_rng(0)
     damaged = {"text": b"not levels", "zeros": bytes(1000), "archive": b"PK\x03\x04" + bytes(1000)}
-    # The last levels, at the end, are mostly numbers of clusters and digests.
-    for place in (*rng.integers(0, len(good), 20), *rng.integers(len(good) - 3000, len(good), 30)):
+    pages, journal = rng.integers(0, len(expected), 30), rng.integers(len(expected), len(good), 30)
+    # The first bytes, pages, the journal; at its end are mostly numbers of clusters and digests.
+    for place in (*range(0, 42, 7), *pages, *journal, *rng.integers(len(good) - 500, len(good), 20)):
         flipped = bytearray(good)
         flipped[place] ^= 1 << rng.integers(8)
         damaged[f"bit flipped in byte {place} of {len(good)}"] = bytes(flipped)
@@ -204,11 +262,11 @@ def test_damaged_checkpoint_is_named(asset, checkpoint, tmp_path):
     for damage, content in damaged.items():
         checkpoint.write_bytes(content)
         try:
-            bundle = build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
+            build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
         except ValueError as error:
             refused.append(str(error))
-        else:  # one that makes a level look cut off
-            assert bytes_of(bundle, tmp_path) == expected, damage
+        else:  # one that makes a level look cut off, or is where the header and tables will be
+            assert checkpoint.read_bytes() == expected, damage
     assert len(refused) > len(damaged) / 2
     assert [message for message in refused if not message.endswith("remove it to start again")] == []
 
@@ -227,7 +285,7 @@ def test_resume_path_needs_a_folder(asset, tmp_path):
 def test_a_second_build_to_the_same_place_is_refused(asset, tmp_path):
     """And the first goes on undisturbed."""
     with started_build(ENDLESS, "cpu", tmp_path) as process:
-        wait_for_growth(tmp_path / "levels", process, before=-1)
+        wait_for_growth(tmp_path / "levels", process)
         for use in (
             lambda: build_bundle(asset, config=QUICK, progress=False, resume_path=tmp_path / "levels"),
             lambda: v3dg.build.discard_levels(tmp_path / "levels"),
@@ -285,7 +343,7 @@ def test_a_lock_on_a_file_that_was_removed_is_none(tmp_path, monkeypatch):
         locked.append(name)
 
     locked = []
-    monkeypatch.setattr("v3dg.build.checkpoint.lock", lock)
+    monkeypatch.setattr("v3dg.build.unfinished.lock", lock)
     with _open_locked(path) as file:
         assert os.path.samestat(os.fstat(file.fileno()), path.stat())
     assert len(locked) == 2
@@ -312,16 +370,16 @@ def files_of_at_most(num_bytes):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_full_disk_leaves_whole_levels(asset, checkpoint, tmp_path):
+def test_a_full_disk_leaves_what_can_be_gone_on_with(asset, checkpoint, expected):
+    """Or nothing, where no level was finished."""
     whole = checkpoint.read_bytes()
-    expected = bytes_of(build_bundle(asset, config=QUICK, progress=False), tmp_path)
-    for num_bytes in (0, 10, 1000, len(whole) // 2, len(whole) - 1):
+    journal = np.linspace(len(expected), len(whole) - 1, 5).astype(int)
+    for num_bytes in (0, 10, 1000, len(expected) // 2, *journal):
         checkpoint.unlink(missing_ok=True)
         with files_of_at_most(num_bytes), pytest.raises(OSError, match=r"File too large: '.*levels'"):
             build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
         left = checkpoint.read_bytes() if checkpoint.exists() else b""
-        assert whole.startswith(left)
         assert len(left) <= num_bytes
-        bundle = build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
-        assert bytes_of(bundle, tmp_path) == expected
-        assert checkpoint.read_bytes() == whole
+        assert len(left) == 0 or len(left) > len(expected)
+        build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
+        assert checkpoint.read_bytes() == expected

@@ -239,7 +239,7 @@ def test_arrays_that_tables_were_made_of_stay_their_owner_s(saved):
 
 
 def test_threads_read_large_bundles(tmp_path, monkeypatch):
-    monkeypatch.setattr("v3dg.bundle.pages._BYTES_PER_TASK", 4096)
+    monkeypatch.setattr("v3dg.bundle.file._BYTES_PER_TASK", 4096)
     bundle = random_bundle(1, num_levels=6, sh_degree=1, max_cluster=100)
     path = tmp_path / "a.v3dg"
     bundle.write(path)
@@ -350,7 +350,7 @@ def test_a_sparse_file_of_ten_gigabytes_opens(tmp_path, reads):
     bundle = Bundle.open(path)
     assert bundle.info()["bytes"] == path.stat().st_size
     assert reads.num_bytes < 100_000
-    with pytest.raises(ValueError, match=r"large.v3dg: page 7 \(clusters 7 to 7\): the hash does not match"):
+    with pytest.raises(ValueError, match=r"large.v3dg: page 7 \(gaussians \d+ to \d+\): the hash does not"):
         bundle.cluster_gaussians(7)
     assert reads.num_bytes < 100_000 + page_file_bytes
 
@@ -395,7 +395,8 @@ def test_other_pages_of_a_damaged_file_can_be_read(saved):
     path.write_bytes(data)
     opened = Bundle.open(path)
     clusters = opened.page_range(page)
-    message = rf"small\.v3dg: page {page} \(clusters {clusters[0]} to {clusters[-1]}\): the hash does not"
+    first, last = bundle.clusters.offset[[clusters[0], clusters[-1] + 1]]
+    message = rf"small\.v3dg: page {page} \(gaussians {first} to {last - 1}\): the hash does not"
     with pytest.raises(ValueError, match=message):
         opened.read_page(page)
     for other in set(range(opened.num_pages)) - {page}:

@@ -18,7 +18,7 @@ import v3dg
 from v3dg import BuildConfig, Gaussians, _core, _files, cleaning
 from v3dg.build import external_split
 from v3dg.build import leaves_on_disk as on_disk
-from v3dg.build.checkpoint import digest_of
+from v3dg.build.digest import digest_of
 from v3dg.build.leaves import MemoryLeaves
 from v3dg.build.leaves_on_disk import DiskLeaves, leaves_on_disk
 from v3dg.build.scratch import RowFile

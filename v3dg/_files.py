@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator
@@ -20,42 +20,56 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str], *, is_locked: bool = False) -> Iterator[str]:
+def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
     """Give an empty file beside `path` to write to; at the end it replaces `path`, on failure it is removed.
 
     What is written is on the disk before it gets its name, and has the permissions of what it replaces, and
     the owner and group where the system allows it. A link at `path` stays a link, to the new file; at the
-    name beside it, none is followed. Where the caller sees to it that no other writes to `path` meanwhile,
-    that name is always the same, and what a killed program left there is removed.
+    name beside it, none is followed.
 
     A folder is an IsADirectoryError, what may not be written to a PermissionError, a device or a pipe a
     ValueError; an OSError of writing has `path` for the file's name.
     """
     path = os.fspath(path)  # a number would stand for an open file
-    replaced = _status_of_file(path)
-    target = os.path.realpath(path)
-    folder, name = os.path.split(target)
-    own = hashlib.blake2b(os.fsencode(os.path.abspath(path)), digest_size=8).hexdigest()
+    status_of_replaced(path)
+    folder, name = os.path.split(os.path.realpath(path))
     # The start of the name only: a name may have 255 bytes, and a character up to four.
-    temporary = os.path.join(folder, f".{name[:40]}.{own if is_locked else secrets.token_hex(8)}.tmp")
+    temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
     with naming_errors(path, temporary):
-        if is_locked:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(temporary)
         # Nobody may read what replaces a private file before it has the permissions of that.
-        os.close(os.open(temporary, _NEW_FILE, 0o666 if replaced is None else 0o600))
+        os.close(os.open(temporary, _NEW_FILE, 0o600))
         try:
             yield temporary
-            _finish(temporary, replaced)
-            os.replace(temporary, target)
+            put_in_place(temporary, path)
         except BaseException:
             with contextlib.suppress(FileNotFoundError, NotADirectoryError):
                 os.unlink(temporary)
             raise
 
 
-def _status_of_file(path: str | os.PathLike[str]) -> os.stat_result | None:
-    """Of what is to be replaced, if there is something and it may be."""
+def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
+    """Bring a file that only its owner may read to the disk and to `path`, with what is permitted there."""
+    replaced = status_of_replaced(path)
+    with naming_errors(path, os.fspath(private)):
+        descriptor = os.open(private, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            if replaced is None:
+                status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+                found = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
+                os.fchmod(descriptor, 0o666 & ~int(found[1] if found else "077", 8))
+            else:
+                for owner, group in ((-1, replaced.st_gid), (replaced.st_uid, -1)):
+                    with contextlib.suppress(OSError):
+                        os.fchown(descriptor, owner, group)
+                os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        os.replace(private, os.path.realpath(path))
+
+
+def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
+    """Of what is to be replaced, if there is something and it may be; errors as `replacing`."""
     try:
         status = os.stat(path)
     except FileNotFoundError:
@@ -67,20 +81,6 @@ def _status_of_file(path: str | os.PathLike[str]) -> os.stat_result | None:
     # Renaming asks the folder alone; that the file itself may be written to, opening it finds out.
     os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
     return status
-
-
-def _finish(path: str, replaced: os.stat_result | None) -> None:
-    """Bring a new file to the disk, with the permissions of what it replaces."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        if replaced is not None:
-            for owner, group in ((-1, replaced.st_gid), (replaced.st_uid, -1)):
-                with contextlib.suppress(OSError):
-                    os.fchown(descriptor, owner, group)
-            os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @contextlib.contextmanager

@@ -128,11 +128,7 @@ class BuildConfig:
             raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
 
     def check_views(self, most_gaussians: int) -> None:
-        """Refuse views that are too large, where groups are simplified to at most so many gaussians.
-
-        Raises:
-            ValueError: A view, or all that are kept of a group, have too many pixels.
-        """
+        """Refuse, with ValueError, views of too many pixels for groups of at most so many gaussians."""
         side, name = self.image_size, "image_size"
         if side == 0:  # as fit_view() of the core has it
             name, x2 = "px2_per_gaussian", self.distance**-2

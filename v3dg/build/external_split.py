@@ -1,8 +1,7 @@
 """The median split of more points than memory holds.
 
-A node that does not fit in memory is split in passes over its points: for the longest side of its box, twice
-for the median of that axis (the upper and the lower half of its bits), and once to move the points. That is
-64 bytes read and 16 written for each point of the node. A node that fits is read once and split by the core.
+A node that does not fit is split in passes over its points: for the longest side of its box, twice for the
+median of that axis (the upper and the lower half of its bits), and once to move the points.
 """
 
 from __future__ import annotations
@@ -36,10 +35,7 @@ def points_of(means: npt.NDArray[np.float32], index: npt.NDArray[np.integer]) ->
 def split(files: tuple[RowFile, RowFile], count: int, depth: int, num_fitting: int, order: RowFile) -> None:
     """Write the indices of points in the order of `_core.median_split`, with which it agrees in every bit.
 
-    Args:
-        files: Of points: the first `count` rows of one, by ascending index, finite; the other is for passes.
-        num_fitting: Most points of a node that is split in memory.
-        order: Of indices, to write to.
+    The first `count` rows of one file have the points, finite, by ascending index; the other is for passes.
     """
     todo = [(0, count, depth, 0)]
     while todo:

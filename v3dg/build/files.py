@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from contextlib import nullcontext, suppress
-from functools import partial
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, Literal
 
 from v3dg import _files
 from v3dg._device import Device
-from v3dg.build.checkpoint import discard_levels
 from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import MemoryLeaves, made_with
 from v3dg.build.leaves_on_disk import leaves_on_disk
 from v3dg.build.memory import in_bytes, most_units, unit_bytes
+from v3dg.build.unfinished import discard_levels
 from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle
-from v3dg.bundle.file import writing
 from v3dg.gaussians import Gaussians
 
 AssetPath = str | os.PathLike[str]
@@ -36,11 +35,12 @@ def build_file(
     resume: bool = False,
     unusable: Literal["drop", "refuse"] = "drop",
     memory: int | str | None = None,
+    executor: Executor | None = None,
 ) -> tuple[Bundle, bool]:
     """Build the bundle of an asset's file, or of several that make one asset, straight into a file.
 
-    Until the bundle is there, finished levels are kept at `levels_path`. An asset that does not fit in memory
-    is brought into order in a scratch folder beside the bundle, which is removed.
+    Until it is whole, the bundle is at `levels_path`. An asset that does not fit in memory is brought into
+    order in a scratch folder beside it, which is removed.
 
     Args:
         asset: What is in the asset's file, where it is in memory already.
@@ -48,7 +48,7 @@ def build_file(
             from the levels of a build that was interrupted; otherwise all is made anew.
         memory: Of the host, for the build beside what the process has: bytes, or text like "8GiB". By default
             half of what is free.
-        config, seed, progress, device, unusable: As for `build_bundle`.
+        config, seed, progress, device, unusable, executor: As for `build_bundle`.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
@@ -60,30 +60,39 @@ def build_file(
     paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
     bundle_path = Path(bundle_path)
     config = config or BuildConfig()
-    levels, scratch = levels_path(bundle_path), bundle_path.with_name(bundle_path.name + ".scratch")
-    _files.check_folder(bundle_path)
+    levels = levels_path(bundle_path)
+    _files.check_folder(levels)
+    _files.status_of_replaced(bundle_path)
     devices, num_bytes = devices_for(device, asset), in_bytes(memory)  # before anything is read
     if not resume:
         discard_levels(levels)
     where: dict[str, Any] = {"config": config, "unusable": unusable, "device": devices[0]}
+    bounds: dict[str, Any] = {"memory": num_bytes, "reserved": unit_bytes, "progress": progress}
+    if executor is not None:
+        bounds["most_in_memory"] = 0  # where workers would not find them
+    with (
+        _naming_asset(paths[0]),
+        nullcontext(MemoryLeaves(asset, **where))
+        if asset is not None
+        else leaves_on_disk(paths, levels.with_suffix(".scratch"), **bounds, **where) as leaves,
+    ):
+        del asset
+        if resume and _is_made_with(bundle_path, made_with(leaves, config, seed)):
+            with suppress(RuntimeError):  # another build to the same place has begun
+                discard_levels(levels)
+            return Bundle.open(bundle_path), False
+        at: dict[str, Any] = {"bundle_path": bundle_path, "most_units": most_units(num_bytes, leaves)}
+        return build_into(levels, leaves, config, seed, devices, progress, executor=executor, **at), True
+
+
+@contextmanager
+def _naming_asset(path: AssetPath) -> Iterator[None]:
+    """Have errors of an asset begin with the name of its file."""
     try:
-        with (
-            leaves_on_disk(paths, scratch, memory=num_bytes, reserved=unit_bytes, progress=progress, **where)
-            if asset is None
-            else nullcontext(MemoryLeaves(asset, **where))
-        ) as leaves:
-            del asset
-            is_kept = resume and _is_made_with(bundle_path, made_with(leaves, config, seed))
-            if not is_kept:
-                # The levels beside the bundle are locked, so no other build writes to it.
-                sink, most = partial(writing, bundle_path, is_locked=True), most_units(num_bytes, leaves)
-                build_into(sink, leaves, config, seed, devices, progress, levels, most)
+        yield
     except ValueError as error:
-        place = f"{os.fspath(paths[0])}: " if str(error).startswith("asset: ") else ""
+        place = f"{os.fspath(path)}: " if str(error).startswith("asset: ") else ""
         raise ValueError(f"{place}{error}") from None
-    with suppress(RuntimeError):  # another build to the same place has begun
-        discard_levels(levels)
-    return Bundle.open(bundle_path), not is_kept
 
 
 def _is_made_with(bundle_path: Path, how: dict[str, Any]) -> bool:
@@ -95,6 +104,8 @@ def _is_made_with(bundle_path: Path, how: dict[str, Any]) -> bool:
 
 
 def levels_path(bundle_path: str | os.PathLike[str]) -> Path:
-    """Where `build_file` keeps finished levels until the bundle is there."""
+    """The file that `build_file` makes the bundle in; from there an interrupted build goes on."""
     path = Path(bundle_path)
+    if path.is_symlink():  # beside what it leads to, which it is to replace
+        path = Path(os.path.realpath(path))
     return path.with_name(path.name + ".partial")

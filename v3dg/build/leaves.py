@@ -16,8 +16,8 @@ import numpy.typing as npt
 from v3dg import _core, _device, cleaning
 from v3dg._device import Device
 from v3dg._numbers import one_of
-from v3dg.build.checkpoint import digest_of
 from v3dg.build.config import BuildConfig
+from v3dg.build.digest import digest_of
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
 Unusable = Literal["drop", "refuse"]
@@ -25,22 +25,14 @@ Unusable = Literal["drop", "refuse"]
 
 @dataclass(eq=False)
 class Leaves(ABC):
-    """Leaves of a build, wherever they are.
-
-    Attributes:
-        num_gaussians: Leaves.
-        asset_gaussians: Those of the asset, with those that cannot be drawn.
-        dropped: How many of each kind cannot be drawn, as `cleaning` counts them.
-        digest: Of the asset; docs/format.md has the definition.
-        resident_bytes: Memory of the host that they take as long as they are read.
-    """
+    """Leaves of a build, wherever they are, of an asset that also has what cannot be drawn."""
 
     num_gaussians: int
     asset_gaussians: int
     sh_degree: int
     dropped: dict[str, int]
     digest: str
-    resident_bytes: int
+    resident_bytes: int  # of the host, as long as they are read
 
     @abstractmethod
     def read(self, first: int, last: int) -> Gaussians:
@@ -48,18 +40,10 @@ class Leaves(ABC):
 
 
 class MemoryLeaves(Leaves):
-    """The leaves of an asset in memory, on any device, that are split on another when they are first read.
-
-    Raises:
-        ValueError: The asset has no gaussian that can be drawn; or wrong ones, and they are to be refused.
-    """
+    """The leaves of an asset in memory, on any device, that are split on another when they are first read."""
 
     def __init__(
-        self,
-        asset: Gaussians,
-        config: BuildConfig,
-        unusable: Unusable = "drop",
-        device: Device = _device.CPU,
+        self, asset: Gaussians, config: BuildConfig, unusable: Unusable = "drop", device: Device = _device.CPU
     ) -> None:
         if str(asset.means.dtype).endswith("64"):
             raise ValueError("asset: expected float32 arrays, got float64; convert them first")
@@ -93,11 +77,7 @@ class MemoryLeaves(Leaves):
 
 
 def made_with(leaves: Leaves, config: BuildConfig, seed: int) -> dict[str, Any]:
-    """What the config of a bundle says of how it was made.
-
-    Raises:
-        ValueError: The seed is out of range.
-    """
+    """What the config of a bundle says of how it was made."""
     seed = operator.index(seed)
     if not 0 <= seed < 2**58:
         raise ValueError(f"seed: expected 0 to 2^58 - 1, got {seed}")

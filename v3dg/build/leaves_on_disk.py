@@ -2,10 +2,7 @@
 
 An asset that does not fit in memory is read twice, in blocks. The first time its means go to scratch files,
 where they are split (`external_split`) as far as into *buckets*, nodes that are small enough to be sorted
-when they are read. The second time every gaussian goes to its bucket. Of P bytes a gaussian in memory (56 at
-SH degree 0, 236 at degree 3) and F in the input, that reads 2 F and writes P + 16. For the split and the way
-to the buckets it reads 24 and writes 4, and for each halving of a node that does not fit in memory it reads
-64 and writes 16. The scratch folder takes up to P + 4 bytes a gaussian.
+when they are read. The second time every gaussian goes to its bucket. docs/size.md counts the bytes.
 """
 
 from __future__ import annotations
@@ -26,15 +23,14 @@ import numpy.typing as npt
 from v3dg import _core
 from v3dg._device import CPU, Device
 from v3dg.build import external_split
-from v3dg.build.checkpoint import PIECE, digest_of_hashes, new_pool, parts_of
 from v3dg.build.config import BuildConfig
+from v3dg.build.digest import PIECE, digest_of_hashes, hash_of, new_pool, pieces_of
 from v3dg.build.leaves import Leaves, MemoryLeaves, Tally, Unusable
 from v3dg.build.memory import in_mib
 from v3dg.build.plan import halved
 from v3dg.build.progress import bar_of_gaussians
 from v3dg.build.scratch import RowFile, scratch_folder
 from v3dg.bundle.codec import Codec
-from v3dg.bundle.format import page_hash
 from v3dg.formats._asset_file import AssetFile
 from v3dg.gaussians import Gaussians, gaussian_bytes
 from v3dg.io import open_asset
@@ -43,6 +39,7 @@ _MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few are rea
 _MOST_IN_BLOCK_BYTES = 1 << 28  # more would not be faster: rows are taken from all over a block
 _SENT_AT_ONCE = 1 << 12  # gaussians that a thread brings to a bucket
 _OVERHEAD_BYTES = 24 << 20
+_CHANGED = "expected the file not to change while it is read, got another one"
 _NAMES = ("points", "spare", "order", "rows")
 
 _Blocks = Iterator[tuple[int, Gaussians]]
@@ -50,10 +47,7 @@ _Blocks = Iterator[tuple[int, Gaussians]]
 
 @dataclass(eq=False)
 class DiskLeaves(Leaves):
-    """Leaves in a scratch folder, for as long as that is there; can be pickled and read by many at once.
-
-    A read needs memory for what it returns and for about two buckets: `resident_bytes`.
-    """
+    """Leaves in a scratch folder, for as long as that is there; can be pickled and read by many at once."""
 
     path: Path
     _bucket_offset: npt.NDArray[np.int64]
@@ -89,29 +83,12 @@ def leaves_on_disk(
     reserved: Callable[[int, int], int] = lambda num_gaussians, sh_degree: 0,
     device: Device = CPU,
     progress: bool = False,
+    most_in_memory: int = 1 << 32,
 ) -> Iterator[Leaves]:
     """The leaves of the asset that some files make together, one after the other, within so much memory.
 
-    Their order is that of the median split of all of them, whatever the memory. Files of a lower SH degree
-    than others get zeros for the coefficients that they lack, which changes no colour.
-
-    Args:
-        paths: Of at least one file of any kind that `read_asset` reads.
-        folder: For scratch, where the asset does not fit in memory: made, and removed at the end. What a
-            killed build left there is removed first.
-        memory: Bytes beside what the process already has, until the leaves are there. Reading leaves then
-            takes what `DiskLeaves` says.
-        reserved: Of the memory, what is for others from the beginning, by gaussians and SH degree.
-        device: Where an asset that fits in memory is split.
-        unusable: As for `build_bundle`.
-        progress: Show a bar with the gaussians read.
-
-    Raises:
-        ValueError: A file is none of these; nothing in them can be drawn; or memory is too little, and the
-            message says how much is needed.
-        OSError: A file cannot be read; or the disk of `folder` is too small for the scratch, which is told
-            before work begins, or full.
-        RuntimeError: Another build is using the folder.
+    Their order is that of the median split of all of them, whatever the memory, of which `reserved` tells
+    what is for others. The scratch folder is made where it is needed, and removed at the end.
     """
     tiles = [_Tile.of(path) for path in paths]
     count = sum(tile.num_gaussians for tile in tiles)
@@ -120,11 +97,10 @@ def leaves_on_disk(
     degree = max(tile.sh_degree for tile in tiles)
     sizes = _Sizes.of(memory, reserved(count, degree), degree, tiles)
     folder = Path(folder)
-    fits = count <= sizes.in_memory
+    fits = count <= min(sizes.in_memory, most_in_memory)
     # Where none is needed, what a killed build left is removed.
     scratch = nullcontext() if fits and not os.path.lexists(folder) else scratch_folder(folder, _NAMES)
-    is_visible = progress and not fits
-    with scratch, bar_of_gaussians(2 * count, is_visible, desc="reading", leave=False) as bar:
+    with scratch, bar_of_gaussians(2 * count, progress and not fits, desc="reading", leave=False) as bar:
         if fits:
             buffer = Codec(degree).empty(count)
             for _ in _blocks(tiles, buffer, bar):
@@ -155,22 +131,13 @@ class _Tile:
     def open(self) -> AssetFile:
         file = open_asset(self.path)
         if (file.num_gaussians, file.sh_degree) != (self.num_gaussians, self.sh_degree):
-            raise _changed(self.path)
+            raise ValueError(f"{os.fspath(self.path)}: {_CHANGED}")
         return file
-
-
-def _changed(path: str | os.PathLike[str]) -> ValueError:
-    return ValueError(f"{os.fspath(path)}: expected the file not to change while it is read, got another one")
 
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Most gaussians that fit: of the asset in memory at once, in a block of the input, and in the splits.
-
-    Attributes:
-        in_node: Of a node that is split in memory.
-        in_bucket: Of a node that is sorted when it is read.
-    """
+    """Most gaussians that fit: of the asset at once, in a block, in a node that is split, in a bucket."""
 
     in_memory: int
     in_block: int
@@ -179,11 +146,7 @@ class _Sizes:
 
     @staticmethod
     def of(memory: int, reserved: int, degree: int, tiles: Sequence[_Tile]) -> _Sizes:
-        """What fits in so much memory.
-
-        Raises:
-            ValueError: Too little does.
-        """
+        """What fits in so much memory; ValueError where too little does."""
         gaussian = gaussian_bytes(degree)
         # Beside the block, a piece of it as it is decoded, in double precision.
         overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
@@ -288,15 +251,12 @@ def _sort_on_disk(
         again = _write_rows(blocks, order_file, ends, row_file)
     order.unlink()
     if again != digest:
-        raise _changed(tiles[0].path if len(tiles) == 1 else f"one of {len(tiles)} files")
+        which = os.fspath(tiles[0].path) if len(tiles) == 1 else f"one of {len(tiles)} files"
+        raise ValueError(f"{which}: {_CHANGED}")
     bar.close()
     bucket_bytes = int(np.diff(offset).max()) * _bytes_in_bucket(degree)
     about = count, tally.num_gaussians, degree, tally.counts, digest, bucket_bytes
-    return DiskLeaves(*about, rows, offset, depth - bucket_depth)
-
-
-def _hash(part: Gaussians) -> bytes:
-    return page_hash(vars(part).values())
+    return DiskLeaves(*about, rows.absolute(), offset, depth - bucket_depth)
 
 
 def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
@@ -304,14 +264,14 @@ def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
     hashes: list[bytes] = []
     with new_pool() as pool:
         for first, block in blocks:
-            parts = parts_of(block)
-            hashes += pool.map(_hash, parts)
-            for number, part in enumerate(parts):
+            pieces = pieces_of(block)
+            hashes += pool.map(hash_of, pieces)
+            for number, piece in enumerate(pieces):
                 end = tally.num_drawable
-                row = np.flatnonzero(tally.add(part))
+                row = np.flatnonzero(tally.add(piece))
                 index = first + number * PIECE + row
-                points.write(end, external_split.points_of(part.means[row], index))
-    return digest_of_hashes(hashes).hex()
+                points.write(end, external_split.points_of(piece.means[row], index))
+    return digest_of_hashes(hashes)
 
 
 def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], rows: RowFile) -> str:
@@ -319,7 +279,7 @@ def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], ro
     hashes: list[bytes] = []
     with new_pool() as pool:
         for number, (first, block) in enumerate(blocks):
-            hashes += pool.map(_hash, parts_of(block))
+            hashes += pool.map(hash_of, pieces_of(block))
             arrays = [array.reshape(len(block), -1) for array in vars(block).values()]
 
             def send(begin: int, end: int, first: int = first, arrays: Any = arrays) -> None:
@@ -330,7 +290,7 @@ def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], ro
                     rows.write(start, np.concatenate(columns, axis=1))
 
             deque(pool.map(send, ends[:, number].tolist(), ends[:, number + 1].tolist()), maxlen=0)
-    return digest_of_hashes(hashes).hex()
+    return digest_of_hashes(hashes)
 
 
 def _ends_in_buckets(

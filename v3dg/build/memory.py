@@ -19,11 +19,7 @@ _LEAF_BYTES, _LEAF_COPIES = 320, 2.5
 
 
 def in_bytes(memory: int | str | None) -> int:
-    """An amount of memory: bytes, or text like "8GiB"; None is half of what is free.
-
-    Raises:
-        ValueError: It is neither.
-    """
+    """An amount of memory: bytes, or text like "8GiB"; None is half of what is free."""
     if memory is None:
         return _free_bytes() // 2
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", str(memory), re.IGNORECASE)

@@ -21,20 +21,13 @@ class LevelPlan:
     """One level, or a run of its groups: C clusters made by G groups, each of as many clusters.
 
     At level 0 every cluster is a group of its own.
-
-    Attributes:
-        first_group: Number of the first group in the level of the whole asset.
-        offset: (C + 1,) gaussians of each cluster.
-        group_offset: (G + 1,) gaussians that each group is simplified to.
-        leaf_offset: (G + 1,) gaussians of level 0 under each group.
-        weight: (G,) float32, of the footprint.
     """
 
-    first_group: int
-    offset: Offsets
-    group_offset: Offsets
-    leaf_offset: Offsets
-    weight: npt.NDArray[np.float32]
+    first_group: int  # its number in the level of the whole asset
+    offset: Offsets  # (C + 1,) gaussians of each cluster
+    group_offset: Offsets  # (G + 1,) gaussians that each group is simplified to
+    leaf_offset: Offsets  # (G + 1,) gaussians of level 0 under each group
+    weight: npt.NDArray[np.float32]  # (G,) of the footprint
 
     @property
     def num_clusters(self) -> int:
@@ -83,14 +76,16 @@ class Plan:
         levels = ((below, below.num_groups // top) for below in self.levels[: level + 1])
         return Plan(tuple(below.groups(first_group * n, last_group * n) for below, n in levels))
 
-    def units(self, most_leaves: int) -> Units:
-        """Cut the plan into runs of groups of one level, each above no more leaves than so many."""
-        num_leaves = self.levels[0].num_gaussians
-        num_units = 1 << max(0, math.ceil(num_leaves / most_leaves) - 1).bit_length()
-        level = max(n for n, here in enumerate(self.levels) if here.num_groups >= num_units)
-        each = self.levels[level].num_groups // num_units
-        plans = tuple(self.subtree(level, i * each, (i + 1) * each) for i in range(num_units))
-        return Units(level, plans)
+    def units(self, most_leaves: int) -> list[Plan]:
+        """Cut the plan into parts that share no page, each above so many leaves at most where it can."""
+        wanted = 1 << max(0, math.ceil(self.levels[0].num_gaussians / most_leaves) - 1).bit_length()
+        if wanted == 1 or len(self.levels) == 1:
+            return [self]
+        level = max(n for n, here in enumerate(self.levels) if n < 2 or here.num_groups >= wanted)
+        num_groups = self.levels[level].num_groups
+        each = max(1, num_groups // wanted)
+        trees = (self.subtree(level, first, first + each) for first in range(0, num_groups, each))
+        return [Plan(tree.levels[:-1]) for tree in trees]
 
     @property
     def first_page(self) -> list[int]:
@@ -110,14 +105,6 @@ class Plan:
             clusters.append(np.full(count, each, np.int64))
             gaussians.append(np.diff(level.offset[::each]))
         return PageLayout(_offset_of(np.concatenate(clusters)), _offset_of(np.concatenate(gaussians)))
-
-
-@dataclass(frozen=True, eq=False)
-class Units:
-    """The parts of a plan that are built alone: the subtrees under equal runs of the groups of one level."""
-
-    level: int
-    plans: tuple[Plan, ...]
 
 
 def _next_shape(below: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:

@@ -23,30 +23,22 @@ class Stopped(Exception):
 
 
 class Bar:
-    """One bar over all levels; it advances by fitted gaussians, which is what time goes with.
-
-    Parts of the plan may be built on threads of their own.
-
-    Args:
-        initial: Gaussians of levels that were built before.
-    """
+    """One bar over all levels; it advances by fitted gaussians, which is what time goes with."""
 
     def __init__(self, plan: Plan, initial: int, is_visible: bool) -> None:
-        self._total = sum(level.num_gaussians for level in plan.levels[1:])
+        total = sum(level.num_gaussians for level in plan.levels[1:])
         self._last_level = len(plan.levels) - 1
         self._initial = initial
-        self._is_visible = is_visible
         self._fitted: dict[tuple[int, int], float] = {}  # by part and first level
         self._lock = threading.Lock()
-        self._bar: Any = None
+        self._bar = bar_of_gaussians(total, is_visible, initial=initial, smoothing=0.1)
         self._is_stopped = False
 
     def __enter__(self) -> Bar:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
+        self._bar.close()
 
     def stop(self) -> None:
         """Let every thread that shows something find out that the build has failed."""
@@ -58,16 +50,21 @@ class Bar:
         def show(levels: range, num_groups: int, num_gaussians: int, state: _core.FitProgress) -> None:
             if self._is_stopped:
                 raise Stopped
+            self._update((part, levels[0]), num_gaussians * state.groups_done / num_groups)
             with self._lock:
-                self._fitted[part, levels[0]] = num_gaussians * state.groups_done / num_groups
-                if self._bar is None:
-                    self._bar = bar_of_gaussians(
-                        self._total, self._is_visible, initial=self._initial, smoothing=0.1
-                    )
                 self._bar.set_description(f"level {levels[-1]}/{self._last_level}", refresh=False)
                 if (done := state.groups_done) > 0:
                     text = f"groups {done}/{num_groups}, loss {state.loss_sum / done:.4f}"
                     self._bar.set_postfix_str(text, refresh=False)
-                    self._bar.update(self._initial + int(sum(self._fitted.values())) - self._bar.n)
 
         return show
+
+    def add(self, part: int, level: int, num_gaussians: int) -> None:
+        """Count a level that was made elsewhere."""
+        if level > 0:
+            self._update((part, level), num_gaussians)
+
+    def _update(self, key: tuple[int, int], num_gaussians: float) -> None:
+        with self._lock:
+            self._fitted[key] = num_gaussians
+            self._bar.update(self._initial + int(sum(self._fitted.values())) - self._bar.n)

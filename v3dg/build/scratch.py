@@ -17,11 +17,7 @@ from v3dg import _files
 
 
 class RowFile:
-    """A file of rows of one width, float32 or uint32, in the byte order of the machine.
-
-    Args:
-        must_be_new: Make the file, to write to; else open it, to read.
-    """
+    """A file of rows of one width, float32 or uint32, in the byte order of the machine."""
 
     def __init__(self, path: Path, width: int, dtype: npt.DTypeLike, *, must_be_new: bool = False) -> None:
         self.path = path
@@ -37,11 +33,7 @@ class RowFile:
         os.close(self._descriptor)
 
     def read(self, first: int, last: int) -> npt.NDArray[Any]:
-        """Rows `first` to `last`, (M, width); (M,) where the width is 1.
-
-        Raises:
-            OSError: They are not there, or cannot be read.
-        """
+        """Rows `first` to `last`, (M, width); (M,) where the width is 1."""
         rows = np.empty((last - first, self._width)[: 1 + (self._width > 1)], self._dtype)
         with _files.naming_errors(self.path):
             if not _files.read_at(self._descriptor, rows, first * self._row_bytes):
@@ -54,11 +46,7 @@ class RowFile:
             yield self.read(start, min(start + size, last))
 
     def write(self, first: int, rows: npt.NDArray[Any]) -> None:
-        """Write rows from row `first` on.
-
-        Raises:
-            OSError: The disk is full, or cannot be written to.
-        """
+        """Write rows from row `first` on."""
         data = np.ascontiguousarray(rows, self._dtype).reshape(-1).view(np.uint8).data
         with _files.naming_errors(self.path):
             _files.write_at(self._descriptor, data, first * self._row_bytes)
@@ -66,13 +54,7 @@ class RowFile:
 
 @contextmanager
 def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
-    """Make a folder for files of these names, empty at first and gone in the end, also after a killed run's.
-
-    Raises:
-        RuntimeError: Another run is using it.
-        ValueError: It has other files.
-        OSError: It cannot be made, or is a link.
-    """
+    """Make a folder for files of these names, empty at first, gone in the end, also after a killed run's."""
     folder.mkdir(mode=0o700, exist_ok=True)
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
@@ -92,17 +74,12 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
 
 
 def lock(descriptor: int, path: str | os.PathLike[str]) -> None:
-    """Keep other builds from what is open there until it is closed.
-
-    Raises:
-        RuntimeError: Another build is using it.
-    """
+    """Keep other builds from what is open there until it is closed."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        place = os.fspath(path)
         raise RuntimeError(
-            f"{place}: another build is using it; wait for it, or write to another place"
+            f"{os.fspath(path)}: another build is using it; wait for it, or write to another place"
         ) from None
     except OSError as error:
         # Some network file systems have no locks; there, two builds of one output are the user's to avoid.

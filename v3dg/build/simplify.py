@@ -25,19 +25,12 @@ Show = Callable[[range, int, int, _core.FitProgress], None]
 
 @dataclass(frozen=True, eq=False)
 class LevelTables:
-    """What was measured of a level, on the host; all else follows from the plan.
+    """What was measured of a level, on the host; all else follows from the plan."""
 
-    Attributes:
-        box: (C, 2, 3) float32, of what the clusters draw.
-        ball: (G, 4) float32, nested, for selection.
-        fit_ball: (G, 4) float32, as small as is known, which the fit looks at.
-        error: (G, 2) float32, residual of the fits.
-    """
-
-    box: npt.NDArray[np.float32]
-    ball: npt.NDArray[np.float32]
-    fit_ball: npt.NDArray[np.float32]
-    error: npt.NDArray[np.float32]
+    box: npt.NDArray[np.float32]  # (C, 2, 3), of what the clusters draw
+    ball: npt.NDArray[np.float32]  # (G, 4), nested, for selection
+    fit_ball: npt.NDArray[np.float32]  # (G, 4), as small as is known, which the fit looks at
+    error: npt.NDArray[np.float32]  # (G, 2), residual of the fits
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +50,12 @@ def build_levels(
     finished: Iterable[Level] = (),
     show: Show = lambda levels, num_groups, num_gaussians, state: None,
 ) -> Iterator[Level]:
-    """Yield all levels of a plan, one after another: the leaves first, as level 0.
+    """Yield all levels of a plan, one after another: the leaves first, as level 0; some may be `finished`.
 
     What a group becomes depends on the leaves under it, the config, the seed, its level and its number in
     the level, and on nothing else. So the plan may be of the whole asset or of any subtree: on the CPU, the
     same groups get the same bits. On CUDA, how many groups are fitted at once can change how a group is
     spread over the GPU, and thereby the last bits.
-
-    Args:
-        leaves: The gaussians of level 0 in the order of the median split, where the work is to be done.
-        finished: Levels from 1 on that need not be built again.
     """
     here = plan.levels[0]
     ball = _core.bound_spheres(_spheres(leaves), here.leaf_offset)
@@ -82,12 +71,7 @@ def build_levels(
 def build_above(
     below: dict[int, Level], plan: Plan, config: BuildConfig, seed: int, finished: Iterable[Level], show: Show
 ) -> Iterator[Level]:
-    """Yield the levels of a plan above others, one after another; as `build_levels` for the rest.
-
-    Args:
-        below: Levels by number, where the work is to be done: the last, and those before it that the next
-            ones are fitted to. Those that are no longer needed are taken out.
-    """
+    """Yield the levels of a plan above those of `below`, which keeps those that the next are fitted to."""
     saved = iter(finished)
     last = max(below)
     where = _device.of(below[last].gaussians.means)

@@ -1,29 +1,33 @@
-"""The build of a whole asset: its units on all devices, then what is above them, into a sink."""
+"""The build of a whole asset: its units on an executor, then what is above them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from v3dg import _device
 from v3dg._device import Device
 from v3dg.build.assemble import assemble
-from v3dg.build.checkpoint import Checkpoint
 from v3dg.build.config import BuildConfig
-from v3dg.build.leaves import Leaves, made_with
-from v3dg.build.plan import Plan, Units
+from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
+from v3dg.build.plan import Plan
 from v3dg.build.progress import Bar
-from v3dg.build.simplify import Level, LevelTables, build_above, build_levels
-from v3dg.bundle import Clusters, Groups
+from v3dg.build.simplify import Level, LevelTables, Show, build_above, build_levels
+from v3dg.build.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
+from v3dg.bundle import Bundle
 from v3dg.bundle.codec import Codec
-from v3dg.bundle.pages import PageLayout
+from v3dg.bundle.file import BundlePlan
+from v3dg.bundle.pages import PageRun
 from v3dg.gaussians import Gaussians
 
 # Leaves of a unit: enough to keep a GPU busy, and little memory. The last bits of a bundle depend on it.
@@ -31,19 +35,7 @@ UNIT_LEAVES = 1 << 20
 # Units that a GPU works on at once, so that others fill what the smallest levels of one leave idle.
 _UNITS_ON_GPU = 4
 
-
-class Sink(Protocol):
-    """Where finished pages go: `BundleWriter`, or memory."""
-
-    def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
-        """Take the gaussians of a run of pages."""
-
-    def finish(self, clusters: Clusters, groups: Groups) -> None:
-        """Take the tables, when all pages are there."""
-
-
-OpenSink: TypeAlias = Callable[[PageLayout, Codec, dict[str, Any]], AbstractContextManager[Sink]]
-"""Makes a sink for the pages of this layout and codec; the last argument says how the bundle is built."""
+_Levels = dict[int, FinishedLevel]
 
 
 def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[Device]:
@@ -57,46 +49,55 @@ def devices_for(device: str | Device, asset: Gaussians | None = None) -> list[De
 
 
 def build_into(
-    open_sink: OpenSink,
+    path: str | os.PathLike[str] | None,
     leaves: Leaves,
     config: BuildConfig,
     seed: int,
     devices: Sequence[Device],
     progress: bool,
-    resume_path: str | os.PathLike[str] | None,
+    *,
+    bundle_path: Path | None = None,
     most_units: int | None = None,
-) -> None:
-    """Build all levels of an asset into a sink; as `build_bundle` for the rest.
-
-    Args:
-        devices: Of one kind; the units are spread over them.
-        most_units: That may be in memory at once.
-    """
+    executor: Executor | None = None,
+) -> Bundle:
+    """Build all levels of an asset, in memory or in a file that replaces `bundle_path`; as `build_bundle`."""
     if not isinstance(progress, bool):
         raise TypeError(f"progress: expected True or False, got {progress!r}")
     plan = Plan.of(leaves.num_gaussians, config)
     config.check_views(max((np.diff(made.group_offset).max() for made in plan.levels[1:]), default=1))
     units = plan.units(UNIT_LEAVES)
-    codec = Codec(leaves.sh_degree)
-    how = made_with(leaves, config, seed)
-    parts = [dict(enumerate(part.levels)) for part in units.plans]
-    parts.append({n: level for n, level in enumerate(plan.levels) if n > units.level})
+    file = BundlePlan(plan.layout, Codec(leaves.sh_degree), made_with(leaves, config, seed))
+    parts = _parts(plan, units, file)
     with (
         _device.memory_errors(),
-        Checkpoint(resume_path, parts, leaves.sh_degree, how, devices[0]) as checkpoint,
-        open_sink(plan.layout, codec, how) as sink,
-        Bar(plan, checkpoint.num_gaussians, progress) as bar,
+        Unfinished(Path(path), file, parts, devices[0], bundle_path)
+        if path is not None
+        else nullcontext(MemoryStore(file)) as store,
     ):
-        build = _Build(config, how["seed"], plan, units, sink, checkpoint, bar)
-        sink.finish(*assemble(plan, build.all_levels(leaves, devices, most_units), config))
+        if not store.is_whole:
+            done = sum(parts[part][number][0].num_gaussians for part, number in store.levels if number > 0)
+            with Bar(plan, done, progress) as bar:
+                build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
+                tables, hashes = build.all_levels(leaves, devices, most_units, executor)
+            store.finish(*assemble(plan, tables, config), hashes)
+        return store.bundle()
 
 
-@dataclass(frozen=True, eq=False)
-class _Unit:
-    """What is left of a unit when its pages are written: all tables, and what the levels above need."""
+def _parts(plan: Plan, units: Sequence[Plan], file: BundlePlan) -> list[Part]:
+    """The units, and last what is above them."""
 
-    tables: list[LevelTables]
-    kept: dict[int, Gaussians]
+    def runs(number: int, count: int) -> list[PageRun]:
+        first, last = plan.first_page[number : number + 2]
+        each = (last - first) // count
+        return [file.run(page, page + each) for page in range(first, last, each)]
+
+    num_low = len(units[0].levels)
+    pages = [runs(n, len(units)) for n in range(num_low)]
+    parts: list[Part] = [
+        {n: (level, pages[n][number]) for n, level in enumerate(unit.levels)}
+        for number, unit in enumerate(units)
+    ]
+    return [*parts, {n: (plan.levels[n], runs(n, 1)[0]) for n in range(num_low, len(plan.levels))}]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,101 +107,156 @@ class _Build:
     config: BuildConfig
     seed: int
     plan: Plan
-    units: Units
-    sink: Sink
-    checkpoint: Checkpoint
+    units: Sequence[Plan]
+    parts: list[Part]
+    file: BundlePlan
+    store: Unfinished | MemoryStore
     bar: Bar
 
     @property
-    def kept(self) -> range:
-        """Levels of the units that the work above them begins with."""
-        last = self.units.level
-        has_above = last + 1 < len(self.plan.levels)
-        return range(self.config.target_of(last + 1) if has_above else last, last + 1)
+    def num_low(self) -> int:
+        """Levels of the units."""
+        return len(self.units[0].levels)
 
     def all_levels(
-        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None
-    ) -> list[LevelTables]:
-        """Build all levels; their tables."""
-        workers = [device for _ in range(_UNITS_ON_GPU) for device in devices if device.is_cuda]
-        workers = (workers or list(devices))[:most_units]
-        tables, below = self._join(self._build_units(leaves, workers), devices[0])
-        top = len(self.units.plans)
-        finished, show = self.checkpoint.load(top), self.bar.show_of(top)
-        above = build_above(below, self.plan, self.config, self.seed, finished, show)
-        for number, level in enumerate(above, self.units.level + 1):
-            host = Level(level.gaussians.numpy(), level.tables)
-            self._write(number, host.gaussians)
-            self.checkpoint.save(top, number, host)
-            tables.append(host.tables)
-        return tables
+        self, leaves: Leaves, devices: Sequence[Device], most_units: int | None, executor: Executor | None
+    ) -> tuple[list[LevelTables], npt.NDArray[np.uint8]]:
+        """Build all levels; their tables, and the hashes of all pages."""
+        if executor is None:
+            self._build_here(leaves, devices, most_units)
+        else:
+            self._build_elsewhere(leaves, devices[0], executor)
+        finished = [self._joined(number) for number in range(self.num_low)]
+        top, levels, pages = len(self.units), self.store.levels, self.store.pages
+        runs = {number: run for number, (_, run) in self.parts[top].items()}
+        saved = (levels[top, n].read(pages, run) for n, run in runs.items() if (top, n) in levels)
+        below: dict[int, Level] = {}
+        first = self.config.target_of(self.num_low) if runs else self.num_low - 1
+        for n in range(first, self.num_low):  # what the levels above begin with
+            level = finished[n].read(pages, self.file.run(*self.plan.first_page[n : n + 2]))
+            below[n] = Level(_device.place(level.gaussians, devices[0]), level.tables)
+        above = build_above(below, self.plan, self.config, self.seed, saved, self.bar.show_of(top))
+        for number, level in enumerate(above, self.num_low):
+            if (top, number) not in levels:
+                hashes = pages.write(runs[number], level.gaussians)
+                self.store.save(top, number, FinishedLevel(level.tables, hashes))
+            finished.append(levels[top, number])
+        return [level.tables for level in finished], np.concatenate([level.hashes for level in finished])
 
-    def _build_units(self, leaves: Leaves, workers: Sequence[Device]) -> list[_Unit]:
-        units: list[Any] = [None] * len(self.units.plans)
+    def _build_here(self, leaves: Leaves, devices: Sequence[Device], most_units: int | None) -> None:
+        workers = [device for _ in range(_UNITS_ON_GPU) for device in devices if device.is_cuda]
+        workers = (workers or list(devices))[: min(most_units or len(self.parts), len(self.parts))]
         free: SimpleQueue[Device] = SimpleQueue()
         for device in workers:
             free.put(device)
 
-        def build(number: int) -> None:
+        def work(unit: int) -> _Levels:
             device = free.get()
             try:
-                with _device.own_stream(device):
-                    units[number] = self._unit(number, leaves, device)
+                with _device.own_stream(device), _device.memory_errors():
+                    for number, level in self._task(unit, leaves).levels(device, self.bar.show_of(unit)):
+                        self.store.save(unit, number, level)
             finally:
                 free.put(device)
+            return {}
 
-        self._on_threads(build, len(units), min(len(units), len(workers)))
-        return units
+        if len(workers) == 1:
+            for unit in self._todo:
+                work(unit)
+        else:
+            with ThreadPoolExecutor(len(workers)) as executor:
+                self._collect(lambda unit: executor.submit(work, unit))
 
-    def _join(self, units: list[_Unit], device: Device) -> tuple[list[LevelTables], dict[int, Level]]:
-        """The tables of all levels of the units, and the levels that were kept, whole, on the device."""
-        by_level = zip(*(unit.tables for unit in units), strict=True)
-        arrays = [zip(*(vars(part).values() for part in parts), strict=True) for parts in by_level]
-        tables = [LevelTables(*map(np.concatenate, columns)) for columns in arrays]
-        whole = {n: Gaussians.concatenate([unit.kept[n] for unit in units]) for n in self.kept}
-        self._write(self.units.level, whole[self.units.level])
-        return tables, {n: Level(_device.place(part, device), tables[n]) for n, part in whole.items()}
+    def _build_elsewhere(self, leaves: Leaves, device: Device, executor: Executor) -> None:
+        like, nonce = (str(device).partition(":")[0], *described(device)), os.urandom(8)
 
-    def _unit(self, unit: int, leaves: Leaves, device: Device) -> _Unit:
-        plan = self.units.plans[unit]
-        first = self.plan.levels[0].offset[plan.levels[0].first_group]
-        with _device.memory_errors():
-            own = _device.place(leaves.read(first, first + plan.levels[0].num_gaussians), device)
-            finished, show = self.checkpoint.load(unit), self.bar.show_of(unit)
-            levels = build_levels(own, plan, self.config, self.seed, finished=finished, show=show)
-            del own
-            tables: list[LevelTables] = []
-            kept: dict[int, Gaussians] = {}
-            for number, level in enumerate(levels):
-                host = Level(level.gaussians.numpy(), level.tables)
-                if number < self.units.level:
-                    above = plan.levels[number + 1]
-                    page = self.plan.first_page[number] + above.first_group
-                    self.sink.write(page, page + above.num_groups, host.gaussians)
-                if number > 0:
-                    self.checkpoint.save(unit, number, host)
-                if number in self.kept:
-                    kept[number] = host.gaussians
-                tables.append(host.tables)
-                del level, host  # while the next is made, their memory is free
-        return _Unit(tables, kept)
+        def submit(unit: int) -> Future[_Levels]:
+            task = self._task(unit, leaves)
+            if isinstance(leaves, MemoryLeaves):  # those of the unit go along
+                task = replace(task, leaves=task.leaves().numpy)
+            return executor.submit(build_elsewhere, task, like, nonce)
 
-    def _write(self, number: int, gaussians: Gaussians) -> None:
-        self.sink.write(self.plan.first_page[number], self.plan.first_page[number + 1], gaussians)
+        try:
+            self._collect(submit)
+        except (OSError, ValueError, RuntimeError, MemoryError):
+            raise
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise RuntimeError(f"executor: expected all units to be built, got {reason}") from error
 
-    def _on_threads(self, work: Callable[[int], None], count: int, num_threads: int) -> None:
-        """Do the work for all numbers below the count; what fails on one thread ends it on all."""
-        if num_threads == 1:
-            for number in range(count):
-                work(number)
-            return
-        with ThreadPoolExecutor(num_threads) as pool:
-            futures = [pool.submit(work, number) for number in range(count)]
-            try:
-                for future in as_completed(futures):
-                    future.result()
-            except BaseException:
-                self.bar.stop()
-                for future in futures:
-                    future.cancel()
-                raise
+    def _collect(self, submit: Callable[[int], Future[_Levels]]) -> None:
+        """Have units built, and save what comes back; what fails, or an interrupt, ends the others."""
+        units: dict[Future[_Levels], int] = {}
+        try:
+            for unit in self._todo:
+                units[submit(unit)] = unit
+            for future in as_completed(units):
+                for number, level in future.result().items():
+                    self.store.save(units[future], number, level)
+                    self.bar.add(units[future], number, self.parts[units[future]][number][0].num_gaussians)
+        except BaseException:
+            self.bar.stop()
+            for future in units:
+                future.cancel()
+            raise
+
+    @property
+    def _todo(self) -> list[int]:
+        return [n for n in range(len(self.units)) if (n, self.num_low - 1) not in self.store.levels]
+
+    def _task(self, unit: int, leaves: Leaves) -> UnitTask:
+        plan = self.units[unit]
+        first = int(self.plan.levels[0].offset[plan.levels[0].first_group])
+        finished = {n: level for (part, n), level in self.store.levels.items() if part == unit}
+        read = partial(leaves.read, first, first + plan.levels[0].num_gaussians)
+        runs = [run for _, run in self.parts[unit].values()]
+        return UnitTask(read, plan, runs, self.config, self.seed, finished, self.store.pages)
+
+    def _joined(self, number: int) -> FinishedLevel:
+        """A level of all units."""
+        parts = [self.store.levels[unit, number] for unit in range(len(self.units))]
+        columns = zip(*(vars(part.tables).values() for part in parts), strict=True)
+        tables = LevelTables(*map(np.concatenate, columns))
+        return FinishedLevel(tables, np.concatenate([part.hashes for part in parts]))
+
+
+@dataclass(frozen=True, eq=False)
+class UnitTask:
+    """All that the work on a unit needs; it can be pickled where `leaves` and `pages` can."""
+
+    leaves: Callable[[], Gaussians]
+    plan: Plan
+    runs: Sequence[PageRun]  # pages of its levels
+    config: BuildConfig
+    seed: int
+    finished: Mapping[int, FinishedLevel]  # levels that are built already
+    pages: PageFile | MemoryStore
+
+    def levels(self, device: Device, show: Show) -> Iterator[tuple[int, FinishedLevel]]:
+        """Build the levels that are not finished, one after another, and write their pages."""
+        finished = (self.finished[n].read(self.pages, self.runs[n]) for n in sorted(self.finished))
+        leaves = next(finished).gaussians if self.finished else self.leaves()
+        own = _device.place(leaves, device)
+        levels = build_levels(own, self.plan, self.config, self.seed, finished=finished, show=show)
+        del leaves, own
+        for number, level in enumerate(levels):
+            if number not in self.finished:
+                hashes = self.pages.write(self.runs[number], level.gaussians)
+                yield number, FinishedLevel(level.tables, hashes)
+            del level  # while the next is made, its memory is free
+
+
+def build_elsewhere(task: UnitTask, like: tuple[str, str, str], _: bytes) -> _Levels:
+    """Build a unit in a worker of an executor, on a device of this kind, which must be described like this.
+
+    The last argument is another in each build: dask gives what it has for the same arguments.
+    """
+    device, here = _device.resolve(like[0]), f"worker on {socket.gethostname()}: expected"
+    if (own := described(device)) != like[1:]:
+        wanted, got = (" with v3dg ".join(pair) for pair in (like[1:], own))
+        raise RuntimeError(f"{here} {wanted} as where the build began, got {got}; the last bits would differ")
+    assert isinstance(task.pages, PageFile)
+    if not task.pages.path.exists():
+        raise RuntimeError(f"{here} {task.pages.path}, got none; share its folder")
+    with _device.own_stream(device), _device.memory_errors():
+        return dict(task.levels(device, lambda *_: None))

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from v3dg import _files
 from v3dg._json import parse_json
 from v3dg._numbers import check, check_all, check_type
-from v3dg.bundle.codec import Codec
-from v3dg.bundle.file import BundleFile, writing
-from v3dg.bundle.format import VERSION, config_to_json, file_bytes, page_file_bytes, page_tables
+from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
+from v3dg.bundle.format import HASH_BYTES, VERSION, config_to_json, page_file_bytes, page_tables
 from v3dg.bundle.pages import FilePages, MemoryPages, PageLayout, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
@@ -38,11 +38,7 @@ class Bundle:
     _file: BundleFile | None = None
 
     def __init__(
-        self,
-        clusters: Clusters,
-        groups: Groups,
-        gaussians: Gaussians,
-        config: dict[str, Any] | None = None,
+        self, clusters: Clusters, groups: Groups, gaussians: Gaussians, config: dict[str, Any] | None = None
     ) -> None:
         check_type("clusters", clusters, Clusters, "Clusters")
         check_type("groups", groups, Groups, "Groups")
@@ -51,23 +47,18 @@ class Bundle:
         clusters, groups = replace(clusters), replace(groups)
         check_tables(clusters, groups, len(gaussians))
         pages = MemoryPages(PageLayout.of(clusters), gaussians.numpy())
-        self._set(clusters, groups, config or {}, Codec(gaussians.sh_degree), pages)
+        self._set(clusters, groups, config or {}, pages)
 
     def _set(
-        self,
-        clusters: Clusters,
-        groups: Groups,
-        config: dict[str, Any],
-        codec: Codec,
-        pages: MemoryPages | FilePages,
+        self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: MemoryPages | FilePages
     ) -> None:
         self.config: dict[str, Any] = parse_json(config_to_json(config))
         self._clusters = clusters
         self._groups = groups
-        self.sh_degree = codec.sh_degree
-        self._codec = codec
+        self._codec = pages.codec
+        self.sh_degree = pages.codec.sh_degree
         self._layout = pages.layout
-        self._pages: MemoryPages | FilePages = pages
+        self._pages = pages
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Bundle:
@@ -94,7 +85,7 @@ class Bundle:
             pages = FilePages(PageLayout.of(clusters), file)
             _check_page_tables(tables, page_tables(pages.layout, file.codec), file.pages_bytes)
             bundle = cls.__new__(cls)
-            bundle._set(clusters, groups, file.config, file.codec, pages)
+            bundle._set(clusters, groups, file.config, pages)
             bundle._file = file
         except ValueError as error:
             raise ValueError(f"{file.path}: {error}") from None
@@ -107,10 +98,15 @@ class Bundle:
         there stays and nothing else is left.
         """
         page_bytes = self._codec.page_bytes(self._layout.num_gaussians)
-        with writing(path, self._layout, self._codec, self.config) as writer:
+        plan = BundlePlan(self._layout, self._codec, self.config)
+        with _files.replacing(path) as temporary, open(temporary, "wb", buffering=0) as file:
+            hashes = [np.empty((0, HASH_BYTES), np.uint8)]
             for pages in runs_of_pages(0, self.num_pages, page_bytes, _BYTES_AT_ONCE):
-                writer.write(pages.start, pages.stop, self._pages.read(pages.start, pages.stop))
-            writer.finish(self.clusters, self.groups)
+                gaussians = self._pages.read(pages.start, pages.stop)
+                run = plan.run(pages.start, pages.stop)
+                hashes.append(write_pages(file.fileno(), run, self._codec, gaussians))
+            plan.write_tables(file.fileno(), self.clusters, self.groups, np.concatenate(hashes))
+            plan.write_header(file.fileno())
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what is in memory, and of a file its path: the copy opens it again."""
@@ -215,7 +211,7 @@ class Bundle:
         return {
             "path": self.path,
             "version": VERSION,
-            "bytes": file_bytes(self._layout, self._codec, self.config),
+            "bytes": BundlePlan(self._layout, self._codec, self.config).num_bytes,
             "sh_degree": self.sh_degree,
             "num_gaussians": self.num_gaussians,
             "num_clusters": len(self.clusters),

@@ -11,9 +11,7 @@ import hashlib
 import os
 import re
 import weakref
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import InitVar, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -31,120 +29,117 @@ from v3dg.bundle.format import (
     SCHEMA,
     VERSION,
     entries_of,
-    entries_of_layout,
     header_of,
-    padding_bytes,
+    page_file_bytes,
     page_hash,
     page_tables,
 )
+from v3dg.bundle.pages import on_threads, runs_of_pages
 from v3dg.bundle.tables import check_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from v3dg.bundle.pages import PageLayout
+    from v3dg.bundle.pages import PageLayout, PageRun
     from v3dg.bundle.tables import Clusters, Groups
     from v3dg.gaussians import Gaussians
 
-_THREADS = 8
+_BYTES_PER_TASK = 16 << 20
 _DAMAGED = "the file is damaged, copy or build it again"
 
 
-@dataclass(eq=False, repr=False)
-class BundleWriter:
-    """A bundle's file in the making: takes pages as they are finished, in any order, then the tables.
+class BundlePlan:
+    """Where what is in a bundle's file; the layout, the codec and the config tell before the first page."""
 
-    What goes where is known before the first page: the layout says how many clusters, groups and gaussians
-    there will be. `writing` makes one.
-    """
+    def __init__(self, layout: PageLayout, codec: Codec, config: dict[str, Any]) -> None:
+        self.layout, self.codec, self.config = layout, codec, config
+        self._page_tables = page_tables(layout, codec)
+        pages_bytes = int(page_file_bytes(self._page_tables["pages.bytes"]).sum())
+        num_clusters, num_pages = int(layout.first_cluster[-1]), layout.num_pages
+        entries = entries_of(num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
+        self.header = header_of(entries, codec.sh_degree, config)
+        ends = (entries[name]["data_offsets"][1] for name in ("pages", "hash"))
+        self._pages_end, self.num_bytes = (len(self.header) + int(end) for end in ends)
+        self._places = np.append(len(self.header) + self._page_tables["pages.offset"], self._pages_end)
 
-    _fd: int
-    _pool: ThreadPoolExecutor
-    _layout: PageLayout
-    _codec: Codec
-    config: InitVar[dict[str, Any]]
+    def run(self, first_page: int, last_page: int) -> PageRun:
+        """A run of the pages."""
+        return self.layout.run(first_page, last_page, self._places)
 
-    def __post_init__(self, config: dict[str, Any]) -> None:
-        self._entries = entries_of_layout(self._layout, self._codec)
-        self._header = header_of(self._entries, self._codec.sh_degree, config)
-        self._page_tables = page_tables(self._layout, self._codec)
-        self._hashes = np.zeros((self._layout.num_pages, HASH_BYTES), np.uint8)
-        self._is_written = np.zeros(self._layout.num_pages, bool)
-        self.is_finished = False
-
-    def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
-        """Write the gaussians of a run of pages, on any device, to their place."""
-        assert len(gaussians) == len(self._layout.rows(first_page, last_page))
-        host = gaussians.numpy()
-        start = len(self._header) + self._page_tables["pages.offset"]
-
-        def write(page: int) -> None:
-            pieces = self._codec.encode(host, self._layout.slice_in(page, first_page))
-            padding = np.zeros(padding_bytes(sum(piece.nbytes for piece in pieces)), np.uint8)
-            data = np.concatenate([piece.reshape(-1).view(np.uint8) for piece in (*pieces, padding)])
-            self._hashes[page] = np.frombuffer(page_hash((data,)), np.uint8)
-            _files.write_at(self._fd, data.data, int(start[page]))
-
-        for _ in self._pool.map(write, range(first_page, last_page)):
-            pass
-        self._is_written[first_page:last_page] = True
-
-    def finish(self, clusters: Clusters, groups: Groups) -> None:
-        """Write the header and the tables, which are checked; all pages of the clusters are written."""
-        if not self._is_written.all():
-            missing = np.flatnonzero(~self._is_written)
-            raise RuntimeError(f"expected all pages, got none of {len(missing)}; the first is {missing[0]}")
-        check_tables(clusters, groups, int(self._layout.first_gaussian[-1]))
-        tables = self._page_tables | {"pages.hash": self._hashes}
+    def write_tables(
+        self, descriptor: int, clusters: Clusters, groups: Groups, hashes: NDArray[np.uint8]
+    ) -> None:
+        """Write the tables, which are checked, behind the pages; those have these hashes, (P, 16)."""
+        check_tables(clusters, groups, int(self.layout.first_gaussian[-1]))
+        tables = self._page_tables | {"pages.hash": hashes}
         for prefix, part in (("clusters", clusters), ("groups", groups)):
             tables |= {f"{prefix}.{name}": array for name, array in vars(part).items()}
         end = b"".join(tables[name].astype(DTYPES[kind], copy=False).tobytes() for name, kind, _, _ in SCHEMA)
-        end += hashlib.blake2b(self._header + end, digest_size=HASH_BYTES).digest()
-        _files.write_at(self._fd, self._header, 0)
-        start, last = (self._entries[name]["data_offsets"][1] for name in ("pages", "hash"))
-        assert start + len(end) == last
-        _files.write_at(self._fd, end, len(self._header) + start)
-        self.is_finished = True
+        end += hashlib.blake2b(self.header + end, digest_size=HASH_BYTES).digest()
+        assert self._pages_end + len(end) == self.num_bytes
+        _files.write_at(descriptor, end, self._pages_end)
+
+    def write_header(self, descriptor: int) -> None:
+        """Write the header; a file that has the first bytes of it has all."""
+        _files.write_at(descriptor, self.header[ALIGNMENT_BYTES:], ALIGNMENT_BYTES)
+        _files.write_at(descriptor, self.header[:ALIGNMENT_BYTES], 0)
 
 
-@contextmanager
-def writing(
-    path: str | os.PathLike[str],
-    layout: PageLayout,
-    codec: Codec,
-    config: dict[str, Any],
-    *,
-    is_locked: bool = False,
-) -> Iterator[BundleWriter]:
-    """Write a bundle's file, which appears at ``path`` when all is done; a failure leaves nothing behind."""
-    with (
-        _files.replacing(path, is_locked=is_locked) as temporary,
-        open(temporary, "wb", buffering=0) as file,
-        ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool,
-    ):
-        writer = BundleWriter(file.fileno(), pool, layout, codec, config)
-        yield writer
-        if not writer.is_finished:
-            raise RuntimeError(f"{os.fspath(path)}: expected the tables after the pages, got none")
+def write_pages(descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians) -> NDArray[np.uint8]:
+    """Write the gaussians of a run of pages, on any device, to their place; (n, 16) their hashes."""
+    host, sizes = gaussians.numpy(), np.diff(run.places)
+    hashes = np.empty((len(run), HASH_BYTES), np.uint8)
+
+    def write(page: int) -> None:
+        data = np.zeros(int(sizes[page]), np.uint8)
+        end = 0
+        for piece in codec.encode(host, run.rows_of(page)):
+            end += piece.nbytes
+            data[end - piece.nbytes : end] = piece.reshape(-1).view(np.uint8)
+        hashes[page] = np.frombuffer(page_hash((data,)), np.uint8)
+        _files.write_at(descriptor, data.data, int(run.places[page]))
+
+    on_threads(write, range(len(run)))
+    return hashes
+
+
+def read_pages(
+    path: str | os.PathLike[str], descriptor: int, run: PageRun, codec: Codec, hashes: NDArray[np.uint8]
+) -> Gaussians:
+    """The gaussians of a run of pages; ValueError unless they are there and have these hashes."""
+    sizes = codec.page_bytes(np.diff(run.first_gaussian))
+    result = codec.empty(run.rows.stop - run.rows.start)
+
+    def read_page(page: int, arrays: Sequence[NDArray[Any]]) -> None:
+        place, end = run.places[page : page + 2].tolist()
+        pieces = (*arrays, np.empty(end - place - int(sizes[page]), np.uint8))
+        first, last = run.first_gaussian[page : page + 2].tolist()
+        name = f"page {run.first_page + page} (gaussians {first} to {last - 1})"
+        try:
+            for piece in pieces:
+                if not _files.read_at(descriptor, piece, place):
+                    raise ValueError(f"{os.fspath(path)}: {name} is not there; the file was truncated")
+                place += piece.nbytes
+        except OSError as error:
+            problem = f"{os.strerror(error.errno or errno.EIO)} in {name}"
+            raise OSError(error.errno, problem, os.fspath(path)) from error
+        if page_hash(pieces) != hashes[page].tobytes():
+            raise ValueError(f"{os.fspath(path)}: {name}: the hash does not match; {_DAMAGED}")
+
+    def read(pages: range) -> None:
+        for page in pages:
+            codec.decode(partial(read_page, page), result, run.rows_of(page))
+
+    on_threads(read, list(runs_of_pages(0, len(run), sizes, _BYTES_PER_TASK)))
+    return result
 
 
 class BundleFile:
     """A bundle file: header and tables are read and checked against the file's own hash, pages are not.
 
-    It is closed when it is dropped.
-
-    Attributes:
-        pages_bytes: Size of all pages with their padding.
-        codec: What the bytes of its pages are.
-        config: The JSON object that was saved.
-        tables: One read-only array for every name in SCHEMA, with the shapes of docs/format.md.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is not a bundle of a known version, or the header, a size or the hash is wrong. Nothing
-            is allocated that is larger than the file.
+    Nothing is allocated that is larger than the file, which is closed when this is dropped.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -167,6 +162,8 @@ class BundleFile:
         length = np.empty(8, np.uint8)
         self._read([length], 0)
         header_bytes = int.from_bytes(length.tobytes(), "little")
+        if header_bytes == 0:
+            self._fail("expected a bundle, got one that is not finished, or another kind of file")
         if header_bytes > min(self.num_bytes - 8, MAX_HEADER_BYTES):
             self._fail(
                 f"header: expected a bundle (safetensors), got a header length of {header_bytes} in a file "
@@ -250,17 +247,11 @@ class BundleFile:
                 self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
             offset += buffer.nbytes
 
-    def read_page(self, page: int, arrays: Sequence[NDArray[Any]]) -> None:
-        """Read a page's bytes into the arrays, one after another; ValueError unless its hash fits."""
-        num_bytes = int(self.tables["pages.bytes"][page])
-        padding = np.empty(padding_bytes(num_bytes), np.uint8)
-        first = int(self.tables["pages.first_cluster"][page])
-        last = first + int(self.tables["pages.num_clusters"][page]) - 1
-        try:
-            self._read((*arrays, padding), self._data_start + int(self.tables["pages.offset"][page]))
-        except OSError as error:
-            raise OSError(
-                error.errno, f"{os.strerror(error.errno or errno.EIO)} in page {page}", self.path
-            ) from error
-        if page_hash((*arrays, padding)) != self.tables["pages.hash"][page].tobytes():
-            self._fail(f"page {page} (clusters {first} to {last}): the hash does not match; {_DAMAGED}")
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """(P+1,) first byte of each page in the file, and the end."""
+        return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
+
+    def read_pages(self, run: PageRun) -> Gaussians:
+        """The gaussians of a run of pages, verified."""
+        return read_pages(self.path, self._fd, run, self.codec, self.tables["pages.hash"][run.first_page :])

@@ -49,11 +49,6 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-def padding_bytes(num_bytes: int) -> int:
-    """Count the bytes from here to the next multiple of the alignment."""
-    return -num_bytes % ALIGNMENT_BYTES
-
-
 def page_file_bytes(page_bytes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Round the sizes of pages up to the alignment: what they take in the file."""
     return page_bytes + -page_bytes % ALIGNMENT_BYTES
@@ -91,19 +86,12 @@ def entries_of(num_clusters: int, num_groups: int, num_pages: int, pages_bytes: 
     return entries
 
 
-def entries_of_layout(layout: PageLayout, codec: Codec) -> dict[str, Any]:
-    """The same from what is in each page: a group for each but the last."""
-    pages_bytes = int(page_file_bytes(codec.page_bytes(layout.num_gaussians)).sum())
-    num_clusters, num_pages = int(layout.first_cluster[-1]), layout.num_pages
-    return entries_of(num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
-
-
 def header_of(entries: dict[str, Any], sh_degree: int, config: dict[str, Any]) -> bytes:
     """The length and the JSON, filled up with spaces so that the data starts aligned."""
     metadata = {"format": FORMAT, "version": str(VERSION), "sh_degree": str(sh_degree)}
     metadata["config"] = config_to_json(config)
     text = json.dumps({"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")).encode()
-    text += b" " * padding_bytes(8 + len(text))
+    text += b" " * (-(8 + len(text)) % ALIGNMENT_BYTES)
     if len(text) > MAX_HEADER_BYTES:
         size = len(metadata["config"])
         raise ValueError(f"config: expected at most {MAX_HEADER_BYTES} bytes of JSON, got {size}; shorten it")
@@ -117,10 +105,3 @@ def config_to_json(config: dict[str, Any]) -> str:
         return json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"config: expected values that JSON can hold, got {error}") from None
-
-
-def file_bytes(layout: PageLayout, codec: Codec, config: dict[str, Any]) -> int:
-    """Size of the file that this makes."""
-    entries = entries_of_layout(layout, codec)
-    header = header_of(entries, codec.sh_degree, config)
-    return len(header) + int(entries["hash"]["data_offsets"][1])

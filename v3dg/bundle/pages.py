@@ -3,39 +3,35 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from v3dg import _device
+from v3dg.bundle.codec import Codec
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
     from v3dg.bundle.file import BundleFile
     from v3dg.bundle.tables import Clusters
 
-_READ_THREADS = 8
-_BYTES_PER_TASK = 16 << 20
+_Item = TypeVar("_Item")
+_THREADS = 8
 
 
 @dataclass(frozen=True, eq=False)
 class PageLayout:
-    """P pages in file order: page g is the clusters that group g replaces, the last page is the last level.
+    """P pages in file order: page g is what group g replaces, the last page is the last level."""
 
-    Attributes:
-        first_cluster: (P+1,) int64. First cluster of each page, and the number of clusters.
-        first_gaussian: (P+1,) int64. First gaussian of each page, and the number of gaussians.
-    """
-
-    first_cluster: NDArray[np.int64]
-    first_gaussian: NDArray[np.int64]
+    first_cluster: NDArray[np.int64]  # (P+1,) of each page, and the number of clusters
+    first_gaussian: NDArray[np.int64]  # (P+1,) of each page, and the number of gaussians
 
     @staticmethod
     def of(clusters: Clusters) -> PageLayout:
@@ -55,31 +51,49 @@ class PageLayout:
         """(P,) of each page."""
         return np.diff(self.first_gaussian)
 
-    def rows(self, first_page: int, last_page: int) -> range:
-        """The gaussians of a run of pages."""
-        return range(int(self.first_gaussian[first_page]), int(self.first_gaussian[last_page]))
+    def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> PageRun:
+        """A run of the pages, of which all begin at these bytes of a file, and end."""
+        gaussians, places = (a[first_page : last_page + 1] for a in (self.first_gaussian, places))
+        return PageRun(first_page, gaussians, places)
 
-    def slice_in(self, page: int, first_page: int) -> slice:
-        """Where a page's gaussians are among those that begin with the first page's."""
-        rows, before = self.rows(page, page + 1), int(self.first_gaussian[first_page])
-        return slice(rows.start - before, rows.stop - before)
+
+@dataclass(frozen=True, eq=False)
+class PageRun:
+    """Neighbouring pages, as much as is known of them before they are written."""
+
+    first_page: int  # number in the bundle
+    first_gaussian: NDArray[np.int64]  # (n+1,) of each page, in the bundle, and the end
+    places: NDArray[np.int64]  # (n+1,) first byte of each page in the file, and the end
+
+    def __len__(self) -> int:
+        return len(self.first_gaussian) - 1
+
+    @property
+    def rows(self) -> slice:
+        """Their gaussians in the bundle."""
+        return slice(int(self.first_gaussian[0]), int(self.first_gaussian[-1]))
+
+    def rows_of(self, number: int) -> slice:
+        """The gaussians of one of them, by its place in the run, among those of all."""
+        first, last = (self.first_gaussian[number : number + 2] - self.first_gaussian[0]).tolist()
+        return slice(first, last)
 
 
 class MemoryPages:
     """Pages whose gaussians are all in memory, on the host."""
 
     def __init__(self, layout: PageLayout, gaussians: Gaussians) -> None:
-        self.layout = layout
+        self.layout, self.codec = layout, Codec(gaussians.sh_degree)
         self.gaussians = gaussians
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Gaussians of a run of pages; they share memory with `gaussians`."""
-        rows = self.layout.rows(first_page, last_page)
-        return self.gaussians.subset(slice(rows.start, rows.stop))
+        first, last = self.layout.first_gaussian[[first_page, last_page]].tolist()
+        return self.gaussians.subset(slice(first, last))
 
-    def write(self, first_page: int, last_page: int, gaussians: Gaussians) -> None:
+    def write(self, run: PageRun, gaussians: Gaussians) -> None:
         """Copy the gaussians of a run of pages, on any device, to their place."""
-        place = vars(self.read(first_page, last_page)).values()
+        place = vars(self.gaussians.subset(run.rows)).values()
         for array, out in zip(vars(gaussians).values(), place, strict=True):
             _device.copy_to_host(array, out)
 
@@ -88,7 +102,7 @@ class FilePages:
     """Pages that are read from a file when they are asked for; a single one is kept until the next."""
 
     def __init__(self, layout: PageLayout, file: BundleFile) -> None:
-        self.layout = layout
+        self.layout, self.codec = layout, file.codec
         self._file = file
         self._last_page: tuple[int, Gaussians] | None = None
 
@@ -102,21 +116,16 @@ class FilePages:
         return kept[1]
 
     def _read(self, first_page: int, last_page: int) -> Gaussians:
-        """Read pages straight into the arrays of the result."""
-        result = self._file.codec.empty(len(self.layout.rows(first_page, last_page)))
+        return self._file.read_pages(self.layout.run(first_page, last_page, self._file.places))
 
-        def read(pages: range) -> None:
-            for page in pages:
-                read_arrays = partial(self._file.read_page, page)
-                self._file.codec.decode(read_arrays, result, self.layout.slice_in(page, first_page))
 
-        tasks = list(runs_of_pages(first_page, last_page, self._file.tables["pages.bytes"], _BYTES_PER_TASK))
-        if len(tasks) == 1:
-            read(tasks[0])
-        else:
-            with ThreadPoolExecutor(min(_READ_THREADS, os.cpu_count() or 1)) as pool:
-                list(pool.map(read, tasks))
-        return result
+def on_threads(work: Callable[[_Item], None], items: Sequence[_Item]) -> None:
+    """Do work for all items, on threads if there are several."""
+    if len(items) < 2:
+        deque(map(work, items), maxlen=0)
+    else:
+        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+            deque(pool.map(work, items), maxlen=0)
 
 
 def runs_of_pages(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import time
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,6 +32,7 @@ from v3dg.cli._common import (
 )
 from v3dg.io import SUFFIXES
 
+_PATIENCE_S = 20  # for a scheduler's answer
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
 
@@ -54,6 +58,9 @@ class Build(OnDevice):
     memory: Annotated[str | None, option("SIZE")] = None
     """Memory of the host for the build, as 8GiB; half of what is free if not given. An asset that does not
     fit is brought into order on the disk of the output."""
+    scheduler: Annotated[str | None, option("ADDRESS")] = None
+    """Build on the workers of a dask scheduler, as tcp://host:8786, which reach the output's folder, too;
+    needs v3dg[cluster]."""
     quiet: Flag = False
     """Show no progress."""
 
@@ -64,15 +71,44 @@ def run(options: Build) -> None:
             "PATH: expected one or more assets, or a folder of them, got nothing; run v3dg build --help"
         )
     is_one = options.output is not None and options.output.suffix == ".v3dg"
-    if is_one or (len(options.assets) == 1 and not options.assets[0].is_dir()):
-        assets = _files_of(options.assets)
-        result = _build(options, assets, options.output or assets[0].with_suffix(".v3dg"))
-        print_result(options.json, result, _lines(result))
-    else:
-        _run_many(options)
+    with _executor_at(options.scheduler) as executor:
+        if is_one or (len(options.assets) == 1 and not options.assets[0].is_dir()):
+            assets = _files_of(options.assets)
+            result = _build(options, assets, options.output or assets[0].with_suffix(".v3dg"), executor)
+            print_result(options.json, result, _lines(result))
+        else:
+            _run_many(options, executor)
 
 
-def _run_many(options: Build) -> None:
+@contextmanager
+def _executor_at(address: str | None) -> Iterator[Executor | None]:
+    """The workers of a dask scheduler."""
+    if address is None:
+        yield None
+        return
+    import asyncio
+
+    try:
+        from distributed import Client
+        from distributed.comm import connect
+    except ImportError:
+        raise ImportError("--scheduler: expected distributed; pip install 'v3dg[cluster]'") from None
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are told once, by the command
+
+    async def greet() -> None:
+        (await asyncio.wait_for(connect(address), _PATIENCE_S)).abort()
+
+    try:
+        asyncio.run(greet())  # a client would wait for ever for one that listens and says nothing
+        client = Client(address, timeout=_PATIENCE_S)
+    except (OSError, ValueError, asyncio.TimeoutError) as error:
+        found = f"none ({' '.join(str(error).split()) or 'no answer'})"
+        raise RuntimeError(f"{address}: expected a dask scheduler that answers, got {found}") from None
+    with client:
+        yield client.get_executor()
+
+
+def _run_many(options: Build, executor: Executor | None) -> None:
     outputs = _outputs(options)
     start = time.perf_counter()
     results: list[dict[str, Any]] = []
@@ -80,7 +116,7 @@ def _run_many(options: Build) -> None:
         if not options.quiet:
             tell(f"[{len(results) + 1}/{len(outputs)}] {asset}")
         try:
-            results.append(_build(options, [asset], output))
+            results.append(_build(options, [asset], output, executor))
         except FAILURES as error:
             results.append({"asset": str(asset), "status": "failed", "error": failure_text(error)})
             if not options.quiet:
@@ -149,7 +185,9 @@ def _outputs(options: Build) -> dict[Path, Path]:
     return {asset: output for output, asset in asset_of.items()}
 
 
-def _build(options: Build, asset_paths: Sequence[Path], output: Path) -> dict[str, Any]:
+def _build(
+    options: Build, asset_paths: Sequence[Path], output: Path, executor: Executor | None
+) -> dict[str, Any]:
     """Build and write one bundle; what was done, as JSON values."""
     for path in asset_paths:
         require_file(path, *SUFFIXES)
@@ -177,6 +215,7 @@ def _build(options: Build, asset_paths: Sequence[Path], output: Path) -> dict[st
                 resume=options.resume,
                 unusable="refuse" if options.strict else "drop",
                 memory=options.memory,
+                executor=executor,
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{to_resume()}") from None

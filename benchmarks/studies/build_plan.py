@@ -1,0 +1,94 @@
+"""What a build of so many gaussians needs, computed from its plan: nothing is built, and no time is told.
+
+Sizes are in bytes. `disk` is what is on it at once; `read` and `written` is all of it, without what a build
+that is gone on with reads again. `host` is without the interpreter and its libraries, about 0.1 GB.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import tyro
+
+from v3dg import BuildConfig, _core
+from v3dg.build.leaves_on_disk import _Sizes, _Tile
+from v3dg.build.memory import in_bytes, unit_bytes
+from v3dg.build.plan import LevelPlan, Plan
+from v3dg.build.whole import UNIT_LEAVES
+from v3dg.bundle.codec import Codec
+from v3dg.bundle.file import BundlePlan
+from v3dg.gaussians import gaussian_bytes
+
+
+@dataclass
+class Config:
+    millions: tuple[float, ...] = (1, 10, 100, 1000)
+    """Gaussians of each build."""
+    sh_degree: tuple[int, ...] = (0, 3)
+    memory: str = "8GiB"
+    """What each may use of the host."""
+
+
+def main(options: Config) -> None:
+    for millions in options.millions:
+        for degree in options.sh_degree:
+            print(json.dumps(needs(int(1e6 * millions), degree, options.memory)), flush=True)
+
+
+def needs(num_gaussians: int, sh_degree: int, memory: str) -> dict[str, Any]:
+    """Counts and bytes of a build, as JSON values."""
+    config = BuildConfig()
+    plan = Plan.of(num_gaussians, config)
+    units = plan.units(UNIT_LEAVES)
+    file = BundlePlan(plan.layout, Codec(sh_degree), {})
+    gaussian, num_low = gaussian_bytes(sh_degree), len(units[0].levels)
+    records = [record_bytes(level.num_clusters, level.num_groups) for level in plan.levels]
+    num_pages = plan.first_page[-1]
+    journal = sum(records) + 16 * num_pages + 24 * (len(units) * num_low + len(plan.levels) - num_low)
+    kept = range(config.target_of(num_low) if num_low < len(plan.levels) else num_low - 1, num_low)
+    top = sum(plan.levels[number].num_gaussians for number in kept) * gaussian
+    pages = int(np.diff(file.run(0, num_pages).places).sum())
+    input_bytes, a_unit = num_gaussians * gaussian, unit_bytes(num_gaussians, sh_degree)
+    sizes = _Sizes.of(in_bytes(memory), a_unit, sh_degree, [_Tile("", num_gaussians, sh_degree, 0)])
+    is_sorted = num_gaussians > sizes.in_memory  # on the disk
+    passes = _core.num_halvings(num_gaussians, sizes.in_node)
+    return {
+        "gaussians": num_gaussians,
+        "sh_degree": sh_degree,
+        "levels": len(plan.levels),
+        "clusters": sum(level.num_clusters for level in plan.levels),
+        "pages": num_pages,
+        "units": len(units),
+        "levels_of_a_unit": num_low,
+        "input": input_bytes,
+        "bundle": file.num_bytes,
+        "tables": file.num_bytes - pages,
+        "journal": journal,
+        "scratch": num_gaussians * (4 + max(gaussian, 32)) if is_sorted else 0,
+        "disk": file.num_bytes + journal + (input_bytes if is_sorted else 0),
+        "sorting_passes": passes if is_sorted else 0,
+        "written": file.num_bytes + journal + is_sorted * num_gaussians * (gaussian + 20 + 16 * passes),
+        "read": input_bytes + top + is_sorted * (2 * input_bytes + num_gaussians * (24 + 64 * passes)),
+        "a_unit": a_unit,
+        "a_task": len(pickle.dumps(units[0])),
+        "a_result": (sum(records[:num_low]) + 16 * plan.first_page[num_low]) // len(units),
+        "plan": 2 * sum(array.nbytes for level in plan.levels for array in arrays_of(level)),
+        "top": top,
+    }
+
+
+def arrays_of(level: LevelPlan) -> list[Any]:
+    return [level.offset, level.group_offset, level.leaf_offset, level.weight]
+
+
+def record_bytes(num_clusters: int, num_groups: int) -> int:
+    """Boxes, two balls and the error: what is measured of a level."""
+    return 24 * num_clusters + 40 * num_groups
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,266 @@
+"""Builds on executors: processes, and a dask cluster of which a worker is killed."""
+
+import multiprocessing
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+import v3dg
+from benchmarks.worlds.procedural import make_asset
+from command_line import ENVIRONMENT, PACKAGE, fails, run
+from v3dg import BuildConfig, _core, build_bundle
+from v3dg.build import build_file, levels_path
+
+CONFIG = BuildConfig(cluster_size=32, steps=150, first_steps=150)
+OPTIONS = {"config": CONFIG, "progress": False, "device": "cpu"}
+PATIENCE = 120
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """An asset of 16 units, and its bundle as one process builds it."""
+    folder = tmp_path_factory.mktemp("cluster")
+    v3dg.write_asset(folder / "a.ply", make_asset(num_gaussians=6000, seed=0))
+    with small_units():
+        build_file(folder / "a.ply", folder / "local.v3dg", **OPTIONS)
+    return folder
+
+
+@contextmanager
+def small_units():
+    """For the driver alone: workers get the plan of their unit with it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("v3dg.build.whole.UNIT_LEAVES", 500)
+        yield
+
+
+def build_on(executor, folder, output, **options):
+    with small_units():
+        build_file(folder / "a.ply", output, executor=executor, **OPTIONS, **options)
+    assert output.read_bytes() == (folder / "local.v3dg").read_bytes()
+    assert {path.name for path in output.parent.iterdir()} == {output.name}
+
+
+def spawned_processes(count):
+    return ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
+
+
+# ---- any executor
+
+
+@pytest.fixture
+def at_package(monkeypatch):
+    """Processes that are spawned find the package under test."""
+    monkeypatch.setenv("PYTHONPATH", PACKAGE)
+
+
+def test_processes_build_the_same_bytes(folder, tmp_path, at_package):
+    with spawned_processes(2) as executor:
+        build_on(executor, folder, tmp_path / "out.v3dg")
+
+
+def test_units_of_an_asset_in_memory_go_along(folder, tmp_path, at_package):
+    asset = v3dg.read_asset(folder / "a.ply")
+    with spawned_processes(1) as executor, small_units():
+        with pytest.raises(ValueError, match="resume_path: expected a file that all workers"):
+            build_bundle(asset, executor=executor, **OPTIONS)
+        bundle = build_bundle(asset, executor=executor, resume_path=tmp_path / "out", **OPTIONS)
+    assert bundle.path == str(tmp_path / "out")
+    assert (tmp_path / "out").read_bytes() == (folder / "local.v3dg").read_bytes()
+
+
+def test_a_process_that_dies_leaves_what_can_be_gone_on_with(folder, tmp_path, at_package):
+    output = tmp_path / "out.v3dg"
+    with spawned_processes(1) as executor:
+        executor.submit(os.getpid).result()
+        (pid,) = executor._processes
+        killer = Killer(lambda: is_journal_longer(output, folder) and pid)
+        with killer, small_units(), pytest.raises(RuntimeError, match="terminated abruptly"):
+            build_file(folder / "a.ply", output, executor=executor, **OPTIONS)
+    assert levels_path(output).exists()
+    with ThreadPoolExecutor(2) as executor:
+        build_on(executor, folder, output, resume=True)
+
+
+def test_workers_of_another_kind_are_refused(folder, tmp_path, at_package, monkeypatch):
+    if _core.isa() == "baseline":
+        pytest.skip("expected a processor with AVX2")
+    monkeypatch.setenv("V3DG_ISA", "baseline")
+    with (
+        spawned_processes(1) as executor,
+        small_units(),
+        pytest.raises(
+            RuntimeError, match=rf"worker on {socket.gethostname()}: expected \w+ with v3dg .*, got"
+        ),
+    ):
+        build_file(folder / "a.ply", tmp_path / "out.v3dg", executor=executor, **OPTIONS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_workers_that_do_not_reach_the_folder_say_so(folder, tmp_path, at_package):
+    class Elsewhere(Executor):
+        def submit(self, fn, task, *arguments):
+            object.__setattr__(task.pages, "path", Path("/elsewhere/out.v3dg.partial"))
+            return pool.submit(fn, task, *arguments)
+
+    with (
+        spawned_processes(1) as pool,
+        small_units(),
+        pytest.raises(
+            RuntimeError, match=r"expected /elsewhere/out.v3dg.partial, got none; share its folder"
+        ),
+    ):
+        build_file(folder / "a.ply", tmp_path / "out.v3dg", executor=Elsewhere(), **OPTIONS)
+
+
+class Interrupted(Executor):
+    """Does two units, takes three more, and is interrupted."""
+
+    def __init__(self):
+        self.futures = []
+
+    def submit(self, fn, *arguments):
+        self.futures.append(Future())
+        if len(self.futures) <= 2:
+            self.futures[-1].set_result(fn(*arguments))
+        if len(self.futures) == 6:
+            raise KeyboardInterrupt
+        return self.futures[-1]
+
+
+def test_an_interrupt_cancels_what_waits(folder, tmp_path):
+    executor = Interrupted()
+    with small_units(), pytest.raises(KeyboardInterrupt):
+        build_file(folder / "a.ply", tmp_path / "out.v3dg", executor=executor, **OPTIONS)
+    assert [future.cancelled() for future in executor.futures[:5]] == [False, False, True, True, True]
+
+
+# ---- dask
+
+
+def is_journal_longer(output, folder):
+    """Whether a unit is finished."""
+    path = levels_path(output)
+    return path.exists() and path.stat().st_size > (folder / "local.v3dg").stat().st_size
+
+
+class Killer:
+    """Kills the process whose number a function gives, as soon as it gives one."""
+
+    def __init__(self, victim):
+        self.killed = None
+        self._victim = victim
+        self._thread = threading.Thread(target=self._run)
+        self._is_over = False
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._is_over = True
+        self._thread.join()
+
+    def _run(self):
+        while self.killed is None and not self._is_over:
+            if pid := self._victim():
+                os.kill(pid, signal.SIGKILL)
+                self.killed = pid
+            time.sleep(0.005)
+
+
+@contextmanager
+def cluster(folder, num_workers):
+    """The address of a scheduler, and of workers that are processes of their own."""
+    environment = ENVIRONMENT | {"OMP_NUM_THREADS": "1", "DASK_DISTRIBUTED__ADMIN__LOG_LENGTH": "0"}
+    options = {"cwd": folder, "env": environment, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    dask = [sys.executable, "-m", "dask"]
+    file = folder / "scheduler.json"
+    processes = []
+    try:
+        for command in (
+            ["scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", file],
+            *[["worker", "--scheduler-file", file, "--no-nanny", "--no-dashboard", "--nthreads", "1"]]
+            * num_workers,
+        ):
+            processes.append(subprocess.Popen([*dask, *map(str, command)], **options))
+        end = time.monotonic() + PATIENCE
+        while not file.exists():
+            assert time.monotonic() < end, "no scheduler"
+            time.sleep(0.05)
+        yield file
+    finally:
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.wait()
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_builds_the_same_bytes_though_a_worker_is_killed(folder, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    (tmp_path / "dask").mkdir()
+    (tmp_path / "out").mkdir()
+    output = tmp_path / "out" / "out.v3dg"
+    with (
+        cluster(tmp_path / "dask", 4) as file,
+        distributed.Client(scheduler_file=str(file), timeout=PATIENCE) as client,
+    ):
+        client.wait_for_workers(4, timeout=PATIENCE)
+        pids = client.run(os.getpid)
+
+        def busy():
+            """A worker in the midst of a unit, when another unit is finished."""
+            if not is_journal_longer(output, folder):
+                return None
+            return next((pids[worker] for worker, tasks in client.processing().items() if tasks), None)
+
+        with Killer(busy) as killer:
+            build_on(client.get_executor(), folder, output)
+        assert killer.killed in pids.values()
+        assert len(client.scheduler_info()["workers"]) == 3
+        # And by the command, which gets whole units.
+        address = client.scheduler.address
+        for name, options in (("dask", ["--scheduler", address]), ("here", [])):
+            done = run("build", folder / "a.ply", "-o", tmp_path / f"{name}.v3dg", "--quiet", *options)
+            assert done.returncode == 0, done.stderr
+        assert (tmp_path / "dask.v3dg").read_bytes() == (tmp_path / "here.v3dg").read_bytes()
+
+
+def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    v3dg.write_asset(tmp_path / "a.ply", make_asset(num_gaussians=1000, seed=0))
+    monkeypatch.setattr("v3dg.cli.build._PATIENCE_S", 1)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        from v3dg.cli import build
+
+        with (
+            pytest.raises(
+                RuntimeError, match=f"^{address}: expected a dask scheduler that answers, got none"
+            ),
+            build._executor_at(address),
+        ):
+            pass
+    fails(1, "nowhere: expected a dask scheduler", "build", "a.ply", "--scheduler", "nowhere", cwd=tmp_path)
+
+
+def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
+    v3dg.write_asset(tmp_path / "a.ply", make_asset(num_gaussians=1000, seed=0))
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    from v3dg.cli import build
+
+    with (
+        pytest.raises(ImportError, match=r"--scheduler: expected distributed; pip install 'v3dg\[cluster\]'"),
+        build._executor_at("tcp://127.0.0.1:8786"),
+    ):
+        pass

@@ -1,0 +1,276 @@
+"""The unfinished bundle, from which an interrupted build goes on.
+
+It is the file of the bundle, with the pages that are finished at their places. Where the finished file will
+end begins the journal: a record for each finished level of each part, with its tables and the hashes of its
+pages. The first bytes, a header of no length and the digest of what is built, tell it from a bundle.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import struct
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _device, _files
+from v3dg._device import Device
+from v3dg._version import __version__
+from v3dg.build.plan import LevelPlan
+from v3dg.build.scratch import lock
+from v3dg.build.simplify import Level, LevelTables
+from v3dg.bundle import Bundle, Clusters, Groups
+from v3dg.bundle.codec import Codec
+from v3dg.bundle.file import BundlePlan, read_pages, write_pages
+from v3dg.bundle.format import HASH_BYTES, page_hash
+from v3dg.bundle.pages import MemoryPages, PageRun
+from v3dg.gaussians import Gaussians
+
+_RECORD = struct.Struct("<II16s")  # in front of a level: its part, its number, the hash of what follows
+_MAGIC = bytes(8) + b"unfinished v3dg 1\n"
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedLevel:
+    """A level of a part whose pages are written."""
+
+    tables: LevelTables
+    hashes: npt.NDArray[np.uint8]  # (n, 16) of the pages
+
+    def read(self, pages: PageFile | MemoryStore, run: PageRun) -> Level:
+        """The level, from its pages."""
+        return Level(pages.read(run, self.hashes), self.tables)
+
+
+Part = Mapping[int, tuple[LevelPlan, PageRun]]
+"""What is built alone: the plans of its levels by number, and their pages."""
+
+
+@dataclass(frozen=True)
+class PageFile:
+    """The pages of an unfinished bundle, for any process of any machine that can open its file."""
+
+    path: Path
+    head: bytes
+    codec: Codec
+
+    def write(self, run: PageRun, gaussians: Gaussians) -> npt.NDArray[np.uint8]:
+        """Write the gaussians of a run of pages, on any device; (n, 16) their hashes."""
+        with self._opened(os.O_RDWR) as descriptor:
+            return write_pages(descriptor, run, self.codec, gaussians)
+
+    def read(self, run: PageRun, hashes: npt.NDArray[np.uint8]) -> Gaussians:
+        """The gaussians of a run of pages that have these hashes."""
+        with self._opened(os.O_RDONLY) as descriptor:
+            return read_pages(self.path, descriptor, run, self.codec, hashes)
+
+    @contextmanager
+    def _opened(self, flags: int) -> Iterator[int]:
+        """The file, opened anew: what other machines wrote is seen, what is written is there for them."""
+        with _files.naming_errors(self.path):
+            descriptor = os.open(self.path, flags | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                if os.pread(descriptor, len(self.head), 0) != self.head:
+                    raise ValueError(f"{self.path}: expected the unfinished bundle of this build")
+                yield descriptor
+            finally:
+                os.close(descriptor)
+
+
+class Unfinished:
+    """A bundle in the making, in a file that replaces `bundle_path` in the end, or stays where it is.
+
+    A record that was cut off does not count; a damaged one is an error, as a damaged page is. The file is
+    locked while a build uses it, and is gone after one that finished only leaves.
+    """
+
+    def __init__(
+        self, path: Path, plan: BundlePlan, parts: Sequence[Part], device: Device, bundle_path: Path | None
+    ) -> None:
+        self._path, self._bundle_path = path, bundle_path
+        self._plan, self._parts = plan, parts
+        what = [plan.header.decode("latin-1"), *described(device), len(parts)]
+        digest = page_hash([np.frombuffer(json.dumps(what).encode(), np.uint8)])
+        self.pages = PageFile(Path(os.path.abspath(path)), _MAGIC + digest, plan.codec)
+        self.levels: dict[tuple[int, int], FinishedLevel] = {}
+        self.is_whole = False
+        self._end = plan.num_bytes  # of the journal
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Unfinished:
+        if not self._path.parent.is_dir():
+            raise ValueError(f"resume_path: expected a file in an existing folder, got {self._path}")
+        self._file = _open_locked(self._path)
+        try:
+            with _files.naming_errors(self._path):
+                self._go_on(self._file.fileno(), self.pages.head)
+        except BaseException:
+            self._file.close()
+            raise
+        return self
+
+    def _go_on(self, descriptor: int, own: bytes) -> None:
+        """Find out how far the file is."""
+        head = os.pread(descriptor, len(self._plan.header), 0)
+        if head == self._plan.header:
+            os.ftruncate(descriptor, self._plan.num_bytes)
+            with self._reading():
+                Bundle.open(self._path)
+            self.is_whole = True
+        elif head.startswith(own):
+            with self._reading():
+                self._read_journal()
+            os.ftruncate(descriptor, self._end)
+        elif own.startswith(head):
+            try:
+                _files.write_at(descriptor, own, 0)
+            except OSError:
+                self._path.unlink()
+                raise
+        else:
+            raise ValueError(
+                f"{self._path}: holds something else, or levels of another asset, config, seed, device or "
+                "version; remove it to start again"
+            )
+
+    def __exit__(self, *_: object) -> None:
+        if not self.is_whole and not any(number > 0 for _, number in self.levels):
+            self._path.unlink(missing_ok=True)
+        self._file.close()
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError) as error:
+            raise ValueError(
+                f"{self._path}: expected levels of an interrupted build, could not read them "
+                f"({error}); remove it to start again"
+            ) from error
+
+    def _read_journal(self) -> None:
+        """Take the levels up to a record that was cut off, and check their pages."""
+        descriptor, head = self._file.fileno(), np.empty(_RECORD.size, np.uint8)
+        while _files.read_at(descriptor, head, self._end):
+            part, number, digest = _RECORD.unpack(head.tobytes())
+            if not (part < len(self._parts) and number in self._parts[part]):
+                raise ValueError("a level is damaged")
+            plan, run = self._parts[part][number]
+            clusters, groups = plan.num_clusters, plan.num_groups
+            shapes = (clusters, 2, 3), (groups, 4), (groups, 4), (groups, 2)
+            floats = [np.empty(shape, np.float32) for shape in shapes]
+            arrays = [*floats, np.empty((len(run), HASH_BYTES), np.uint8)]
+            place = self._end + _RECORD.size
+            for array in arrays:
+                if not _files.read_at(descriptor, array, place):
+                    return
+                place += array.nbytes
+            if page_hash(arrays) != digest:
+                raise ValueError("a level is damaged")
+            level = FinishedLevel(LevelTables(*floats), arrays[4])
+            level.read(self.pages, run)  # its pages are as they were
+            self.levels[part, number], self._end = level, place
+
+    def save(self, part: int, number: int, level: FinishedLevel) -> None:
+        """Add a level to the journal; what a full disk cuts off is removed again."""
+        arrays = [*vars(level.tables).values(), level.hashes]
+        record = _RECORD.pack(part, number, page_hash(arrays))
+        with self._lock, _files.naming_errors(self._path):
+            descriptor, end = self._file.fileno(), self._end
+            try:
+                for data in (record, *(array.reshape(-1).view(np.uint8).data for array in arrays)):
+                    _files.write_at(descriptor, data, end)
+                    end += len(data)
+            except OSError:
+                os.ftruncate(descriptor, self._end)
+                raise
+            self.levels[part, number] = level
+            self._end = end
+
+    def finish(self, clusters: Clusters, groups: Groups, hashes: npt.NDArray[np.uint8]) -> None:
+        """Make it a bundle; one that is killed at any moment is gone on with, or whole."""
+        descriptor = self._file.fileno()
+        with _files.naming_errors(self._path):
+            self._plan.write_tables(descriptor, clusters, groups, hashes)
+            os.fsync(descriptor)  # the header says that all else is there
+            self._plan.write_header(descriptor)
+            self.is_whole = True
+            os.ftruncate(descriptor, self._plan.num_bytes)
+
+    def bundle(self) -> Bundle:
+        """The whole bundle, where it is to be."""
+        if self._bundle_path is not None:
+            _files.put_in_place(self._path, self._bundle_path)
+        return Bundle.open(self._bundle_path or self._path)
+
+
+class MemoryStore:
+    """What is finished of a build in memory, and its pages; for the rest as `Unfinished` and `PageFile`."""
+
+    is_whole = False
+
+    def __init__(self, plan: BundlePlan) -> None:
+        self._plan = plan
+        self._pages = MemoryPages(plan.layout, plan.codec.empty(int(plan.layout.first_gaussian[-1])))
+        self.pages = self
+        self.levels: dict[tuple[int, int], FinishedLevel] = {}
+
+    def write(self, run: PageRun, gaussians: Gaussians) -> npt.NDArray[np.uint8]:
+        self._pages.write(run, gaussians)
+        return np.empty((0, HASH_BYTES), np.uint8)
+
+    def read(self, run: PageRun, hashes: npt.NDArray[np.uint8]) -> Gaussians:
+        return self._pages.gaussians.subset(run.rows)
+
+    def save(self, part: int, number: int, level: FinishedLevel) -> None:
+        self.levels[part, number] = level
+
+    def finish(self, clusters: Clusters, groups: Groups, hashes: npt.NDArray[np.uint8]) -> None:
+        self._tables = clusters, groups
+
+    def bundle(self) -> Bundle:
+        return Bundle(*self._tables, self._pages.gaussians, self._plan.config)
+
+
+def described(device: Device) -> tuple[str, str]:
+    """What the last bits of a build depend on: the kind of a device, and the version."""
+    return _device.describe(device), __version__
+
+
+def discard_levels(resume_path: str | os.PathLike[str]) -> None:
+    """Remove what an interrupted build left there, if anything; RuntimeError where a build is using it."""
+    if os.path.lexists(resume_path):
+        with _open_locked(resume_path):
+            os.unlink(resume_path)
+
+
+def _open_locked(path: str | os.PathLike[str]) -> FileIO:
+    """Open or make a file to read and write; other builds are kept out until it is closed."""
+    # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+    while True:
+        if os.path.islink(path):
+            raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a link; remove it")
+        # Whoever may see the bundle is settled when it replaces what is there.
+        file = FileIO(path, "r+", opener=lambda name, _: os.open(name, flags, 0o600))
+        try:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a device or a pipe")
+            lock(file.fileno(), path)
+            # The build that had the lock before may have removed the file.
+            with suppress(FileNotFoundError):
+                if os.path.samestat(status, os.lstat(path)):
+                    return file
+        except BaseException:
+            file.close()
+            raise
+        file.close()
