@@ -147,5 +147,4 @@ def ball_of_most(points: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.
 def _any(values: Array) -> Any:
     """Whether any of a row is true, for each row of an array of any dimensions."""
     rows = values.reshape(len(values), math.prod(values.shape[1:]))
-    # NumPy looks at a whole array many times faster than at short rows, and most are all false.
-    return rows.any(axis=1) if rows.any() else rows[:, 0]
+    return rows.any(axis=1) if rows.any() else rows[:, 0]  # NumPy is slow with short rows

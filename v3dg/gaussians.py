@@ -116,8 +116,7 @@ class Gaussians:
             rows: Any = cast(Any, index).cpu().numpy() if _is_tensor(index) else index
             if isinstance(rows, slice) or rows.dtype == bool:
                 return self._map(lambda array: np.ascontiguousarray(array[rows]))
-            # Several times as fast as an index in brackets, and other threads go on.
-            return self._map(lambda array: array.take(rows, axis=0))
+            return self._map(lambda array: array.take(rows, axis=0))  # unlike [rows], lets threads run
         if not isinstance(index, slice):
             import torch
 

@@ -159,11 +159,9 @@ class BuildConfig:
         The lowest, of which most is seen, start from the fit below; those above, which have few groups and
         would be waited for one after another, from what is merged of the fit below them all.
         """
-        last = first + 1
+        last, end = first + 1, min(end, first + self._visible_levels)
         if self.target_of(first) > 0 and self.targets == "finest":
-            while last < min(end, first + self._visible_levels) and self.steps_at(last) == self.steps_at(
-                first
-            ):
+            while last < end and self.steps_at(last) == self.steps_at(first):
                 last += 1
         return range(first, last)
 
