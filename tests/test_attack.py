@@ -13,6 +13,7 @@ TRIES = {
     "misuses": 300,
     "interrupts": 14,
     "kills": 8,
+    "bounded": 6,
     "threads": 30,
     "memory": 8,
 }

@@ -1,5 +1,6 @@
 """Builds that are interrupted, killed, gone on with; and the unfinished bundles that they leave."""
 
+import errno
 import hashlib
 import os
 import resource
@@ -19,6 +20,7 @@ import v3dg.build
 from benchmarks.worlds.procedural import make_asset
 from random_bundle import random_gaussians
 from v3dg import BuildConfig, _files, build_bundle
+from v3dg.build import leaves_on_disk
 from v3dg.build.digest import digest_of
 from v3dg.build.unfinished import _open_locked
 from v3dg.bundle.file import BundlePlan
@@ -383,3 +385,72 @@ def test_a_full_disk_leaves_what_can_be_gone_on_with(asset, checkpoint, expected
         assert len(left) == 0 or len(left) > len(expected)
         build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint)
         assert checkpoint.read_bytes() == expected
+
+
+# ---- files that do not fit in memory
+
+
+@pytest.fixture(scope="module")
+def tiles(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tiles")
+    for i in range(2):
+        v3dg.write_asset(folder / f"{i}.ply", make_asset(num_gaussians=1200, seed=i))
+    return [folder / f"{i}.ply" for i in range(2)]
+
+
+@pytest.fixture
+def bounded(tiles, monkeypatch):
+    """Builds the tiles on the disk and in several units, as if they were many and memory small."""
+    monkeypatch.setattr("v3dg.build.whole.UNIT_LEAVES", 400)
+    sizes = leaves_on_disk._Sizes(in_memory=0, in_block=1 << 16, in_node=700, in_bucket=300)
+    monkeypatch.setattr(leaves_on_disk._Sizes, "of", lambda *_: sizes)
+    config = BuildConfig(cluster_size=32, steps=0, num_views=1)
+
+    def build(output):
+        v3dg.build.build_file(tiles, output, config=config, progress=False, device="cpu", resume=True)
+        return output.read_bytes()
+
+    return build
+
+
+def test_a_disk_that_is_full_at_any_write_of_a_bounded_build(bounded, tmp_path, monkeypatch):
+    """The first, the last and some between of each kind, of which half gets to the disk."""
+    write, kinds = _files.write_at, []
+    expected = bounded(tmp_path / "whole.v3dg")
+
+    def kind_of(descriptor, offset):
+        name = os.path.basename(os.readlink(f"/proc/self/fd/{descriptor}"))
+        is_journal = offset >= len(expected)
+        return name if name in leaves_on_disk._NAMES else "journal" if is_journal else "pages"
+
+    def noted(descriptor, data, offset):
+        kinds.append(kind_of(descriptor, offset))
+        write(descriptor, data, offset)
+
+    def full(descriptor, data, offset):
+        if kind_of(descriptor, offset) != kind:
+            return write(descriptor, data, offset)
+        left[0] -= 1
+        if left[0] >= 0:
+            return write(descriptor, data, offset)
+        write(descriptor, memoryview(data)[: len(data) // 2], offset)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(_files, "write_at", noted)
+    assert bounded(tmp_path / "whole2.v3dg") == expected
+    assert set(kinds) == {*leaves_on_disk._NAMES, "journal", "pages"}
+    monkeypatch.setattr(_files, "write_at", full)
+    output = tmp_path / "out" / "out.v3dg"
+    output.parent.mkdir()
+    for kind in sorted(set(kinds)):
+        for place in np.unique(np.linspace(0, kinds.count(kind) - 1, 5).astype(int)).tolist():
+            left = [place]
+            with pytest.raises(OSError, match="No space left on device") as raised:
+                bounded(output)
+            folder = f"{output}.scratch" if kind in leaves_on_disk._NAMES else output.parent
+            assert os.path.dirname(raised.value.filename) == str(folder)
+            assert set(names_in(output.parent)) <= {"out.v3dg.partial"}
+            left = [sys.maxsize]
+            assert bounded(output) == expected
+            assert names_in(output.parent) == ["out.v3dg"]
+            output.unlink()

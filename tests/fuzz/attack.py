@@ -26,7 +26,8 @@ KINDS = {
     "commands": 0.15,
     "misuses": 0.05,
     "interrupts": 0.25,
-    "kills": 0.15,
+    "kills": 0.1,
+    "bounded": 0.05,
     "threads": 0.03,
     "memory": 0.07,
 }

@@ -95,8 +95,7 @@ class Unfinished:
     def __init__(
         self, path: Path, plan: BundlePlan, parts: Sequence[Part], device: Device, bundle_path: Path | None
     ) -> None:
-        self._path, self._bundle_path = path, bundle_path
-        self._plan, self._parts = plan, parts
+        self._path, self._bundle_path, self._plan, self._parts = path, bundle_path, plan, parts
         what = [plan.header.decode("latin-1"), *described(device), len(parts)]
         digest = page_hash([np.frombuffer(json.dumps(what).encode(), np.uint8)])
         self.pages = PageFile(Path(os.path.abspath(path)), _MAGIC + digest, plan.codec)
@@ -128,7 +127,6 @@ class Unfinished:
         elif head.startswith(own):
             with self._reading():
                 self._read_journal()
-            os.ftruncate(descriptor, self._end)
         elif own.startswith(head):
             try:
                 _files.write_at(descriptor, own, 0)
@@ -180,20 +178,16 @@ class Unfinished:
             self.levels[part, number], self._end = level, place
 
     def save(self, part: int, number: int, level: FinishedLevel) -> None:
-        """Add a level to the journal; what a full disk cuts off is removed again."""
+        """Add a level to the journal; what a full disk cuts off does not count."""
         arrays = [*vars(level.tables).values(), level.hashes]
         record = _RECORD.pack(part, number, page_hash(arrays))
         with self._lock, _files.naming_errors(self._path):
             descriptor, end = self._file.fileno(), self._end
-            try:
-                for data in (record, *(array.reshape(-1).view(np.uint8).data for array in arrays)):
-                    _files.write_at(descriptor, data, end)
-                    end += len(data)
-            except OSError:
-                os.ftruncate(descriptor, self._end)
-                raise
-            self.levels[part, number] = level
-            self._end = end
+            os.ftruncate(descriptor, end)
+            for data in (record, *(array.reshape(-1).view(np.uint8).data for array in arrays)):
+                _files.write_at(descriptor, data, end)
+                end += len(data)
+            self.levels[part, number], self._end = level, end
 
     def finish(self, clusters: Clusters, groups: Groups, hashes: npt.NDArray[np.uint8]) -> None:
         """Make it a bundle; one that is killed at any moment is gone on with, or whole."""
@@ -201,7 +195,11 @@ class Unfinished:
         with _files.naming_errors(self._path):
             self._plan.write_tables(descriptor, clusters, groups, hashes)
             os.fsync(descriptor)  # the header says that all else is there
-            self._plan.write_header(descriptor)
+            try:
+                self._plan.write_header(descriptor)
+            except OSError:
+                os.pwrite(descriptor, self.pages.head, 0)  # where something is already
+                raise
             self.is_whole = True
             os.ftruncate(descriptor, self._plan.num_bytes)
 

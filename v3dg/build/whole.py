@@ -181,7 +181,7 @@ class _Build:
         except (OSError, ValueError, RuntimeError, MemoryError):
             raise
         except Exception as error:
-            reason = f"{type(error).__name__}: {error}"
+            reason = f"{type(error).__name__}: {error}".rstrip(": ")
             raise RuntimeError(f"executor: expected all units to be built, got {reason}") from error
 
     def _collect(self, submit: Callable[[int], Future[_Levels]]) -> None:

@@ -93,7 +93,8 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
         from distributed.comm import connect
     except ImportError:
         raise ImportError("--scheduler: expected distributed; pip install 'v3dg[cluster]'") from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are told once, by the command
+    for name in ("distributed", "distributed.client"):  # errors are told once, by the command
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
     async def greet() -> None:
         (await asyncio.wait_for(connect(address), _PATIENCE_S)).abort()

@@ -44,12 +44,15 @@ def prepare(shared):
 
 
 class Attack:
+    kinds, weights = KINDS, WEIGHTS
+    files = ("large.v3dg",)
+
     def __init__(self, shared):
         self._shared, self._whole = shared, {}
 
     def plan(self, rng, work):
-        (what,) = rng.choices(list(KINDS), WEIGHTS)
-        program, name = KINDS[what]
+        (what,) = rng.choices(list(self.kinds), self.weights)
+        program, name = self.kinds[what]
         seconds, _ = self._of_nothing(what, "asset.ply", work)
         self._of_nothing(what, "other.ply", work)
         before = self._put(work, "asset.ply")
@@ -58,15 +61,16 @@ class Attack:
             (work / name).write_bytes(b"before")
         moments = [rng.uniform(0, 1.05 * seconds) for _ in range(rng.choice((1, 1, 2, 4)))]
         # Another asset takes the place of the one that is built, perhaps with its date or an older one.
-        swaps = what == "build" and rng.random() < 0.4
+        swaps = what.startswith("build") and rng.random() < 0.4
         date = rng.choice((None, 0, os.stat(work / "asset.ply").st_mtime_ns))
 
         def do():
-            whole = {b"before", self._of_nothing(what, "asset.ply", work)[1]}
+            found, whole = "", {b"before", self._of_nothing(what, "asset.ply", work)[1]}
             for moment in moments:
                 ended = run([], work, program=program, limit_s=60, meddle=partial(_kill, moment))
                 if ended.code not in (0, -signal.SIGKILL):
                     return outcome(ended, fault_of(ended) or f"code {ended.code}: {ended.err[-200:]!a}")
+                found = f" from {_left(work, name)}" if _left(work, name) else ""
                 fault = _fault_of_files(work, before, name, whole, is_replaced)
                 if fault is not None:
                     return Outcome("fault", f"after {moment:.2f} s: {fault}")
@@ -85,29 +89,36 @@ class Attack:
                 fault = (
                     f"not the bytes of one that nothing stopped{', but of the asset before' if swaps else ''}"
                 )
-            if fault is None and (work / f"{name}.partial").exists():
-                fault = "levels are left beside a whole bundle"
-            return outcome(ended, fault)
+            if fault is None and _left(work, name):
+                fault = f"{_left(work, name)} is left beside a whole bundle"
+            result = outcome(ended, fault)
+            result.name += found
+            return result
 
         return what, do
 
     def _put(self, work, asset):
         work.mkdir(exist_ok=True)
-        for name, source in (("asset.ply", asset), ("large.v3dg", "large.v3dg")):
+        for name, source in (("asset.ply", asset), *zip(self.files, self.files, strict=True)):
             (work / name).write_bytes((self._shared / source).read_bytes())
         return names_in(work)
 
     def _of_nothing(self, what, asset, work):
         """The seconds and the bytes of one that nothing stops."""
-        key = what, asset if what == "build" else ""
+        key = what, asset if what.startswith("build") else ""
         if key not in self._whole:
-            program, name = KINDS[what]
+            program, name = self.kinds[what]
             place = work.parent / f"{work.name}_{random.randrange(1 << 60):x}"
             self._put(place, asset)
             ended = run([], place, program=program, limit_s=60)
             assert ended.code == 0, ended
             self._whole[key] = ended.seconds, (place / name).read_bytes()
         return self._whole[key]
+
+
+def _left(work, name):
+    """What an unfinished build left."""
+    return " and ".join(end for end in ("partial", "scratch") if (work / f"{name}.{end}").exists())
 
 
 def _kill(moment, process, _):
@@ -120,6 +131,8 @@ def _kill(moment, process, _):
 def _fault_of_files(work, before, name, whole, is_replaced):
     """Whether the file is as it was or whole, and beside it is only what is known to be no file yet."""
     for path in names_in(work) - before - {name, f"{name}.partial"}:
+        if path.startswith(f"{name}.scratch"):  # gone after the next that ends
+            continue
         if not (path.startswith(f".{name}") and path.endswith(".tmp")):
             return f"left {path}"
         (work / path).unlink()
