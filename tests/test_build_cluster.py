@@ -91,6 +91,24 @@ def test_a_process_that_dies_leaves_what_can_be_gone_on_with(folder, tmp_path, a
         build_on(executor, folder, output, resume=True)
 
 
+def test_an_executor_goes_on_in_the_midst_of_units(folder, tmp_path, monkeypatch):
+    """Where one process was interrupted."""
+    output, left, simplify = tmp_path / "out.v3dg", [8], v3dg.build.simplify._simplify
+
+    def some(*arguments):
+        left[0] -= 1
+        if left[0] == 0:
+            raise KeyboardInterrupt
+        return simplify(*arguments)
+
+    with small_units(), monkeypatch.context() as patch:
+        patch.setattr("v3dg.build.simplify._simplify", some)
+        with pytest.raises(KeyboardInterrupt):
+            build_file(folder / "a.ply", output, **OPTIONS)
+    with ThreadPoolExecutor(2) as executor:
+        build_on(executor, folder, output, resume=True)
+
+
 def test_workers_of_another_kind_are_refused(folder, tmp_path, at_package, monkeypatch):
     if _core.isa() == "baseline":
         pytest.skip("expected a processor with AVX2")
