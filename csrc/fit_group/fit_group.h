@@ -67,7 +67,7 @@ using FitImage = std::vector<float>;
 struct FitScratch {
     Buffer<Record<float>> records;
     Buffer<uint32_t> source;
-    Buffer<uint64_t> order, order_scratch;
+    Buffer<uint64_t> order, order_scratch, row;
 };
 
 // Throws std::invalid_argument where a picture of the group would have a side of more than 65,535 px.

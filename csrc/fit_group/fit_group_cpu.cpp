@@ -42,12 +42,13 @@ static bool misses_tile(const Record<float>& g, int left, int top) {
     return g.x1 < left || g.y1 < top || g.x0 >= left + kTileSize || g.y0 >= top + kTileSize;
 }
 
-static void blend_sorted(const FitScratch& scratch, size_t count, int left, int top, int size,
-                         TilePlanes<float>& tile) {
+// Blends records in this order.
+static void blend_sorted(const FitScratch& scratch, const uint64_t* order, size_t count, int left, int top,
+                         int size, TilePlanes<float>& tile) {
     const BlockPixels<float> pixels;
     uint64_t alive = clear_tile(tile, left, top, square(size), Extra::kNothing);
     for (size_t i = 0; i < count && alive != 0; ++i) {
-        const Record<float>& g = scratch.records.data()[record_of(scratch.order.data()[i])];
+        const Record<float>& g = scratch.records.data()[record_of(order[i])];
         if (misses_tile(g, left, top)) continue;
         const uint64_t blocks = live_blocks(g, left, top, alive);
         if (blocks != 0) blend_record<float, Extra::kNothing>(g, blocks, left, top, pixels, tile, alive);
@@ -70,20 +71,34 @@ void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget&
     image.assign(static_cast<size_t>(across) * across * kPlanes * kTilePixels, 0.0f);
     const float share = 1.0f / static_cast<float>(ss * ss);
     TilePlanes<float> tile;
-    for (int top = 0; top < ss * view.size; top += kTileSize)
+    uint64_t* const in_row = scratch.row.reserve(count);
+    for (int top = 0; top < ss * view.size; top += kTileSize) {
+        size_t num_in_row = 0;
+        for (size_t i = 0; i < count; ++i) {
+            const uint64_t entry = scratch.order.data()[i];
+            const Record<float>& g = scratch.records.data()[record_of(entry)];
+            if (g.y1 >= top && g.y0 < top + kTileSize) in_row[num_in_row++] = entry;
+        }
         for (int left = 0; left < ss * view.size; left += kTileSize) {
-            blend_sorted(scratch, count, left, top, ss * view.size, tile);
-            for (int y = 0; y < kTileSize && top + y < ss * view.size; ++y)
+            blend_sorted(scratch, in_row, num_in_row, left, top, ss * view.size, tile);
+            for (int y = 0; y < kTileSize && top + y < ss * view.size; ++y) {
+                const int py = (top + y) / ss;
+                int px = left / ss, sample = left % ss;
                 for (int x = 0; x < kTileSize && left + x < ss * view.size; ++x) {
-                    const int px = (left + x) / ss, py = (top + y) / ss, p = place_in_tile(x, y);
+                    const int p = place_in_tile(x, y), out = place_in_tile(px % kTileSize, py % kTileSize);
                     float* planes =
                         image.data() +
                         static_cast<size_t>(py / kTileSize * across + px / kTileSize) * kPlanes * kTilePixels;
-                    const int out = place_in_tile(px % kTileSize, py % kTileSize);
                     for (int c = 0; c < 3; ++c) planes[c * kTilePixels + out] += share * tile.color[c][p];
                     planes[3 * kTilePixels + out] += share * (1 - std::fabs(tile.transmittance[p]));
+                    if (++sample == ss) {
+                        sample = 0;
+                        ++px;
+                    }
                 }
+            }
         }
+    }
 }
 
 // The parameters of one group, one flat array in the order means, quats, log scales, logits, sh; a gradient
@@ -296,8 +311,8 @@ class Comparison {
         const int across = tiles_across(view);
         tiles_.resize(static_cast<size_t>(across) * across);
         for (int t = 0; t < across * across; ++t)
-            blend_sorted(scratch_, count, t % across * kTileSize, t / across * kTileSize, view.size,
-                         tiles_[t]);
+            blend_sorted(scratch_, scratch_.order.data(), count, t % across * kTileSize,
+                         t / across * kTileSize, view.size, tiles_[t]);
         return count;
     }
 

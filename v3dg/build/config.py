@@ -83,7 +83,7 @@ class BuildConfig:
     first_steps: int = 150
     views_per_step: int = 2
     num_views: int = 64
-    supersample: int = 4
+    supersample: int = 3
     image_size: int = 0
     px2_per_gaussian: float = 2.0
     distance: float = 4.0
