@@ -51,8 +51,8 @@ V3DG_HD inline uint64_t view_of_picture(const FitConfig& config, uint64_t pictur
 // Writes what each step of Adam takes, on the device.
 void make_steps(const FitConfig& config, FitStep* steps, cudaStream_t stream);
 
-// Groups that have the same fate whatever the memory: how blocks take them follows from all, not from those
-// whose pictures fit into memory together.
+// The groups of a whole level. How blocks take groups follows from this, and not from those whose pictures
+// fit into memory together, so that free memory changes no bits.
 struct FitExtent {
     size_t num_groups;
     uint32_t most;  // gaussians of a group
