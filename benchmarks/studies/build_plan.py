@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from v3dg import BuildConfig, _core
-from v3dg.build.leaves_on_disk import _Sizes, _Tile
+from v3dg.build.leaves_on_disk import _Sizes, _Tile, scratch_bytes
 from v3dg.build.memory import in_bytes, unit_bytes
 from v3dg.build.plan import LevelPlan, Plan
 from v3dg.build.whole import UNIT_LEAVES
@@ -68,7 +68,7 @@ def needs(num_gaussians: int, sh_degree: int, memory: str) -> dict[str, Any]:
         "bundle": file.num_bytes,
         "tables": file.num_bytes - pages,
         "journal": journal,
-        "scratch": num_gaussians * (4 + max(gaussian, 32)) if is_sorted else 0,
+        "scratch": scratch_bytes(num_gaussians, sh_degree) if is_sorted else 0,
         "disk": file.num_bytes + journal + (input_bytes if is_sorted else 0),
         "sorting_passes": passes if is_sorted else 0,
         "written": file.num_bytes + journal + is_sorted * num_gaussians * (gaussian + 20 + 16 * passes),

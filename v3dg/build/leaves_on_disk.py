@@ -175,9 +175,13 @@ def _bytes_in_bucket(degree: int) -> int:
     return 2 * gaussian_bytes(degree) + external_split.FITTING_BYTES
 
 
+def scratch_bytes(count: int, degree: int) -> int:
+    """What the scratch of so many gaussians takes on the disk, at most."""
+    return count * (4 + max(gaussian_bytes(degree), 2 * 16))
+
+
 def _check_disk(folder: Path, count: int, degree: int) -> None:
-    needed = count * (4 + max(gaussian_bytes(degree), 2 * 16))
-    free = shutil.disk_usage(folder).free
+    needed, free = scratch_bytes(count, degree), shutil.disk_usage(folder).free
     if free < needed:
         raise OSError(
             f"{folder}: expected {in_mib(needed)} free for scratch, got {in_mib(free)}; "
