@@ -25,7 +25,6 @@ SIZES = {0.5: 4, 1.0: 4, 2.0: 2, 4.0: 2, 8.0: 1}
 """In units of 2 px² a gaussian, as a side; the samples of a pixel's side that the leaves are drawn with."""
 _MOST_SAMPLES = 12_000_000  # of one picture
 _WEIGHTS = np.array([1, 1, 1, 1.5], np.float32) / 3  # mean |colour| and half of |alpha|, as the fit has it
-_SH0 = 0.28209479177387814
 _FOV = 0.3
 
 
@@ -137,7 +136,7 @@ class Groups:
             sh = torch.zeros(len(asset), 1, 3, requires_grad=True)
             v3dg.rasterize(replace(asset, sh=sh), camera).color.sum().backward()
             assert sh.grad is not None
-            weight = np.append(0, np.cumsum(sh.grad[:, 0].mean(1).double().numpy() / _SH0))
+            weight = np.append(0, np.cumsum(sh.grad[:, 0].mean(1).double().numpy() / _core.sh_base0))
             seen += weight[self.leaf[:, 1]] - weight[self.leaf[:, 0]]
             alone += self.cover * (self._size(camera) / 2) ** 2
         self.visibility = seen / alone
