@@ -215,6 +215,7 @@ def test_units_hold_all_leaves_and_no_more_than_asked():
             sizes = [part.levels[0].num_gaussians for part in units]
             assert sum(sizes) == count
             assert max(sizes) <= max(most, 2 * 256)  # a page is not shared
+            assert len({len(part.levels) for part in units}) == 1
 
 
 # ---- files
