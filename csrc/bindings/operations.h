@@ -11,6 +11,7 @@ void bind_ply(pybind11::module_& m);
 void bind_cluster(pybind11::module_& m);
 void bind_simplify(pybind11::module_& m);
 void bind_gather(pybind11::module_& m);
+void bind_quantize(pybind11::module_& m);
 void bind_select(pybind11::module_& m);
 void bind_rasterize(pybind11::module_& m);
 void bind_scene(pybind11::module_& m);
