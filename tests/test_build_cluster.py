@@ -78,6 +78,15 @@ def test_units_of_an_asset_in_memory_go_along(folder, tmp_path, at_package):
     assert (tmp_path / "out").read_bytes() == (folder / "local.v3dg").read_bytes()
 
 
+def test_processes_round_as_one_does(folder, tmp_path, at_package):
+    asset = v3dg.read_asset(folder / "a.ply")
+    with small_units(), spawned_processes(2) as executor:
+        build_bundle(asset, codec="quantized", **OPTIONS).write(tmp_path / "alone")
+        options = {"executor": executor, "resume_path": tmp_path / "out"}
+        build_bundle(asset, codec="quantized", **options, **OPTIONS)
+    assert (tmp_path / "out").read_bytes() == (tmp_path / "alone").read_bytes()
+
+
 def test_a_process_that_dies_leaves_what_can_be_gone_on_with(folder, tmp_path, at_package):
     output = tmp_path / "out.v3dg"
     with spawned_processes(1) as executor:

@@ -16,7 +16,7 @@ from v3dg.build.fit import fit_config
 from v3dg.build.leaves import MemoryLeaves
 from v3dg.build.plan import Plan
 from v3dg.build.simplify import Level, LevelTables, build_levels
-from v3dg.bundle.codec import Codec
+from v3dg.bundle.codec import CODECS, codec_of
 from v3dg.bundle.file import BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES
 from v3dg.bundle.pages import PageLayout
@@ -62,13 +62,13 @@ def part_of(level, plan, part):
     )
 
 
-def build_subtree(leaves, plan, config, level, first_group, last_group):
+def build_subtree(leaves, plan, config, codec, level, first_group, last_group):
     """The levels above the leaves under a run of groups, made from those leaves alone; and their plan."""
     part = plan.subtree(level, first_group, last_group)
     bottom = part.levels[0].first_group
     rows = plan.levels[0].offset[[bottom, bottom + part.levels[0].num_groups]]
     own = Gaussians(*(np.array(getattr(leaves, name)[slice(*rows)]) for name in scenes.NAMES))
-    return list(build_levels(own, part, config, SEED)), part
+    return list(build_levels(own, part, config, SEED, codec)), part
 
 
 def joined(levels):
@@ -120,17 +120,18 @@ def test_plan_of_a_subtree_is_a_part_of_the_plan():
 # ---- subtrees
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_a_subtree_alone_is_that_of_the_whole(asset, name):
+@pytest.mark.parametrize(("name", "codec"), [*((name, "float32") for name in CONFIGS), ("ours", "quantized")])
+def test_a_subtree_alone_is_that_of_the_whole(asset, name, codec):
     """Whatever is built beside it, below which level, and in which order."""
     config = CONFIGS[name]
     leaves, plan = in_split_order(asset, config), Plan.of(len(asset), config)
-    whole = list(build_levels(leaves, plan, config, SEED))
+    codec = codec_of(codec, asset.sh_degree)
+    whole = list(build_levels(leaves, plan, config, SEED, codec))
     num_compared = 0
     for level in (3, 1, 2):
         num_groups = plan.levels[level].num_groups
         for group in np.random.default_rng(level).permutation(num_groups)[:3]:
-            levels, part = build_subtree(leaves, plan, config, level, group, group + 1)
+            levels, part = build_subtree(leaves, plan, config, codec, level, group, group + 1)
             for built, of_whole, here, there in zip(levels, whole, part.levels, plan.levels, strict=False):
                 expected = arrays_of(part_of(of_whole, there, here))
                 for key, array in arrays_of(built).items():
@@ -139,17 +140,19 @@ def test_a_subtree_alone_is_that_of_the_whole(asset, name):
     assert num_compared > 20
 
 
+@pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("name", ["ours", "groups_of_4"])
-def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
+def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
     """Their pages go to the file as they are finished; what is above is built from what they became."""
     config = CONFIGS[name]
-    build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu").write(tmp_path / "whole.v3dg")
+    options = {"config": config, "seed": SEED, "progress": False, "device": "cpu", "codec": codec}
+    build_bundle(asset, **options).write(tmp_path / "whole.v3dg")
     made_with = v3dg.Bundle.open(tmp_path / "whole.v3dg").config
     leaves, plan = in_split_order(asset, config), Plan.of(len(asset), config)
     level = 2
     num_groups = plan.levels[level].num_groups
     subtrees = {}
-    codec, first_page = Codec(asset.sh_degree), plan.first_page
+    codec, first_page = codec_of(codec, asset.sh_degree), plan.first_page
     file = BundlePlan(plan.layout, codec, made_with)
     hashes = np.zeros((first_page[-1], HASH_BYTES), np.uint8)
     with open(tmp_path / "parts.v3dg", "wb") as output:
@@ -158,14 +161,14 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
             hashes[first:last] = write_pages(output.fileno(), file.run(first, last), codec, gaussians)
 
         for group in np.random.default_rng(0).permutation(num_groups):
-            levels, part = build_subtree(leaves, plan, config, level, group, group + 1)
+            levels, part = build_subtree(leaves, plan, config, codec, level, group, group + 1)
             for number, above in enumerate(part.levels[1:]):
                 page = first_page[number] + above.first_group
                 write(page, page + above.num_groups, levels[number].gaussians)
             subtrees[group] = levels
         in_order = zip(*(subtrees[group] for group in range(num_groups)), strict=True)
         finished = [joined(levels) for levels in in_order][1:]
-        whole = list(build_levels(leaves, plan, config, SEED, finished=finished))
+        whole = list(build_levels(leaves, plan, config, SEED, codec, finished=finished))
         for number in range(level, len(whole)):
             write(first_page[number], first_page[number + 1], whole[number].gaussians)
         tables = assemble(plan, [level.tables for level in whole], config)
@@ -177,15 +180,16 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, tmp_path):
 # ---- units
 
 
+@pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("name", ["ours", "previous", "groups_of_4"])
-def test_units_are_the_same_on_any_number_of_threads(asset, name, monkeypatch, tmp_path):
+def test_units_are_the_same_on_any_number_of_threads(asset, name, codec, monkeypatch, tmp_path):
     """And an interrupted build goes on to the same bytes, whichever units were finished."""
     config = CONFIGS[name]
     monkeypatch.setattr("v3dg.build.whole.UNIT_LEAVES", 160)
-    whole = build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu")
+    whole = build_bundle(asset, config=config, seed=SEED, progress=False, device="cpu", codec=codec)
     whole.write(tmp_path / "one.v3dg")
     monkeypatch.setattr("v3dg._device.all_like", lambda device: [device] * 3)
-    three = {"config": config, "seed": SEED, "progress": False}
+    three = {"config": config, "seed": SEED, "progress": False, "codec": codec}
     monkeypatch.setattr("v3dg._device.missing_for_cuda", lambda: "none wanted")
     build_bundle(asset, **three).write(tmp_path / "three.v3dg")
     assert (tmp_path / "three.v3dg").read_bytes() == (tmp_path / "one.v3dg").read_bytes()
@@ -221,9 +225,10 @@ def test_units_hold_all_leaves_and_no_more_than_asked():
 # ---- files
 
 
-def test_a_file_is_built_as_a_bundle_is(asset, tmp_path):
+@pytest.mark.parametrize("codec", CODECS)
+def test_a_file_is_built_as_a_bundle_is(asset, codec, tmp_path):
     v3dg.write_asset(tmp_path / "asset.ply", asset)
-    options = {"config": SMALL, "seed": SEED, "progress": False, "device": "cpu"}
+    options = {"config": SMALL, "seed": SEED, "progress": False, "device": "cpu", "codec": codec}
     bundle, is_built = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
     assert is_built
     assert bundle.path == str(tmp_path / "out.v3dg")
@@ -232,6 +237,13 @@ def test_a_file_is_built_as_a_bundle_is(asset, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"asset.ply", "out.v3dg", "memory.v3dg"}
     again = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
     assert not again[1]
+    opened = v3dg.Bundle.open(tmp_path / "out.v3dg")
+    other = next(iter(CODECS.keys() - {codec}))
+    parts = (opened.clusters, opened.groups, opened.gaussians, opened.config)
+    v3dg.Bundle(*parts, other).write(tmp_path / "out.v3dg")
+    again = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
+    assert again[1]  # what was converted since is not what was built
+    assert (tmp_path / "out.v3dg").read_bytes() == (tmp_path / "memory.v3dg").read_bytes()
 
 
 def test_what_a_killed_build_left_of_a_file_is_written_over(asset, tmp_path):

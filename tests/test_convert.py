@@ -61,6 +61,27 @@ def test_a_level_of_a_bundle(folder):
         np.testing.assert_array_equal(gaussians.means, bundle.level_gaussians(level or 0).means)
 
 
+def test_a_bundle_becomes_one_of_another_codec_and_back(folder):
+    def write(*arguments):
+        done = run("convert", *arguments, "--json", cwd=folder)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)["codec"]
+
+    assert write("tuft.v3dg", "same.v3dg") == "float32"
+    assert (folder / "same.v3dg").read_bytes() == (folder / "tuft.v3dg").read_bytes()
+    assert write("tuft.v3dg", "small.v3dg", "--codec", "quantized") == "quantized"
+    assert (folder / "small.v3dg").stat().st_size < (folder / "tuft.v3dg").stat().st_size / 3
+    assert write("small.v3dg", "again.v3dg") == "quantized"
+    assert (folder / "again.v3dg").read_bytes() == (folder / "small.v3dg").read_bytes()
+    assert write("small.v3dg", "back.v3dg", "--codec", "float32") == "float32"
+    small, back = (v3dg.Bundle.open(folder / name) for name in ("small.v3dg", "back.v3dg"))
+    np.testing.assert_array_equal(back.gaussians.means, small.gaussians.means)
+    assert write("back.v3dg", "again.v3dg", "--codec", "quantized") == "quantized"
+    assert (folder / "again.v3dg").read_bytes() == (folder / "small.v3dg").read_bytes()
+    text = run("info", "small.v3dg", cwd=folder).stdout
+    assert "bundle, version 2 (quantized)" in text
+
+
 def test_the_cut_of_a_bundle_for_a_turntables_camera(folder):
     result, fine = converted(folder, "tuft.v3dg", "cut.ply", "--tolerance", "0")
     _, coarse = converted(folder, "tuft.v3dg", "cut.ply", "--budget", 500)
@@ -128,6 +149,9 @@ def test_what_cannot_be_meant_is_refused(folder):
         "x.obj",
         cwd=folder,
     )
+    fails(2, "expected a bundle to write anew", "convert", "tuft.ply", "x.v3dg", cwd=folder)
+    fails(2, "and no level or cut", "convert", "tuft.v3dg", "x.v3dg", "--level", "1", cwd=folder)
+    fails(2, "--codec: expected an output", "convert", "tuft.ply", "x.ply", "--codec", "float32", cwd=folder)
     fails(1, "create it first", "convert", "tuft.ply", "no/x.ply", cwd=folder)
     fails(1, "budget: expected at least", "convert", "tuft.v3dg", "x.ply", "--budget", "1", cwd=folder)
 

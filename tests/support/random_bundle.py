@@ -71,7 +71,9 @@ def random_groups(rng, parent, level):
     return Groups(ball=ball, weight=weight, parent=parent, level=level, error=error)
 
 
-def random_bundle(seed=0, *, num_levels=3, sh_degree=0, max_cluster=5, max_fan=3, config=None):
+def random_bundle(
+    seed=0, *, num_levels=3, sh_degree=0, max_cluster=5, max_fan=3, config=None, codec="float32"
+):
     """A valid bundle; clusters may be empty. ``num_levels`` 0 gives a bundle without clusters."""
     rng = np.random.default_rng(seed)
     if num_levels:
@@ -96,4 +98,4 @@ def random_bundle(seed=0, *, num_levels=3, sh_degree=0, max_cluster=5, max_fan=3
         antialiased=rng.integers(0, 2, count).astype(np.uint8),
     )
     parent, level = (np.ascontiguousarray(column) for column in group_links.T)
-    return Bundle(clusters, random_groups(rng, parent, level), gaussians, config)
+    return Bundle(clusters, random_groups(rng, parent, level), gaussians, config, codec)

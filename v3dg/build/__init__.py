@@ -28,6 +28,7 @@ def build_bundle(
     resume_path: str | os.PathLike[str] | None = None,
     unusable: Literal["drop", "refuse"] = "drop",
     executor: Executor | None = None,
+    codec: Literal["float32", "quantized"] = "float32",
 ) -> Bundle:
     """Build all levels of one asset (V3DG, algorithm 1; what we do differently is in docs/levels.md).
 
@@ -50,6 +51,8 @@ def build_bundle(
         executor: Whose workers build, as `dask.distributed.Client.get_executor()`; by default, threads of
             this process. They are to have devices of one kind with this process, which builds the topmost
             levels, and to reach `resume_path`, where they write their parts (docs/cluster.md).
+        codec: How the bundle keeps gaussians, see `v3dg.Bundle`. Where that rounds, levels are fitted to what
+            those below them were rounded to.
 
     Raises:
         ValueError: The asset has nothing that can be drawn, or a setting is wrong.
@@ -64,4 +67,4 @@ def build_bundle(
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
     if executor is not None and resume_path is None:
         raise ValueError("resume_path: expected a file that all workers of the executor reach, got None")
-    return build_into(resume_path, leaves, config, seed, devices, progress, executor=executor)
+    return build_into(resume_path, leaves, config, seed, devices, progress, codec=codec, executor=executor)

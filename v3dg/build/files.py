@@ -36,6 +36,7 @@ def build_file(
     unusable: Literal["drop", "refuse"] = "drop",
     memory: int | str | None = None,
     executor: Executor | None = None,
+    codec: Literal["float32", "quantized"] = "float32",
 ) -> tuple[Bundle, bool]:
     """Build the bundle of an asset's file, or of several that make one asset, straight into a file.
 
@@ -48,7 +49,7 @@ def build_file(
             from the levels of a build that was interrupted; otherwise all is made anew.
         memory: Of the host, for the build beside what the process has: bytes, or text like "8GiB". By default
             half of what is free.
-        config, seed, progress, device, unusable, executor: As for `build_bundle`.
+        config, seed, progress, device, unusable, executor, codec: As for `build_bundle`.
 
     Returns:
         The bundle, opened from its file, and whether it was built.
@@ -58,8 +59,7 @@ def build_file(
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As `read_asset` and `build_bundle`.
     """
     paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
-    bundle_path = Path(bundle_path)
-    config = config or BuildConfig()
+    bundle_path, config = Path(bundle_path), config or BuildConfig()
     levels = levels_path(bundle_path)
     _files.check_folder(levels)
     _files.status_of_replaced(bundle_path)
@@ -68,8 +68,7 @@ def build_file(
         discard_levels(levels)
     where: dict[str, Any] = {"config": config, "unusable": unusable, "device": devices[0]}
     bounds: dict[str, Any] = {"memory": num_bytes, "reserved": unit_bytes, "progress": progress}
-    if executor is not None:
-        bounds["most_in_memory"] = 0  # where workers would not find them
+    bounds |= {} if executor is None else {"most_in_memory": 0}  # where workers would not find them
     with (
         _naming_asset(paths[0]),
         nullcontext(MemoryLeaves(asset, **where))
@@ -77,12 +76,13 @@ def build_file(
         else leaves_on_disk(paths, levels.with_suffix(".scratch"), **bounds, **where) as leaves,
     ):
         del asset
-        if resume and _is_made_with(bundle_path, made_with(leaves, config, seed)):
+        if resume and _is_made_with(bundle_path, made_with(leaves, config, seed, codec), codec):
             with suppress(RuntimeError):  # another build to the same place has begun
                 discard_levels(levels)
             return Bundle.open(bundle_path), False
         at: dict[str, Any] = {"bundle_path": bundle_path, "most_units": most_units(num_bytes, leaves)}
-        return build_into(levels, leaves, config, seed, devices, progress, executor=executor, **at), True
+        at |= {"codec": codec, "executor": executor}
+        return build_into(levels, leaves, config, seed, devices, progress, **at), True
 
 
 @contextmanager
@@ -95,10 +95,11 @@ def _naming_asset(path: AssetPath) -> Iterator[None]:
         raise ValueError(f"{place}{error}") from None
 
 
-def _is_made_with(bundle_path: Path, how: dict[str, Any]) -> bool:
-    """Whether a bundle is there and says that it was made so."""
+def _is_made_with(bundle_path: Path, how: dict[str, Any], codec: str) -> bool:
+    """Whether a bundle is there, says that it was made so, and was not converted since."""
     try:
-        return Bundle.open(bundle_path).config == how
+        bundle = Bundle.open(bundle_path)
+        return bundle.config == how and bundle.codec == codec
     except (ValueError, OSError):  # none, damaged, or of another version: build it
         return False
 

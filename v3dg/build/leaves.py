@@ -18,6 +18,7 @@ from v3dg._device import Device
 from v3dg._numbers import one_of
 from v3dg.build.config import BuildConfig
 from v3dg.build.digest import digest_of
+from v3dg.bundle.codec import Codec
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
 Unusable = Literal["drop", "refuse"]
@@ -76,7 +77,7 @@ class MemoryLeaves(Leaves):
         return np.take(rows, _device.to_host(order))
 
 
-def made_with(leaves: Leaves, config: BuildConfig, seed: int) -> dict[str, Any]:
+def made_with(leaves: Leaves, config: BuildConfig, seed: int, codec: str) -> dict[str, Any]:
     """What the config of a bundle says of how it was made."""
     seed = operator.index(seed)
     if not 0 <= seed < 2**58:
@@ -87,6 +88,7 @@ def made_with(leaves: Leaves, config: BuildConfig, seed: int) -> dict[str, Any]:
         "asset_gaussians": leaves.asset_gaussians,
         "asset_digest": leaves.digest,
         "dropped": leaves.dropped,
+        **({} if codec == Codec.name else {"codec": codec}),
     }
 
 

@@ -103,7 +103,7 @@ class Plan:
         for level, count in zip(self.levels, self._num_pages, strict=True):
             each = level.num_clusters // count
             clusters.append(np.full(count, each, np.int64))
-            gaussians.append(np.diff(level.offset[::each]))
+            gaussians.append(np.diff(level.offset))
         return PageLayout(_offset_of(np.concatenate(clusters)), _offset_of(np.concatenate(gaussians)))
 
 

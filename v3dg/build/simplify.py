@@ -14,7 +14,7 @@ from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
 from v3dg.build.plan import LevelPlan, Offsets, Plan
 from v3dg.bundle.codec import Codec
-from v3dg.gaussians import Array, Gaussians
+from v3dg.gaussians import Array, Gaussians, empty
 
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
 _GROUPS_AT_ONCE = 256
@@ -46,6 +46,7 @@ def build_levels(
     plan: Plan,
     config: BuildConfig,
     seed: int,
+    codec: Codec,
     *,
     finished: Iterable[Level] = (),
     show: Show = lambda levels, num_groups, num_gaussians, state: None,
@@ -58,6 +59,7 @@ def build_levels(
     spread over the GPU, and thereby the last bits.
     """
     here = plan.levels[0]
+    leaves = codec.rounded(leaves, here.offset)
     ball = _core.bound_spheres(_spheres(leaves), here.leaf_offset)
     box, ball = (_device.to_host(array) for array in (_core.bound_by_boxes(leaves.rows, here.offset), ball))
     level = Level(leaves, LevelTables(box, ball, ball, np.zeros((here.num_groups, 2), np.float32)))
@@ -65,11 +67,17 @@ def build_levels(
     yield level
     below = {0: level}
     del level
-    yield from build_above(below, plan, config, seed, finished, show)
+    yield from build_above(below, plan, config, seed, codec, finished, show)
 
 
 def build_above(
-    below: dict[int, Level], plan: Plan, config: BuildConfig, seed: int, finished: Iterable[Level], show: Show
+    below: dict[int, Level],
+    plan: Plan,
+    config: BuildConfig,
+    seed: int,
+    codec: Codec,
+    finished: Iterable[Level],
+    show: Show,
 ) -> Iterator[Level]:
     """Yield the levels of a plan above those of `below`, which keeps those that the next are fitted to."""
     saved = iter(finished)
@@ -79,7 +87,7 @@ def build_above(
         levels = config.levels_at_once(last + 1, len(plan.levels))
         made = list(islice(saved, len(levels)))
         if len(made) < len(levels):
-            made = _simplify(below, plan, levels, config, seed, show)
+            made = _simplify(below, plan, levels, config, seed, codec, show)
         for number, level in zip(levels, made, strict=True):
             below[number] = Level(_device.place(level.gaussians, where), level.tables)
         last = levels[-1]
@@ -90,7 +98,13 @@ def build_above(
 
 
 def _simplify(
-    below: Mapping[int, Level], plan: Plan, levels: range, config: BuildConfig, seed: int, show: Show
+    below: Mapping[int, Level],
+    plan: Plan,
+    levels: range,
+    config: BuildConfig,
+    seed: int,
+    codec: Codec,
+    show: Show,
 ) -> list[Level]:
     """Make the next levels, whose groups are fitted together."""
     plans = [plan.levels[number] for number in levels]
@@ -131,7 +145,7 @@ def _simplify(
     for i, number in enumerate(levels):
         ball = _core.bound_spheres(ball, _children(plan, number - 1, number))
         part = gaussians.subset(slice(int(rows[i]), int(rows[i + 1])))
-        made.append(_level(part, plans[i], ball, balls[i], error[groups[i] : groups[i + 1]]))
+        made.append(_level(part, plans[i], codec, ball, balls[i], error[groups[i] : groups[i + 1]]))
     return made
 
 
@@ -140,13 +154,14 @@ def _streams(number: int, plan: LevelPlan) -> npt.NDArray[np.int64]:
     return (number << 40) + np.arange(plan.first_group, plan.first_group + plan.num_groups, dtype=np.int64)
 
 
-def _level(gaussians: Gaussians, plan: LevelPlan, *tables: npt.NDArray[np.float32]) -> Level:
+def _level(gaussians: Gaussians, plan: LevelPlan, codec: Codec, *tables: npt.NDArray[np.float32]) -> Level:
     """A level of fitted groups, each split into its clusters."""
     clusters_made = plan.num_clusters // plan.num_groups
     if clusters_made > 1:
         depth = clusters_made.bit_length() - 1
         order, _ = _core.median_split(gaussians.means, plan.group_offset, depth)
         gaussians = gaussians.subset(order)
+    gaussians = codec.rounded(gaussians, plan.offset)
     box = _device.to_host(_core.bound_by_boxes(gaussians.rows, plan.offset))
     return Level(gaussians, LevelTables(box, *tables))
 
@@ -189,7 +204,7 @@ def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: B
     """What groups start from: their gaussians halved, from `offset` to `out_offset`."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
-    result = Codec(gaussians.sh_degree).empty(int(out_offset[-1]))
+    result = empty(int(out_offset[-1]), gaussians.sh_degree)
     for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
         cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
         part = gaussians.subset(slice(cuts[0], cuts[-1]))

@@ -216,8 +216,8 @@ class MemoryStore:
     is_whole = False
 
     def __init__(self, plan: BundlePlan) -> None:
-        self._plan = plan
-        self._pages = MemoryPages(plan.layout, plan.codec.empty(int(plan.layout.first_gaussian[-1])))
+        self._plan, self.codec = plan, plan.codec
+        self._pages = MemoryPages(plan.layout, plan.codec.empty(int(plan.layout.offset[-1])), plan.codec)
         self.pages = self
         self.levels: dict[tuple[int, int], FinishedLevel] = {}
 
@@ -235,7 +235,7 @@ class MemoryStore:
         self._tables = clusters, groups
 
     def bundle(self) -> Bundle:
-        return Bundle(*self._tables, self._pages.gaussians, self._plan.config)
+        return Bundle(*self._tables, self._pages.gaussians, self._plan.config, self.codec.name)
 
 
 def described(device: Device) -> tuple[str, str]:

@@ -25,7 +25,7 @@ from v3dg.build.progress import Bar
 from v3dg.build.simplify import Level, LevelTables, Show, build_above, build_levels
 from v3dg.build.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 from v3dg.bundle import Bundle
-from v3dg.bundle.codec import Codec
+from v3dg.bundle.codec import codec_of
 from v3dg.bundle.file import BundlePlan
 from v3dg.bundle.pages import PageRun
 from v3dg.gaussians import Gaussians
@@ -56,6 +56,7 @@ def build_into(
     devices: Sequence[Device],
     progress: bool,
     *,
+    codec: str,
     bundle_path: Path | None = None,
     most_units: int | None = None,
     executor: Executor | None = None,
@@ -66,7 +67,8 @@ def build_into(
     plan = Plan.of(leaves.num_gaussians, config)
     config.check_views(max((np.diff(made.group_offset).max() for made in plan.levels[1:]), default=1))
     units = plan.units(UNIT_LEAVES)
-    file = BundlePlan(plan.layout, Codec(leaves.sh_degree), made_with(leaves, config, seed))
+    kept = codec_of(codec, leaves.sh_degree)
+    file = BundlePlan(plan.layout, kept, made_with(leaves, config, seed, codec))
     parts = _parts(plan, units, file)
     with (
         _device.memory_errors(),
@@ -135,7 +137,8 @@ class _Build:
         for n in range(first, self.num_low):  # what the levels above begin with
             level = finished[n].read(pages, self.file.run(*self.plan.first_page[n : n + 2]))
             below[n] = Level(_device.place(level.gaussians, devices[0]), level.tables)
-        above = build_above(below, self.plan, self.config, self.seed, saved, self.bar.show_of(top))
+        how = (self.plan, self.config, self.seed, self.file.codec)
+        above = build_above(below, *how, saved, self.bar.show_of(top))
         for number, level in enumerate(above, self.num_low):
             if (top, number) not in levels:
                 hashes = pages.write(runs[number], level.gaussians)
@@ -237,7 +240,8 @@ class UnitTask:
         finished = (self.finished[n].read(self.pages, self.runs[n]) for n in sorted(self.finished))
         leaves = next(finished).gaussians if self.finished else self.leaves()
         own = _device.place(leaves, device)
-        levels = build_levels(own, self.plan, self.config, self.seed, finished=finished, show=show)
+        how = (self.plan, self.config, self.seed, self.pages.codec)
+        levels = build_levels(own, *how, finished=finished, show=show)
         del leaves, own
         for number, level in enumerate(levels):
             if number not in self.finished:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from v3dg import _files
+from v3dg import _core, _files
 from v3dg._json import parse_json
 from v3dg._numbers import check, check_all, check_type
+from v3dg.bundle.codec import Codec, codec_of
 from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
-from v3dg.bundle.format import HASH_BYTES, VERSION, config_to_json, page_file_bytes, page_tables
+from v3dg.bundle.format import HASH_BYTES, config_to_json, page_tables
 from v3dg.bundle.pages import FilePages, MemoryPages, PageLayout, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
@@ -29,16 +30,23 @@ class Bundle:
     Attributes:
         config: How it was built, as JSON values.
         sh_degree: 0 to 3, the same for all gaussians.
+        codec: How its file keeps gaussians. "float32": every bit. "quantized": in 16 (SH degree 0) to 40
+            bytes (degree 3), to which they are rounded when the bundle is made; docs/format.md has the error.
 
     Raises:
-        ValueError: The tables do not fit each other or the gaussians, do not guarantee an exact cut, or
-            ``config`` is not JSON.
+        ValueError: The tables do not fit each other or the gaussians, do not guarantee an exact cut,
+            ``config`` is not JSON, or the codec is unknown or cannot hold a value.
     """
 
     _file: BundleFile | None = None
 
     def __init__(
-        self, clusters: Clusters, groups: Groups, gaussians: Gaussians, config: dict[str, Any] | None = None
+        self,
+        clusters: Clusters,
+        groups: Groups,
+        gaussians: Gaussians,
+        config: dict[str, Any] | None = None,
+        codec: str = Codec.name,
     ) -> None:
         check_type("clusters", clusters, Clusters, "Clusters")
         check_type("groups", groups, Groups, "Groups")
@@ -46,7 +54,13 @@ class Bundle:
         # Made anew, because unpickling leaves out what making does: checks, and that arrays are read-only.
         clusters, groups = replace(clusters), replace(groups)
         check_tables(clusters, groups, len(gaussians))
-        pages = MemoryPages(PageLayout.of(clusters), gaussians.numpy())
+        kept = codec_of(codec, gaussians.sh_degree)
+        gaussians = kept.rounded(gaussians.numpy(), clusters.offset)
+        if codec != Codec.name:
+            filled = np.diff(clusters.offset)[:, None, None] > 0
+            box = np.where(filled, _core.bound_by_boxes(gaussians.rows, clusters.offset), clusters.box)
+            clusters = replace(clusters, box=box)
+        pages = MemoryPages(PageLayout.of(clusters), gaussians, kept)
         self._set(clusters, groups, config or {}, pages)
 
     def _set(
@@ -55,7 +69,7 @@ class Bundle:
         self.config: dict[str, Any] = parse_json(config_to_json(config))
         self._clusters = clusters
         self._groups = groups
-        self._codec = pages.codec
+        self._codec, self.codec = pages.codec, pages.codec.name
         self.sh_degree = pages.codec.sh_degree
         self._layout = pages.layout
         self._pages = pages
@@ -83,7 +97,7 @@ class Bundle:
             check("clusters.offset[-1]", num_gaussians <= most, expected)
             check_tables(clusters, groups, num_gaussians)
             pages = FilePages(PageLayout.of(clusters), file)
-            _check_page_tables(tables, page_tables(pages.layout, file.codec), file.pages_bytes)
+            _check_page_tables(pages, file)
             bundle = cls.__new__(cls)
             bundle._set(clusters, groups, file.config, pages)
             bundle._file = file
@@ -97,7 +111,7 @@ class Bundle:
         The file appears at ``path`` when it is complete and not before: on an error or an interrupt, what was
         there stays and nothing else is left.
         """
-        page_bytes = self._codec.page_bytes(self._layout.num_gaussians)
+        page_bytes = self._layout.page_bytes(self._codec)
         plan = BundlePlan(self._layout, self._codec, self.config)
         with _files.replacing(path) as temporary, open(temporary, "wb", buffering=0) as file:
             hashes = [np.empty((0, HASH_BYTES), np.uint8)]
@@ -112,7 +126,7 @@ class Bundle:
         """Pickle what is in memory, and of a file its path: the copy opens it again."""
         if self._file is not None:
             return Bundle.open, (os.path.abspath(self._file.path),)
-        return Bundle, (self.clusters, self.groups, self.gaussians, self.config)
+        return Bundle, (self.clusters, self.groups, self.gaussians, self.config, self.codec)
 
     @property
     def clusters(self) -> Clusters:
@@ -167,7 +181,7 @@ class Bundle:
     def gaussians(self) -> Gaussians:
         """All gaussians, in the order of the clusters; read and verified on first use, then kept."""
         if not isinstance(self._pages, MemoryPages):
-            self._pages = MemoryPages(self._layout, self._pages.read(0, self.num_pages))
+            self._pages = MemoryPages(self._layout, self._pages.read(0, self.num_pages), self._codec)
         return self._pages.gaussians
 
     def read_page(self, page: int) -> Gaussians:
@@ -191,7 +205,7 @@ class Bundle:
 
     def info(self) -> dict[str, Any]:
         """Describe the bundle in JSON values, without reading gaussians; sizes are those of its file."""
-        page_sizes = page_file_bytes(self._codec.page_bytes(self._layout.num_gaussians))
+        page_sizes = self._layout.page_bytes(self._codec)
         page_level = self.clusters.level[self._layout.first_cluster[:-1]]
         offset = self.clusters.offset
         levels = []
@@ -210,7 +224,8 @@ class Bundle:
             )
         return {
             "path": self.path,
-            "version": VERSION,
+            "version": self._codec.version,
+            "codec": self.codec,
             "bytes": BundlePlan(self._layout, self._codec, self.config).num_bytes,
             "sh_degree": self.sh_degree,
             "num_gaussians": self.num_gaussians,
@@ -223,15 +238,14 @@ class Bundle:
         }
 
 
-def _check_page_tables(
-    tables: dict[str, NDArray[Any]], expected: dict[str, NDArray[Any]], pages_bytes: int
-) -> None:
-    num_pages, expected_num_pages = len(tables["pages.bytes"]), len(expected["pages.bytes"])
+def _check_page_tables(pages: FilePages, file: BundleFile) -> None:
+    tables, expected = file.tables, page_tables(pages.layout, pages.codec)
+    num_pages, expected_num_pages = len(tables["pages.offset"]), pages.layout.num_pages
     check("pages", num_pages == expected_num_pages, f"{expected_num_pages} for the clusters, got {num_pages}")
     for name, values in expected.items():
         check_all(name, tables[name], tables[name] == values, lambda i, v=values: f"{v[i]} for its clusters")
-    total = int(page_file_bytes(expected["pages.bytes"]).sum())
-    check("pages", total == pages_bytes, f"{total} bytes for the gaussians, got {pages_bytes}")
+    total = int(pages.layout.page_bytes(pages.codec).sum())
+    check("pages", total == file.pages_bytes, f"{total} bytes for the gaussians, got {file.pages_bytes}")
 
 
 def _mean(values: NDArray[np.float32]) -> float | None:

@@ -1,37 +1,96 @@
-"""The codec: what the bytes of a page are."""
+"""The codecs: what the bytes of a page are."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
+
+from v3dg import _core, _device
+from v3dg._numbers import one_of
 from v3dg.gaussians import Gaussians, empty, gaussian_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
-    import numpy as np
     from numpy.typing import NDArray
 
 
 class Codec:
-    """Gaussians of one SH degree as bytes, and back: the arrays of a page, float32, one after another."""
+    """Gaussians of one SH degree as bytes, and back: the arrays of a page, float32, one after another.
+
+    Attributes:
+        name: As users and files have it.
+        version: Of the files that have it.
+        alignment: Where a page begins in the file: at a multiple of so many bytes.
+        gaussian_bytes, cluster_bytes: What a page holds for each.
+    """
+
+    name: ClassVar[str] = "float32"
+    version: ClassVar[int] = 1
+    alignment: int = 4096  # the memory page, so that a page maps or loads directly
 
     def __init__(self, sh_degree: int) -> None:
         self.sh_degree = sh_degree
-        self.gaussian_bytes = gaussian_bytes(sh_degree)
+        self.gaussian_bytes, self.cluster_bytes = gaussian_bytes(sh_degree), 0
 
-    def page_bytes(self, num_gaussians: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Sizes of pages of so many gaussians, without what they are filled up with."""
-        return num_gaussians * self.gaussian_bytes
+    def page_bytes(
+        self, num_gaussians: NDArray[np.int64], num_clusters: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Sizes of pages of so many, with what they are filled up with."""
+        num_bytes = num_gaussians * self.gaussian_bytes + num_clusters * self.cluster_bytes
+        return num_bytes + -num_bytes % self.alignment
 
-    def encode(self, gaussians: Gaussians, rows: slice) -> list[NDArray[Any]]:
-        """Arrays whose bytes, one array after another, are those of the page that has these rows."""
-        return [array[rows] for array in vars(gaussians).values()]
+    def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
+        """Arrays whose bytes, one after another, are the page of the clusters that begin at these rows."""
+        return [array[offset[0] : offset[-1]] for array in vars(gaussians).values()]
 
-    def decode(self, read: Callable[[Sequence[NDArray[Any]]], None], out: Gaussians, rows: slice) -> None:
-        """Fill the rows with a page, whose bytes `read` reads into the arrays that it is given."""
-        read(self.encode(out, rows))
+    def buffers(self, out: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
+        """Arrays to read such a page to, from which `decode` takes it."""
+        return Codec.encode(self, out, offset)
+
+    def decode(self, buffers: Sequence[NDArray[Any]], out: Gaussians, offset: NDArray[np.int64]) -> None:
+        """Fill the rows with the page; ValueError where it is none."""
+
+    def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
+        """The gaussians of these clusters as they come back from pages, where they are."""
+        return gaussians
 
     def empty(self, count: int) -> Gaussians:
         """Gaussians on the host to decode to, with any values."""
         return empty(count, self.sh_degree)
+
+
+class Quantized(Codec):
+    """Codes of 16 bytes and up to 24 for the higher degrees, relative to the ranges of a cluster."""
+
+    name = "quantized"
+    version = 2
+
+    def __init__(self, sh_degree: int) -> None:
+        self.sh_degree = sh_degree
+        self.gaussian_bytes, self.cluster_bytes, self.alignment = _core.page_code_bytes(sh_degree)
+
+    def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
+        return [_core.encode_page(gaussians.rows, offset)]
+
+    def buffers(self, out: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
+        size = self.page_bytes(offset[-1] - offset[0], np.int64(len(offset) - 1))
+        return [np.empty(int(size) // 4, np.int32)]
+
+    def decode(self, buffers: Sequence[NDArray[Any]], out: Gaussians, offset: NDArray[np.int64]) -> None:
+        _core.decode_page(buffers[0], offset, out.rows)
+
+    def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
+        result = self.empty(len(gaussians))
+        self.decode(self.encode(gaussians.numpy(), offset), result, offset)
+        return _device.place(result, _device.of(gaussians.means))
+
+
+CODECS: dict[str, type[Codec]] = {codec.name: codec for codec in (Codec, Quantized)}
+
+
+def codec_of(name: str, sh_degree: int) -> Codec:
+    """The codec of that name; ValueError where there is none."""
+    one_of(name, "codec", tuple(CODECS))
+    return CODECS[name](sh_degree)

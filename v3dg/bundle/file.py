@@ -11,7 +11,6 @@ import hashlib
 import os
 import re
 import weakref
-from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -19,20 +18,18 @@ import numpy as np
 from v3dg import _files
 from v3dg._json import parse_json, shown
 from v3dg._numbers import check
-from v3dg.bundle.codec import Codec
+from v3dg.bundle.codec import CODECS, Codec
 from v3dg.bundle.format import (
-    ALIGNMENT_BYTES,
     DTYPES,
     FORMAT,
     HASH_BYTES,
     MAX_HEADER_BYTES,
-    SCHEMA,
     VERSION,
     entries_of,
     header_of,
-    page_file_bytes,
     page_hash,
     page_tables,
+    schema_of,
 )
 from v3dg.bundle.pages import on_threads, runs_of_pages
 from v3dg.bundle.tables import check_tables
@@ -47,6 +44,7 @@ if TYPE_CHECKING:
     from v3dg.gaussians import Gaussians
 
 _BYTES_PER_TASK = 16 << 20
+_FIRST_BYTES = 4096  # of the header: what a disk writes at once
 _DAMAGED = "the file is damaged, copy or build it again"
 
 
@@ -56,10 +54,10 @@ class BundlePlan:
     def __init__(self, layout: PageLayout, codec: Codec, config: dict[str, Any]) -> None:
         self.layout, self.codec, self.config = layout, codec, config
         self._page_tables = page_tables(layout, codec)
-        pages_bytes = int(page_file_bytes(self._page_tables["pages.bytes"]).sum())
+        pages_bytes = int(layout.page_bytes(codec).sum())
         num_clusters, num_pages = int(layout.first_cluster[-1]), layout.num_pages
-        entries = entries_of(num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
-        self.header = header_of(entries, codec.sh_degree, config)
+        entries = entries_of(codec.version, num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
+        self.header = header_of(entries, codec, config)
         ends = (entries[name]["data_offsets"][1] for name in ("pages", "hash"))
         self._pages_end, self.num_bytes = (len(self.header) + int(end) for end in ends)
         self._places = np.append(len(self.header) + self._page_tables["pages.offset"], self._pages_end)
@@ -76,15 +74,16 @@ class BundlePlan:
         tables = self._page_tables | {"pages.hash": hashes}
         for prefix, part in (("clusters", clusters), ("groups", groups)):
             tables |= {f"{prefix}.{name}": array for name, array in vars(part).items()}
-        end = b"".join(tables[name].astype(DTYPES[kind], copy=False).tobytes() for name, kind, _, _ in SCHEMA)
+        schema = schema_of(self.codec.version)
+        end = b"".join(tables[name].astype(DTYPES[kind], copy=False).tobytes() for name, kind, _, _ in schema)
         end += hashlib.blake2b(self.header + end, digest_size=HASH_BYTES).digest()
         assert self._pages_end + len(end) == self.num_bytes
         _files.write_at(descriptor, end, self._pages_end)
 
     def write_header(self, descriptor: int) -> None:
         """Write the header; a file that has the first bytes of it has all."""
-        _files.write_at(descriptor, self.header[ALIGNMENT_BYTES:], ALIGNMENT_BYTES)
-        _files.write_at(descriptor, self.header[:ALIGNMENT_BYTES], 0)
+        _files.write_at(descriptor, self.header[_FIRST_BYTES:], _FIRST_BYTES)
+        _files.write_at(descriptor, self.header[:_FIRST_BYTES], 0)
 
 
 def write_pages(descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussians) -> NDArray[np.uint8]:
@@ -95,7 +94,7 @@ def write_pages(descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussian
     def write(page: int) -> None:
         data = np.zeros(int(sizes[page]), np.uint8)
         end = 0
-        for piece in codec.encode(host, run.rows_of(page)):
+        for piece in codec.encode(host, run.clusters_of(page)):
             end += piece.nbytes
             data[end - piece.nbytes : end] = piece.reshape(-1).view(np.uint8)
         hashes[page] = np.frombuffer(page_hash((data,)), np.uint8)
@@ -109,13 +108,15 @@ def read_pages(
     path: str | os.PathLike[str], descriptor: int, run: PageRun, codec: Codec, hashes: NDArray[np.uint8]
 ) -> Gaussians:
     """The gaussians of a run of pages; ValueError unless they are there and have these hashes."""
-    sizes = codec.page_bytes(np.diff(run.first_gaussian))
     result = codec.empty(run.rows.stop - run.rows.start)
 
-    def read_page(page: int, arrays: Sequence[NDArray[Any]]) -> None:
+    def read_page(page: int) -> None:
         place, end = run.places[page : page + 2].tolist()
-        pieces = (*arrays, np.empty(end - place - int(sizes[page]), np.uint8))
-        first, last = run.first_gaussian[page : page + 2].tolist()
+        offset = run.clusters_of(page)
+        buffers = codec.buffers(result, offset)
+        fill = end - place - sum(buffer.nbytes for buffer in buffers)
+        pieces = (*buffers, np.empty(fill, np.uint8))
+        first, last = offset[[0, -1]] + run.rows.start
         name = f"page {run.first_page + page} (gaussians {first} to {last - 1})"
         try:
             for piece in pieces:
@@ -127,12 +128,16 @@ def read_pages(
             raise OSError(error.errno, problem, os.fspath(path)) from error
         if page_hash(pieces) != hashes[page].tobytes():
             raise ValueError(f"{os.fspath(path)}: {name}: the hash does not match; {_DAMAGED}")
+        try:
+            codec.decode(buffers, result, offset)
+        except ValueError as error:
+            raise ValueError(f"{os.fspath(path)}: {name}: {error}; {_DAMAGED}") from None
 
     def read(pages: range) -> None:
         for page in pages:
-            codec.decode(partial(read_page, page), result, run.rows_of(page))
+            read_page(page)
 
-    on_threads(read, list(runs_of_pages(0, len(run), sizes, _BYTES_PER_TASK)))
+    on_threads(read, list(runs_of_pages(0, len(run), np.diff(run.places), _BYTES_PER_TASK)))
     return result
 
 
@@ -180,14 +185,18 @@ class BundleFile:
 
     def _read_metadata(self, metadata: Any) -> None:
         metadata = metadata if isinstance(metadata, dict) else {}
-        kind, version, degree, config = map(metadata.get, ("format", "version", "sh_degree", "config"))
+        names = ("format", "version", "sh_degree", "config", "codec")
+        kind, version, degree, config, codec = map(metadata.get, names)
         self._check("format", kind == FORMAT, f"'{FORMAT}', got {shown(kind)}; not a bundle")
         is_number = isinstance(version, str) and re.fullmatch("[1-9][0-9]{0,8}", version)
         self._check("version", is_number, f"a number of 1 or more, got {shown(version)}")
         if int(version) > VERSION:
             self._fail(f"version {int(version)}, this build reads up to {VERSION}; update v3dg")
         self._check("sh_degree", degree in ("0", "1", "2", "3"), f"'0' to '3', got {shown(degree)}")
-        self.codec = Codec(int(degree))
+        name = codec if int(version) > 1 else Codec.name
+        known = [kind for kind in CODECS.values() if kind.version == int(version) and kind.name == name]
+        self._check("codec", known, f"one that this build reads, got {shown(name)}; update v3dg")
+        self.codec = known[0](int(degree))
         self._check("config", isinstance(config, str), f"a string of JSON, got {shown(config)}")
         self.config = self._object("config", config)
 
@@ -202,7 +211,7 @@ class BundleFile:
     def _check_entries(self, header: dict[str, Any]) -> dict[str, Any]:
         """Compare the header with the one that its own counts and the file's size call for."""
         counts = []
-        for name in ("clusters.level", "groups.parent", "pages.bytes", "pages"):
+        for name in ("clusters.level", "groups.parent", "pages.offset", "pages"):
             entry = header.get(name)
             shape: Any = entry.get("shape") if isinstance(entry, dict) else None
             has_side = isinstance(shape, list) and len(shape) == 1 and type(shape[0]) is int and shape[0] >= 0
@@ -211,15 +220,15 @@ class BundleFile:
         wanted, given = max(counts), self.num_bytes
         found = f"got {given}; the file is truncated"
         self._check("size", wanted <= given, f"more than {shown(wanted)} bytes for tensors, {found}")
-        expected = entries_of(*counts)
+        expected = entries_of(self.codec.version, *counts)
         for name, entry in expected.items():
             self._check(name, header.get(name) == entry, f"{entry}, got {shown(header.get(name))}")
         unknown = sorted(set(header) - set(expected))
         if unknown:
-            self._fail(f"{shown(unknown[0])}: expected only the tensors of version {VERSION}")
+            self._fail(f"{shown(unknown[0])}: expected only the tensors of version {self.codec.version}")
         for name, value in (("header", self._data_start), ("pages", counts[3])):
-            is_aligned = value % ALIGNMENT_BYTES == 0
-            self._check(name, is_aligned, f"to end at a multiple of {ALIGNMENT_BYTES}, got {value}")
+            is_aligned = value % self.codec.alignment == 0
+            self._check(name, is_aligned, f"to end at a multiple of {self.codec.alignment}, got {value}")
         wanted = self._data_start + expected["hash"]["data_offsets"][1]
         problem = "truncated" if wanted > given else "followed by other data"
         self._check("size", wanted == given, f"{wanted} bytes, got {given}; the file is {problem}")
@@ -236,7 +245,7 @@ class BundleFile:
             self._fail(f"hash: the header and tables do not match it; {_DAMAGED}")
         data.flags.writeable = False
         self.tables: dict[str, NDArray[Any]] = {}
-        for name, dtype, _, _ in SCHEMA:
+        for name, dtype, _, _ in schema_of(self.codec.version):
             first, last = (offset - start for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 

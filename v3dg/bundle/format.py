@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from v3dg.bundle.pages import PageLayout
 
 FORMAT = "v3dg"
-VERSION = 1
-ALIGNMENT_BYTES = 4096  # of a page in the file: the memory page, so that a page maps or loads directly
+VERSION = 2  # the newest
 HASH_BYTES = 16
 MAX_HEADER_BYTES = 1 << 20  # the header holds 20 entries and the config; more is damage or an attack
 
@@ -49,21 +48,24 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-def page_file_bytes(page_bytes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Round the sizes of pages up to the alignment: what they take in the file."""
-    return page_bytes + -page_bytes % ALIGNMENT_BYTES
+_ONLY_IN_1 = ("pages.bytes", "pages.num_clusters")  # they follow from the others
+
+
+def schema_of(version: int) -> list[tuple[str, str, str, tuple[int, ...]]]:
+    """The tables of a version."""
+    return [table for table in SCHEMA if version == 1 or table[0] not in _ONLY_IN_1]
 
 
 def page_tables(layout: PageLayout, codec: Codec) -> dict[str, NDArray[Any]]:
     """The tables of the pages except the hashes; all follow from what is in each page."""
-    num_bytes = codec.page_bytes(layout.num_gaussians)
-    ends = np.cumsum(page_file_bytes(num_bytes))
-    return {
+    ends = np.cumsum(layout.page_bytes(codec))
+    tables = {
         "pages.offset": np.concatenate([np.zeros(1, np.int64), ends])[:-1],
-        "pages.bytes": num_bytes,
+        "pages.bytes": np.diff(layout.first_gaussian) * codec.gaussian_bytes,
         "pages.first_cluster": layout.first_cluster[:-1].astype(np.int32),
         "pages.num_clusters": np.diff(layout.first_cluster).astype(np.int32),
     }
+    return {name: tables[name] for name, *_ in schema_of(codec.version) if name in tables}
 
 
 def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
@@ -74,10 +76,12 @@ def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
     return digest.digest()
 
 
-def entries_of(num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int) -> dict[str, Any]:
+def entries_of(
+    version: int, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
+) -> dict[str, Any]:
     """Every tensor of the file, in file order, as the header describes it."""
     rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
-    tables = ((name, dtype, [rows[count], *rest]) for name, dtype, count, rest in SCHEMA)
+    tables = ((name, dtype, [rows[count], *rest]) for name, dtype, count, rest in schema_of(version))
     entries: dict[str, Any] = {}
     end = 0
     for name, dtype, shape in (("pages", "U8", [pages_bytes]), *tables, ("hash", "U8", [HASH_BYTES])):
@@ -86,12 +90,13 @@ def entries_of(num_clusters: int, num_groups: int, num_pages: int, pages_bytes: 
     return entries
 
 
-def header_of(entries: dict[str, Any], sh_degree: int, config: dict[str, Any]) -> bytes:
+def header_of(entries: dict[str, Any], codec: Codec, config: dict[str, Any]) -> bytes:
     """The length and the JSON, filled up with spaces so that the data starts aligned."""
-    metadata = {"format": FORMAT, "version": str(VERSION), "sh_degree": str(sh_degree)}
+    metadata = {"format": FORMAT, "version": str(codec.version), "sh_degree": str(codec.sh_degree)}
+    metadata |= {"codec": codec.name} if codec.version > 1 else {}
     metadata["config"] = config_to_json(config)
     text = json.dumps({"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")).encode()
-    text += b" " * (-(8 + len(text)) % ALIGNMENT_BYTES)
+    text += b" " * (-(8 + len(text)) % codec.alignment)
     if len(text) > MAX_HEADER_BYTES:
         size = len(metadata["config"])
         raise ValueError(f"config: expected at most {MAX_HEADER_BYTES} bytes of JSON, got {size}; shorten it")

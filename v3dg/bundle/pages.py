@@ -6,12 +6,12 @@ import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from v3dg import _device
-from v3dg.bundle.codec import Codec
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from v3dg.bundle.codec import Codec
     from v3dg.bundle.file import BundleFile
     from v3dg.bundle.tables import Clusters
 
@@ -31,7 +32,7 @@ class PageLayout:
     """P pages in file order: page g is what group g replaces, the last page is the last level."""
 
     first_cluster: NDArray[np.int64]  # (P+1,) of each page, and the number of clusters
-    first_gaussian: NDArray[np.int64]  # (P+1,) of each page, and the number of gaussians
+    offset: NDArray[np.int64]  # (C+1,) gaussians of each cluster
 
     @staticmethod
     def of(clusters: Clusters) -> PageLayout:
@@ -40,21 +41,26 @@ class PageLayout:
         starts = np.flatnonzero(parent[1:] != parent[:-1]) + 1
         count = len(clusters)
         first = np.concatenate([np.zeros(min(count, 1), np.int64), starts, [count]]).astype(np.int64)
-        return PageLayout(first, clusters.offset[first])
+        return PageLayout(first, clusters.offset)
+
+    @cached_property
+    def first_gaussian(self) -> NDArray[np.int64]:
+        """(P+1,) of each page, and the number of gaussians."""
+        return self.offset[self.first_cluster]
 
     @property
     def num_pages(self) -> int:
         return len(self.first_cluster) - 1
 
-    @property
-    def num_gaussians(self) -> NDArray[np.int64]:
-        """(P,) of each page."""
-        return np.diff(self.first_gaussian)
+    def page_bytes(self, codec: Codec) -> NDArray[np.int64]:
+        """(P,) of each page, with what it is filled up with."""
+        return codec.page_bytes(np.diff(self.first_gaussian), np.diff(self.first_cluster))
 
     def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> PageRun:
         """A run of the pages, of which all begin at these bytes of a file, and end."""
-        gaussians, places = (a[first_page : last_page + 1] for a in (self.first_gaussian, places))
-        return PageRun(first_page, gaussians, places)
+        clusters, places = (a[first_page : last_page + 1] for a in (self.first_cluster, places))
+        offset = self.offset[clusters[0] : clusters[-1] + 1]
+        return PageRun(first_page, clusters - clusters[0], offset, places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,29 +68,30 @@ class PageRun:
     """Neighbouring pages, as much as is known of them before they are written."""
 
     first_page: int  # number in the bundle
-    first_gaussian: NDArray[np.int64]  # (n+1,) of each page, in the bundle, and the end
+    first_cluster: NDArray[np.int64]  # (n+1,) of each page, in the run, and the end
+    offset: NDArray[np.int64]  # gaussians of each cluster of the run, in the bundle, and the end
     places: NDArray[np.int64]  # (n+1,) first byte of each page in the file, and the end
 
     def __len__(self) -> int:
-        return len(self.first_gaussian) - 1
+        return len(self.places) - 1
 
     @property
     def rows(self) -> slice:
         """Their gaussians in the bundle."""
-        return slice(int(self.first_gaussian[0]), int(self.first_gaussian[-1]))
+        return slice(int(self.offset[0]), int(self.offset[-1]))
 
-    def rows_of(self, number: int) -> slice:
-        """The gaussians of one of them, by its place in the run, among those of all."""
-        first, last = (self.first_gaussian[number : number + 2] - self.first_gaussian[0]).tolist()
-        return slice(first, last)
+    def clusters_of(self, number: int) -> NDArray[np.int64]:
+        """Gaussians of each cluster of one page, by its place in the run, among those of all; and the end."""
+        first, last = self.first_cluster[number : number + 2].tolist()
+        offset: NDArray[np.int64] = self.offset[first : last + 1] - self.offset[0]
+        return offset
 
 
 class MemoryPages:
     """Pages whose gaussians are all in memory, on the host."""
 
-    def __init__(self, layout: PageLayout, gaussians: Gaussians) -> None:
-        self.layout, self.codec = layout, Codec(gaussians.sh_degree)
-        self.gaussians = gaussians
+    def __init__(self, layout: PageLayout, gaussians: Gaussians, codec: Codec) -> None:
+        self.layout, self.gaussians, self.codec = layout, gaussians, codec
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Gaussians of a run of pages; they share memory with `gaussians`."""

@@ -49,6 +49,8 @@ class Build(OnDevice):
     """Settings to start from: ours, or those of the V3DG paper."""
     cluster_size: Annotated[int | None, option("N")] = None
     """Most gaussians in a cluster; the config's own if not given."""
+    codec: Literal["float32", "quantized"] = "float32"
+    """How gaussians are kept: every bit, or rounded to 16 to 40 bytes (docs/format.md has the error)."""
     seed: int = 0
     """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
     strict: Flag = False
@@ -211,6 +213,7 @@ def _build(
                 output,
                 config=config,
                 seed=options.seed,
+                codec=options.codec,
                 progress=not options.quiet,
                 device=options.device,
                 resume=options.resume,

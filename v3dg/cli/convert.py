@@ -31,12 +31,14 @@ from v3dg.select import select
 
 @dataclass
 class Convert(Common):
-    """Write an asset, a level of a bundle, or its cut for a camera, in another format."""
+    """Write an asset, a level of a bundle, or its cut for a camera, in another format; or a bundle anew."""
 
     subject: tyro.conf.Positional[Path]
     """An asset in any format that is read (docs/formats.md), a bundle (.v3dg) or a scene (.json)."""
     output: tyro.conf.Positional[Path]
-    """File to write, .ply, .compressed.ply, .spz or .sog."""
+    """File to write, .ply, .compressed.ply, .spz or .sog; of a bundle also .v3dg, with all levels."""
+    codec: Annotated[Literal["float32", "quantized"] | None, option("{float32,quantized}")] = None
+    """How a .v3dg that is written keeps gaussians, as for `v3dg build`; as the bundle does if not given."""
     level: Annotated[int | None, option("N")] = None
     """Write this level of a bundle; 0, the asset itself, if no cut is asked for."""
     tolerance: Annotated[float | None, option("PX2")] = None
@@ -51,8 +53,12 @@ class Convert(Common):
 def run(options: Convert) -> None:
     view = options.view
     view.check(options.subject)
-    if not options.output.name.lower().endswith(WRITE_SUFFIXES):
-        raise ValueError(f"{options.output}: expected a file name that ends in {', '.join(WRITE_SUFFIXES)}")
+    to_bundle = options.output.name.lower().endswith(".v3dg")
+    if not (to_bundle or options.output.name.lower().endswith(WRITE_SUFFIXES)):
+        suffixes = ", ".join((*WRITE_SUFFIXES, ".v3dg"))
+        raise ValueError(f"{options.output}: expected a file name that ends in {suffixes}")
+    if options.codec is not None and not to_bundle:
+        raise UsageError(f"--codec: expected an output that ends in .v3dg, got {options.output}")
     _files.check_folder(options.output)
     given = (options.tolerance, options.budget, view.cameras, view.camera)
     is_cut = is_scene(options.subject) or any(value is not None for value in given)
@@ -63,7 +69,13 @@ def run(options: Convert) -> None:
     start = time.perf_counter()
     subject, own_cameras = load_subject(options.subject)
     told: dict[str, Any] = {}
-    if isinstance(subject, Gaussians):
+    if to_bundle:
+        if not isinstance(subject, Bundle) or is_cut or options.level is not None:
+            raise UsageError(f"{options.output}: expected a bundle to write anew, and no level or cut of it")
+        gaussians, codec = subject.gaussians, options.codec or subject.codec
+        Bundle(subject.clusters, subject.groups, gaussians, subject.config, codec).write(options.output)
+        told = {"codec": codec}
+    elif isinstance(subject, Gaussians):
         if is_cut or options.level is not None:
             raise UsageError("--level, --tolerance, --budget: expected a bundle or a scene; build one first")
         gaussians = subject
@@ -76,7 +88,8 @@ def run(options: Convert) -> None:
         if len(cameras) != 1:
             raise UsageError(f"--camera: expected one of {len(cameras)} cameras; give its name or its place")
         gaussians, told = _cut(options, subject, *cameras.items())
-    write_asset(options.output, gaussians)
+    if not to_bundle:
+        write_asset(options.output, gaussians)
     result = {
         "output": str(options.output),
         "gaussians": len(gaussians),

@@ -115,7 +115,7 @@ def _bundle_info(path: Path, bundle: Bundle) -> _Description:
         "alpha error": "{error_alpha:.4f}",
     }
     lines = [
-        f"{path}: bundle, version {result['version']}, {bytes_text(result['bytes'])}",
+        f"{path}: bundle, version {result['version']} ({result['codec']}), {bytes_text(result['bytes'])}",
         f"{bundle.num_gaussians:,} gaussians, SH degree {bundle.sh_degree}, "
         f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, {result['num_pages']:,} pages",
         "",
