@@ -197,6 +197,54 @@ def test_tiles_lose_no_pixel_of_any_gaussian(gaussian, size, center, filter_px2)
     )
 
 
+# Where pixels stop
+
+
+def draw_stopped(device, gaussians, camera, min_transmittance, **mode):
+    raster = v3dg.render(gaussians, camera, min_transmittance=min_transmittance, device=device, **mode)
+    return v3dg.Image(*host((raster.color, raster.alpha, raster.depth)))
+
+
+@pytest.mark.parametrize("min_transmittance", [0.0, 1e-4, 1e-3, 0.1, 0.99])
+def test_pixels_stop_behind_the_one_that_hides_the_rest(device, min_transmittance):
+    camera, mode = scenes.CAMERAS["plain"], {"background": (0.2, 0.9, 0.4)}
+    gaussians = scenes.trained_like(30, camera, 600)
+    picture = reference.rasterize(gaussians, camera, min_transmittance=min_transmittance, **mode)
+    assert picture.is_stopped.any() == (min_transmittance > 0)
+    drawn = draw_stopped(device, gaussians, camera, min_transmittance, **mode)
+    assert_pictures_agree(drawn, picture, NEEDLES_FLOAT)
+
+
+@pytest.mark.parametrize("min_transmittance", [1e-4, 1e-3, 1e-2])
+def test_no_more_light_is_lost_than_asked_for(device, min_transmittance):
+    """Also where gaussians are opaque, which takes all light but a thousandth at once."""
+    camera = scenes.CAMERAS["plain"]
+    loose = scenes.trained_like(31, camera, 2000)
+    gaussians = scenes.replaced(
+        loose,
+        opacities=np.where(np.arange(len(loose)) % 2 == 0, np.float32(1), loose.opacities),
+        sh=np.clip(loose.sh, -0.2, 0.2),  # colours of 0 to 1
+    )
+    whole = draw_stopped(device, gaussians, camera, 0.0)
+    picture = draw_stopped(device, gaussians, camera, min_transmittance)
+    for plane, of_whole in ((picture.color, whole.color), (picture.alpha, whole.alpha)):
+        assert 0 < np.abs(plane - of_whole).max() <= min_transmittance * (1 + 1e-4)
+
+
+@pytest.mark.parametrize("value", [-1e-9, 1.001, np.nan, "much"])
+def test_a_share_of_light_is_refused_that_is_none(value):
+    camera = scenes.CAMERAS["plain"]
+    with pytest.raises(ValueError, match=r"min_transmittance: expected a share of light, 0 to 0\.99, got"):
+        v3dg.render(scenes.trained_like(32, camera, 5), camera, min_transmittance=value, device="cpu")
+
+
+def test_assets_are_drawn_as_rasterized_unless_asked(device):
+    camera = scenes.CAMERAS["plain"]
+    gaussians = scenes.trained_like(33, camera, 600)
+    rendered = draw_stopped(device, gaussians, camera, None)
+    assert digest(rendered) == digest(draw(device, gaussians, camera))
+
+
 # Properties
 
 

@@ -8,6 +8,7 @@ import scenes_lod
 from devices import host
 from v3dg import Camera, Gaussians, Renderer, Scene, _core, _device, rasterize, render, select
 from v3dg._device import Device
+from v3dg.render import shade_of
 from v3dg.residency import residency
 
 pytestmark = [
@@ -176,4 +177,6 @@ def test_frame_refuses_what_is_on_the_other_device():
     residency.set_models(frame, [bundle], Device(0), "cluster")
     rule = _core.Rule(tolerance_px2=1.0, budget=None, min_level=0, footprint="solid_angle", culls=True)
     with pytest.raises(ValueError, match="scene: expected one on the frame's device"):
-        frame.draw(residency.scene(scene, Device(1)).core, CAMERA.core, rule, [0, 0, 0])
+        frame.draw(
+            residency.scene(scene, Device(1)).core, CAMERA.core, rule, shade_of([0, 0, 0], None, False)
+        )

@@ -7,11 +7,12 @@ import pytest
 
 import scenes
 from random_bundle import random_bundle
-from v3dg import Camera, _core
+from v3dg import _core
 from v3dg._device import CPU
 from v3dg.residency import residency
 
 CAMERA = {"viewmat": np.eye(4), "K": np.diag([50.0, 50.0, 1.0]), "width": 64, "height": 48, "near": 0.01}
+SHADE = _core.Shade(background=[0, 0, 0], min_transmittance=1e-3)
 RULE = {
     "tolerance_px2": 3.0,
     "budget": None,
@@ -259,7 +260,7 @@ def test_other_values_are_refused():
             ("models", "Model", lambda w=wrong: frame.set_models([w], [])),
             ("palettes", "Palette", lambda w=wrong: frame.set_models([model], [w])),
             ("table", "ClusterTable", lambda w=wrong: _core.Palette(w, np.zeros((1, 3), np.float32), -1)),
-            ("scene", "ResidentScene", lambda w=wrong: frame.draw(w, camera, rule, [0, 0, 0])),
+            ("scene", "ResidentScene", lambda w=wrong: frame.draw(w, camera, rule, SHADE)),
             ("model", "Model", lambda w=wrong: _core.AssetFrame(w)),
         ):
             with pytest.raises(TypeError, match=rf"{name}: expected {expected}, got <class '.*{kind}'>"):
@@ -276,7 +277,7 @@ def test_frame_refuses_a_scene_of_other_bundles():
         frame, scene = _core.SceneFrame(-1), _core.ResidentScene(-1)
         frame.set_models([residency.model(bundle, CPU) for bundle in bundles[:has]], [])
         scene.set_bundles(tables)
-        arguments = scene, _core.Camera(**CAMERA), _core.Rule(**RULE), [0, 0, 0]
+        arguments = scene, _core.Camera(**CAMERA), _core.Rule(**RULE), SHADE
         if tables == [one, two][: len(tables)] and len(tables) <= has:
             assert not frame.draw(*arguments).alpha.any()
             continue
@@ -285,7 +286,6 @@ def test_frame_refuses_a_scene_of_other_bundles():
 
 
 def test_background_has_three_numbers():
-    asset = _core.AssetFrame(_core.Model(rows()))
     for background in ([0, 0], [0, 0, 0, 0], None, "red"):
-        with pytest.raises(TypeError, match="incompatible function arguments"):
-            asset.draw(Camera(CAMERA["viewmat"], CAMERA["K"], 64, 48).core, background)
+        with pytest.raises(TypeError, match="incompatible constructor arguments"):
+            _core.Shade(background=background, min_transmittance=1e-3)

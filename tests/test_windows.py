@@ -6,6 +6,7 @@ import pytest
 import scenes_lod
 from v3dg import Camera, Scene, _core, render, select
 from v3dg._device import CPU
+from v3dg.render import shade_of
 from v3dg.residency import residency
 
 CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
@@ -30,7 +31,7 @@ def draw_window(scene, camera, window):
         camera.core.window(*window),
         selection.instance_ids,
         selection.cluster_ids,
-        [0.1, 0.2, 0.3],
+        shade_of((0.1, 0.2, 0.3), None, False),
     )
     return drawing.color, drawing.alpha, drawing.depth, drawing.finish()
 

@@ -251,6 +251,11 @@ class Palette:
 
     def __init__(self, table: ClusterTable, sh: NDArray[np.float32], device: int) -> None: ...
 
+class Shade:
+    """What is behind a picture, and when its pixels stop."""
+
+    def __init__(self, *, background: Sequence[float], min_transmittance: float) -> None: ...
+
 class SceneFrame:
     """Draws scenes of the same bundles on one device."""
 
@@ -261,7 +266,7 @@ class SceneFrame:
         scene: ResidentScene,
         camera: Camera,
         rule: Rule,
-        background: Sequence[float],
+        shade: Shade,
         stop: Stop | None = None,
     ) -> Drawing: ...
     def draw_cut(
@@ -270,7 +275,7 @@ class SceneFrame:
         camera: Camera,
         instance_ids: Array,
         cluster_ids: Array,
-        background: Sequence[float],
+        shade: Shade,
         stop: Stop | None = None,
     ) -> Drawing: ...
     def count_cut(
@@ -279,6 +284,7 @@ class SceneFrame:
         camera: Camera,
         instance_ids: Int32,
         cluster_ids: Int32,
+        shade: Shade,
         stop: Stop | None = None,
     ) -> Drawing: ...
     def pick_cut(
@@ -289,7 +295,7 @@ class AssetFrame:
     """Draws gaussians without levels on the device that they are on."""
 
     def __init__(self, model: Model) -> None: ...
-    def draw(self, camera: Camera, background: Sequence[float], stop: Stop | None = None) -> Drawing: ...
+    def draw(self, camera: Camera, shade: Shade, stop: Stop | None = None) -> Drawing: ...
 
 # fit_level
 class FitConfig:

@@ -180,5 +180,7 @@ def draw_truth(
     Each sample is clipped to [0,1] as a screen does, before it is averaged over its pixel.
     """
     larger = camera.scaled(supersampling)
-    color = render(subject, larger, tolerance=0.0, background=background, device=device).color
+    color = render(
+        subject, larger, tolerance=0.0, background=background, min_transmittance=1e-4, device=device
+    ).color
     return to_8bit(box_downsample(color.clip(0, 1), supersampling))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check, color
+from v3dg._numbers import check, color, real
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.false_color import ColorBy
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 _Subject: TypeAlias = Scene | Bundle | Gaussians
+
+# Of pictures with levels, whose own error is far larger; docs/cuda.md has what it saves.
+DEFAULT_MIN_TRANSMITTANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ class _Options(CutOptions, total=False):
     cut: Selection | None
     color_by: ColorBy
     background: Sequence[float]
+    min_transmittance: float | None
 
 
 @overload
@@ -93,6 +97,7 @@ def render(
     cut: Selection | None = None,
     color_by: ColorBy = "appearance",
     background: Sequence[float] = (0.0, 0.0, 0.0),
+    min_transmittance: float | None = None,
     device: str | Device = "auto",
 ) -> RenderedImage | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
@@ -109,6 +114,9 @@ def render(
             the place of `tolerance`, `budget` and `min_level`.
         color_by: "level" or "cluster" colours gaussians by the one that they belong to.
         background: Three numbers.
+        min_transmittance: A pixel stops behind the gaussian that lets no more than this share of light
+            through, 0 to 0.99, so that no channel misses more than this times what lies behind. None is 0.001
+            for scenes and bundles, and draws assets as `v3dg.rasterize` does.
         device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws torch tensors there, on
             the stream that is torch's current one, and keeps on the device what the next picture of the same
             scene or bundle needs. Use a `Renderer` to say how long. "auto" is "cuda" where that works.
@@ -125,8 +133,8 @@ def render(
         frame = residency.frame(subject, (color_by, where), lambda: _Frame(subject, color_by, where))
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
     if isinstance(camera, Camera):
-        return frame.draw(subject, camera, background, **options)
-    return [frame.draw(subject, view, background, **options) for view in camera]
+        return frame.draw(subject, camera, background, min_transmittance, **options)
+    return [frame.draw(subject, view, background, min_transmittance, **options) for view in camera]
 
 
 class Renderer:
@@ -165,10 +173,11 @@ class Renderer:
         min_level: int = 0,
         cut: Selection | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
+        min_transmittance: float | None = None,
     ) -> RenderedImage:
         """Draw as `v3dg.render` does."""
         options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
-        return self._frame.draw(self._subject, camera, background, **options)
+        return self._frame.draw(self._subject, camera, background, min_transmittance, **options)
 
 
 class _Frame:
@@ -190,10 +199,11 @@ class _Frame:
         subject: _Subject,
         camera: Camera,
         background: Sequence[float],
+        min_transmittance: float | None,
         cut: Selection | None,
         **options: Any,
     ) -> RenderedImage:
-        shade = color(background, "background")
+        shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians))
         if isinstance(subject, Gaussians):
             _check_asset(self._color_by, cut=cut, **options)
             drawing = self._asset.draw(camera.core, shade)
@@ -234,6 +244,15 @@ class _Frame:
         import torch
 
         return torch.tensor(ids, device=str(self._device))
+
+
+def shade_of(background: Sequence[float], min_transmittance: float | None, is_asset: bool) -> _core.Shade:
+    """What `render` says of the two, as the core has it: below 0, pixels stop as `rasterize` has them."""
+    if min_transmittance is None:
+        stop = -1.0 if is_asset else DEFAULT_MIN_TRANSMITTANCE
+    else:
+        stop = real(min_transmittance, "min_transmittance", "a share of light, 0 to 0.99", 0, 0.99)
+    return _core.Shade(background=color(background, "background"), min_transmittance=stop)
 
 
 def _stats(stats: _core.FrameStats, tolerance: float) -> Stats:

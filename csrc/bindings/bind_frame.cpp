@@ -90,8 +90,6 @@ class BoundDrawing {
 #endif
 };
 
-using Background = std::array<double, 3>;
-
 NewPicture picture_of(const Window& window, bool with_depth) {
     return {window.height(), window.width(), {}, {}, py::none(), with_depth};
 }
@@ -133,18 +131,17 @@ class BoundSceneFrame {
     }
 
     std::unique_ptr<BoundDrawing> draw(const py::object& scene_object, const BoundCamera& camera,
-                                       const SelectRule& rule, const Background& background,
-                                       const Stop* stop) {
+                                       const SelectRule& rule, const Shade& shade, const Stop* stop) {
         auto& scene = checked(scene_object);
         if (device_.is_host())
-            return on_host(scene, camera, background, true,
+            return on_host(scene, camera, shade, true,
                            [&](const HostScene& host, const Picture<float>& picture) {
                                return cpu::draw_scene(host, camera.camera, rule, picture, flag_of(stop));
                            });
 #if V3DG_WITH_CUDA
         const Work work(device_);
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
-        const cuda::FrameImage image = picture.on_device(device_, camera.camera, background);
+        const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
         auto drawing = frame_->draw(scene.on_device(), camera.camera, rule, image, work.stream());
         return std::make_unique<BoundDrawing>(
             std::move(picture), py::make_tuple(py::cast(this), scene_object), device_, std::move(drawing));
@@ -155,7 +152,7 @@ class BoundSceneFrame {
 
     std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object, const BoundCamera& camera,
                                            const py::object& instance_ids, const py::object& cluster_ids,
-                                           const Background& background, const Stop* stop) {
+                                           const Shade& shade, const Stop* stop) {
         auto& scene = checked(scene_object);
         const Span<const int32_t> instance =
             span_on<const int32_t>(device_, instance_ids, "instance_ids", {-1});
@@ -163,13 +160,13 @@ class BoundSceneFrame {
                                                                    {static_cast<py::ssize_t>(instance.size)});
         if (device_.is_host())
             return on_host(
-                scene, camera, background, true, [&](const HostScene& host, const Picture<float>& picture) {
+                scene, camera, shade, true, [&](const HostScene& host, const Picture<float>& picture) {
                     return cpu::draw_cut(host, camera.camera, instance, cluster, picture, flag_of(stop));
                 });
 #if V3DG_WITH_CUDA
         const Work work(device_);
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
-        const cuda::FrameImage image = picture.on_device(device_, camera.camera, background);
+        const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
         auto drawing =
             frame_->draw_cut(scene.on_device(), camera.camera, instance, cluster, image, work.stream());
         return std::make_unique<BoundDrawing>(
@@ -183,17 +180,16 @@ class BoundSceneFrame {
     // As draw_cut(), with the number of gaussians that each pixel is blended of in place of depth.
     std::unique_ptr<BoundDrawing> count_cut(const py::object& scene_object, const BoundCamera& camera,
                                             const py::array& instance_ids, const py::array& cluster_ids,
-                                            const Stop* stop) {
+                                            const Shade& shade, const Stop* stop) {
         require_host("count_cut");
         const Span<const int32_t> instance = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
         const Span<const int32_t> cluster =
             span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instance.size)});
-        return on_host(checked(scene_object), camera, {0, 0, 0}, true,
-                       [&](const HostScene& host, Picture<float> picture) {
-                           std::swap(picture.depth, picture.count);
-                           return cpu::draw_cut(host, camera.camera, instance, cluster, picture,
-                                                flag_of(stop));
-                       });
+        return on_host(
+            checked(scene_object), camera, shade, true, [&](const HostScene& host, Picture<float> picture) {
+                std::swap(picture.depth, picture.count);
+                return cpu::draw_cut(host, camera.camera, instance, cluster, picture, flag_of(stop));
+            });
     }
 
     // (place in the cut, weight, depth), or None.
@@ -265,11 +261,11 @@ class BoundSceneFrame {
     // The window of the camera, drawn by draw(host scene, picture) without Python's lock.
     template <class DrawPicture>
     std::unique_ptr<BoundDrawing> on_host(const BoundScene& scene, const BoundCamera& camera,
-                                          const Background& background, bool with_depth,
+                                          const Shade& shade, bool with_depth,
                                           const DrawPicture& draw_picture) const {
         const Window window = window_of(camera.camera);
         NewPicture out = picture_of(window, with_depth);
-        const Picture<float> picture = out.on_host<float>(window, background);
+        const Picture<float> picture = out.on_host<float>(window, shade);
         const std::shared_ptr<const SceneState> state = scene.state();
         const std::vector<SceneModel> models = models_of(*state);
         const py::list gaussians = models_, colors = palettes_;  // which another thread may replace meanwhile
@@ -300,15 +296,14 @@ class BoundAssetFrame {
 #endif
     }
 
-    std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Background& background,
-                                       const Stop* stop) {
+    std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade, const Stop* stop) {
         const auto& model = held<BoundModel>(model_, "model");
-        if (model.device().is_host()) return on_host(model.host(), camera, background, stop);
+        if (model.device().is_host()) return on_host(model.host(), camera, shade, stop);
 #if V3DG_WITH_CUDA
         const Device device = model.device();
         const Work work(device);
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
-        const cuda::FrameImage image = picture.on_device(device, camera.camera, background);
+        const cuda::FrameImage image = picture.on_device(device, camera.camera, shade);
         const cuda::PackedModel& packed = *model.packed();
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
                                     work.stream(), &packed.packed());
@@ -320,10 +315,10 @@ class BoundAssetFrame {
 
   private:
     static std::unique_ptr<BoundDrawing> on_host(const Model<float>& model, const BoundCamera& camera,
-                                                 const Background& background, const Stop* stop) {
+                                                 const Shade& shade, const Stop* stop) {
         const Window window = window_of(camera.camera);
         NewPicture out = picture_of(window, true);
-        const Picture<float> picture = out.on_host<float>(window, background);
+        const Picture<float> picture = out.on_host<float>(window, shade);
         SceneFrameCounts counts;
         {
             const py::gil_scoped_release unlocked;
@@ -355,6 +350,11 @@ void bind_frame(py::module_& m) {
         .def_readonly("exceeds_budget", &FrameStats::exceeds_budget)
         .def_readonly("select_ms", &FrameStats::select_ms)
         .def_readonly("draw_ms", &FrameStats::draw_ms);
+    py::class_<Shade>(m, "Shade", "What is behind a picture, and when its pixels stop.")
+        .def(py::init([](const std::array<double, 3>& background, float min_transmittance) {
+                 return Shade{background, min_transmittance};
+             }),
+             py::kw_only(), "background"_a, "min_transmittance"_a);
     py::class_<BoundDrawing>(m, "Drawing", "A frame that has been drawn, or enqueued on a device.")
         .def_property_readonly("color", [](const BoundDrawing& d) { return d.picture().color; })
         .def_property_readonly("alpha", [](const BoundDrawing& d) { return d.picture().alpha; })
@@ -363,18 +363,17 @@ void bind_frame(py::module_& m) {
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
         .def(py::init<int>(), "device"_a)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
-        .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "background"_a,
-             "stop"_a = nullptr)
+        .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a, "stop"_a = nullptr)
         .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,
-             "background"_a, "stop"_a = nullptr)
+             "shade"_a, "stop"_a = nullptr)
         .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,
-             "cluster_ids"_a, "stop"_a = nullptr)
+             "cluster_ids"_a, "shade"_a, "stop"_a = nullptr)
         .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
              "cluster_ids"_a);
     py::class_<BoundAssetFrame>(m, "AssetFrame",
                                 "Draws gaussians without levels on the device that they are on.")
         .def(py::init<py::object>(), "model"_a)
-        .def("draw", &BoundAssetFrame::draw, "camera"_a, "background"_a, "stop"_a = nullptr);
+        .def("draw", &BoundAssetFrame::draw, "camera"_a, "shade"_a, "stop"_a = nullptr);
 }
 
 }  // namespace v3dg

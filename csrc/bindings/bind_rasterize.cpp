@@ -120,7 +120,8 @@ template <class T>
 py::tuple rasterize_on_host(const Rows& gaussians, const BoundCamera& camera, const Look& look,
                             bool with_depth, bool keep_tape) {
     NewPicture out{camera.height(), camera.width(), {}, {}, py::none(), with_depth};
-    const Picture<T> picture = out.on_host<T>({0, 0, camera.width(), camera.height()}, look.background);
+    const Picture<T> picture =
+        out.on_host<T>({0, 0, camera.width(), camera.height()}, Shade{look.background});
     const GaussianRows<const T> rows = gaussians.read<T>();
     std::unique_ptr<HostTape<T>> tape;
     RenderCounts counts;
@@ -176,7 +177,7 @@ py::tuple rasterize_on_device(const Rows& gaussians, const BoundCamera& camera, 
     NewPicture out{camera.height(), camera.width(), {}, {}, py::none(), with_depth};
     const cuda::ModelPicture in{gaussians.read<float>(), view_of_world<float>(camera.camera),
                                 static_cast<float>(look.filter_px2), look.antialiased,
-                                out.on_device(device, camera.camera, look.background)};
+                                out.on_device(device, camera.camera, Shade{look.background})};
     std::unique_ptr<cuda::DifferentiableFrame> frame;
     {
         const py::gil_scoped_release unlocked;

@@ -9,6 +9,12 @@
 
 namespace v3dg {
 
+// What is behind the gaussians of a pixel, and when it stops (frame/image.h).
+struct Shade {
+    std::array<double, 3> background;
+    float min_transmittance = kStopsBefore;
+};
+
 // The planes of a new picture, to be filled in: colour (H, W, 3), alpha and, where it is wanted, depth (H,
 // W).
 struct NewPicture {
@@ -17,15 +23,17 @@ struct NewPicture {
     bool with_depth;
 
     template <class T>
-    Picture<T> on_host(const Window& window, const std::array<double, 3>& background) {
+    Picture<T> on_host(const Window& window, const Shade& shade) {
         const NewArray<T> color_plane({}, {height, width, 3}), alpha_plane({}, {height, width});
         color = color_plane.object;
         alpha = alpha_plane.object;
         Picture<T> picture{window,
-                           {T(background[0]), T(background[1]), T(background[2])},
+                           {T(shade.background[0]), T(shade.background[1]), T(shade.background[2])},
                            color_plane.span.data,
                            alpha_plane.span.data,
-                           nullptr};
+                           nullptr,
+                           nullptr,
+                           shade.min_transmittance};
         if (with_depth) {
             const NewArray<T> depth_plane({}, {height, width});
             depth = depth_plane.object;
@@ -35,7 +43,7 @@ struct NewPicture {
     }
 
 #if V3DG_WITH_CUDA
-    cuda::FrameImage on_device(Device device, const Camera& camera, const std::array<double, 3>& background) {
+    cuda::FrameImage on_device(Device device, const Camera& camera, const Shade& shade) {
         const NewArray<float> color_plane(device, {height, width, 3}), alpha_plane(device, {height, width});
         color = color_plane.object;
         alpha = alpha_plane.object;
@@ -45,9 +53,13 @@ struct NewPicture {
             depth = depth_plane.object;
             depth_data = depth_plane.span.data;
         }
-        const float b[3] = {float(background[0]), float(background[1]), float(background[2])};
-        return cuda::frame_image(pinhole_of<float>(camera), static_cast<int>(width), static_cast<int>(height),
-                                 b, color_plane.span.data, alpha_plane.span.data, depth_data);
+        const auto& of = shade.background;
+        const float b[3] = {float(of[0]), float(of[1]), float(of[2])};
+        cuda::FrameImage image =
+            cuda::frame_image(pinhole_of<float>(camera), static_cast<int>(width), static_cast<int>(height), b,
+                              color_plane.span.data, alpha_plane.span.data, depth_data);
+        image.min_transmittance = shade.min_transmittance;
+        return image;
     }
 #endif
 };

@@ -51,7 +51,8 @@ static void blend_sorted(const FitScratch& scratch, const uint64_t* order, size_
         const Record<float>& g = scratch.records.data()[record_of(order[i])];
         if (misses_tile(g, left, top)) continue;
         const uint64_t blocks = live_blocks(g, left, top, alive);
-        if (blocks != 0) blend_record<float, Extra::kNothing>(g, blocks, left, top, pixels, tile, alive);
+        if (blocks != 0)
+            blend_record<float, Extra::kNothing>(g, blocks, left, top, pixels, StopsBefore{}, tile, alive);
     }
 }
 

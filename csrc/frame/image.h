@@ -18,6 +18,25 @@ struct Window {
     V3DG_INLINE bool contains(int x, int y) const { return x0 <= x && x < x1 && y0 <= y && y < y1; }
 };
 
+// A pixel stops where hardly any light gets through, and what is behind is left out. As gsplat's do: before a
+// gaussian that would leave kMinTransmittance or less, which is left out too.
+struct StopsBefore {};
+// Behind the gaussian that leaves this much or less, so that no more is left out.
+template <class T>
+struct StopsBehind {
+    T transmittance;
+};
+
+// What pictures hold: StopsBehind, or StopsBefore where that is negative.
+constexpr float kStopsBefore = -1.0f;
+template <class T, class Draw>
+V3DG_INLINE void with_stop(float min_transmittance, const Draw& draw) {
+    if (min_transmittance < 0)
+        draw(StopsBefore{});
+    else
+        draw(StopsBehind<T>{static_cast<T>(min_transmittance)});
+}
+
 // The pixels of a window, row major; colour has three channels.
 template <class T>
 struct Picture {
@@ -27,6 +46,7 @@ struct Picture {
     T* alpha;
     T* depth;            // expected depth, sum of weight * depth over alpha, 0 where alpha is 0; may be null
     T* count = nullptr;  // gaussians that were blended, in place of depth; may be null
+    float min_transmittance = kStopsBefore;
 };
 
 // Gradients of the picture, laid out as it is; `depth` may be null.
@@ -48,7 +68,8 @@ struct FrameImage {
     int tile_columns, tile_rows;
     uint32_t first_tile;  // in the batch, its tiles row by row
     float background[3];
-    float *color, *alpha, *depth;  // as Picture<float> has them; depth may be null
+    float *color, *alpha, *depth;            // as Picture<float> has them; depth may be null
+    float min_transmittance = kStopsBefore;  // the same for all pictures of a frame
 };
 
 }  // namespace cuda

@@ -78,8 +78,9 @@ struct FrameLists {
     const unsigned long long* tile_first;  // [num_tiles + 1] into entries
     TileEntry *entries, *scratch;          // each tile's in any order
     const FrameCounters* counters;
-    Capacity capacity;  // at most kMostFrameRecords records
-    TilePlan* plans;    // [num_tiles] scratch
+    Capacity capacity;        // at most kMostFrameRecords records
+    TilePlan* plans;          // [num_tiles] scratch
+    float min_transmittance;  // of the images
 };
 
 // A record over more tiles than this is looked at row by row of tiles.

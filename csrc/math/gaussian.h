@@ -12,7 +12,7 @@ namespace v3dg {
 
 constexpr double kMinAlpha = 1.0 / 255;     // contributions below it are skipped
 constexpr double kMaxAlpha = 0.999;         // alpha is cut here
-constexpr double kMinTransmittance = 1e-4;  // a pixel stops before it would fall to this
+constexpr double kMinTransmittance = 1e-4;  // a pixel that stops as gsplat's do stops before this
 constexpr double kLog2MinAlpha = -7.994353436858858;
 constexpr double kReachSigmas = 3.33;  // where opacity 1 has fallen below 1/255
 constexpr double kLn2 = 0.6931471805599453;

@@ -14,7 +14,7 @@ namespace cuda {
 namespace {
 
 // Bytes of target pictures that may wait at once; a quarter of what is free, if that is less.
-constexpr size_t kTargetBytes = size_t(3) << 29;
+constexpr size_t kTargetBytes = size_t(1) << 30;
 constexpr std::chrono::microseconds kBetweenLooks{50};
 
 // Memory that the host and a running kernel both see.

@@ -178,7 +178,8 @@ FrameLists Frame::lists(const FrameBatch& batch) const {
             reinterpret_cast<TileEntry*>(scratch_.data()),
             &reinterpret_cast<const State*>(cleared_.data())->counters,
             capacity_,
-            plans_.data()};
+            plans_.data(),
+            batch.min_transmittance};
 }
 
 FrameTape Frame::tape() const {

@@ -60,7 +60,8 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const FrameI
                            1,
                            num_tiles(image),
                            packed_.data(),
-                           scene.num_instances() > 1};
+                           scene.num_instances() > 1,
+                           image.min_transmittance};
     return frame_.draw(batch, std::move(prepare), stream);
 }
 
@@ -112,9 +113,14 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
     const ModelTables tables{rows, packed == nullptr ? PackedPlanes{} : *packed, {view, 0, 0}, image};
-    const FrameBatch batch{&on_device->rows,  &on_device->placement,
-                           &on_device->image, 1,
-                           num_tiles(image),  packed == nullptr ? nullptr : &on_device->packed};
+    const FrameBatch batch{&on_device->rows,
+                           &on_device->placement,
+                           &on_device->image,
+                           1,
+                           num_tiles(image),
+                           packed == nullptr ? nullptr : &on_device->packed,
+                           false,
+                           image.min_transmittance};
     const unsigned blocks = std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));
     return frame_.draw(
         batch,

@@ -16,16 +16,16 @@ static V3DG_INLINE void prefetch(const Record<T>* records, const uint64_t* entry
     __builtin_prefetch(at + sizeof(Record<T>) - 1);
 }
 
-template <class T, Extra kExtra>
+template <class T, Extra kExtra, class Stop>
 static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
-                       const Window& window, TilePlanes<T>& tile) {
+                       const Window& window, Stop stop, TilePlanes<T>& tile) {
     const BlockPixels<T> pixels;
     uint64_t alive = clear_tile(tile, left, top, window, kExtra);
     for (size_t i = 0; i < count && alive != 0; ++i) {
         prefetch(records, entry, i, count);
         const Record<T>& g = records[record_of(entry[i])];
         const uint64_t blocks = live_blocks(g, left, top, alive);
-        if (blocks != 0) blend_record<T, kExtra>(g, blocks, left, top, pixels, tile, alive);
+        if (blocks != 0) blend_record<T, kExtra>(g, blocks, left, top, pixels, stop, tile, alive);
     }
 }
 
@@ -45,12 +45,14 @@ template <class T>
 void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
                     const Picture<T>& picture) {
     TilePlanes<T> tile;
-    if (picture.count != nullptr)
-        blend_tile<T, Extra::kCount>(records, entry, count, left, top, picture.window, tile);
-    else if (picture.depth != nullptr)
-        blend_tile<T, Extra::kDepth>(records, entry, count, left, top, picture.window, tile);
-    else
-        blend_tile<T, Extra::kNothing>(records, entry, count, left, top, picture.window, tile);
+    with_stop<T>(picture.min_transmittance, [&](auto stop) {
+        if (picture.count != nullptr)
+            blend_tile<T, Extra::kCount>(records, entry, count, left, top, picture.window, stop, tile);
+        else if (picture.depth != nullptr)
+            blend_tile<T, Extra::kDepth>(records, entry, count, left, top, picture.window, stop, tile);
+        else
+            blend_tile<T, Extra::kNothing>(records, entry, count, left, top, picture.window, stop, tile);
+    });
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
         for (int c = 0; c < 3; ++c) picture.color[3 * out + c] = tile.color[c][p] + t * picture.background[c];
@@ -68,7 +70,7 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
                      RecordGradient<T>* d_entry, T* d_background) {
     TilePlanes<T> tile;
     constexpr Extra kExtra = kWithDepth ? Extra::kDepth : Extra::kNothing;
-    blend_tile<T, kExtra>(records, entry, count, left, top, picture.window, tile);
+    blend_tile<T, kExtra>(records, entry, count, left, top, picture.window, StopsBefore{}, tile);
     TileGradient<T> grad = {};
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];

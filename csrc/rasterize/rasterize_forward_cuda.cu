@@ -81,8 +81,8 @@ __device__ uint32_t transpose_bits(uint32_t bits) {
 }
 
 // A warp blends the batch, of `num_groups` times 32 records, over a sub-tile.
-template <bool kWithDepth>
-__device__ void blend_sub(int sub, int num_groups, int left, int top, BlendShared& s) {
+template <bool kWithDepth, class Stop>
+__device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop, BlendShared& s) {
     const int lane = threadIdx.x % 32;
     uint32_t* list = s.list[threadIdx.x / 32];
     const uint32_t own_blocks = 3u << blocks_place(sub);
@@ -133,7 +133,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, BlendShare
             next = last_of_group[-highest];
             const Falloff<float> f = falloff_at(p.x, p.y, a.x, a.y, a.z, a.w, b.x, b.y);
             float weight;
-            alive = blend_live(alpha_of(f), p.transmittance, weight);
+            alive = blend_live(alpha_of(f), p.transmittance, weight, stop);
             p.color[0] += weight * b.z;
             p.color[1] += weight * b.w;
             p.color[2] += weight * c.x;
@@ -150,8 +150,9 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, BlendShare
 }
 
 // Blends the sorted piece.
-template <bool kWithDepth>
-__device__ void blend_piece(const Record<float>* records, uint32_t count, int left, int top, BlendShared& s) {
+template <bool kWithDepth, class Stop>
+__device__ void blend_piece(const Record<float>* records, uint32_t count, int left, int top, Stop stop,
+                            BlendShared& s) {
     for (uint32_t first = 0; first < count && s.alive_blocks != 0; first += kBlendBatch) {
         uint32_t* reached = &s.reached[first / kBlendBatch % 2];
         for (uint32_t i = threadIdx.x; i < kBlendBatch; i += kBlendThreads) {
@@ -178,7 +179,7 @@ __device__ void blend_piece(const Record<float>* records, uint32_t count, int le
         for (uint32_t passed = 0;;) {
             for (; passed < taken; ++passed) subs &= subs - 1;
             if (subs == 0) break;
-            blend_sub<kWithDepth>((__ffs(subs) - 1) / 2, num_groups, left, top, s);
+            blend_sub<kWithDepth>((__ffs(subs) - 1) / 2, num_groups, left, top, stop, s);
             if (threadIdx.x % 32 == 0) taken = kBlendWarps + atomicAdd(&s.subs_taken, 1u);
             taken = __shfl_sync(kAllLanes, taken, 0);
         }
@@ -188,10 +189,10 @@ __device__ void blend_piece(const Record<float>* records, uint32_t count, int le
 }
 
 // Blends the list of a tile. Returns how many of its entries were not dropped.
-template <bool kWithDepth>
+template <bool kWithDepth, class Stop>
 __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries, TileEntry* scratch,
                                uint32_t count, const Buckets& spread_buckets, uint32_t* order, int left,
-                               int top, BlendShared& s) {
+                               int top, Stop stop, BlendShared& s) {
     int depth = 0;  // of levels
     if (count > kPiece) {
         if (threadIdx.x == 0) s.level[0] = {count, true, spread_buckets};
@@ -239,14 +240,15 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
             for (uint32_t i = threadIdx.x; i < held; i += kBlendThreads)
                 order[blended + i] = record_of(TileEntry{s.key[s.sorted[i]]});
         blended += held;
-        blend_piece<kWithDepth>(records, held, left, top, s);
+        blend_piece<kWithDepth>(records, held, left, top, stop, s);
     }
     return blended;
 }
 
-template <bool kWithDepth>
+template <bool kWithDepth, class Stop>
 __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint32_t tile,
-                           const Buckets& spread_buckets, const FrameImage& image, BlendShared& s) {
+                           const Buckets& spread_buckets, const FrameImage& image, Stop stop,
+                           BlendShared& s) {
     const int in_image = static_cast<int>(tile - image.first_tile);
     const int left = in_image % image.tile_columns * kFrameTileWidth;
     const int top = in_image / image.tile_columns * kFrameTileHeight;
@@ -279,7 +281,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
     const uint32_t count = static_cast<uint32_t>(lists.tile_first[tile + 1] - first);
     const uint32_t blended = blend_list<kWithDepth>(
         lists.records, lists.entries + first, lists.scratch + first, count, spread_buckets,
-        tape.order == nullptr ? nullptr : tape.order + first, left, top, s);
+        tape.order == nullptr ? nullptr : tape.order + first, left, top, stop, s);
     if (tape.blended != nullptr && threadIdx.x == 0) tape.blended[tile] = blended;
 
     for_each_pixel([&](int sub, int x, int y) {
@@ -364,17 +366,18 @@ __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists list
     }
 }
 
+template <class Stop>
 __global__ void __launch_bounds__(kBlendThreads, kBlocks)
-    rasterize_kernel(FrameLists lists, RasterTape tape) {
+    rasterize_kernel(FrameLists lists, RasterTape tape, Stop stop) {
     if (!lists.capacity.holds(*lists.counters)) return;
     BlendShared& s = *reinterpret_cast<BlendShared*>(shared_memory());
     const TilePlan plan = lists.plans[blockIdx.x];
     const Buckets buckets{plan.lowest, plan.last_bucket, plan.shift, false};
     const FrameImage& image = lists.images[plan.image];
     if (image.depth != nullptr)
-        blend_tile<true>(lists, tape, plan.tile, buckets, image, s);
+        blend_tile<true>(lists, tape, plan.tile, buckets, image, stop, s);
     else
-        blend_tile<false>(lists, tape, plan.tile, buckets, image, s);
+        blend_tile<false>(lists, tape, plan.tile, buckets, image, stop, s);
 }
 
 }  // namespace
@@ -384,8 +387,10 @@ void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t str
     launch("plan_kernel", plan_kernel, 1, kPlanThreads, 0, stream, lists);
     launch("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles), kPlanThreads,
            0, stream, lists);
-    launch("rasterize_kernel", rasterize_kernel, lists.num_tiles, kBlendThreads, sizeof(BlendShared), stream,
-           lists, tape == nullptr ? RasterTape{} : *tape);
+    with_stop<float>(lists.min_transmittance, [&](auto stop) {
+        launch("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_tiles, kBlendThreads,
+               sizeof(BlendShared), stream, lists, tape == nullptr ? RasterTape{} : *tape, stop);
+    });
 }
 
 }  // namespace cuda

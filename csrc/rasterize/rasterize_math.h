@@ -4,6 +4,7 @@
 //
 // A pixel's transmittance is negative once it has stopped; its magnitude is then the final value.
 
+#include "frame/image.h"
 #include "math/ellipse.h"
 #include "math/gaussian.h"
 
@@ -41,7 +42,16 @@ V3DG_HD V3DG_INLINE V alpha_of(const Falloff<V>& f) {
 
 // Blends over a pixel with transmittance `t`, updates it and returns the gaussian's weight.
 template <class V>
-V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t) {
+V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBehind<Lane<V>> stop) {
+    const V next = t * (1 - alpha);
+    const auto is_live = t > V{};
+    const V weight = is_live ? alpha * t : V{};
+    const V behind = next > all_lanes<V>(stop.transmittance) ? next : -next;
+    t = is_live ? behind : t;
+    return weight;
+}
+template <class V>
+V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBefore = {}) {
     const V next = t * (1 - alpha);
     const auto goes_on = next > all_lanes<V>(Lane<V>(kMinTransmittance));
     const V weight = goes_on ? alpha * t : V{};
@@ -128,9 +138,13 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
-// blend_weight() for a single pixel that has not stopped. Returns whether it goes on; if not, `t` stays as it
-// was.
-V3DG_HD inline bool blend_live(float alpha, float& t, float& weight) {
+// blend_weight() for a single pixel that has not stopped. Returns whether it goes on; `t` stays positive.
+V3DG_HD inline bool blend_live(float alpha, float& t, float& weight, StopsBehind<float> stop) {
+    weight = alpha * t;
+    t *= 1 - alpha;
+    return t > stop.transmittance;
+}
+V3DG_HD inline bool blend_live(float alpha, float& t, float& weight, StopsBefore = {}) {
     const float next = t * (1 - alpha);
     const bool goes_on = next > static_cast<float>(kMinTransmittance);
     weight = goes_on ? alpha * t : 0.0f;

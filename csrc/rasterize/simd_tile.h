@@ -121,9 +121,9 @@ struct BlockPixels {
 };
 
 // Blends one record over the live blocks of a tile; clears the bits of blocks that have stopped.
-template <class T, Extra kExtra>
+template <class T, Extra kExtra, class Stop>
 V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int top,
-                              const BlockPixels<T>& pixels, TilePlanes<T>& tile, uint64_t& alive) {
+                              const BlockPixels<T>& pixels, Stop stop, TilePlanes<T>& tile, uint64_t& alive) {
     using V = Vec<T>;
     const V l11 = all_lanes<V>(g.l11), l12 = all_lanes<V>(g.l12), l22 = all_lanes<V>(g.l22);
     const V log2_opacity = all_lanes<V>(g.log2_opacity);
@@ -147,7 +147,7 @@ V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int
         for (int part = 0; part < kBlockPixels / kLanes<T>; ++part) {
             const int p = kBlockPixels * block + part * kLanes<T>;
             V t = load(tile.transmittance + p);
-            const V weight = blend_weight(alpha[part], t);
+            const V weight = blend_weight(alpha[part], t, stop);
             store(tile.transmittance + p, t);
             live |= bits_of(t > V{});
             store(tile.color[0] + p, load(tile.color[0] + p) + weight * red);

@@ -20,7 +20,7 @@ class Picture:
     alpha: np.ndarray  # (H,W)
     depth: np.ndarray  # (H,W) expected depth, 0 where nothing is drawn
     num_blended: np.ndarray  # (H,W) gaussians that contributed
-    is_stopped: np.ndarray  # (H,W) whether a gaussian was left out to keep the transmittance
+    is_stopped: np.ndarray  # (H,W) whether it takes no more gaussians
     # (H,W) smallest relative distance of an alpha to 1/255 or of a transmittance to where a pixel stops, and
     # of an unclamped alpha to 0.999: below a band, rounding may decide otherwise than float64 does.
     cutoff_distance: np.ndarray
@@ -29,8 +29,17 @@ class Picture:
 
 
 def rasterize(
-    gaussians, camera, *, filter_px2=0.0, antialiased=False, background=(0.0, 0.0, 0.0), sh_degree=None
+    gaussians,
+    camera,
+    *,
+    filter_px2=0.0,
+    antialiased=False,
+    background=(0.0, 0.0, 0.0),
+    sh_degree=None,
+    min_transmittance=None,
 ) -> Picture:
+    """Pixels stop before TRANSMITTANCE_MIN; behind the gaussian that leaves `min_transmittance` if given."""
+    stop = TRANSMITTANCE_MIN if min_transmittance is None else min_transmittance
     projection = project(gaussians, camera, filter_px2=filter_px2)
     colors = reference_sh.color(gaussians.sh, np.asarray(gaussians.means) - camera.position, sh_degree)
     opacities = np.asarray(gaussians.opacities, np.float64)
@@ -64,15 +73,16 @@ def rasterize(
 
         counts = is_open & (alpha >= ALPHA_MIN)
         distance = np.abs(falloff / ALPHA_MIN - 1)
-        distance = np.where(counts, np.minimum(distance, np.abs(left / TRANSMITTANCE_MIN - 1)), distance)
+        if stop > 0:
+            distance = np.where(counts, np.minimum(distance, np.abs(left / stop - 1)), distance)
         cutoff_distance = np.where(is_open, np.minimum(cutoff_distance, distance), cutoff_distance)
         clamp_distance = np.where(
             is_open, np.minimum(clamp_distance, np.abs(falloff / ALPHA_MAX - 1)), clamp_distance
         )
 
-        stops = counts & (left <= TRANSMITTANCE_MIN)
+        stops = counts & (left <= stop)
         is_open &= ~stops
-        blends = counts & ~stops
+        blends = counts if min_transmittance is not None else counts & ~stops
         weight = np.where(blends, transmittance * alpha, 0.0)
         color += weight[..., None] * colors[i]
         weighted_depth += weight * projection.depth[i]

@@ -19,7 +19,7 @@ from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.pictures import to_8bit
-from v3dg.render import render
+from v3dg.render import render, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE, Selection, select
@@ -33,6 +33,7 @@ Shows: TypeAlias = Literal["appearance", "level", "cluster", "depth", "alpha", "
 MOST_COUNTED = 256
 # So many gaussians are drawn whole while the camera moves, too.
 _FEW_GAUSSIANS = 500_000
+_SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False)
 # From dark to bright, even in lightness.
 _RAMP = np.array(
     [
@@ -246,7 +247,7 @@ class SceneView:
             return color, alpha, depth, image.stats.gaussians_in_frustum
         frame, scene = self._frame(color_by, cut)
         drawing = frame.draw_cut(
-            scene, camera.core.window(*window), cut.instance_ids, cut.cluster_ids, (0.0, 0.0, 0.0), stop
+            scene, camera.core.window(*window), cut.instance_ids, cut.cluster_ids, _SHADE, stop
         )
         _check(stop)
         return drawing.color, drawing.alpha, drawing.depth, drawing.finish().in_frustum
@@ -256,7 +257,14 @@ class SceneView:
     ) -> tuple[npt.NDArray[np.float32], int]:
         """(H, W) gaussians that each pixel is blended of; drawn on the CPU on any device."""
         frame, scene = self._frame("appearance", cut)
-        drawing = frame.count_cut(scene, camera.core.window(*window), cut.instance_ids, cut.cluster_ids, stop)
+        drawing = frame.count_cut(
+            scene,
+            camera.core.window(*window),
+            cut.instance_ids,
+            cut.cluster_ids,
+            _SHADE,
+            stop,
+        )
         _check(stop)
         return drawing.depth, drawing.finish().in_frustum
 
