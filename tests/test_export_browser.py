@@ -1,7 +1,8 @@
-"""An export in SuperSplat's own viewer, in Chromium.
+"""Exports in SuperSplat's own viewer, and in their own page, in Chromium.
 
-Wants playwright, Chromium where PATH finds it, and the viewer: `npm install @playcanvas/supersplat-viewer`,
-whose folder `public` the environment variable SUPERSPLAT_VIEWER names.
+They need playwright, Chromium where PATH finds it, and what environment variables name: SUPERSPLAT_VIEWER the
+folder `public` of `npm install @playcanvas/supersplat-viewer@1.36.2`, PLAYCANVAS the file
+`build/playcanvas.min.mjs` of `npm install playcanvas@2.23.3`.
 """
 
 import functools
@@ -19,16 +20,15 @@ from PIL import Image
 import chromium
 import v3dg
 from benchmarks.worlds.procedural import make_donut
-from v3dg.export import write_streamed_sog
+from v3dg.export import write_site, write_streamed_sog
 from v3dg.metrics import psnr
 
 pytest.importorskip("playwright.sync_api")
 
-VIEWER = os.environ.get("SUPERSPLAT_VIEWER")
+VIEWER, ENGINE = os.environ.get("SUPERSPLAT_VIEWER"), os.environ.get("PLAYCANVAS")
 pytestmark = [
     pytest.mark.witness,
     pytest.mark.skipif(chromium.PROGRAM is None, reason="neither chromium nor google-chrome is installed"),
-    pytest.mark.skipif(VIEWER is None, reason="SUPERSPLAT_VIEWER does not name its folder"),
 ]
 
 SIDE = 300
@@ -50,7 +50,7 @@ def bundle():
 @pytest.fixture(scope="module")
 def server(tmp_path_factory, bundle):
     folder = tmp_path_factory.mktemp("web") / "site"
-    shutil.copytree(VIEWER, folder)
+    shutil.copytree(VIEWER, folder) if VIEWER else folder.mkdir()
     write_streamed_sog(bundle, folder / "donut", chunk=6000, up="z")
     handler = functools.partial(Handler, directory=folder)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
@@ -58,6 +58,10 @@ def server(tmp_path_factory, bundle):
         threading.Thread(target=server.serve_forever).start()
         yield server
         server.shutdown()
+
+
+needs_viewer = pytest.mark.skipif(VIEWER is None, reason="SUPERSPLAT_VIEWER does not name its folder")
+needs_engine = pytest.mark.skipif(ENGINE is None, reason="PLAYCANVAS does not name the engine's file")
 
 
 def seen(browser, server, options=""):
@@ -97,13 +101,64 @@ def wanted(bundle, server):
     return np.clip(v3dg.rasterize(bundle.level_gaussians(0), camera, filter_px2=0.3).color, 0, 1)
 
 
+@needs_viewer
 def test_the_viewer_shows_what_we_do(browser, server, bundle):
     picture, levels = seen(browser, server)
     assert levels == {"0"}
     assert psnr(picture, wanted(bundle, server)) > 32
 
 
+@needs_viewer
 def test_a_budget_brings_coarser_levels_that_look_alike(browser, server, bundle):
     picture, levels = seen(browser, server, "&budget=0.006")
     assert "0" not in levels
     assert psnr(picture, wanted(bundle, server)) > 28
+
+
+@pytest.fixture(scope="module")
+def town(bundle):
+    """Ninety instances, from near to far, and a camera."""
+    rng = np.random.default_rng(0)
+    scene = v3dg.Scene()
+    positions = np.stack([rng.uniform(-4, 4, 90), rng.uniform(0, 40, 90), np.zeros(90)], axis=1)
+    scene.add(bundle, positions, rng.normal(size=(90, 4)), rng.uniform(0.5, 1.5, 90))
+    return scene, v3dg.Camera.look_at((0, -4, 3), (0, 6, 0), width=SIDE, height=SIDE)
+
+
+def page_of(browser, server, town, query):
+    """The picture at which the page of a town settles, and how many gaussians it draws."""
+    scene, camera = town
+    folder = server.folder / "town"
+    if not folder.exists():
+        write_site(scene, folder, {"gate": camera})
+        shutil.copy(ENGINE, folder)
+    page = browser.new_page(viewport={"width": SIDE, "height": SIDE})
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(f"http://127.0.0.1:{server.server_address[1]}/town/index.html?webgl&noui&{query}")
+    states = [None, None]
+    for _ in range(60):
+        page.wait_for_timeout(1000)
+        states.append(page.evaluate("window.v3dg ? [window.v3dg.ready, window.v3dg.drawn] : null"))
+        if states[-1] and states[-1][0] and states[-1] == states[-2] == states[-3]:
+            break
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")) / 255
+    page.close()
+    assert errors == []
+    return picture, states[-1][1]
+
+
+@needs_engine
+def test_the_page_of_a_scene_shows_what_we_do(browser, server, town):
+    scene, camera = town
+    picture, drawn = page_of(browser, server, town, "tolerance=1")
+    assert 20_000 < drawn < 90 * 20_000
+    color = np.clip(v3dg.render(scene, camera, tolerance=1, device="cpu").color, 0, 1)
+    assert psnr(picture, color) > 28
+
+
+@needs_engine
+@pytest.mark.parametrize("budget", [50_000, 10_000])
+def test_the_page_of_a_scene_keeps_its_budget(browser, server, town, budget):
+    _, drawn = page_of(browser, server, town, f"budget={budget}&tolerance=0.1")
+    assert 0.9 * budget < drawn <= budget

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,46 +10,58 @@ from typing import Annotated
 
 import tyro
 
-from v3dg import _files
 from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
 from v3dg.cli._common import Common, Flag, UsageError, bytes_text, option, print_result, require_file
-from v3dg.export import DEFAULT_CHUNK, INDEX, Axis, write_streamed_sog
+from v3dg.export import DEFAULT_CHUNK, ENGINE, ENGINE_VERSION, Axis, write_site
+from v3dg.scene import Scene
+from v3dg.scene_file import read_scene
 
 
 @dataclass
 class Export(Common):
-    """Write a bundle as streamed SOG, for the web viewers of PlayCanvas and SuperSplat (docs/formats.md)."""
+    """Write a scene or a bundle as a web page with streamed SOG (docs/formats.md)."""
 
-    bundle: tyro.conf.Positional[Path]
-    """A bundle (.v3dg)."""
+    subject: tyro.conf.Positional[Path]
+    """A scene (.json) or a bundle (.v3dg)."""
     output: Annotated[Path | None, option("FOLDER", "-o")] = None
-    """Folder to write, whose lod-meta.json viewers open; the bundle's name with _web if not given."""
+    """Folder to write, made with those above it; the subject's name with _web if not given."""
     chunk: int = DEFAULT_CHUNK
-    """Most gaussians of the asset in a chunk, for which the viewer chooses a level."""
-    up: Axis = "-y"
-    """Direction that is up in the asset; viewers assume -y, as in most trained assets."""
+    """Most gaussians of an asset in a chunk, for which the viewer chooses a level."""
+    up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
+    """Direction that is up; z for a scene and -y, as in most trained assets, for a bundle if not given."""
     quiet: Flag = False
     """Show no progress."""
 
 
 def run(options: Export) -> None:
-    require_file(options.bundle, ".v3dg")
+    require_file(options.subject, ".v3dg", ".json")
     if options.chunk < 1:
         raise UsageError(f"--chunk: expected at least 1, got {options.chunk}")
-    folder = options.output or options.bundle.with_name(f"{options.bundle.stem}_web")
-    _files.check_folder(folder)
+    folder = options.output or options.subject.with_name(f"{options.subject.stem}_web")
     start = time.perf_counter()
-    done = write_streamed_sog(
-        Bundle.open(options.bundle), folder, chunk=options.chunk, up=options.up, progress=not options.quiet
+    subject, cameras = _read(options.subject)
+    done = write_site(
+        subject, folder, cameras, chunk=options.chunk, up=options.up, progress=not options.quiet
     )
-    result = {
-        "output": str(folder / INDEX),
-        "levels": len(done.counts),
-        **asdict(done),
-        "seconds": time.perf_counter() - start,
-    }
-    text = (
-        f"{folder / INDEX}: {len(done.counts)} levels, {done.chunks:,} chunks, "
-        f"{sum(done.counts):,} gaussians, {bytes_text(done.bytes)}, {result['seconds']:.1f} s"
-    )
-    print_result(options.json, result, [text])
+    result = {"output": str(folder), **asdict(done), "seconds": time.perf_counter() - start}
+    lines = [
+        f"{folder}: {done.instances:,} instances, {done.gaussians:,} gaussians, "
+        f"{done.coarsest:,} at the coarsest, {bytes_text(done.bytes)}, {result['seconds']:.1f} s"
+    ]
+    there = shlex.quote(str(folder))
+    if not done.has_engine:
+        lines += [
+            "it needs PlayCanvas's engine beside it, once:",
+            f"  npm install playcanvas@{ENGINE_VERSION}",
+            f"  cp node_modules/playcanvas/build/{ENGINE} {there}/",
+        ]
+    lines += [
+        f"to look at it: python -m http.server --bind 127.0.0.1 --directory {there}",
+        "  then open http://127.0.0.1:8000/",
+    ]
+    print_result(options.json, result, lines)
+
+
+def _read(path: Path) -> tuple[Scene | Bundle, dict[str, Camera]]:
+    return (Bundle.open(path), {}) if path.suffix == ".v3dg" else read_scene(path)

@@ -1,54 +1,47 @@
 """A bundle for stock web viewers: streamed SOG, the level-of-detail format of PlayCanvas and SuperSplat.
 
-The asset is cut into chunks, which are subtrees of the bundle. Each chunk has the bundle's levels up to the
-one at which a single group is left of it; a viewer chooses a level for each. Chunks of one level are stored
-side by side in folders of SOG, and `lod-meta.json` says which gaussians of which folder they are.
+The asset is cut into chunks, which are subtrees of the bundle, and a viewer chooses a level for each. Up to
+the level at which a single group is left of a chunk, any choice is a cut of the bundle; of coarser levels a
+chunk has the gaussians that are nearest to it. Chunks of one level are stored side by side in folders of SOG,
+and `lod-meta.json` says which gaussians of which folder they are.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
 import os
-import secrets
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _core, _device, _files
+from v3dg._numbers import check
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
 from v3dg.cleaning import ball_of_most
+from v3dg.export._common import (
+    Axis,
+    bytes_below,
+    replacing_folder,
+    turn_upright,
+    turned,
+    write_document,
+)
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable, morton_order
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import rotation_from_quaternion
 
-Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
-
 INDEX = "lod-meta.json"
+SETTINGS = "settings.json"
 DEFAULT_CHUNK = 16384
 # A folder is filled chunk by chunk until it holds so many gaussians: about a megabyte to load at once.
 _FOLDER_GAUSSIANS = 1 << 17
 _FOV_DEGREES = 50.0  # vertical, of the camera that a viewer starts with
-
-# Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers take it.
-_HALF = math.sqrt(0.5)
-_TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
-    "x": (_HALF, 0.0, 0.0, -_HALF),
-    "y": (0.0, 1.0, 0.0, 0.0),
-    "z": (_HALF, _HALF, 0.0, 0.0),
-    "-x": (_HALF, 0.0, 0.0, _HALF),
-    "-y": (1.0, 0.0, 0.0, 0.0),
-    "-z": (_HALF, -_HALF, 0.0, 0.0),
-}
 
 
 @dataclass(frozen=True)
@@ -81,9 +74,9 @@ def write_streamed_sog(
     Besides, `settings.json` tells SuperSplat's viewer where to start. Memory is needed for one folder of SOG.
 
     Args:
-        folder: Where to; new, empty, or with an earlier export.
-        chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view more closely, and have
-            fewer levels.
+        folder: Where to; new, empty, or with an earlier export. Folders above it are made.
+        chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view more closely, and fewer
+            of their levels go together exactly, whichever each of them has.
         up: What is up in the asset, which is turned to what viewers take to be up. Trained assets mostly have
             y down, so nothing is turned.
         progress: Show a bar.
@@ -95,47 +88,45 @@ def write_streamed_sog(
 
     Source: PlayCanvas, the streamed SOG format, version 1.
     """
-    if not bundle.num_gaussians:
-        raise ValueError("bundle: expected gaussians to export, got none")
-    if up not in _TO_UPRIGHT:
-        raise ValueError(f"up: expected one of {', '.join(_TO_UPRIGHT)}, got {up!r}")
     from tqdm import tqdm
 
-    turn = np.array([_TO_UPRIGHT[up]])
-    plan = _Plan.of(bundle, chunk)
-    total = int(bundle.clusters.offset[bundle.level_range(plan.top).stop])
-    with _replacing_folder(Path(folder)) as place:
+    turn, plan = turn_upright(up), Plan.of(bundle, chunk)
+    with replacing_folder(Path(folder)) as place:
+        total = bundle.num_gaussians
         with tqdm(None, "export", total, unit=" gaussians", unit_scale=True, disable=not progress) as bar:
-            names, lods, counts = _write_folders(place, plan, turn, bar.update)
-        index = {
-            "version": 1,
-            "asset": {"generator": f"v3dg {__version__}"},
-            "count": sum(counts),
-            "counts": counts,
-            "lodLevels": len(counts),
-            "filenames": [f"{name}/meta.json" for name in names],
-            "tree": plan.tree(lods, turn),
-        }
-        settings = _viewer_settings(_turned(bundle.level_gaussians(plan.top), turn))
-        for file, document in ((INDEX, index), ("settings.json", settings)):
-            (place / file).write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
-        size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
-    return Export(counts, plan.num_chunks, len(names), size)
+            done = write_levels(plan, place, turn, bar.update)
+    return done
+
+
+def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int], Any]) -> Export:
+    """Fill a folder with the levels of a bundle, turned by a quaternion (1, 4)."""
+    names, lods, counts = _write_folders(place, plan, turn, advance)
+    index = {
+        "version": 1,
+        "asset": {"generator": f"v3dg {__version__}"},
+        "count": sum(counts),
+        "counts": counts,
+        "lodLevels": len(counts),
+        "filenames": [f"{name}/meta.json" for name in names],
+        "tree": plan.tree(lods, turn),
+    }
+    write_document(place / INDEX, index)
+    write_document(place / SETTINGS, _viewer_settings(turned(plan.bundle.level_gaussians(plan.top), turn)))
+    return Export(counts, plan.num_chunks, len(names), bytes_below(place))
 
 
 def _write_folders(
-    place: Path, plan: _Plan, turn: Floats, advance: Callable[[int], Any]
+    place: Path, plan: Plan, turn: Floats, advance: Callable[[int], Any]
 ) -> tuple[list[str], list[dict[str, dict[str, int]]], list[int]]:
     """Write a folder of SOG after another: their names, where each chunk's levels are, gaussians by level."""
     names: list[str] = []
     lods: list[dict[str, dict[str, int]]] = [{} for _ in range(plan.num_chunks)]
-    counts = [0] * (plan.top + 1)
-    for level in range(plan.top + 1):
+    counts = [0] * plan.bundle.num_levels
+    for level in range(plan.bundle.num_levels):
         parts: list[Gaussians] = []
         first, size = len(names), 0
-        for number, clusters in enumerate(plan.by_chunk(np.array(plan.bundle.level_range(level)))):
-            chunk = Gaussians.concatenate([plan.bundle.cluster_gaussians(int(c)) for c in clusters])
-            chunk = _turned(check_writable(chunk), turn)
+        for number, part in enumerate(plan.parts(level)):
+            chunk = turned(check_writable(part), turn)
             lods[number][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
             parts.append(chunk.subset(morton_order(chunk.means)))
             size += len(chunk)
@@ -178,27 +169,8 @@ def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
     }
 
 
-def _turned(gaussians: Gaussians, quaternion: Floats) -> Gaussians:
-    """Gaussians turned about the origin, by a quaternion (1, 4)."""
-    turned = _core.gather(
-        bundles=[gaussians.rows],
-        instances=_core.Instances(
-            bundle=np.zeros(1, np.int32),
-            positions=np.zeros((1, 3)),
-            quaternions=quaternion,
-            scales=np.ones(1),
-            importance=np.ones(1, np.float32),
-        ),
-        instance=np.zeros(1, np.int32),
-        first_row=np.zeros(1, np.int64),
-        offset=np.array([0, len(gaussians)]),
-        device=_device.of(gaussians.means).number,
-    )
-    return Gaussians(*turned)
-
-
 @dataclass(frozen=True)
-class _Plan:
+class Plan:
     """Chunks of a bundle: the groups of its level `top`, or all of a bundle of one level.
 
     Attributes:
@@ -213,7 +185,8 @@ class _Plan:
     chunk_of_group: NDArray[np.int64]
 
     @classmethod
-    def of(cls, bundle: Bundle, chunk: int) -> _Plan:
+    def of(cls, bundle: Bundle, chunk: int) -> Plan:
+        check("bundle", bundle.num_gaussians, "gaussians to export, got none")
         clusters, groups = bundle.clusters, bundle.groups
         if bundle.num_levels == 1:
             return cls(bundle, 0, 1, np.zeros(len(clusters), np.int64), np.zeros(0, np.int64))
@@ -237,6 +210,31 @@ class _Plan:
         group = np.where(clusters.level < top, clusters.parent_group, clusters.own_group)
         chunk_of_cluster = np.where(clusters.level <= top, number[ancestor[group]], -1)
         return cls(bundle, top, len(tops), chunk_of_cluster, number)
+
+    def parts(self, level: int) -> Iterator[Gaussians]:
+        """Gaussians of one level, chunk by chunk."""
+        clusters = np.array(self.bundle.level_range(level))
+        if level <= self.top:
+            for ids in self.by_chunk(clusters):
+                yield Gaussians.concatenate([self.bundle.cluster_gaussians(int(c)) for c in ids])
+            return
+        gaussians, table, groups = (
+            self.bundle.level_gaussians(level),
+            self.bundle.clusters,
+            self.bundle.groups,
+        )
+        tops = np.flatnonzero(self.chunk_of_group >= 0)
+        above: NDArray[Any] = tops
+        for _ in range(level - self.top):
+            above = groups.parent[above]
+        group = np.repeat(table.own_group[clusters], np.diff(table.offset[clusters[0] : clusters[-1] + 2]))
+        chunk = np.empty(len(gaussians), np.int64)
+        for g in np.unique(group):
+            candidates, rows = tops[above == g], np.flatnonzero(group == g)
+            apart = gaussians.means[rows, None].astype(np.float64) - groups.ball[candidates, :3]
+            chunk[rows] = self.chunk_of_group[candidates[np.square(apart).sum(axis=2).argmin(axis=1)]]
+        for number in range(self.num_chunks):
+            yield gaussians.subset(chunk == number)
 
     def by_chunk(self, clusters: NDArray[np.int64]) -> list[NDArray[np.int64]]:
         """Ids of clusters, by the chunk that they are in."""
@@ -270,32 +268,3 @@ def _node(points: Any, **content: Any) -> dict[str, Any]:
     """A node of the tree that bounds points."""
     bound = {"min": np.min(points, axis=0).tolist(), "max": np.max(points, axis=0).tolist()}
     return {"bound": bound, **content}
-
-
-@contextlib.contextmanager
-def _replacing_folder(folder: Path) -> Iterator[Path]:
-    """Give a new folder beside `folder` to fill; at the end it takes its place, on failure it is removed."""
-    if folder.exists() and not (
-        folder.is_dir() and ((folder / INDEX).is_file() or not any(folder.iterdir()))
-    ):
-        raise ValueError(
-            f"{folder}: expected a new folder, or one with an earlier export, got something else"
-        )
-    target = folder.resolve()
-    temporary, old = (
-        target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.{end}") for end in ("tmp", "old")
-    )
-    with _files.naming_errors(folder, os.fspath(temporary)):
-        try:
-            temporary.mkdir()
-            yield temporary
-            if target.exists():
-                target.rename(old)
-            temporary.rename(target)
-            shutil.rmtree(old, ignore_errors=True)
-        except BaseException:
-            if old.exists() and not target.exists():
-                old.rename(target)
-            for rest in (temporary, old):
-                shutil.rmtree(rest, ignore_errors=True)
-            raise

@@ -1,0 +1,11 @@
+"""Bundles and scenes for the viewers of other programs: a module a format (docs/formats.md)."""
+
+from v3dg.export._common import Axis as Axis
+from v3dg.export.site import ENGINE as ENGINE
+from v3dg.export.site import ENGINE_VERSION as ENGINE_VERSION
+from v3dg.export.site import Site as Site
+from v3dg.export.site import write_site as write_site
+from v3dg.export.streamed_sog import DEFAULT_CHUNK as DEFAULT_CHUNK
+from v3dg.export.streamed_sog import INDEX as INDEX
+from v3dg.export.streamed_sog import Export as Export
+from v3dg.export.streamed_sog import write_streamed_sog as write_streamed_sog

@@ -1,0 +1,111 @@
+"""What exports share: which way is up, turning gaussians, and folders that are complete or not there."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from v3dg import _core, _device, _files
+from v3dg._numbers import one_of
+from v3dg.cameras import Floats
+from v3dg.gaussians import Gaussians
+from v3dg.rotations import rotation_from_quaternion
+
+Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+# Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers take it.
+_HALF = math.sqrt(0.5)
+_TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
+    "x": (_HALF, 0.0, 0.0, -_HALF),
+    "y": (0.0, 1.0, 0.0, 0.0),
+    "z": (_HALF, _HALF, 0.0, 0.0),
+    "-x": (_HALF, 0.0, 0.0, _HALF),
+    "-y": (1.0, 0.0, 0.0, 0.0),
+    "-z": (_HALF, -_HALF, 0.0, 0.0),
+}
+# From there to where y is up, as in WebGL, and z, as on a globe.
+_FROM_UPRIGHT = {"y": np.diag([-1.0, -1.0, 1.0]), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
+
+# The file by which an export is known, of each kind: nothing else is replaced by another export.
+MARKS = ("lod-meta.json", "site.json", "tileset.json")
+
+
+def turn_upright(up: Axis) -> Floats:
+    """(1, 4) w x y z that turns what is up in an asset to -y; ValueError for another name."""
+    one_of(up, "up", tuple(_TO_UPRIGHT))
+    return np.array([_TO_UPRIGHT[up]])
+
+
+def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
+    """(3, 3) rotation that turns what is up to an axis."""
+    return np.asarray(_FROM_UPRIGHT[frame] @ rotation_from_quaternion(turn_upright(up)[0])) + 0.0
+
+
+def turned(gaussians: Gaussians, quaternion: Floats) -> Gaussians:
+    """Gaussians turned about the origin, by a quaternion (1, 4)."""
+    rows = _core.gather(
+        bundles=[gaussians.rows],
+        instances=_core.Instances(
+            bundle=np.zeros(1, np.int32),
+            positions=np.zeros((1, 3)),
+            quaternions=quaternion,
+            scales=np.ones(1),
+            importance=np.ones(1, np.float32),
+        ),
+        instance=np.zeros(1, np.int32),
+        first_row=np.zeros(1, np.int64),
+        offset=np.array([0, len(gaussians)]),
+        device=_device.of(gaussians.means).number,
+    )
+    return Gaussians(*rows)
+
+
+def write_document(path: Path, document: Any) -> None:
+    """JSON without spaces, into a folder that is not in its place yet."""
+    path.write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
+
+
+def bytes_below(folder: Path) -> int:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+@contextlib.contextmanager
+def replacing_folder(folder: Path) -> Iterator[Path]:
+    """Give a new folder beside `folder` to fill; at the end it takes its place, on failure it is removed."""
+    if folder.exists() and not (
+        folder.is_dir() and (any((folder / mark).is_file() for mark in MARKS) or not any(folder.iterdir()))
+    ):
+        raise ValueError(
+            f"{folder}: expected a new folder, or one with an earlier export, got something else"
+        )
+    target = folder.resolve()
+    missing = [parent for parent in target.parents if not parent.exists()]  # the lowest first
+    temporary, old = (
+        target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.{end}") for end in ("tmp", "old")
+    )
+    with _files.naming_errors(folder, os.fspath(temporary)):
+        try:
+            temporary.mkdir(parents=True)
+            yield temporary
+            if target.exists():
+                target.rename(old)
+            temporary.rename(target)
+            shutil.rmtree(old, ignore_errors=True)
+        except BaseException:
+            if old.exists() and not target.exists():
+                old.rename(target)
+            for rest in (temporary, old):
+                shutil.rmtree(rest, ignore_errors=True)
+            for parent in missing:
+                with contextlib.suppress(OSError):  # somebody else has put something there
+                    parent.rmdir()
+            raise
