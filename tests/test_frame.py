@@ -1,5 +1,7 @@
 """Frames drawn by CUDA: the CPU's pictures, whatever the stream, the buffers and what was drawn before."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ import scenes
 import scenes_lod
 from compare import PICTURE_FLOAT
 from devices import host
-from v3dg import Camera, Gaussians, Renderer, Scene, render, select
+from v3dg import Camera, Gaussians, Renderer, Scene, rasterize, render, select
 
 pytestmark = pytest.mark.gpu
 
@@ -93,6 +95,30 @@ def test_gaussians_of_any_size(scale):
     scales = (scale * np.exp(0.3 * rng.normal(size=(600, 3)))).astype(np.float32)
     asset = Gaussians(blob.means, blob.quats, scales, 0.3 * blob.opacities, blob.sh)
     assert_like_cpu(render(asset, CAMERA, device="cuda"), render(asset, CAMERA, device="cpu"))
+
+
+@pytest.mark.parametrize("depths", ["spread", "one before all", "equal"])
+@pytest.mark.parametrize("count", [3000, 60_000])
+def test_tiles_blended_in_parts_have_the_same_bytes(depths, count):
+    """Where few tiles have most of the entries; a frame that keeps a tape blends tiles whole."""
+    rng = np.random.default_rng(count)
+    camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 0.9, width=640, height=400)
+    nearest, farthest = {"spread": (2, 3), "one before all": (4, 4.1), "equal": (2, 2)}[depths]
+    depth = rng.uniform(nearest, farthest, count)
+    if depths == "one before all":
+        depth[0] = 0.02
+    asset = scenes.gaussians(
+        np.stack([*(rng.uniform(-0.15, 0.15, (2, count)) * depth), depth], axis=1),
+        scales=rng.uniform(0.001, 0.01, (count, 3)),
+        opacities=rng.uniform(0.05, 0.9, count),
+        sh=rng.normal(0, 1, (count, 1, 3)).astype(np.float32),
+    ).torch("cuda")
+    in_parts = rasterize(asset, camera, background=BACKGROUND)
+    kept = replace(asset, means=asset.means.clone().requires_grad_())
+    whole = rasterize(kept, camera, background=BACKGROUND)
+    assert whole.color.requires_grad
+    assert_same_bytes(in_parts, whole)
+    assert host(whole.alpha).max() > 0.9
 
 
 def test_poisoned_gaussians_are_left_out():

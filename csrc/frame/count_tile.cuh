@@ -9,8 +9,6 @@
 namespace v3dg {
 namespace cuda {
 
-constexpr uint32_t kNoTile = 0xffffffffu;
-
 // Adds one to count[tile] for every lane that has one; for a whole warp.
 __device__ inline void count_tile(uint32_t* count, uint32_t tile) {
     const unsigned peers = __match_any_sync(kAllLanes, tile);

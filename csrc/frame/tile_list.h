@@ -62,12 +62,16 @@ V3DG_HD inline uint32_t blocks_of(TileEntry e) {
     return columns * (0x01010101u >> (8 * (3 - last)) & 0x01010101u << (8 * below));
 }
 
-// A tile in the order in which tiles are blended, and how its list was spread if that is long.
+// A tile, or one of its parts, in the order in which they are blended; the parts of a tile stand side by
+// side, and the first of them says how the tile's list was spread if that is long.
 struct TilePlan {
-    uint32_t tile, image;
-    uint32_t lowest;  // of the depths that the buckets were made for
+    uint32_t tile, image;  // kNoTile where there is none
+    uint32_t lowest;       // of the depths that the buckets were made for
     uint16_t last_bucket, shift;
+    uint8_t part, log2_parts;
+    bool fits_windows;  // no bucket needs to be spread again, which the parts could not do side by side
 };
+constexpr uint32_t kNoTile = ~0u;
 
 // Input of the blend stage.
 struct FrameLists {
@@ -79,7 +83,8 @@ struct FrameLists {
     TileEntry *entries, *scratch;          // each tile's in any order
     const FrameCounters* counters;
     Capacity capacity;        // at most kMostFrameRecords records
-    TilePlan* plans;          // [num_tiles] scratch
+    TilePlan* plans;          // [num_plans] scratch
+    uint32_t num_plans;       // num_tiles, or most_plans() where tiles may be blended in parts
     float min_transmittance;  // of the images
 };
 

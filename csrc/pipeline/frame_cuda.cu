@@ -148,7 +148,8 @@ void Frame::enqueue(Drawing& drawing) {
     tile_bin({item_tiles, few, records, batch.images, batch.num_images, batch.num_tiles, capacity, large,
               tiles, &state->counters},
              bins, stream);
-    room(plans_, batch.num_tiles, drawing);
+    num_plans_ = keeps_tape ? batch.num_tiles : most_plans(batch.num_tiles);
+    room(plans_, num_plans_, drawing);
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
     const auto report = [&] {
@@ -179,6 +180,7 @@ FrameLists Frame::lists(const FrameBatch& batch) const {
             &reinterpret_cast<const State*>(cleared_.data())->counters,
             capacity_,
             plans_.data(),
+            num_plans_,
             batch.min_transmittance};
 }
 

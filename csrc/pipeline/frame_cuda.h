@@ -91,6 +91,7 @@ class Frame {
     DeviceBuffer<unsigned long long> scratch_;  // the few tiles of records, then of the blend stage
     DeviceBuffer<unsigned long long> tile_first_;
     DeviceBuffer<TilePlan> plans_;
+    uint32_t num_plans_ = 0;
     DeviceBuffer<unsigned char> cleared_;  // State, states of the scan, counts of the tiles
 
     std::vector<std::unique_ptr<Slot>> slots_;

@@ -15,6 +15,9 @@ struct RasterTape {
     uint32_t* blended;
 };
 
+// Plans that blending in parts takes at most. A frame with a tape has one for each tile.
+uint32_t most_plans(uint32_t num_tiles);
+
 // Blends each tile's list into the pictures that lists.images name; every pixel is written. Overwrites
 // lists.entries and lists.scratch. Does nothing where the counters are over a capacity. The result does not
 // depend on the order of the entries within a tile's list. `tape` may be null.

@@ -3,7 +3,8 @@
 // Lists are sorted piece by piece, nearest first. Entries over pixels that have all stopped by then are
 // dropped unsorted, and their records are never fetched. A list that does not fit into a piece is first
 // spread over buckets of depth, from one half of its memory to the other; a bucket too long for a window is
-// spread again.
+// spread again. A list with far more than its share of a frame's entries is blended in parts of the tile,
+// side by side.
 //
 // Most gaussians cover a pixel or two. So a warp takes 32 records that may reach its sub-tile, each lane
 // finds which pixels one of them reaches, and the bits are transposed: a pixel then walks its own records
@@ -23,9 +24,11 @@ namespace {
 constexpr int kBlocks = 8;          // on a multiprocessor
 constexpr int kLog2Spread = 11;     // buckets of a list, at most
 constexpr int kPlanThreads = 1024;  // of the kernels before the blend
+constexpr int kMostParts = 4;       // of a tile
 
 static_assert(kSubWidth == 8 && kSubHeight == 4, "the window of reached_pixels");
-static_assert(kPiece % 3 == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0, "begins a class of plan_kernel");
+static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
+              "kPiece / kMostParts begins a class of plan_kernel");
 static_assert(kEntryBlockSize == kSubHeight && 2 * kEntryBlockSize == kSubWidth, "a sub-tile is two blocks");
 
 // Copies 16 bytes from device to shared memory; they are there once the thread has waited.
@@ -47,6 +50,12 @@ __device__ void wait_for_copies() {
 
 // Of a sub-tile's two among the tile's blocks.
 __device__ int blocks_place(int sub) { return 8 * (sub / kSubColumns) + 2 * (sub % kSubColumns); }
+
+// A part of a tile: the whole, its left or right half, or a quarter. A bit for each of its blocks.
+__device__ uint32_t blocks_of_part(int part, int log2_parts) {
+    if (log2_parts == 0) return ~0u;
+    return (log2_parts == 1 ? 0x0f0f0f0fu : 0x0f0fu) << (4 * (part & 1) + 16 * (part >> 1));
+}
 
 struct BlendedPixel {
     float x, y;  // of the centre
@@ -227,7 +236,7 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
             }
             // Not even one does.
             const uint32_t end = end_of_bucket(from, done, level.end, level.buckets);
-            const Buckets buckets = find_buckets<kBlendThreads>(from, done, end, false, s.spreading);
+            const Buckets buckets = find_buckets<kBlendThreads>(from, done, end, false, false, s.spreading);
             spread<kBlendThreads>(from, level.in_scratch ? entries : scratch, done, end, buckets,
                                   s.spreading);
             if (threadIdx.x == 0) s.level[depth] = {end, !level.in_scratch, buckets};
@@ -247,8 +256,8 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
 
 template <bool kWithDepth, class Stop>
 __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint32_t tile,
-                           const Buckets& spread_buckets, const FrameImage& image, Stop stop,
-                           BlendShared& s) {
+                           const Buckets& spread_buckets, uint32_t own_blocks, const FrameImage& image,
+                           Stop stop, BlendShared& s) {
     const int in_image = static_cast<int>(tile - image.first_tile);
     const int left = in_image % image.tile_columns * kFrameTileWidth;
     const int top = in_image / image.tile_columns * kFrameTileHeight;
@@ -256,12 +265,13 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
     // A thread begins and ends one pixel of each sub-tile that it takes.
     const auto for_each_pixel = [&](const auto& visit) {
         for (int sub = warp; sub < kSubs; sub += kBlendWarps)
-            visit(sub, left + sub % kSubColumns * kSubWidth + lane % kSubWidth,
-                  top + sub / kSubColumns * kSubHeight + lane / kSubWidth);
+            if ((own_blocks >> blocks_place(sub) & 1) != 0)
+                visit(sub, left + sub % kSubColumns * kSubWidth + lane % kSubWidth,
+                      top + sub / kSubColumns * kSubHeight + lane / kSubWidth);
     };
 
     if (threadIdx.x == 0) {
-        s.alive_blocks = ~0u;
+        s.alive_blocks = own_blocks;
         s.window[0] = {0, ~0u};
         s.lowest = ~0u;
         s.highest = 0;
@@ -300,35 +310,42 @@ __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
 }
 
 // Plans the tiles by falling load, so that no block is left with a long list at the end. Loads of one class,
-// half an octave wide, follow in any order; kPiece begins one.
-__global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists) {
+// half an octave wide, follow in any order. Where few tiles have most of the entries, as of an asset in the
+// middle of a picture, they are blended in parts, each by a block that drops what does not reach it: there
+// are `num_places` for blocks at a time, and no block is to have much more than its share.
+__global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
     constexpr int kClasses = 64;
-    __shared__ uint32_t place[kClasses];
+    __shared__ uint32_t place[kClasses], num_planned;
     if (!lists.capacity.holds(*lists.counters)) return;
-    const auto class_of = [&](uint32_t tile) {
-        const uint32_t count = count_of(lists, tile);
-        if (count < 2) return kClasses - 1 - static_cast<int>(count);
-        const int octave = 31 - __clz(static_cast<int>(count));
-        return kClasses - 1 - 2 * octave - static_cast<int>(count >> (octave - 1) & 1);
+    const auto share = static_cast<uint32_t>(lists.tile_first[lists.num_tiles] / num_places + 1);
+    const auto log2_parts_of = [&](uint32_t count) {
+        if (lists.num_plans == lists.num_tiles || count <= kPiece || count < share) return 0;
+        return count / 2 < share ? 1 : 2;
     };
-    // Calls visit(tile, its class) for a thread's share of the tiles, some of whose loads are under way
+    const auto class_of = [&](uint32_t count) {
+        const uint32_t load = count >> log2_parts_of(count);
+        if (load < 2) return kClasses - 1 - static_cast<int>(load);
+        const int octave = 31 - __clz(static_cast<int>(load));
+        return kClasses - 1 - 2 * octave - static_cast<int>(load >> (octave - 1) & 1);
+    };
+    // Calls visit(tile, its count) for a thread's share of the tiles, some of whose loads are under way
     // together.
     const auto for_each_tile = [&](const auto& visit) {
         constexpr int kTogether = 4;
         for (uint32_t first = threadIdx.x; first < lists.num_tiles; first += kTogether * kPlanThreads) {
-            int tile_class[kTogether];
+            uint32_t count[kTogether];
 #pragma unroll
             for (int k = 0; k < kTogether; ++k)
-                tile_class[k] = class_of(min(first + k * kPlanThreads, lists.num_tiles - 1));
+                count[k] = count_of(lists, min(first + k * kPlanThreads, lists.num_tiles - 1));
 #pragma unroll
             for (int k = 0; k < kTogether; ++k)
-                if (first + k * kPlanThreads < lists.num_tiles)
-                    visit(first + k * kPlanThreads, tile_class[k]);
+                if (first + k * kPlanThreads < lists.num_tiles) visit(first + k * kPlanThreads, count[k]);
         }
     };
     if (threadIdx.x < kClasses) place[threadIdx.x] = 0;
     __syncthreads();
-    for_each_tile([&](uint32_t, int tile_class) { atomicAdd(&place[tile_class], 1u); });
+    for_each_tile(
+        [&](uint32_t, uint32_t count) { atomicAdd(&place[class_of(count)], 1u << log2_parts_of(count)); });
     __syncthreads();
     if (threadIdx.x == 0) {
         uint32_t first = 0;
@@ -337,28 +354,41 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists) {
             p = first;
             first += count;
         }
+        num_planned = first;
     }
     __syncthreads();
-    for_each_tile([&](uint32_t tile, int tile_class) {
-        TilePlan& plan = lists.plans[atomicAdd(&place[tile_class], 1u)];
-        plan.tile = tile;
-        plan.image = lists.image_of_tile[tile];
+    for_each_tile([&](uint32_t tile, uint32_t count) {
+        const int log2_parts = log2_parts_of(count);
+        TilePlan* plan = lists.plans + atomicAdd(&place[class_of(count)], 1u << log2_parts);
+        const uint32_t image = lists.image_of_tile[tile];
+        for (int part = 0; part < 1 << log2_parts; ++part)
+            plan[part] = {tile, image, 0, 0, 0, uint8_t(part), uint8_t(log2_parts), false};
     });
+    for (uint32_t i = num_planned + threadIdx.x; i < lists.num_plans; i += kPlanThreads)
+        lists.plans[i].tile = kNoTile;
 }
 
 // Spreads the long lists, a block one after another.
 __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists lists) {
     __shared__ SpreadShared<kLog2Spread> s;
     if (!lists.capacity.holds(*lists.counters)) return;
-    for (uint32_t i = blockIdx.x; i < lists.num_tiles; i += gridDim.x) {
+    for (uint32_t i = blockIdx.x; i < lists.num_plans; i += gridDim.x) {
         TilePlan& plan = lists.plans[i];
+        if (plan.tile == kNoTile) return;
         const uint32_t count = count_of(lists, plan.tile);
-        if (count < kPiece) return;  // and so are all that follow
-        if (count == kPiece) continue;
+        if (count >> plan.log2_parts < kPiece / kMostParts) return;  // and so are all that follow
+        if (count <= kPiece || plan.part != 0) continue;
         const unsigned long long first = lists.tile_first[plan.tile];
-        const Buckets buckets = find_buckets<kPlanThreads>(lists.entries + first, 0, count, true, s);
+        const Buckets buckets =
+            find_buckets<kPlanThreads>(lists.entries + first, 0, count, true, plan.log2_parts > 0, s);
         spread<kPlanThreads>(lists.entries + first, lists.scratch + first, 0, count, buckets, s);
+        // A bucket's counter now stands where the next one begins.
+        bool is_long = false;
+        for (uint32_t b = threadIdx.x; b <= buckets.last; b += kPlanThreads)
+            is_long = is_long || s.bucket[b] - (b > 0 ? s.bucket[b - 1] : 0) > kWindow;
+        is_long = __syncthreads_or(is_long);
         if (threadIdx.x == 0) {
+            plan.fits_windows = !is_long;
             plan.lowest = buckets.lowest;
             plan.last_bucket = static_cast<uint16_t>(buckets.last);
             plan.shift = static_cast<uint16_t>(buckets.shift);
@@ -371,24 +401,36 @@ __global__ void __launch_bounds__(kBlendThreads, kBlocks)
     rasterize_kernel(FrameLists lists, RasterTape tape, Stop stop) {
     if (!lists.capacity.holds(*lists.counters)) return;
     BlendShared& s = *reinterpret_cast<BlendShared*>(shared_memory());
-    const TilePlan plan = lists.plans[blockIdx.x];
+    const uint32_t tile = lists.plans[blockIdx.x].tile;
+    if (tile == kNoTile) return;
+    const int part = lists.plans[blockIdx.x].part;
+    const TilePlan plan = lists.plans[blockIdx.x - part];
+    if (part > 0 && !plan.fits_windows) return;  // the first blends it all
+    const uint32_t own_blocks = blocks_of_part(part, plan.fits_windows ? plan.log2_parts : 0);
     const Buckets buckets{plan.lowest, plan.last_bucket, plan.shift, false};
     const FrameImage& image = lists.images[plan.image];
     if (image.depth != nullptr)
-        blend_tile<true>(lists, tape, plan.tile, buckets, image, stop, s);
+        blend_tile<true>(lists, tape, tile, buckets, own_blocks, image, stop, s);
     else
-        blend_tile<false>(lists, tape, plan.tile, buckets, image, stop, s);
+        blend_tile<false>(lists, tape, tile, buckets, own_blocks, image, stop, s);
 }
+
+uint32_t num_places() { return static_cast<uint32_t>(kBlocks) * num_multiprocessors(); }
 
 }  // namespace
 
+uint32_t most_plans(uint32_t num_tiles) {
+    // A tile of one share has one more, of two three more, and there are num_places() shares.
+    return num_tiles + (kMostParts - 1) * num_places() / 2 + 1;
+}
+
 void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t stream) {
     if (lists.num_tiles == 0) return;
-    launch("plan_kernel", plan_kernel, 1, kPlanThreads, 0, stream, lists);
+    launch("plan_kernel", plan_kernel, 1, kPlanThreads, 0, stream, lists, num_places());
     launch("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles), kPlanThreads,
            0, stream, lists);
     with_stop<float>(lists.min_transmittance, [&](auto stop) {
-        launch("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_tiles, kBlendThreads,
+        launch("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans, kBlendThreads,
                sizeof(BlendShared), stream, lists, tape == nullptr ? RasterTape{} : *tape, stop);
     });
 }

@@ -89,10 +89,11 @@ __device__ void for_each_entry(const TileEntry* entries, uint32_t first, uint32_
     }
 }
 
-// Buckets for entries [first, last): for the range of all of them, or of a sample when `roughly`.
+// Buckets for entries [first, last): for the range of all of them, or of a sample when `roughly`. As many as
+// there can be when `finely`.
 template <int kBlock, int kLog2Buckets>
 __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last, bool roughly,
-                                SpreadShared<kLog2Buckets>& s) {
+                                bool finely, SpreadShared<kLog2Buckets>& s) {
     if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
     uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // of depths and records
     const auto widen = [&](TileEntry e) {
@@ -120,7 +121,8 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
     }
     __syncthreads();
     // Some 64 entries a bucket; the fewer, the more of what is written together stays together in the cache.
-    const int log2_buckets = min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
+    const int log2_buckets =
+        finely ? kLog2Buckets : min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
     const bool by_record = !roughly && s.range[0] == s.range[1];
     const uint32_t* range = s.range + (by_record ? 2 : 0);
     return buckets_over(range[0], range[1], log2_buckets, by_record);
