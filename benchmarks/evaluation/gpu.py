@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import threading
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
@@ -65,20 +66,20 @@ def picture_error(picture: Any, truth: Any) -> dict[str, float]:
     }
 
 
-def placed_gaussians(scene: Scene) -> v3dg.Gaussians:
-    """All instances of a scene of one bundle, in full detail, in the world, on the GPU; SH degree 0."""
+def placed_gaussians(scene: Scene, device: str = DEVICE) -> v3dg.Gaussians:
+    """All instances of a scene of one bundle, in full detail, in the world, as tensors; SH degree 0."""
     import torch
 
-    asset = scene.bundles[0].level_gaussians(0).torch(DEVICE)
-    means = torch.empty(len(scene), len(asset), 3, device=DEVICE)
-    quats = torch.empty(len(scene), len(asset), 4, device=DEVICE)
-    product = torch.as_tensor(_left_products(scene.quaternions), device=DEVICE)
-    linear = torch.as_tensor(scene.rotations * scene.scales[:, None, None], device=DEVICE)
-    positions = torch.as_tensor(scene.positions, device=DEVICE)
+    asset = scene.bundles[0].level_gaussians(0).torch(device)
+    means = torch.empty(len(scene), len(asset), 3, device=device)
+    quats = torch.empty(len(scene), len(asset), 4, device=device)
+    product = torch.as_tensor(_left_products(scene.quaternions), device=device)
+    linear = torch.as_tensor(scene.rotations * scene.scales[:, None, None], device=device)
+    positions = torch.as_tensor(scene.positions, device=device)
     for i in range(len(scene)):
         means[i] = asset.means.double() @ linear[i].T + positions[i]
         quats[i] = asset.quats.double() @ product[i].T
-    scales = torch.as_tensor(scene.scales, device=DEVICE).float()[:, None, None] * asset.scales
+    scales = torch.as_tensor(scene.scales, device=device).float()[:, None, None] * asset.scales
     opacities = asset.opacities.expand(len(scene), -1)
     sh = asset.sh.expand(len(scene), -1, -1, -1)
     return v3dg.Gaussians(
@@ -119,7 +120,14 @@ def time_gsplat(gaussians: v3dg.Gaussians, camera: Camera, repeats: int) -> Time
 def gsplat_picture(
     gaussians: v3dg.Gaussians, camera: Camera, *, packed: bool, eps2d: float = 0.0
 ) -> tuple[Any, Any]:
-    """Colour (H, W, 3) and alpha (H, W) as gsplat draws them; differentiable.
+    """Colour (H, W, 3) and alpha (H, W) as gsplat draws them; differentiable."""
+    return gsplat_frame(gaussians, camera, packed=packed, eps2d=eps2d)()
+
+
+def gsplat_frame(
+    gaussians: v3dg.Gaussians, camera: Camera, *, packed: bool, eps2d: float = 0.0
+) -> Callable[[], tuple[Any, Any]]:
+    """A call that draws `gsplat_picture`, with all that it needs on the GPU.
 
     Colours without a view dependence are handed over as they are, which spares gsplat a pass.
     """
@@ -130,19 +138,25 @@ def gsplat_picture(
         colors, degree = (gaussians.sh[:, 0] * _core.sh_base0 + 0.5).clamp_min(0), None
     else:
         colors, degree = gaussians.sh, gaussians.sh_degree
-    color, alpha, _ = gsplat.rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        colors,
-        torch.as_tensor(camera.viewmat, dtype=torch.float32, device=DEVICE)[None],
-        torch.as_tensor(camera.K, dtype=torch.float32, device=DEVICE)[None],
-        camera.width,
-        camera.height,
-        near_plane=camera.near,
-        eps2d=eps2d,
-        sh_degree=degree,
-        packed=packed,
-    )
-    return color[0], alpha[0, ..., 0]
+    device = gaussians.means.device
+    viewmat, K = (torch.as_tensor(m, dtype=torch.float32, device=device) for m in (camera.viewmat, camera.K))
+
+    def draw() -> tuple[Any, Any]:
+        color, alpha, _ = gsplat.rasterization(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            colors,
+            viewmat[None],
+            K[None],
+            camera.width,
+            camera.height,
+            near_plane=camera.near,
+            eps2d=eps2d,
+            sh_degree=degree,
+            packed=packed,
+        )
+        return color[0], alpha[0, ..., 0]
+
+    return draw

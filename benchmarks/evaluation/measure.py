@@ -50,9 +50,14 @@ def time_ms(call: Callable[[], Any], device: str, repeats: int) -> Time:
     """Time single calls from an idle device to an idle device, after a warm-up; Python's share counts."""
     for _ in range(_WARM_UPS):
         call()
-    clock = _cuda_ms if device == "cuda" else _wall_ms
-    times = [clock(call) for _ in range(repeats)]
+    times = times_ms(call, device, repeats)
     return Time(statistics.median(times), min(times), max(times))
+
+
+def times_ms(call: Callable[[], Any], device: str, repeats: int) -> list[float]:
+    """Milliseconds of single calls, each from an idle device to an idle device."""
+    clock = _cuda_ms if device == "cuda" else _wall_ms
+    return [clock(call) for _ in range(repeats)]
 
 
 def _wall_ms(call: Callable[[], Any]) -> float:

@@ -1,0 +1,360 @@
+"""Our frames and gradients beside those of other rasterizers, in one run: times, memory and errors.
+
+    python -m benchmarks.studies.peers --layout donutsea.json --asset donut.ply \\
+        --captured ASSETS --names Fungi --modules PEERS -o peers.json
+
+Measured is what can be imported: gsplat 1.5, the inference renderer of its main branch ("HiGS"), Faster-GS,
+FlashGS. PEERS has a folder for each that is put in front of Python's path: `gsplat`, `higs`, and, because the
+latter two have the filter compiled in, `fastergs_0`, `fastergs_0.3`, `flashgs_0` and `flashgs_0.3`. Every
+one is measured in a process of its own, so that one that fails leaves the others alone; what failed is in the
+result with what it said.
+
+ASSETS is a folder as `pairs` has it. Instances are drawn without a filter, assets and random gaussians with
+0.3 px², as assets are trained, and, at the first size, without one. Times are of CUDA events around single
+calls that start on an idle device and end with it, so what Python costs is in them. Errors are to float64, in
+eight windows of each picture. Memory is what the process has on the device while it draws, without those
+inputs of which the renderer has a copy of its own. A training step starts from logarithms of scales and
+logits of opacities, as optimisers hold them, and its loss is a weighted sum of the picture's colours.
+Gradients of few gaussians are compared with float64's.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import multiprocessing
+import statistics
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from benchmarks.evaluation import gpu, record
+from benchmarks.evaluation.measure import times_ms
+from benchmarks.studies import peers_scenes as scenes
+from benchmarks.studies.peers_draw import INPUTS, ROWS, Draw, Job, Peer, Raw, jobs
+from benchmarks.studies.peers_scenes import TRAINED_PX2, Subject
+from v3dg.cameras import Camera
+
+Row = dict[str, Any]
+
+_WARM_UPS = 3
+_LEAST_REPEATS, _MOST_REPEATS = 7, 51
+_SMALL = 20_000, 320, 180  # gaussians and picture of which gradients are compared with float64
+_TRUTHS = "truths"
+_OURS = "v3dg"
+
+
+@dataclass
+class Config:
+    asset: Path | None = None
+    """A .ply file; by default the procedural asset."""
+    layout: Path | None = None
+    """A layout of instances of that asset; without one, that part is left out."""
+    cameras: tuple[int, ...] = (45, 50, 55, 59)
+    """Which cameras of the layout."""
+    captured: Path | None = None
+    """A folder with assets.json; without one, that part is left out."""
+    names: tuple[str, ...] = ()
+    """Assets of that folder."""
+    counts: tuple[int, ...] = (1_000_000, 4_000_000, 20_000_000)
+    """How many random gaussians."""
+    sh_degree: int = 3
+    """Of the random gaussians."""
+    widths: tuple[int, ...] = (1920, 3840)
+    """px; pictures are 16 : 9."""
+    train_at_most: int = 4_000_000
+    """Gaussians of the scenes that are trained with."""
+    modules: Path | None = None
+    """Folder with a folder for each of the peers."""
+    jobs: tuple[str, ...] = ()
+    """Which processes, by the names of their folders; all by default."""
+    seconds: float = 0.4
+    """Time to spend on a row, within 7 to 51 repeats."""
+    patience: float = 180.0
+    """Seconds after which a process is ended."""
+    window: int = 128
+    """px of a side of the windows that are compared."""
+    device: Literal["cpu", "cuda"] = "cuda"
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+
+
+def subjects(config: Config) -> Iterator[tuple[str, Callable[[], Subject]]]:
+    """Names of scenes, and what makes each; the largest last, for a pool keeps what was taken once."""
+    device = config.device
+    for name in config.names:
+        yield name, partial(scenes.captured, config.captured or Path(), name, device)
+    for count in sorted(config.counts):
+        yield f"random {count}", partial(scenes.random, count, config.sh_degree, device)
+    if config.layout is not None:
+        make = partial(scenes.instances, config.layout, config.asset, config.cameras, device)
+        yield config.layout.stem, make
+
+
+def views(config: Config, subject: Subject, filter_px2: float) -> Iterator[tuple[Row, Camera]]:
+    """The pictures that are drawn with a filter: what they are, and their cameras."""
+    widths = config.widths if filter_px2 == subject.filters_px2[0] else config.widths[:1]
+    for width in widths:
+        for name, camera in subject.cameras.items():
+            height = width * 9 // 16
+            about = {"scene": subject.name, "view": name, "width": width, "height": height}
+            yield {**about, "filter_px2": filter_px2}, scenes.at_size(camera, width, height)
+
+
+class Book:
+    """Rows as they are measured, a line of JSON each, so that a process that ends leaves what it had."""
+
+    def __init__(self, folder: Path, job: str) -> None:
+        self._path, self._folder, self._job = folder / f"{job}.jsonl", folder, job
+
+    def write(self, kind: str, row: Row) -> None:
+        with self._path.open("a") as file:
+            file.write(json.dumps({"kind": kind, "job": self._job, **row}) + "\n")
+        print(self._job, kind, {k: v for k, v in row.items() if k != "trace"}, flush=True)
+
+    def rows(self) -> list[Row]:
+        lines = self._path.read_text().splitlines() if self._path.exists() else []
+        return [json.loads(line) for line in lines]
+
+    def failure(self, about: Row, error: BaseException) -> None:
+        said = f"{type(error).__name__}: {error}"
+        self.write("failure", {**about, "error": said[-600:], "trace": traceback.format_exc()[-1500:]})
+
+    def truth_path(self, about: Row) -> Path:
+        parts = (str(about[name]) for name in ("scene", "view", "width", "filter_px2"))
+        return self._folder / ("_".join(parts).replace(" ", "-") + ".npz")
+
+
+def work(config: Config, name: str, folder: Path) -> None:
+    """What a process does."""
+    book = Book(folder, name)
+    job = next((job for job in jobs() if job.name == name), None)
+    if config.modules is not None:
+        sys.path.insert(0, str(config.modules / name))
+    try:
+        if job is not None:
+            importlib.import_module(job.module)
+    except Exception as error:
+        book.failure({}, error)
+        return
+    if config.device == "cuda":
+        with gpu.PeakMemory():  # the first one notes what an idle process has
+            pass
+    for scene, make in subjects(config):
+        try:
+            subject = make()
+            if job is None:
+                write_truths(config, subject, book)
+            else:
+                measure(config, job, subject, book)
+            del subject
+        except Exception as error:
+            book.failure({"scene": scene}, error)
+    if job is not None:
+        compare_gradients(config, job, book)
+
+
+def write_truths(config: Config, subject: Subject, book: Book) -> None:
+    for filter_px2 in subject.filters_px2:
+        for about, camera in views(config, subject, filter_px2):
+            pictures = scenes.truths(subject, camera, filter_px2, config.window)
+            np.savez(book.truth_path(about), *pictures)
+
+
+def measure(config: Config, job: Job, subject: Subject, book: Book) -> None:
+    """Frames of every view, and training steps of the first one."""
+    filters = [px2 for px2 in subject.filters_px2 if job.filter_px2 in (None, px2)]
+    few = len(subject.gaussians) <= config.train_at_most
+    for peer in job.peers:
+        if subject.gaussians.sh_degree not in peer.sh_degrees:
+            continue
+        for filter_px2 in filters:
+            parts: list[Callable[..., None]] = [frames]
+            if peer.train and few and filter_px2 == TRAINED_PX2:
+                parts.append(training)
+            for part in parts:
+                try:
+                    part(config, peer, subject, filter_px2, book)
+                except Exception as error:
+                    about = {"scene": subject.name, "renderer": peer.name, "filter_px2": filter_px2}
+                    book.failure({**about, "part": part.__name__}, error)
+
+
+def frames(config: Config, peer: Peer, subject: Subject, filter_px2: float, book: Book) -> None:
+    import torch
+
+    with torch.no_grad():
+        of = peer.prepare(subject, filter_px2)
+        copied = set(INPUTS) - set(peer.keeps(subject, filter_px2))
+        spare = sum(getattr(subject.gaussians, name).nbytes for name in copied) / 1e9
+        for view, camera in views(config, subject, filter_px2):
+            about = {**view, "renderer": peer.name, "gaussians": len(subject.gaussians)}
+            try:
+                row, shown = measured(config, of(camera), spare)
+                errors = errors_of(peer.picture(shown), camera, book.truth_path(view), config.window)
+                book.write("frame", {**about, **row, **errors})
+            except Exception as error:
+                book.failure(about, error)
+
+
+def training(config: Config, peer: Peer, subject: Subject, filter_px2: float, book: Book) -> None:
+    """A step of the first view."""
+    import torch
+
+    assert peer.train is not None
+    view, camera = next(views(config, subject, filter_px2))
+    generator = torch.Generator(config.device).manual_seed(1)
+    shape = (camera.height, camera.width, 3)
+    weights = torch.randn(*shape, generator=generator, device=config.device)
+    trained = peer.train(Raw.of(subject.gaussians), camera, filter_px2, weights)
+    forward, _ = measured(config, trained.forward)
+    both, _ = measured(config, trained.step)
+    about = {**view, "renderer": peer.name, "gaussians": len(subject.gaussians)}
+    book.write("training", {**about, "forward_ms": forward["ms"], **both})
+
+
+def measured(config: Config, draw: Draw, spare: float = 0.0) -> tuple[Row, Any]:
+    """Times of a call and the device's memory during it, and what it returned.
+
+    Args:
+        spare: Gigabytes in use that the call does not need.
+    """
+    gigabytes = None
+    if config.device == "cuda":
+        with gpu.PeakMemory() as memory:
+            for _ in range(_WARM_UPS):
+                draw()
+            times_ms(draw, config.device, 1)  # ends on an idle device
+        gigabytes = round(memory.gigabytes - spare, 2)
+    first = statistics.median(times_ms(draw, config.device, 3))
+    repeats = int(min(max(1e3 * config.seconds / max(first, 1e-3), _LEAST_REPEATS), _MOST_REPEATS))
+    times = times_ms(draw, config.device, repeats)
+    row = {"ms": statistics.median(times), "p95_ms": float(np.quantile(times, 0.95)), "least_ms": min(times)}
+    return {**{k: round(v, 3) for k, v in row.items()}, "repeats": repeats, "gigabytes": gigabytes}, draw()
+
+
+def errors_of(picture: Any, camera: Camera, path: Path, side: int) -> Row:
+    """How far the windows of a picture are from the truth, both clipped to [0, 1]."""
+    if not path.exists():
+        return {}
+    picture = picture.cpu().numpy() if hasattr(picture, "cpu") else np.asarray(picture)
+    scale = 255 if picture.dtype == np.uint8 else 1
+    with np.load(path) as stored:
+        truths = [stored[name] for name in stored.files]
+    differences = [
+        np.clip(picture[y0:y1, x0:x1].astype(np.float64) / scale, 0, 1) - np.clip(truth, 0, 1)
+        for (x0, y0, x1, y1), truth in zip(scenes.windows(camera, side), truths, strict=True)
+    ]
+    error = np.abs(np.concatenate([d.reshape(-1, 3) for d in differences]))
+    return {
+        "psnr": round(float(-10 * np.log10(max(np.square(error).mean(), 1e-20))), 2),
+        "mean_error": float(f"{error.mean():.3e}"),
+        "largest_error": float(f"{error.max():.3e}"),
+        "share_over_1_255": float(f"{(error.max(axis=1) > 1 / 255).mean():.3e}"),
+    }
+
+
+def compare_gradients(config: Config, job: Job, book: Book) -> None:
+    """Relative L2 distances of gradients to those of float64, of few gaussians in a small picture."""
+    trainable = [peer for peer in job.peers if peer.train and job.filter_px2 in (None, TRAINED_PX2)]
+    if not trainable:
+        return
+    import torch
+
+    count, width, height = _SMALL
+    subject = scenes.random(count, config.sh_degree, config.device)
+    camera = scenes.at_size(subject.cameras["front"], width, height)
+    weights = torch.from_numpy(np.random.default_rng(1).standard_normal((height, width, 3)))
+    wide = subject.gaussians.scales * scenes.TRAINED_WIDTH / width  # as many px as before
+    raw = Raw.of(replace(subject.gaussians, scales=wide))
+    doubles = Raw(*(getattr(raw, name).double().cpu() for name in ROWS))
+    ours = next(peer.train for peer in jobs()[0].peers if peer.train)
+    exact = ours(doubles, camera, TRAINED_PX2, weights)
+    truth = exact.named(exact.step())
+    for peer in trainable:
+        try:
+            assert peer.train is not None
+            trained = peer.train(raw, camera, TRAINED_PX2, weights.float().to(config.device))
+            found = {name: g.double().cpu() for name, g in trained.named(trained.step()).items()}
+            book.write("gradients", {"renderer": peer.name, "relative_l2": distances(found, truth)})
+        except Exception as error:
+            book.failure({"renderer": peer.name, "part": "gradients"}, error)
+
+
+def distances(values: dict[str, Any], truths: dict[str, Any]) -> dict[str, float]:
+    """Relative to the truths' lengths."""
+    found = {name: float((values[name] - truths[name]).norm() / truths[name].norm()) for name in ROWS}
+    return {name: float(f"{distance:.2e}") for name, distance in found.items()}
+
+
+def run(config: Config, name: str, folder: Path) -> list[Row]:
+    """The rows of one process, and that it failed if it did."""
+    book = Book(folder, name)
+    process = multiprocessing.get_context("spawn").Process(target=work, args=(config, name, folder))
+    process.start()
+    process.join(config.patience)
+    if process.is_alive():
+        process.terminate()
+        process.join()
+        book.write("failure", {"error": f"ended after {config.patience:g} s"})
+    elif process.exitcode:
+        book.write("failure", {"error": f"the process ended with {process.exitcode}"})
+    return book.rows()
+
+
+def main(config: Config) -> None:
+    known = [job.name for job in jobs()]
+    unknown = set(config.jobs) - set(known)
+    if unknown:
+        sys.exit(f"jobs: expected some of {', '.join(known)}, got {', '.join(sorted(unknown))}")
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in [_TRUTHS, *(name for name in known if not config.jobs or name in config.jobs)]:
+            rows += run(config, name, Path(folder))
+            record.write(config.output, result(config, rows), config.device)
+    print_table([row for row in rows if row["kind"] == "frame"])
+
+
+def result(config: Config, rows: list[Row]) -> Row:
+    kinds = {
+        kind: [{k: v for k, v in row.items() if k != "kind"} for row in rows if row["kind"] == kind]
+        for kind in ("frame", "training", "gradients", "failure")
+    }
+    differs = {peer.name: peer.differs for job in jobs() for peer in job.peers if peer.differs}
+    versions = {job.name: version for job in jobs() if (version := version_of(config, job.name))}
+    return {"window": config.window, "differs": differs, "versions": versions, **kinds}
+
+
+def version_of(config: Config, job: str) -> str | None:
+    """What the folder of a peer says in its file VERSION."""
+    path = (config.modules or Path()) / job / "VERSION"
+    return path.read_text().strip() if config.modules and path.exists() else None
+
+
+def print_table(rows: list[Row]) -> None:
+    """Of each picture ours over the fastest peer, and everyone's times, PSNR to float64, and memory."""
+    pictures: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        key = tuple(row[name] for name in ("scene", "view", "width", "filter_px2"))
+        pictures.setdefault(key, []).append(row)
+    for key, found in pictures.items():
+        ours = [row["ms"] for row in found if row["job"] == _OURS and not row["renderer"].endswith("1e-4")]
+        peers = [row["ms"] for row in found if not row["job"].startswith(_OURS)]
+        ratio = f"ours / fastest peer {min(ours) / min(peers):.2f}" if ours and peers else ""
+        print("{}, {}, {} px, filter {}: ".format(*key) + ratio)
+        for row in found:
+            name = row["renderer"] + (" again" if row["job"].endswith("again") else "")
+            psnr = f"{row['psnr']:.1f} dB" if "psnr" in row else ""
+            memory = f"{row['gigabytes']} GB" if row["gigabytes"] is not None else ""
+            print(f"    {name:24} {row['ms']:9.3f} ms, p95 {row['p95_ms']:9.3f}  {psnr:>9}  {memory}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
