@@ -42,7 +42,7 @@ def converted(folder, *arguments):
     return result, v3dg.read_asset(folder / arguments[1])
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog", ".glb"])
 def test_an_asset_becomes_any_format_and_that_a_ply(folder, suffix):
     asset = v3dg.read_asset(folder / "tuft.ply")
     result, _ = converted(folder, "tuft.ply", f"a{suffix}")
@@ -50,6 +50,22 @@ def test_an_asset_becomes_any_format_and_that_a_ply(folder, suffix):
     assert result["sh_degree"] == asset.sh_degree
     _, back = converted(folder, f"a{suffix}", "back.ply")
     np.testing.assert_allclose(back.means.mean(axis=0), asset.means.mean(axis=0), atol=1e-3)
+
+
+def test_versions_of_spz(folder):
+    sizes = {v: converted(folder, "tuft.ply", "a.spz", "--spz-version", v)[0]["bytes"] for v in (2, 3, 4)}
+    assert sizes[2] < sizes[3]
+    fails(
+        2,
+        "--spz-version: expected a .spz to write",
+        "convert",
+        "tuft.ply",
+        "a.sog",
+        "--spz-version",
+        4,
+        cwd=folder,
+    )
+    fails(2, "--spz-version", "convert", "tuft.ply", "b.spz", "--spz-version", 5, cwd=folder)
 
 
 def test_a_level_of_a_bundle(folder):

@@ -2,7 +2,8 @@
 
 They need playwright, Chromium where PATH finds it, and what environment variables name: SUPERSPLAT_VIEWER the
 folder `public` of `npm install @playcanvas/supersplat-viewer@1.36.2`, PLAYCANVAS the file
-`build/playcanvas.min.mjs` of `npm install playcanvas@2.23.3`.
+`build/playcanvas.min.mjs` of `npm install playcanvas@2.23.3`, CESIUM the folder `Build/Cesium` of
+`npm install cesium@1.145.0`.
 """
 
 import functools
@@ -20,7 +21,7 @@ from PIL import Image
 import chromium
 import v3dg
 from benchmarks.worlds.procedural import make_donut
-from v3dg.export import write_site, write_streamed_sog
+from v3dg.export import write_site, write_streamed_sog, write_tiles
 from v3dg.metrics import psnr
 
 pytest.importorskip("playwright.sync_api")
@@ -60,6 +61,7 @@ def server(tmp_path_factory, bundle):
         server.shutdown()
 
 
+CESIUM = os.environ.get("CESIUM")
 needs_viewer = pytest.mark.skipif(VIEWER is None, reason="SUPERSPLAT_VIEWER does not name its folder")
 needs_engine = pytest.mark.skipif(ENGINE is None, reason="PLAYCANVAS does not name the engine's file")
 
@@ -132,10 +134,15 @@ def page_of(browser, server, town, query):
     if not folder.exists():
         write_site(scene, folder, {"gate": camera})
         shutil.copy(ENGINE, folder)
+    return settled(browser, server, f"town/index.html?webgl&noui&{query}")
+
+
+def settled(browser, server, address):
+    """The picture at which one of our pages settles, and how much it draws."""
     page = browser.new_page(viewport={"width": SIDE, "height": SIDE})
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
-    page.goto(f"http://127.0.0.1:{server.server_address[1]}/town/index.html?webgl&noui&{query}")
+    page.goto(f"http://127.0.0.1:{server.server_address[1]}/{address}")
     states = [None, None]
     for _ in range(60):
         page.wait_for_timeout(1000)
@@ -162,3 +169,16 @@ def test_the_page_of_a_scene_shows_what_we_do(browser, server, town):
 def test_the_page_of_a_scene_keeps_its_budget(browser, server, town, budget):
     _, drawn = page_of(browser, server, town, f"budget={budget}&tolerance=0.1")
     assert 0.9 * budget < drawn <= budget
+
+
+@pytest.mark.skipif(CESIUM is None, reason="CESIUM does not name its folder")
+def test_cesium_shows_tiles_and_fewer_from_far(browser, server, bundle):
+    """From near those of the asset itself, one for each group of level 1."""
+    write_tiles(bundle, server.folder / "tiles", up="z")
+    (server.folder / "tiles" / "cesium").symlink_to(CESIUM)
+    picture, near = settled(browser, server, "tiles/index.html?distance=1.2")
+    assert near == (bundle.groups.level == 1).sum()
+    side = picture[SIDE // 4 : -SIDE // 4, SIDE // 4 : -SIDE // 4]
+    assert (side.max(axis=2) > 0.2).mean() > 0.5
+    _, far = settled(browser, server, "tiles/index.html?distance=40")
+    assert 0 < far < near / 8

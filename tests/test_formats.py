@@ -5,6 +5,7 @@ What all readers share is in test_malformed.py.
 """
 
 import gzip
+import json
 import os
 import struct
 import sys
@@ -22,6 +23,7 @@ from hypothesis import strategies as st
 from test_ply import random_gaussians
 from v3dg import Gaussians, read_asset, write_asset
 from v3dg.formats import _reading
+from v3dg.rotations import placed
 
 FIXTURES = Path(__file__).parent / "fixtures"
 SH_C0 = 0.28209479177387814
@@ -102,6 +104,7 @@ WRITTEN = {
     ".sog": lambda reference: (
         sog_bounds(reference) | {"opacities": 0.5 / 255, "quats": QUAT / np.sqrt(2) / 255 * 1.01}
     ),
+    ".glb": lambda _: {},
 }
 
 # File, the asset that it was made of, its bounds; who wrote it is in fixtures/README.md.
@@ -184,7 +187,31 @@ def test_what_is_written_reads_back(tmp_path, suffix, degree):
     path = tmp_path / f"a{suffix}"
     write_asset(path, reference)
     assert_within(in_order_of(reference, read_asset(path)), reference, WRITTEN[suffix](reference))
-    assert path.stat().st_size < 64 * (20 + 3 * sh.shape[1]) + 17_000  # SOG's tables
+    numbers = 4 * (11 + 3 * sh.shape[1]) if suffix == ".glb" else 20 + 3 * sh.shape[1]
+    assert path.stat().st_size < 64 * numbers + 17_000  # SOG's tables
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_every_version_of_spz_reads_back(tmp_path, version, degree):
+    reference = read_asset(FIXTURES / f"sh{degree}.ply")
+    write_asset(tmp_path / "a.spz", reference, version=version)
+    start = (tmp_path / "a.spz").read_bytes()
+    assert (gzip.decompress(start) if version < 4 else start)[4] == version
+    bounds = spz_bounds() | ({"quats": 0.1} if version == 2 else {})  # where w is nearly 0
+    assert_within(read_asset(tmp_path / "a.spz"), reference, bounds)
+    for wrong, path in ((5, "a.spz"), (3, "a.sog")):
+        with pytest.raises(ValueError, match=rf"version: expected .*, got {wrong}"):
+            write_asset(tmp_path / path, reference, version=wrong)
+
+
+def test_gsply_reads_version_2_of_spz(tmp_path):
+    reference = read_asset(FIXTURES / "sh3.ply")
+    write_asset(tmp_path / "a.spz", reference, version=2)
+    theirs = gsply.read_spz(str(tmp_path / "a.spz"))
+    np.testing.assert_allclose(theirs.means, reference.means, atol=2**-12)
+    dot = np.abs((unit(theirs.quats) * unit(reference.quats)).sum(axis=1))
+    assert dot.min() > 1 - 0.1**2 / 2  # the bound that quaternions of version 2 have
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -245,7 +272,7 @@ def test_small_and_large_assets_keep_their_shape_in_spz(tmp_path):
     assert not (tmp_path / "b.spz").exists()
 
 
-@pytest.mark.parametrize("suffix", WRITTEN)
+@pytest.mark.parametrize("suffix", sorted(WRITTEN.keys() - {".glb"}))
 def test_what_no_pixel_shows_is_not_rounded_up_to_what_one_does(tmp_path, suffix):
     asset = random_gaussians(4, 0)
     asset.opacities[:] = 0.0, 0.9 / 255, 1 / 255, 1.4 / 255
@@ -600,6 +627,95 @@ def test_hostile_compressed_ply_is_refused(tmp_path, case):
     assert_refused_cheaply(tmp_path / "a.ply", message)
 
 
+def test_glb_of_splat_transform_is_read_as_it_is():
+    """It turns assets so that y is up, by half a turn about z."""
+    reference, found = read_asset(FIXTURES / "sh3.ply"), read_asset(FIXTURES / "sh3.glb")
+    assert_within(placed(found, (0, 0, 0, 1)), reference, {})
+
+
+def glb(change):
+    """The fixture with its JSON changed by a function, or its bytes by another."""
+    content = (FIXTURES / "sh3.glb").read_bytes()
+    size = int.from_bytes(content[12:16], "little")
+    document = json.loads(content[20 : 20 + size])
+    change(document)
+    text = json.dumps(document).encode()
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + content[20 + size :]
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+
+def attribute(document, name):
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    return document["accessors"][attributes[name]]
+
+
+HOSTILE_GLB = {
+    "no extension": (
+        lambda d: d["meshes"][0]["primitives"][0].pop("extensions"),
+        "expected a primitive with KHR_gaussian_splatting, got none; meshes are not read",
+    ),
+    "a node's transform": (
+        lambda d: d["nodes"][0].update(scale=[2, 2, 2]),
+        "nodes[0]: expected a node without a transform, got scale; apply it first",
+    ),
+    "no attribute": (
+        lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("KHR_gaussian_splatting:SCALE"),
+        "expected the field KHR_gaussian_splatting:SCALE",
+    ),
+    "a partial degree": (
+        lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(
+            "KHR_gaussian_splatting:SH_DEGREE_3_COEF_6"
+        ),
+        "expected the field KHR_gaussian_splatting:SH_DEGREE_3_COEF_6",
+    ),
+    "an accessor that is not there": (
+        lambda d: d["meshes"][0]["primitives"][0]["attributes"].update({"POSITION": 99}),
+        "POSITION: expected 0 to 20, got 99",
+    ),
+    "another type": (lambda d: attribute(d, "POSITION").update(type="VEC4"), "type: expected VEC3, got"),
+    "another number": (
+        lambda d: attribute(d, "KHR_gaussian_splatting:SCALE").update(count=65),
+        "count: expected 64, as POSITION has, got 65",
+    ),
+    "too many": (
+        lambda d: [accessor.update(count=1 << 40) for accessor in d["accessors"]],
+        "a byte a gaussian beyond 262144",
+    ),
+    "beyond its view": (
+        lambda d: [accessor.update(count=65) for accessor in d["accessors"]],
+        "expected 65 values in its view, got 768 bytes",
+    ),
+    "beyond the file": (
+        lambda d: d["bufferViews"][0].update(byteOffset=1 << 20),
+        "bufferViews[0].byteOffset: expected 0 to",
+    ),
+    "logs": (
+        lambda d: d["meshes"][0]["primitives"][0]["attributes"].update(
+            {
+                "KHR_gaussian_splatting:SCALE": d["meshes"][0]["primitives"][0]["attributes"][
+                    "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"
+                ]
+            }
+        ),
+        "expected scales of 0 or more, got less; drafts of the extension had their logs",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_GLB)
+def test_hostile_glb_is_refused(tmp_path, case):
+    change, message = HOSTILE_GLB[case]
+    (tmp_path / "a.glb").write_bytes(glb(change))
+    assert_refused_cheaply(tmp_path / "a.glb", message)
+
+
+def test_a_glb_that_is_cut_off_is_refused(tmp_path):
+    content = (FIXTURES / "sh3.glb").read_bytes()
+    for size in (0, 3, 19, 400, len(content) - 1):
+        (tmp_path / "a.glb").write_bytes(content[:size])
+        assert_refused_cheaply(tmp_path / "a.glb", "expected a .glb file, glTF 2.0 that is whole, got")
+
+
 @settings(max_examples=300)
 @example(name="sh3.sog", edits=[(230, 128)], in_header=True)  # a file name in a zip that is no UTF-8
 @given(
@@ -611,6 +727,7 @@ def test_hostile_compressed_ply_is_refused(tmp_path, case):
             "sh3_v3.spz",
             "sh3_v4.spz",
             "sh3_mkkellogg_2.ksplat",
+            "sh3.glb",
         ]
     ),
     edits=st.lists(st.tuples(st.integers(0, 1 << 20), st.integers(0, 255)), min_size=1, max_size=4),

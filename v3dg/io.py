@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import pathlib
 from collections.abc import Callable, Mapping
-from typing import TypeVar, get_args
+from functools import partial
+from typing import Literal, TypeVar, get_args
 
-from v3dg._numbers import check_type, one_of
-from v3dg.formats import checkpoint, compressed_ply, ksplat, ply, sog, splat, spz, streamed_sog
+from v3dg._numbers import check, check_type, one_of
+from v3dg.formats import checkpoint, compressed_ply, gltf, ksplat, ply, sog, splat, spz, streamed_sog
 from v3dg.formats._asset_file import AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
@@ -22,6 +23,7 @@ _READERS: dict[str, Callable[[Path], AssetFile]] = {
     ".splat": splat.open_file,
     ".ksplat": ksplat.open_file,
     ".spz": spz.open_file,
+    ".glb": gltf.open_file,
     ".sog": sog.open_file,
     "lod-meta.json": streamed_sog.open_file,
     "meta.json": sog.open_file,
@@ -32,6 +34,7 @@ _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
     ".compressed.ply": compressed_ply.write,
     ".ply": ply.write,
     ".spz": spz.write,
+    ".glb": gltf.write,
     ".sog": sog.write,
 }
 # The files of an asset, where they may be several.
@@ -57,6 +60,7 @@ def read_asset(path: Path) -> Gaussians:
       normalised, except those of length zero, which stay as they are. Values that are not finite are passed
       on. Little more memory is needed than for the result. A compressed `.ply`, of PlayCanvas and
       SuperSplat, is told by its content.
+    - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1 to 4; `.sog` of
       PlayCanvas, version 2, or the `meta.json` of one that is not in a zip; the finest level of streamed SOG,
       by its `lod-meta.json`.
@@ -88,7 +92,13 @@ def asset_bytes(path: Path) -> int:
     return bytes_of(_by_name(path, _FILES)(pathlib.Path(path)))
 
 
-def write_asset(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "binary_little_endian") -> None:
+def write_asset(
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    encoding: PlyEncoding = "binary_little_endian",
+    version: Literal[2, 3, 4] | None = None,
+) -> None:
     """Write an asset, replacing what is there in one step once all is written.
 
     The end of the name tells the kind (docs/formats.md has what each loses):
@@ -97,11 +107,13 @@ def write_asset(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "bi
       channel), opacity (logit), scale (log), rot. An opacity of 1 is written as logit 20 and of 0 as logit
       -110, a scale of 0 as log -110: finite, and they read back as exactly 1, 0 and 0.
     - `.compressed.ply`: 16 bytes a gaussian and one a coefficient of higher SH. The order changes.
-    - `.spz`: version 3.
+    - `.spz`: version 3, or another.
+    - `.glb`: glTF 2.0 with KHR_gaussian_splatting, of float32 numbers.
     - `.sog`: version 2. The order changes.
 
     Args:
         encoding: Of a `.ply`; the others have one only.
+        version: Of a `.spz`; 3 if None. Version 2 is for viewers from before 2025, 4 for those since 2026.
 
     Raises:
         ValueError: Another name, an unknown encoding, or values that the format cannot hold: a negative
@@ -111,6 +123,9 @@ def write_asset(path: Path, gaussians: Gaussians, *, encoding: PlyEncoding = "bi
     """
     check_type("gaussians", gaussians, Gaussians, "Gaussians")
     write = _by_name(path, _WRITERS)
+    if version is not None:
+        check("version", write is spz.write, f"none for {os.fspath(path)}, which is no .spz, got {version}")
+        write = partial(spz.write, version=version)
     if write is ply.write:
         one_of(encoding, "encoding", get_args(PlyEncoding))
         ply.write(path, gaussians, encoding)

@@ -36,7 +36,7 @@ class Convert(Common):
     subject: tyro.conf.Positional[Path]
     """An asset in any format that is read (docs/formats.md), a bundle (.v3dg) or a scene (.json)."""
     output: tyro.conf.Positional[Path]
-    """File to write, .ply, .compressed.ply, .spz or .sog; of a bundle also .v3dg, with all levels."""
+    """File to write, .ply, .compressed.ply, .spz, .sog or .glb; of a bundle also .v3dg, with all levels."""
     codec: Annotated[Literal["float32", "quantized"] | None, option("{float32,quantized}")] = None
     """How a .v3dg that is written keeps gaussians, as for `v3dg build`; as the bundle does if not given."""
     level: Annotated[int | None, option("N")] = None
@@ -47,6 +47,8 @@ class Convert(Common):
     """Write the cut with at most this many gaussians."""
     outside: Literal["drop", "keep"] = "drop"
     """What becomes of the part of the cut that the camera does not see."""
+    spz_version: Literal[2, 3, 4] | None = None
+    """Version of a .spz; 3 if not given."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -59,6 +61,8 @@ def run(options: Convert) -> None:
         raise ValueError(f"{options.output}: expected a file name that ends in {suffixes}")
     if options.codec is not None and not to_bundle:
         raise UsageError(f"--codec: expected an output that ends in .v3dg, got {options.output}")
+    if options.spz_version and not options.output.name.lower().endswith(".spz"):
+        raise UsageError(f"--spz-version: expected a .spz to write, got {options.output}; leave it out")
     _files.check_folder(options.output)
     given = (options.tolerance, options.budget, view.cameras, view.camera)
     is_cut = is_scene(options.subject) or any(value is not None for value in given)
@@ -89,7 +93,7 @@ def run(options: Convert) -> None:
             raise UsageError(f"--camera: expected one of {len(cameras)} cameras; give its name or its place")
         gaussians, told = _cut(options, subject, *cameras.items())
     if not to_bundle:
-        write_asset(options.output, gaussians)
+        write_asset(options.output, gaussians, version=options.spz_version)
     result = {
         "output": str(options.output),
         "gaussians": len(gaussians),

@@ -6,28 +6,40 @@ import shlex
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cli._common import Common, Flag, UsageError, bytes_text, option, print_result, require_file
-from v3dg.export import DEFAULT_CHUNK, ENGINE, ENGINE_VERSION, Axis, write_site
+from v3dg.export import (
+    CESIUM_VERSION,
+    DEFAULT_CHUNK,
+    ENGINE,
+    ENGINE_VERSION,
+    Axis,
+    Site,
+    Tiles,
+    write_site,
+    write_tiles,
+)
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene
 
 
 @dataclass
 class Export(Common):
-    """Write a scene or a bundle as a web page with streamed SOG (docs/formats.md)."""
+    """Write a scene or a bundle for web viewers, with a page that shows it (docs/formats.md)."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json) or a bundle (.v3dg)."""
     output: Annotated[Path | None, option("FOLDER", "-o")] = None
     """Folder to write, made with those above it; the subject's name with _web if not given."""
+    to: Literal["sog", "tiles"] = "sog"
+    """Streamed SOG, for PlayCanvas and SuperSplat, or 3D Tiles, for CesiumJS."""
     chunk: int = DEFAULT_CHUNK
-    """Most gaussians of an asset in a chunk, for which the viewer chooses a level."""
+    """Most gaussians of an asset in a chunk of streamed SOG, for which the viewer chooses a level."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
     """Direction that is up; z for a scene and -y, as in most trained assets, for a bundle if not given."""
     quiet: Flag = False
@@ -41,26 +53,25 @@ def run(options: Export) -> None:
     folder = options.output or options.subject.with_name(f"{options.subject.stem}_web")
     start = time.perf_counter()
     subject, cameras = _read(options.subject)
-    done = write_site(
-        subject, folder, cameras, chunk=options.chunk, up=options.up, progress=not options.quiet
-    )
-    result = {"output": str(folder), **asdict(done), "seconds": time.perf_counter() - start}
-    lines = [
-        f"{folder}: {done.instances:,} instances, {done.gaussians:,} gaussians, "
-        f"{done.coarsest:,} at the coarsest, {bytes_text(done.bytes)}, {result['seconds']:.1f} s"
-    ]
+    common: dict[str, Any] = {"up": options.up, "progress": not options.quiet}
     there = shlex.quote(str(folder))
-    if not done.has_engine:
-        lines += [
-            "it needs PlayCanvas's engine beside it, once:",
-            f"  npm install playcanvas@{ENGINE_VERSION}",
-            f"  cp node_modules/playcanvas/build/{ENGINE} {there}/",
-        ]
-    lines += [
-        f"to look at it: python -m http.server --bind 127.0.0.1 --directory {there}",
-        "  then open http://127.0.0.1:8000/",
-    ]
-    print_result(options.json, result, lines)
+    done: Site | Tiles
+    if options.to == "tiles":
+        done = write_tiles(subject, folder, **common)
+        text, needs = f"{done.tiles:,} tiles", "CesiumJS"
+        engine, copied = f"cesium@{CESIUM_VERSION}", f"-r node_modules/cesium/Build/Cesium {there}/cesium"
+    else:
+        done = write_site(subject, folder, cameras, chunk=options.chunk, **common)
+        text = f"{done.gaussians:,} gaussians, {done.coarsest:,} at the coarsest"
+        needs = "" if done.has_engine else "PlayCanvas's engine"
+        engine, copied = f"playcanvas@{ENGINE_VERSION}", f"node_modules/playcanvas/build/{ENGINE} {there}/"
+    result = {"output": str(folder), **asdict(done), "seconds": time.perf_counter() - start}
+    seconds = f"{result['seconds']:.1f} s"
+    lines = [f"{folder}: {done.instances:,} instances, {text}, {bytes_text(done.bytes)}, {seconds}"]
+    if needs:
+        lines += [f"it needs {needs} beside it, once:", f"  npm install {engine}", f"  cp {copied}"]
+    lines += [f"to look at it: python -m http.server --bind 127.0.0.1 --directory {there}"]
+    print_result(options.json, result, [*lines, "  then open http://127.0.0.1:8000/"])
 
 
 def _read(path: Path) -> tuple[Scene | Bundle, dict[str, Camera]]:

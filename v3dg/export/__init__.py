@@ -9,3 +9,6 @@ from v3dg.export.streamed_sog import DEFAULT_CHUNK as DEFAULT_CHUNK
 from v3dg.export.streamed_sog import INDEX as INDEX
 from v3dg.export.streamed_sog import Export as Export
 from v3dg.export.streamed_sog import write_streamed_sog as write_streamed_sog
+from v3dg.export.tiles import CESIUM_VERSION as CESIUM_VERSION
+from v3dg.export.tiles import Tiles as Tiles
+from v3dg.export.tiles import write_tiles as write_tiles

@@ -9,16 +9,17 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from v3dg import _core, _device, _files
+from v3dg import _files
 from v3dg._numbers import one_of
 from v3dg.cameras import Floats
-from v3dg.gaussians import Gaussians
 from v3dg.rotations import rotation_from_quaternion
+from v3dg.scene import Scene
 
 Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
@@ -40,38 +41,34 @@ MARKS = ("lod-meta.json", "site.json", "tileset.json")
 
 
 def turn_upright(up: Axis) -> Floats:
-    """(1, 4) w x y z that turns what is up in an asset to -y; ValueError for another name."""
+    """(4,) w x y z that turns what is up in an asset to -y; ValueError for another name."""
     one_of(up, "up", tuple(_TO_UPRIGHT))
-    return np.array([_TO_UPRIGHT[up]])
+    return np.array(_TO_UPRIGHT[up])
 
 
 def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
     """(3, 3) rotation that turns what is up to an axis."""
-    return np.asarray(_FROM_UPRIGHT[frame] @ rotation_from_quaternion(turn_upright(up)[0])) + 0.0
+    return np.asarray(_FROM_UPRIGHT[frame] @ rotation_from_quaternion(turn_upright(up))) + 0.0
 
 
-def turned(gaussians: Gaussians, quaternion: Floats) -> Gaussians:
-    """Gaussians turned about the origin, by a quaternion (1, 4)."""
-    rows = _core.gather(
-        bundles=[gaussians.rows],
-        instances=_core.Instances(
-            bundle=np.zeros(1, np.int32),
-            positions=np.zeros((1, 3)),
-            quaternions=quaternion,
-            scales=np.ones(1),
-            importance=np.ones(1, np.float32),
-        ),
-        instance=np.zeros(1, np.int32),
-        first_row=np.zeros(1, np.int64),
-        offset=np.array([0, len(gaussians)]),
-        device=_device.of(gaussians.means).number,
-    )
-    return Gaussians(*rows)
+def names_of(scene: Scene) -> list[str]:
+    """A folder for each bundle, after its file."""
+    names: list[str] = []
+    for number, bundle in enumerate(scene.bundles):
+        stem = Path(bundle.path or "bundle").stem
+        name = "".join(c if c.isascii() and c.isalnum() else "_" for c in stem)[:80]
+        names.append(f"{name}_{number}" if name in names else name)
+    return names
 
 
 def write_document(path: Path, document: Any) -> None:
     """JSON without spaces, into a folder that is not in its place yet."""
     path.write_text(json.dumps(document, separators=(",", ":")), encoding="utf-8")
+
+
+def write_page(folder: Path, name: str) -> None:
+    """The page of an export, which the package has by that name."""
+    (folder / "index.html").write_bytes(files("v3dg.export").joinpath(name).read_bytes())
 
 
 def bytes_below(folder: Path) -> int:

@@ -10,25 +10,24 @@ import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg._numbers import check
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera, Floats
-from v3dg.cleaning import ball_of_most
+from v3dg.cameras import Camera
 from v3dg.export._common import (
     Axis,
     bytes_below,
+    names_of,
     replacing_folder,
     rotation_to,
     turn_upright,
     write_document,
+    write_page,
 )
 from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, Plan, write_levels
 from v3dg.scene import Scene
@@ -99,7 +98,7 @@ def write_site(
         total = sum(bundle.num_gaussians for bundle in scene.bundles)
         listed, counts = [], []
         with tqdm(None, "export", total, unit=" gaussians", unit_scale=True, disable=not progress) as bar:
-            for name, plan in zip(_names(scene) if is_scene else ["."], plans, strict=True):
+            for name, plan in zip(names_of(scene) if is_scene else ["."], plans, strict=True):
                 (place / name).mkdir(exist_ok=True)
                 done = write_levels(plan, place / name, turn, bar.update)
                 index = INDEX if name == "." else f"{name}/{INDEX}"
@@ -108,27 +107,19 @@ def write_site(
         document = {
             "version": 1,
             "tolerance": DEFAULT_TOLERANCE,
-            "rotation": rotation_to(axis if is_scene else "-y", "y").T.tolist(),  # by columns
+            # By columns: of the files' world, and of the cameras', to one with y up.
+            "rotation": rotation_to(axis if is_scene else "-y", "y").T.tolist(),
+            "camera_rotation": rotation_to(axis, "y").T.tolist(),
             "bundles": listed,
             "instances": _instances(scene),
-            "cameras": _cameras(scene, cameras or {}, rotation_to(axis, "y")),
+            "cameras": _cameras(cameras or {}),
         }
         write_document(place / SITE, document)
-        (place / "index.html").write_bytes(files("v3dg.export").joinpath("page.html").read_bytes())
+        write_page(place, "site.html")
         has_engine = _bring_engine(folder, place)
         size = bytes_below(place)
     finest, coarsest = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
     return Site(len(listed), len(scene), finest, coarsest, size, has_engine)
-
-
-def _names(scene: Scene) -> list[str]:
-    """A folder for each bundle, after its file."""
-    names: list[str] = []
-    for number, bundle in enumerate(scene.bundles):
-        stem = Path(bundle.path or "bundle").stem
-        name = "".join(c if c.isascii() and c.isalnum() else "_" for c in stem)[:80]
-        names.append(f"{name}_{number}" if name in names else name)
-    return names
 
 
 def _detail(bundle: Bundle) -> dict[str, float]:
@@ -148,56 +139,23 @@ def _detail(bundle: Bundle) -> dict[str, float]:
 
 def _instances(scene: Scene) -> dict[str, list[Any]]:
     """Columns, in a few digits more than float32 has."""
-
-    def short(values: NDArray[np.floating[Any]]) -> list[float]:
-        return [float(f"{value:.9g}") for value in values.ravel().tolist()]
-
-    return {
-        "bundle": scene.instance_bundle.tolist(),
-        "positions": short(scene.positions),
-        "quaternions": short(scene.quaternions),
-        "scales": short(scene.scales),
-        "importance": short(scene.importance),
-    }
+    names = ("positions", "quaternions", "scales", "importance")
+    columns = {name: getattr(scene, name).ravel().tolist() for name in names}
+    short = {name: [float(f"{value:.9g}") for value in values] for name, values in columns.items()}
+    return {"bundle": scene.instance_bundle.tolist(), **short}
 
 
-def _cameras(scene: Scene, cameras: Mapping[str, Camera], world: Floats) -> list[dict[str, Any]]:
-    """Cameras as the page takes them: x right, y up, z backward, in a world with y up."""
-    centre, radius = _ball(scene)
-    if not cameras:
-        height = math.tan(math.radians(25.0))
-        eye = centre + (world.T @ [0.4, 0.4, 0.8]) / 0.98 * radius * 1.2 / math.sin(math.atan(height))
-        up = world.T @ [0.0, 1.0, 0.0]
-        cameras = {"start": Camera.look_at(eye, centre, up, 2 * math.atan(height), width=800, height=800)}
-    found = []
-    for name, camera in cameras.items():
-        axes = world @ camera.viewmat[:3, :3].T @ np.diag([1.0, -1.0, -1.0])
-        position = world @ camera.position
-        distance = max(float(np.linalg.norm(camera.position - centre)), 1e-3 * radius)
-        found.append(
-            {
-                "name": name,
-                "position": position.tolist(),
-                "axes": axes.T.tolist(),
-                "fov": math.degrees(2 * math.atan(camera.height / 2 / camera.fy)),
-                "distance": distance,
-                "near": max(camera.near, 1e-4 * distance),
-                "far": 4 * (distance + radius),
-            }
-        )
-    return found
-
-
-def _ball(scene: Scene) -> tuple[NDArray[np.floating[Any]], float]:
-    """Around nearly all that there is, in the world before it is turned upright."""
-    of_bundle = []
-    for bundle in scene.bundles:
-        centre, radius = ball_of_most(bundle.level_gaussians(bundle.num_levels - 1).means.astype(np.float64))
-        of_bundle.append([*centre, radius])
-    balls = np.array(of_bundle)[scene.instance_bundle]
-    rotated = np.einsum("nij,nj->ni", scene.rotations, balls[:, :3] * scene.scales[:, None])
-    centres, reach = scene.positions + rotated, balls[:, 3:] * scene.scales[:, None]
-    return ball_of_most(np.concatenate([centres - reach, centres + reach]))
+def _cameras(cameras: Mapping[str, Camera]) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": name,
+            "position": camera.position.tolist(),
+            "axes": camera.viewmat[:3, :3].tolist(),  # right, down, forward
+            "fov_y": 2 * math.atan(camera.height / 2 / camera.fy),
+            "near": camera.near,
+        }
+        for name, camera in cameras.items()
+    ]
 
 
 def _bring_engine(folder: Path, place: Path) -> bool:

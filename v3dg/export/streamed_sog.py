@@ -28,13 +28,12 @@ from v3dg.export._common import (
     bytes_below,
     replacing_folder,
     turn_upright,
-    turned,
     write_document,
 )
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable, morton_order
 from v3dg.gaussians import Gaussians
-from v3dg.rotations import rotation_from_quaternion
+from v3dg.rotations import placed, rotation_from_quaternion
 
 INDEX = "lod-meta.json"
 SETTINGS = "settings.json"
@@ -99,7 +98,7 @@ def write_streamed_sog(
 
 
 def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int], Any]) -> Export:
-    """Fill a folder with the levels of a bundle, turned by a quaternion (1, 4)."""
+    """Fill a folder with the levels of a bundle, turned by a quaternion (4,)."""
     names, lods, counts = _write_folders(place, plan, turn, advance)
     index = {
         "version": 1,
@@ -111,7 +110,7 @@ def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int],
         "tree": plan.tree(lods, turn),
     }
     write_document(place / INDEX, index)
-    write_document(place / SETTINGS, _viewer_settings(turned(plan.bundle.level_gaussians(plan.top), turn)))
+    write_document(place / SETTINGS, _viewer_settings(placed(plan.bundle.level_gaussians(plan.top), turn)))
     return Export(counts, plan.num_chunks, len(names), bytes_below(place))
 
 
@@ -126,7 +125,7 @@ def _write_folders(
         parts: list[Gaussians] = []
         first, size = len(names), 0
         for number, part in enumerate(plan.parts(level)):
-            chunk = turned(check_writable(part), turn)
+            chunk = placed(check_writable(part), turn)
             lods[number][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
             parts.append(chunk.subset(morton_order(chunk.means)))
             size += len(chunk)
@@ -246,7 +245,7 @@ class Plan:
         """The spatial index: the groups above the chunks, with bounds, in boxes that stay along the axes."""
         clusters, parent = self.bundle.clusters, self.bundle.groups.parent
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
-        corners = clusters.box.astype(np.float64) @ rotation_from_quaternion(turn[0]).T
+        corners = clusters.box.astype(np.float64) @ rotation_from_quaternion(turn).T
         chunks = enumerate(self.by_chunk(used))
         nodes = {c: _node(corners[ids].reshape(-1, 3), lods=lods[c]) for c, ids in chunks if len(ids)}
         of_group = {g: nodes[c] for g, c in enumerate(self.chunk_of_group.tolist()) if c in nodes}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -61,7 +61,11 @@ def open_file(path: Path) -> AssetFile:
 def read(path: Path) -> Gaussians:
     """Read a `.spz` file of version 1 to 4."""
     claims = Claims()
-    content = claims.read(path)
+    return decode(path, claims.read(path), claims)
+
+
+def decode(path: Path, content: bytes, claims: Claims) -> Gaussians:
+    """The gaussians of a `.spz` file's content."""
     if content[:2] == b"\x1f\x8b":
         return _decode(*_sections_of_gzip(path, content, claims))
     is_zstd = content[:4] == _MAGIC.to_bytes(4, "little")
@@ -69,9 +73,19 @@ def read(path: Path) -> Gaussians:
     return _decode(*_sections_of_zstd(path, content, claims))
 
 
-def write(path: Path, gaussians: Gaussians) -> None:
-    """Write a `.spz` file of version 3, which all readers know; the order stays."""
+def write(path: Path, gaussians: Gaussians, version: int = 3) -> None:
+    """Write a `.spz` file of version 2, 3 or 4; the order stays."""
+    check("version", version in (2, 3, 4), f"2, 3 or 4 for .spz, got {version}")
     host = check_writable(gaussians)
+    with _files.replacing(path) as temporary, open(temporary, "wb") as file:
+        for part in encode(host, version):
+            file.write(part)
+        # Gaussians that are all alike take too little to be believed; readers pass over zeros at the end.
+        file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
+
+
+def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
+    """Parts of a `.spz` file, of NumPy gaussians with values that can be held."""
     reach = float(np.abs(host.means).max(initial=0.0))
     bits = _fraction_bits(reach)
     fits = reach * 2**bits <= _LARGEST_FIXED
@@ -81,23 +95,36 @@ def write(path: Path, gaussians: Gaussians) -> None:
         numbers = np.rint(host.means[rows].astype(np.float64) * 2**bits).astype("<i4")
         return bytes(numbers.view(np.uint8).reshape(-1, 4)[:, :3].tobytes())
 
-    sections: tuple[Callable[[slice], bytes], ...] = (
+    rotations = _rotation_bytes if version == 2 else _rotation_words
+    sections: list[Callable[[slice], bytes]] = [
         fixed,
         lambda rows: opacity_bytes(host.opacities[rows]).astype(np.uint8).tobytes(),
         lambda rows: _bytes((host.sh[rows, 0] * _COLOR_SCALE + 0.5) * 255.0),
         lambda rows: _bytes((log_scales(host.scales[rows]) + 10.0) * 16.0),
-        lambda rows: _rotation_words(host.quats[rows]),
+        lambda rows: rotations(host.quats[rows]),
         lambda rows: _bytes(host.sh[rows, 1:] * 128.0 + 128.0),
-    )
-    with _files.replacing(path) as temporary, open(temporary, "wb") as file:
-        compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
-        file.write(compressor.compress(_HEADER.pack(_MAGIC, 3, len(host), host.sh_degree, bits, 0, 0)))
-        for section in sections:
-            for rows in blocks(len(host)):
-                file.write(compressor.compress(section(rows)))
-        file.write(compressor.flush())
-        # Gaussians that are all alike take too little to be believed; gzip passes over zeros at the end.
-        file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
+    ]
+    header = _HEADER.pack(_MAGIC, version, len(host), host.sh_degree, bits, 0, 0)
+    if version == 4:
+        yield from _zstd_parts(header, len(host), sections if host.sh_degree else sections[:-1])
+        return
+    compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
+    yield compressor.compress(header)
+    for section in sections:
+        for rows in blocks(len(host)):
+            yield compressor.compress(section(rows))
+    yield compressor.flush()
+
+
+def _zstd_parts(header: bytes, count: int, sections: list[Callable[[slice], bytes]]) -> Iterator[bytes]:
+    """The header with the number of streams and the place of the table of their sizes, the table, streams."""
+    import zstandard
+
+    raw = [b"".join(map(section, blocks(count))) for section in sections]
+    packed = [zstandard.ZstdCompressor(level=12).compress(stream) for stream in raw]
+    yield header[:15] + struct.pack("<BI12x", len(raw), _ZSTD_HEADER_BYTES)
+    yield b"".join(_STREAM_SIZES.pack(len(a), len(b)) for a, b in zip(packed, raw, strict=True))
+    yield from packed
 
 
 def _bytes(values: Floats) -> bytes:
@@ -108,6 +135,12 @@ def _fraction_bits(reach: float) -> int:
     """Bits after the point: 12, as Niantic's writer has it, but 2^-17 of the largest coordinate at most."""
     whole = math.ceil(math.log2(reach)) if reach > 0 else 0
     return max(0, min(max(12, 17 - whole), 22 - whole, 24))
+
+
+def _rotation_bytes(quats: Floats) -> bytes:
+    """x y z of the quaternion whose w is not negative."""
+    unit = normalised(quats)
+    return _bytes((unit[:, 1:] * np.where(unit[:, :1] < 0, -1.0, 1.0) + 1.0) * 127.5)
 
 
 def _rotation_words(quats: Floats) -> bytes:

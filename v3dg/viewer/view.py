@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v3dg.cameras import Camera, Floats, VectorLike
-from v3dg.rotations import rotation_from_quaternion
+from v3dg.cameras import Camera, VectorLike
+from v3dg.rotations import quaternion_from_rotation, rotation_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -45,17 +45,6 @@ class View:
         fx, fy = width / 2 / (half_y * self.aspect), height / 2 / half_y
         K = np.array([[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]])
         return Camera(viewmat, K, width, height, near)
-
-
-def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, float]:
-    """Unit quaternion w x y z with w >= 0 of a (3, 3) rotation."""
-    # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinctions, stable for any angle.
-    r = np.asarray(rotation, np.float64)
-    symmetric = np.full((4, 4), np.trace(r))
-    symmetric[1:, 0] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    symmetric[1:, 1:] = r + r.T - np.trace(r) * np.eye(3)
-    w, x, y, z = np.linalg.eigh(symmetric, UPLO="L")[1][:, -1].tolist()
-    return (-w, -x, -y, -z) if w < 0 else (w, x, y, z)
 
 
 def look_at(eye: VectorLike, target: VectorLike, up: VectorLike, fov_y: float, aspect: float) -> View:
