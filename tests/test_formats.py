@@ -20,6 +20,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import v3dg
 from test_ply import random_gaussians
 from v3dg import Gaussians, read_asset, write_asset
 from v3dg.formats import _reading
@@ -714,6 +715,68 @@ def test_a_glb_that_is_cut_off_is_refused(tmp_path):
     for size in (0, 3, 19, 400, len(content) - 1):
         (tmp_path / "a.glb").write_bytes(content[:size])
         assert_refused_cheaply(tmp_path / "a.glb", "expected a .glb file, glTF 2.0 that is whole, got")
+
+
+def hier_of(asset, half, inner=7):
+    """Bytes of a `.hier`, as its program's writer has them: some inner gaussians, then leaves, two a node."""
+    kind, count = ("<f2" if half else "<f4"), inner + len(asset)
+
+    def column(values, of=kind):
+        filled = np.concatenate([np.full((inner, *values.shape[1:]), 9.0), values])
+        return filled.astype(of).tobytes()
+
+    columns = [
+        column(asset.means, "<f4"),
+        column(asset.quats),
+        column(np.log(asset.scales)),
+        column(asset.opacities),
+        column(asset.sh.reshape(len(asset), 48)),
+    ]
+    nodes = [(i, 0, 1) for i in range(inner)]  # where gaussians begin, how many are leaves, how many merged
+    nodes += [(inner + i, min(2, len(asset) - i), 0) for i in range(0, len(asset), 2)]
+    if half:
+        records = b"".join(struct.pack("<iiihhhh", -1, s, 0, 0, 0, n, m) for s, n, m in nodes)
+    else:
+        records = b"".join(struct.pack("<7i", 0, -1, s, n, m, 0, 0) for s, n, m in nodes)
+    boxes = bytes(len(nodes) * (16 if half else 32))
+    head = struct.pack("<i", -count if half else count)
+    return head + b"".join(columns) + struct.pack("<i", len(nodes)) + records + boxes
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_leaves_of_h3dg_are_read(tmp_path, half):
+    reference = read_asset(FIXTURES / "sh3.ply")
+    (tmp_path / "a.hier").write_bytes(hier_of(reference, half))
+    bounds = dict.fromkeys(("log_scales", "quats", "opacities", "color", "band 1", "higher"), 0.003)
+    assert_within(read_asset(tmp_path / "a.hier"), reference, bounds if half else {})
+    file = v3dg.io.open_asset(tmp_path / "a.hier")
+    np.testing.assert_array_equal(file.read(10, 20).means, reference.means[10:20])
+    assert len(file.read(5, 5)) == 0
+
+
+HOSTILE_HIER = {
+    "nothing": (lambda _: b"", "expected a number of gaussians, got 0 bytes"),
+    "many gaussians": (
+        lambda c: struct.pack("<i", 2**31 - 1) + c[4:],
+        "expected 2147483647 gaussians, got",
+    ),
+    "cut off": (lambda c: c[:1000], "expected 71 gaussians, got 1000 bytes"),
+    "many nodes": (
+        lambda c: c[: 4 + 71 * 236] + struct.pack("<i", 2**31 - 1) + c[8 + 71 * 236 :],
+        "expected 2147483647 nodes, got",
+    ),
+    "leaves elsewhere": (
+        lambda c: c[: 8 + 71 * 236 + 8] + struct.pack("<ii", 71, 1) + c[8 + 71 * 236 + 16 :],
+        "expected leaves among 71 gaussians, got others",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_HIER)
+def test_hostile_hier_is_refused(tmp_path, case):
+    change, message = HOSTILE_HIER[case]
+    (tmp_path / "a.hier").write_bytes(change(hier_of(read_asset(FIXTURES / "sh3.ply"), half=False)))
+    assert_refused_cheaply(tmp_path / "a.hier", message)
 
 
 @settings(max_examples=300)

@@ -1,21 +1,28 @@
-"""Camera files: the `transforms.json` of nerfstudio, instant-ngp and NeRF's synthetic scenes."""
+"""Camera files: the `transforms.json` of nerfstudio, instant-ngp and NeRF's synthetic scenes.
+
+And folders with cameras: nerfstudio's runs, and COLMAP's models, with its own library.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from v3dg._json import Node, read_json, write_json
-from v3dg._numbers import one_of
+from v3dg._numbers import check, one_of
 from v3dg.cameras import Camera, Floats, intrinsics, is_rotation, viewmat_from_blender
 
 # Names of COLMAP's models that are pinholes but for the distortion, which is looked at by itself.
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_RUN = "config.yml"  # by which a run of nerfstudio is known
+_DATA = re.compile(r"^\s*data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:\s*- .*\n)+)", re.MULTILINE)
 # From a camera with x right, y up, z backward to one with x right, y down, z forward.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
@@ -28,6 +35,9 @@ def read_cameras(
     applied_transform: Literal["keep", "undo"] = "keep",
 ) -> dict[str, Camera]:
     """Read the cameras of a nerfstudio `transforms.json`, in file order (docs/scene.md).
+
+    Or those of a folder: of a model of COLMAP, binary or text, by their images' names, with the extra
+    `colmap`; or of a run of nerfstudio (also by its `config.yml`), in the frame that it trained in.
 
     A camera is named by its `file_path`; where those are missing or repeat, by its place, from 0. Pictures,
     depths, masks and point clouds that the file names are not looked at.
@@ -44,6 +54,12 @@ def read_cameras(
     """
     one_of(distortion, "distortion", ("refuse", "ignore"))
     one_of(applied_transform, "applied_transform", ("keep", "undo"))
+    place = Path(path)
+    run = place.parent if place.name == _RUN else place
+    if (run / _RUN).is_file():
+        path, applied_transform = _data_of(run), "undo"
+    elif place.is_dir():
+        return _read_colmap(place, distortion)
     root = read_json(path)
     top = root.some_fields(("frames",))
     undo_transform = _applied(top) if applied_transform == "undo" else None
@@ -59,11 +75,66 @@ def read_cameras(
         viewmat = node.attempt(partial(viewmat_from_blender, matrix))
         if undo_transform is not None:
             viewmat = _undone(viewmat, *undo_transform)
+        if (run / _RUN).is_file():
+            viewmat = _undone(viewmat, *_trained(run))
         cameras.append(node.attempt(partial(Camera, viewmat, K, width, height, near)))
         names.append(frame["file_path"].text() if "file_path" in frame else "")
     if "" in names or len(set(names)) < len(names):
         names = [str(i) for i in range(len(cameras))]
     return dict(zip(names, cameras, strict=True))
+
+
+def _data_of(run: Path) -> Path:
+    """The `transforms.json` of the data that a nerfstudio run was trained on."""
+    # YAML with objects of Python in it, of which only a path is looked at.
+    text = (run / _RUN).read_text(encoding="utf-8", errors="replace")
+    parts = [re.findall(r"^\s*- (.*)$", found, re.MULTILINE) for found in _DATA.findall(text)]
+    named = [Path(*(part.strip("'\"") for part in found)) for found in parts]
+    folders = [folder / data for data in named for folder in (Path(), *list(run.resolve().parents)[:4])]
+    files = [folder if folder.suffix == ".json" else folder / "transforms.json" for folder in folders]
+    found = next((file for file in files if file.is_file()), None)
+    if found is None:
+        tried = " or ".join(map(str, dict.fromkeys(files))) or "a path under data:, which it has not"
+        raise ValueError(f"{run / _RUN}: expected the run's data at {tried}, got none; put it there")
+    return found
+
+
+def _trained(run: Path) -> tuple[Floats, float]:
+    """What takes a point of the frame that a run trained in to that of its data: as `_applied` has it."""
+    top = read_json(run / "dataparser_transforms.json").some_fields(("transform", "scale"))
+    matrix, scale = _rows(top["transform"]), top["scale"].positive()
+    if not is_rotation(matrix[:3, :3]):
+        raise top["transform"].error("a rotation and a translation")
+    back = np.linalg.inv(matrix)
+    back[:3, 3] *= scale
+    return np.asarray(back, np.float64), 1 / scale
+
+
+def _read_colmap(folder: Path, distortion: str) -> dict[str, Camera]:
+    places = [folder / part for part in ("", "sparse/0", "sparse")]
+    models = [place for place in places for end in ("bin", "txt") if (place / f"images.{end}").is_file()]
+    if not models:
+        expected = "a model of COLMAP (images.bin or images.txt) or a run of nerfstudio (config.yml)"
+        raise ValueError(f"{folder}: expected {expected}, got a folder without")
+    try:
+        import pycolmap
+    except ImportError:
+        raise ImportError("COLMAP: expected pycolmap, got none; pip install 'v3dg[colmap]'") from None
+    cameras = {}
+    try:
+        model = pycolmap.Reconstruction(os.fspath(models[0]))
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise ValueError(f"{models[0]}: expected a model of COLMAP, got {str(error)[:200]!a}") from None
+    for _, image in sorted(model.images.items()):
+        camera = model.cameras[image.camera_id]
+        is_right = camera.is_perspective_pinhole() and (camera.is_undistorted() or distortion == "ignore")
+        found = f"{camera.model_name}; undistort the pictures first, or ignore it"
+        check(f"{models[0]}: {image.name}", is_right, f"a pinhole without lens distortion, got {found}")
+        K, viewmat = np.diag([camera.focal_length_x, camera.focal_length_y, 1.0]), np.eye(4)
+        K[:2, 2] = camera.principal_point_x, camera.principal_point_y
+        viewmat[:3] = image.cam_from_world().matrix()
+        cameras[image.name] = Camera(viewmat, K, camera.width, camera.height)
+    return cameras
 
 
 def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -> None:

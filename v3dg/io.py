@@ -9,7 +9,7 @@ from functools import partial
 from typing import Literal, TypeVar, get_args
 
 from v3dg._numbers import check, check_type, one_of
-from v3dg.formats import checkpoint, compressed_ply, gltf, ksplat, ply, sog, splat, spz, streamed_sog
+from v3dg.formats import checkpoint, compressed_ply, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog
 from v3dg.formats._asset_file import AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
@@ -24,6 +24,7 @@ _READERS: dict[str, Callable[[Path], AssetFile]] = {
     ".ksplat": ksplat.open_file,
     ".spz": spz.open_file,
     ".glb": gltf.open_file,
+    ".hier": hier.open_file,
     ".sog": sog.open_file,
     "lod-meta.json": streamed_sog.open_file,
     "meta.json": sog.open_file,
@@ -60,7 +61,7 @@ def read_asset(path: Path) -> Gaussians:
       normalised, except those of length zero, which stay as they are. Values that are not finite are passed
       on. Little more memory is needed than for the result. A compressed `.ply`, of PlayCanvas and
       SuperSplat, is told by its content.
-    - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`.
+    - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of `.hier`, of H3DG.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1 to 4; `.sog` of
       PlayCanvas, version 2, or the `meta.json` of one that is not in a zip; the finest level of streamed SOG,
       by its `lod-meta.json`.

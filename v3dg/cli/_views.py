@@ -37,7 +37,7 @@ class ViewOptions:
     """From where to look: a scene's own cameras, those of a camera file, or a turntable."""
 
     cameras: Annotated[Path | None, option("PATH")] = None
-    """Draw from the cameras of this nerfstudio transforms.json."""
+    """Draw from the cameras of this nerfstudio transforms.json, run of nerfstudio, or model of COLMAP."""
     distortion: Literal["refuse", "ignore"] = "refuse"
     """Whether lens distortion in that file is an error, or left out of the pictures."""
     camera: Annotated[str | None, option("NAME")] = None

@@ -8,10 +8,12 @@ and `lod-meta.json` says which gaussians of which folder they are.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -149,23 +151,8 @@ def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
     towards_camera = np.array([0.4, 0.4, 0.8]) / np.linalg.norm([0.4, 0.4, 0.8])
     position = centre + distance * towards_camera
     pose = {"position": position.tolist(), "target": centre.tolist(), "fov": _FOV_DEGREES}
-    return {
-        "version": 2,
-        "tonemapping": "none",
-        "highPrecisionRendering": False,
-        "background": {"color": [0.0, 0.0, 0.0]},
-        "postEffectSettings": {
-            "sharpness": {"enabled": False, "amount": 0},
-            "bloom": {"enabled": False, "intensity": 0.1, "blurLevel": 2},
-            "grading": {"enabled": False, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
-            "vignette": {"enabled": False, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
-            "fringing": {"enabled": False, "intensity": 0.5},
-        },
-        "animTracks": [],
-        "cameras": [{"initial": pose}],
-        "annotations": [],
-        "startMode": "default",
-    }
+    settings = json.loads(files("v3dg.export").joinpath(SETTINGS).read_text(encoding="utf-8"))
+    return {**settings, "cameras": [{"initial": pose}]}
 
 
 @dataclass(frozen=True)
