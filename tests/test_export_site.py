@@ -82,7 +82,7 @@ def test_what_is_up_is_up_in_the_page(place, up):
 def test_levels_reach_as_far_as_selection_has_them():
     """Beyond `reach` times the focal length over √tolerance, half of the groups of level 1 are enough."""
     bundle = random_bundle(3, num_levels=5)
-    detail = v3dg.export.site._detail(bundle)
+    detail = v3dg.export._common.detail_of(bundle)
     first = bundle.groups.level == 1
     radius, weight = bundle.groups.ball[first, 3], bundle.groups.weight[first]
     focal, tolerance = 700.0, 3.0

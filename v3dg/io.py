@@ -9,7 +9,19 @@ from functools import partial
 from typing import Literal, TypeVar, get_args
 
 from v3dg._numbers import check, check_type, one_of
-from v3dg.formats import checkpoint, compressed_ply, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog
+from v3dg.formats import (
+    checkpoint,
+    compressed_ply,
+    gltf,
+    hier,
+    ksplat,
+    ply,
+    sog,
+    splat,
+    spz,
+    streamed_sog,
+    usd,
+)
 from v3dg.formats._asset_file import AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
@@ -25,6 +37,7 @@ _READERS: dict[str, Callable[[Path], AssetFile]] = {
     ".spz": spz.open_file,
     ".glb": gltf.open_file,
     ".hier": hier.open_file,
+    **dict.fromkeys(usd.SUFFIXES, usd.open_file),
     ".sog": sog.open_file,
     "lod-meta.json": streamed_sog.open_file,
     "meta.json": sog.open_file,
@@ -36,6 +49,7 @@ _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
     ".ply": ply.write,
     ".spz": spz.write,
     ".glb": gltf.write,
+    **dict.fromkeys(usd.SUFFIXES, usd.write),
     ".sog": sog.write,
 }
 # The files of an asset, where they may be several.
@@ -62,6 +76,7 @@ def read_asset(path: Path) -> Gaussians:
       on. Little more memory is needed than for the result. A compressed `.ply`, of PlayCanvas and
       SuperSplat, is told by its content.
     - `.glb`, glTF with KHR_gaussian_splatting, also compressed as `.spz`; the leaves of `.hier`, of H3DG.
+    - `.usd`, `.usda` and `.usdc`, OpenUSD, with the extra `usd`, whose library bounds what is read.
     - `.splat`, of antimatter15; `.ksplat`, of mkkellogg; `.spz`, of Niantic, version 1 to 4; `.sog` of
       PlayCanvas, version 2, or the `meta.json` of one that is not in a zip; the finest level of streamed SOG,
       by its `lod-meta.json`.
@@ -110,6 +125,7 @@ def write_asset(
     - `.compressed.ply`: 16 bytes a gaussian and one a coefficient of higher SH. The order changes.
     - `.spz`: version 3, or another.
     - `.glb`: glTF 2.0 with KHR_gaussian_splatting, of float32 numbers.
+    - `.usd`, `.usda`, `.usdc`: OpenUSD, a ParticleField3DGaussianSplat of float32 numbers.
     - `.sog`: version 2. The order changes.
 
     Args:

@@ -23,19 +23,22 @@ from v3dg.export import (
     Tiles,
     write_site,
     write_tiles,
+    write_usd,
 )
+from v3dg.formats.usd import SUFFIXES as USD_SUFFIXES
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene
 
 
 @dataclass
 class Export(Common):
-    """Write a scene or a bundle for web viewers, with a page that shows it (docs/formats.md)."""
+    """Write a scene or a bundle as a page for the web, as 3D Tiles, or as OpenUSD (docs/formats.md)."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json) or a bundle (.v3dg)."""
     output: Annotated[Path | None, option("FOLDER", "-o")] = None
-    """Folder to write, made with those above it; the subject's name with _web if not given."""
+    """Folder to write, made with those above it; the subject's name with _web if not given. With a name that
+    ends in .usd, .usda or .usdc, the file to write."""
     to: Literal["sog", "tiles"] = "sog"
     """Streamed SOG, for PlayCanvas and SuperSplat, or 3D Tiles, for CesiumJS."""
     chunk: int = DEFAULT_CHUNK
@@ -53,6 +56,11 @@ def run(options: Export) -> None:
     folder = options.output or options.subject.with_name(f"{options.subject.stem}_web")
     start = time.perf_counter()
     subject, cameras = _read(options.subject)
+    if folder.suffix.lower() in USD_SUFFIXES:
+        size = write_usd(subject, folder, up=options.up)
+        written = {"output": str(folder), "bytes": size, "seconds": time.perf_counter() - start}
+        print_result(options.json, written, [f"{folder}: {bytes_text(size)}, {written['seconds']:.1f} s"])
+        return
     common: dict[str, Any] = {"up": options.up, "progress": not options.quiet}
     there = shlex.quote(str(folder))
     done: Site | Tiles

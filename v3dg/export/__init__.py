@@ -12,3 +12,4 @@ from v3dg.export.streamed_sog import write_streamed_sog as write_streamed_sog
 from v3dg.export.tiles import CESIUM_VERSION as CESIUM_VERSION
 from v3dg.export.tiles import Tiles as Tiles
 from v3dg.export.tiles import write_tiles as write_tiles
+from v3dg.export.usd import write_usd as write_usd

@@ -17,6 +17,7 @@ import numpy as np
 
 from v3dg import _files
 from v3dg._numbers import one_of
+from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
 from v3dg.rotations import rotation_from_quaternion
 from v3dg.scene import Scene
@@ -59,6 +60,21 @@ def names_of(scene: Scene) -> list[str]:
         name = "".join(c if c.isascii() and c.isalnum() else "_" for c in stem)[:80]
         names.append(f"{name}_{number}" if name in names else name)
     return names
+
+
+def detail_of(bundle: Bundle) -> dict[str, float]:
+    """How far levels reach: `reach` times focal length in px over √tolerance is where level 1 is enough.
+
+    Each further level is enough from `ratio` times the distance of the one before it.
+    """
+    groups = bundle.groups
+    radius = groups.ball[:, 3].astype(np.float64) * np.sqrt(math.pi * groups.weight.astype(np.float64))
+    levels = range(1, bundle.num_levels)
+    reach = [float(np.median(radius[groups.level == level])) for level in levels]
+    if not reach:
+        return {"reach": 0.0, "ratio": math.sqrt(2)}
+    ratio = (reach[-1] / reach[0]) ** (1 / max(1, len(reach) - 1))
+    return {"reach": reach[0], "ratio": max(ratio, 1.2)}  # the engine takes no less
 
 
 def write_document(path: Path, document: Any) -> None:

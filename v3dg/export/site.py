@@ -22,6 +22,7 @@ from v3dg.cameras import Camera
 from v3dg.export._common import (
     Axis,
     bytes_below,
+    detail_of,
     names_of,
     replacing_folder,
     rotation_to,
@@ -102,7 +103,7 @@ def write_site(
                 (place / name).mkdir(exist_ok=True)
                 done = write_levels(plan, place / name, turn, bar.update)
                 index = INDEX if name == "." else f"{name}/{INDEX}"
-                listed.append({"url": index, "counts": done.counts, **_detail(plan.bundle)})
+                listed.append({"url": index, "counts": done.counts, **detail_of(plan.bundle)})
                 counts.append((done.counts[0], done.counts[-1]))
         document = {
             "version": 1,
@@ -120,21 +121,6 @@ def write_site(
         size = bytes_below(place)
     finest, coarsest = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
     return Site(len(listed), len(scene), finest, coarsest, size, has_engine)
-
-
-def _detail(bundle: Bundle) -> dict[str, float]:
-    """How far levels reach: `reach` times focal length in px over √tolerance is where level 1 is enough.
-
-    Each further level is enough from `ratio` times the distance of the one before it.
-    """
-    groups = bundle.groups
-    radius = groups.ball[:, 3].astype(np.float64) * np.sqrt(math.pi * groups.weight.astype(np.float64))
-    levels = range(1, bundle.num_levels)
-    reach = [float(np.median(radius[groups.level == level])) for level in levels]
-    if not reach:
-        return {"reach": 0.0, "ratio": math.sqrt(2)}
-    ratio = (reach[-1] / reach[0]) ** (1 / max(1, len(reach) - 1))
-    return {"reach": reach[0], "ratio": max(ratio, 1.2)}  # the engine takes no less
 
 
 def _instances(scene: Scene) -> dict[str, list[Any]]:
