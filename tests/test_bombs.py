@@ -277,7 +277,39 @@ PLY = {
     ),
 }
 
+
+def glb_of(document, blob=b""):
+    """A file with its JSON and its binary chunk."""
+    text = document if isinstance(document, bytes) else json.dumps(document).encode()
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+    chunks += struct.pack("<II", len(blob), 0x004E4942) + blob
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+
+def glb_of_one_stream(times):
+    """As many primitives, all of the same large stream of one gaussian."""
+    stream = gzip.compress(spz_header(1) + bytes(20)) + bytes(1 << 20)
+    extension = {"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}
+    primitive = {"attributes": {"POSITION": 0}, "extensions": {"KHR_gaussian_splatting": extension}}
+    document = {
+        "meshes": [{"primitives": [primitive] * times}],
+        "accessors": [{"count": 1}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(stream)}],
+        "buffers": [{}],
+    }
+    return glb_of(document, stream)
+
+
+GLB = {
+    "many accessors": lambda: glb_of(b'{"accessors":[' + b"{}," * 1_000_000 + b"{}]}"),
+    "many accessors in 1 MiB": lambda: glb_of(
+        b'{"buffers":[],"bufferViews":[],"meshes":[],"accessors":[' + b"{}," * 300_000 + b"{}]}"
+    ),
+    "one stream many times": lambda: glb_of_one_stream(4000),
+}
+
 BOMBS = {
+    **{f"glb: {name}": ("a.glb", make) for name, make in GLB.items()},
     **{f"sog: {name}": ("a.sog", make) for name, make in SOG.items()},
     **{f"spz: {name}": ("a.spz", make) for name, make in SPZ.items()},
     **{f"checkpoint: {name}": ("a.pt", make) for name, make in CHECKPOINT.items()},

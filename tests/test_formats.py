@@ -763,7 +763,7 @@ HOSTILE_HIER = {
     "cut off": (lambda c: c[:1000], "expected 71 gaussians, got 1000 bytes"),
     "many nodes": (
         lambda c: c[: 4 + 71 * 236] + struct.pack("<i", 2**31 - 1) + c[8 + 71 * 236 :],
-        "expected 2147483647 nodes, got",
+        "expected 2147483647 nodes and no more, got",
     ),
     "leaves elsewhere": (
         lambda c: c[: 8 + 71 * 236 + 8] + struct.pack("<ii", 71, 1) + c[8 + 71 * 236 + 16 :],

@@ -21,7 +21,7 @@ import torch
 import v3dg
 from random_bundle import random_bundle, random_gaussians
 from test_camera_file import CAPTURE
-from test_formats import FIXTURES, gsplat_tensors
+from test_formats import FIXTURES, gsplat_tensors, hier_of
 from test_ply import HOSTILE, Element, ply_bytes, random_columns, vertex_lines
 from test_ply import header as ply_header
 from test_scene_file import GOOD, flat_layout, published_layout
@@ -30,6 +30,7 @@ from v3dg.io import open_asset
 from v3dg.pictures import write_picture
 
 BUNDLE = random_bundle(1)
+OF_DEGREE_3 = random_gaussians(np.random.default_rng(1), 40, 3)
 BUNDLES = {"sub/donut.v3dg": BUNDLE, "donut.ply": BUNDLE, "oak": BUNDLE, "donut": BUNDLE}
 
 
@@ -94,6 +95,9 @@ READERS = {
     "spz 4": ("a.spz", lambda _: (FIXTURES / "sh3_v4.spz").read_bytes(), read_asset),
     "ksplat": ("a.ksplat", lambda _: (FIXTURES / "sh3_mkkellogg_2.ksplat").read_bytes(), read_asset),
     "sog": ("a.sog", lambda _: (FIXTURES / "sh3.sog").read_bytes(), read_asset),
+    "glb": ("a.glb", lambda folder: written(folder / "w.glb"), read_asset),
+    "hier": ("a.hier", lambda _: hier_of(OF_DEGREE_3, half=False), read_asset),
+    "half hier": ("a.hier", lambda _: hier_of(OF_DEGREE_3, half=True), read_asset),
     "checkpoint": ("a.pt", lambda folder: checkpoint(folder / "w.pt"), read_asset),
     "cameras": ("a.json", lambda _: json.dumps(CAPTURE).encode(), v3dg.read_cameras),
 }
@@ -383,6 +387,7 @@ WRITERS = {
     "scene": ("a.json", lambda path: v3dg.write_scene(path, v3dg.Scene.of(BUNDLE), ["b.v3dg"])),
     "compressed ply": ("a.compressed.ply", lambda path: v3dg.write_asset(path, ASSET)),
     "spz": ("a.spz", lambda path: v3dg.write_asset(path, ASSET)),
+    "glb": ("a.glb", lambda path: v3dg.write_asset(path, ASSET)),
     "cameras": ("a.json", lambda path: v3dg.write_cameras(path, {"a": CAMERA})),
     "picture": ("a.png", lambda path: write_picture(path, np.zeros((8, 8, 3), np.float32))),
 }

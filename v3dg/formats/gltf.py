@@ -33,6 +33,7 @@ _BYTE, _FLOAT = 5121, 5126
 _DTYPES = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _MOST_GAUSSIANS = 1 << 40
+_MOST_JSON = 1 << 20  # bytes
 
 
 def open_file(path: AnyPath) -> AssetFile:
@@ -116,11 +117,11 @@ class _Glb:
     """A file: its JSON, its binary chunk, and the primitives in it that are gaussians, of one SH degree."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._claims = path, Claims()
+        self._path, self._claims, self._expanded = path, Claims(), 0
         content = self._claims.read(path)
         with telling(path, "a .glb file, glTF 2.0 that is whole"):
             magic, version, total, size, kind = struct.unpack_from("<IIIII", content)
-            if (magic, version, total, kind) != (_MAGIC, 2, len(content), _JSON):
+            if (magic, version, total, kind) != (_MAGIC, 2, len(content), _JSON) or size > _MOST_JSON:
                 raise ValueError(f"{content[:20].hex(' ')} at the start of {len(content)} bytes")
             self._root = Node(parse_json(content[20 : 20 + size].decode("utf-8")), str(path), "")
         self._blob = memoryview(content)[28 + size :]
@@ -158,7 +159,11 @@ class _Glb:
         extension = primitive.field("extensions").field(_NAME)
         if extension.has("extensions") and extension.field("extensions").has(_SPZ):
             view = self._item("bufferViews", extension.field("extensions").field(_SPZ), "bufferView")
-            return spz.decode(self._path, bytes(self._view(view)), self._claims)
+            content = bytes(self._view(view))
+            self._expanded += len(content)  # so that many primitives cannot have one large stream
+            most = len(self._blob)
+            check(self._path, self._expanded <= most, f"{most} bytes of .spz, got {self._expanded}")
+            return spz.decode(self._path, content, self._claims)
         count, attributes = self.count_of(primitive), primitive.field("attributes")
         self._claims.add(self._path, count)
 

@@ -36,8 +36,9 @@ def open_file(path: Path) -> AssetFile:
     first = 4 + np.cumsum([0, *(count * dtype.itemsize for dtype in dtypes)])
     check(path, first[-1] + 4 <= file.num_bytes, f"{count} gaussians, got {file.num_bytes} bytes")
     num_nodes, node = int(file.rows(_INT, first[-1], 1)[0]), _NODES[kind]
-    fits = 0 <= num_nodes * node.itemsize <= file.num_bytes - first[-1] - 4
-    check(path, fits, f"{num_nodes} nodes, got {file.num_bytes} bytes")
+    of_node = node.itemsize + 8 * dtypes[1].base.itemsize  # with its box, which is not looked at
+    fits = num_nodes * of_node == file.num_bytes - first[-1] - 4
+    check(path, fits, f"{num_nodes} nodes and no more, got {file.num_bytes} bytes")
     leaves = _leaves(path, file.rows(node, first[-1] + 4, num_nodes), count)
 
     def read(start: int, stop: int) -> Gaussians:
