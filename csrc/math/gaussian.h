@@ -83,14 +83,21 @@ struct PackedPlanes {
     Palette palette;
 };
 
-// How far from its mean a gaussian reaches at most, in its model's units: no less than extent_of() leads to.
-// Negative where it is too faint to be drawn, not a number where it may have no area, or is none.
+// How many standard deviations a gaussian reaches at most: no fewer than extent_of() leads to. Negative where
+// it is too faint to be drawn, not a number where it is none.
+V3DG_HD inline float reach_in_sigmas(float opacity) {
+    if (opacity < float(kMinAlpha)) return -1.0f;
+    const float sigmas = sqrt_of(log2_of(opacity) - float(kLog2MinAlpha)) * float(1.001 / kFalloffScale);
+    return opacity <= 1 ? sigmas : NAN;
+}
+
+// The same from its mean in its model's units. Also not a number where the gaussian may have no area.
 V3DG_HD inline float reach_of(const Gaussian3d<float>& g) {
-    if (g.opacity < float(kMinAlpha)) return -1.0f;
+    const float sigmas = reach_in_sigmas(g.opacity);
+    if (sigmas < 0) return -1.0f;
     const float least = min_of(g.scale[0], min_of(g.scale[1], g.scale[2]));
     const float most = max_of(g.scale[0], max_of(g.scale[1], g.scale[2]));
-    const float sigmas = sqrt_of(log2_of(g.opacity) - float(kLog2MinAlpha)) * float(1.001 / kFalloffScale);
-    return least > 0 && g.opacity <= 1 ? most * sigmas : NAN;
+    return least > 0 ? most * sigmas : NAN;
 }
 
 // A gaussian in the form that is quickest to project, for what is projected more than once. Its covariance is
@@ -102,40 +109,106 @@ struct PackedGaussian {
     float log2_opacity;
 };
 
+// Doubles that are rounded as it is written, whatever they are compiled with.
+V3DG_HD inline double product_of(double a, double b) {
+#ifdef __CUDA_ARCH__
+    return __dmul_rn(a, b);
+#else
+    return a * b;
+#endif
+}
+V3DG_HD inline double sum_of(double a, double b) {
+#ifdef __CUDA_ARCH__
+    return __dadd_rn(a, b);
+#else
+    return a + b;
+#endif
+}
+
+// 1 / b, ready for quotient_of().
+V3DG_HD inline double inverse_of(double b) {
+#ifdef __CUDA_ARCH__
+    double r;
+    asm("rcp.approx.ftz.f64 %0, %1;" : "=d"(r) : "d"(b));
+    const double error = __fma_rn(-b, r, 1.0);
+    r = __fma_rn(r, __fma_rn(error, error, error), r);
+    return __fma_rn(r, __fma_rn(-b, r, 1.0), r);
+#else
+    return 1 / b;
+#endif
+}
+// a / b of numbers that are far from the ends of the range of doubles, as those that float32 leads to are;
+// for them it is how a device divides, without the test whether they are.
+V3DG_HD inline double quotient_of(double a, double b, double inverse) {
+#ifdef __CUDA_ARCH__
+    const double q = __dmul_rn(a, inverse);
+    return __fma_rn(inverse, __fma_rn(-b, q, a), q);
+#else
+    (void)inverse;
+    return a / b;
+#endif
+}
+// Rounded to float32. Whoever reads the result counts what is below 2^-126 as 0.
+V3DG_HD inline float rounded(double x) {
+#ifdef __CUDA_ARCH__
+    float y;
+    asm("cvt.rn.f32.f64 %0, %1;" : "=f"(y) : "d"(x));
+    return y;
+#else
+    return static_cast<float>(x);
+#endif
+}
+
+// Every rounding is written out, so that all kernels that pack a gaussian come to the same bits.
 V3DG_HD inline PackedGaussian pack_gaussian(const Gaussian3d<float>& g) {
     PackedGaussian out{};
     for (int k = 0; k < 3; ++k) out.mean[k] = g.mean[k];
     out.log2_opacity = log2_of(g.opacity);
     out.reach = reach_of(g);
-    double quat[4], r[9];
-    for (int k = 0; k < 4; ++k) quat[k] = g.quat[k];
-    rotation_of_quat(quat, r);
-    int order[3] = {0, 1, 2};
+    // Columns of its rotation, as rotation_of_quat() has it.
+    const double w = g.quat[0], x = g.quat[1], y = g.quat[2], z = g.quat[3];
+    const double xx = product_of(x, x), yy = product_of(y, y), zz = product_of(z, z), wx = product_of(w, x),
+                 wz = product_of(w, z), xz = product_of(x, z);
+    const double n2 = sum_of(sum_of(::fma(w, w, xx), yy), zz),
+                 s = n2 > 0 ? quotient_of(2, n2, inverse_of(n2)) : 0;
+    double column[3][3] = {
+        {::fma(sum_of(yy, zz), -s, 1.0), product_of(s, ::fma(x, y, wz)), product_of(s, ::fma(-w, y, xz))},
+        {product_of(s, ::fma(x, y, -wz)), ::fma(sum_of(xx, zz), -s, 1.0), product_of(s, ::fma(y, z, wx))},
+        {product_of(s, ::fma(w, y, xz)), product_of(s, ::fma(y, z, -wx)), ::fma(sum_of(xx, yy), -s, 1.0)},
+    };
+    // Without indices that registers could not be used for.
+    float scale[3] = {g.scale[0], g.scale[1], g.scale[2]};
     for (int pass = 0; pass < 3; ++pass) {
         const int k = pass % 2;
-        if (g.scale[order[k]] >= g.scale[order[k + 1]]) continue;
-        const int other = order[k];
-        order[k] = order[k + 1];
-        order[k + 1] = other;
+        const bool is_in_order = scale[k] >= scale[k + 1];
+        const float longer = is_in_order ? scale[k] : scale[k + 1];
+        scale[k + 1] = is_in_order ? scale[k + 1] : scale[k];
+        scale[k] = longer;
+        for (int i = 0; i < 3; ++i) {
+            const double of_longer = is_in_order ? column[k][i] : column[k + 1][i];
+            column[k + 1][i] = is_in_order ? column[k + 1][i] : column[k][i];
+            column[k][i] = of_longer;
+        }
     }
-    double column[3][3];
     for (int k = 0; k < 3; ++k)
-        for (int i = 0; i < 3; ++i) column[k][i] = r[3 * i + order[k]] * double(g.scale[order[k]]);
+        for (int i = 0; i < 3; ++i) column[k][i] = product_of(column[k][i], scale[k]);
     // Rotate columns 1 and 2 by a Givens rotation so that column 2 begins with 0; F Fᵀ does not change. They
     // are the shortest columns, so their rounding is least.
-    const double x = column[1][0], y = column[2][0], length = sqrt_of(x * x + y * y);
-    const double cosine = length > 0 ? x / length : 1, sine = length > 0 ? y / length : 0;
+    const double a0 = column[1][0], b0 = column[2][0], length = sqrt_of(::fma(a0, a0, product_of(b0, b0)));
+    const double inverse = inverse_of(length);
+    const double cosine = length > 0 ? quotient_of(a0, length, inverse) : 1,
+                 sine = length > 0 ? quotient_of(b0, length, inverse) : 0;
     for (int i = 0; i < 3; ++i) {
         const double a = column[1][i], b = column[2][i];
-        column[1][i] = cosine * a + sine * b;
-        column[2][i] = cosine * b - sine * a;
+        column[1][i] = ::fma(a, cosine, product_of(b, sine));
+        column[2][i] = ::fma(b, cosine, -product_of(a, sine));
     }
     for (int i = 0; i < 3; ++i) {
-        out.f[i] = static_cast<float>(column[0][i]);
-        out.f[3 + i] = static_cast<float>(column[1][i]);
+        out.f[i] = rounded(column[0][i]);
+        out.f[3 + i] = rounded(column[1][i]);
     }
-    out.f[6] = static_cast<float>(column[2][1]);
-    out.f[7] = static_cast<float>(column[2][2]);
+    out.f[6] = rounded(column[2][1]);
+    out.f[7] = rounded(column[2][2]);
     return out;
 }
 
