@@ -114,8 +114,11 @@ def _bundle_info(path: Path, bundle: Bundle) -> _Description:
         "colour error": "{error_color:.4f}",
         "alpha error": "{error_alpha:.4f}",
     }
+    leaves = level_size(bundle, 0) if len(bundle.level_range(0)) else 0
+    each = f", {result['bytes'] / leaves:.1f} bytes a gaussian of level 0" if leaves else ""
     lines = [
-        f"{path}: bundle, version {result['version']} ({result['codec']}), {bytes_text(result['bytes'])}",
+        f"{path}: bundle, version {result['version']} ({result['codec']}), "
+        f"{bytes_text(result['bytes'])}{each}",
         f"{bundle.num_gaussians:,} gaussians, SH degree {bundle.sh_degree}, "
         f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, {result['num_pages']:,} pages",
         "",
