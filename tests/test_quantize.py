@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 import scenes
 from reference import quantize as reference
@@ -256,16 +255,3 @@ def test_wrong_arguments_are_refused():
     page.view(np.float32)[4 * len(gaussians)] = np.nan
     with pytest.raises(ValueError, match="cluster 0 of the page: expected ranges of finite numbers"):
         _core.decode_page(page, offset, gaussians.rows)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("sh_degree", DEGREES)
-def test_a_device_decodes_to_the_same_bits(sh_degree):
-    gaussians, offset = random_clusters(10, sh_degree)
-    offset = np.insert(offset, 2, offset[2])  # an empty cluster
-    page = _core.encode_page(gaussians.rows, offset)
-    out = like(gaussians).torch("cuda")
-    _core.decode_page(torch.from_numpy(page).cuda(), offset, out.rows)
-    expected = decoded(page, offset, gaussians)
-    for name in scenes.NAMES:
-        assert getattr(out, name).cpu().numpy().tobytes() == getattr(expected, name).tobytes(), name

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from os import PathLike
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +111,12 @@ def merge(gaussians: Rows, in_offset: Int64, out_offset: Int64) -> Columns: ...
 # quantize
 def page_code_bytes(sh_degree: int) -> tuple[int, int, int]: ...
 def encode_page(gaussians: Rows, offset: Int64) -> Int32: ...
-def decode_page(page: Array, offset: Int64, out: Rows) -> None: ...
+def decode_page(page: Int32, offset: Int64, out: Rows) -> None: ...
+
+class Codes:
+    """All pages of a bundle as codes, on the host; borrows the arrays."""
+
+    def __init__(self, pages: Int32, first_cluster: Int64, offset: Int64, sh_degree: int) -> None: ...
 
 # gather
 def gather(
@@ -230,10 +235,14 @@ class Drawing:
 class Model:
     """Gaussians as frames of their device read them."""
 
+    @overload
     def __init__(self, gaussians: Rows) -> None: ...
+    @overload
+    def __init__(self, codes: Codes, device: int) -> None: ...
     def __len__(self) -> int: ...
     @property
     def bytes(self) -> int: ...
+    def decode(self, cluster_ids: Int32) -> Columns: ...
 
 class ResidentScene:
     """What selection reads of a scene, on one device."""

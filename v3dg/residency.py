@@ -12,7 +12,9 @@ import threading
 import weakref
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
 
 from v3dg import _core
 from v3dg._device import Device
@@ -20,6 +22,9 @@ from v3dg.bundle import Bundle
 from v3dg.false_color import ColorBy, palette_of
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 _Kept = TypeVar("_Kept")
 
@@ -129,15 +134,32 @@ class Residency:
         with self.lock if device.is_cuda else nullcontext():
             yield self.scene(subject, device)
 
+    def rows(
+        self, bundle: Bundle, clusters: NDArray[np.int32], device: Device
+    ) -> tuple[_core.Rows, NDArray[np.int64]]:
+        """Gaussians of the bundle on a device, and where those of (S,) clusters begin among them: (S,)."""
+        if bundle.codes is None:
+            return self.gaussians(bundle, device).rows, bundle.clusters.offset[clusters]
+        ids, place = np.unique(clusters, return_inverse=True)
+        first = np.concatenate([[0], np.cumsum(np.diff(bundle.clusters.offset)[ids])])
+        return Gaussians(*self.model(bundle, device).decode(ids)).rows, first[place]
+
+    def model(self, bundle: Bundle, device: Device) -> _core.Model:
+        """The bundle's gaussians, or their codes, as frames of a device read them."""
+
+        def make() -> _core.Model:
+            codes = bundle.codes
+            if codes is not None:
+                return _core.Model(codes, device.number)
+            return _core.Model(self.gaussians(bundle, device).rows)
+
+        return self._once(bundle, ("model", device), make)
+
     def gaussians(self, bundle: Bundle, device: Device) -> Gaussians:
         """All gaussians of the bundle on a device."""
         if not device.is_cuda:
             return bundle.gaussians
         return self._once(bundle, ("gaussians", device), lambda: bundle.gaussians.torch(str(device)))
-
-    def model(self, bundle: Bundle, device: Device) -> _core.Model:
-        """The bundle's gaussians as frames of a device read them."""
-        return self._once(bundle, ("model", device), lambda: _core.Model(self.gaussians(bundle, device).rows))
 
     def set_models(
         self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy

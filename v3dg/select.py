@@ -87,11 +87,16 @@ class Selection:
         shift = vector(origin, "origin")
         scene = copy.copy(self.scene)  # which stays as it is
         ids, instance = np.unique(self.instance_ids, return_inverse=True)
-        first_row = self._per_pair(lambda clusters: clusters.offset[:-1])
         used, bundle = np.unique(scene.instance_bundle[ids], return_inverse=True)
+        rows, first_row = [], np.empty(len(self), np.int64)
+        self.check(scene.revision)
         with where.current():
+            for number, b in enumerate(used):
+                mine = bundle[instance] == number
+                found, first_row[mine] = residency.rows(scene.bundles[b], self.cluster_ids[mine], where)
+                rows.append(found)
             world = _core.gather(
-                bundles=[residency.gaussians(scene.bundles[b], where).rows for b in used],
+                bundles=rows,
                 instances=_core.Instances(
                     bundle=bundle.astype(np.int32),
                     positions=scene.positions[ids] - shift,

@@ -114,7 +114,7 @@ class BoundSceneFrame {
             const auto& model = held<BoundModel>(item, "models");
             check_device(model.device(), "models");
             num_gaussians.push_back(model.size());
-            if (device_.is_host()) host.push_back({&model.host().planes(), {}, {}, {}});
+            if (device_.is_host()) host.push_back(model.on_host());
         }
         for (size_t b = 0; b < palettes.size(); ++b) {
             const auto& palette = held<BoundPalette>(palettes[b], "palettes");
@@ -229,13 +229,14 @@ class BoundSceneFrame {
 
 #if V3DG_WITH_CUDA
     void set_models_on_device(const py::list& models, const py::list& palettes) {
-        std::vector<std::shared_ptr<const cuda::PackedModel>> packed;
-        for (const py::handle& model : models) packed.push_back(model.cast<const BoundModel&>().packed());
+        std::vector<cuda::DeviceModel> on_device;
+        for (const py::handle& model : models)
+            on_device.push_back(model.cast<const BoundModel&>().on_device());
         std::vector<std::shared_ptr<const cuda::DevicePalette>> colors;
         for (const py::handle& palette : palettes)
             colors.push_back(palette.cast<const BoundPalette&>().on_device());
         const Work work(device_);
-        frame_->set_models(std::move(packed), std::move(colors), work.stream());
+        frame_->set_models(std::move(on_device), std::move(colors), work.stream());
     }
 #endif
 
@@ -290,6 +291,8 @@ class BoundSceneFrame {
 class BoundAssetFrame {
   public:
     explicit BoundAssetFrame(const py::object& model) : model_(model) {
+        if (held<BoundModel>(model, "model").has_codes())
+            throw py::value_error("model: expected one of rows, got one of codes");
         const Work work(held<BoundModel>(model, "model").device());
 #if V3DG_WITH_CUDA
         if (!work.device().is_host()) frame_ = std::make_unique<cuda::ModelFrame>();
@@ -298,13 +301,13 @@ class BoundAssetFrame {
 
     std::unique_ptr<BoundDrawing> draw(const BoundCamera& camera, const Shade& shade, const Stop* stop) {
         const auto& model = held<BoundModel>(model_, "model");
-        if (model.device().is_host()) return on_host(model.host(), camera, shade, stop);
+        if (model.device().is_host()) return on_host(model, camera, shade, stop);
 #if V3DG_WITH_CUDA
         const Device device = model.device();
         const Work work(device);
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
         const cuda::FrameImage image = picture.on_device(device, camera.camera, shade);
-        const cuda::PackedModel& packed = *model.packed();
+        const cuda::PackedModel& packed = *model.on_device().packed;
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
                                     work.stream(), &packed.packed());
         return std::make_unique<BoundDrawing>(std::move(picture), py::cast(this), device, std::move(drawing));
@@ -314,7 +317,7 @@ class BoundAssetFrame {
     }
 
   private:
-    static std::unique_ptr<BoundDrawing> on_host(const Model<float>& model, const BoundCamera& camera,
+    static std::unique_ptr<BoundDrawing> on_host(const BoundModel& model, const BoundCamera& camera,
                                                  const Shade& shade, const Stop* stop) {
         const Window window = window_of(camera.camera);
         NewPicture out = picture_of(window, true);
@@ -322,7 +325,8 @@ class BoundAssetFrame {
         SceneFrameCounts counts;
         {
             const py::gil_scoped_release unlocked;
-            counts = cpu::draw_model(model.planes(), model.size(), camera.camera, picture, flag_of(stop));
+            counts =
+                cpu::draw_model(*model.on_host().planes, model.size(), camera.camera, picture, flag_of(stop));
         }
         return std::make_unique<BoundDrawing>(std::move(out), stats_of(counts));
     }

@@ -6,6 +6,9 @@ namespace v3dg {
 void bind_scene(py::module_& m) {
     py::class_<BoundModel>(m, "Model", "Gaussians as frames of their device read them.")
         .def(py::init<const Rows&>(), "gaussians"_a)
+        .def(py::init<py::object, int>(), "codes"_a, "device"_a)
+        .def("decode", &BoundModel::decode, "cluster_ids"_a,
+             "Gaussians of clusters, where they are codes: means, quats, scales, opacities, sh.")
         .def("__len__", &BoundModel::size)
         .def_property_readonly("bytes", &BoundModel::bytes);
     py::class_<BoundPalette>(m, "Palette", "Colours of a bundle's clusters, in which gaussians can be drawn.")

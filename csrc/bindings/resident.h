@@ -5,8 +5,10 @@
 #include <memory>
 #include <vector>
 
+#include "bindings/codes.h"
 #include "bindings/tables.h"
 #include "pipeline/model.h"
+#include "pipeline/scene_frame.h"
 #include "residency/page_table.h"
 #include "select/select.h"
 
@@ -29,32 +31,80 @@ class BoundModel {
         }
 #if V3DG_WITH_CUDA
         rows_ = std::make_unique<Rows>(rows);
-        packed_ = std::make_shared<cuda::PackedModel>(read, work.stream());
+        on_device_.packed = std::make_shared<cuda::PackedModel>(read, work.stream());
+#endif
+    }
+    BoundModel(const py::object& codes, int device) : device_{device} {
+        const auto& given = held<BoundCodes>(codes, "codes");
+        size_ = given.num_gaussians();
+        const Work work(device_);
+        codes_ = given.pages().codes();
+        for (size_t c = 0; c < codes_.num_clusters(); ++c)
+            num_gaussians_.push_back(static_cast<uint32_t>(codes_.offset[c + 1] - codes_.offset[c]));
+        if (device_.is_host()) {
+            codes_object_ = codes;
+            return;
+        }
+#if V3DG_WITH_CUDA
+        const py::gil_scoped_release unlocked;
+        on_device_.coded = std::make_shared<cuda::CodedModel>(given.pages(), work.stream());
+        codes_ = on_device_.coded->codes();
 #endif
     }
 
     Device device() const { return device_; }
     size_t size() const { return size_; }
-    const Model<float>& host() const { return *host_; }
+    bool has_codes() const { return codes_.offset.size > 0; }
+    // On the host; without what the scene knows of the clusters.
+    SceneModel on_host() const {
+        return {has_codes() ? nullptr : &host_->planes(), {}, {}, {}, has_codes() ? &codes_ : nullptr};
+    }
     size_t bytes() const {
         if (host_ != nullptr) return host_->bytes();
+        if (device_.is_host()) return codes_.range_size * codes_.num_clusters();
 #if V3DG_WITH_CUDA
-        return packed_->bytes() + size_ * sizeof(float) * (11 + 3 * num_sh_bases(rows_->sh_degree()));
+        if (has_codes()) return on_device_.coded->bytes();
+        return on_device_.packed->bytes() +
+               size_ * sizeof(float) * (11 + 3 * num_sh_bases(rows_->sh_degree()));
 #else
         return 0;
 #endif
     }
 #if V3DG_WITH_CUDA
-    const std::shared_ptr<const cuda::PackedModel>& packed() const { return packed_; }
+    const cuda::DeviceModel& on_device() const { return on_device_; }
 #endif
+
+    // The gaussians of clusters, from codes: means, quats, scales, opacities, sh.
+    py::tuple decode(const py::array& cluster_ids) const {
+        if (!has_codes()) throw py::value_error("decode: expected a model of codes, got one of rows");
+        const Span<const int32_t> cluster = span_of<const int32_t>(cluster_ids, "cluster_ids", {-1});
+        std::vector<int64_t> offset{0};
+        for (const int32_t c : cluster) {
+            if (c < 0 || static_cast<size_t>(c) >= num_gaussians_.size())
+                throw std::out_of_range("cluster_ids: expected ids below " +
+                                        std::to_string(num_gaussians_.size()) + ", got " + std::to_string(c));
+            offset.push_back(offset.back() + num_gaussians_[c]);
+        }
+        const Work work(device_);
+        const NewRows out(device_, static_cast<size_t>(offset.back()), codes_.sh_degree);
+        const DecodeInput in{codes_, cluster, {offset.data(), offset.size()}};
+        {
+            const py::gil_scoped_release unlocked;
+            V3DG_DISPATCH(work, decode, in, out.rows());
+        }
+        return out.arrays();
+    }
 
   private:
     Device device_;
-    size_t size_;
+    size_t size_ = 0;
     std::shared_ptr<Model<float>> host_;
+    py::object codes_object_;  // which `codes_` is of, on the host
+    Codes codes_{};
+    std::vector<uint32_t> num_gaussians_;  // of each cluster of codes
 #if V3DG_WITH_CUDA
     std::unique_ptr<Rows> rows_;  // which the packed model reads
-    std::shared_ptr<const cuda::PackedModel> packed_;
+    cuda::DeviceModel on_device_;
 #endif
 };
 

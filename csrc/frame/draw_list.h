@@ -10,6 +10,8 @@
 
 namespace v3dg {
 
+struct Codes;
+
 // How gaussians are drawn, apart from where. Neighbours in memory of the same appearance are drawn together.
 template <class T>
 struct Appearance {
@@ -24,17 +26,19 @@ struct Appearance {
 // A run of gaussians of one model, placed in front of the camera.
 template <class T>
 struct Draw {
-    const GaussianPlanes<T>* model;
+    const GaussianPlanes<T>* model;  // null where there are codes
     uint64_t first, count;
     ModelView<T> view;
     Appearance<T> appearance;
     Palette palette{};
+    const Codes* codes = nullptr;
 };
 
 namespace cuda {
 
 // Records that an item may make: as many as a block has threads.
 constexpr int kItemSize = 256;
+constexpr unsigned kItemClusters = 8;
 
 // A model in front of a picture's camera.
 struct Placement {
@@ -45,11 +49,12 @@ struct Placement {
 // Neighbouring gaussians of a placed model, or of a model that several placements share: those at
 // `placement` + k for each bit k of `sharers`, where it is not 0. They are to have one picture, and to make
 // kItemSize records at most: there is room for those from `record` on, and they stand at its beginning, by
-// gaussian and then by placement.
+// gaussian and then by placement. The first gaussian belongs to `cluster` of its bundle, or to one of the
+// kItemClusters - 1 after that.
 struct DrawItem {
     uint32_t placement, first, count, record;
     Appearance<float> appearance;
-    uint32_t sharers;
+    uint32_t sharers, cluster;
 };
 
 // Where the items of a frame are written, in their order. Counts what there is, stores what there is room

@@ -96,6 +96,12 @@ V3DG_HD inline double exp2_in_range(double x) { return ::exp2(x); }
 V3DG_HD inline float log2_of(float x) { return ::log2f(x); }
 V3DG_HD inline double log2_of(double x) { return ::log2(x); }
 
+V3DG_HD inline float float_of_bits(uint32_t bits) {
+    float x;
+    std::memcpy(&x, &bits, sizeof x);
+    return x;
+}
+
 // The scalar behind V, which is a scalar or a vector of them.
 template <class V>
 struct LaneOf {
@@ -103,6 +109,23 @@ struct LaneOf {
 };
 template <class V>
 using Lane = typename LaneOf<V>::type;
+
+// 32 bits, or as many a lane of V.
+template <class V>
+struct BitsOf {
+    using type = uint32_t;
+};
+template <class V>
+using Bits = typename BitsOf<V>::type;
+
+// Bits that are a number below 2^24.
+template <class V>
+V3DG_HD V3DG_INLINE V float_of_number(Bits<V> bits) {
+    if constexpr (std::is_arithmetic<V>::value)
+        return static_cast<V>(static_cast<int32_t>(bits));
+    else
+        return __builtin_convertvector((decltype(V{} < V{}))bits, V);
+}
 
 #ifdef V3DG_ISA
 
@@ -134,6 +157,13 @@ template <>
 struct LaneOf<Vec<double>> {
     using type = double;
 };
+
+template <>
+struct BitsOf<Vec<float>> {
+    using type = BitsVec32;
+};
+V3DG_INLINE Vec<float> float_of_bits(BitsVec32 bits) { return (Vec<float>)bits; }
+V3DG_INLINE Vec<float> abs_of(Vec<float> x) { return (Vec<float>)((BitsVec32)x & 0x7fffffffu); }
 
 V3DG_INLINE Vec<float> sqrt_of(Vec<float> x) {
 #if defined(__AVX512F__)

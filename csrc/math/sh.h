@@ -7,7 +7,7 @@
 
 namespace v3dg {
 
-constexpr int kMaxShBases = 16;
+constexpr int kMaxShDegree = 3, kMaxShBases = 16;
 constexpr double kShBase0 = 0.28209479177387814;  // the same in every direction
 
 V3DG_HD constexpr int num_sh_bases(int degree) { return (degree + 1) * (degree + 1); }

@@ -19,8 +19,10 @@ struct FrameBatch {
     const GaussianRows<const float>* models;
     const Placement* placements;
     const FrameImage* images;
-    uint32_t num_images, num_tiles;          // of all images together
-    const PackedPlanes* packed = nullptr;    // of the same models
+    uint32_t num_images, num_tiles;  // of all images together
+    // As ProjectInput has them.
+    const PackedPlanes* packed = nullptr;
+    const CodedGaussians* coded = nullptr;
     bool has_shared_items = false;           // whether there may be any; a frame that keeps a tape has none
     float min_transmittance = kStopsBefore;  // of the images
 };

@@ -11,10 +11,11 @@ namespace v3dg {
 
 // The gaussians of one bundle on the host, where its clusters lie among them and how they are drawn.
 struct SceneModel {
-    const GaussianPlanes<float>* planes;
+    const GaussianPlanes<float>* planes;  // null where there are codes
     PageTable pages;
     ClusterAppearance appearance;
     Palette palette;
+    const Codes* codes = nullptr;
 };
 
 // A scene on the host: what selection reads of its bundles, their gaussians, and its instances.

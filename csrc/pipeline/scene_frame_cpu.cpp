@@ -84,7 +84,8 @@ class CutDraws {
             view_ = model_view_from_instance(axes_of_instance(camera_, pose), pose);
         }
         end_of_pair_.back() = num_gaussians_ += count;
-        const Draw<float> next{model.planes, first, count, view_, model.appearance[c], model.palette};
+        const Draw<float> next{model.planes,        first,         count,      view_,
+                               model.appearance[c], model.palette, model.codes};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else

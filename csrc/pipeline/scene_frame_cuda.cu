@@ -1,6 +1,7 @@
 #include "pipeline/scene_frame_cuda.h"
 
 #include <algorithm>
+#include <cstring>
 
 #include "base/launch.cuh"
 
@@ -28,6 +29,48 @@ static uint32_t num_tiles(const FrameImage& image) {
 PackedModel::PackedModel(const GaussianRows<const float>& rows, cudaStream_t stream)
     : rows_(rows), planes_(16 * rows.size, stream), packed_(pack(rows, planes_.data(), stream)) {}
 
+CodedModel::CodedModel(const CodedPages& pages, cudaStream_t stream) : codes_(pages.codes()) {
+    constexpr size_t kWordsAtOnce = 4 << 20;
+    const Codes& host = pages.codes();
+    const auto num_rows = static_cast<size_t>(host.offset[host.offset.size - 1]);
+    const size_t sh_words = num_sh_words(host.sh_degree);
+    uint32_t* records = records_.reserve(kRecordWords * num_rows, stream);
+    uint32_t* sh = sh_.reserve(sh_words * num_rows, stream);
+    std::vector<uint32_t> next_records, next_sh;
+    const auto add = [stream](std::vector<uint32_t>& words, const uint32_t* from, size_t count, bool is_last,
+                              uint32_t*& to) {
+        words.insert(words.end(), from, from + count);
+        if (words.empty() || (words.size() < kWordsAtOnce && !is_last)) return;
+        check(cudaMemcpyAsync(to, words.data(), words.size() * sizeof(uint32_t), cudaMemcpyHostToDevice,
+                              stream),
+              "cudaMemcpyAsync of codes");
+        to += words.size();
+        words.clear();
+    };
+    const size_t num_pages = pages.first_cluster().size - 1;
+    for (size_t p = 0; p < num_pages; ++p) {
+        const auto first = static_cast<size_t>(pages.first_cluster()[p]),
+                   last = static_cast<size_t>(pages.first_cluster()[p + 1]);
+        const auto row = static_cast<uint32_t>(host.offset[first]);
+        const auto count = static_cast<size_t>(host.offset[last] - host.offset[first]);
+        const ClusterRanges& own = host.ranges_of(static_cast<uint32_t>(first));
+        add(next_records, host.record_of(own, row), kRecordWords * count, p + 1 == num_pages, records);
+        add(next_sh, host.sh_of(own, row), sh_words * count, p + 1 == num_pages, sh);
+    }
+    std::vector<unsigned char> ranges(size_t(host.range_size) * host.num_clusters());
+    for (uint32_t c = 0; c < host.num_clusters(); ++c) {
+        ClusterRanges own{};
+        std::memcpy(&own, &host.ranges_of(c), host.range_size);
+        own.record_base = own.sh_base = 0;
+        std::memcpy(ranges.data() + size_t(host.range_size) * c, &own, host.range_size);
+    }
+    codes_.records = records_.data();
+    codes_.sh = sh_.data();
+    codes_.ranges = ranges_.copy_from({ranges.data(), ranges.size()}, stream);
+    codes_.offset.data = offset_.copy_from(host.offset, stream);
+    check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+}
+
 DevicePalette::DevicePalette(Span<const float> sh, std::shared_ptr<const BundleTables> tables,
                              cudaStream_t stream)
     : tables_(std::move(tables)), sh_(sh, stream) {}
@@ -37,17 +80,27 @@ Palette DevicePalette::palette() const {
             static_cast<uint32_t>(tables_->num_clusters())};
 }
 
-void SceneFrame::set_models(std::vector<std::shared_ptr<const PackedModel>> models,
+void SceneFrame::set_models(std::vector<DeviceModel> models,
                             std::vector<std::shared_ptr<const DevicePalette>> palettes, cudaStream_t stream) {
-    std::vector<GaussianRows<const float>> rows;
-    std::vector<PackedPlanes> packed;
+    std::vector<GaussianRows<const float>> rows(models.size());
+    std::vector<PackedPlanes> packed(models.size());
+    std::vector<CodedGaussians> coded(models.size());
+    has_packed_ = has_coded_ = false;
     for (size_t b = 0; b < models.size(); ++b) {
-        rows.push_back(models[b]->rows());
-        packed.push_back(models[b]->packed());
-        if (!palettes.empty()) packed.back().palette = palettes[b]->palette();
+        const Palette palette = palettes.empty() ? Palette{} : palettes[b]->palette();
+        if (models[b].coded != nullptr) {
+            coded[b] = {models[b].coded->codes(), palette};
+            has_coded_ = true;
+        } else {
+            rows[b] = models[b].packed->rows();
+            packed[b] = models[b].packed->packed();
+            packed[b].palette = palette;
+            has_packed_ = true;
+        }
     }
     rows_.copy_from({rows.data(), rows.size()}, stream);
     packed_.copy_from({packed.data(), packed.size()}, stream);
+    coded_.copy_from({coded.data(), coded.size()}, stream);
     models_ = std::move(models);
     palettes_ = std::move(palettes);
 }
@@ -59,7 +112,8 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const FrameI
                            images_.reserve(1, stream),
                            1,
                            num_tiles(image),
-                           packed_.data(),
+                           has_packed_ ? packed_.data() : nullptr,
+                           has_coded_ ? coded_.data() : nullptr,
                            scene.num_instances() > 1,
                            image.min_transmittance};
     return frame_.draw(batch, std::move(prepare), stream);
@@ -104,7 +158,7 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
     const uint32_t at = static_cast<uint32_t>(first);
     const uint32_t size =
         static_cast<uint32_t>(min(static_cast<unsigned long long>(kItemSize), count - first));
-    items.items[i] = {0, at, size, at, appearance, 0};
+    items.items[i] = {0, at, size, at, appearance, 0, 0};
 }
 
 std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
@@ -119,6 +173,7 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
                            1,
                            num_tiles(image),
                            packed == nullptr ? nullptr : &on_device->packed,
+                           nullptr,
                            false,
                            image.min_transmittance};
     const unsigned blocks = std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));

@@ -1,6 +1,7 @@
 #pragma once
 
 #include "pipeline/frame_cuda.h"
+#include "quantize/quantize.h"
 #include "select/select_cuda.h"
 
 namespace v3dg {
@@ -24,6 +25,28 @@ class PackedModel {
     PackedPlanes packed_;
 };
 
+// Gaussians as codes on the device that is current when they are made: all records, then all coefficients, so
+// that a row's place follows from its number.
+class CodedModel {
+  public:
+    // Returns when they are there.
+    CodedModel(const CodedPages& pages, cudaStream_t stream);
+    const Codes& codes() const { return codes_; }
+    size_t bytes() const { return records_.bytes() + sh_.bytes() + ranges_.bytes() + offset_.bytes(); }
+
+  private:
+    DeviceBuffer<uint32_t> records_, sh_;
+    DeviceBuffer<unsigned char> ranges_;
+    DeviceBuffer<int64_t> offset_;
+    Codes codes_;
+};
+
+// The gaussians of a bundle: one of the two.
+struct DeviceModel {
+    std::shared_ptr<const PackedModel> packed;
+    std::shared_ptr<const CodedModel> coded;
+};
+
 // Colours of the clusters of one bundle.
 class DevicePalette {
   public:
@@ -41,7 +64,7 @@ class SceneFrame {
   public:
     // The gaussians of each bundle of the scenes that are drawn next and, unless there are none, the colours
     // of their clusters. The host's arrays may be reused on return.
-    void set_models(std::vector<std::shared_ptr<const PackedModel>> models,
+    void set_models(std::vector<DeviceModel> models,
                     std::vector<std::shared_ptr<const DevicePalette>> palettes, cudaStream_t stream);
 
     // The scene stays as it is until the drawing is finished.
@@ -56,10 +79,12 @@ class SceneFrame {
     std::unique_ptr<Drawing> draw(const SceneTables& scene, const FrameImage& image, Frame::Prepare prepare,
                                   cudaStream_t stream);
 
-    std::vector<std::shared_ptr<const PackedModel>> models_;
+    std::vector<DeviceModel> models_;
     std::vector<std::shared_ptr<const DevicePalette>> palettes_;
     DeviceBuffer<GaussianRows<const float>> rows_;
     DeviceBuffer<PackedPlanes> packed_;
+    DeviceBuffer<CodedGaussians> coded_;
+    bool has_packed_ = false, has_coded_ = false;
     DeviceBuffer<Placement> placements_;
     DeviceBuffer<FrameImage> images_;
     Cut cut_;

@@ -1,19 +1,68 @@
 #include "project/project.h"
 
+#include <algorithm>
+
+#include "quantize/quantize_math.h"
+
 // A vector of gaussians at a time: lanes are neighbours in the planes.
 
 namespace v3dg {
 namespace V3DG_ISA {
 
+// Gaussians in planes.
 template <class T>
-static V3DG_INLINE Gaussian3d<Vec<T>> load_gaussians(const GaussianPlanes<T>& m, uint64_t i) {
-    Gaussian3d<Vec<T>> g;
-    for (int k = 0; k < 3; ++k) g.mean[k] = load(m.mean[k] + i);
-    for (int k = 0; k < 4; ++k) g.quat[k] = load(m.quat[k] + i);
-    for (int k = 0; k < 3; ++k) g.scale[k] = load(m.scale[k] + i);
-    g.opacity = load(m.opacity + i);
-    return g;
-}
+struct PlaneSource {
+    const GaussianPlanes<T>& m;
+
+    // Those of the lanes that there are, from row i on.
+    V3DG_INLINE Gaussian3d<Vec<T>> load_gaussians(uint64_t i, uint64_t) const {
+        Gaussian3d<Vec<T>> g;
+        for (int k = 0; k < 3; ++k) g.mean[k] = load(m.mean[k] + i);
+        for (int k = 0; k < 4; ++k) g.quat[k] = load(m.quat[k] + i);
+        for (int k = 0; k < 3; ++k) g.scale[k] = load(m.scale[k] + i);
+        g.opacity = load(m.opacity + i);
+        return g;
+    }
+    V3DG_INLINE int load_sh(uint64_t i, uint64_t, Vec<T>* sh) const {
+        for (int k = 0; k < 3 * num_sh_bases(m.sh_degree); ++k) sh[k] = load(m.sh[k] + i);
+        return m.sh_degree;
+    }
+};
+
+// Codes of one cluster. Lanes past its end repeat its last gaussian.
+struct CodeSource {
+    using V = Vec<float>;
+
+    const Codes& codes;
+    const ClusterRanges& ranges;
+
+    V3DG_INLINE Gaussian3d<V> load_gaussians(uint64_t i, uint64_t count) const {
+        Bits<V> words[kRecordWords];
+        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, count, words);
+        Gaussian3d<V> g;
+        V color[3];
+        decode(words, ranges, g, color);
+        return g;
+    }
+    V3DG_INLINE int load_sh(uint64_t i, uint64_t count, V* sh) const {
+        Bits<V> words[2 * kMaxShDegree];
+        Gaussian3d<V> g;
+        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, count, words);
+        decode(words, ranges, g, sh);
+        load_words(codes.sh_of(ranges, static_cast<uint32_t>(i)), num_sh_words(codes.sh_degree), count,
+                   words);
+        decode_sh(words, ranges.sh_step, codes.sh_degree, sh + 3);
+        return codes.sh_degree;
+    }
+
+  private:
+    static V3DG_INLINE void load_words(const uint32_t* rows, int width, uint64_t count, Bits<V>* words) {
+        for (int lane = 0; lane < kLanes<float>; ++lane) {
+            const uint64_t row = static_cast<uint64_t>(lane) < count ? lane : count - 1;
+            for (int k = 0; k < width; ++k) words[k][lane] = rows[width * row + k];
+        }
+    }
+};
 
 // Tiles that the pixels from `first` to `last` lie in, along one axis.
 template <class I>
@@ -32,20 +81,19 @@ static V3DG_INLINE void load_palette(const Palette& palette, uint64_t at, unsign
     }
 }
 
-// Writes the records of those gaussians from `at` on whose bits are set in `lanes`.
-template <class T, class V, class I>
-static V3DG_INLINE void write_records(const Draw<T>& draw, uint64_t at, unsigned lanes,
-                                      const Gaussian3d<V>& g, const Ellipse<V>& e, const PixelBox<I>& box,
-                                      Record<T>* records) {
-    const GaussianPlanes<T>& model = *draw.model;
+// Writes the records of those of the `count` gaussians from `at` on whose bits are set in `lanes`.
+template <class Source, class T, class V, class I>
+static V3DG_INLINE void write_records(const Source& from, const Draw<T>& draw, uint64_t at, uint64_t count,
+                                      unsigned lanes, const Gaussian3d<V>& g, const Ellipse<V>& e,
+                                      const PixelBox<I>& box, Record<T>* records) {
     V sh[3 * kMaxShBases], direction[3], color[3];
     from_eye(draw.view, g.mean, direction);
     if (draw.palette.sh != nullptr) {
         load_palette(draw.palette, at, lanes, sh);
         color_of_sh(0, direction, sh, color);
     } else {
-        for (int k = 0; k < 3 * num_sh_bases(model.sh_degree); ++k) sh[k] = load(model.sh[k] + at);
-        color_of_sh(model.sh_degree, direction, sh, color);
+        const int sh_degree = from.load_sh(at, count, sh);
+        color_of_sh(sh_degree, direction, sh, color);
     }
     for (Record<T>* r = records; lanes != 0; lanes &= lanes - 1, ++r) {
         const int i = __builtin_ctz(lanes);
@@ -58,21 +106,21 @@ static V3DG_INLINE void write_records(const Draw<T>& draw, uint64_t at, unsigned
     }
 }
 
-template <class T>
-size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
-               const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base,
-               Reach& reach) {
+// As project(), of the rows from `first` on.
+template <class Source, class T>
+static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t first, uint64_t count,
+                           const Pinhole<T>& camera, const Window& window, Record<T>* records,
+                           uint32_t* source, uint32_t source_base, Reach& reach) {
     using V = Vec<T>;
     using I = decltype(V{} < V{});
     constexpr int kWidth = kLanes<T>;
-    const GaussianPlanes<T>& model = *draw.model;
     const int width = static_cast<int>(camera.width), height = static_cast<int>(camera.height);
     I top = I{} + INT_MAX, bottom = I{} - 1, entries = I{};
     size_t num_records = 0;
     for (uint64_t done = 0; done < count; done += kWidth) {
-        const uint64_t at = draw.first + skip + done;
+        const uint64_t at = first + done;
         const unsigned lanes = count - done >= kWidth ? (1u << kWidth) - 1 : (1u << (count - done)) - 1;
-        const Gaussian3d<V> g = load_gaussians(model, at);
+        const Gaussian3d<V> g = from.load_gaussians(at, count - done);
         Projection<V> s;
         to_view(draw.view, g.mean, s.p);
         const auto in_front = s.p[2] >= all_lanes<V>(camera.near_depth);
@@ -108,7 +156,7 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
             for (unsigned left = kept; left != 0; left &= left - 1)
                 source[num_records + __builtin_popcount(kept) - __builtin_popcount(left)] =
                     source_base + static_cast<uint32_t>(done) + __builtin_ctz(left);
-        write_records(draw, at, kept, g, e, box, records + num_records);
+        write_records(from, draw, at, count - done, kept, g, e, box, records + num_records);
         num_records += __builtin_popcount(kept);
     }
     for (int i = 0; i < kWidth; ++i) {
@@ -117,6 +165,38 @@ size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole
         reach.entries += static_cast<uint64_t>(entries[i]);
     }
     return num_records;
+}
+
+// As project(), a cluster at a time.
+static size_t project_codes(const Draw<float>& draw, uint64_t skip, uint64_t count,
+                            const Pinhole<float>& camera, const Window& window, Record<float>* records,
+                            uint32_t* source, uint32_t source_base, Reach& reach) {
+    const Codes& codes = *draw.codes;
+    const uint64_t start = draw.first + skip, end = start + count;
+    size_t num_records = 0;
+    uint64_t first = start;
+    size_t cluster = std::upper_bound(codes.offset.begin(), codes.offset.end(), static_cast<int64_t>(start)) -
+                     codes.offset.begin() - 1;
+    for (; first < end; ++cluster) {
+        const uint64_t last = std::min(end, static_cast<uint64_t>(codes.offset[cluster + 1]));
+        num_records += project_rows(CodeSource{codes, codes.ranges_of(static_cast<uint32_t>(cluster))}, draw,
+                                    first, last - first, camera, window, records + num_records,
+                                    source == nullptr ? nullptr : source + num_records,
+                                    source_base + static_cast<uint32_t>(first - start), reach);
+        first = last;
+    }
+    return num_records;
+}
+
+template <class T>
+size_t project(const Draw<T>& draw, uint64_t skip, uint64_t count, const Pinhole<T>& camera,
+               const Window& window, Record<T>* records, uint32_t* source, uint32_t source_base,
+               Reach& reach) {
+    if constexpr (std::is_same<T, float>::value)
+        if (draw.codes != nullptr)
+            return project_codes(draw, skip, count, camera, window, records, source, source_base, reach);
+    return project_rows(PlaneSource<T>{*draw.model}, draw, draw.first + skip, count, camera, window, records,
+                        source, source_base, reach);
 }
 
 // Scattered gaussians: lanes are filled one by one, which is small beside the arithmetic.

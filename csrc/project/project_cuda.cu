@@ -12,6 +12,7 @@
 #include "frame/count_tile.cuh"
 #include "frame/record.cuh"
 #include "project/project_math.h"
+#include "project/sources.cuh"
 
 namespace v3dg {
 namespace cuda {
@@ -21,16 +22,6 @@ namespace {
 constexpr unsigned kWarps = 8;
 constexpr unsigned kBlocks = 4;  // on a multiprocessor
 constexpr unsigned kQueue = 64;  // fewer than 32 wait when 32 come
-
-// What an item needs.
-template <class Model>
-struct ItemTables {
-    alignas(16) Placement placement;
-    alignas(16) FrameImage image;
-    alignas(16) Model model;
-    DrawItem item;
-    SlopeLimits<float> limits;  // of the image
-};
 
 // A gaussian in front of the camera.
 struct Queued {
@@ -46,86 +37,6 @@ struct WarpSpace {
     float4 records[kRecordVectors * 32];  // on their way out: written by lane, read in a row
     unsigned num_large;                   // of the item's records so far,
     uint8_t large[kItemSize];             // and which they are
-};
-
-__device__ float4 load4(const float* rows, uint32_t row) {
-    return __ldg(reinterpret_cast<const float4*>(rows) + row);
-}
-
-template <int kDegree>
-__device__ void color_of(const float* rows, uint32_t g, const float mean[3], const ModelView<float>& view,
-                         float color[3]) {
-    constexpr int kSize = 3 * num_sh_bases(kDegree);
-    float sh[kSize];
-    const float* row = rows + size_t(g) * kSize;
-    if constexpr (kSize % 4 == 0) {
-#pragma unroll
-        for (int k = 0; k < kSize; k += 4) {
-            const float4 x = load4(row, k / 4);
-            sh[k] = x.x;
-            sh[k + 1] = x.y;
-            sh[k + 2] = x.z;
-            sh[k + 3] = x.w;
-        }
-    } else {
-#pragma unroll
-        for (int k = 0; k < kSize; ++k) sh[k] = __ldg(row + k);
-    }
-    float direction[3];
-    from_eye(view, mean, direction);
-    color_of_sh(kDegree, direction, sh, color);
-}
-
-// Gaussians as users hold them.
-struct RowSource {
-    using Model = GaussianRows<const float>;
-    static constexpr bool kHasPalette = false;
-
-    // A gaussian's mean and reach, all that is read of most of those that reach no pixel centre.
-    static __device__ float4 load_sphere(const GaussianRows<const float>& m, uint32_t g) {
-        Gaussian3d<float> gaussian{{__ldg(m.means + 3 * size_t(g)), __ldg(m.means + 3 * size_t(g) + 1),
-                                    __ldg(m.means + 3 * size_t(g) + 2)},
-                                   {1, 0, 0, 0},
-                                   {},
-                                   __ldg(m.opacities + g)};
-        for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
-        return {gaussian.mean[0], gaussian.mean[1], gaussian.mean[2], reach_of(gaussian)};
-    }
-
-    // s.p is set; `color` is that of degree 0.
-    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
-                                             uint32_t g, Projection<float>& s, float color[3]) {
-        const GaussianRows<const float>& m = in.model;
-        Gaussian3d<float> gaussian{{}, {}, {}, __ldg(m.opacities + g)};
-        for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
-        const float4 quat = load4(m.quats, g);
-        gaussian.quat[0] = quat.x;
-        gaussian.quat[1] = quat.y;
-        gaussian.quat[2] = quat.z;
-        gaussian.quat[3] = quat.w;
-        if (m.sh_degree == 0) color_of<0>(m.sh, g, gaussian.mean, view, color);
-        return project_gaussian(gaussian, view, in.image.camera, in.item.appearance.filter_px2,
-                                in.item.appearance.antialiased, s);
-    }
-};
-
-struct PackedSource {
-    using Model = PackedPlanes;
-    static constexpr bool kHasPalette = true;
-
-    static __device__ float4 load_sphere(const PackedPlanes& m, uint32_t g) { return load4(m.plane[0], g); }
-
-    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
-                                             uint32_t g, Projection<float>& s, float color[3]) {
-        const PackedPlanes& m = in.model;
-        const float4 a = load4(m.plane[1], g), b = load4(m.plane[2], g), c = load4(m.plane[3], g);
-        color[0] = c.y;
-        color[1] = c.z;
-        color[2] = c.w;
-        const PackedGaussian gaussian{{}, 0.0f, {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, c.x};
-        return project_packed(gaussian, view, in.image.camera, in.limits, in.item.appearance.filter_px2,
-                              in.item.appearance.antialiased, s);
-    }
 };
 
 // What is known of a gaussian from the sphere around it.
@@ -156,10 +67,11 @@ __device__ SphereTest test_sphere(const ItemTables<Model>& in, const float p[3],
 // The record of gaussian g at p in view space. Returns whether it reaches a pixel centre.
 template <class Source>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in, const ModelView<float>& view,
-                            uint32_t g, const float p[3], Record<float>& r, unsigned& num_in_frustum) {
+                            typename Source::Place place, uint32_t g, const float p[3], Record<float>& r,
+                            unsigned& num_in_frustum) {
     Projection<float> s;
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
-    const Ellipse<float> e = Source::project(in, view, g, s, r.color);
+    const Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
     float half_x, half_y;
     const Pinhole<float>& cam = in.image.camera;
     // The sphere has told that it is not too faint.
@@ -170,23 +82,7 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in, const 
     if (!box.holds_pixels()) return false;
 
     set_ellipse(e, box, r);
-    if constexpr (Source::kHasPalette) {
-        const Palette& palette = in.model.palette;
-        if (palette.sh != nullptr) {
-            const float anywhere[3] = {0, 0, 0};
-            color_of<0>(palette.sh, palette.cluster_of(g), anywhere, view, r.color);
-            return true;
-        }
-    }
-    if (in.model.sh_degree > 0) {
-        const float4 sphere = Source::load_sphere(in.model, g);
-        const float mean[3] = {sphere.x, sphere.y, sphere.z};
-        switch (in.model.sh_degree) {
-            case 1: color_of<1>(in.model.sh, g, mean, view, r.color); break;
-            case 2: color_of<2>(in.model.sh, g, mean, view, r.color); break;
-            default: color_of<3>(in.model.sh, g, mean, view, r.color);
-        }
-    }
+    Source::shade(in.model, view, place, g, r.color);
     return true;
 }
 
@@ -207,8 +103,8 @@ __device__ void store_word(T& to, uint32_t word) {
 // many there are. `sharers` are the placements of a shared item.
 template <class Source, bool kIsShared>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, const Placement* sharers,
-                                  unsigned head, unsigned count, uint32_t first, const ProjectOutput& out,
-                                  unsigned& num_in_frustum) {
+                                  const typename Source::Place& start, unsigned head, unsigned count,
+                                  uint32_t first, const ProjectOutput& out, unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
     Record<float> r;
@@ -218,7 +114,7 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
         const Queued queued = space.queue[(head + lane) % kQueue];
         g = in.item.first + (kIsShared ? queued.place / 32 : queued.place);
         const ModelView<float>& view = kIsShared ? sharers[queued.place % 32].view : in.placement.view;
-        reaches_pixel = project_one<Source>(in, view, g, queued.p, r, num_in_frustum);
+        reaches_pixel = project_one<Source>(in, view, start, g, queued.p, r, num_in_frustum);
     }
     const unsigned kept = __ballot_sync(kAllLanes, reaches_pixel);
     if (kept == 0) return 0;
@@ -319,17 +215,20 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     };
     const float reach_scale = sees ? reach_scale_of() : 0;
     unsigned head = 0, waiting = 0, written = 0;
-    float4 next_sphere = {0, 0, 0, 0};
+    const typename Source::Place start = Source::start(tables);
+    typename Source::Place here = start;
+    typename Source::Fetched next_fetched{};
     if ((kIsShared ? 0 : lane) < count)
-        next_sphere = Source::load_sphere(tables.model, tables.item.first + (kIsShared ? 0 : lane));
+        next_fetched = Source::fetch(tables.model, tables.item.first + (kIsShared ? 0 : lane));
     for (unsigned first = 0; first < count || waiting > 0; first += kRound) {
-        const float4 sphere = next_sphere;
+        const typename Source::Fetched fetched = next_fetched;
         const unsigned place = kIsShared ? first : first + lane;
         if (place + kRound < count)
-            next_sphere = Source::load_sphere(tables.model, tables.item.first + place + kRound);
+            next_fetched = Source::fetch(tables.model, tables.item.first + place + kRound);
         bool may_reach = false;
         float p[3];
         if (place < count && sees) {
+            const float4 sphere = Source::sphere(tables.model, here, tables.item.first + place, fetched);
             const float mean[3] = {sphere.x, sphere.y, sphere.z};
             to_view(view, mean, p);
             const SphereTest told = test_sphere(tables, p, sphere.w, reach_scale);
@@ -345,8 +244,8 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         if (waiting < 32 && first + kRound < count) continue;
         // After the last there may be two rounds left.
         const unsigned taken = min(waiting, 32u);
-        written += write_records<Source, kIsShared>(space, sharers, head, taken, tables.item.record + written,
-                                                    out, num_in_frustum);
+        written += write_records<Source, kIsShared>(space, sharers, start, head, taken,
+                                                    tables.item.record + written, out, num_in_frustum);
         head += taken;
         waiting -= taken;
         __syncwarp();  // before the queue and the records are written again
@@ -380,6 +279,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
     unsigned num_in_frustum = 0, num_records = 0;
     Loaded loaded;
+    Source::prepare();
     // The item after this one and its placement are fetched while this one is projected.
     unsigned i = blockIdx.x * kWarps + threadIdx.x / 32;
     uint32_t item_word = 0, placement_word = 0, next_item_word = 0;
@@ -397,7 +297,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         }
         __syncwarp();
         store_tables(space.tables, this_item_word, this_placement_word, in, models, loaded);
-        if (space.tables.item.sharers != 0) continue;
+        if (space.tables.item.sharers != 0 || !Source::has(space.tables.model)) continue;
         const unsigned written =
             project_item<Source, false>(space, nullptr, *in.items.counters, out, num_in_frustum);
         num_records += written;
@@ -416,6 +316,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
     unsigned num_in_frustum = 0, num_records = 0;
     Loaded loaded;
+    Source::prepare();
     for (unsigned first = blockIdx.x * kWarps + threadIdx.x / 32; first < num_items; first += 32 * stride) {
         const unsigned mine = first + threadIdx.x % 32 * stride;
         unsigned todo = __ballot_sync(kAllLanes, mine < num_items && in.items.items[mine].sharers != 0);
@@ -426,6 +327,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
             __syncwarp();
             store_tables(space.tables, load_word(item), load_word(sharers[__ffs(item.sharers) - 1]), in,
                          models, loaded);
+            if (!Source::has(space.tables.model)) continue;
             const unsigned written =
                 project_item<Source, true>(space, sharers, *in.items.counters, out, num_in_frustum);
             num_records += written;
@@ -477,10 +379,9 @@ static void project_from(const typename Source::Model* models, const ProjectInpu
 }
 
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream) {
-    if (in.packed != nullptr)
-        project_from<PackedSource>(in.packed, in, out, stream);
-    else
-        project_from<RowSource>(in.models, in, out, stream);
+    if (in.packed != nullptr) project_from<PackedSource>(in.packed, in, out, stream);
+    if (in.coded != nullptr) project_from<CodeSource>(in.coded, in, out, stream);
+    if (in.packed == nullptr && in.coded == nullptr) project_from<RowSource>(in.models, in, out, stream);
 }
 
 }  // namespace cuda

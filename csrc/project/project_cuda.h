@@ -3,13 +3,23 @@
 #include "base/device.h"
 #include "frame/draw_list.h"
 #include "frame/tile_list.h"
+#include "quantize/quantize_math.h"
 
 namespace v3dg {
 namespace cuda {
 
+// Gaussians that stay as codes.
+struct CodedGaussians {
+    Codes codes;
+    Palette palette;
+};
+
+// Models are rows, or of each one is either packed or coded, and not there in the other list. A list that
+// would have none is null.
 struct ProjectInput {
     const GaussianRows<const float>* models;
-    const PackedPlanes* packed;  // read in place of `models` where it is not null
+    const PackedPlanes* packed;
+    const CodedGaussians* coded;
     const Placement* placements;
     const FrameImage* images;
     ItemList items;         // in the counters: sets in_frustum, records and large, which start at 0

@@ -1,5 +1,6 @@
 #pragma once
 
+#include "base/buffer.h"
 #include "base/span.h"
 #include "base/stream.h"
 #include "quantize/quantize_math.h"
@@ -26,13 +27,13 @@ struct PageCodes {
     }
 };
 
-// One gaussian of a page: the formula of both halves.
-V3DG_HD inline void decode_row(const PageCodes<const uint32_t>& page, const ClusterRanges& ranges, size_t row,
-                               const GaussianRows<float>& out) {
+// Writes one gaussian to a row.
+V3DG_HD inline void decode_row(const uint32_t* record, const uint32_t* sh_words, const ClusterRanges& ranges,
+                               const GaussianRows<float>& out, size_t row) {
     Gaussian3d<float> g;
     float* sh = out.sh + out.num_sh() * row;
-    decode(page.record(row), ranges, g, sh);
-    decode_sh(page.sh(row), ranges.sh_step, page.sh_degree, sh + 3);
+    decode(record, ranges, g, sh);
+    decode_sh(sh_words, ranges.sh_step, out.sh_degree, sh + 3);
     for (int k = 0; k < 3; ++k) {
         out.means[3 * row + k] = g.mean[k];
         out.scales[3 * row + k] = g.scale[k];
@@ -40,6 +41,30 @@ V3DG_HD inline void decode_row(const PageCodes<const uint32_t>& page, const Clus
     for (int k = 0; k < 4; ++k) out.quats[4 * row + k] = g.quat[k];
     out.opacities[row] = g.opacity;
 }
+
+// Pages of a bundle on the host, as its file has them. Borrows words and offsets, owns the ranges.
+class CodedPages {
+  public:
+    // words: all pages, P of them; first_cluster: [P + 1]; offset: [C + 1]. Throws std::invalid_argument,
+    // naming the cluster, where ranges are not are_valid().
+    CodedPages(const uint32_t* words, Span<const int64_t> first_cluster, Span<const int64_t> offset,
+               int sh_degree);
+    const Codes& codes() const { return codes_; }
+    Span<const int64_t> first_cluster() const { return first_cluster_; }
+    size_t bytes() const { return ranges_.capacity(); }
+
+  private:
+    Buffer<unsigned char> ranges_;
+    Span<const int64_t> first_cluster_;
+    Codes codes_;
+};
+
+// Clusters, in any order, and where their gaussians are to be.
+struct DecodeInput {
+    Codes codes;
+    Span<const int32_t> cluster;  // [S]
+    Span<const int64_t> offset;   // [S + 1] rows of the result, ascending from 0
+};
 
 namespace cpu {
 // Codes gaussians to the nearest step of the ranges of their clusters; what was decoded from a page gives the
@@ -51,12 +76,13 @@ void encode_page(const GaussianRows<const float>& in, const PageCodes<uint32_t>&
 // The gaussians of a page. Throws std::invalid_argument, naming the cluster, where ranges are not
 // are_valid().
 void decode_page(const PageCodes<const uint32_t>& page, const GaussianRows<float>& out);
+
+// The gaussians of clusters.
+void decode(const DecodeInput& in, const GaussianRows<float>& out);
 }  // namespace cpu
 
-// The same bits. Words and `out` are on the device, offsets on the host; the ranges are not checked. Work is
-// queued on the stream. Throws std::runtime_error when CUDA reports an error.
-namespace cuda {
-void decode_page(const PageCodes<const uint32_t>& page, const GaussianRows<float>& out, Stream stream);
-}
+// The same bits. The codes and `out` are on the device, all else on the host. Work is queued on the stream.
+// Throws std::runtime_error when CUDA reports an error.
+namespace cuda { void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream); }
 
 }  // namespace v3dg

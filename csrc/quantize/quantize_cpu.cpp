@@ -253,6 +253,15 @@ CodedRanges ranges_at(const uint32_t* words, int sh_degree) {
     return out;
 }
 
+// Throws std::invalid_argument, which names the cluster, where they are not are_valid().
+ClusterRanges valid_ranges(const uint32_t* words, int sh_degree, size_t cluster, const char* whose) {
+    const CodedRanges coded = ranges_at(words, sh_degree);
+    if (!are_valid(coded.code, coded.sh_steps, sh_degree))
+        throw std::invalid_argument("cluster " + std::to_string(cluster) + whose +
+                                    ": expected ranges of finite numbers, got others");
+    return decoded(coded, sh_degree);
+}
+
 void encode_cluster(const GaussianRows<const float>& in, const PageCodes<uint32_t>& page, size_t c) {
     std::vector<Prepared> cluster;
     cluster.reserve(in.size);
@@ -290,14 +299,52 @@ void cpu::encode_page(const GaussianRows<const float>& in, const PageCodes<uint3
 
 void cpu::decode_page(const PageCodes<const uint32_t>& page, const GaussianRows<float>& out) {
     parallel_for(page.num_clusters(), kClustersAtOnce, [&](size_t c) {
-        const CodedRanges coded = ranges_at(page.ranges(c), page.sh_degree);
-        if (!are_valid(coded.code, coded.sh_steps, page.sh_degree))
-            throw std::invalid_argument("cluster " + std::to_string(c) +
-                                        " of the page: expected ranges of finite numbers, got others");
-        const ClusterRanges ranges = decoded(coded, page.sh_degree);
+        const ClusterRanges ranges = valid_ranges(page.ranges(c), page.sh_degree, c, " of the page");
         for (auto row = static_cast<size_t>(page.offset[c]); row < static_cast<size_t>(page.offset[c + 1]);
              ++row)
-            decode_row(page, ranges, row, out);
+            decode_row(page.record(row), page.sh(row), ranges, out, row);
+    });
+}
+
+CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster, Span<const int64_t> offset,
+                       int sh_degree)
+    : ranges_(size_t(range_bytes(sh_degree)) * (offset.size - 1)),
+      first_cluster_(first_cluster),
+      codes_{words, words, ranges_.data(), offset, sh_degree, range_bytes(sh_degree)} {
+    std::vector<uint64_t> place(first_cluster.size, 0);  // words before each page
+    const auto page_at = [&](size_t p) {
+        const auto first = static_cast<size_t>(first_cluster[p]),
+                   last = static_cast<size_t>(first_cluster[p + 1]);
+        return PageCodes<const uint32_t>{
+            {offset.data + first, last - first + 1}, words + place[p], sh_degree};
+    };
+    for (size_t p = 0; p + 1 < place.size(); ++p) {
+        const PageCodes<const uint32_t> page = page_at(p);
+        place[p + 1] =
+            place[p] + page_bytes(page.end_row() - page.first_row(), page.num_clusters(), sh_degree) / 4;
+    }
+    parallel_for(place.size() - 1, kClustersAtOnce, [&](size_t p) {
+        const PageCodes<const uint32_t> page = page_at(p);
+        const size_t first_row = page.first_row();
+        for (size_t k = 0; k < page.num_clusters(); ++k) {
+            const auto c = static_cast<size_t>(first_cluster[p]) + k;
+            ClusterRanges own = valid_ranges(page.ranges(k), sh_degree, c, "");
+            own.record_base =
+                static_cast<uint32_t>((page.record(first_row) - words) / kRecordWords - first_row);
+            own.sh_base = static_cast<uint32_t>((page.sh(first_row) - words) / 2 - sh_degree * first_row);
+            std::memcpy(ranges_.data() + size_t(range_bytes(sh_degree)) * c, &own, range_bytes(sh_degree));
+        }
+    });
+}
+
+void cpu::decode(const DecodeInput& in, const GaussianRows<float>& out) {
+    parallel_for(in.cluster.size, kClustersAtOnce, [&](size_t s) {
+        const ClusterRanges& ranges = in.codes.ranges_of(in.cluster[s]);
+        const auto first = static_cast<uint32_t>(in.codes.offset[in.cluster[s]]);
+        for (int64_t row = in.offset[s]; row < in.offset[s + 1]; ++row) {
+            const uint32_t from = first + static_cast<uint32_t>(row - in.offset[s]);
+            decode_row(in.codes.record_of(ranges, from), in.codes.sh_of(ranges, from), ranges, out, row);
+        }
     });
 }
 

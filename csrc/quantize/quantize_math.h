@@ -6,6 +6,7 @@
 // Every device and every instruction set decodes to the same bits, whether products are contracted into sums
 // or not: a step has so few bits that its product with a code is exact in float32, so there is one rounding.
 
+#include "base/span.h"
 #include "math/gaussian.h"
 
 namespace v3dg {
@@ -18,6 +19,7 @@ constexpr uint32_t kMostMean = 4095, kMostScale = 1023, kMostColor = 511, kMostO
 // most sin(22.5 degrees), which is 255 steps. A quaternion of codes has the length sqrt(kQuatLength2).
 constexpr int32_t kZeroQuat = 255, kQuatLength2 = 444016;
 constexpr float kQuatStep = 0.0015007235f;  // 1 / sqrt(kQuatLength2)
+constexpr float kOpacityStep = 1.0f / 255;
 // Scales are coded by the bits of the float, which rise about as the logarithm does: from 2^-64 to 2^64.
 constexpr uint32_t kLeastScaleBits = 63u << 23, kMostScaleBits = (191u << 23) - 1;
 constexpr int kScaleFirstShift = 14, kScaleStepShift = 4;
@@ -57,12 +59,6 @@ V3DG_HD constexpr size_t page_bytes(size_t num_gaussians, size_t num_clusters, i
            kPageAlignment * kPageAlignment;
 }
 
-V3DG_HD inline float float_of_bits(uint32_t bits) {
-    float x;
-    std::memcpy(&x, &bits, sizeof x);
-    return x;
-}
-
 // Of a finite half.
 V3DG_HD inline float float_of_half(uint32_t half) {
     const uint32_t exponent = half >> 10 & 31, fraction = half & 1023;
@@ -71,11 +67,39 @@ V3DG_HD inline float float_of_half(uint32_t half) {
     return half & 0x8000 ? -size : size;
 }
 
-// The ranges of a cluster, ready to decode with.
-struct ClusterRanges {
-    float mean_first[3], mean_step[3], color_first[3], color_step[3];
-    uint32_t scale_first, scale_step;
-    float sh_step[9];  // band by band, three channels each
+// The ranges of a cluster, ready to decode with, and where its codes are. In tables each takes range_bytes().
+struct alignas(16) ClusterRanges {
+    float mean_first[3];
+    uint32_t scale_first;
+    float mean_step[3];
+    uint32_t scale_step;
+    float color_first[3], color_step[3];
+    uint32_t record_base, sh_base;  // as Codes has them
+    float sh_step[9];               // band by band, three channels each
+};
+V3DG_HD constexpr uint32_t range_bytes(int sh_degree) { return 64 + (3 * sh_degree + 3) / 4 * 16; }
+static_assert(range_bytes(3) == sizeof(ClusterRanges), "all of it");
+
+// The gaussians of a bundle as codes, on the host or on a device. Row r, of cluster c, has four words from
+// 4 (record_base + r) of `records` on, and two words a degree from 2 (sh_base + degree r) of `sh` on; what is
+// in brackets is modulo 2^32.
+struct Codes {
+    const uint32_t *records, *sh;
+    const unsigned char* ranges;  // [C]
+    Span<const int64_t> offset;   // [C + 1] gaussians before each cluster
+    int sh_degree;
+    uint32_t range_size;  // range_bytes()
+
+    V3DG_HD size_t num_clusters() const { return offset.size - 1; }
+    V3DG_HD V3DG_INLINE const ClusterRanges& ranges_of(uint32_t cluster) const {
+        return *reinterpret_cast<const ClusterRanges*>(ranges + size_t(range_size) * cluster);
+    }
+    V3DG_HD V3DG_INLINE const uint32_t* record_of(const ClusterRanges& own, uint32_t row) const {
+        return records + size_t(kRecordWords) * (own.record_base + row);
+    }
+    V3DG_HD V3DG_INLINE const uint32_t* sh_of(const ClusterRanges& own, uint32_t row) const {
+        return sh + 2 * size_t(own.sh_base + sh_degree * row);
+    }
 };
 
 // `sh_steps` are the halves behind the code, three a band.
@@ -93,59 +117,73 @@ V3DG_HD inline ClusterRanges ranges_of(const ClusterCode& code, const uint16_t* 
     return out;
 }
 
-V3DG_HD inline float exact_sqrt(float x) {
+template <class V>
+V3DG_HD V3DG_INLINE V exact_sqrt(V x) {
 #ifdef __CUDA_ARCH__
     return __fsqrt_rn(x);  // whatever the file is compiled with
 #else
-    return ::sqrtf(x);
+    return sqrt_of(x);
 #endif
 }
 
-// One gaussian with the coefficients of its constant basis. A finite result follows from ranges that
-// are_valid().
-V3DG_HD inline void decode(const uint32_t record[kRecordWords], const ClusterRanges& ranges,
-                           Gaussian3d<float>& g, float color[3]) {
-    const uint32_t a = record[0], b = record[1], c = record[2], d = record[3];
-    const uint32_t mean[3] = {a & 4095, a >> 12 & 4095, b & 4095};
-    const uint32_t scale[3] = {b >> 12 & 1023, b >> 22, c & 1023};
-    const uint32_t colors[3] = {c >> 28 | (d & 31) << 4, d >> 5 & 511, d >> 14 & 511};
-    const int32_t x = int32_t(c >> 10 & 511) - kZeroQuat, y = int32_t(c >> 19 & 511) - kZeroQuat,
-                  z = int32_t(d >> 23) - kZeroQuat;
+// `num_bits` bits of each lane's word as a number.
+template <class V>
+V3DG_HD V3DG_INLINE V number_at(Bits<V> word, int first, int num_bits) {
+    return float_of_number<V>(word >> first & ((1u << num_bits) - 1));
+}
+
+// One gaussian, or one a lane, with the coefficients of its constant basis. A finite result follows from
+// ranges that are_valid().
+template <class V>
+V3DG_HD V3DG_INLINE void decode(const Bits<V> record[kRecordWords], const ClusterRanges& ranges,
+                                Gaussian3d<V>& g, V color[3]) {
+    const Bits<V> a = record[0], b = record[1], c = record[2], d = record[3];
+    const V mean[3] = {number_at<V>(a, 0, 12), number_at<V>(a, 12, 12), number_at<V>(b, 0, 12)};
+    const Bits<V> scale[3] = {b >> 12 & 1023u, b >> 22, c & 1023u};
+    const V colors[3] = {float_of_number<V>(c >> 28 | (d & 31u) << 4), number_at<V>(d, 5, 9),
+                         number_at<V>(d, 14, 9)};
     for (int k = 0; k < 3; ++k) {
-        g.mean[k] = ranges.mean_first[k] + static_cast<float>(mean[k]) * ranges.mean_step[k];
+        g.mean[k] = ranges.mean_first[k] + mean[k] * ranges.mean_step[k];
         g.scale[k] = float_of_bits(ranges.scale_first + scale[k] * ranges.scale_step);
-        color[k] = ranges.color_first[k] + static_cast<float>(colors[k]) * ranges.color_step[k];
+        color[k] = ranges.color_first[k] + colors[k] * ranges.color_step[k];
     }
-    g.opacity = static_cast<float>(a >> 24) * (1.0f / 255);
-    g.quat[0] = exact_sqrt(static_cast<float>(kQuatLength2 - x * x - y * y - z * z)) * kQuatStep;
-    g.quat[1] = static_cast<float>(x) * kQuatStep;
-    g.quat[2] = static_cast<float>(y) * kQuatStep;
-    g.quat[3] = static_cast<float>(z) * kQuatStep;
+    g.opacity = number_at<V>(a, 24, 8) * kOpacityStep;
+    const V x = number_at<V>(c, 10, 9) - float(kZeroQuat), y = number_at<V>(c, 19, 9) - float(kZeroQuat),
+            z = number_at<V>(d, 23, 9) - float(kZeroQuat);
+    g.quat[0] = exact_sqrt(float(kQuatLength2) - x * x - y * y - z * z) * kQuatStep;  // of whole numbers
+    g.quat[1] = x * kQuatStep;
+    g.quat[2] = y * kQuatStep;
+    g.quat[3] = z * kQuatStep;
 }
 
 // `num_bits` bits of words, from bit `first` on.
-V3DG_HD inline uint32_t bits_at(const uint32_t* words, int first, int num_bits) {
+template <class B>
+V3DG_HD V3DG_INLINE B bits_at(const B* words, int first, int num_bits) {
     const int word = first / 32, shift = first % 32;
-    uint32_t bits = words[word] >> shift;
+    B bits = words[word] >> shift;
     if (shift + num_bits > 32) bits |= words[word + 1] << (32 - shift);
     return bits & ((1u << num_bits) - 1);
 }
 
-// The coefficients above the constant basis, three channels each. A code is a signed number whose square
-// counts, so that small values have small steps.
-V3DG_HD inline void decode_sh(const uint32_t* words, const float* step, int sh_degree, float* sh) {
+// The coefficients above the constant basis, three channels each, of one gaussian or of one a lane. A code is
+// a signed number whose square counts, so that small values have small steps.
+template <class V>
+V3DG_HD V3DG_INLINE void decode_sh(const Bits<V>* words, const float* step, int sh_degree, V* sh) {
     int first = 0;
+#ifdef __CUDA_ARCH__
+#pragma unroll
+#endif
     for (int basis = 1; basis < num_sh_bases(sh_degree); ++basis) {
-        float value[3];
+        V value[3];
         for (int channel = 0; channel < 3; ++channel) {
             const int num_bits = sh_bits(sh_degree, basis, channel);
-            const int32_t code = int32_t(bits_at(words, first, num_bits)) - ((1 << (num_bits - 1)) - 1);
-            value[channel] = static_cast<float>(code < 0 ? -code * code : code * code) *
-                             step[3 * (band_of(basis) - 1) + channel];
+            const V code = float_of_number<V>(bits_at(words, first, num_bits)) -
+                           static_cast<float>((1 << (num_bits - 1)) - 1);
+            value[channel] = code * abs_of(code) * step[3 * (band_of(basis) - 1) + channel];
             first += num_bits;
         }
-        const float base = value[0] - value[2];
-        float* out = sh + 3 * (basis - 1);
+        const V base = value[0] - value[2];
+        V* out = sh + 3 * (basis - 1);
         out[0] = base + value[1];
         out[1] = value[0] + value[2];
         out[2] = base - value[1];

@@ -100,6 +100,7 @@ struct ItemOutput {
     }
     __device__ void write(const LaneClusters& mine, Count first, Count record) const {
         for_each_drawn(mine, [&](const DrawnRun& run) {
+            static_assert(kLaneClusters <= kItemClusters, "a run may be as long");
             const int32_t cluster = mine.cluster(run.k);
             const unsigned size = mine.size(run.k, run.num_clusters), step = run.gaussians_an_item();
             const uint32_t placement = run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
@@ -109,8 +110,13 @@ struct ItemOutput {
                 const unsigned count = min(step, size - skip);
                 if (first < items.item_capacity &&
                     record + run.num_instances * count <= items.record_capacity)
-                    items.items[first] = {placement,  gaussian + skip, count, static_cast<uint32_t>(record),
-                                          appearance, run.sharers};
+                    items.items[first] = {placement,
+                                          gaussian + skip,
+                                          count,
+                                          static_cast<uint32_t>(record),
+                                          appearance,
+                                          run.sharers,
+                                          static_cast<uint32_t>(cluster)};
                 record += run.num_instances * count;
             }
         });

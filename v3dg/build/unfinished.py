@@ -31,7 +31,7 @@ from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundlePlan, read_pages, write_pages
 from v3dg.bundle.format import HASH_BYTES, page_hash
-from v3dg.bundle.pages import MemoryPages, PageRun
+from v3dg.bundle.pages import PageRun
 from v3dg.gaussians import Gaussians
 
 _RECORD = struct.Struct("<II16s")  # in front of a level: its part, its number, the hash of what follows
@@ -217,16 +217,18 @@ class MemoryStore:
 
     def __init__(self, plan: BundlePlan) -> None:
         self._plan, self.codec = plan, plan.codec
-        self._pages = MemoryPages(plan.layout, plan.codec.empty(int(plan.layout.offset[-1])), plan.codec)
+        self._gaussians = plan.codec.empty(int(plan.layout.offset[-1]))
         self.pages = self
         self.levels: dict[tuple[int, int], FinishedLevel] = {}
 
     def write(self, run: PageRun, gaussians: Gaussians) -> npt.NDArray[np.uint8]:
-        self._pages.write(run, gaussians)
+        place = vars(self._gaussians.subset(run.rows)).values()
+        for array, out in zip(vars(gaussians).values(), place, strict=True):
+            _device.copy_to_host(array, out)
         return np.empty((0, HASH_BYTES), np.uint8)
 
     def read(self, run: PageRun, hashes: npt.NDArray[np.uint8]) -> Gaussians:
-        return self._pages.gaussians.subset(run.rows)
+        return self._gaussians.subset(run.rows)
 
     def save(self, part: int, number: int, level: FinishedLevel) -> None:
         self.levels[part, number] = level
@@ -235,7 +237,7 @@ class MemoryStore:
         self._tables = clusters, groups
 
     def bundle(self) -> Bundle:
-        return Bundle(*self._tables, self._pages.gaussians, self._plan.config, self.codec.name)
+        return Bundle(*self._tables, self._gaussians, self._plan.config, self.codec.name)
 
 
 def described(device: Device) -> tuple[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -14,13 +14,14 @@ from v3dg._numbers import check, check_all, check_type
 from v3dg.bundle.codec import Codec, codec_of
 from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES, config_to_json, page_tables
-from v3dg.bundle.pages import FilePages, MemoryPages, PageLayout, runs_of_pages
+from v3dg.bundle.pages import CodePages, FilePages, MemoryPages, PageLayout, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+_Pages: TypeAlias = MemoryPages | CodePages | FilePages
 _BYTES_AT_ONCE = 64 << 20
 
 
@@ -60,12 +61,11 @@ class Bundle:
             filled = np.diff(clusters.offset)[:, None, None] > 0
             box = np.where(filled, _core.bound_by_boxes(gaussians.rows, clusters.offset), clusters.box)
             clusters = replace(clusters, box=box)
-        pages = MemoryPages(PageLayout.of(clusters), gaussians, kept)
-        self._set(clusters, groups, config or {}, pages)
+        layout = PageLayout.of(clusters)
+        in_memory = MemoryPages if codec == Codec.name else CodePages.of
+        self._set(clusters, groups, config or {}, in_memory(layout, gaussians, kept))
 
-    def _set(
-        self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: MemoryPages | FilePages
-    ) -> None:
+    def _set(self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: _Pages) -> None:
         self.config: dict[str, Any] = parse_json(config_to_json(config))
         self._clusters = clusters
         self._groups = groups
@@ -179,10 +179,23 @@ class Bundle:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All gaussians, in the order of the clusters; read and verified on first use, then kept."""
-        if not isinstance(self._pages, MemoryPages):
-            self._pages = MemoryPages(self._layout, self._pages.read(0, self.num_pages), self._codec)
-        return self._pages.gaussians
+        """All gaussians, in the order of the clusters; read and verified on first use, then kept.
+
+        Of a quantised bundle, codes are kept: each use makes new rows of them.
+        """
+        pages = self._in_memory()
+        return pages.gaussians if isinstance(pages, MemoryPages) else pages.read(0, self.num_pages)
+
+    @property
+    def codes(self) -> _core.Codes | None:
+        """What is drawn of a quantised bundle, for the compiled operations; read and verified like them."""
+        pages = None if self.codec == Codec.name else self._in_memory()
+        return pages.codes if isinstance(pages, CodePages) else None
+
+    def _in_memory(self) -> MemoryPages | CodePages:
+        if isinstance(self._pages, FilePages):
+            self._pages = self._pages.in_memory()
+        return self._pages
 
     def read_page(self, page: int) -> Gaussians:
         """Gaussians of the clusters that share parent group ``page``, or of the last level; verified."""

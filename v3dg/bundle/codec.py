@@ -61,6 +61,9 @@ class Codec:
         return empty(count, self.sh_degree)
 
 
+_WORD = 4  # bytes; codes are arrays of int32
+
+
 class Quantized(Codec):
     """Codes of 16 bytes and up to 24 for the higher degrees, relative to the ranges of a cluster."""
 
@@ -76,7 +79,7 @@ class Quantized(Codec):
 
     def buffers(self, out: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
         size = self.page_bytes(offset[-1] - offset[0], np.int64(len(offset) - 1))
-        return [np.empty(int(size) // 4, np.int32)]
+        return [np.empty(int(size) // _WORD, np.int32)]
 
     def decode(self, buffers: Sequence[NDArray[Any]], out: Gaussians, offset: NDArray[np.int64]) -> None:
         _core.decode_page(buffers[0], offset, out.rows)

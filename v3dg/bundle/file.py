@@ -31,11 +31,11 @@ from v3dg.bundle.format import (
     page_tables,
     schema_of,
 )
-from v3dg.bundle.pages import on_threads, runs_of_pages
+from v3dg.bundle.pages import DAMAGED, on_threads, runs_of_pages
 from v3dg.bundle.tables import check_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 _BYTES_PER_TASK = 16 << 20
 _FIRST_BYTES = 4096  # of the header: what a disk writes at once
-_DAMAGED = "the file is damaged, copy or build it again"
 
 
 class BundlePlan:
@@ -110,13 +109,39 @@ def read_pages(
     """The gaussians of a run of pages; ValueError unless they are there and have these hashes."""
     result = codec.empty(run.rows.stop - run.rows.start)
 
+    def decode(page: int, buffers: Sequence[NDArray[Any]]) -> None:
+        codec.decode(buffers, result, run.clusters_of(page))
+
+    _read_run(path, descriptor, run, hashes, lambda p: codec.buffers(result, run.clusters_of(p)), decode)
+    return result
+
+
+def read_codes(
+    path: str | os.PathLike[str], descriptor: int, run: PageRun, hashes: NDArray[np.uint8]
+) -> NDArray[np.int32]:
+    """The words of a run of quantised pages; ValueError unless they are there and have these hashes."""
+    first = (run.places - run.places[0]) // 4
+    words = np.empty(int(first[-1]), np.int32)
+    _read_run(path, descriptor, run, hashes, lambda p: [words[first[p] : first[p + 1]]], lambda *_: None)
+    return words
+
+
+def _read_run(
+    path: str | os.PathLike[str],
+    descriptor: int,
+    run: PageRun,
+    hashes: NDArray[np.uint8],
+    buffers_of: Callable[[int], Sequence[NDArray[Any]]],
+    take: Callable[[int, Sequence[NDArray[Any]]], None],
+) -> None:
+    """Fill the buffers of each page and hand them over."""
+
     def read_page(page: int) -> None:
         place, end = run.places[page : page + 2].tolist()
-        offset = run.clusters_of(page)
-        buffers = codec.buffers(result, offset)
+        buffers = buffers_of(page)
         fill = end - place - sum(buffer.nbytes for buffer in buffers)
         pieces = (*buffers, np.empty(fill, np.uint8))
-        first, last = offset[[0, -1]] + run.rows.start
+        first, last = run.clusters_of(page)[[0, -1]] + run.rows.start
         name = f"page {run.first_page + page} (gaussians {first} to {last - 1})"
         try:
             for piece in pieces:
@@ -127,18 +152,17 @@ def read_pages(
             problem = f"{os.strerror(error.errno or errno.EIO)} in {name}"
             raise OSError(error.errno, problem, os.fspath(path)) from error
         if page_hash(pieces) != hashes[page].tobytes():
-            raise ValueError(f"{os.fspath(path)}: {name}: the hash does not match; {_DAMAGED}")
+            raise ValueError(f"{os.fspath(path)}: {name}: the hash does not match; {DAMAGED}")
         try:
-            codec.decode(buffers, result, offset)
+            take(page, buffers)
         except ValueError as error:
-            raise ValueError(f"{os.fspath(path)}: {name}: {error}; {_DAMAGED}") from None
+            raise ValueError(f"{os.fspath(path)}: {name}: {error}; {DAMAGED}") from None
 
     def read(pages: range) -> None:
         for page in pages:
             read_page(page)
 
     on_threads(read, list(runs_of_pages(0, len(run), np.diff(run.places), _BYTES_PER_TASK)))
-    return result
 
 
 class BundleFile:
@@ -242,7 +266,7 @@ class BundleFile:
         stored = np.empty(HASH_BYTES, np.uint8)
         self._read([data, stored], self._data_start + start)
         if page_hash((*header, data)) != stored.tobytes():
-            self._fail(f"hash: the header and tables do not match it; {_DAMAGED}")
+            self._fail(f"hash: the header and tables do not match it; {DAMAGED}")
         data.flags.writeable = False
         self.tables: dict[str, NDArray[Any]] = {}
         for name, dtype, _, _ in schema_of(self.codec.version):
@@ -264,3 +288,7 @@ class BundleFile:
     def read_pages(self, run: PageRun) -> Gaussians:
         """The gaussians of a run of pages, verified."""
         return read_pages(self.path, self._fd, run, self.codec, self.tables["pages.hash"][run.first_page :])
+
+    def read_codes(self, run: PageRun) -> NDArray[np.int32]:
+        """The words of a run of quantised pages, verified."""
+        return read_codes(self.path, self._fd, run, self.tables["pages.hash"][run.first_page :])

@@ -11,20 +11,21 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from v3dg import _device
-from v3dg.gaussians import Gaussians
+from v3dg import _core
+from v3dg.bundle.codec import Codec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from v3dg.bundle.codec import Codec
     from v3dg.bundle.file import BundleFile
     from v3dg.bundle.tables import Clusters
+    from v3dg.gaussians import Gaussians
 
 _Item = TypeVar("_Item")
 _THREADS = 8
+DAMAGED = "the file is damaged, copy or build it again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,10 @@ class PageLayout:
     @property
     def num_pages(self) -> int:
         return len(self.first_cluster) - 1
+
+    def clusters_of(self, page: int) -> NDArray[np.int64]:
+        """Gaussians of each cluster of a page, in the bundle; and the end."""
+        return self.offset[self.first_cluster[page] : self.first_cluster[page + 1] + 1]
 
     def page_bytes(self, codec: Codec) -> NDArray[np.int64]:
         """(P,) of each page, with what it is filled up with."""
@@ -88,7 +93,7 @@ class PageRun:
 
 
 class MemoryPages:
-    """Pages whose gaussians are all in memory, on the host."""
+    """Pages of float32 whose gaussians are all in memory, on the host."""
 
     def __init__(self, layout: PageLayout, gaussians: Gaussians, codec: Codec) -> None:
         self.layout, self.gaussians, self.codec = layout, gaussians, codec
@@ -98,11 +103,42 @@ class MemoryPages:
         first, last = self.layout.first_gaussian[[first_page, last_page]].tolist()
         return self.gaussians.subset(slice(first, last))
 
-    def write(self, run: PageRun, gaussians: Gaussians) -> None:
-        """Copy the gaussians of a run of pages, on any device, to their place."""
-        place = vars(self.gaussians.subset(run.rows)).values()
-        for array, out in zip(vars(gaussians).values(), place, strict=True):
-            _device.copy_to_host(array, out)
+
+class CodePages:
+    """Quantised pages that are all in memory, as codes; rows are made of them where they are asked for."""
+
+    def __init__(self, layout: PageLayout, words: NDArray[np.int32], codec: Codec) -> None:
+        self.layout, self.codec, self._words = layout, codec, words
+        self.codes = _core.Codes(words, layout.first_cluster, layout.offset, codec.sh_degree)
+
+    @staticmethod
+    def of(layout: PageLayout, gaussians: Gaussians, codec: Codec) -> CodePages:
+        """The pages of gaussians on the host."""
+        places = _places(layout, codec)
+        words = np.empty(int(places[-1]), np.int32)
+
+        def encode(page: int) -> None:
+            (words[places[page] : places[page + 1]],) = codec.encode(gaussians, layout.clusters_of(page))
+
+        on_threads(encode, range(layout.num_pages))
+        return CodePages(layout, words, codec)
+
+    def read(self, first_page: int, last_page: int) -> Gaussians:
+        """Gaussians of a run of pages."""
+        places, first_row = _places(self.layout, self.codec), self.layout.first_gaussian
+        result = self.codec.empty(int(first_row[last_page] - first_row[first_page]))
+
+        def decode(page: int) -> None:
+            words = self._words[places[page] : places[page + 1]]
+            self.codec.decode([words], result, self.layout.clusters_of(page) - first_row[first_page])
+
+        on_threads(decode, range(first_page, last_page))
+        return result
+
+
+def _places(layout: PageLayout, codec: Codec) -> NDArray[np.int64]:
+    """(P+1,) words before each page."""
+    return np.concatenate([np.zeros(1, np.int64), np.cumsum(layout.page_bytes(codec) // 4)])
 
 
 class FilePages:
@@ -121,6 +157,17 @@ class FilePages:
         if kept is None or kept[0] != first_page:
             self._last_page = kept = (first_page, self._read(first_page, last_page))
         return kept[1]
+
+    def in_memory(self) -> MemoryPages | CodePages:
+        """All of them; read and verified."""
+        run = self.layout.run(0, self.layout.num_pages, self._file.places)
+        if self.codec.name == Codec.name:
+            return MemoryPages(self.layout, self._file.read_pages(run), self.codec)
+        words = self._file.read_codes(run)
+        try:
+            return CodePages(self.layout, words, self.codec)
+        except ValueError as error:
+            raise ValueError(f"{self._file.path}: {error}; {DAMAGED}") from None
 
     def _read(self, first_page: int, last_page: int) -> Gaussians:
         return self._file.read_pages(self.layout.run(first_page, last_page, self._file.places))

@@ -1,0 +1,250 @@
+#pragma once
+
+// Where the project kernels read gaussians: from rows, from planes of packed gaussians, or from codes.
+
+#include "base/launch.cuh"
+#include "project/project_cuda.h"
+#include "project/project_math.h"
+
+namespace v3dg {
+namespace cuda {
+
+// What an item needs.
+template <class Model>
+struct ItemTables {
+    alignas(16) Placement placement;
+    alignas(16) FrameImage image;
+    alignas(16) Model model;
+    DrawItem item;
+    SlopeLimits<float> limits;  // of the image
+};
+
+__device__ inline float4 load4(const float* rows, uint32_t row) {
+    return __ldg(reinterpret_cast<const float4*>(rows) + row);
+}
+
+template <int kDegree>
+__device__ void color_of(const float* sh, const float mean[3], const ModelView<float>& view, float color[3]) {
+    float direction[3];
+    from_eye(view, mean, direction);
+    color_of_sh(kDegree, direction, sh, color);
+}
+
+template <int kDegree>
+__device__ void color_of_row(const float* rows, uint32_t g, const float mean[3], const ModelView<float>& view,
+                             float color[3]) {
+    constexpr int kSize = 3 * num_sh_bases(kDegree);
+    float sh[kSize];
+    const float* row = rows + size_t(g) * kSize;
+    if constexpr (kSize % 4 == 0) {
+#pragma unroll
+        for (int k = 0; k < kSize; k += 4) {
+            const float4 x = load4(row, k / 4);
+            sh[k] = x.x;
+            sh[k + 1] = x.y;
+            sh[k + 2] = x.z;
+            sh[k + 3] = x.w;
+        }
+    } else {
+#pragma unroll
+        for (int k = 0; k < kSize; ++k) sh[k] = __ldg(row + k);
+    }
+    color_of<kDegree>(sh, mean, view, color);
+}
+
+// A source tells what a gaussian is, in steps, because most reach no pixel centre: a lane fetch()es what the
+// sphere around it follows from, early; sphere() is its mean and its reach; project() its ellipse, where s.p
+// is set; shade() its colour.
+
+// Gaussians as rows.
+template <class RowModel>
+struct OfRows {
+    using Model = RowModel;
+    using Fetched = float4;
+    struct Place {};  // a row is all that is needed
+
+    static __device__ Place start(const ItemTables<Model>&) { return {}; }
+    static __device__ void prepare() {}
+    static __device__ float4 sphere(const Model&, Place&, uint32_t, const float4& fetched) { return fetched; }
+};
+
+// As users hold them.
+struct RowSource : OfRows<GaussianRows<const float>> {
+    static __device__ bool has(const Model&) { return true; }
+    static __device__ float4 fetch(const Model& m, uint32_t g) {
+        Gaussian3d<float> gaussian{{__ldg(m.means + 3 * size_t(g)), __ldg(m.means + 3 * size_t(g) + 1),
+                                    __ldg(m.means + 3 * size_t(g) + 2)},
+                                   {1, 0, 0, 0},
+                                   {},
+                                   __ldg(m.opacities + g)};
+        for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
+        return {gaussian.mean[0], gaussian.mean[1], gaussian.mean[2], reach_of(gaussian)};
+    }
+    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
+                                             Place&, uint32_t g, Projection<float>& s, float color[3]) {
+        const GaussianRows<const float>& m = in.model;
+        Gaussian3d<float> gaussian{{}, {}, {}, __ldg(m.opacities + g)};
+        for (int k = 0; k < 3; ++k) gaussian.scale[k] = __ldg(m.scales + 3 * size_t(g) + k);
+        const float4 quat = load4(m.quats, g);
+        gaussian.quat[0] = quat.x;
+        gaussian.quat[1] = quat.y;
+        gaussian.quat[2] = quat.z;
+        gaussian.quat[3] = quat.w;
+        if (m.sh_degree == 0) color_of_row<0>(m.sh, g, gaussian.mean, view, color);
+        return project_gaussian(gaussian, view, in.image.camera, in.item.appearance.filter_px2,
+                                in.item.appearance.antialiased, s);
+    }
+    static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&, uint32_t g,
+                                 float color[3]) {
+        if (m.sh_degree > 0) shade_row(m.sh, m.sh_degree, g, fetch(m, g), view, color);
+    }
+    static __device__ void shade_row(const float* sh, int sh_degree, uint32_t g, const float4& sphere,
+                                     const ModelView<float>& view, float color[3]) {
+        const float mean[3] = {sphere.x, sphere.y, sphere.z};
+        switch (sh_degree) {
+            case 1: color_of_row<1>(sh, g, mean, view, color); break;
+            case 2: color_of_row<2>(sh, g, mean, view, color); break;
+            default: color_of_row<3>(sh, g, mean, view, color);
+        }
+    }
+};
+
+struct PackedSource : OfRows<PackedPlanes> {
+    static __device__ bool has(const Model& m) { return m.plane[0] != nullptr; }
+    static __device__ float4 fetch(const Model& m, uint32_t g) { return load4(m.plane[0], g); }
+    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
+                                             Place&, uint32_t g, Projection<float>& s, float color[3]) {
+        const PackedPlanes& m = in.model;
+        const float4 a = load4(m.plane[1], g), b = load4(m.plane[2], g), c = load4(m.plane[3], g);
+        color[0] = c.y;
+        color[1] = c.z;
+        color[2] = c.w;
+        const PackedGaussian gaussian{{}, 0.0f, {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, c.x};
+        return project_packed(gaussian, view, in.image.camera, in.limits, in.item.appearance.filter_px2,
+                              in.item.appearance.antialiased, s);
+    }
+    static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&, uint32_t g,
+                                 float color[3]) {
+        const float anywhere[3] = {0, 0, 0};
+        if (m.palette.sh != nullptr)
+            color_of_row<0>(m.palette.sh, m.palette.cluster_of(g), anywhere, view, color);
+        else if (m.sh_degree > 0)
+            RowSource::shade_row(m.sh, m.sh_degree, g, fetch(m, g), view, color);
+    }
+};
+
+// Codes come to the same bits as the rows that they are decoded to, packed.
+struct CodeSource {
+    using Model = CodedGaussians;
+    using Fetched = uint4;
+    struct Place {
+        uint32_t cluster, end;  // of the rows of the cluster
+    };
+    // What follows from an opacity's code.
+    struct OpacityEntry {
+        float reach_in_sigmas, log2_opacity;
+    };
+
+    static __device__ bool has(const Model& m) { return m.codes.records != nullptr; }
+    static __device__ OpacityEntry* opacity_table() {
+        __shared__ OpacityEntry entries[kMostOpacity + 1];
+        return entries;
+    }
+    // For a whole block.
+    static __device__ void prepare() {
+        for (unsigned code = threadIdx.x; code <= kMostOpacity; code += blockDim.x) {
+            const float opacity = static_cast<float>(code) * kOpacityStep;
+            opacity_table()[code] = {reach_in_sigmas(opacity), log2_of(opacity)};
+        }
+        __syncthreads();
+    }
+    // Where the item's first gaussian is; for a whole warp.
+    static __device__ Place start(const ItemTables<Model>& in) {
+        const Span<const int64_t>& offset = in.model.codes.offset;
+        const uint32_t next = in.item.cluster + 1 + threadIdx.x % 32;
+        const bool is_before = threadIdx.x % 32 < kItemClusters && next < offset.size &&
+                               static_cast<uint32_t>(__ldg(offset.data + next)) <= in.item.first;
+        const uint32_t cluster = in.item.cluster + __popc(__ballot_sync(kAllLanes, is_before));
+        return {cluster, static_cast<uint32_t>(__ldg(offset.data + cluster + 1))};
+    }
+    // To a row of the same cluster or of a later one.
+    static __device__ void advance(const Model& m, Place& place, uint32_t g) {
+        while (g >= place.end)
+            place.end = static_cast<uint32_t>(__ldg(m.codes.offset.data + ++place.cluster + 1));
+    }
+    static __device__ uint4 fetch(const Model& m, uint32_t g) {
+        return __ldg(reinterpret_cast<const uint4*>(m.codes.records) + g);
+    }
+    static __device__ Gaussian3d<float> decoded(const Model& m, uint32_t cluster, const uint4& record,
+                                                float color[3]) {
+        const uint32_t words[kRecordWords] = {record.x, record.y, record.z, record.w};
+        const auto* at = reinterpret_cast<const float*>(&m.codes.ranges_of(cluster));
+        const float4 mean_first = load4(at, 0), mean_step = load4(at, 1), a = load4(at, 2), b = load4(at, 3);
+        const ClusterRanges ranges{{mean_first.x, mean_first.y, mean_first.z},
+                                   __float_as_uint(mean_first.w),
+                                   {mean_step.x, mean_step.y, mean_step.z},
+                                   __float_as_uint(mean_step.w),
+                                   {a.x, a.y, a.z},
+                                   {a.w, b.x, b.y},
+                                   0,
+                                   0,
+                                   {}};
+        Gaussian3d<float> g;
+        decode(words, ranges, g, color);
+        return g;
+    }
+    static __device__ float4 sphere(const Model& m, Place& place, uint32_t g, const uint4& record) {
+        advance(m, place, g);
+        float color[3];
+        const Gaussian3d<float> gaussian = decoded(m, place.cluster, record, color);
+        const float sigmas = opacity_table()[record.x >> 24].reach_in_sigmas;
+        const float most = max_of(gaussian.scale[0], max_of(gaussian.scale[1], gaussian.scale[2]));
+        return {gaussian.mean[0], gaussian.mean[1], gaussian.mean[2], sigmas < 0 ? -1.0f : most * sigmas};
+    }
+    static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
+                                             Place& place, uint32_t g, Projection<float>& s, float color[3]) {
+        const uint4 record = fetch(in.model, g);
+        advance(in.model, place, g);
+        float sh[3];
+        const Gaussian3d<float> gaussian = decoded(in.model, place.cluster, record, sh);
+        color_of_sh(0, gaussian.mean, sh, color);
+        PackedGaussian packed = pack_gaussian(gaussian);
+        packed.log2_opacity = opacity_table()[record.x >> 24].log2_opacity;
+        return project_packed(packed, view, in.image.camera, in.limits, in.item.appearance.filter_px2,
+                              in.item.appearance.antialiased, s);
+    }
+    static __device__ void shade(const Model& m, const ModelView<float>& view, const Place& place, uint32_t g,
+                                 float color[3]) {
+        const float anywhere[3] = {0, 0, 0};
+        if (m.palette.sh != nullptr) {
+            color_of_row<0>(m.palette.sh, place.cluster, anywhere, view, color);
+            return;
+        }
+        switch (m.codes.sh_degree) {
+            case 0: break;
+            case 1: shade_codes<1>(m, view, place, g, color); break;
+            case 2: shade_codes<2>(m, view, place, g, color); break;
+            default: shade_codes<3>(m, view, place, g, color);
+        }
+    }
+    template <int kDegree>
+    static __device__ void shade_codes(const Model& m, const ModelView<float>& view, const Place& place,
+                                       uint32_t g, float color[3]) {
+        float sh[3 * num_sh_bases(kDegree)], step[3 * kDegree];
+        const Gaussian3d<float> gaussian = decoded(m, place.cluster, fetch(m, g), sh);
+        uint32_t words[num_sh_words(kDegree)];
+#pragma unroll
+        for (int k = 0; k < kDegree; ++k) {
+            const uint2 pair = __ldg(reinterpret_cast<const uint2*>(m.codes.sh) + kDegree * size_t(g) + k);
+            words[2 * k] = pair.x;
+            words[2 * k + 1] = pair.y;
+        }
+#pragma unroll
+        for (int k = 0; k < 3 * kDegree; ++k) step[k] = __ldg(m.codes.ranges_of(place.cluster).sh_step + k);
+        decode_sh<float>(words, step, kDegree, sh + 3);
+        color_of<kDegree>(sh, gaussian.mean, view, color);
+    }
+};
+
+}  // namespace cuda
+}  // namespace v3dg
