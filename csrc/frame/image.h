@@ -68,8 +68,8 @@ struct FrameImage {
     int tile_columns, tile_rows;
     uint32_t first_tile;  // in the batch, its tiles row by row
     float background[3];
-    float *color, *alpha, *depth;            // as Picture<float> has them; depth may be null
-    float min_transmittance = kStopsBefore;  // the same for all pictures of a frame
+    float *color, *alpha, *depth;  // as Picture<float> has them; depth may be null
+    float min_transmittance;       // the same for all pictures of a frame
 };
 
 }  // namespace cuda

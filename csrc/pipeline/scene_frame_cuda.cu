@@ -19,7 +19,8 @@ FrameImage frame_image(const Pinhole<float>& camera, int width, int height, cons
             {background[0], background[1], background[2]},
             color,
             alpha,
-            depth};
+            depth,
+            kStopsBefore};
 }
 
 static uint32_t num_tiles(const FrameImage& image) {
