@@ -33,7 +33,7 @@ class Subject:
     def __init__(self, folder: Path, name: str, about: dict[str, Any], views: int) -> None:
         self.name, self._folder, self._about = name, folder, about
         self.asset = v3dg.read_asset(folder / about["file"])
-        self._cameras = self._scene_views(views) if "cameras" in about else self._object_views(views)
+        self.cameras = self._scene_views(views) if "cameras" in about else self._object_views(views)
 
     def _scene_views(self, views: int) -> list[v3dg.Camera]:
         cameras = v3dg.read_cameras(self._folder / self._about["cameras"])
@@ -50,7 +50,7 @@ class Subject:
     @cached_property
     def _is_seen(self) -> list[Any]:
         """(N,) for each view, whether a gaussian's mean is in the picture."""
-        return [self._places(camera)[1] for camera in self._cameras]
+        return [self._places(camera)[1] for camera in self.cameras]
 
     def _places(self, camera: v3dg.Camera) -> tuple[Any, Any]:
         """(N, 2) px and (N,) whether they are in the picture."""
@@ -66,13 +66,13 @@ class Subject:
         """Each view, at a factor times the size at which a level of so many gaussians is at home."""
         if "cameras" in self._about:
             wanted = HOME_PX2 * count * float(np.mean([seen.mean() for seen in self._is_seen]))
-            scales = [math.sqrt(wanted / (c.width * c.height)) for c in self._cameras]
+            scales = [math.sqrt(wanted / (c.width * c.height)) for c in self.cameras]
         else:
             solid_angle = 2 * math.pi * (1 - math.sqrt(1 - _DISTANCE**-2))
-            scales = [math.sqrt(HOME_PX2 * count / solid_angle) / c.fx for c in self._cameras]
+            scales = [math.sqrt(HOME_PX2 * count / solid_angle) / c.fx for c in self.cameras]
         rng = np.random.default_rng([zlib.crc32(self.name.encode()), count, round(64 * factor)])
         return [
-            self._size(scaled(c, factor * s), widest, rng) for c, s in zip(self._cameras, scales, strict=True)
+            self._size(scaled(c, factor * s), widest, rng) for c, s in zip(self.cameras, scales, strict=True)
         ]
 
     def _size(self, camera: v3dg.Camera, widest: int, rng: np.random.Generator) -> Size:
