@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import v3dg
-from benchmarks.studies import pairs, pairs_report, pairs_subject
+from benchmarks.studies import pairs, pairs_report, pairs_subject, tolerances
 from benchmarks.worlds.procedural import make_person
+from v3dg._judges import Judges
 from v3dg.metrics import has_flip
 
 
@@ -148,3 +149,47 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
     pairs_report.report(pairs_report.Report(tmp_path / "again" / "pairs.json", tmp_path / "pairs.md"))
     text = (tmp_path / "pairs.md").read_text()
     assert f"{best[0]['ours_flip']:.4f} / {best[0]['best_flip']:.4f} = {best[0]['ratio']:.2f}" in text
+
+
+@pytest.mark.skipif(not has_flip(), reason="FLIP is not installed")
+def test_build_settings_reach_our_levels_and_the_record(folder, tmp_path):
+    build = v3dg.BuildConfig(steps=2, num_views=2, px2_per_gaussian=1.0)
+    pairs.measure(
+        pairs.Measure(
+            folder,
+            output=tmp_path,
+            only=("thing",),
+            methods=("ours",),
+            percents=(25.0,),
+            factors=(2.0,),
+            views=1,
+            device="cpu",
+            build=build,
+        )
+    )
+    found = json.loads((tmp_path / "pairs.json").read_text())
+    assert found["changes"] == {"steps": 2, "num_views": 2, "px2_per_gaussian": 1.0}
+
+
+def test_tolerances_compare_a_cut_with_all_gaussians():
+    def row(asset, tolerance, flip, psnr):
+        return {"asset": asset, "width": 64, "tolerance": tolerance, "flip": flip, "psnr": psnr, "share": 0.5}
+
+    rows = [row("a", 0.0, 0.1, 30.0), row("a", 3.0, 0.05, 31.0)]
+    rows += [row("b", 0.0, 0.1, 30.0), row("b", 3.0, 0.2, 28.0)]
+    line = tolerances.summary(rows).splitlines()[-1]
+    assert [cell.strip() for cell in line.strip("|").split("|")] == [
+        *("3", "1.000", "50%", "2.00", "b, 64 px", "-0.50", "0.1250", "50%")
+    ]
+
+
+@pytest.mark.skipif(not has_flip(), reason="FLIP is not installed")
+def test_tolerance_zero_is_every_gaussian(folder):
+    config = tolerances.Config(folder, tolerances=(1e9,), widths=(32,), views=1, device="cpu")
+    judges = Judges()
+    try:
+        whole, coarsest = tolerances.measure(config, subject(folder, "thing"), judges)
+    finally:
+        judges.close()
+    assert (whole["tolerance"], whole["share"]) == (0.0, 1.0)
+    assert coarsest["share"] < 0.1

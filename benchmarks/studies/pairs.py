@@ -32,7 +32,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -51,7 +51,7 @@ from v3dg.pictures import Picture, to_8bit
 Row = dict[str, Any]
 
 PERCENTS = (50.0, 25.0, 12.5, 6.25, 3.0, 1.5, 0.7)
-OUR_STEPS = {"ours": None, "merged": 0}
+_OURS = ("ours", "merged")
 _SAMPLES = 4
 _FULL_ENOUGH = 0.97  # of a budget
 _COARSEST_PX2 = 1e30
@@ -80,6 +80,8 @@ class Measure:
     """px of a side of the pictures that are compared."""
     views: int = 4
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
+    """How ours are built; merging alone is the same without a step."""
 
 
 @dataclass(frozen=True)
@@ -127,9 +129,7 @@ class Study:
     def _drawn(self, subject: Subject) -> Iterator[tuple[Row, Picture, Picture]]:
         """What is to be compared: what it is, the truth, the picture."""
         bundles = {
-            name: self._built(subject, name, steps)
-            for name, steps in OUR_STEPS.items()
-            if name in set[str](self._config.methods)
+            name: self._built(subject, name) for name in _OURS if name in set[str](self._config.methods)
         }
         self._asset = self._placed(subject.asset)
         targets: dict[float | str, tuple[int, list[Level]]] = {
@@ -146,8 +146,8 @@ class Study:
     def _placed(self, gaussians: v3dg.Gaussians) -> v3dg.Gaussians:
         return gaussians.torch("cuda") if self.device == "cuda" else gaussians
 
-    def _built(self, subject: Subject, name: str, steps: int | None) -> v3dg.Bundle:
-        config = v3dg.BuildConfig() if steps is None else v3dg.BuildConfig(steps=steps)
+    def _built(self, subject: Subject, name: str) -> v3dg.Bundle:
+        config = self._config.build if name == "ours" else replace(self._config.build, steps=0)
         start = time.perf_counter()
         bundle = v3dg.build_bundle(subject.asset, config=config, device=self.device, progress=False)
         seconds = round(time.perf_counter() - start, 2)
@@ -237,6 +237,7 @@ def measure(config: Measure) -> None:
     if missing:
         raise SystemExit(f"--only: expected some of {', '.join(about)}, got {missing[0]}")
     settings = {"factors": list(config.factors), "widest": config.widest, "views": config.views}
+    changes = dict(asdict(config.build).items() - asdict(v3dg.BuildConfig()).items())
     rows = known_rows(config.known, settings)
     config.output.mkdir(parents=True, exist_ok=True)
     study, judges = Study(config), Judges()
@@ -246,7 +247,8 @@ def measure(config: Measure) -> None:
             subject = Subject(config.assets, name, about[name], config.views)
             rows = rows | by_key(study.rows(subject, judges))
             print(f"{name}: {len(subject.asset)} gaussians, {time.perf_counter() - start:.0f} s", flush=True)
-            result = {"settings": settings, "builds": study.builds, "rows": list(rows.values())}
+            result = {"settings": settings, "changes": changes, "builds": study.builds}
+            result |= {"rows": list(rows.values())}
             record.write(config.output / "pairs.json", result, study.device)
     finally:
         judges.close()
