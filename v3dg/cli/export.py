@@ -10,21 +10,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from v3dg import export
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cli._common import Common, Flag, UsageError, bytes_text, option, print_result, require_file
-from v3dg.export import (
-    CESIUM_VERSION,
-    DEFAULT_CHUNK,
-    ENGINE,
-    ENGINE_VERSION,
-    Axis,
-    Site,
-    Tiles,
-    write_site,
-    write_tiles,
-    write_usd,
-)
+from v3dg.export import Axis
 from v3dg.formats.usd import SUFFIXES as USD_SUFFIXES
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene
@@ -41,7 +31,7 @@ class Export(Common):
     ends in .usd, .usda or .usdc, the file to write."""
     to: Literal["sog", "tiles"] = "sog"
     """Streamed SOG, for PlayCanvas and SuperSplat, or 3D Tiles, for CesiumJS."""
-    chunk: int = DEFAULT_CHUNK
+    chunk: int = export.DEFAULT_CHUNK
     """Most gaussians of an asset in a chunk of streamed SOG, for which the viewer chooses a level."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
     """Direction that is up; z for a scene and -y, as in most trained assets, for a bundle if not given."""
@@ -57,27 +47,27 @@ def run(options: Export) -> None:
     start = time.perf_counter()
     subject, cameras = _read(options.subject)
     if folder.suffix.lower() in USD_SUFFIXES:
-        size = write_usd(subject, folder, up=options.up)
+        size = export.write_usd(subject, folder, up=options.up)
         written = {"output": str(folder), "bytes": size, "seconds": time.perf_counter() - start}
         print_result(options.json, written, [f"{folder}: {bytes_text(size)}, {written['seconds']:.1f} s"])
         return
     common: dict[str, Any] = {"up": options.up, "progress": not options.quiet}
     there = shlex.quote(str(folder))
-    done: Site | Tiles
+    done: export.Site | export.Tiles
+    needs: tuple[str, ...]
     if options.to == "tiles":
-        done = write_tiles(subject, folder, **common)
-        text, needs = f"{done.tiles:,} tiles", "CesiumJS"
-        engine, copied = f"cesium@{CESIUM_VERSION}", f"-r node_modules/cesium/Build/Cesium {there}/cesium"
+        done = export.write_tiles(subject, folder, **common)
+        text, needs = f"{done.tiles:,} tiles", () if (folder / export.CESIUM).exists() else export.TILES_NEED
     else:
-        done = write_site(subject, folder, cameras, chunk=options.chunk, **common)
+        done = export.write_site(subject, folder, cameras, chunk=options.chunk, **common)
         text = f"{done.gaussians:,} gaussians, {done.coarsest:,} at the coarsest"
-        needs = "" if done.has_engine else "PlayCanvas's engine"
-        engine, copied = f"playcanvas@{ENGINE_VERSION}", f"node_modules/playcanvas/build/{ENGINE} {there}/"
+        needs = () if done.has_engine else export.SITE_NEEDS
     result = {"output": str(folder), **asdict(done), "seconds": time.perf_counter() - start}
     seconds = f"{result['seconds']:.1f} s"
-    lines = [f"{folder}: {done.instances:,} instances, {text}, {bytes_text(done.bytes)}, {seconds}"]
+    instances = f"{done.instances:,} instance{'s' * (done.instances != 1)}"
+    lines = [f"{folder}: {instances}, {text}, {bytes_text(done.bytes)}, {seconds}"]
     if needs:
-        lines += [f"it needs {needs} beside it, once:", f"  npm install {engine}", f"  cp {copied}"]
+        lines += ["it needs its engine beside it, once:", *(f"  {line.format(there)}" for line in needs)]
     lines += [f"to look at it: python -m http.server --bind 127.0.0.1 --directory {there}"]
     print_result(options.json, result, [*lines, "  then open http://127.0.0.1:8000/"])
 

@@ -92,8 +92,11 @@ def bytes_below(folder: Path) -> int:
 
 
 @contextlib.contextmanager
-def replacing_folder(folder: Path) -> Iterator[Path]:
-    """Give a new folder beside `folder` to fill; at the end it takes its place, on failure it is removed."""
+def replacing_folder(folder: Path, keep: str = "") -> Iterator[Path]:
+    """Give a new folder beside `folder` to fill; at the end it takes its place, on failure it is removed.
+
+    What is there by the name `keep` moves along.
+    """
     if folder.exists() and not (
         folder.is_dir() and (any((folder / mark).is_file() for mark in MARKS) or not any(folder.iterdir()))
     ):
@@ -112,6 +115,8 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
             if target.exists():
                 target.rename(old)
             temporary.rename(target)
+            if keep and (old / keep).exists():
+                (old / keep).rename(target / keep)
             shutil.rmtree(old, ignore_errors=True)
         except BaseException:
             if old.exists() and not target.exists():

@@ -19,25 +19,16 @@ from v3dg import _files
 from v3dg._numbers import check
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
-from v3dg.export._common import (
-    Axis,
-    bytes_below,
-    detail_of,
-    names_of,
-    replacing_folder,
-    rotation_to,
-    turn_upright,
-    write_document,
-    write_page,
-)
+from v3dg.export import _common
+from v3dg.export._common import Axis
 from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, Plan, write_levels
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
 SITE = "site.json"
 ENGINE = "playcanvas.min.mjs"
-ENGINE_VERSION = "2.23.3"
-"""Of PlayCanvas's engine, with which the page is tested."""
+SITE_NEEDS = "npm install playcanvas@2.23.3", f"cp node_modules/playcanvas/build/{ENGINE} {{}}/"
+"""Commands that bring PlayCanvas's engine, in the version that the page is tested with, to a folder."""
 
 
 @dataclass(frozen=True)
@@ -91,34 +82,34 @@ def write_site(
     is_scene = isinstance(subject, Scene)
     axis: Axis = up or ("z" if is_scene else "-y")
     # A bundle alone is turned to what viewers take to be up; a scene's stay as its instances have them.
-    turn = turn_upright("-y" if is_scene else axis)
+    turn = _common.turn_upright("-y" if is_scene else axis)
     scene = Scene.of(subject)
     check("scene", len(scene), "instances to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
-    with replacing_folder(folder) as place:
+    with _common.replacing_folder(folder) as place:
         total = sum(bundle.num_gaussians for bundle in scene.bundles)
         listed, counts = [], []
         with tqdm(None, "export", total, unit=" gaussians", unit_scale=True, disable=not progress) as bar:
-            for name, plan in zip(names_of(scene) if is_scene else ["."], plans, strict=True):
+            for name, plan in zip(_common.names_of(scene) if is_scene else ["."], plans, strict=True):
                 (place / name).mkdir(exist_ok=True)
                 done = write_levels(plan, place / name, turn, bar.update)
                 index = INDEX if name == "." else f"{name}/{INDEX}"
-                listed.append({"url": index, "counts": done.counts, **detail_of(plan.bundle)})
+                listed.append({"url": index, "counts": done.counts, **_common.detail_of(plan.bundle)})
                 counts.append((done.counts[0], done.counts[-1]))
         document = {
             "version": 1,
             "tolerance": DEFAULT_TOLERANCE,
             # By columns: of the files' world, and of the cameras', to one with y up.
-            "rotation": rotation_to(axis if is_scene else "-y", "y").T.tolist(),
-            "camera_rotation": rotation_to(axis, "y").T.tolist(),
+            "rotation": _common.rotation_to(axis if is_scene else "-y", "y").T.tolist(),
+            "camera_rotation": _common.rotation_to(axis, "y").T.tolist(),
             "bundles": listed,
             "instances": _instances(scene),
             "cameras": _cameras(cameras or {}),
         }
-        write_document(place / SITE, document)
-        write_page(place, "site.html")
+        _common.write_document(place / SITE, document)
+        _common.write_page(place, "site.html")
         has_engine = _bring_engine(folder, place)
-        size = bytes_below(place)
+        size = _common.bytes_below(place)
     finest, coarsest = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
     return Site(len(listed), len(scene), finest, coarsest, size, has_engine)
 

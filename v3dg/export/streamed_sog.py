@@ -25,13 +25,8 @@ from v3dg._version import __version__
 from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
 from v3dg.cleaning import ball_of_most
-from v3dg.export._common import (
-    Axis,
-    bytes_below,
-    replacing_folder,
-    turn_upright,
-    write_document,
-)
+from v3dg.export import _common
+from v3dg.export._common import Axis
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable, morton_order
 from v3dg.gaussians import Gaussians
@@ -91,8 +86,8 @@ def write_streamed_sog(
     """
     from tqdm import tqdm
 
-    turn, plan = turn_upright(up), Plan.of(bundle, chunk)
-    with replacing_folder(Path(folder)) as place:
+    turn, plan = _common.turn_upright(up), Plan.of(bundle, chunk)
+    with _common.replacing_folder(Path(folder)) as place:
         total = bundle.num_gaussians
         with tqdm(None, "export", total, unit=" gaussians", unit_scale=True, disable=not progress) as bar:
             done = write_levels(plan, place, turn, bar.update)
@@ -111,9 +106,11 @@ def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int],
         "filenames": [f"{name}/meta.json" for name in names],
         "tree": plan.tree(lods, turn),
     }
-    write_document(place / INDEX, index)
-    write_document(place / SETTINGS, _viewer_settings(placed(plan.bundle.level_gaussians(plan.top), turn)))
-    return Export(counts, plan.num_chunks, len(names), bytes_below(place))
+    _common.write_document(place / INDEX, index)
+    _common.write_document(
+        place / SETTINGS, _viewer_settings(placed(plan.bundle.level_gaussians(plan.top), turn))
+    )
+    return Export(counts, plan.num_chunks, len(names), _common.bytes_below(place))
 
 
 def _write_folders(

@@ -21,15 +21,8 @@ from v3dg._numbers import check
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
-from v3dg.export._common import (
-    Axis,
-    bytes_below,
-    names_of,
-    replacing_folder,
-    rotation_to,
-    write_document,
-    write_page,
-)
+from v3dg.export import _common
+from v3dg.export._common import Axis
 from v3dg.formats import gltf
 from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
@@ -38,8 +31,10 @@ from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
 TILESET = "tileset.json"
-CESIUM_VERSION = "1.145.0"
-"""Of CesiumJS, with which the page is tested."""
+CESIUM = "cesium"
+"""Folder beside the page with CesiumJS, which stays when an export is replaced."""
+TILES_NEED = "npm install cesium@1.145.0", f"cp -r node_modules/cesium/Build/Cesium {{}}/{CESIUM}"
+"""Commands that bring CesiumJS, in the version that the page is tested with, to a folder."""
 
 _SCREEN_SPACE_ERROR = 16.0  # px, CesiumJS's limit where none is given
 # The content's y is up, the tiles' z.
@@ -91,13 +86,13 @@ def write_tiles(
     from tqdm import tqdm
 
     root = np.eye(4)
-    root[:3, :3] = rotation_to(up or ("z" if isinstance(subject, Scene) else "-y"), "z")
+    root[:3, :3] = _common.rotation_to(up or ("z" if isinstance(subject, Scene) else "-y"), "z")
     scene = Scene.of(subject)
     check("scene", len(scene), "instances to export, got none")
     for bundle in scene.bundles:
         check("bundle", bundle.num_gaussians, "gaussians to export, got none")
-    names, trees = names_of(scene), []
-    with replacing_folder(Path(folder)) as place:
+    names, trees = _common.names_of(scene), []
+    with _common.replacing_folder(Path(folder), keep=CESIUM) as place:
         total = sum(bundle.num_gaussians for bundle in scene.bundles)
         with tqdm(None, "export", total, unit=" gaussians", unit_scale=True, disable=not progress) as bar:
             for name, bundle in zip(names, scene.bundles, strict=True):
@@ -116,8 +111,8 @@ def write_tiles(
         ]
         tree = {"transform": root.T.ravel().tolist(), **_above(instances)}
         _write_tileset(place / TILESET, tree)
-        write_page(place, "tiles.html")
-        size, tiles = bytes_below(place), sum(1 for _ in place.rglob("*.glb"))
+        _common.write_page(place, "tiles.html")
+        size, tiles = _common.bytes_below(place), sum(1 for _ in place.rglob("*.glb"))
     return Tiles(len(trees), len(scene), tiles, size)
 
 
@@ -214,4 +209,4 @@ def _write_tileset(path: Path, root: dict[str, Any]) -> None:
         "geometricError": root["geometricError"],
         "root": {"refine": "REPLACE", **root},
     }
-    write_document(path, document)
+    _common.write_document(path, document)

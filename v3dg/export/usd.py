@@ -10,7 +10,8 @@ import numpy as np
 
 from v3dg._numbers import check, one_of
 from v3dg.bundle import Bundle
-from v3dg.export._common import Axis, detail_of, names_of, rotation_to
+from v3dg.export import _common
+from v3dg.export._common import Axis
 from v3dg.formats import usd
 from v3dg.formats._packing import check_writable
 from v3dg.rotations import quaternion_from_rotation
@@ -46,11 +47,11 @@ def write_usd(subject: Scene | Bundle, path: str | os.PathLike[str], *, up: Axis
     stage = usd.new_stage("Z")
     world = pxr.UsdGeom.Xform.Define(stage, "/world")
     stage.SetDefaultPrim(world.GetPrim())
-    turn = rotation_to(up or ("z" if isinstance(subject, Scene) else "-y"), "z")
+    turn = _common.rotation_to(up or ("z" if isinstance(subject, Scene) else "-y"), "z")
     w, *xyz = quaternion_from_rotation(turn)
     world.AddOrientOp().Set(pxr.Gf.Quatf(w, *xyz))
     above = "/world/instances" if isinstance(subject, Scene) else "/world"
-    paths = [f"{above}/{pxr.Tf.MakeValidIdentifier(name)}" for name in names_of(scene)]
+    paths = [f"{above}/{pxr.Tf.MakeValidIdentifier(name)}" for name in _common.names_of(scene)]
     if isinstance(subject, Scene):
         vectors, quats = pxr.Vt.Vec3fArray.FromNumpy, np.roll(scene.quaternions, -1, axis=1)
         instancer = pxr.UsdGeom.PointInstancer.Define(stage, "/world/instances")
@@ -73,7 +74,7 @@ def _define_levels(stage: object, place: str, bundle: Bundle) -> None:
     if bundle.num_levels < 2:
         return
     low, high = bundle.clusters.box[:, 0].min(axis=0), bundle.clusters.box[:, 1].max(axis=0)
-    detail, radius = detail_of(bundle), float(np.linalg.norm(high - low)) / 2
+    detail, radius = _common.detail_of(bundle), float(np.linalg.norm(high - low)) / 2
     # Share of the picture that the ball around the box covers from where level 1 is enough.
     share = math.pi * DEFAULT_TOLERANCE / _PIXELS * (radius / max(detail["reach"], _LEAST)) ** 2
     sizes = [share / detail["ratio"] ** (2 * level) for level in range(bundle.num_levels - 1)]
