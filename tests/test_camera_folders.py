@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import v3dg
+from command_line import fails
 from command_line import run as run_command
 from scenes_lod import random_camera
 from v3dg import read_cameras
@@ -160,3 +161,27 @@ def test_the_command_takes_a_folder(tmp_path, cameras):
     done = run_command("render", "donut.ply", "--cameras", ".", "-o", "a.png", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "a.png").is_file()
+
+
+def test_the_viewer_offers_the_cameras_of_a_folder(tmp_path, monkeypatch, cameras):
+    from benchmarks.worlds.procedural import make_donut
+    from v3dg import cli
+
+    offered = {}
+
+    class Site:
+        def __init__(self, view, **options):
+            offered.update(options["cameras"])
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("v3dg.viewer.server.Site", Site)
+    v3dg.write_asset(tmp_path / "donut.ply", make_donut(1000))
+    write_model(tmp_path / "capture", cameras)
+    assert (
+        cli.main(["view", f"{tmp_path}/donut.ply", "--cameras", f"{tmp_path}/capture", "--device", "cpu"])
+        == 130
+    )
+    assert_same(offered, cameras)
+    (tmp_path / "empty").mkdir()
+    wrong = "view", "donut.ply", "--cameras", "empty"
+    fails(1, "empty: expected a model of COLMAP", *wrong, cwd=tmp_path)

@@ -15,12 +15,14 @@ from typing import Annotated, Literal
 import tyro
 
 from v3dg._start import SIGNALS
+from v3dg.camera_file import read_cameras
 from v3dg.cli._common import Threads, UsageError, option, require_subject
 from v3dg.cli._views import direction_of, load_subject
 from v3dg.export import Axis
 
 # Between looks for a signal: a wait without an end misses one that comes just before it.
 _SECONDS = 0.1
+_SIZE = (800, 800)  # px, of cameras whose file has none; the page has its own
 
 
 @dataclass
@@ -35,6 +37,10 @@ class View:
     """Port to listen at; the next free one where it is taken."""
     up: Axis = "z"
     """Which way is up."""
+    cameras: Annotated[Path | None, option("PATH")] = None
+    """Offer the cameras of this nerfstudio transforms.json, run of nerfstudio, or model of COLMAP."""
+    distortion: Literal["refuse", "ignore"] = "refuse"
+    """Whether lens distortion of those is an error, or left out of the pictures."""
     tolerance: Annotated[float | None, option("PX2")] = None
     """Screen area in px² that a coarser cluster's gaussian may stand for, at first; 3, or 0 with a budget."""
     budget: Annotated[int | None, option("N")] = None
@@ -61,6 +67,8 @@ def run(options: View) -> None:
     if not math.isfinite(tolerance):
         raise UsageError(f"--tolerance: expected a number, got {tolerance}")
     subject, cameras = load_subject(options.subject)
+    if options.cameras is not None:
+        cameras = read_cameras(options.cameras, size=_SIZE, distortion=options.distortion)
     if isinstance(subject, Gaussians) and options.budget is not None:
         raise UsageError(
             f"--budget: expected a bundle or a scene, got the asset {options.subject}; build a bundle of it"
