@@ -47,7 +47,7 @@ class Convert(Common):
     """Write the cut with at most this many gaussians."""
     outside: Literal["drop", "keep"] = "drop"
     """What becomes of the part of the cut that the camera does not see."""
-    spz_version: Literal[2, 3, 4] | None = None
+    spz_version: Annotated[Literal[2, 3, 4] | None, option("{2,3,4}")] = None
     """Version of a .spz; 3 if not given."""
     view: Views = field(default_factory=ViewOptions)
 
