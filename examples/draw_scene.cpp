@@ -58,14 +58,15 @@ int main(int num_arguments, char** arguments) {
     const std::vector<double> position{-1.3, 0, 0, 1.3, 0, 0}, quaternion{1, 0, 0, 0, 1, 0, 0, 0},
         scale{1, 0.7};
     const std::vector<float> importance{1, 1};
-    const SceneModel drawn{&model.planes(), whole_bundle(table.table()), table.appearance(), {}};
+    const SceneModel drawn{&model.planes(), table.appearance(), {}};
     const HostScene scene{{&table.table(), 1},
                           {&drawn, 1},
                           {{bundle_of_instance.data(), 2},
                            {position.data(), 6},
                            {quaternion.data(), 8},
                            {scale.data(), 2},
-                           {importance.data(), 2}}};
+                           {importance.data(), 2}},
+                          {}};
 
     // A camera at (0, 0, -6) that looks along z.
     Camera camera{};

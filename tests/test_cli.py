@@ -253,6 +253,16 @@ def test_render_scene(folder, tmp_path):
         assert picture.size == (48, 32)
 
 
+def test_render_from_a_pool(folder, tmp_path):
+    pictures = []
+    for options in ((), ("--memory", "64MB")):
+        path = tmp_path / f"{len(options)}.png"
+        done = run("render", folder / "tuft.v3dg", "-o", path, "--size", 64, 48, "--views", 1, *options)
+        assert done.returncode == 0, done.stderr
+        pictures.append(path.read_bytes())
+    assert pictures[0] == pictures[1]
+
+
 def test_render_within_a_budget(folder, tmp_path):
     out = tmp_path / "small.png"
     options = ("--camera", "near", "--budget", 400, "--color-by", "level", "--json")

@@ -25,7 +25,7 @@ MAY_INCLUDE = {
     "simplify": {"base", "math", "cluster"},
     "gather": {"base", "math"},
     "quantize": {"base", "math"},
-    "residency": {"base", "math", "frame"},
+    "residency": {"base", "math", "io", "frame", "quantize"},
     "select": {"base", "math", "frame", "residency"},
     "project": {"base", "math", "frame", "quantize"},
     "tile_bin": {"base", "math", "frame"},
@@ -34,6 +34,7 @@ MAY_INCLUDE = {
     "pipeline": {
         "base",
         "math",
+        "io",
         "frame",
         "quantize",
         "residency",

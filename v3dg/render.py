@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import check, color, real
+from v3dg.build.memory import in_bytes
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image
+from v3dg.pool import Pool
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
 from v3dg.select import CutOptions, Selection, over_budget, rule_of
@@ -40,6 +42,10 @@ class Stats:
             came to; 0 for an asset.
         select_ms: Time to choose the clusters.
         draw_ms: Time to draw them.
+        missing: Pages that the picture misses, in place of which coarser ones are drawn; 0 where all is
+            resident, or the renderer has settled. This and the next as far as is known.
+        failed: Pages that cannot be read.
+        bytes_in: Bytes of pages that came in with this picture.
     """
 
     gaussians_selected: int
@@ -47,6 +53,9 @@ class Stats:
     tolerance: float
     select_ms: float
     draw_ms: float
+    missing: int = 0
+    failed: int = 0
+    bytes_in: int = 0
 
 
 class RenderedImage(Image):
@@ -77,6 +86,7 @@ class _Options(CutOptions, total=False):
     color_by: ColorBy
     background: Sequence[float]
     min_transmittance: float | None
+    memory: int | str | None
 
 
 @overload
@@ -99,6 +109,7 @@ def render(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     min_transmittance: float | None = None,
     device: str | Device = "auto",
+    memory: int | str | None = None,
 ) -> RenderedImage | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
@@ -120,6 +131,7 @@ def render(
         device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws torch tensors there, on
             the stream that is torch's current one, and keeps on the device what the next picture of the same
             scene or bundle needs. Use a `Renderer` to say how long. "auto" is "cuda" where that works.
+        memory: As in `Renderer`; each picture is settled.
 
     Raises:
         ValueError: An argument is not as above, or the coarsest cut has more gaussians than the budget; on
@@ -128,13 +140,17 @@ def render(
     """
     where = _device.resolve(device)
     if isinstance(subject, Gaussians):
-        frame = _Frame(subject, color_by, where)
+        frame = _Frame(subject, color_by, where, memory)
     else:
-        frame = residency.frame(subject, (color_by, where), lambda: _Frame(subject, color_by, where))
+        key = color_by, where, memory
+        frame = residency.frame(subject, key, lambda: _Frame(subject, color_by, where, memory))
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
-    if isinstance(camera, Camera):
-        return frame.draw(subject, camera, background, min_transmittance, **options)
-    return [frame.draw(subject, view, background, min_transmittance, **options) for view in camera]
+    pictures = []
+    for view in [camera] if isinstance(camera, Camera) else camera:
+        if memory is not None:
+            frame.settle(subject, view, **options)
+        pictures.append(frame.draw(subject, view, background, min_transmittance, **options))
+    return pictures[0] if isinstance(camera, Camera) else pictures
 
 
 class Renderer:
@@ -146,12 +162,20 @@ class Renderer:
     the graph, and capture again when the scene has changed. A picture that is under way when its scene is
     changed is finished first.
 
+    With `memory`, only a part of the bundles is resident, so that they may be far larger than memory: pages
+    come in from the files as views need them, read by other threads. A picture waits for none of them: where
+    one is missing, the coarser clusters above it are drawn. Use `settle` for a picture that misses nothing.
+    If a view needs more than there is room for, the tolerance is raised until it fits.
+
     Args:
-        color_by: As in `v3dg.render`.
+        color_by: As in `v3dg.render`; with `memory`, "appearance".
         device: As in `v3dg.render`. The renderer stays on it, whichever device is torch's current one later.
+        memory: For gaussians: bytes, or text like "2GB". All are resident if None. On the CPU alone so far.
 
     Raises:
         RuntimeError: Something is missing for the device.
+        ValueError: `memory` has no room for the coarsest level, or is given for a CUDA device, or the
+            coarsest page of a file is damaged.
     """
 
     def __init__(
@@ -160,9 +184,10 @@ class Renderer:
         *,
         color_by: ColorBy = "appearance",
         device: str | Device = "auto",
+        memory: int | str | None = None,
     ) -> None:
         self._subject = subject
-        self._frame = _Frame(subject, color_by, _device.resolve(device))
+        self._frame = _Frame(subject, color_by, _device.resolve(device), memory)
 
     def render(
         self,
@@ -175,21 +200,54 @@ class Renderer:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         min_transmittance: float | None = None,
     ) -> RenderedImage:
-        """Draw as `v3dg.render` does."""
+        """Draw as `v3dg.render` does, of what is resident."""
         options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
         return self._frame.draw(self._subject, camera, background, min_transmittance, **options)
+
+    def settle(
+        self,
+        camera: Camera,
+        *,
+        tolerance: float | None = None,
+        budget: int | None = None,
+        min_level: int = 0,
+        timeout: float = 30.0,
+    ) -> None:
+        """Wait until what a view needs is resident, so that its picture misses nothing.
+
+        The picture is then the same, bit for bit, as if all were resident; or as it is at the tolerance that
+        it says, where there is not enough room. Returns at once where all is resident.
+
+        Args:
+            timeout: Seconds after which it gives up if not a single page came in.
+
+        Raises:
+            ValueError: A page is damaged; the message says which.
+            OSError: A page cannot be read. A TimeoutError if the disk does not answer.
+        """
+        options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level}
+        self._frame.settle(self._subject, camera, timeout, **options)
 
 
 class _Frame:
     """Buffers that pictures of one subject are drawn with; it does not keep the subject alive."""
 
-    def __init__(self, subject: _Subject, color_by: ColorBy, device: Device) -> None:
+    def __init__(
+        self, subject: _Subject, color_by: ColorBy, device: Device, memory: int | str | None
+    ) -> None:
         self._device, self._color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
+        self._pool: Pool | None = None
+        self._memory = None if memory is None else in_bytes(memory)
         if isinstance(subject, Gaussians):
+            check("memory", memory is None, f"None for an asset, which has no pages, got {memory}")
             _check_asset(color_by)
             self._asset = _core.AssetFrame(_core.Model(_device.place(subject, device).rows))
         else:
+            expected = f"'appearance' for a pool, got {color_by!r}"
+            check("color_by", memory is None or color_by == "appearance", expected)
+            expected = f"none on {device}, for pools are on the CPU so far, got {memory}; take device='cpu'"
+            check("memory", memory is None or not device.is_cuda, expected)
             self._frame = _core.SceneFrame(device.number)
             with residency.reading(subject, device) as resident:
                 self._take_models(resident)
@@ -210,13 +268,21 @@ class _Frame:
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
         rule = rule_of(**options, footprint="solid_angle", cull=True)
         with residency.reading(subject, self._device) as resident:
-            self._take_models(resident)
-            if cut is None:
+            pool = self._take_models(resident)
+            if pool is not None:
+                check("cut", cut is None, "none for a pool, which has its own, got one")
+                before = pool.core.status()
+                drawing = self._frame.draw_resident(resident.core, pool.core, camera.core, rule, shade)
+            elif cut is None:
                 drawing = self._frame.draw(resident.core, camera.core, rule, shade)
             else:
                 _check_cut(cut, subject, resident, **options)
                 pairs = self._here(cut.instance_ids), self._here(cut.cluster_ids)
                 drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade)
+            if pool is not None:
+                now = pool.core.status()
+                came_in = {"missing": now.missing, "failed": now.failed}
+                came_in["bytes_in"] = now.bytes_in - before.bytes_in
             resident.add_drawing(drawing)
         budget = options["budget"]
 
@@ -225,18 +291,40 @@ class _Frame:
             if budget is not None and stats.exceeds_budget:
                 raise over_budget(budget, stats.gaussians)
             chosen = stats.tolerance_px2 if budget is not None else rule.tolerance_px2
+            if pool is not None:
+                return replace(_stats(stats, stats.tolerance_px2), **came_in)
             return _stats(stats, chosen if cut is None else cut.tolerance)
 
         if not self._device.is_cuda:
             finish()
         return RenderedImage(drawing, finish)
 
-    def _take_models(self, resident: ResidentScene) -> None:
+    def settle(
+        self, subject: _Subject, camera: Camera, timeout: float = 30.0, cut: Any = None, **options: Any
+    ) -> None:
+        """Bring in what a view needs."""
+        rule = rule_of(**options, footprint="solid_angle", cull=True)
+        if self._memory is None or cut is not None:
+            return
+        assert not isinstance(subject, Gaussians)
+        with residency.reading(subject, self._device) as resident:
+            pool = self._take_models(resident)
+        assert pool is not None
+        pool.settle(resident, camera.core, rule, timeout)
+
+    def _take_models(self, resident: ResidentScene) -> Pool | None:
+        """Have the gaussians of the scene's bundles at hand: in a pool, or all of them."""
         with residency.lock:
             bundles = resident.bundles
+            if self._memory is not None:
+                tables = [residency.table(bundle) for bundle in bundles]
+                if self._pool is None or self._pool.tables != tables:
+                    self._pool = Pool(bundles, tables, self._memory)
+                return self._pool
             if self._num_models < len(bundles):
                 residency.set_models(self._frame, bundles, self._device, self._color_by)
                 self._num_models = len(bundles)
+            return None
 
     def _here(self, ids: Any) -> Any:
         if not self._device.is_cuda:

@@ -23,6 +23,7 @@ def main(arguments=None):
     parser.add_argument("--trials", type=int, default=10_000_000)
     parser.add_argument("--bundle", type=Path, help="a .v3dg file; random trees if not given")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--partial", action="store_true", help="of random pages, closed towards the root")
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args(arguments)
@@ -30,7 +31,13 @@ def main(arguments=None):
     bundles = [Bundle.open(arguments.bundle)] if arguments.bundle else None
     result = {
         "bundle": str(arguments.bundle) if arguments.bundle else "random trees",
-        **run_trials(arguments.trials, bundles, seed=arguments.seed, device=arguments.device),
+        **run_trials(
+            arguments.trials,
+            bundles,
+            seed=arguments.seed,
+            device=arguments.device,
+            partial=arguments.partial,
+        ),
     }
     print(
         json.dumps(result)

@@ -5,6 +5,7 @@
 
 #include "bindings/operations.h"
 #include "bindings/picture.h"
+#include "bindings/pool.h"
 #include "bindings/resident.h"
 #include "pipeline/scene_frame.h"
 
@@ -150,6 +151,34 @@ class BoundSceneFrame {
 #endif
     }
 
+    // What is resident of the bundles of a pool, with what comes in before.
+    std::unique_ptr<BoundDrawing> draw_resident(const py::object& scene_object, const py::object& pool_object,
+                                                const BoundCamera& camera, const SelectRule& rule,
+                                                const Shade& shade, const Stop* stop) {
+        const auto& scene = held<BoundScene>(scene_object, "scene");
+        auto& pool = held<BoundPool>(pool_object, "pool");
+        require_host("draw_resident");
+        if (scene.device() != device_) throw py::value_error("scene: expected one on the frame's device");
+        const std::shared_ptr<const SceneState> state = scene.state();
+        pool.check_scene(*state);
+        const Window window = window_of(camera.camera);
+        NewPicture out = picture_of(window, true);
+        const Picture<float> picture = out.on_host<float>(window, shade);
+        std::vector<SceneModel> models;
+        for (size_t b = 0; b < state->tables.size(); ++b)
+            models.push_back({&pool.planes(b), state->bundle(b).appearance(), {}});
+        SceneFrameCounts counts{};
+        {
+            const py::gil_scoped_release unlocked;
+            pool.frame_on_host(*state, rule, true, [&](auto tables, const SelectRule& raised, auto needs) {
+                const HostScene host{tables, {models.data(), models.size()}, state->instances, needs};
+                counts = cpu::draw_scene(host, camera.camera, raised, picture, flag_of(stop));
+                return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
+            });
+        }
+        return std::make_unique<BoundDrawing>(std::move(out), stats_of(counts));
+    }
+
     std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object, const BoundCamera& camera,
                                            const py::object& instance_ids, const py::object& cluster_ids,
                                            const Shade& shade, const Stop* stop) {
@@ -249,14 +278,14 @@ class BoundSceneFrame {
     std::vector<SceneModel> models_of(const SceneState& scene) const {
         std::vector<SceneModel> models(host_.begin(), host_.begin() + scene.tables.size());
         for (size_t b = 0; b < models.size(); ++b) {
-            models[b].pages = whole_bundle(scene.tables[b]);
             models[b].appearance = scene.bundle(b).appearance();
         }
         return models;
     }
 
     static HostScene host_scene(const SceneState& scene, const std::vector<SceneModel>& models) {
-        return {{scene.tables.data(), scene.tables.size()}, {models.data(), models.size()}, scene.instances};
+        return {
+            {scene.tables.data(), scene.tables.size()}, {models.data(), models.size()}, scene.instances, {}};
     }
 
     // The window of the camera, drawn by draw(host scene, picture) without Python's lock.
@@ -368,6 +397,8 @@ void bind_frame(py::module_& m) {
         .def(py::init<int>(), "device"_a)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a, "stop"_a = nullptr)
+        .def("draw_resident", &BoundSceneFrame::draw_resident, "scene"_a, "pool"_a, "camera"_a, "rule"_a,
+             "shade"_a, "stop"_a = nullptr)
         .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,
              "shade"_a, "stop"_a = nullptr)
         .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,

@@ -19,7 +19,9 @@ void bind_scene(py::module_& m) {
         .def("set_instances", &BoundScene::set_instances, "bundle"_a, "importance"_a, "positions"_a,
              "quaternions"_a, "scales"_a)
         .def("set_poses", &BoundScene::set_poses, "positions"_a, "quaternions"_a, "scales"_a)
-        .def("select", &BoundScene::select, "camera"_a, "rule"_a);
+        .def("select", &BoundScene::select, "camera"_a, "rule"_a)
+        .def("page_needs", &BoundScene::page_needs, "camera"_a, "rule"_a,
+             "For each bundle how urgently its pages are needed: (G+1,), above 1 where the cut misses them.");
 }
 
 }  // namespace v3dg

@@ -30,7 +30,7 @@ struct Arguments {
               const SelectRule& rule) {
         for (const BoundTable& table : tables_of_bundles) tables.push_back(table.table());
         instances.check_bundles(tables.size());
-        input = {{tables.data(), tables.size()}, instances.table(), camera.camera, rule};
+        input = {{tables.data(), tables.size()}, instances.table(), camera.camera, rule, {}};
     }
 };
 
@@ -77,7 +77,7 @@ py::tuple bounds_may_draw(const Tables& tables, const Instances& instances, cons
 
 BoundTable::BoundTable(py::array ball, py::array weight, py::array level, py::array own_group,
                        py::array parent_group, py::array box, py::array filter_px2, py::array antialiased,
-                       py::array offset)
+                       py::array offset, py::object page_shift)
     : arrays_{ball, weight, level, own_group, parent_group, box, filter_px2, antialiased, offset} {
     const Span<const float> balls = span_of<const float>(ball, "ball", {-1, 4});
     const size_t num_groups = balls.size / 4;
@@ -97,6 +97,10 @@ BoundTable::BoundTable(py::array ball, py::array weight, py::array level, py::ar
     check_groups(given.own_group, "own_group", num_groups);
     check_groups(given.parent_group, "parent_group", num_groups);
     offsets_of(offset, static_cast<size_t>(given.offset[clusters]));
+    if (!page_shift.is_none()) {
+        given.pages.shift = span_of<const int64_t>(page_shift, "page_shift", {groups + 1});
+        arrays_.push_back(py::reinterpret_borrow<py::array>(page_shift));
+    }
     host_ = std::make_unique<HostTable>(given, appearance);
 }
 
@@ -132,9 +136,9 @@ BoundCut::BoundCut(const SelectOutput& out)
 void bind_select(py::module_& m) {
     py::class_<BoundTable>(m, "ClusterTable", "What selection and drawing read of a bundle's clusters.")
         .def(py::init<py::array, py::array, py::array, py::array, py::array, py::array, py::array, py::array,
-                      py::array>(),
+                      py::array, py::object>(),
              py::kw_only(), "ball"_a, "weight"_a, "level"_a, "own_group"_a, "parent_group"_a, "box"_a,
-             "filter_px2"_a, "antialiased"_a, "offset"_a)
+             "filter_px2"_a, "antialiased"_a, "offset"_a, "page_shift"_a = py::none())
         .def("bytes_on", &BoundTable::bytes_on, "device"_a, "Memory that the tables take on a device.");
     py::class_<BoundCut>(m, "Cut", "The clusters that one view needs, and what their selection came to.")
         .def_readonly("instance_ids", &BoundCut::instance_ids)

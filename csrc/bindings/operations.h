@@ -15,6 +15,7 @@ void bind_quantize(pybind11::module_& m);
 void bind_select(pybind11::module_& m);
 void bind_rasterize(pybind11::module_& m);
 void bind_scene(pybind11::module_& m);
+void bind_pool(pybind11::module_& m);
 void bind_frame(pybind11::module_& m);
 void bind_fit_level(pybind11::module_& m);
 

@@ -9,7 +9,6 @@
 #include "bindings/tables.h"
 #include "pipeline/model.h"
 #include "pipeline/scene_frame.h"
-#include "residency/page_table.h"
 #include "select/select.h"
 
 #if V3DG_WITH_CUDA
@@ -57,7 +56,7 @@ class BoundModel {
     bool has_codes() const { return codes_.offset.size > 0; }
     // On the host; without what the scene knows of the clusters.
     SceneModel on_host() const {
-        return {has_codes() ? nullptr : &host_->planes(), {}, {}, {}, has_codes() ? &codes_ : nullptr};
+        return {has_codes() ? nullptr : &host_->planes(), {}, {}, has_codes() ? &codes_ : nullptr};
     }
     size_t bytes() const {
         if (host_ != nullptr) return host_->bytes();
@@ -116,7 +115,7 @@ class BoundPalette {
         const auto& table = held<BoundTable>(table_object, "table");
         const auto clusters = static_cast<py::ssize_t>(table.table().num_clusters());
         const Span<const float> colors = span_of<const float>(sh, "sh", {clusters, 3});
-        host_ = {colors.data, whole_bundle(table.table()).first_row.data, static_cast<uint32_t>(clusters)};
+        host_ = {colors.data, table.table().offset.data, static_cast<uint32_t>(clusters)};
         const Work work(device_);
 #if V3DG_WITH_CUDA
         if (device_.is_host()) return;
@@ -243,7 +242,7 @@ class BoundScene {
             const py::gil_scoped_release unlocked;
             if (device_.is_host())
                 cpu::select(
-                    {{state->tables.data(), state->tables.size()}, state->instances, camera.camera, rule},
+                    {{state->tables.data(), state->tables.size()}, state->instances, camera.camera, rule, {}},
                     out);
 #if V3DG_WITH_CUDA
             else
@@ -251,6 +250,30 @@ class BoundScene {
 #endif
         }
         return BoundCut(out);
+    }
+
+    // Priorities of the pages of each bundle, on the host.
+    py::list page_needs(const BoundCamera& camera, const SelectRule& rule) const {
+        if (!device_.is_host())
+            throw py::value_error("page_needs: expected a scene on the CPU, got one on a CUDA device");
+        const std::shared_ptr<const SceneState> state = state_;
+        py::list priorities;
+        std::vector<Span<uint32_t>> needs;
+        for (const ClusterTable& table : state->tables) {
+            const NewArray<float> priority({}, {static_cast<py::ssize_t>(table.num_pages())});
+            std::fill(priority.span.begin(), priority.span.end(), 0.0f);
+            needs.push_back({reinterpret_cast<uint32_t*>(priority.span.data), priority.span.size});
+            priorities.append(priority.object);
+        }
+        SelectOutput out;
+        const py::gil_scoped_release unlocked;
+        cpu::select({{state->tables.data(), state->tables.size()},
+                     state->instances,
+                     camera.camera,
+                     rule,
+                     {needs.data(), needs.size()}},
+                    out);
+        return priorities;
     }
 
   private:

@@ -17,7 +17,8 @@ namespace v3dg {
 class BoundTable {
   public:
     BoundTable(py::array ball, py::array weight, py::array level, py::array own_group, py::array parent_group,
-               py::array box, py::array filter_px2, py::array antialiased, py::array offset);
+               py::array box, py::array filter_px2, py::array antialiased, py::array offset,
+               py::object page_shift);
     BoundTable(const BoundTable&) = delete;
 
     const ClusterTable& table() const { return host_->table(); }

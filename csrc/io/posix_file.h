@@ -21,6 +21,8 @@ class PosixFile {
     static PosixFile create(const char* path) {
         return PosixFile(::open(path, O_WRONLY | O_CLOEXEC | O_CREAT | O_TRUNC, 0666));
     }
+    // Of an open file, which may then be closed.
+    static PosixFile duplicate(int descriptor) { return PosixFile(::fcntl(descriptor, F_DUPFD_CLOEXEC, 0)); }
     PosixFile(PosixFile&& other) noexcept : descriptor_(other.descriptor_) { other.descriptor_ = -1; }
     PosixFile& operator=(PosixFile&&) = delete;
     ~PosixFile() {

@@ -4,15 +4,13 @@
 #include <vector>
 
 #include "pipeline/render.h"
-#include "residency/page_table.h"
 #include "select/select.h"
 
 namespace v3dg {
 
-// The gaussians of one bundle on the host, where its clusters lie among them and how they are drawn.
+// The gaussians of one bundle on the host, and how its clusters are drawn.
 struct SceneModel {
     const GaussianPlanes<float>* planes;  // null where there are codes
-    PageTable pages;
     ClusterAppearance appearance;
     Palette palette;
     const Codes* codes = nullptr;
@@ -23,6 +21,7 @@ struct HostScene {
     Span<const ClusterTable> tables;
     Span<const SceneModel> models;  // of the same bundles
     InstanceTable instances;
+    Span<const Span<uint32_t>> needs = {};  // as SelectInput has them
 };
 
 // What one frame came to.

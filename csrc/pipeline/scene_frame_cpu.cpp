@@ -76,7 +76,7 @@ class CutDraws {
         if (c < 0 || static_cast<size_t>(c) >= table.num_clusters())
             throw std::out_of_range("cluster_ids: expected ids of the bundle's clusters, got " +
                                     std::to_string(c));
-        const uint64_t first = model.pages.first_row[c], count = table.num_gaussians(c);
+        const uint64_t first = table.first_row(c), count = table.num_gaussians(c);
         end_of_pair_.push_back(num_gaussians_);
         if (i != last_instance_) {
             const Pose pose = scene_.instances.pose(i);
@@ -113,7 +113,7 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Camera& camera, c
                                  const Picture<float>& picture, const std::atomic<bool>* stop) {
     const double start = now();
     SelectOutput cut;
-    select({scene.tables, scene.instances, camera, rule}, cut);
+    select({scene.tables, scene.instances, camera, rule, scene.needs}, cut);
     const double select_seconds = now() - start;
     SceneFrameCounts counts{};
     if (cut.fits_budget)

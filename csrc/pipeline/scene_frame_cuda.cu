@@ -77,7 +77,7 @@ DevicePalette::DevicePalette(Span<const float> sh, std::shared_ptr<const BundleT
     : tables_(std::move(tables)), sh_(sh, stream) {}
 
 Palette DevicePalette::palette() const {
-    return {sh_.data(), tables_->on_device().pages.first_row.data,
+    return {sh_.data(), tables_->on_device().table.offset.data,
             static_cast<uint32_t>(tables_->num_clusters())};
 }
 

@@ -35,12 +35,11 @@ class Upload {
     std::vector<std::function<void(const unsigned char*)>> moves_;
 };
 
-std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const PageTable& pages,
-                                       const ClusterAppearance& appearance) {
+std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const ClusterAppearance& appearance) {
     std::vector<uint8_t> joins((table.num_clusters() + kClustersOfBounds - 1) / kClustersOfBounds, 0);
     for (size_t c = 0; c < table.num_clusters(); ++c) {
         const size_t k = c % kClustersOfBounds;
-        if (k > 0 && pages.follows(table, c) && appearance[c - 1] == appearance[c])
+        if (k > 0 && table.follows(c) && appearance[c - 1] == appearance[c])
             joins[c / kClustersOfBounds] |= 1 << k;
     }
     return joins;
@@ -50,10 +49,10 @@ std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const PageTabl
 
 BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
                            cudaStream_t stream)
-    : on_device_{table, {}, appearance, {}, nullptr} {
+    : on_device_{table, appearance, {}, nullptr} {
     static_assert(kClustersOfBounds <= 8, "a byte says which of them are drawn together");
     const std::vector<ClusterBounds> bounds = bounds_of_clusters(table);
-    const std::vector<uint8_t> joins = joins_of_clusters(table, whole_bundle(table), appearance);
+    const std::vector<uint8_t> joins = joins_of_clusters(table, appearance);
     on_device_.bounds = {bounds.data(), bounds.size()};
     Span<const uint8_t> joins_on_device{joins.data(), joins.size()};
     ClusterTable& t = on_device_.table;
@@ -67,12 +66,12 @@ BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& a
     upload.add(t.offset);
     upload.add(t.top_group);
     upload.add(t.top_cluster);
+    upload.add(t.pages.shift);
     upload.add(on_device_.appearance.filter_px2);
     upload.add(on_device_.appearance.antialiased);
     upload.add(on_device_.bounds);
     upload.add(joins_on_device);
     upload.finish(storage_, stream);
-    on_device_.pages = whole_bundle(t);
     on_device_.joins = joins_on_device.data;
 }
 

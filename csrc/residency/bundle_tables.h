@@ -5,7 +5,6 @@
 
 #include "base/device.h"
 #include "residency/cluster_bounds.h"
-#include "residency/page_table.h"
 
 namespace v3dg {
 namespace cuda {
@@ -13,7 +12,6 @@ namespace cuda {
 // What kernels read of a bundle; everything lies on the device.
 struct BundleOnDevice {
     ClusterTable table;
-    PageTable pages;
     ClusterAppearance appearance;
     Span<const ClusterBounds> bounds;
     // A byte for each of the bounds; bit k: its cluster k is drawn together with the one before, since its

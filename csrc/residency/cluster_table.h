@@ -8,6 +8,7 @@
 #include "base/span.h"
 #include "frame/draw_list.h"
 #include "math/bounds.h"
+#include "residency/page_table.h"
 
 namespace v3dg {
 
@@ -24,9 +25,18 @@ struct ClusterTable {
     Span<const int32_t> top_cluster;   // clusters that no group replaces
     Box bounds;                        // of all boxes
     float pad_px;                      // how far the filter reaches, and a pixel
+    PageTable pages;                   // where the gaussians are
 
     V3DG_HD size_t num_clusters() const { return own_group.size; }
     V3DG_HD int64_t num_gaussians(size_t c) const { return offset[c + 1] - offset[c]; }
+    V3DG_HD size_t num_pages() const { return ball.size + 1; }
+    V3DG_HD size_t page_of(size_t c) const { return parent_group[c] < 0 ? ball.size : parent_group[c]; }
+    // Where the rows of a cluster begin among those that are resident; its page is.
+    V3DG_HD int64_t first_row(size_t c) const {
+        return pages.is_whole() ? offset[c] : offset[c] + pages.shift[page_of(c)];
+    }
+    // Whether they begin where those of the cluster before it end, wherever pages lie.
+    V3DG_HD bool follows(size_t c) const { return pages.is_whole() || page_of(c) == page_of(c - 1); }
 };
 
 // How the clusters of a bundle are drawn.
@@ -40,7 +50,7 @@ struct ClusterAppearance {
 // The tables of a bundle on the host. Borrows the arrays that it is given and owns what it derives from them.
 class HostTable {
   public:
-    // `given` has the arrays from `ball` to `offset`.
+    // `given` has the arrays from `ball` to `offset`, and the pages.
     HostTable(const ClusterTable& given, const ClusterAppearance& appearance);
     HostTable(const HostTable&) = delete;
     HostTable& operator=(const HostTable&) = delete;

@@ -1,27 +1,31 @@
 #pragma once
 
-#include "residency/cluster_table.h"
+#include <cstdint>
+
+#include "base/span.h"
 
 namespace v3dg {
 
-// Where the gaussians of a bundle's clusters lie in memory. How many a cluster has says ClusterTable::offset.
-//
-// So far a bundle is resident as a whole or not at all. Once single pages can be absent, a group whose finer
-// clusters lie in an absent page has metric 0, as it has at SelectRule::min_level: it always fits, and what
-// is below it is never drawn. The cut stays exact as long as a page is resident only together with the pages
-// above it.
-struct PageTable {
-    Span<const int64_t> first_row;  // [C] among the rows of the bundle's resident gaussians
+constexpr int64_t kAbsentPage = INT64_MIN;
 
-    // Whether the rows of cluster c begin where those of the cluster before it end.
-    V3DG_HD bool follows(const ClusterTable& table, size_t c) const {
-        return first_row[c] == first_row[c - 1] + table.num_gaussians(c - 1);
-    }
+// Where the pages of a bundle lie in memory, and which of them are there. Page g holds the clusters that
+// group g replaces, the last page those that nothing replaces.
+//
+// The cut refines only what is there. It stays exact as long as a page is resident only together with the
+// pages above it, of which the last one is resident always.
+struct PageTable {
+    // [G + 1] by how many rows a page lies behind its place in the bundle, or kAbsentPage. Empty: all pages
+    // are there, in the order of the bundle.
+    Span<const int64_t> shift;
+
+    V3DG_HD bool is_whole() const { return shift.empty(); }
+    V3DG_HD bool is_resident(size_t page) const { return is_whole() || shift[page] != kAbsentPage; }
 };
 
-// The rows of a bundle that is resident as a whole lie in the order of its clusters. Borrows from the table.
-inline PageTable whole_bundle(const ClusterTable& table) {
-    return {{table.offset.data, table.num_clusters()}};
-}
+// A page that a cut needs, and how urgently; select_math.h says what priorities are.
+struct PageRequest {
+    uint32_t bundle, page;
+    float priority;
+};
 
 }  // namespace v3dg

@@ -95,8 +95,8 @@ __device__ unsigned ask_clusters(const LaneClusters& mine, const InstanceView& v
                                  Tolerances tolerances, const Ask& ask) {
     const unsigned lane = threadIdx.x % 32;
     const uint32_t part_first = mine.first - kLaneClusters * lane;
-    const bool asks =
-        mine.first < mine.bundle->table.num_clusters() && may_draw(mine.bounds(), view, rule, tolerances);
+    const bool asks = mine.first < mine.bundle->table.num_clusters() &&
+                      may_draw(mine.bundle->table, mine.bounds(), view, rule, tolerances);
     unsigned todo = __ballot_sync(kAllLanes, asks), found = 0;
     while (todo != 0) {
         unsigned owners = 0, owner = 32;  // in bytes; of this lane

@@ -104,7 +104,7 @@ struct ItemOutput {
             const int32_t cluster = mine.cluster(run.k);
             const unsigned size = mine.size(run.k, run.num_clusters), step = run.gaussians_an_item();
             const uint32_t placement = run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
-            const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->pages.first_row[cluster]);
+            const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.first_row(cluster));
             const Appearance<float> appearance = mine.bundle->appearance[cluster];
             for (unsigned skip = 0; skip < size; skip += step, ++first) {
                 const unsigned count = min(step, size - skip);

@@ -14,10 +14,12 @@ namespace v3dg {
 // Selected pairs are in ascending order of instance, then cluster. Pairs outside the frustum are left out,
 // unless they could touch a pixel. Both halves give the same bits for any number of threads.
 //
+// Groups whose page is not resident are not refined.
+//
 // With a budget, the tolerance is the least of those that a budget chooses from (select_math.h) from which on
 // no cut has more gaussians: a coarser cut can have more than a finer one where the frustum cuts through it.
 // There may be none: then `fits_budget` is false, nothing is selected and `num_gaussians` is what the
-// coarsest cut has.
+// coarsest cut has. All pages count as resident: while some are not, the cut may have more or less.
 //
 // Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the footprint and the
 // nesting balls are ours.
@@ -26,6 +28,10 @@ struct SelectInput {
     InstanceTable instances;
     Camera camera;
     SelectRule rule;
+    // Where it is told which pages are needed, of the bundles of which only some are resident: [G + 1] of
+    // each, bits of the highest priority of each page (select_math.h), 0 where it is not needed and before.
+    // Empty: nobody asks.
+    Span<const Span<uint32_t>> needs = {};
 };
 
 struct SelectOutput {

@@ -4,6 +4,7 @@
 #include "select/select.h"
 
 #include <algorithm>
+#include <cstring>
 #include <numeric>
 #include <utility>
 
@@ -76,19 +77,26 @@ struct SeenInstance {
 struct Scratch {
     std::vector<uint8_t> fits;    // of each group
     std::vector<int32_t> chosen;  // clusters
+    std::vector<float> priority;  // of each group, where pages are asked for
 
-    explicit Scratch(const View& view) : fits(view.most_groups), chosen(view.most_clusters) {}
+    explicit Scratch(const View& view)
+        : fits(view.most_groups),
+          chosen(view.most_clusters),
+          priority(view.in.needs.empty() ? 0 : view.most_groups) {}
 };
 
 // Answers for all groups of an instance. What it reads comes as copies, which nothing that it writes can
-// change, so that the compiler works on several groups at once.
+// change, so that the compiler works on several groups at once. Those that are absent, which it could not ask
+// for at once, fit whatever the answer.
 template <Footprint footprint>
-void ask_groups(const ClusterTable table, const InstanceView view, SelectRule rule,
-                uint8_t* __restrict fits) {
+void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule, uint8_t* __restrict fits) {
     rule.footprint = footprint;
+    const PageTable pages = table.pages;
+    table.pages = {};
     const AskedGroups groups{table, view, rule};
     const int32_t num_groups = static_cast<int32_t>(table.ball.size);
     for (int32_t g = 0; g < num_groups; ++g) fits[g] = groups.fits(g);
+    for (int32_t g = 0; g < num_groups && !pages.is_whole(); ++g) fits[g] |= !pages.is_resident(g);
 }
 
 // Returns how many clusters suffice and writes which.
@@ -103,6 +111,27 @@ size_t find_sufficient(const ClusterTable table, const InstanceView view, const 
         num_sufficient += cut.suffices(c);
     }
     return num_sufficient;
+}
+
+// Positive floats order as their bits do.
+void raise(uint32_t& need, float priority) {
+    uint32_t bits, before = __atomic_load_n(&need, __ATOMIC_RELAXED);
+    std::memcpy(&bits, &priority, sizeof bits);
+    while (before < bits &&
+           !__atomic_compare_exchange_n(&need, &before, bits, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
+    }
+}
+
+// Tells which pages an instance needs whose table is asked.
+template <class Cut>
+void tell_needs(const Cut& cut, const SelectRule& rule, Span<uint32_t> needs, std::vector<float>& priority) {
+    const ClusterTable& table = cut.table;
+    for (size_t g = 0; g < table.ball.size; ++g)
+        priority[g] = priority_of(wanted_metric_px2(table, static_cast<int32_t>(g), cut.view, rule), rule);
+    for (size_t c = 0; c < table.num_clusters(); ++c) {
+        const PageNeed need = page_need(table, c, [&](int32_t g) { return priority[g]; });
+        if (need.page >= 0 && !cut.is_culled(c)) raise(needs[need.page], need.priority);
+    }
 }
 
 // Appends what instance i draws.
@@ -123,6 +152,8 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
         else
             ask_groups<Footprint::paper>(seen.table, seen.view, rule, fits);
         end += find_sufficient(seen.table, seen.view, rule, fits, chosen);
+        if (!view.in.needs.empty() && !seen.table.pages.is_whole())
+            tell_needs(cut, rule, view.in.needs[view.in.instances.bundle[i]], scratch.priority);
     }
     if (cut.culls) end = std::remove_if(chosen, end, [&](int32_t c) { return cut.is_culled(c); });
     out.instance.insert(out.instance.end(), end - chosen, static_cast<int32_t>(i));
@@ -219,7 +250,7 @@ void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset
         const SeenInstance seen(view, i);
         for (size_t g = 0; g < seen.table.ball.size; ++g)
             metric[metric_offset[i] + g] =
-                metric_px2(seen.table, static_cast<int32_t>(g), seen.view, in.rule);
+                wanted_metric_px2(seen.table, static_cast<int32_t>(g), seen.view, in.rule);
     });
 }
 
@@ -232,7 +263,7 @@ void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<con
         const SeenInstance seen(view, i);
         uint8_t* out = may_draw.data + first[i];
         for (const ClusterBounds& b : bounds[in.instances.bundle[i]])
-            *out++ = seen.is_placed && v3dg::may_draw(b, seen.view, in.rule, tolerances);
+            *out++ = seen.is_placed && v3dg::may_draw(seen.table, b, seen.view, in.rule, tolerances);
     });
 }
 

@@ -71,12 +71,19 @@ V3DG_HD inline float footprint_px2(const Ball& ball, const InstanceView& view, F
     return area >= 0.0f ? area : INFINITY;
 }
 
-// Screen area, px2, that one gaussian of the clusters made by group g stands for. 0 where nothing finer may
-// be drawn, so that the group always fits.
-V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
-                                const SelectRule& rule) {
+// Screen area, px2, that one gaussian of the clusters made by group g stands for, whichever pages are
+// resident. 0 where nothing finer may be drawn, so that the group always fits.
+V3DG_HD inline float wanted_metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
+                                       const SelectRule& rule) {
     const float metric = footprint_px2(table.ball[g], view, rule.footprint) * table.weight[g];
     return table.level[g] <= rule.min_level ? 0.0f : metric;
+}
+
+// The same as the cut takes it: 0, too, where what is finer is not resident. Both are closed towards the
+// root, and so is what is wanted and resident: the cut stays exact.
+V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const InstanceView& view,
+                                const SelectRule& rule) {
+    return table.pages.is_resident(g) ? wanted_metric_px2(table, g, view, rule) : 0.0f;
 }
 
 V3DG_HD inline bool fits(float metric_px2, const SelectRule& rule) {
@@ -146,12 +153,12 @@ V3DG_HD inline float tolerance_of_bin(uint32_t bin, float tolerance) {
     return value;
 }
 
-// Whether the clusters that nothing replaces are the cut. The paper's footprint does not grow towards the
-// root, so that a group may fail to fit below one that does.
+// Whether the clusters that nothing replaces are the cut, and no page is wanted. The paper's footprint does
+// not grow towards the root, so that a group may fail to fit below one that does.
 V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view, const SelectRule& rule) {
     if (rule.footprint == Footprint::paper) return false;
     for (size_t i = 0; i < table.top_group.size; ++i)
-        if (!fits(metric_px2(table, table.top_group[i], view, rule), rule)) return false;
+        if (!fits(wanted_metric_px2(table, table.top_group[i], view, rule), rule)) return false;
     return true;
 }
 
@@ -181,7 +188,8 @@ struct BinRange {
     V3DG_HD bool is_empty() const { return first >= end; }
 };
 
-// What the decision asks of a group, answered when it is asked.
+// What the decision asks of a group, answered when it is asked. A budget counts as if all pages were
+// resident, so that its tolerance does not depend on which of them are.
 struct AskedGroups {
     const ClusterTable& table;
     const InstanceView& view;
@@ -189,7 +197,7 @@ struct AskedGroups {
 
     V3DG_HD bool fits(int32_t g) const { return v3dg::fits(metric_px2(table, g, view, rule), rule); }
     V3DG_HD uint32_t bin(int32_t g) const {
-        return bin_of_metric(metric_px2(table, g, view, rule), rule.tolerance_px2);
+        return bin_of_metric(wanted_metric_px2(table, g, view, rule), rule.tolerance_px2);
     }
 };
 
@@ -223,6 +231,40 @@ struct InstanceCut {
     }
 };
 
+// How urgently the page of a group is wanted: above 1 if the cut misses it, at most 1 if it would at a
+// smaller tolerance.
+V3DG_HD inline float priority_of(float metric_px2, const SelectRule& rule) {
+    const float ratio = metric_px2 / rule.tolerance_px2;
+    if (fits(metric_px2, rule)) return ratio <= 1.0f ? ratio : 0.0f;
+    return ratio > 1.0f ? ratio : 1.0f + FLT_EPSILON;
+}
+// Pages are asked for ahead, before the cut misses them, from this priority on.
+constexpr float kLeastPriority = 0.5f;
+
+// A page that a cut needs, and how urgently.
+struct PageNeed {
+    int32_t page;  // -1: none
+    float priority;
+};
+
+// The page that a cluster which is not culled tells that its instance needs, and with it those above;
+// `priority` says how urgently the page of a group does. Once all are resident whose priority is above 1, and
+// the pages above them, the cut is the one that is made if every page is: a cluster of that has its page, and
+// one that stands in for finer ones asks for theirs.
+template <class Priority>
+V3DG_HD inline PageNeed page_need(const ClusterTable& table, size_t c, const Priority& priority) {
+    const int32_t own = table.own_group[c], parent = table.parent_group[c];
+    const float above = parent < 0 ? INFINITY : priority(parent);
+    if (!(above > 1.0f)) return {-1, 0.0f};
+    const size_t page = table.page_of(c);
+    if (own >= 0 && table.pages.is_resident(page)) {
+        const float below = priority(own);
+        const bool is_finer_drawn = below > 1.0f && table.pages.is_resident(own);
+        if (below > kLeastPriority && !is_finer_drawn) return {own, below};
+    }
+    return {static_cast<int32_t>(page), above};
+}
+
 // More than rounding can do to a metric, which is compared with what bounds it.
 constexpr float kBoundMargin = 1e-3f;
 
@@ -248,11 +290,13 @@ V3DG_HD inline bool owns_do_not_fit(const ClusterBounds& bounds, const InstanceV
 
 enum class Tolerances { this_one, from_this_on };
 
-// False only if none of the clusters is drawn at these tolerances.
-V3DG_HD inline bool may_draw(const ClusterBounds& bounds, const InstanceView& view, const SelectRule& rule,
-                             Tolerances tolerances) {
+// False only if none of the clusters is drawn at these tolerances. Bounds do not know which pages are absent,
+// whose groups fit whatever they say.
+V3DG_HD inline bool may_draw(const ClusterTable& table, const ClusterBounds& bounds, const InstanceView& view,
+                             const SelectRule& rule, Tolerances tolerances) {
     return !(rule.culls && is_outside(bounds.box, view)) && !parents_fit(bounds, view, rule) &&
-           (tolerances == Tolerances::from_this_on || !owns_do_not_fit(bounds, view, rule));
+           (tolerances == Tolerances::from_this_on || !table.pages.is_whole() ||
+            !owns_do_not_fit(bounds, view, rule));
 }
 
 }  // namespace v3dg

@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 
+from partial import closed_residency, random_shift, resident_scene, rule
 from random_bundle import random_bundle
 from scenes_lod import blob, group_metrics, lod_bundle
 from v3dg import Camera, Scene, select
@@ -92,8 +93,11 @@ def check_counting(bundle, number, whole):
             raise AssertionError("the count of violations does not count")
 
 
-def run_trials(num_trials, bundles=None, *, seed=0, device="cpu"):
-    """Violations among the trials, and what was tried; random trees if no bundles are given."""
+def run_trials(num_trials, bundles=None, *, seed=0, device="cpu", partial=False):
+    """Violations among the trials, and what was tried; random trees if no bundles are given.
+
+    With ``partial``, of pages closed towards the root, other ones for each camera.
+    """
     rng = np.random.default_rng(seed)
     bundles = bundles or random_trees(rng)
     numbers = [numbers_of_clusters(bundle, rng) for bundle in bundles]
@@ -105,18 +109,27 @@ def run_trials(num_trials, bundles=None, *, seed=0, device="cpu"):
         b = int(rng.integers(len(bundles)))
         count = min(BATCH, num_trials - trials)
         scene, camera, tolerance, is_tie = random_batch(bundles[b], rng, count)
-        selection = select(scene, camera, tolerance=tolerance, cull=False, device=device)
+        if partial:
+            shift, _ = random_shift(rng, bundles[b], closed_residency(rng, bundles[b]))
+            begin = time.perf_counter()
+            selection = resident_scene(scene, [shift], device).select(
+                camera.core, rule(tolerance, cull=False)
+            )
+            seconds += time.perf_counter() - begin
+        else:
+            selection = select(scene, camera, tolerance=tolerance, cull=False, device=device)
+            seconds += selection.seconds
         wrong += count_wrong(selection.instance_ids, selection.cluster_ids, count, *numbers[b])
         trials += count
         ties += is_tie
-        drawn += len(selection)
+        drawn += len(selection.cluster_ids)
         ends = (bundles[b].clusters.own_group < 0) | (bundles[b].clusters.parent_group < 0)
         at_ends += int(ends[selection.cluster_ids].sum())
-        seconds += selection.seconds
     return {
         "clusters": [len(bundle.clusters) for bundle in bundles],
         "seed": seed,
         "device": device,
+        "partial": partial,
         "trials": trials,
         "violations": wrong,
         "batches_with_the_tolerance_a_metric": ties,

@@ -197,6 +197,13 @@ class Bundle:
             self._pages = self._pages.in_memory()
         return self._pages
 
+    @property
+    def page_source(self) -> Any:
+        """What the core reads single pages from: the file, or all gaussians where they are in memory."""
+        if self._file is None or isinstance(self._pages, MemoryPages):
+            return self.gaussians.rows
+        return self._file.source
+
     def read_page(self, page: int) -> Gaussians:
         """Gaussians of the clusters that share parent group ``page``, or of the last level; verified."""
         check_index("page", page, self.num_pages)

@@ -285,6 +285,12 @@ class BundleFile:
         """(P+1,) first byte of each page in the file, and the end."""
         return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
 
+    @property
+    def source(self) -> tuple[str, int, str, int, NDArray[np.int64], NDArray[np.uint8]]:
+        """What the core reads pages with: name, descriptor, codec, SH degree, places and hashes."""
+        codec = self.codec
+        return self.path, self._fd, codec.name, codec.sh_degree, self.places, self.tables["pages.hash"]
+
     def read_pages(self, run: PageRun) -> Gaussians:
         """The gaussians of a run of pages, verified."""
         return read_pages(self.path, self._fd, run, self.codec, self.tables["pages.hash"][run.first_page :])

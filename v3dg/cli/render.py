@@ -33,6 +33,8 @@ class Render(OnDevice):
     """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Red, green and blue of the background, each 0 to 1."""
+    memory: Annotated[str | None, option("SIZE")] = None
+    """Draw from so much memory, as 2GB, with pages read from the files as cameras need them (on the CPU)."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -55,6 +57,7 @@ def run(options: Render) -> None:
             color_by=options.color_by,
             background=options.background,
             device=device,
+            memory=options.memory,
         )
         write_picture(path, _device.to_host(image.color))
         pictures.append(

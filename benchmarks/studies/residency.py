@@ -1,0 +1,218 @@
+"""What a pool of pages does to frames: flights and teleports over a field of many different copies.
+
+Copies of a bundle are written with the colours of all gaussians changed a little, so that no two share a
+page, and stand in a grid. For pools of several sizes, as shares of what a view needs: how long frames take,
+how many bytes come in and how many pages are missing, and how far the picture is from the settled one. The
+size of a pool is a choice here: whether all would fit is said by the row without a pool.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import tyro
+
+import v3dg
+from benchmarks.evaluation import record
+from v3dg import _device
+from v3dg.metrics import psnr
+
+
+@dataclass
+class Config:
+    bundle: Path
+    """A .v3dg file, of which copies are made."""
+    side: int = 3
+    """Of the grid of copies."""
+    size: tuple[int, int] = (640, 360)
+    tolerance: float = 3.0
+    frames: int = 120
+    """Of a flight across the field."""
+    hz: float = 0.0
+    """Frames a second that a flight is paced to; as many as there can be if 0."""
+    shares: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
+    """Slots of each pool, over those that the neediest view of the flight takes."""
+    device: str = "cpu"
+    is_whole_drawn: bool = True
+    """Whether everything is drawn without a pool, too."""
+    folder: Path | None = None
+    """Where the copies are kept."""
+    output: str | None = None
+
+
+def write_copies(config: Config, folder: Path) -> list[Path]:
+    """Bundles like the given one, each with colours of its own."""
+    bundle, paths = v3dg.Bundle.open(config.bundle), []
+    for number in range(config.side**2):
+        path = folder / f"copy_{number}.v3dg"
+        paths.append(path)
+        if path.exists():
+            continue
+        sh = bundle.gaussians.sh.copy()
+        sh[:, 0] += np.random.default_rng(number).normal(0, 0.05, sh[:, 0].shape).astype(np.float32)
+        changed = dataclasses.replace(bundle.gaussians, sh=sh)
+        v3dg.Bundle(bundle.clusters, bundle.groups, changed, bundle.config, bundle.codec).write(path)
+    return paths
+
+
+class Field:
+    """Copies in a grid of unit spacing, and cameras over it."""
+
+    def __init__(self, config: Config, paths: list[Path]) -> None:
+        self.config, self.paths = config, paths
+        self.scene = v3dg.Scene()
+        for number, path in enumerate(paths):
+            bundle = v3dg.Bundle.open(path)
+            box = bundle.clusters.box[bundle.clusters.parent_group < 0]
+            low, high = box[:, 0].min(axis=0), box[:, 1].max(axis=0)
+            scale = 1 / float((high - low)[:2].max())
+            place = np.array([number % config.side, number // config.side, 0.0])
+            middle = scale * np.append((low + high)[:2] / 2, low[2])
+            self.scene.add(bundle, positions=place - middle, scales=scale)
+
+    def camera(self, at: float) -> v3dg.Camera:
+        """From 0 at the near edge to 1 at the far one."""
+        width, height = self.config.size
+        across, along = 0.5 * (self.config.side - 1), at * self.config.side - 0.8
+        eye = (across + 0.3 * np.sin(6 * at), along, 0.6)
+        target = (across, along + 1.0, 0.1)
+        return v3dg.Camera.look_at(eye, target, (0, 0, 1), 1.0, width=width, height=height)
+
+    def flight(self) -> list[v3dg.Camera]:
+        return [self.camera(at) for at in np.linspace(0, 0.8, self.config.frames)]
+
+    def drop_cached_pages(self) -> None:
+        """Have the system forget what it keeps of the files, as far as it listens."""
+        for path in self.paths:
+            descriptor = os.open(path, os.O_RDONLY)
+            os.fsync(descriptor)
+            os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+            os.close(descriptor)
+
+    def memory(self, num_slots: int) -> int:
+        """Bytes of a pool with about so many slots."""
+        degree = max(bundle.sh_degree for bundle in self.scene.bundles)
+        num_sh = 3 * (degree + 1) ** 2
+        floats = 11 + num_sh if self.config.device == "cpu" else 16 + (-(-num_sh // 4) * 4 if degree else 0)
+        rows = 0
+        for bundle in self.scene.bundles:
+            counts = np.diff(bundle._layout.first_gaussian)
+            rows += int(counts[-1])
+        rows += num_slots * int(counts[:-1].max())
+        num_bytes = 4 * floats * rows
+        return num_bytes + min(64 << 20, num_bytes // 7) + 4096
+
+
+def timed(config: Config, renderer: v3dg.Renderer, cameras: list[v3dg.Camera]) -> list[dict[str, Any]]:
+    """Draw one picture after the other; what each took, and its stats."""
+    frames, start = [], time.perf_counter()
+    for number, camera in enumerate(cameras):
+        if config.hz:
+            time.sleep(max(0.0, start + number / config.hz - time.perf_counter()))
+        begin = time.perf_counter()
+        image = renderer.render(camera, tolerance=config.tolerance)
+        stats = dataclasses.asdict(image.stats)
+        frames.append({"image": image, "ms": 1e3 * (time.perf_counter() - begin), **stats})
+    return frames
+
+
+def summary(frames: list[dict[str, Any]]) -> dict[str, Any]:
+    ms = np.array([frame["ms"] for frame in frames])
+    result = {f"p{q}_ms": float(np.percentile(ms, q)) for q in (50, 95, 99)} | {"worst_ms": float(ms.max())}
+    for name in ("missing", "bytes_in", "gaussians_selected"):
+        values = np.array([frame[name] for frame in frames])
+        result |= {f"mean_{name}": float(values.mean()), f"most_{name}": int(values.max())}
+    return result | {"most_tolerance": max(frame["tolerance"] for frame in frames)}
+
+
+def errors(frames: list[dict[str, Any]], truth: dict[int, np.ndarray]) -> dict[str, Any]:
+    """PSNR of some pictures against the settled ones; equal pictures count as 100 dB."""
+    values = [decibels(truth[number], frames[number]["image"]) for number in truth]
+    return {"mean_psnr": float(np.mean(values)), "least_psnr": float(np.min(values))}
+
+
+def decibels(settled: np.ndarray, image: v3dg.Image) -> float:
+    return min(100.0, float(psnr(settled, pixels(image))))
+
+
+def pixels(image: v3dg.Image) -> np.ndarray:
+    return np.clip(_device.to_host(image.color), 0, 1)
+
+
+def teleport(config: Config, field: Field, memory: int, *, cold: bool) -> dict[str, Any]:
+    """From one end of the field to the other: pictures until nothing is missing."""
+    renderer = v3dg.Renderer(field.scene, device=config.device, memory=memory)
+    renderer.settle(field.camera(0), tolerance=config.tolerance)
+    renderer.render(field.camera(0), tolerance=config.tolerance).stats  # noqa: B018
+    if cold:
+        field.drop_cached_pages()
+    start, curve = time.perf_counter(), []
+    while time.perf_counter() - start < 20:
+        image = renderer.render(field.camera(0.8), tolerance=config.tolerance)
+        missing, seconds = image.stats.missing, time.perf_counter() - start
+        curve.append({"seconds": seconds, "missing": missing, "picture": pixels(image)})
+        if len(curve) > 3 and not any(frame["missing"] for frame in curve[-2:]):
+            break
+    renderer.settle(field.camera(0.8), tolerance=config.tolerance)
+    settled = pixels(renderer.render(field.camera(0.8), tolerance=config.tolerance))
+    for frame in curve:
+        frame["psnr"] = min(100.0, float(psnr(settled, frame.pop("picture"))))
+    return {"cold": cold, "curve": curve[:200], "frames_until_settled": len(curve)}
+
+
+def main(config: Config) -> None:
+    with TemporaryDirectory() as temporary:
+        folder = config.folder or Path(temporary)
+        folder.mkdir(exist_ok=True)
+        field = Field(config, write_copies(config, folder))
+        cameras = field.flight()
+        begin = time.perf_counter()
+        roomy = v3dg.Renderer(field.scene, device=config.device, memory=field.memory(10**9 // 400))
+        roomy.render(cameras[0], tolerance=config.tolerance).stats  # noqa: B018
+        first_ms = 1e3 * (time.perf_counter() - begin)
+        truth, most_needed = {}, 0
+        for number in range(0, len(cameras), max(1, len(cameras) // 12)):
+            roomy.settle(cameras[number], tolerance=config.tolerance)
+            most_needed = max(most_needed, roomy._frame._pool.core.status().needed)
+            truth[number] = pixels(roomy.render(cameras[number], tolerance=config.tolerance))
+        del roomy
+        result: dict[str, Any] = {
+            "config": {k: str(v) for k, v in vars(config).items()},
+            "gaussians": sum(bundle.num_gaussians for bundle in field.scene.bundles),
+            "leaves": sum(int(b.clusters.offset[b.level_range(0).stop]) for b in field.scene.bundles),
+            "file_bytes": sum(path.stat().st_size for path in field.paths),
+            "first_picture_ms": first_ms,
+            "most_needed_slots": most_needed,
+            "flights": [],
+            "teleports": [],
+        }
+        if config.is_whole_drawn:
+            renderer = v3dg.Renderer(field.scene, device=config.device)
+            timed(config, renderer, cameras[:3])
+            frames = timed(config, renderer, cameras)
+            result["flights"].append({"share": None, **summary(frames), **errors(frames, truth)})
+            del renderer
+        for share in config.shares:
+            memory = field.memory(int(share * most_needed))
+            renderer = v3dg.Renderer(field.scene, device=config.device, memory=memory)
+            renderer.settle(cameras[0], tolerance=config.tolerance)
+            frames = timed(config, renderer, cameras)
+            row = {"share": share, "memory": memory, **summary(frames), **errors(frames, truth)}
+            result["flights"].append(row)
+            print(row, flush=True)
+        for cold in (False, True):
+            row = teleport(config, field, field.memory(2 * most_needed), cold=cold)
+            result["teleports"].append(row)
+            print({k: v for k, v in row.items() if k != "curve"}, flush=True)
+        record.write(config.output, {"device": config.device, **result}, config.device)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))

@@ -1,0 +1,135 @@
+#include <algorithm>
+#include <cstring>
+
+#include "bindings/operations.h"
+#include "bindings/pool.h"
+
+namespace v3dg {
+
+namespace {
+
+// At most so much of a pool's memory is for pages on their way.
+constexpr size_t kMostBlockBytes = size_t(64) << 20, kBlockShare = 8;
+
+[[noreturn]] void raise(const PageError& error) {
+    PyErr_SetString(error.is_damage ? PyExc_ValueError : PyExc_OSError, error.what());
+    throw py::error_already_set();
+}
+
+std::shared_ptr<const PageSource> source_of(const py::handle& source, const ClusterTable& table) {
+    if (py::isinstance<Rows>(source))
+        return std::make_shared<MemoryPages>(table, source.cast<const Rows&>().read<float>());
+    const auto file = source.cast<py::tuple>();
+    const auto codec = file[2].cast<std::string>();
+    if (codec != "float32" && codec != "quantized")
+        throw py::value_error("codec: expected float32 or quantized, got " + codec);
+    const py::array places = file[4], hashes = file[5];
+    const auto num_pages = static_cast<py::ssize_t>(table.num_clusters() > 0 ? table.num_pages() : 0);
+    return std::make_shared<FilePages>(table, file[3].cast<int>(),
+                                       codec == "float32" ? PageCodec::float32 : PageCodec::quantized,
+                                       file[0].cast<std::string>(), file[1].cast<int>(),
+                                       span_of<const int64_t>(places, "places", {num_pages + 1}),
+                                       span_of<const uint8_t>(hashes, "hashes", {num_pages, 16}));
+}
+
+py::array_t<bool> resident_pages(BoundPool& pool, size_t bundle) {
+    if (bundle >= pool.pool().num_bundles())
+        throw py::value_error("bundle: expected one below " + std::to_string(pool.pool().num_bundles()) +
+                              ", got " + std::to_string(bundle));
+    const Span<const int64_t> shift = pool.pool().shift(bundle);
+    py::array_t<bool> there(static_cast<py::ssize_t>(shift.size));
+    std::transform(shift.begin(), shift.end(), there.mutable_data(),
+                   [](int64_t s) { return s != kAbsentPage; });
+    return there;
+}
+
+}  // namespace
+
+BoundPool::BoundPool(const py::list& tables, const py::list& sources, size_t num_bytes, unsigned num_threads)
+    : tables_(tables), sources_(sources) {
+    std::vector<PagedBundle> bundles;
+    int max_degree = 0;
+    for (size_t b = 0; b < tables.size(); ++b) {
+        const ClusterTable& table = held<BoundTable>(tables[b], "tables").table();
+        bundles.push_back({table, source_of(sources[b], table)});
+        max_degree = std::max(max_degree, bundles.back().source->sh_degree());
+        needs_.emplace_back();
+    }
+    PoolLimits limits{};
+    limits.num_threads = num_threads;
+    limits.block_bytes = std::min(kMostBlockBytes, num_bytes / kBlockShare);
+    const size_t row_bytes = sizeof(float) * (11 + 3 * num_sh_bases(max_degree));
+    limits.num_rows = (num_bytes - limits.block_bytes) / row_bytes;
+    try {
+        const py::gil_scoped_release unlocked;
+        pool_ = std::make_unique<PagePool>(bundles, limits, std::make_shared<HostBlocks>());
+    } catch (const PageError& error) {
+        raise(error);
+    }
+    const size_t num_rows = pool_->first_slot_row() + pool_->num_slots() * pool_->slot_rows();
+    host_ = std::make_unique<HostPages>(*pool_, num_rows);
+}
+
+void BoundPool::check_scene(const SceneState& scene) const {
+    bool fits = scene.bundles.size() == tables_.size();
+    for (size_t b = 0; fits && b < tables_.size(); ++b) fits = tables_[b].is(scene.bundles[b]);
+    if (!fits) throw py::value_error("scene: expected one of the bundles that the pool is of");
+}
+
+void BoundPool::note_needs(float tolerance_px2, bool adapts) {
+    std::vector<PageRequest> needs;
+    for (uint32_t b = 0; b < needs_.size(); ++b)
+        for (uint32_t p = 0; p < needs_[b].size(); ++p) {
+            if (needs_[b][p] == 0) continue;
+            needs.push_back({b, p, 0});
+            std::memcpy(&needs.back().priority, &needs_[b][p], sizeof(float));
+        }
+    pool_->note_needs(pool_->frame(), {needs.data(), needs.size()}, 0, tolerance_px2, adapts);
+}
+
+float BoundPool::ask(const py::object& scene_object, const BoundCamera& camera, const SelectRule& rule) {
+    const auto& held_scene = held<BoundScene>(scene_object, "scene");
+    const std::shared_ptr<const SceneState> state = held_scene.state();
+    check_scene(*state);
+    float tolerance = 0;
+    const py::gil_scoped_release unlocked;
+    frame_on_host(*state, rule, false, [&](auto tables, const SelectRule& raised, auto needs) {
+        SelectOutput out;
+        cpu::select({tables, state->instances, camera.camera, raised, needs}, out);
+        return tolerance = out.fits_budget ? out.tolerance_px2 : raised.tolerance_px2;
+    });
+    return tolerance;
+}
+
+void bind_pool(py::module_& m) {
+    py::class_<PoolStatus>(m, "PoolStatus", "What of the pages is there, and what is missing.")
+        .def_readonly("num_slots", &PoolStatus::num_slots)
+        .def_readonly("num_resident", &PoolStatus::num_resident)
+        .def_readonly("needed", &PoolStatus::needed)
+        .def_readonly("missing", &PoolStatus::missing)
+        .def_readonly("failed", &PoolStatus::failed)
+        .def_readonly("pages_in", &PoolStatus::pages_in)
+        .def_readonly("bytes_in", &PoolStatus::bytes_in)
+        .def_readonly("least_tolerance_px2", &PoolStatus::least_tolerance_px2)
+        .def_readonly("error", &PoolStatus::error)
+        .def_readonly("is_damage", &PoolStatus::is_damage);
+    py::class_<BoundPool>(m, "PagePool", "Pages of bundles in a fixed amount of the host's memory.")
+        .def(py::init<py::list, py::list, size_t, unsigned>(), "tables"_a, "sources"_a, "num_bytes"_a,
+             "num_threads"_a)
+        .def("ask", &BoundPool::ask, "scene"_a, "camera"_a, "rule"_a,
+             "Brings pages and finds out what a view needs; the tolerance that was used.")
+        .def("status", &BoundPool::status)
+        .def("resident", &resident_pages, "bundle"_a, "(P,) which pages of a bundle are there.")
+        .def(
+            "raise_tolerance",
+            [](BoundPool& p, float from) { return p.pool().raise_tolerance_at_once(from); }, "from_px2"_a,
+            "Raises it, unless there is room for what the last view needs; whether it did.")
+        .def("reset_tolerance", [](BoundPool& p) { p.pool().reset_tolerance(); })
+        .def(
+            "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); }, "seconds"_a,
+            py::call_guard<py::gil_scoped_release>(), "Waits for pages; whether there are any to bring.")
+        .def("read_one", [](BoundPool& p) { return p.pool().read_one(); })
+        .def("forget_failures", [](BoundPool& p) { p.pool().forget_failures(); });
+}
+
+}  // namespace v3dg

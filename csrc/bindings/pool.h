@@ -1,0 +1,58 @@
+#pragma once
+
+// The part of bundles that is resident on the host, of a size that does not grow.
+
+#include <algorithm>
+#include <memory>
+#include <mutex>
+#include <vector>
+
+#include "bindings/resident.h"
+#include "residency/host_pages.h"
+
+namespace v3dg {
+
+class BoundPool {
+  public:
+    // `sources` has for each table either the arrays of gaussians in memory, or the file of the bundle: its
+    // name, descriptor, SH degree, places (P+1,) and hashes (P, 16).
+    BoundPool(const py::list& tables, const py::list& sources, size_t num_bytes, unsigned num_threads);
+
+    PagePool& pool() { return *pool_; }
+    PoolStatus status() const { return pool_->status(); }
+    void check_scene(const SceneState& scene) const;
+
+    // A frame on the host, bounded if it is one of a flight: brings pages, calls cut(tables, rule, needs),
+    // which returns the tolerance that was used, and takes note of what that needed. Without Python's lock.
+    template <class Cut>
+    void frame_on_host(const SceneState& scene, SelectRule rule, bool is_bounded, const Cut& cut) {
+        const std::lock_guard<std::mutex> lock(busy_);
+        host_->apply(*pool_, pool_->begin_frame(is_bounded));
+        pool_->release();
+        std::vector<ClusterTable> tables = scene.tables;
+        std::vector<Span<uint32_t>> needs;
+        for (size_t b = 0; b < tables.size(); ++b) {
+            tables[b].pages.shift = pool_->shift(b);
+            needs_[b].assign(tables[b].num_pages(), 0);
+            needs.push_back({needs_[b].data(), needs_[b].size()});
+        }
+        rule.tolerance_px2 = std::max(rule.tolerance_px2, pool_->status().least_tolerance_px2);
+        note_needs(cut(Span<const ClusterTable>{tables.data(), tables.size()}, rule,
+                       Span<const Span<uint32_t>>{needs.data(), needs.size()}),
+                   is_bounded);
+    }
+    const GaussianPlanes<float>& planes(size_t bundle) const { return host_->planes(bundle); }
+    // Cuts the scene for a view, without drawing, and returns the tolerance that was used.
+    float ask(const py::object& scene_object, const BoundCamera& camera, const SelectRule& rule);
+
+  private:
+    void note_needs(float tolerance_px2, bool adapts);
+
+    const py::list tables_, sources_;
+    std::unique_ptr<PagePool> pool_;
+    std::unique_ptr<HostPages> host_;
+    std::mutex busy_;
+    std::vector<std::vector<uint32_t>> needs_;  // of each bundle
+};
+
+}  // namespace v3dg

@@ -1,0 +1,196 @@
+"""The cut of a scene of which only some pages are resident: exact, and it tells what it misses."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from devices import host, on
+from exact_cut import count_wrong, numbers_of_clusters, random_batch, random_trees, run_trials
+from partial import ABSENT, closed_residency, page_rows, random_shift, resident_scene, rule
+from random_bundle import random_bundle
+from scenes_lod import blob, group_metrics, lod_bundle, random_camera, random_scene
+from v3dg import Gaussians, Scene, _core, select
+from v3dg._device import CPU
+from v3dg.residency import residency
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def scene_of(rng, *, sh_degree=0):
+    """Instances of two bundles: one as a build lays it out, and a tree of any shape."""
+    asset = blob(rng, int(rng.integers(1, 400)), sh_degree=sh_degree)
+    scene = random_scene(rng, lod_bundle(rng, asset, int(rng.integers(2, 30))), 5)
+    tree = random_bundle(int(rng.integers(1 << 30)), num_levels=int(rng.integers(1, 6)), sh_degree=sh_degree)
+    scene.add(tree, positions=rng.normal(size=(3, 3)), importance=np.float32(rng.uniform(0.1, 10)))
+    return scene
+
+
+def a_tolerance(rng, scene, camera):
+    """The metric of some group, or about that."""
+    metrics = np.concatenate(group_metrics(scene, camera))
+    metrics = metrics[np.isfinite(metrics)]
+    return float(rng.choice(metrics)) * float(rng.choice([1.0, 0.7])) if len(metrics) else 1.0
+
+
+def test_every_path_has_exactly_one_cluster(device):
+    assert run_trials(20_000 if device == "cpu" else 200_000, device=device, partial=True)["violations"] == 0
+
+
+def test_violations_would_be_counted(monkeypatch):
+    """Pages without those above them: a cut that is drawn twice."""
+    rng = np.random.default_rng(0)
+    bundle = random_trees(rng)[0]
+    number, whole = numbers_of_clusters(bundle, rng)
+    there = rng.random(bundle.num_pages) < 0.7
+    there[-1] = True
+    shift, _ = random_shift(rng, bundle, there)
+    wrong = 0
+    for _ in range(10):
+        scene, camera, tolerance, _ = random_batch(bundle, rng, 200)
+        cut = resident_scene(scene, [shift]).select(camera.core, rule(tolerance, cull=False))
+        wrong += count_wrong(cut.instance_ids, cut.cluster_ids, 200, number, whole)
+    assert wrong > 100
+
+
+@settings(max_examples=60)
+@given(seed=seeds)
+def test_cut_refines_what_is_wanted_and_there(seed):
+    rng = np.random.default_rng(seed)
+    scene = scene_of(rng)
+    camera, min_level = random_camera(rng), int(rng.integers(0, 3))
+    tolerance = a_tolerance(rng, scene, camera)
+    there = [closed_residency(rng, bundle) for bundle in scene.bundles]
+    shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
+    cut = resident_scene(scene, shifts).select(camera.core, rule(tolerance, None, min_level, cull=False))
+    expected = []
+    for i, metrics in enumerate(group_metrics(scene, camera)):
+        b = scene.instance_bundle[i]
+        clusters, levels = scene.bundles[b].clusters, scene.bundles[b].groups.level
+        refined = (metrics > np.float32(tolerance)) & (levels > min_level) & there[b][:-1]
+        own = np.append(refined, False)[clusters.own_group]
+        parent = np.append(refined, True)[clusters.parent_group]
+        expected += [(i, c) for c in np.flatnonzero(parent & ~own)]
+    assert list(zip(cut.instance_ids, cut.cluster_ids, strict=True)) == expected
+    for i, c in expected:
+        bundle = scene.bundles[scene.instance_bundle[i]]
+        assert there[scene.instance_bundle[i]][bundle.clusters.parent_group[c]]
+
+
+@settings(max_examples=60)
+@given(seed=seeds, has_budget=st.booleans(), min_level=st.integers(0, 2))
+def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget, min_level):
+    rng = np.random.default_rng(seed)
+    scene = scene_of(rng)
+    camera = random_camera(rng)
+    options = {"tolerance": a_tolerance(rng, scene, camera), "min_level": min_level}
+    if has_budget:
+        least = select(scene, camera, tolerance=np.inf, device="cpu").num_gaussians
+        most = select(scene, camera, tolerance=0, device="cpu").num_gaussians
+        options |= {"budget": int(rng.integers(least, max(least, most) + 1)), "tolerance": 0.0}
+    whole = select(scene, camera, device="cpu", **options)
+    there = [closed_residency(rng, bundle, share=0.3) for bundle in scene.bundles]
+    shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
+    core = resident_scene(scene, shifts)  # which borrows the arrays
+    for _ in range(100):
+        needs = core.page_needs(camera.core, rule(**options))
+        missing = [np.flatnonzero((n > 1) & (s == ABSENT)) for n, s in zip(needs, shifts, strict=True)]
+        if not any(map(len, missing)):
+            break
+        for bundle, shift, pages in zip(scene.bundles, shifts, missing, strict=True):
+            for page in pages:
+                while shift[page] == ABSENT:  # with all above it
+                    shift[page] = 0
+                    page = bundle.groups.parent[page]
+    cut = core.select(camera.core, rule(**options))
+    assert cut.tolerance_px2 == np.float32(whole.tolerance)
+    np.testing.assert_array_equal(cut.instance_ids, whole.instance_ids)
+    np.testing.assert_array_equal(cut.cluster_ids, whole.cluster_ids)
+
+
+@settings(max_examples=30)
+@given(seed=seeds)
+def test_needs_are_what_the_cut_draws_or_misses(seed):
+    rng = np.random.default_rng(seed)
+    scene = scene_of(rng)
+    camera = random_camera(rng)
+    one = rule(a_tolerance(rng, scene, camera))
+    there = [closed_residency(rng, bundle) for bundle in scene.bundles]
+    shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
+    core = resident_scene(scene, shifts)
+    cut, needs = core.select(camera.core, one), core.page_needs(camera.core, one)
+    for i, c in zip(cut.instance_ids, cut.cluster_ids, strict=True):
+        b = scene.instance_bundle[i]
+        clusters = scene.bundles[b].clusters
+        own, page = clusters.own_group[c], clusters.parent_group[c]
+        asks_for_finer = own >= 0 and needs[b][own] > 0
+        assert page < 0 or needs[b][page] > 1 or asks_for_finer
+
+
+def test_all_pages_are_as_good_as_no_table(device):
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        scene = scene_of(rng)
+        camera = random_camera(rng)
+        shifts = [random_shift(rng, b, np.ones(max(b.num_pages, 1), bool))[0] for b in scene.bundles]
+        core = resident_scene(scene, shifts, device)
+        tolerance = a_tolerance(rng, scene, camera)
+        for options in ({}, {"budget": 300}, {"min_level": 1}):
+            try:
+                whole = select(scene, camera, tolerance=tolerance, device=device, **options)
+            except ValueError:
+                continue  # over the budget
+            cut = core.select(camera.core, rule(tolerance, **options))
+            np.testing.assert_array_equal(cut.cluster_ids, whole.cluster_ids)
+            np.testing.assert_array_equal(cut.instance_ids, whole.instance_ids)
+
+
+def test_pages_are_drawn_from_wherever_they_lie(device):
+    """The same cut of the same pages, in order and in any order with other rows in between."""
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        scene = Scene()
+        bundle = lod_bundle(rng, blob(rng, 300, sh_degree=1), 12)
+        scene.add(bundle, positions=rng.normal(size=(3, 3)))
+        camera = random_camera(rng)
+        one = rule(a_tolerance(rng, scene, camera))
+        there = closed_residency(rng, bundle, share=0.8)
+        in_order = np.where(there, 0, ABSENT)
+        shift, num_rows = random_shift(rng, bundle, there)
+        rows = moved_rows(bundle, shift, num_rows)
+        pictures = []
+        for places, gaussians in ((in_order, bundle.gaussians), (shift, rows)):
+            core = resident_scene(scene, [places], device)
+            frame = _core.SceneFrame(-1 if device == "cpu" else 0)
+            frame.set_models([_core.Model(on(device, gaussians).rows)], [])
+            shade = _core.Shade(background=[0.0, 0.0, 0.0], min_transmittance=1e-4)
+            drawing = frame.draw(core, camera.core, one, shade)
+            assert drawing.finish().gaussians > 0
+            pictures.append(host((drawing.color, drawing.alpha, drawing.depth)))
+        for one_plane, other in zip(*pictures, strict=True):
+            np.testing.assert_array_equal(one_plane, other)
+
+
+def moved_rows(bundle, shift, num_rows):
+    """The bundle's gaussians at their places; what is in between is poison."""
+    count = max(num_rows, bundle.num_gaussians)
+    arrays = {
+        n: np.full((count, *a.shape[1:]), np.nan, np.float32) for n, a in vars(bundle.gaussians).items()
+    }
+    first, length = page_rows(bundle)
+    for page in np.flatnonzero(shift != ABSENT):
+        source = slice(first[page], first[page] + length[page])
+        place = slice(source.start + shift[page], source.stop + shift[page])
+        for name, array in arrays.items():
+            array[place] = getattr(bundle.gaussians, name)[source]
+    return Gaussians(**arrays)
+
+
+def test_wrong_shape_of_pages_is_refused():
+    bundle = random_bundle(0)
+    with pytest.raises(ValueError, match="page_shift"):
+        _core.ClusterTable(
+            **vars(bundle.clusters) | {n: getattr(bundle.groups, n) for n in ("ball", "weight", "level")},
+            page_shift=np.zeros(2, np.int64),
+        )
+    assert residency.scene(bundle, CPU).core.page_needs(random_camera(np.random.default_rng(0)).core, rule())

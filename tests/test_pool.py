@@ -1,0 +1,362 @@
+"""Pools: pictures of scenes of which only a part is in memory, settled and not, and with faults."""
+
+import os
+import time
+
+import numpy as np
+import pytest
+
+import v3dg.pool
+from devices import host
+from random_bundle import random_bundle
+from scenes_lod import blob, lod_bundle
+from v3dg import Bundle, Camera, Renderer, Scene, render
+
+CAMERA = Camera.look_at((0, -9, 1), (0, 0, 0), (0, 0, 1), 0.9, width=93, height=61)
+NEAR = Camera.look_at((2, -2, 1), (0, 0, 0), (0, 0, 1), 0.7, width=93, height=61)
+AWAY = Camera.look_at((0, -9, 1), (0, -20, 0), (0, 0, 1), 0.9, width=93, height=61)
+FINE = {"tolerance": 0.5}
+
+
+@pytest.fixture
+def device():
+    """Pools are on the CPU alone."""
+    return "cpu"
+
+
+@pytest.fixture
+def asset():
+    """Of SH degree 1, about 250 pages."""
+    rng = np.random.default_rng(0)
+    return lod_bundle(rng, blob(rng, 5000, sh_degree=1), 32)
+
+
+@pytest.fixture
+def path(asset, tmp_path):
+    asset.write(tmp_path / "asset.v3dg")
+    return tmp_path / "asset.v3dg"
+
+
+@pytest.fixture
+def scene(path):
+    """Instances of a file, of one of codes and of a bundle in memory, each of another SH degree."""
+    rng, scene = np.random.default_rng(1), Scene()
+    scene.add(Bundle.open(path), positions=2 * rng.normal(size=(3, 3)), quaternions=rng.normal(size=(3, 4)))
+    scene.add(lod_bundle(rng, blob(rng, 2000), 32), positions=(1.0, 0, 0), importance=2)
+    rough = lod_bundle(rng, blob(rng, 1500, sh_degree=2), 32)
+    coded = path.with_name("coded.v3dg")
+    Bundle(rough.clusters, rough.groups, rough.gaussians, codec="quantized").write(coded)
+    scene.add(Bundle.open(coded), positions=(-1.0, 0, 0.5))
+    return scene
+
+
+def planes(image):
+    return host((image.color, image.alpha, image.depth))
+
+
+def status(renderer):
+    return renderer._frame._pool.core.status()
+
+
+def assert_same(image, expected):
+    for one, other in zip(planes(image), planes(expected), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"tolerance": 0.0}, FINE, {"tolerance": 20.0}, {"budget": 4000}, {"tolerance": 0.1, "min_level": 2}],
+)
+def test_settled_picture_is_that_of_all_pages(scene, device, options):
+    renderer = Renderer(scene, device=device, memory="64MB")
+    for camera in (CAMERA, NEAR, AWAY, CAMERA):
+        renderer.settle(camera, **options)
+        image = renderer.render(camera, **options)
+        assert image.stats.missing == image.stats.failed == 0
+        assert_same(image, render(scene, camera, device=device, **options))
+
+
+def test_stills_are_settled(scene, device):
+    pictures = render(scene, [CAMERA, NEAR], device=device, memory="64MB", **FINE)
+    for picture, expected in zip(pictures, render(scene, [CAMERA, NEAR], device=device, **FINE), strict=True):
+        assert_same(picture, expected)
+
+
+def test_pool_that_is_just_large_enough_settles_wherever_the_camera_goes(path, device):
+    scene = Scene()
+    scene.add(Bundle.open(path))
+    coarse = {"tolerance": 300.0}
+    roomy = Renderer(scene, device=device, memory="64MB")
+    slots = status_after(roomy, CAMERA, **coarse).needed
+    assert slots < 0.8 * status(roomy).num_slots
+    renderer = Renderer(scene, device=device, memory=memory_for(scene, device, slots + 2))
+    rng = np.random.default_rng(3)
+    num_fine = 0
+    for _ in range(12):
+        eye = rng.normal(size=3) * rng.choice([3.0, 8.0])
+        camera = Camera.look_at(eye, 0.3 * rng.normal(size=3), (0, 0, 1), 0.7, width=93, height=61)
+        now = status_after(renderer, camera, **coarse)
+        assert now.num_resident <= now.num_slots == slots + 2
+        image = renderer.render(camera, **coarse)
+        assert_same(image, render(scene, camera, device=device, tolerance=image.stats.tolerance))
+        if status_after(roomy, camera, **coarse).needed <= slots:
+            num_fine += 1
+            assert image.stats.tolerance == np.float32(300)
+    assert num_fine > 2
+
+
+def status_after(renderer, camera, **options):
+    renderer.settle(camera, **options)
+    return status(renderer)
+
+
+def memory_for(scene, device, num_slots):
+    """Bytes of a pool with so many slots."""
+    low, high = 1 << 10, 1 << 26
+    while high - low > 64:
+        middle = (low + high) // 2
+        try:
+            few = status_of_new(scene, device, middle) < num_slots
+        except ValueError:
+            few = True
+        low, high = (middle, high) if few else (low, middle)
+    assert status_of_new(scene, device, high) == num_slots
+    return high
+
+
+def status_of_new(scene, device, memory):
+    renderer = Renderer(scene, device=device, memory=memory)
+    renderer.render(AWAY).stats  # noqa: B018
+    return status(renderer).num_slots
+
+
+def test_shortage_raises_the_tolerance_alike_whatever_was_there_before(scene, device):
+    pictures = []
+    for before in ([], [NEAR], [AWAY, CAMERA, NEAR]):
+        renderer = Renderer(scene, device=device, memory=150_000)
+        for camera in before:
+            renderer.settle(camera, tolerance=3.0)
+            renderer.render(camera, tolerance=3.0).stats  # noqa: B018
+        renderer.settle(CAMERA, **FINE)
+        pictures.append(renderer.render(CAMERA, **FINE))
+        assert pictures[-1].stats.missing == 0
+        assert pictures[-1].stats.tolerance > 0.5
+        assert_same(pictures[-1], pictures[0])
+    tolerance = pictures[0].stats.tolerance
+    assert_same(pictures[0], render(scene, CAMERA, device=device, tolerance=tolerance))
+
+
+def test_frames_become_finer_until_nothing_is_missing(scene, device):
+    renderer = Renderer(scene, device=device, memory="64MB")
+    first = renderer.render(CAMERA, **FINE)
+    assert first.color.shape == (61, 93, 3)
+    missing, deadline = [], time.monotonic() + 60
+    # On a device, a picture tells what one before it missed.
+    while (len(missing) < 4 or any(missing[-4:])) and time.monotonic() < deadline:
+        missing.append(renderer.render(CAMERA, **FINE).stats.missing)
+        time.sleep(0.01)
+    assert missing[-1] == 0
+    assert_same(renderer.render(CAMERA, **FINE), render(scene, CAMERA, device=device, **FINE))
+    assert status(renderer).bytes_in > 0
+
+
+def test_shortage_raises_the_tolerance_from_frame_to_frame(scene, device):
+    renderer = Renderer(scene, device=device, memory=150_000)
+    tolerances = [renderer.render(CAMERA, **FINE).stats.tolerance for _ in range(300)]
+    steps = np.array(tolerances[1:]) / tolerances[:-1]
+    assert (steps <= 1.0201).all()
+    assert (steps >= 0.98).all()
+    assert tolerances[-1] > 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pages_are_there_together_with_those_above_them(scene, device, seed, monkeypatch):
+    """In every order of frames and of pages that have been read, with too little room for most views."""
+    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
+    rng = np.random.default_rng(seed)
+    renderer = Renderer(scene, device=device, memory=int(rng.integers(60_000, 160_000)))
+    num_changes, before = 0, None
+    for _ in range(80):
+        eye = rng.choice([1.5, 4.0, 12.0]) * rng.normal(size=3)
+        camera = Camera.look_at(eye, rng.normal(size=3), (0, 0, 1), 0.9, width=61, height=43)
+        for _ in range(int(rng.integers(1, 4))):
+            renderer.render(camera, tolerance=float(rng.choice([0.5, 5.0, 50.0]))).stats  # noqa: B018
+            core = renderer._frame._pool.core
+            for _ in range(int(rng.integers(0, 40))):
+                core.read_one()
+        there = [core.resident(b) for b in range(len(scene.bundles))]
+        for bundle, pages in zip(scene.bundles, there, strict=True):
+            assert pages[-1]
+            assert pages[bundle.groups.parent][pages[:-1]].all()
+        now = core.status()
+        assert sum(pages[:-1].sum() for pages in there) == now.num_resident <= now.num_slots
+        num_changes += before is not None and any((a & ~b).any() for a, b in zip(before, there, strict=True))
+        before = there
+    assert num_changes > 0  # pages left, too
+
+
+def test_gaussians_of_a_file_stay_on_the_disk(path, device):
+    bundle = Bundle.open(path)
+    render(bundle, CAMERA, device=device, memory="64MB", **FINE).stats  # noqa: B018
+    assert "FilePages" in type(bundle._pages).__name__
+
+
+def test_scene_may_change(scene, asset, device):
+    renderer = Renderer(scene, device=device, memory="64MB")
+    for change in (
+        lambda: scene.move([0], positions=[[0.5, 0, 0]]),
+        lambda: scene.remove([1]),
+        lambda: scene.add(asset, positions=(0.0, 1, 0)),
+        lambda: scene.set_importance(3.0),
+    ):
+        change()
+        renderer.settle(CAMERA, **FINE)
+        assert_same(renderer.render(CAMERA, **FINE), render(scene, CAMERA, device=device, **FINE))
+
+
+@pytest.mark.parametrize("num_levels", [0, 1, 4])
+def test_small_bundles(num_levels, device):
+    bundle = random_bundle(5, num_levels=num_levels)
+    image = render(bundle, CAMERA, device=device, memory="1MB", tolerance=0.0)
+    assert_same(image, render(bundle, CAMERA, device=device, tolerance=0.0))
+
+
+def test_what_a_pool_cannot_do_is_refused(asset, device):
+    with pytest.raises(ValueError, match="memory: expected room for at least"):
+        render(asset, CAMERA, device=device, memory=1000)
+    with pytest.raises(ValueError, match="memory: expected bytes"):
+        Renderer(asset, device=device, memory="plenty")
+    with pytest.raises(ValueError, match="color_by: expected 'appearance'"):
+        Renderer(asset, device=device, memory="1MB", color_by="level")
+    with pytest.raises(ValueError, match="memory: expected None for an asset"):
+        Renderer(asset.gaussians, device=device, memory="1MB")
+    cut = v3dg.select(asset, CAMERA, device=device)
+    with pytest.raises(ValueError, match="cut: expected none for a pool"):
+        render(asset, CAMERA, cut=cut, device=device, memory="1MB")
+    renderer = Renderer(asset, device=device)
+    renderer.settle(CAMERA)  # all is there
+
+
+def damage(path, page):
+    bundle = Bundle.open(path)
+    with open(path, "r+b") as file:
+        file.seek(int(bundle._file.places[page]) + 5)
+        byte = file.read(1)
+        file.seek(-1, os.SEEK_CUR)
+        file.write(bytes([byte[0] ^ 1]))
+
+
+def draws_coarser(renderer):
+    """Pictures until pages failed; they are drawn nevertheless."""
+    deadline = time.monotonic() + 30
+    while (image := renderer.render(CAMERA, tolerance=0.0)).stats.failed == 0:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert host(image.alpha).max() > 0.1
+    return image
+
+
+def test_damaged_page_leaves_the_picture_coarser_and_is_named(path, device):
+    whole = render(Bundle.open(path), CAMERA, device=device, tolerance=0.0)
+    damage(path, 3)
+    bundle = Bundle.open(path)
+    renderer = Renderer(bundle, device=device, memory="64MB")
+    draws_coarser(renderer)
+    with pytest.raises(ValueError, match=r"asset\.v3dg: page 3: the hash does not match"):
+        renderer.settle(CAMERA, tolerance=0.0)
+    # All but that page are there.
+    assert host(renderer.render(CAMERA, tolerance=0.0).alpha).max() > 0.1
+    damage(path, 3)  # back
+    renderer.settle(CAMERA, tolerance=0.0)
+    assert_same(renderer.render(CAMERA, tolerance=0.0), whole)
+
+
+def test_truncated_file_is_an_error_and_not_a_crash(path, device):
+    bundle = Bundle.open(path)
+    renderer = Renderer(bundle, device=device, memory="64MB")
+    os.truncate(path, int(bundle._file.places[2]))
+    draws_coarser(renderer)
+    with pytest.raises(ValueError, match=r"asset\.v3dg: page \d+ is not there; the file was truncated"):
+        renderer.settle(CAMERA, tolerance=0.0)
+
+
+def test_replaced_file_changes_nothing(path, asset, device):
+    bundle = Bundle.open(path)
+    renderer = Renderer(bundle, device=device, memory="64MB")
+    renderer.render(CAMERA, **FINE).stats  # noqa: B018
+    random_bundle(1).write(path)
+    renderer.settle(CAMERA, **FINE)
+    assert_same(renderer.render(CAMERA, **FINE), render(asset, CAMERA, device=device, **FINE))
+
+
+def test_coarsest_page_has_to_be_readable(path, device):
+    damage(path, Bundle.open(path).num_pages - 1)
+    with pytest.raises(ValueError, match="the hash does not match"):
+        render(Bundle.open(path), CAMERA, device=device, memory="64MB")
+
+
+def test_failing_disk_is_an_error_of_the_system(path, device):
+    bundle = Bundle.open(path)
+    renderer = Renderer(bundle, device=device, memory="64MB")
+    renderer.render(AWAY).stats  # noqa: B018  makes the pool
+    own = {fd for fd in map(int, os.listdir("/proc/self/fd")) if links_to(fd, path)}
+    memory = os.open("/proc/self/mem", os.O_RDONLY)  # reads of its first pages are errors
+    kept = os.dup(bundle._file._fd)
+    try:
+        for fd in own:
+            os.dup2(memory, fd)
+        draws_coarser(renderer)
+        with pytest.raises(OSError, match=r"asset\.v3dg: page \d+: Input/output error"):
+            renderer.settle(CAMERA, tolerance=0.0)
+    finally:
+        for fd in own:
+            os.dup2(kept, fd)
+        os.close(memory)
+        os.close(kept)
+    renderer.settle(CAMERA, tolerance=0.0)
+    assert renderer.render(CAMERA, tolerance=0.0).stats.missing == 0
+
+
+def links_to(fd, path):
+    try:
+        return os.readlink(f"/proc/self/fd/{fd}") == os.fspath(path)
+    except OSError:
+        return False
+
+
+def test_disk_that_does_not_answer_ends_the_wait(path, device, monkeypatch):
+    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
+    renderer = Renderer(Bundle.open(path), device=device, memory="64MB")
+    start = time.monotonic()
+    with pytest.raises(TimeoutError, match="pages are missing and none came in"):
+        renderer.settle(CAMERA, timeout=0.2, **FINE)
+    assert time.monotonic() - start < 20
+    for _ in range(3):
+        image = renderer.render(CAMERA, **FINE)  # waits for nothing
+    assert image.stats.missing > 0
+    core = renderer._frame._pool.core
+    while core.read_one():  # page by page, the most urgent first
+        before = image.stats.missing
+        image = renderer.render(CAMERA, **FINE)
+        assert image.stats.missing <= before
+    image = [renderer.render(CAMERA, **FINE) for _ in range(3)][-1]
+    assert_same(image, render(Bundle.open(path), CAMERA, device=device, **FINE))
+
+
+def test_child_of_a_fork_is_told_to_make_another(path):
+    renderer = Renderer(Bundle.open(path), device="cpu", memory="64MB")
+    renderer.render(CAMERA, **FINE)
+    child = os.fork()
+    if child == 0:
+        try:
+            renderer.settle(NEAR, **FINE)
+        except RuntimeError as error:
+            os._exit(7 if "from before a fork" in str(error) else 8)
+        os._exit(9)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+
+
+@pytest.mark.gpu
+def test_pools_are_on_the_cpu_alone(scene):
+    with pytest.raises(ValueError, match="memory: expected none on cuda:0, for pools are on the CPU so far"):
+        Renderer(scene, device="cuda", memory="64MB")

@@ -1,0 +1,53 @@
+"""Pools: the part of a scene's bundles that is resident on the host, in memory of a fixed size."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from v3dg import _core
+
+if TYPE_CHECKING:
+    from v3dg.bundle import Bundle
+    from v3dg.residency import ResidentScene
+
+NUM_THREADS = 8  # that read pages; a disk answers several at once
+_WAIT_SECONDS = 0.05  # until Ctrl-C is heard
+
+
+class Pool:
+    """Pages of bundles in a fixed amount of the host's memory, which come and go as views need them."""
+
+    def __init__(self, bundles: tuple[Bundle, ...], tables: list[_core.ClusterTable], num_bytes: int) -> None:
+        self.tables = tables
+        sources = [bundle.page_source for bundle in bundles]
+        self.core = _core.PagePool(tables, sources, num_bytes, NUM_THREADS)
+
+    def settle(
+        self, resident: ResidentScene, camera: _core.Camera, rule: _core.Rule, timeout: float
+    ) -> float:
+        """Bring in what the view needs; the tolerance that it then has.
+
+        Raises:
+            ValueError: A page is damaged.
+            OSError: A page cannot be read; TimeoutError when none came in for so many seconds.
+        """
+        core = self.core
+        core.forget_failures()
+        core.reset_tolerance()
+        last, known = time.monotonic(), -1
+        while True:
+            tolerance = core.ask(resident.core, camera, rule)
+            status = core.status()
+            if status.failed:
+                raise (ValueError if status.is_damage else OSError)(status.error)
+            if core.raise_tolerance(tolerance):
+                continue
+            if not status.missing:
+                return tolerance
+            if status.pages_in != known:
+                last, known = time.monotonic(), status.pages_in
+            elif time.monotonic() - last > timeout:
+                missing = f"{status.missing} pages are missing and none came in for {timeout:g} s"
+                raise TimeoutError(f"settle: expected the disk to answer, but {missing}")
+            core.wait(_WAIT_SECONDS)
