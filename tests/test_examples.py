@@ -89,10 +89,14 @@ def test_arguments_for_gsplat_describe_the_picture(gsplat_example):
         filter_px2=arguments["eps2d"],
         antialiased=True,
     )
-    wanted = v3dg.render(scene, camera, tolerance=config.tolerance, device="cpu")
+    options = {"tolerance": config.tolerance, "min_transmittance": 0, "device": "cpu"}
+    wanted = v3dg.render(scene, camera, **options)
     assert wanted.alpha.max() > 0.9
-    # Coarser levels have the filter of the arguments; what is left is rounding of the translation.
-    assert psnr(wanted.color, drawn.color.numpy()) > 100
+    # Coarser levels have the filter of the arguments; what is left is rounding of the translation. Where
+    # gsplat's pixels stop, ours go on here.
+    go_on = wanted.alpha < 0.9999
+    assert 0.5 < go_on.mean() < 1
+    assert psnr(wanted.color[go_on][None], drawn.color.numpy()[go_on][None]) > 100
 
 
 @pytest.mark.gpu

@@ -76,11 +76,15 @@ CALLS = {
     "select": (lambda **given: v3dg.select(BUNDLE, CAMERA, device="cpu", **given), options()),
     "render": (
         lambda **given: v3dg.render(BUNDLE, CAMERA, device="cpu", **given).stats,
-        options(background=(0, 0, 0)),
+        options(background=(0, 0, 0), min_transmittance=0.001),
     ),
     "Renderer.render": (
         lambda **given: v3dg.Renderer(BUNDLE, device="cpu").render(CAMERA, **given).stats,
-        options(background=(0, 0, 0)),
+        options(background=(0, 0, 0), min_transmittance=0.001),
+    ),
+    "Renderer.settle": (
+        lambda **given: v3dg.Renderer(BUNDLE, device="cpu", memory="64MB").settle(CAMERA, **given),
+        options(timeout=30.0),
     ),
     "render of an asset": (
         lambda **given: v3dg.render(ASSET, CAMERA, device="cpu", **given).stats,

@@ -21,6 +21,9 @@ from v3dg.render import render
 FLIP_PIXELS_PER_DEGREE = 67.0
 """A 0.7 m wide 4K display seen from 0.7 m: the viewing condition that FLIP's authors use."""
 
+MIN_TRANSMITTANCE = 1e-4
+"""Where pixels of the truth stop, a tenth of where those of pictures do."""
+
 FLIP_MISSING = "FLIP wants flip-evaluator, which is not installed; pip install 'v3dg[flip]'"
 
 _SSIM_SIGMA_PX = 1.5
@@ -181,6 +184,11 @@ def draw_truth(
     """
     larger = camera.scaled(supersampling)
     color = render(
-        subject, larger, tolerance=0.0, background=background, min_transmittance=1e-4, device=device
+        subject,
+        larger,
+        tolerance=0.0,
+        background=background,
+        min_transmittance=MIN_TRANSMITTANCE,
+        device=device,
     ).color
     return to_8bit(box_downsample(color.clip(0, 1), supersampling))

@@ -303,6 +303,7 @@ class _Frame:
         self, subject: _Subject, camera: Camera, timeout: float = 30.0, cut: Any = None, **options: Any
     ) -> None:
         """Bring in what a view needs."""
+        real(timeout, "timeout", "seconds, at least 0", 0)
         rule = rule_of(**options, footprint="solid_angle", cull=True)
         if self._memory is None or cut is not None:
             return

@@ -27,7 +27,7 @@ from v3dg.cli._common import (
     table_lines,
 )
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
-from v3dg.metrics import FLIP_MISSING, draw_truth, error_image, errors_of
+from v3dg.metrics import FLIP_MISSING, MIN_TRANSMITTANCE, draw_truth, error_image, errors_of
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 
@@ -167,7 +167,14 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair], int | None]:
     def pairs() -> Iterator[_Pair]:
         for name, camera in cameras.items():
             truth = draw_truth(reference, camera, device, options.supersample)
-            image = render(test, camera, tolerance=options.tolerance, budget=options.budget, device=device)
+            image = render(
+                test,
+                camera,
+                tolerance=options.tolerance,
+                budget=options.budget,
+                min_transmittance=MIN_TRANSMITTANCE,  # the truth's, so that only the gaussians differ
+                device=device,
+            )
             yield _Pair(name, truth, to_8bit(image.color), image.stats.gaussians_selected)
 
     return list(cameras), pairs(), finest
