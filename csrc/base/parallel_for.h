@@ -1,5 +1,7 @@
 #pragma once
 
+#include <omp.h>
+
 #include <cstddef>
 
 #include "base/first_error.h"
@@ -11,12 +13,18 @@ namespace v3dg {
 template <class Body>
 void parallel_for(size_t count, size_t chunk, const Body& body) {
     FirstError error;
-#pragma omp parallel for schedule(dynamic, 1) if (count > chunk)
-    for (size_t first = 0; first < count; first += chunk) {
+    const auto run = [&](size_t first) {
         const size_t last = first + chunk < count ? first + chunk : count;
         error.run(first, [&] {
             for (size_t i = first; i < last; ++i) body(i);
         });
+    };
+    if (omp_get_max_threads() == 1) {
+        // Without a team, for want of whose memory OpenMP would end the process.
+        for (size_t first = 0; first < count; first += chunk) run(first);
+    } else {
+#pragma omp parallel for schedule(dynamic, 1) if (count > chunk)
+        for (size_t first = 0; first < count; first += chunk) run(first);
     }
     error.rethrow();
 }
