@@ -277,15 +277,12 @@ class BoundSceneFrame {
 
     std::vector<SceneModel> models_of(const SceneState& scene) const {
         std::vector<SceneModel> models(host_.begin(), host_.begin() + scene.tables.size());
-        for (size_t b = 0; b < models.size(); ++b) {
-            models[b].appearance = scene.bundle(b).appearance();
-        }
+        for (size_t b = 0; b < models.size(); ++b) models[b].appearance = scene.bundle(b).appearance();
         return models;
     }
 
     static HostScene host_scene(const SceneState& scene, const std::vector<SceneModel>& models) {
-        return {
-            {scene.tables.data(), scene.tables.size()}, {models.data(), models.size()}, scene.instances, {}};
+        return {{scene.tables.data(), scene.tables.size()}, {models.data(), models.size()}, scene.instances};
     }
 
     // The window of the camera, drawn by draw(host scene, picture) without Python's lock.
