@@ -20,8 +20,8 @@ constexpr unsigned kBlocks = 5;    // on a multiprocessor
 constexpr uint32_t kNoItem = ~0u;  // in place of a number of records
 
 // Large records that a warp takes together; lanes 16 apart have the same one. Neighbours cover the same
-// tiles, so a tile is looked at for all of them at once, in windows of so many tiles, unless they lie
-// scattered over more tiles than they have.
+// tiles, so a tile is looked at for all of them at once, in windows of so many tiles, unless they lie so
+// scattered that a tile has fewer than two of them.
 struct LargeBatch {
     uint32_t image;
     uint32_t record;        // of this lane; the first one where it has none
@@ -58,7 +58,7 @@ __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long firs
     batch.all_rows = -warp_min(-bottom) - batch.top + 1;
     batch.columns_inverse = 1 / static_cast<float>(batch.columns);
     const int tiles = batch.columns * batch.all_rows;
-    const bool is_dense = tiles <= kMostTiles || tiles <= warp_sum(boxes) / 2;  // two lanes count each box
+    const bool is_dense = tiles <= warp_sum(boxes) / 4;  // two lanes count each box
     // Halfway between two quotients of whole numbers.
     const int fitting = static_cast<int>((kMostTiles + 0.5f) * batch.columns_inverse);
     if (is_dense) batch.window_rows = min(fitting, kMostRows / static_cast<int>(kLargeAtOnce));
