@@ -18,6 +18,11 @@ DEGREES = (0, 1, 2, 3)
 PLANES = ("color", "alpha", "depth")
 
 
+@pytest.fixture(autouse=True)
+def small_bundles_stay_codes(monkeypatch):
+    monkeypatch.setattr("v3dg.residency.MOST_DECODED_BYTES", 0)
+
+
 def both(bundle):
     """The bundle as codes, and as the rows that they are decoded to."""
     codes = Bundle(bundle.clusters, bundle.groups, bundle.gaussians, codec="quantized")
@@ -171,6 +176,25 @@ def test_memory_a_gaussian_stays_below_its_bound(device, sh_degree, most):
     render(codes, scenes_lod.random_camera(np.random.default_rng(0)), device=device).stats  # noqa: B018
     model, table = residency.model(codes, where), residency.table(codes)
     assert (model.bytes + table.bytes_on(where.number)) / codes.num_gaussians <= most
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("num_decoded", [0, 1, 2])
+def test_small_bundles_are_decoded_once_while_they_fit(monkeypatch, num_decoded):
+    where = _device.resolve("cuda")
+    pairs = [both(lod_bundle(seed, 1)) for seed in (3, 3, 3)]
+    row_bytes = residency.model(pairs[0][1], where).bytes
+    taken = sum(of.get(("decoded", where), 0) for of in residency._kept.values())
+    monkeypatch.setattr("v3dg.residency.MOST_DECODED_BYTES", taken + int((num_decoded + 0.5) * row_bytes))
+    camera = scenes_lod.random_camera(np.random.default_rng(0))
+    for k, (codes, rows) in enumerate(pairs):
+        same_bits(*(render(b, camera, device="cuda") for b in (codes, rows)))
+        is_decoded = residency.model(codes, where).bytes == row_bytes
+        assert is_decoded == (k < num_decoded)
+        cut = select(codes, camera, device="cuda")
+        for name, array in vars(cut.gaussians()).items():
+            expected = getattr(select(rows, camera, device="cuda").gaussians(), name)
+            assert host(array).tobytes() == host(expected).tobytes(), name
 
 
 def test_pages_that_are_none_are_refused():
