@@ -69,7 +69,8 @@ def test_pictures_have_the_same_bits(device, sh_degree):
     codes, rows = both(lod_bundle(sh_degree, sh_degree))
     for distance in (0.3, 2.0, 5.0, 40.0):
         camera = scenes_lod.random_camera(rng, distance=distance, width=97, height=61)
-        for options in ({}, {"tolerance": 30.0}, {"budget": 300}, {"min_level": 1}, {"color_by": "cluster"}):
+        others = {"budget": 300}, {"min_level": 1}, {"color_by": "cluster"}, {"fade": 4.0}
+        for options in ({}, {"tolerance": 30.0}, *others):
             same_bits(*(render(b, camera, device=device, **options) for b in (codes, rows)))
 
 
@@ -82,9 +83,10 @@ def test_scenes_of_either_kind_and_of_both_have_the_same_bits(device, sh_degree)
         renderers = [Renderer(scene, color_by=color_by, device=device) for scene in all_scenes]
         for distance in (2.0, 8.0, 300.0):
             camera = scenes_lod.random_camera(rng, distance=distance, width=90, height=70)
-            first, *others = (renderer.render(camera, tolerance=4.0) for renderer in renderers)
-            for other in others:
-                same_bits(first, other)
+            for fade in (None, 1.5):
+                first, *others = (renderer.render(camera, tolerance=4.0, fade=fade) for renderer in renderers)
+                for other in others:
+                    same_bits(first, other)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -93,7 +95,7 @@ def test_empty_and_tiny_clusters_have_the_same_bits(device, seed):
     bundle = random_bundle(seed, num_levels=seed % 5, sh_degree=seed % 4, max_cluster=3 + seed % 3)
     scene_of_codes, scene_of_rows, *_ = scenes_of([bundle], seed, 6)
     camera = scenes_lod.random_camera(rng, distance=4.0)
-    for options in ({}, {"tolerance": 100.0}):
+    for options in ({}, {"tolerance": 100.0}, {"fade": 4.0}):
         cut = select(scene_of_codes, camera, device=device, **options)
         pictures = [render(s, camera, device=device, **options) for s in (scene_of_codes, scene_of_rows)]
         same_bits(*pictures)

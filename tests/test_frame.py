@@ -7,44 +7,13 @@ import pytest
 
 import scenes
 import scenes_lod
-from compare import PICTURE_FLOAT
 from devices import host
+from frames import CAMERA, assert_like_cpu, assert_same_bytes, composed_scene
 from v3dg import Camera, Gaussians, Renderer, Scene, rasterize, render, select
 
 pytestmark = pytest.mark.gpu
 
-CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
 BACKGROUND = (0.1, 0.2, 0.3)
-
-
-def arrays(image):
-    return host((image.color, image.alpha, image.depth))
-
-
-def assert_same_bytes(image, other):
-    for got, expected in zip(arrays(image), arrays(other), strict=True):
-        np.testing.assert_array_equal(got, expected)
-
-
-def assert_like_cpu(image, expected):
-    """Both round; a pixel more or less at a cut-off may differ by more."""
-    for got, wanted in zip(arrays(image), arrays(expected), strict=True):
-        assert got.shape == wanted.shape
-        assert np.isfinite(got).all()
-        error = np.abs(got - wanted) / np.maximum(1, np.abs(wanted))
-        assert error.mean() <= PICTURE_FLOAT.mean
-        assert (error > PICTURE_FLOAT.absolute).mean() <= PICTURE_FLOAT.share
-    assert image.stats.gaussians_selected == expected.stats.gaussians_selected
-    assert image.stats.gaussians_in_frustum == expected.stats.gaussians_in_frustum
-
-
-def composed_scene(rng, sh_degree=1):
-    bundles = [
-        scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, n, sh_degree=sh_degree), 64) for n in (900, 300)
-    ]
-    scene = scenes_lod.random_scene(rng, bundles[0], 30, spread=3.0)
-    scene.add(bundles[1], positions=rng.normal(size=(7, 3)), quaternions=rng.normal(size=(7, 4)))
-    return scene
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
@@ -199,16 +168,17 @@ def test_other_streams_see_the_picture():
         assert torch.equal(color, expected.color)
 
 
-def test_a_graph_draws_again():
+@pytest.mark.parametrize("options", [{"tolerance": 0.0}, {"tolerance": 2.0, "fade": 1.5}])
+def test_a_graph_draws_again(options):
     import torch
 
     subject = composed_scene(np.random.default_rng(9))
     renderer = Renderer(subject)
-    expected = renderer.render(CAMERA, tolerance=0.0)
+    expected = renderer.render(CAMERA, **options)
     count = expected.stats.gaussians_in_frustum
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        image = renderer.render(CAMERA, tolerance=0.0)
+        image = renderer.render(CAMERA, **options)
     # Other pictures, which need other buffers, in between.
     other = renderer.render(CAMERA.scaled(4), tolerance=0.0)
     other.stats  # noqa: B018  waits

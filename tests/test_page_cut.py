@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices import host, on
-from exact_cut import count_wrong, numbers_of_clusters, random_batch, random_trees, run_trials
+from exact_cut import count_wrong, numbers_of_clusters, parts_of, random_batch, random_trees, run_trials
 from partial import ABSENT, closed_residency, page_rows, random_shift, resident_scene, rule
 from random_bundle import random_bundle
 from scenes_lod import blob, group_metrics, lod_bundle, random_camera, random_scene
@@ -15,6 +15,7 @@ from v3dg._device import CPU
 from v3dg.residency import residency
 
 seeds = st.integers(0, 2**32 - 1)
+fades = st.sampled_from([None, 1.05, 4.0])
 
 
 def scene_of(rng, *, sh_degree=0):
@@ -33,11 +34,16 @@ def a_tolerance(rng, scene, camera):
     return float(rng.choice(metrics)) * float(rng.choice([1.0, 0.7])) if len(metrics) else 1.0
 
 
-def test_every_path_has_exactly_one_cluster(device):
-    assert run_trials(20_000 if device == "cpu" else 200_000, device=device, partial=True)["violations"] == 0
+@pytest.mark.parametrize("fades", [False, True])
+def test_every_path_has_exactly_one_cluster(device, fades):
+    """With fades, weights that add up to exactly one."""
+    result = run_trials(200_000, device=device, partial=True, fades=fades)
+    assert result["violations"] == 0
+    assert result.get("selected_with_weights_below_1", 1) > 0.1
 
 
-def test_violations_would_be_counted(monkeypatch):
+@pytest.mark.parametrize("fade", [None, 1.3])
+def test_violations_would_be_counted(fade):
     """Pages without those above them: a cut that is drawn twice."""
     rng = np.random.default_rng(0)
     bundle = random_trees(rng)[0]
@@ -48,8 +54,9 @@ def test_violations_would_be_counted(monkeypatch):
     wrong = 0
     for _ in range(10):
         scene, camera, tolerance, _ = random_batch(bundle, rng, 200)
-        cut = resident_scene(scene, [shift]).select(camera.core, rule(tolerance, cull=False))
-        wrong += count_wrong(cut.instance_ids, cut.cluster_ids, 200, number, whole)
+        cut = resident_scene(scene, [shift]).select(camera.core, rule(tolerance, fade=fade, cull=False))
+        parts = None if fade is None else parts_of(cut.weights)
+        wrong += count_wrong(cut.instance_ids, cut.cluster_ids, 200, number, whole, parts)
     assert wrong > 100
 
 
@@ -78,12 +85,12 @@ def test_cut_refines_what_is_wanted_and_there(seed):
 
 
 @settings(max_examples=60)
-@given(seed=seeds, has_budget=st.booleans(), min_level=st.integers(0, 2))
-def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget, min_level):
+@given(seed=seeds, has_budget=st.booleans(), min_level=st.integers(0, 2), fade=fades)
+def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget, min_level, fade):
     rng = np.random.default_rng(seed)
     scene = scene_of(rng)
     camera = random_camera(rng)
-    options = {"tolerance": a_tolerance(rng, scene, camera), "min_level": min_level}
+    options = {"tolerance": a_tolerance(rng, scene, camera), "min_level": min_level, "fade": fade}
     if has_budget:
         least = select(scene, camera, tolerance=np.inf, device="cpu").num_gaussians
         most = select(scene, camera, tolerance=0, device="cpu").num_gaussians
@@ -106,15 +113,20 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
     assert cut.tolerance_px2 == np.float32(whole.tolerance)
     np.testing.assert_array_equal(cut.instance_ids, whole.instance_ids)
     np.testing.assert_array_equal(cut.cluster_ids, whole.cluster_ids)
+    np.testing.assert_array_equal(weights_of(cut), whole.weights)
+
+
+def weights_of(cut):
+    return cut.weights if len(cut.weights) else np.ones(len(cut.cluster_ids), np.float32)
 
 
 @settings(max_examples=30)
-@given(seed=seeds)
-def test_needs_are_what_the_cut_draws_or_misses(seed):
+@given(seed=seeds, fade=fades)
+def test_needs_are_what_the_cut_draws_or_misses(seed, fade):
     rng = np.random.default_rng(seed)
     scene = scene_of(rng)
     camera = random_camera(rng)
-    one = rule(a_tolerance(rng, scene, camera))
+    one = rule(a_tolerance(rng, scene, camera), fade=fade)
     there = [closed_residency(rng, bundle) for bundle in scene.bundles]
     shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
     core = resident_scene(scene, shifts)
@@ -135,7 +147,7 @@ def test_all_pages_are_as_good_as_no_table(device):
         shifts = [random_shift(rng, b, np.ones(max(b.num_pages, 1), bool))[0] for b in scene.bundles]
         core = resident_scene(scene, shifts, device)
         tolerance = a_tolerance(rng, scene, camera)
-        for options in ({}, {"budget": 300}, {"min_level": 1}):
+        for options in ({}, {"budget": 300}, {"min_level": 1}, {"fade": 1.3}, {"fade": 1.3, "budget": 300}):
             try:
                 whole = select(scene, camera, tolerance=tolerance, device=device, **options)
             except ValueError:
@@ -143,9 +155,30 @@ def test_all_pages_are_as_good_as_no_table(device):
             cut = core.select(camera.core, rule(tolerance, **options))
             np.testing.assert_array_equal(cut.cluster_ids, whole.cluster_ids)
             np.testing.assert_array_equal(cut.instance_ids, whole.instance_ids)
+            np.testing.assert_array_equal(weights_of(cut), whole.weights)
 
 
-def test_pages_are_drawn_from_wherever_they_lie(device):
+@pytest.mark.gpu
+def test_both_devices_choose_the_same_of_what_is_there():
+    rng = np.random.default_rng(3)
+    below = 0
+    for k in range(40):
+        scene, camera = scene_of(rng), random_camera(rng)
+        there = [closed_residency(rng, bundle) for bundle in scene.bundles]
+        shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
+        one = rule(a_tolerance(rng, scene, camera), fade=[None, 1.05, 1.3, 4.0][k % 4])
+        cpu, cuda = (
+            resident_scene(scene, shifts, device).select(camera.core, one) for device in ("cpu", "cuda")
+        )
+        np.testing.assert_array_equal(cpu.instance_ids, cuda.instance_ids)
+        np.testing.assert_array_equal(cpu.cluster_ids, cuda.cluster_ids)
+        np.testing.assert_array_equal(cpu.weights, cuda.weights)
+        below += int((cpu.weights < 1).sum())
+    assert below > 100
+
+
+@pytest.mark.parametrize("fade", [None, 1.5])
+def test_pages_are_drawn_from_wherever_they_lie(device, fade):
     """The same cut of the same pages, in order and in any order with other rows in between."""
     rng = np.random.default_rng(2)
     for _ in range(5):
@@ -153,7 +186,7 @@ def test_pages_are_drawn_from_wherever_they_lie(device):
         bundle = lod_bundle(rng, blob(rng, 300, sh_degree=1), 12)
         scene.add(bundle, positions=rng.normal(size=(3, 3)))
         camera = random_camera(rng)
-        one = rule(a_tolerance(rng, scene, camera))
+        one = rule(a_tolerance(rng, scene, camera), fade=fade)
         there = closed_residency(rng, bundle, share=0.8)
         in_order = np.where(there, 0, ABSENT)
         shift, num_rows = random_shift(rng, bundle, there)

@@ -65,7 +65,15 @@ def assert_same(image, expected):
 
 @pytest.mark.parametrize(
     "options",
-    [{"tolerance": 0.0}, FINE, {"tolerance": 20.0}, {"budget": 4000}, {"tolerance": 0.1, "min_level": 2}],
+    [
+        {"tolerance": 0.0},
+        FINE,
+        {"tolerance": 20.0},
+        {"budget": 4000},
+        {"tolerance": 0.1, "min_level": 2},
+        {"tolerance": 20.0, "fade": 1.05},
+        {"budget": 4000, "fade": 1.5},
+    ],
 )
 def test_settled_picture_is_that_of_all_pages(scene, device, options):
     renderer = Renderer(scene, device=device, memory="64MB")

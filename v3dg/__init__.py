@@ -24,9 +24,10 @@ from v3dg.rasterize import rasterize
 from v3dg.render import RenderedImage, Renderer, Stats, render
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene, write_scene
-from v3dg.select import DEFAULT_TOLERANCE, Selection, select
+from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select
 
 __all__ = [
+    "DEFAULT_FADE",
     "DEFAULT_TOLERANCE",
     "BuildConfig",
     "Bundle",

@@ -44,6 +44,7 @@ class Rule:
         min_level: int,
         footprint: Literal["solid_angle", "paper"],
         culls: bool,
+        fade: float = 1.0,
     ) -> None: ...
     @property
     def tolerance_px2(self) -> float: ...
@@ -126,6 +127,7 @@ def gather(
     instance: Int32,
     first_row: Int64,
     offset: Int64,
+    weights: Float32 | None = None,
     device: int,
 ) -> Columns: ...
 
@@ -156,6 +158,8 @@ class Cut:
     def instance_ids(self) -> Int32: ...
     @property
     def cluster_ids(self) -> Int32: ...
+    @property
+    def weights(self) -> Float32: ...
     @property
     def num_gaussians(self) -> int: ...
     @property
@@ -336,6 +340,7 @@ class SceneFrame:
         cluster_ids: Array,
         shade: Shade,
         stop: Stop | None = None,
+        weights: Array | None = None,
     ) -> Drawing: ...
     def count_cut(
         self,
@@ -345,6 +350,7 @@ class SceneFrame:
         cluster_ids: Int32,
         shade: Shade,
         stop: Stop | None = None,
+        weights: Float32 | None = None,
     ) -> Drawing: ...
     def pick_cut(
         self, scene: ResidentScene, camera: Camera, instance_ids: Int32, cluster_ids: Int32

@@ -104,6 +104,7 @@ def render(
     tolerance: float | None = None,
     budget: int | None = None,
     min_level: int = 0,
+    fade: float | None = None,
     cut: Selection | None = None,
     color_by: ColorBy = "appearance",
     background: Sequence[float] = (0.0, 0.0, 0.0),
@@ -121,8 +122,10 @@ def render(
         subject: What to draw, in world space.
         camera: Pinhole camera. With several, each has its own cut and its own picture, as if drawn alone.
         tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
+        fade: As in `v3dg.select`; weights multiply opacities. Give `v3dg.DEFAULT_FADE` for pictures that
+            follow each other, as in a film.
         cut: Draw what was selected before from this scene, whatever the camera: a cut to walk around. Takes
-            the place of `tolerance`, `budget` and `min_level`.
+            the place of `tolerance`, `budget`, `min_level` and `fade`.
         color_by: "level" or "cluster" colours gaussians by the one that they belong to.
         background: Three numbers.
         min_transmittance: A pixel stops behind the gaussian that lets no more than this share of light
@@ -144,7 +147,8 @@ def render(
     else:
         key = color_by, where, memory
         frame = residency.frame(subject, key, lambda: _Frame(subject, color_by, where, memory))
-    options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
+    options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
+    options["cut"] = cut
     pictures = []
     for view in [camera] if isinstance(camera, Camera) else camera:
         if memory is not None:
@@ -196,12 +200,14 @@ class Renderer:
         tolerance: float | None = None,
         budget: int | None = None,
         min_level: int = 0,
+        fade: float | None = None,
         cut: Selection | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         min_transmittance: float | None = None,
     ) -> RenderedImage:
         """Draw as `v3dg.render` does, of what is resident."""
-        options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "cut": cut}
+        options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
+        options["cut"] = cut
         return self._frame.draw(self._subject, camera, background, min_transmittance, **options)
 
     def settle(
@@ -211,6 +217,7 @@ class Renderer:
         tolerance: float | None = None,
         budget: int | None = None,
         min_level: int = 0,
+        fade: float | None = None,
         timeout: float = 30.0,
     ) -> None:
         """Wait until what a view needs is resident, so that its picture misses nothing.
@@ -225,7 +232,7 @@ class Renderer:
             ValueError: A page is damaged; the message says which.
             OSError: A page cannot be read. A TimeoutError if the disk does not answer.
         """
-        options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level}
+        options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
         self._frame.settle(self._subject, camera, timeout, **options)
 
 
@@ -266,7 +273,7 @@ class _Frame:
             _check_asset(self._color_by, cut=cut, **options)
             drawing = self._asset.draw(camera.core, shade)
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
-        rule = rule_of(**options, footprint="solid_angle", cull=True)
+        rule = rule_of(**options)
         with residency.reading(subject, self._device) as resident:
             pool = self._take_models(resident)
             if pool is not None:
@@ -278,7 +285,8 @@ class _Frame:
             else:
                 _check_cut(cut, subject, resident, **options)
                 pairs = self._here(cut.instance_ids), self._here(cut.cluster_ids)
-                drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade)
+                weights = None if cut.given_weights is None else self._here(cut.given_weights)
+                drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade, weights=weights)
             if pool is not None:
                 now = pool.core.status()
                 came_in = {"missing": now.missing, "failed": now.failed}
@@ -304,7 +312,7 @@ class _Frame:
     ) -> None:
         """Bring in what a view needs."""
         real(timeout, "timeout", "seconds, at least 0", 0)
-        rule = rule_of(**options, footprint="solid_angle", cull=True)
+        rule = rule_of(**options)
         if self._memory is None or cut is not None:
             return
         assert not isinstance(subject, Gaussians)
@@ -351,10 +359,11 @@ def _stats(stats: _core.FrameStats, tolerance: float) -> Stats:
 def _check_asset(color_by: ColorBy, **options: Any) -> None:
     """An asset has no levels: refuse what asks for them."""
     for name, value in options.items():
-        check(name, name == "tolerance" or not value, "a scene or a bundle to choose from, got an asset")
+        is_harmless = name in ("tolerance", "fade") or not value
+        check(name, is_harmless, "a scene or a bundle to choose from, got an asset")
     expected = f"'appearance' for an asset, which has no levels, got {color_by!r}"
     check("color_by", color_by == "appearance", expected)
-    rule_of(options.get("tolerance"), None, 0, "solid_angle", True)
+    rule_of(options.get("tolerance"), None, 0, fade=options.get("fade"))
 
 
 def _check_cut(cut: Selection, subject: Scene | Bundle, resident: ResidentScene, **options: Any) -> None:

@@ -29,6 +29,9 @@ Footprint: TypeAlias = Literal["solid_angle", "paper"]
 # px² of screen that one gaussian of a coarser cluster may stand for; docs/levels.md has the error it gives.
 DEFAULT_TOLERANCE = 3.0
 
+# Fade of pictures that follow each other; docs/fades.md has what it costs and what it gains.
+DEFAULT_FADE = 1.05
+
 
 @dataclass(frozen=True, eq=False)
 class Selection:
@@ -43,6 +46,7 @@ class Selection:
         tolerance: px² that were used; with a budget, those that it came to.
         seconds: Wall time of the selection.
         revision: Of the scene, when its instances were looked at; as it is now if None.
+        given_weights: As `weights`, not to be written to; None where all are 1, as they are without a fade.
     """
 
     scene: Scene
@@ -52,12 +56,18 @@ class Selection:
     tolerance: float
     seconds: float
     revision: tuple[int, int, int] | None = None
+    given_weights: npt.NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         if self.revision is None:
             object.__setattr__(self, "revision", self.scene.revision)
-        for ids in (self.instance_ids, self.cluster_ids):
-            ids.flags.writeable = False
+        weights, expected = self.weights, f"{len(self)} numbers of 0 to 1"
+        check("given_weights", len(weights) == len(self), f"{expected}, got {len(weights)}")
+        check("given_weights", ((weights >= 0) & (weights <= 1)).all(), f"{expected}, got others")
+        if (weights == 1).all():
+            object.__setattr__(self, "given_weights", None)
+        for values in (self.instance_ids, self.cluster_ids, weights):
+            values.flags.writeable = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Selection, tuple(getattr(self, field.name) for field in fields(self))
@@ -75,7 +85,8 @@ class Selection:
         """Return the selected gaussians in the world, N in the order of the selection, for any rasterizer.
 
         Spherical harmonics are rotated into the world's frame, which is exact. The degree is the highest of
-        the bundles that are selected from.
+        the bundles that are selected from. Opacities are multiplied by the weights of their clusters, so that
+        every rasterizer fades.
 
         Args:
             origin: (3,) point in the world that means are relative to; take the camera's position where the
@@ -107,9 +118,15 @@ class Selection:
                 instance=instance.astype(np.int32),
                 first_row=first_row,
                 offset=self._first(),
+                weights=self.given_weights,
                 device=where.number,
             )
         return Gaussians(*world)
+
+    @property
+    def weights(self) -> npt.NDArray[np.float32]:
+        """(S,) in [0, 1] with which the clusters are drawn."""
+        return np.ones(len(self), np.float32) if self.given_weights is None else self.given_weights
 
     @property
     def filters_px2(self) -> npt.NDArray[np.float32]:
@@ -147,6 +164,7 @@ class CutOptions(TypedDict, total=False):
     tolerance: float | None
     budget: int | None
     min_level: int
+    fade: float | None
     device: str | Device
 
 
@@ -170,6 +188,7 @@ def select(
     min_level: int = 0,
     footprint: Footprint = "solid_angle",
     cull: bool = True,
+    fade: float | None = None,
     device: str | Device = "auto",
 ) -> Selection | list[Selection]:
     """Choose the clusters that are just detailed enough for one view, or for each of several.
@@ -188,6 +207,10 @@ def select(
         footprint: ``"solid_angle"``, or ``"paper"`` for the published formula, with which a path can
             have more than one cluster.
         cull: False keeps what lies outside the frustum.
+        fade: What is within this factor of the tolerance is drawn on two levels, or more, with weights that
+            add up to exactly 1 on every path and depend on the view alone: a level comes as the other goes,
+            so that nothing pops while the camera moves. `DEFAULT_FADE` is meant for that, and for nothing
+            else; 1 and None choose one cluster on every path. Not with the paper's footprint.
         device: Where to choose: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is CUDA where that works; all
             choose the same.
 
@@ -198,7 +221,7 @@ def select(
 
     Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the budget is ours.
     """
-    rule = rule_of(tolerance, budget, min_level, footprint, cull)
+    rule = rule_of(tolerance, budget, min_level, footprint, cull, fade)
     where = _device.resolve(device)
     if not isinstance(camera, Camera):
         return [_select(subject, view, rule, budget, where) for view in camera]
@@ -217,11 +240,17 @@ def _select(
     seconds = time.perf_counter() - start
     pairs = cut.instance_ids, cut.cluster_ids
     scene, revision = Scene.of(subject), resident.revision
-    return Selection(scene, *pairs, cut.num_gaussians, cut.tolerance_px2, seconds, revision)
+    weights = cut.weights if len(cut.weights) else None
+    return Selection(scene, *pairs, cut.num_gaussians, cut.tolerance_px2, seconds, revision, weights)
 
 
 def rule_of(
-    tolerance: float | None, budget: int | None, min_level: int, footprint: Footprint, cull: bool
+    tolerance: float | None,
+    budget: int | None,
+    min_level: int,
+    footprint: Footprint = "solid_angle",
+    cull: bool = True,
+    fade: float | None = None,
 ) -> _core.Rule:
     """What to choose, as the core takes it; ValueError where a number is not as `select` has it."""
     if tolerance is None:
@@ -230,12 +259,16 @@ def rule_of(
     if budget is not None:
         budget = whole(budget, "budget", "0 gaussians or more", 0, most=(1 << 63) - 1)
     one_of(footprint, "footprint", get_args(Footprint))
+    factor = 1.0 if fade is None else real(fade, "fade", "None or a factor of 1 to 1000", 1, 1000)
+    expected = "None with the paper's footprint, which can decrease towards the root"
+    check("fade", factor == 1 or footprint != "paper", f"{expected}, got {factor:g}")
     return _core.Rule(
         tolerance_px2=tolerance if tolerance == np.inf else min(tolerance, MOST_FLOAT),
         budget=budget,
         min_level=whole(min_level, "min_level", "a level, 0 or more", 0),
         footprint=footprint,
         culls=bool(cull),
+        fade=factor,
     )
 
 

@@ -25,6 +25,7 @@ def main(arguments=None):
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--partial", action="store_true", help="of random pages, closed towards the root")
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--fades", action="store_true", help="weights of random fades have to add up to 1")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args(arguments)
 
@@ -37,6 +38,7 @@ def main(arguments=None):
             seed=arguments.seed,
             device=arguments.device,
             partial=arguments.partial,
+            fades=arguments.fades,
         ),
     }
     print(

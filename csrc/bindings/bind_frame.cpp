@@ -181,26 +181,23 @@ class BoundSceneFrame {
 
     std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object, const BoundCamera& camera,
                                            const py::object& instance_ids, const py::object& cluster_ids,
-                                           const Shade& shade, const Stop* stop) {
+                                           const Shade& shade, const Stop* stop, const py::object& weights) {
         auto& scene = checked(scene_object);
-        const Span<const int32_t> instance =
-            span_on<const int32_t>(device_, instance_ids, "instance_ids", {-1});
-        const Span<const int32_t> cluster = span_on<const int32_t>(device_, cluster_ids, "cluster_ids",
-                                                                   {static_cast<py::ssize_t>(instance.size)});
+        const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
         if (device_.is_host())
-            return on_host(
-                scene, camera, shade, true, [&](const HostScene& host, const Picture<float>& picture) {
-                    return cpu::draw_cut(host, camera.camera, instance, cluster, picture, flag_of(stop));
-                });
+            return on_host(scene, camera, shade, true,
+                           [&](const HostScene& host, const Picture<float>& picture) {
+                               return cpu::draw_cut(host, camera.camera, given, picture, flag_of(stop));
+                           });
 #if V3DG_WITH_CUDA
         const Work work(device_);
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
         const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
-        auto drawing =
-            frame_->draw_cut(scene.on_device(), camera.camera, instance, cluster, image, work.stream());
+        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, image, work.stream());
         return std::make_unique<BoundDrawing>(
-            std::move(picture), py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids),
-            device_, std::move(drawing));
+            std::move(picture),
+            py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights), device_,
+            std::move(drawing));
 #else
         return nullptr;
 #endif
@@ -209,16 +206,14 @@ class BoundSceneFrame {
     // As draw_cut(), with the number of gaussians that each pixel is blended of in place of depth.
     std::unique_ptr<BoundDrawing> count_cut(const py::object& scene_object, const BoundCamera& camera,
                                             const py::array& instance_ids, const py::array& cluster_ids,
-                                            const Shade& shade, const Stop* stop) {
+                                            const Shade& shade, const Stop* stop, const py::object& weights) {
         require_host("count_cut");
-        const Span<const int32_t> instance = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
-        const Span<const int32_t> cluster =
-            span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instance.size)});
-        return on_host(
-            checked(scene_object), camera, shade, true, [&](const HostScene& host, Picture<float> picture) {
-                std::swap(picture.depth, picture.count);
-                return cpu::draw_cut(host, camera.camera, instance, cluster, picture, flag_of(stop));
-            });
+        const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
+        return on_host(checked(scene_object), camera, shade, true,
+                       [&](const HostScene& host, Picture<float> picture) {
+                           std::swap(picture.depth, picture.count);
+                           return cpu::draw_cut(host, camera.camera, given, picture, flag_of(stop));
+                       });
     }
 
     // (place in the cut, weight, depth), or None.
@@ -226,21 +221,29 @@ class BoundSceneFrame {
                         const py::array& instance_ids, const py::array& cluster_ids) {
         require_host("pick_cut");
         const std::shared_ptr<const SceneState> state = checked(scene_object).state();
-        const Span<const int32_t> instance = span_of<const int32_t>(instance_ids, "instance_ids", {-1});
-        const Span<const int32_t> cluster =
-            span_of<const int32_t>(cluster_ids, "cluster_ids", {static_cast<py::ssize_t>(instance.size)});
+        const GivenCut given = given_cut(instance_ids, cluster_ids, py::none());
         const std::vector<SceneModel> models = models_of(*state);
         ScenePick picked{};
         bool shows_any = false;
         {
             const py::gil_scoped_release unlocked;
-            shows_any = cpu::pick_cut(host_scene(*state, models), camera.camera, instance, cluster, picked);
+            shows_any = cpu::pick_cut(host_scene(*state, models), camera.camera, given, picked);
         }
         if (!shows_any) return py::none();
         return py::make_tuple(picked.pair, picked.weight, picked.depth);
     }
 
   private:
+    // Weights are of 0 to 1, or None where all are 1.
+    GivenCut given_cut(const py::handle& instance_ids, const py::handle& cluster_ids,
+                       const py::handle& weights) const {
+        GivenCut given{span_on<const int32_t>(device_, instance_ids, "instance_ids", {-1}), {}, {}};
+        const auto size = static_cast<py::ssize_t>(given.instance.size);
+        given.cluster = span_on<const int32_t>(device_, cluster_ids, "cluster_ids", {size});
+        if (!weights.is_none()) given.weight = span_on<const float>(device_, weights, "weights", {size});
+        return given;
+    }
+
     BoundScene& checked(const py::object& scene_object) const {
         auto& scene = held<BoundScene>(scene_object, "scene");
         if (scene.device() != device_) throw py::value_error("scene: expected one on the frame's device");
@@ -397,9 +400,9 @@ void bind_frame(py::module_& m) {
         .def("draw_resident", &BoundSceneFrame::draw_resident, "scene"_a, "pool"_a, "camera"_a, "rule"_a,
              "shade"_a, "stop"_a = nullptr)
         .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,
-             "shade"_a, "stop"_a = nullptr)
+             "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
         .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,
-             "cluster_ids"_a, "shade"_a, "stop"_a = nullptr)
+             "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
         .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
              "cluster_ids"_a);
     py::class_<BoundAssetFrame>(m, "AssetFrame",

@@ -27,7 +27,8 @@ void check_clusters(const GatherInput& in) {
 }
 
 py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles, const Instances& instances,
-                 const py::array& instance, const py::array& first_row, const py::array& offset, int device) {
+                 const py::array& instance, const py::array& first_row, const py::array& offset,
+                 const py::object& weights, int device) {
     std::vector<GaussianRows<const float>> rows;
     int sh_degree = 0;
     for (const Rows& bundle : bundles) {
@@ -48,6 +49,7 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
     const auto num_clusters = static_cast<py::ssize_t>(in.instance.size);
     in.first_row = span_of<const int64_t>(first_row, "first_row", {num_clusters});
     in.offset = span_of<const int64_t>(offset, "offset", {num_clusters + 1});
+    if (!weights.is_none()) in.weight = span_of<const float>(weights, "weights", {num_clusters});
     check_clusters(in);
     const Work work(Device{device});
     const NewRows out(Device{device}, static_cast<size_t>(in.offset[in.instance.size]), sh_degree);
@@ -62,7 +64,7 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
 
 void bind_gather(py::module_& m) {
     m.def("gather", &gather, py::kw_only(), "bundles"_a, "instances"_a, "instance"_a, "first_row"_a,
-          "offset"_a, "device"_a,
+          "offset"_a, "weights"_a = py::none(), "device"_a,
           "Gaussians of clusters of instances in the world: means, quats, scales, opacities, sh.");
 }
 

@@ -129,6 +129,7 @@ size_t BoundTable::bytes_on(int device) const {
 BoundCut::BoundCut(const SelectOutput& out)
     : instance_ids(array_of(out.instance)),
       cluster_ids(array_of(out.cluster)),
+      weights(array_of(out.weight)),
       num_gaussians(out.num_gaussians),
       tolerance_px2(out.tolerance_px2),
       fits_budget(out.fits_budget) {}
@@ -143,6 +144,7 @@ void bind_select(py::module_& m) {
     py::class_<BoundCut>(m, "Cut", "The clusters that one view needs, and what their selection came to.")
         .def_readonly("instance_ids", &BoundCut::instance_ids)
         .def_readonly("cluster_ids", &BoundCut::cluster_ids)
+        .def_readonly("weights", &BoundCut::weights, "None of them without a fade, where all are 1.")
         .def_readonly("num_gaussians", &BoundCut::num_gaussians)
         .def_readonly("tolerance_px2", &BoundCut::tolerance_px2)
         .def_readonly("fits_budget", &BoundCut::fits_budget);

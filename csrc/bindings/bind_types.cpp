@@ -64,13 +64,16 @@ Footprint footprint_of(const std::string& name) {
 }
 
 SelectRule make_rule(double tolerance_px2, std::optional<uint64_t> budget, int32_t min_level,
-                     const std::string& footprint, bool culls) {
+                     const std::string& footprint, bool culls, double fade) {
     SelectRule rule;
     rule.tolerance_px2 = static_cast<float>(tolerance_px2);
     rule.budget = budget.value_or(kNoBudget);
     rule.min_level = min_level;
     rule.footprint = footprint_of(footprint);
     rule.culls = culls;
+    if (!(fade >= 1) || (fade > 1 && rule.footprint == Footprint::paper))
+        throw py::value_error("fade: expected a factor of 1 or more, and 1 with the paper's footprint");
+    rule.fade = {static_cast<float>(fade), 1.0f / static_cast<float>(fade)};
     return rule;
 }
 
@@ -166,7 +169,7 @@ void bind_types(py::module_& m) {
         .def_property_readonly("position", &position_of, "Where it is in the world: (3,).");
     py::class_<SelectRule>(m, "Rule", "What a selection chooses.")
         .def(py::init(&make_rule), py::kw_only(), "tolerance_px2"_a, "budget"_a, "min_level"_a, "footprint"_a,
-             "culls"_a)
+             "culls"_a, "fade"_a = 1.0)
         .def_readonly("tolerance_px2", &SelectRule::tolerance_px2);
     py::class_<Instances>(m, "Instances", "Instances of bundles; borrows the arrays, which are on the host.")
         .def(py::init<py::array, py::array, py::array, py::array, py::array>(), py::kw_only(), "bundle"_a,

@@ -44,6 +44,7 @@ class BoundTable {
 // The pairs (instance, cluster) of a selection, and what it came to.
 struct BoundCut {
     py::array_t<int32_t> instance_ids, cluster_ids;
+    py::array_t<float> weights;
     int64_t num_gaussians;
     float tolerance_px2;
     bool fits_budget;

@@ -32,6 +32,7 @@ struct Draw {
     Appearance<T> appearance;
     Palette palette{};
     const Codes* codes = nullptr;
+    T weight = 1;  // multiplies opacities; less of what fades
 };
 
 namespace cuda {
@@ -55,6 +56,7 @@ struct DrawItem {
     uint32_t placement, first, count, record;
     Appearance<float> appearance;
     uint32_t sharers, cluster;
+    float weight;  // multiplies opacities: 1, or less of what fades
 };
 
 // Where the items of a frame are written, in their order. Counts what there is, stores what there is room

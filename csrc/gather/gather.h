@@ -20,6 +20,7 @@ struct GatherInput {
     Span<const int32_t> instance;
     Span<const int64_t> first_row;  // in the bundle
     Span<const int64_t> offset;     // [S + 1] in the result, ascending from 0
+    Span<const float> weight;       // [S] that opacities are multiplied by; none where all are 1
 };
 
 // Writes the gaussians of all clusters in the world, in order. Spherical harmonics are rotated into the

@@ -40,7 +40,8 @@ V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotatio
     product[1] = static_cast<float>(q[0] * p[1] + q[1] * p[0] + q[2] * p[3] - q[3] * p[2]);
     product[2] = static_cast<float>(q[0] * p[2] - q[1] * p[3] + q[2] * p[0] + q[3] * p[1]);
     product[3] = static_cast<float>(q[0] * p[3] + q[1] * p[2] - q[2] * p[1] + q[3] * p[0]);
-    out.opacities[to] = rows.opacities[from];
+    const float opacity = rows.opacities[from];
+    out.opacities[to] = in.weight.size == 0 ? opacity : opacity * in.weight[s];
 }
 
 // Writes the three coefficients of one SH basis of that gaussian, rotated into the world with its band.

@@ -75,7 +75,9 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items, un
                                          min(static_cast<uint32_t>(kItemSize), count - first),
                                          p.first_record + first,
                                          t.appearance,
-                                         0};
+                                         0,
+                                         0,
+                                         1.0f};
     }
 }
 

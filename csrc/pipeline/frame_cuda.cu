@@ -144,7 +144,7 @@ void Frame::enqueue(Drawing& drawing) {
     drawing.prepare_(items, stream);
     if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
     project({batch.models, batch.packed, batch.coded, batch.placements, batch.images, items,
-             batch.has_shared_items},
+             batch.has_shared_items, batch.has_faded_items},
             {records, few, item_records, item_tiles, source, tiles, large, capacity.large}, stream);
     tile_bin({item_tiles, few, records, batch.images, batch.num_images, batch.num_tiles, capacity, large,
               tiles, &state->counters},

@@ -25,6 +25,7 @@ struct FrameBatch {
     const CodedGaussians* coded = nullptr;
     bool has_shared_items = false;           // whether there may be any; a frame that keeps a tape has none
     float min_transmittance = kStopsBefore;  // of the images
+    bool has_faded_items = false;            // the same as of shared ones; these are of scenes and not shared
 };
 
 // What a frame leaves for its backward pass, valid until the next frame is drawn.

@@ -47,17 +47,15 @@ SceneFrameCounts draw_scene(const HostScene& scene, const Camera& camera, const 
                             const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
 // Draws pairs that were selected before. Throws std::out_of_range where one is not of the scene.
-SceneFrameCounts draw_cut(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
-                          Span<const int32_t> cluster, const Picture<float>& picture,
-                          const std::atomic<bool>* stop = nullptr);
+SceneFrameCounts draw_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,
+                          const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
 // Draws all gaussians of one model, in the world, without a filter.
 SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,
                             const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
 // The gaussian that the first pixel of the camera's window shows most of. Returns whether there is any.
-bool pick_cut(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
-              Span<const int32_t> cluster, ScenePick& picked);
+bool pick_cut(const HostScene& scene, const Camera& camera, const GivenCut& given, ScenePick& picked);
 
 }  // namespace cpu
 }  // namespace v3dg

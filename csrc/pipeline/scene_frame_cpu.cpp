@@ -49,13 +49,13 @@ SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& c
 }
 
 // The clusters of a cut as draws. Clusters of one instance whose rows follow on each other make one draw if
-// they are drawn alike.
+// they are drawn alike, also with the same weight.
 class CutDraws {
   public:
-    CutDraws(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
-             Span<const int32_t> cluster)
+    CutDraws(const HostScene& scene, const Camera& camera, const GivenCut& given)
         : scene_(scene), camera_(camera) {
-        for (size_t s = 0; s < instance.size; ++s) add(instance[s], cluster[s]);
+        for (size_t s = 0; s < given.instance.size; ++s)
+            add(given.instance[s], given.cluster[s], given.weight_of(s));
     }
 
     const std::vector<Draw<float>>& draws() const { return draws_; }
@@ -66,7 +66,7 @@ class CutDraws {
     }
 
   private:
-    void add(int32_t i, int32_t c) {
+    void add(int32_t i, int32_t c, float weight) {
         if (i < 0 || static_cast<size_t>(i) >= scene_.instances.bundle.size)
             throw std::out_of_range("instance_ids: expected ids of the scene's instances, got " +
                                     std::to_string(i));
@@ -84,8 +84,8 @@ class CutDraws {
             view_ = model_view_from_instance(axes_of_instance(camera_, pose), pose);
         }
         end_of_pair_.back() = num_gaussians_ += count;
-        const Draw<float> next{model.planes,        first,         count,      view_,
-                               model.appearance[c], model.palette, model.codes};
+        const Draw<float> next{model.planes,        first,         count,       view_,
+                               model.appearance[c], model.palette, model.codes, weight};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else
@@ -95,7 +95,7 @@ class CutDraws {
 
     // Whether the second, of the same instance, begins where the first ends and is drawn alike.
     static bool joins(const Draw<float>& a, const Draw<float>& b) {
-        return a.first + a.count == b.first && a.appearance == b.appearance;
+        return a.first + a.count == b.first && a.appearance == b.appearance && a.weight == b.weight;
     }
 
     const HostScene& scene_;
@@ -117,8 +117,11 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Camera& camera, c
     const double select_seconds = now() - start;
     SceneFrameCounts counts{};
     if (cut.fits_budget)
-        counts = draw_cut(scene, camera, {cut.instance.data(), cut.instance.size()},
-                          {cut.cluster.data(), cut.cluster.size()}, picture, stop);
+        counts = draw_cut(scene, camera,
+                          {{cut.instance.data(), cut.instance.size()},
+                           {cut.cluster.data(), cut.cluster.size()},
+                           {cut.weight.data(), cut.weight.size()}},
+                          picture, stop);
     counts.gaussians = cut.num_gaussians;
     counts.tolerance_px2 = cut.tolerance_px2;
     counts.exceeds_budget = !cut.fits_budget;
@@ -126,11 +129,10 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Camera& camera, c
     return counts;
 }
 
-SceneFrameCounts cpu::draw_cut(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
-                               Span<const int32_t> cluster, const Picture<float>& picture,
-                               const std::atomic<bool>* stop) {
+SceneFrameCounts cpu::draw_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,
+                               const Picture<float>& picture, const std::atomic<bool>* stop) {
     const double start = now();
-    const CutDraws cut(scene, camera, instance, cluster);
+    const CutDraws cut(scene, camera, given);
     SceneFrameCounts counts = draw_all(cut.draws(), camera, picture, stop);
     counts.gaussians = cut.num_gaussians();
     counts.draw_seconds = now() - start;
@@ -147,9 +149,8 @@ SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t coun
     return counts;
 }
 
-bool cpu::pick_cut(const HostScene& scene, const Camera& camera, Span<const int32_t> instance,
-                   Span<const int32_t> cluster, ScenePick& picked) {
-    const CutDraws cut(scene, camera, instance, cluster);
+bool cpu::pick_cut(const HostScene& scene, const Camera& camera, const GivenCut& given, ScenePick& picked) {
+    const CutDraws cut(scene, camera, given);
     Pick found{};
     if (!pick(cut.draws(), pinhole_of<float>(camera), static_cast<int>(camera.x0),
               static_cast<int>(camera.y0), found))

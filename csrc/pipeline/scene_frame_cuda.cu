@@ -106,7 +106,7 @@ void SceneFrame::set_models(std::vector<DeviceModel> models,
     palettes_ = std::move(palettes);
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const FrameImage& image,
+std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const FrameImage& image, bool fades,
                                           Frame::Prepare prepare, cudaStream_t stream) {
     const FrameBatch batch{rows_.data(),
                            placements_.reserve(scene.num_instances(), stream),
@@ -116,7 +116,8 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const FrameI
                            has_packed_ ? packed_.data() : nullptr,
                            has_coded_ ? coded_.data() : nullptr,
                            scene.num_instances() > 1,
-                           image.min_transmittance};
+                           image.min_transmittance,
+                           fades};
     return frame_.draw(batch, std::move(prepare), stream);
 }
 
@@ -124,7 +125,7 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Camera
                                           const SelectRule& rule, const FrameImage& image,
                                           cudaStream_t stream) {
     return draw(
-        scene, image,
+        scene, image, rule.fade.is_on(),
         [=, &scene](const ItemList& items, cudaStream_t on) {
             cut_.cut_items(scene, camera, rule, image, images_.data(), placements_.data(), items, on);
         },
@@ -132,13 +133,12 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Camera
 }
 
 std::unique_ptr<Drawing> SceneFrame::draw_cut(const SceneTables& scene, const Camera& camera,
-                                              Span<const int32_t> instance, Span<const int32_t> cluster,
-                                              const FrameImage& image, cudaStream_t stream) {
+                                              const GivenCut& given, const FrameImage& image,
+                                              cudaStream_t stream) {
     return draw(
-        scene, image,
+        scene, image, given.weight.size > 0,
         [=, &scene](const ItemList& items, cudaStream_t on) {
-            cut_.given_items(scene, camera, instance, cluster, image, images_.data(), placements_.data(),
-                             items, on);
+            cut_.given_items(scene, camera, given, image, images_.data(), placements_.data(), items, on);
         },
         stream);
 }
@@ -159,7 +159,7 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
     const uint32_t at = static_cast<uint32_t>(first);
     const uint32_t size =
         static_cast<uint32_t>(min(static_cast<unsigned long long>(kItemSize), count - first));
-    items.items[i] = {0, at, size, at, appearance, 0, 0};
+    items.items[i] = {0, at, size, at, appearance, 0, 0, 1.0f};
 }
 
 std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows, const ModelView<float>& view,

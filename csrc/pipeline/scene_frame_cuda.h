@@ -71,13 +71,12 @@ class SceneFrame {
     std::unique_ptr<Drawing> draw(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
                                   const FrameImage& image, cudaStream_t stream);
     // Draws pairs that were selected before; they are on the device and stay, too.
-    std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera,
-                                      Span<const int32_t> instance, Span<const int32_t> cluster,
+    std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera, const GivenCut& given,
                                       const FrameImage& image, cudaStream_t stream);
 
   private:
-    std::unique_ptr<Drawing> draw(const SceneTables& scene, const FrameImage& image, Frame::Prepare prepare,
-                                  cudaStream_t stream);
+    std::unique_ptr<Drawing> draw(const SceneTables& scene, const FrameImage& image, bool fades,
+                                  Frame::Prepare prepare, cudaStream_t stream);
 
     std::vector<DeviceModel> models_;
     std::vector<std::shared_ptr<const DevicePalette>> palettes_;

@@ -125,8 +125,9 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
         to_view(draw.view, g.mean, s.p);
         const auto in_front = s.p[2] >= all_lanes<V>(camera.near_depth);
         if ((bits_of(in_front) & lanes) == 0) continue;
-        const Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.appearance.filter_px2,
-                                              draw.appearance.antialiased, s);
+        Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.appearance.filter_px2,
+                                        draw.appearance.antialiased, s);
+        if (draw.weight < 1) fade(draw.weight, e);
 
         V half_x, half_y;
         const auto drawable = in_front & extent_of(g.opacity, e, s, half_x, half_y);

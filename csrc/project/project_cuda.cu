@@ -46,8 +46,8 @@ struct SphereTest {
 };
 
 // Of a gaussian at p in view space. Without branches, because some lane of the warp would take each of them.
-template <class Model>
-__device__ SphereTest test_sphere(const ItemTables<Model>& in, const float p[3], float reach,
+template <class Source>
+__device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, const float p[3], float reach,
                                   float reach_scale) {
     const Pinhole<float>& cam = in.image.camera;
     const float inv_z = 1 / p[2], slope_x = p[0] * inv_z, slope_y = p[1] * inv_z;
@@ -58,8 +58,10 @@ __device__ SphereTest test_sphere(const ItemTables<Model>& in, const float p[3],
     const float from_x = fabsf(u - middle_x), from_y = fabsf(v - middle_y);
     const bool is_outside =
         !(p[2] >= cam.near_depth) | (reach < 0) | (from_x - half >= middle_x) | (from_y - half >= middle_y);
-    // With its centre in the image it is in the frustum for certain, unless compensation makes it too faint.
-    const bool is_inside = (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.antialiased;
+    // With its centre in the image it is in the frustum for certain, unless it is made too faint.
+    const bool is_faded = Source::kFades && in.item.weight < 1;
+    const bool is_inside =
+        (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.antialiased & !is_faded;
     const bool misses = is_inside & (misses_centers(u, half) | misses_centers(v, half));
     return {!(is_outside | misses), misses && !is_outside};
 }
@@ -231,7 +233,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             const float4 sphere = Source::sphere(tables.model, here, tables.item.first + place, fetched);
             const float mean[3] = {sphere.x, sphere.y, sphere.z};
             to_view(view, mean, p);
-            const SphereTest told = test_sphere(tables, p, sphere.w, reach_scale);
+            const SphereTest told = test_sphere<Source>(tables, p, sphere.w, reach_scale);
             may_reach = told.may_reach;
             num_in_frustum += told.misses_centers;
         }
@@ -368,20 +370,31 @@ PackedPlanes pack(const GaussianRows<const float>& rows, float* planes, cudaStre
         {planes, planes + 4 * count, planes + 8 * count, planes + 12 * count}, rows.sh, rows.sh_degree, {}};
 }
 
-template <class Source>
+// Shared items have no weights below 1.
+template <class Source, class SharedSource>
 static void project_from(const typename Source::Model* models, const ProjectInput& in,
                          const ProjectOutput& out, cudaStream_t stream) {
     const unsigned blocks = kBlocks * num_multiprocessors();
     launch("project_kernel", project_kernel<Source>, blocks, 32 * kWarps, 0, stream, in, models, out);
     if (in.has_shared_items)
-        launch("project_shared_kernel", project_shared_kernel<Source>, blocks, 32 * kWarps, 0, stream, in,
-               models, out);
+        launch("project_shared_kernel", project_shared_kernel<SharedSource>, blocks, 32 * kWarps, 0, stream,
+               in, models, out);
+}
+
+template <class Source>
+static void project_scene(const typename Source::Model* models, const ProjectInput& in,
+                          const ProjectOutput& out, cudaStream_t stream) {
+    if (in.has_faded_items)
+        project_from<Faded<Source>, Source>(models, in, out, stream);
+    else
+        project_from<Source, Source>(models, in, out, stream);
 }
 
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream) {
-    if (in.packed != nullptr) project_from<PackedSource>(in.packed, in, out, stream);
-    if (in.coded != nullptr) project_from<CodeSource>(in.coded, in, out, stream);
-    if (in.packed == nullptr && in.coded == nullptr) project_from<RowSource>(in.models, in, out, stream);
+    if (in.packed != nullptr) project_scene<PackedSource>(in.packed, in, out, stream);
+    if (in.coded != nullptr) project_scene<CodeSource>(in.coded, in, out, stream);
+    if (in.packed == nullptr && in.coded == nullptr)
+        project_from<RowSource, RowSource>(in.models, in, out, stream);
 }
 
 }  // namespace cuda

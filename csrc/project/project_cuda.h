@@ -24,6 +24,7 @@ struct ProjectInput {
     const FrameImage* images;
     ItemList items;         // in the counters: sets in_frustum, records and large, which start at 0
     bool has_shared_items;  // whether there may be any
+    bool has_faded_items;   // the same; these are of scenes and not shared
 };
 
 struct ProjectOutput {

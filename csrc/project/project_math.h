@@ -81,6 +81,12 @@ V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const Mo
     return e;
 }
 
+// Multiplies the opacity by the weight of a level that is on its way in or out.
+template <class V>
+V3DG_HD V3DG_INLINE void fade(Lane<V> weight, Ellipse<V>& e) {
+    e.log2_opacity += log2_of(weight);
+}
+
 // How far from its centre, px, alpha is 1/255 or more: where |L d|² = log2 of alpha at the centre over 1/255.
 // Returns whether it is anywhere; the extent means nothing where it is not.
 template <class V>

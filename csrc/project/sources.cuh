@@ -62,6 +62,7 @@ struct OfRows {
     using Model = RowModel;
     using Fetched = float4;
     struct Place {};  // a row is all that is needed
+    static constexpr bool kFades = false;
 
     static __device__ Place start(const ItemTables<Model>&) { return {}; }
     static __device__ void prepare() {}
@@ -137,6 +138,7 @@ struct PackedSource : OfRows<PackedPlanes> {
 struct CodeSource {
     using Model = CodedGaussians;
     using Fetched = uint4;
+    static constexpr bool kFades = false;
     struct Place {
         uint32_t cluster, end;  // of the rows of the cluster
     };
@@ -243,6 +245,20 @@ struct CodeSource {
         for (int k = 0; k < 3 * kDegree; ++k) step[k] = __ldg(m.codes.ranges_of(place.cluster).sh_step + k);
         decode_sh<float>(words, step, kDegree, sh + 3);
         color_of<kDegree>(sh, gaussian.mean, view, color);
+    }
+};
+
+// The same for frames of which some items have weights below 1.
+template <class Source>
+struct Faded : Source {
+    static constexpr bool kFades = true;
+
+    static __device__ Ellipse<float> project(const ItemTables<typename Source::Model>& in,
+                                             const ModelView<float>& view, typename Source::Place& place,
+                                             uint32_t g, Projection<float>& s, float color[3]) {
+        Ellipse<float> e = Source::project(in, view, place, g, s, color);
+        fade(in.item.weight, e);
+        return e;
     }
 };
 

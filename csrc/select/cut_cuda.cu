@@ -139,6 +139,7 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     const unsigned num_parts = *scratch.num_parts, num_tickets = blocks_for(num_parts, kCutWarps);
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
     if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
+    if (!Output::kFades) rule.fade = {};
     for (unsigned ticket = take_ticket(scratch.cut_ticket); ticket < num_tickets;
          ticket = take_ticket(scratch.cut_ticket)) {
         const unsigned p = ticket * kCutWarps + threadIdx.x / 32;
@@ -149,8 +150,9 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
                 const ClusterTable& table = mine.bundle->table;
                 const InstanceView view = scene.views[mine.instance];
                 const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
-                mine.drawn = ask_clusters(mine, view, rule, Tolerances::this_one,
-                                          [&](int32_t c) { return cut.draws(c); });
+                mine.drawn = ask_clusters(
+                    mine, view, rule, Tolerances::this_one, [&](int32_t c) { return cut.drawn_weight(c); },
+                    Output::kFades ? &mine.weights : nullptr);
             }
         }
         write_clusters(mine, ticket, ticket + 1 == num_tickets, scratch.unit_state, scratch.count_state,
@@ -169,16 +171,24 @@ __global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage im
                      static_cast<uint32_t>(scene.instances.bundle[i]), 0};
 }
 
-// A thread kLaneClusters pairs. The pairs of instances without a pose are left out.
+// A thread a pair. The pairs of instances without a pose are left out.
+template <class Output>
 __global__ void __launch_bounds__(kCutThreads)
-    given_kernel(PlacedScene scene, Span<const int32_t> instance, Span<const int32_t> cluster,
-                 Scratch scratch, ItemOutput output) {
+    given_kernel(PlacedScene scene, GivenCut given, Scratch scratch, Output output) {
     const unsigned ticket = take_ticket(scratch.cut_ticket);
     const size_t p = size_t(ticket) * kCutThreads + threadIdx.x;
     LaneClusters mine{};
-    if (p < instance.size && is_placed(scene.instances.pose(instance[p])))
-        mine = {&scene.bundles[scene.instances.bundle[instance[p]]], static_cast<uint32_t>(instance[p]),
-                static_cast<uint32_t>(cluster[p]), false, 1};
+    if (p < given.instance.size && is_placed(scene.instances.pose(given.instance[p]))) {
+        const int32_t i = given.instance[p];
+        mine = {&scene.bundles[scene.instances.bundle[i]],
+                static_cast<uint32_t>(i),
+                static_cast<uint32_t>(given.cluster[p]),
+                false,
+                1,
+                {}};
+        if (Output::kFades)
+            mine.weights = LaneWeights::all(static_cast<int32_t>(given.weight_of(p) * kWhole + 0.5f));
+    }
     write_clusters(mine, ticket, ticket + 1 == gridDim.x, scratch.unit_state, scratch.count_state, output);
 }
 
@@ -257,37 +267,49 @@ void Cut::cut_items(const SceneTables& scene, const Camera& camera, const Select
                     cudaStream_t stream) {
     const DeviceGuard guard(device_);
     const StreamLock lock = scene.lock(stream);
-    cut(scene, camera, rule, {image, images, placements, &items.counters->choice}, ItemOutput{items}, stream);
+    const Target target{image, images, placements, &items.counters->choice};
+    if (rule.fade.is_on())
+        cut(scene, camera, rule, target, ItemOutput<true>{items}, stream);
+    else
+        cut(scene, camera, rule, target, ItemOutput<false>{items}, stream);
 }
 
-void Cut::given_items(const SceneTables& scene, const Camera& camera, Span<const int32_t> instance,
-                      Span<const int32_t> cluster, const FrameImage& image, FrameImage* images,
-                      Placement* placements, const ItemList& items, cudaStream_t stream) {
+void Cut::given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
+                      const FrameImage& image, FrameImage* images, Placement* placements,
+                      const ItemList& items, cudaStream_t stream) {
     const DeviceGuard guard(device_);
     const StreamLock lock = scene.lock(stream);
     const SceneOnDevice on_device = scene.on_device();
     const PlacedScene placed{on_device.bundles, on_device.instances, nullptr, nullptr, nullptr};
-    const unsigned blocks = std::max(1u, blocks_for(instance.size, kCutThreads));
+    const unsigned blocks = std::max(1u, blocks_for(given.instance.size, kCutThreads));
     const size_t words = scratch_words(0, blocks);
     const Scratch scratch = scratch_in(scratch_.reserve(words, stream), 0, blocks);
     check(cudaMemsetAsync(scratch_.data(), 0, words * sizeof(Count), stream), "cudaMemsetAsync");
     launch("place_all_kernel", place_all_kernel, place_blocks(scene.num_instances()), kPlaceThreads, 0,
            stream, placed, camera, image, images, placements);
-    launch("given_kernel", given_kernel, blocks, kCutThreads, 0, stream, placed, instance, cluster, scratch,
-           ItemOutput{items});
+    if (given.weight.size > 0)
+        launch("given_kernel", given_kernel<ItemOutput<true>>, blocks, kCutThreads, 0, stream, placed, given,
+               scratch, ItemOutput<true>{items});
+    else
+        launch("given_kernel", given_kernel<ItemOutput<false>>, blocks, kCutThreads, 0, stream, placed, given,
+               scratch, ItemOutput<false>{items});
 }
 
-void Cut::select(const SceneTables& scene, const Camera& camera, const SelectRule& rule, SelectOutput& out,
-                 cudaStream_t stream) {
+template <bool kFades>
+void Cut::select_pairs(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
+                       SelectOutput& out, cudaStream_t stream) {
     const DeviceGuard guard(device_);
     const StreamLock lock = scene.lock(stream);
     Pairs* on_device = pairs_.reserve(1, stream);
     Pairs counts{};
     // Most cuts of most scenes fit at once.
     for (Count capacity = std::max<Count>(1u << 16, pair_instance_.capacity());; capacity = counts.pairs) {
-        const PairOutput output{pair_instance_.reserve(capacity, stream),
-                                pair_cluster_.reserve(capacity, stream), capacity, &on_device->pairs,
-                                &on_device->gaussians};
+        const PairOutput<kFades> output{pair_instance_.reserve(capacity, stream),
+                                        pair_cluster_.reserve(capacity, stream),
+                                        kFades ? pair_weight_.reserve(capacity, stream) : nullptr,
+                                        capacity,
+                                        &on_device->pairs,
+                                        &on_device->gaussians};
         check(cudaMemsetAsync(on_device, 0, sizeof *on_device, stream), "cudaMemsetAsync");
         cut(scene, camera, rule, {{}, nullptr, nullptr, &on_device->choice}, output, stream);
         copy_to_host(&counts, on_device, 1, stream);
@@ -300,14 +322,25 @@ void Cut::select(const SceneTables& scene, const Camera& camera, const SelectRul
     out.num_gaussians = static_cast<int64_t>(out.fits_budget ? counts.gaussians : counts.choice.least);
     out.instance.resize(counts.pairs);
     out.cluster.resize(counts.pairs);
+    out.weight.resize(kFades ? counts.pairs : 0);
     copy_to_host(out.instance.data(), pair_instance_.data(), counts.pairs, stream);
     copy_to_host(out.cluster.data(), pair_cluster_.data(), counts.pairs, stream);
+    copy_to_host(out.weight.data(), pair_weight_.data(), out.weight.size(), stream);
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+}
+
+void Cut::select(const SceneTables& scene, const Camera& camera, const SelectRule& rule, SelectOutput& out,
+                 cudaStream_t stream) {
+    if (rule.fade.is_on())
+        select_pairs<true>(scene, camera, rule, out, stream);
+    else
+        select_pairs<false>(scene, camera, rule, out, stream);
 }
 
 size_t Cut::bytes() const {
     return views_.bytes() + tops_.bytes() + parts_.bytes() + scratch_.bytes() + change_.bytes() +
-           budget_.bytes() + pair_instance_.bytes() + pair_cluster_.bytes() + pairs_.bytes();
+           budget_.bytes() + pair_instance_.bytes() + pair_cluster_.bytes() + pair_weight_.bytes() +
+           pairs_.bytes();
 }
 
 }  // namespace cuda

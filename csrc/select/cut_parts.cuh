@@ -55,13 +55,30 @@ void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const Bu
                       unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
                       BudgetState* state, cudaStream_t stream);
 
-// What a lane has of a part: clusters of one instance, and a bit for each that is drawn.
+// Weights of a lane's clusters, kWhole or less each. The lane picks one by shifting, for an index would put
+// them into memory.
+struct LaneWeights {
+    uint64_t low, high;
+
+    static __device__ LaneWeights all(int32_t weight) {
+        const uint64_t four = 0x0001000100010001ull * static_cast<uint64_t>(weight);
+        return {four, four};
+    }
+    __device__ int32_t operator[](unsigned k) const {
+        return static_cast<int32_t>((k < 4 ? low : high) >> 16 * (k % 4) & 0xffff);
+    }
+};
+static_assert(kLaneClusters == 8 && kWhole < 1 << 16, "two words hold the weights of a lane");
+
+// What a lane has of a part: clusters of one instance, and a bit for each that is drawn. Weights are of cuts
+// with a fade alone.
 struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
     uint32_t first;  // of a table
     bool are_tops;
     unsigned drawn;
+    LaneWeights weights;
 
     __device__ int32_t cluster(unsigned k) const {
         return are_tops ? bundle->table.top_cluster[k] : static_cast<int32_t>(first + k);
@@ -77,29 +94,41 @@ struct LaneClusters {
 // Those of a table are not asked yet.
 __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const CutPart& part) {
     const unsigned lane = threadIdx.x % 32;
-    LaneClusters mine{nullptr, part.instance, part.first + kLaneClusters * lane, part.tops != 0, 0};
+    LaneClusters mine{nullptr, part.instance, part.first + kLaneClusters * lane, part.tops != 0, 0, {}};
     if (mine.are_tops) {
         if ((part.tops >> lane & 1) == 0) return mine;
         mine.instance += lane;
         mine.drawn = scene.tops[mine.instance];
+        mine.weights = LaneWeights::all(kWhole);
     }
     mine.bundle = &scene.bundles[scene.instances.bundle[mine.instance]];
     return mine;
 }
 
+// Hands the answers of the kLaneClusters lanes from `from` on to this lane, unless that is 32.
+__device__ inline void keep_weights(int32_t answer, unsigned from, LaneWeights& weights) {
+    LaneWeights found{};
+#pragma unroll
+    for (unsigned k = 0; k < kLaneClusters; ++k) {
+        const uint64_t weight = __shfl_sync(kAllLanes, max(answer, 0), (from + k) % 32);
+        (k < 4 ? found.low : found.high) |= weight << 16 * (k % 4);
+    }
+    if (from < 32) weights = found;
+}
+
 // Asks the clusters of a part of a table, a lane a cluster, for the lanes whose bounds do not tell that none
 // of theirs is drawn; four such lanes at a time. Returns to each lane a bit for each of its own clusters for
-// which ask(cluster) was true.
+// which ask(cluster) was positive, and keeps what it was where `weights` is not null.
 template <class Ask>
 __device__ unsigned ask_clusters(const LaneClusters& mine, const InstanceView& view, const SelectRule& rule,
-                                 Tolerances tolerances, const Ask& ask) {
+                                 Tolerances tolerances, const Ask& ask, LaneWeights* weights = nullptr) {
     const unsigned lane = threadIdx.x % 32;
     const uint32_t part_first = mine.first - kLaneClusters * lane;
     const bool asks = mine.first < mine.bundle->table.num_clusters() &&
                       may_draw(mine.bundle->table, mine.bounds(), view, rule, tolerances);
     unsigned todo = __ballot_sync(kAllLanes, asks), found = 0;
     while (todo != 0) {
-        unsigned owners = 0, owner = 32;  // in bytes; of this lane
+        unsigned owners = 0, owner = 32;  // in bytes; that this lane asks for
         for (unsigned at = 0; at < 32; at += kLaneClusters) {
             const unsigned next = todo != 0 ? __ffs(todo) - 1 : 32;
             todo &= todo - 1;
@@ -108,9 +137,15 @@ __device__ unsigned ask_clusters(const LaneClusters& mine, const InstanceView& v
         }
         const uint32_t c = part_first + kLaneClusters * owner + lane % kLaneClusters;
         const bool is_one = owner < 32 && c < mine.bundle->table.num_clusters();
-        const unsigned bits = __ballot_sync(kAllLanes, is_one && ask(static_cast<int32_t>(c)));
+        const int32_t answer = is_one ? static_cast<int32_t>(ask(static_cast<int32_t>(c))) : 0;
+        const unsigned bits = __ballot_sync(kAllLanes, answer > 0);
+        unsigned from = 32;  // where this lane's clusters were asked
         for (unsigned at = 0; at < 32; at += kLaneClusters)
-            if ((owners >> at & 255) == lane) found = bits >> at & 255;
+            if ((owners >> at & 255) == lane) {
+                found = bits >> at & 255;
+                from = at;
+            }
+        if (weights != nullptr) keep_weights(answer, from, *weights);
     }
     return found;
 }

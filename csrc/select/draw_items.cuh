@@ -12,9 +12,12 @@ struct WriteCount {
     unsigned units, gaussians;  // units: elements of the list
 };
 
-// Selected clusters as (instance, cluster).
+// Selected clusters as (instance, cluster), and with a fade their weights.
+template <bool kHasFade>
 struct PairOutput {
+    static constexpr bool kFades = kHasFade;
     int32_t *instance, *cluster;
+    float* weight;
     Count capacity;
     Count *pairs, *gaussians;
 
@@ -32,6 +35,7 @@ struct PairOutput {
             if (mine.drawn >> k & 1) {
                 if (first >= capacity) return;
                 instance[first] = static_cast<int32_t>(mine.instance);
+                if (kFades) weight[first] = share_of(mine.weights[k]);
                 cluster[first++] = mine.cluster(k);
             }
     }
@@ -57,8 +61,9 @@ __device__ inline bool is_worth_sharing(unsigned num_gaussians, unsigned num_ins
     return num_instances > 1 && num_gaussians <= num_instances * (blocks_for(num_gaussians, 32) + 2);
 }
 
-// Calls visit(DrawnRun) in the lane that writes the run; for whole warps.
-template <class Visit>
+// Calls visit(DrawnRun) in the lane that writes the run; for whole warps. With a fade, clusters of different
+// weights are not drawn together.
+template <bool kFades, class Visit>
 __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
     if (!mine.are_tops) {
         if (mine.drawn == 0) return;
@@ -66,7 +71,10 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
         for (unsigned k = 0, end; k < kLaneClusters; k = end) {
             end = k + 1;
             if ((mine.drawn >> k & 1) == 0) continue;
-            while ((mine.drawn & joins) >> end & 1) ++end;
+            while ((mine.drawn & joins) >> end & 1) {
+                if (kFades && mine.weights[end] != mine.weights[k]) break;
+                ++end;
+            }
             visit(DrawnRun{k, end - k, 0, 1});
         }
         return;
@@ -86,12 +94,14 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
 
 // Selected clusters as items. Neighbouring clusters are drawn by the same items, and so are the tops that
 // neighbouring instances have in common.
+template <bool kHasFade>
 struct ItemOutput {
+    static constexpr bool kFades = kHasFade;
     ItemList items;
 
     __device__ WriteCount count(const LaneClusters& mine) const {
         WriteCount count{0, 0};
-        for_each_drawn(mine, [&](const DrawnRun& run) {
+        for_each_drawn<kFades>(mine, [&](const DrawnRun& run) {
             const unsigned size = mine.size(run.k, run.num_clusters);
             count.units += blocks_for(size, run.gaussians_an_item());
             count.gaussians += run.num_instances * size;
@@ -99,13 +109,14 @@ struct ItemOutput {
         return count;
     }
     __device__ void write(const LaneClusters& mine, Count first, Count record) const {
-        for_each_drawn(mine, [&](const DrawnRun& run) {
+        for_each_drawn<kFades>(mine, [&](const DrawnRun& run) {
             static_assert(kLaneClusters <= kItemClusters, "a run may be as long");
             const int32_t cluster = mine.cluster(run.k);
             const unsigned size = mine.size(run.k, run.num_clusters), step = run.gaussians_an_item();
             const uint32_t placement = run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
             const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.first_row(cluster));
             const Appearance<float> appearance = mine.bundle->appearance[cluster];
+            const float weight = kFades ? share_of(mine.weights[run.k]) : 1.0f;
             for (unsigned skip = 0; skip < size; skip += step, ++first) {
                 const unsigned count = min(step, size - skip);
                 if (first < items.item_capacity &&
@@ -116,7 +127,8 @@ struct ItemOutput {
                                           static_cast<uint32_t>(record),
                                           appearance,
                                           run.sharers,
-                                          static_cast<uint32_t>(cluster)};
+                                          static_cast<uint32_t>(cluster),
+                                          weight};
                 record += run.num_instances * count;
             }
         });

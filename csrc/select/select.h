@@ -19,7 +19,11 @@ namespace v3dg {
 // With a budget, the tolerance is the least of those that a budget chooses from (select_math.h) from which on
 // no cut has more gaussians: a coarser cut can have more than a finer one where the frustum cuts through it.
 // There may be none: then `fits_budget` is false, nothing is selected and `num_gaussians` is what the
-// coarsest cut has. All pages count as resident: while some are not, the cut may have more or less.
+// coarsest cut has. All pages count as resident: while some are not, the cut may have more or less. With a
+// fade, what counts at a tolerance is every cluster that may be drawn.
+//
+// With a fade there may be several clusters on a path, whose weights add up to 1, whichever pages are
+// resident. They depend on that and on the metrics of the groups above and below alone.
 //
 // Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the footprint and the
 // nesting balls are ours.
@@ -36,9 +40,18 @@ struct SelectInput {
 
 struct SelectOutput {
     std::vector<int32_t> instance, cluster;  // [S]
+    std::vector<float> weight;               // [S]; none without a fade, where all are 1
     int64_t num_gaussians = 0;
     float tolerance_px2 = 0;  // that was used
     bool fits_budget = true;
+};
+
+// What was selected before. No weights where all are 1.
+struct GivenCut {
+    Span<const int32_t> instance, cluster;
+    Span<const float> weight;
+
+    V3DG_HD float weight_of(size_t s) const { return weight.size == 0 ? 1.0f : weight[s]; }
 };
 
 namespace cpu {

@@ -17,16 +17,20 @@ namespace {
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
 
-// Answers for the groups of one instance: whether each fits, or its bin.
-struct KnownFits {
-    const uint8_t* fits_group;
+// Answers for the groups of one instance: how far each is refined, or its bins.
+struct KnownRefinements {
+    const uint16_t* of_group;
 
-    bool fits(int32_t g) const { return fits_group[g] != 0; }
+    int32_t refinement(int32_t g) const { return of_group[g]; }
+};
+struct GroupBins {
+    uint32_t fitting, unrefined;
 };
 struct KnownBins {
-    const uint32_t* bin_of_group;
+    const GroupBins* of_group;
 
-    uint32_t bin(int32_t g) const { return bin_of_group[g]; }
+    uint32_t first_fitting(int32_t g) const { return of_group[g].fitting; }
+    uint32_t first_unrefined(int32_t g) const { return of_group[g].unrefined; }
 };
 
 // What to select from, with what all instances share.
@@ -75,40 +79,52 @@ struct SeenInstance {
 
 // What a thread works in.
 struct Scratch {
-    std::vector<uint8_t> fits;    // of each group
-    std::vector<int32_t> chosen;  // clusters
-    std::vector<float> priority;  // of each group, where pages are asked for
+    std::vector<uint16_t> refinement;  // of each group
+    std::vector<int32_t> chosen;       // clusters
+    std::vector<float> priority;       // of each group, where pages are asked for
 
     explicit Scratch(const View& view)
-        : fits(view.most_groups),
+        : refinement(view.most_groups),
           chosen(view.most_clusters),
           priority(view.in.needs.empty() ? 0 : view.most_groups) {}
 };
 
 // Answers for all groups of an instance. What it reads comes as copies, which nothing that it writes can
 // change, so that the compiler works on several groups at once. Those that are absent, which it could not ask
-// for at once, fit whatever the answer.
-template <Footprint footprint>
-void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule, uint8_t* __restrict fits) {
+// for at once, are not refined whatever the answer.
+template <Footprint footprint, bool kFades>
+void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
+                uint16_t* __restrict refinement) {
     rule.footprint = footprint;
+    if (!kFades) rule.fade = {};
     const PageTable pages = table.pages;
     table.pages = {};
     const AskedGroups groups{table, view, rule};
     const int32_t num_groups = static_cast<int32_t>(table.ball.size);
-    for (int32_t g = 0; g < num_groups; ++g) fits[g] = groups.fits(g);
-    for (int32_t g = 0; g < num_groups && !pages.is_whole(); ++g) fits[g] |= !pages.is_resident(g);
+    for (int32_t g = 0; g < num_groups; ++g) refinement[g] = static_cast<uint16_t>(groups.refinement(g));
+    for (int32_t g = 0; g < num_groups && !pages.is_whole(); ++g)
+        if (!pages.is_resident(g)) refinement[g] = 0;
+}
+
+void ask_groups(const SeenInstance& seen, const SelectRule& rule, uint16_t* refinement) {
+    if (rule.footprint == Footprint::paper)
+        ask_groups<Footprint::paper, false>(seen.table, seen.view, rule, refinement);
+    else if (rule.fade.is_on())
+        ask_groups<Footprint::solid_angle, true>(seen.table, seen.view, rule, refinement);
+    else
+        ask_groups<Footprint::solid_angle, false>(seen.table, seen.view, rule, refinement);
 }
 
 // Returns how many clusters suffice and writes which.
 size_t find_sufficient(const ClusterTable table, const InstanceView view, const SelectRule rule,
-                       const uint8_t* __restrict fits, int32_t* __restrict cluster) {
-    const InstanceCut<KnownFits> cut{table, view, rule, KnownFits{fits}, false};
+                       const uint16_t* __restrict refinement, int32_t* __restrict cluster) {
+    const InstanceCut<KnownRefinements> cut{table, view, rule, {refinement}, false};
     const size_t num_clusters = table.num_clusters();
     size_t num_sufficient = 0;
     // Without a branch, because none could be foretold.
     for (size_t c = 0; c < num_clusters; ++c) {
         cluster[num_sufficient] = static_cast<int32_t>(c);
-        num_sufficient += cut.suffices(c);
+        num_sufficient += cut.weight(c) > 0;
     }
     return num_sufficient;
 }
@@ -140,31 +156,31 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     const SeenInstance seen(view, i);
     const CutSource source = seen.source(rule);
     if (source == CutSource::nowhere) return;
-    uint8_t* fits = scratch.fits.data();
-    const auto cut = seen.cut(rule, KnownFits{fits});
+    uint16_t* refinement = scratch.refinement.data();
+    const auto cut = seen.cut(rule, KnownRefinements{refinement});
     int32_t* chosen = scratch.chosen.data();
     int32_t* end = chosen;
     if (source == CutSource::tops) {
         end = std::copy(seen.table.top_cluster.begin(), seen.table.top_cluster.end(), chosen);
     } else {
-        if (rule.footprint == Footprint::solid_angle)
-            ask_groups<Footprint::solid_angle>(seen.table, seen.view, rule, fits);
-        else
-            ask_groups<Footprint::paper>(seen.table, seen.view, rule, fits);
-        end += find_sufficient(seen.table, seen.view, rule, fits, chosen);
+        ask_groups(seen, rule, refinement);
+        end += find_sufficient(seen.table, seen.view, rule, refinement, chosen);
         if (!view.in.needs.empty() && !seen.table.pages.is_whole())
             tell_needs(cut, rule, view.in.needs[view.in.instances.bundle[i]], scratch.priority);
     }
     if (cut.culls) end = std::remove_if(chosen, end, [&](int32_t c) { return cut.is_culled(c); });
     out.instance.insert(out.instance.end(), end - chosen, static_cast<int32_t>(i));
     out.cluster.insert(out.cluster.end(), chosen, end);
+    if (rule.fade.is_on())
+        for (const int32_t* c = chosen; c != end; ++c)
+            out.weight.push_back(source == CutSource::tops ? 1.0f : share_of(cut.weight(*c)));
     out.num_gaussians += std::accumulate(
         chosen, end, int64_t(0), [&](int64_t sum, int32_t c) { return sum + seen.table.num_gaussians(c); });
 }
 
 // Adds to `change`, for each tolerance that a budget chooses from, by how many gaussians the cut of instance
 // i differs from that of the tolerance before. bins: as above.
-void count_instance(const View& view, size_t i, std::vector<uint32_t>& bins, std::vector<int64_t>& change) {
+void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins, std::vector<int64_t>& change) {
     const SelectRule& rule = view.in.rule;
     const SeenInstance seen(view, i);
     const CutSource source = seen.source(rule);
@@ -176,7 +192,8 @@ void count_instance(const View& view, size_t i, std::vector<uint32_t>& bins, std
         return;
     }
     const AskedGroups groups = seen.groups(rule);
-    for (size_t g = 0; g < seen.table.ball.size; ++g) bins[g] = groups.bin(static_cast<int32_t>(g));
+    const int32_t num_groups = static_cast<int32_t>(seen.table.ball.size);
+    for (int32_t g = 0; g < num_groups; ++g) bins[g] = {groups.first_fitting(g), groups.first_unrefined(g)};
     for (size_t c = 0; c < seen.table.num_clusters(); ++c) {
         const BinRange range = cut.bins(c);
         if (range.is_empty()) continue;
@@ -193,7 +210,7 @@ int64_t meet_budget(const View& view, SelectRule& rule) {
     std::vector<std::vector<int64_t>> changes(std::min(kBudgetParts, num_instances));
     parallel_for(changes.size(), 1, [&](size_t part) {
         changes[part].assign(kNumBudgetBins + 1, 0);
-        std::vector<uint32_t> bins(view.most_groups);
+        std::vector<GroupBins> bins(view.most_groups);
         for (size_t i = part; i < num_instances; i += changes.size())
             count_instance(view, i, bins, changes[part]);
     });
@@ -238,9 +255,11 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
     }
     out.instance.resize(first[num_chunks]);
     out.cluster.resize(first[num_chunks]);
+    out.weight.resize(rule.fade.is_on() ? first[num_chunks] : 0);
     for (size_t k = 0; k < num_chunks; ++k) {
         std::copy(chunks[k].instance.begin(), chunks[k].instance.end(), out.instance.begin() + first[k]);
         std::copy(chunks[k].cluster.begin(), chunks[k].cluster.end(), out.cluster.begin() + first[k]);
+        std::copy(chunks[k].weight.begin(), chunks[k].weight.end(), out.weight.begin() + first[k]);
     }
 }
 

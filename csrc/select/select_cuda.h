@@ -26,9 +26,9 @@ class Cut {
                    cudaStream_t stream);
 
     // The same for pairs that were selected before, on the device.
-    void given_items(const SceneTables& scene, const Camera& camera, Span<const int32_t> instance,
-                     Span<const int32_t> cluster, const FrameImage& image, FrameImage* images,
-                     Placement* placements, const ItemList& items, cudaStream_t stream);
+    void given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
+                     const FrameImage& image, FrameImage* images, Placement* placements,
+                     const ItemList& items, cudaStream_t stream);
 
     // Selected clusters as pairs on the host, for which it waits.
     void select(const SceneTables& scene, const Camera& camera, const SelectRule& rule, SelectOutput& out,
@@ -45,6 +45,9 @@ class Cut {
     template <class Output>
     void cut(const SceneTables& scene, const Camera& camera, const SelectRule& rule, const Target& target,
              const Output& output, cudaStream_t stream);
+    template <bool kFades>
+    void select_pairs(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
+                      SelectOutput& out, cudaStream_t stream);
 
     const int device_ = current_device();
     DeviceBuffer<InstanceView> views_;
@@ -53,6 +56,7 @@ class Cut {
     DeviceBuffer<unsigned long long> scratch_, change_;
     DeviceBuffer<BudgetState> budget_;
     DeviceBuffer<int32_t> pair_instance_, pair_cluster_;
+    DeviceBuffer<float> pair_weight_;
     DeviceBuffer<Pairs> pairs_;
 };
 

@@ -2,9 +2,10 @@
 
 // The decisions of selection, compiled without contraction on both halves so that they give the same bits.
 //
-// InstanceCut::draws() decides: a cluster is drawn when its own group fits, the group above does not, and it
-// is not culled. Every comparison of a metric with the tolerance goes through fits(): what one test accepts,
-// the other refuses.
+// InstanceCut::drawn_weight() decides: a cluster is drawn when the group above is refined further than its
+// own, and it is not culled. Without a fade a group is refined when it does not fit, so the one fits and the
+// other does not. Every comparison of a metric with the tolerance goes through fits() and is_refined(), which
+// without a fade are each other's opposite: what one test accepts, the other refuses.
 
 #include <cfloat>
 #include <cmath>
@@ -42,12 +43,20 @@ struct InstanceView {
 
 constexpr uint64_t kNoBudget = ~uint64_t(0);
 
+// Metrics within this factor of the tolerance are between two levels, which are then both drawn.
+struct Fade {
+    float factor = 1.0f, inverse = 1.0f;
+
+    V3DG_HD bool is_on() const { return factor > 1.0f; }
+};
+
 struct SelectRule {
     float tolerance_px2;
     Footprint footprint = Footprint::solid_angle;
     bool culls = true;            // drop what lies outside the frustum
     int32_t min_level = 0;        // nothing finer is drawn
     uint64_t budget = kNoBudget;  // most gaussians; the tolerance is raised until they fit
+    Fade fade = {};               // not with the paper's footprint, which may decrease towards the root
 };
 
 V3DG_HD inline float distance2_to(const Ball& ball, const InstanceView& view) {
@@ -87,7 +96,25 @@ V3DG_HD inline float metric_px2(const ClusterTable& table, int32_t g, const Inst
 }
 
 V3DG_HD inline bool fits(float metric_px2, const SelectRule& rule) {
-    return metric_px2 <= rule.tolerance_px2;
+    return metric_px2 * rule.fade.factor <= rule.tolerance_px2;
+}
+V3DG_HD inline bool is_refined(float metric_px2, const SelectRule& rule) {
+    return !(metric_px2 * rule.fade.inverse <= rule.tolerance_px2);
+}
+
+// Weights are whole numbers of so many parts, so that they add up without rounding.
+constexpr int32_t kWhole = 1 << 15;
+
+V3DG_HD inline float share_of(int32_t weight) { return static_cast<float>(weight) * (1.0f / kWhole); }
+
+// How far a group is refined: 0 where it fits, kWhole where it is refined, in between a ramp. Never decreases
+// with the metric, because no step of it does.
+V3DG_HD inline int32_t refinement(float metric_px2, const SelectRule& rule) {
+    const float low = rule.tolerance_px2 * rule.fade.inverse, high = rule.tolerance_px2 * rule.fade.factor;
+    const float ramp = (metric_px2 - low) / (high - low);
+    const float between = ramp > 0.0f ? (ramp < 1.0f ? ramp : 1.0f) : 0.0f;  // 0 where there is no number
+    const int32_t rounded = static_cast<int32_t>(between * kWhole + 0.5f);
+    return fits(metric_px2, rule) ? 0 : is_refined(metric_px2, rule) ? kWhole : rounded;
 }
 
 // Where a box lies as seen from one plane, in units of the plane's normal.
@@ -153,8 +180,8 @@ V3DG_HD inline float tolerance_of_bin(uint32_t bin, float tolerance) {
     return value;
 }
 
-// Whether the clusters that nothing replaces are the cut, and no page is wanted. The paper's footprint does
-// not grow towards the root, so that a group may fail to fit below one that does.
+// Whether the clusters that nothing replaces are the cut, at full weight, and no page is wanted. The paper's
+// footprint does not grow towards the root, so that a group may fail to fit below one that does.
 V3DG_HD inline bool tops_fit(const ClusterTable& table, const InstanceView& view, const SelectRule& rule) {
     if (rule.footprint == Footprint::paper) return false;
     for (size_t i = 0; i < table.top_group.size; ++i)
@@ -195,9 +222,15 @@ struct AskedGroups {
     const InstanceView& view;
     const SelectRule& rule;
 
-    V3DG_HD bool fits(int32_t g) const { return v3dg::fits(metric_px2(table, g, view, rule), rule); }
-    V3DG_HD uint32_t bin(int32_t g) const {
-        return bin_of_metric(wanted_metric_px2(table, g, view, rule), rule.tolerance_px2);
+    V3DG_HD int32_t refinement(int32_t g) const {
+        return v3dg::refinement(metric_px2(table, g, view, rule), rule);
+    }
+    // The first of the tolerances that a budget chooses from at which it fits, and is not refined any more.
+    V3DG_HD uint32_t first_fitting(int32_t g) const {
+        return bin_of_metric(wanted_metric_px2(table, g, view, rule) * rule.fade.factor, rule.tolerance_px2);
+    }
+    V3DG_HD uint32_t first_unrefined(int32_t g) const {
+        return bin_of_metric(wanted_metric_px2(table, g, view, rule) * rule.fade.inverse, rule.tolerance_px2);
     }
 };
 
@@ -212,29 +245,35 @@ struct InstanceCut {
 
     V3DG_HD bool is_culled(size_t c) const { return culls && is_outside(table.box[c], view); }
 
-    // Whether the cluster is just detailed enough. Below the leaves everything fits, above the roots nothing
-    // does.
-    V3DG_HD bool suffices(size_t c) const {
+    // How much of the cluster is drawn, of kWhole, if it is not culled. Below the leaves everything fits,
+    // above the roots nothing does; so the weights on a path from a leaf to its root add up to kWhole, and
+    // none is negative where metrics never decrease towards the root.
+    V3DG_HD int32_t weight(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
-        const bool own_fits = own < 0 || groups.fits(own);
-        const bool parent_fits = parent >= 0 && groups.fits(parent);
-        return own_fits && !parent_fits;
+        const int32_t below = own < 0 ? 0 : groups.refinement(own);
+        const int32_t above = parent < 0 ? kWhole : groups.refinement(parent);
+        return above - below;
     }
 
-    V3DG_HD bool draws(size_t c) const { return suffices(c) && !is_culled(c); }
+    // The same of what is drawn, else 0.
+    V3DG_HD int32_t drawn_weight(size_t c) const {
+        const int32_t drawn = weight(c);
+        return drawn > 0 && !is_culled(c) ? drawn : 0;
+    }
 
-    // The tolerances from the rule's own on at which draws(c) holds.
+    // The tolerances from the rule's own on at which the cluster is drawn; with a fade, at which it may be.
     V3DG_HD BinRange bins(size_t c) const {
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
-        const BinRange range{own < 0 ? 0 : groups.bin(own), parent < 0 ? kNumBudgetBins : groups.bin(parent)};
+        const BinRange range{own < 0 ? 0 : groups.first_unrefined(own),
+                             parent < 0 ? kNumBudgetBins : groups.first_fitting(parent)};
         return range.is_empty() || is_culled(c) ? BinRange{0, 0} : range;
     }
 };
 
 // How urgently the page of a group is wanted: above 1 if the cut misses it, at most 1 if it would at a
-// smaller tolerance.
+// smaller tolerance. A fade misses it earlier.
 V3DG_HD inline float priority_of(float metric_px2, const SelectRule& rule) {
-    const float ratio = metric_px2 / rule.tolerance_px2;
+    const float ratio = metric_px2 * rule.fade.factor / rule.tolerance_px2;
     if (fits(metric_px2, rule)) return ratio <= 1.0f ? ratio : 0.0f;
     return ratio > 1.0f ? ratio : 1.0f + FLT_EPSILON;
 }
@@ -273,18 +312,19 @@ V3DG_HD inline bool parents_fit(const ClusterBounds& bounds, const InstanceView&
                                 const SelectRule& rule) {
     if (bounds.has_root || rule.footprint == Footprint::paper) return false;
     const float distance = sqrtf(distance2_to(bounds.parents, view)) - bounds.parents.radius;
-    return distance > 0.0f &&
-           footprint_at(bounds.most_parent_radius, distance * distance, view) * bounds.most_parent_weight <=
-               (1.0f - kBoundMargin) * rule.tolerance_px2;
+    return distance > 0.0f && footprint_at(bounds.most_parent_radius, distance * distance, view) *
+                                      bounds.most_parent_weight * rule.fade.factor <=
+                                  (1.0f - kBoundMargin) * rule.tolerance_px2;
 }
 
-// Whether none of the clusters has a group of its own that fits.
-V3DG_HD inline bool owns_do_not_fit(const ClusterBounds& bounds, const InstanceView& view,
-                                    const SelectRule& rule) {
+// Whether all the clusters have groups of their own that are refined, so that none of them is drawn.
+V3DG_HD inline bool owns_are_refined(const ClusterBounds& bounds, const InstanceView& view,
+                                     const SelectRule& rule) {
     if (bounds.has_leaf || bounds.least_own_level <= rule.min_level || rule.footprint == Footprint::paper)
         return false;
     const float distance = sqrtf(distance2_to(bounds.owns, view)) + bounds.owns.radius;
-    return footprint_at(bounds.least_own_radius, distance * distance, view) * bounds.least_own_weight >
+    return footprint_at(bounds.least_own_radius, distance * distance, view) * bounds.least_own_weight *
+               rule.fade.inverse >
            (1.0f + kBoundMargin) * rule.tolerance_px2;
 }
 
@@ -296,7 +336,7 @@ V3DG_HD inline bool may_draw(const ClusterTable& table, const ClusterBounds& bou
                              const SelectRule& rule, Tolerances tolerances) {
     return !(rule.culls && is_outside(bounds.box, view)) && !parents_fit(bounds, view, rule) &&
            (tolerances == Tolerances::from_this_on || !table.pages.is_whole() ||
-            !owns_do_not_fit(bounds, view, rule));
+            !owns_are_refined(bounds, view, rule));
 }
 
 }  // namespace v3dg

@@ -3,6 +3,9 @@
 A trial is an instance, a camera and a tolerance. Each leaf gets a random 64-bit number, each group the sum
 of the numbers below it, split at random over the clusters that it made. Then the numbers of the selected
 clusters add up to those of all leaves if every path has exactly one; if not, with a chance of 2^-64.
+
+With a fade, numbers are multiplied by weights: then what has to add up on every path are the weights, to
+exactly 1, which they are whole parts of; if they do not, the chance to miss it is 2^-49.
 """
 
 import time
@@ -15,6 +18,7 @@ from scenes_lod import blob, group_metrics, lod_bundle
 from v3dg import Camera, Scene, select
 
 BATCH = 10_000  # instances that share a camera and a tolerance
+WHOLE = 1 << 15  # parts of a weight
 
 
 def numbers_of_clusters(bundle, rng):
@@ -77,10 +81,13 @@ def random_batch(bundle, rng, count):
     return scene, camera, float(rng.choice(metrics)) * (1 if is_tie else np.exp(rng.normal())), is_tie
 
 
-def count_wrong(instance_ids, cluster_ids, num_instances, number, whole):
-    """Instances whose selected clusters do not add up to the whole."""
+def count_wrong(instance_ids, cluster_ids, num_instances, number, whole, parts=None):
+    """Instances whose selected clusters, of so many parts of their weight, do not add up to the whole."""
     bounds = np.searchsorted(instance_ids, np.arange(num_instances + 1))
-    sums = np.concatenate([np.zeros(1, np.uint64), np.cumsum(number[cluster_ids], dtype=np.uint64)])
+    terms = number[cluster_ids]
+    if parts is not None:
+        terms, whole = terms * parts.astype(np.uint64), np.array([whole]) * np.uint64(WHOLE)
+    sums = np.concatenate([np.zeros(1, np.uint64), np.cumsum(terms, dtype=np.uint64)])
     return int((np.diff(sums[bounds]) != whole).sum())
 
 
@@ -91,35 +98,71 @@ def check_counting(bundle, number, whole):
     for cluster_ids, wrong in [(cut, 0), *((other, 1) for other in others)]:
         if count_wrong(np.zeros(len(cluster_ids), np.int32), cluster_ids, 1, number, whole) != wrong:
             raise AssertionError("the count of violations does not count")
+    ids, parts = np.zeros(len(cut), np.int32), np.full(len(cut), WHOLE)
+    for change in (0, -1):
+        parts[-1] += change
+        if count_wrong(ids, cut, 1, number, whole, parts) != (change != 0):
+            raise AssertionError("the count of violations does not count weights")
 
 
-def run_trials(num_trials, bundles=None, *, seed=0, device="cpu", partial=False):
+def random_options(rng, bundle, tolerance):
+    """What else a view may ask for, that changes which clusters are drawn but not that paths add up."""
+    min_level = int(rng.choice([0, 0, rng.integers(bundle.num_levels + 1)]))
+    return {"tolerance": tolerance, "min_level": min_level, "fade": float(rng.choice([1.01, 1.05, 1.3, 4.0]))}
+
+
+def parts_of(weights):
+    """(S,) whole parts of weights; an error where one is not drawn, or is not of whole parts."""
+    parts = weights.astype(np.float64) * WHOLE
+    if not ((parts > 0) & (parts <= WHOLE) & (parts == np.round(parts))).all():
+        raise AssertionError("weights: expected positive whole parts of at most 1")
+    return parts.astype(np.int64)
+
+
+def cut_of(scene, camera, options, shift, device):
+    """The cut, of pages at these places where there are any, and the seconds that it took."""
+    if shift is None:
+        selection = select(scene, camera, **options, cull=False, device=device)
+        return selection, selection.seconds
+    begin = time.perf_counter()
+    cut = resident_scene(scene, [shift], device).select(camera.core, rule(**options, cull=False))
+    return cut, time.perf_counter() - begin
+
+
+def run_trials(num_trials, bundles=None, *, seed=0, device="cpu", partial=False, fades=False):
     """Violations among the trials, and what was tried; random trees if no bundles are given.
 
-    With ``partial``, of pages closed towards the root, other ones for each camera.
+    With ``partial``, of pages closed towards the root, other ones for each camera. With ``fades``, views also
+    have random fades, finest levels, importances and budgets.
     """
     rng = np.random.default_rng(seed)
     bundles = bundles or random_trees(rng)
     numbers = [numbers_of_clusters(bundle, rng) for bundle in bundles]
     check_counting(bundles[0], *numbers[0])
-    trials = wrong = ties = drawn = at_ends = 0
+    trials = wrong = ties = drawn = at_ends = between = 0
     seconds = 0.0
     start = time.perf_counter()
     while trials < num_trials:
         b = int(rng.integers(len(bundles)))
         count = min(BATCH, num_trials - trials)
         scene, camera, tolerance, is_tie = random_batch(bundles[b], rng, count)
+        shift, options, parts = None, {"tolerance": tolerance}, None
         if partial:
             shift, _ = random_shift(rng, bundles[b], closed_residency(rng, bundles[b]))
-            begin = time.perf_counter()
-            selection = resident_scene(scene, [shift], device).select(
-                camera.core, rule(tolerance, cull=False)
-            )
-            seconds += time.perf_counter() - begin
-        else:
-            selection = select(scene, camera, tolerance=tolerance, cull=False, device=device)
-            seconds += selection.seconds
-        wrong += count_wrong(selection.instance_ids, selection.cluster_ids, count, *numbers[b])
+        if fades:
+            options = random_options(rng, bundles[b], tolerance)
+            scene.set_importance(log_uniform(rng, 0.1, 10, count))
+        selection, took = cut_of(scene, camera, options, shift, device)
+        if fades:
+            if rng.random() < 0.5:
+                least, _ = cut_of(scene, camera, options | {"tolerance": np.inf}, None, device)
+                options["budget"] = least.num_gaussians + int(rng.integers(selection.num_gaussians + 1))
+                selection, took = cut_of(scene, camera, options, shift, device)
+                wrong += shift is None and selection.num_gaussians > options["budget"]
+            parts = parts_of(selection.weights)
+            between += int((parts < WHOLE).sum())
+        wrong += count_wrong(selection.instance_ids, selection.cluster_ids, count, *numbers[b], parts)
+        seconds += took
         trials += count
         ties += is_tie
         drawn += len(selection.cluster_ids)
@@ -135,6 +178,7 @@ def run_trials(num_trials, bundles=None, *, seed=0, device="cpu", partial=False)
         "batches_with_the_tolerance_a_metric": ties,
         "selected_per_trial": drawn / max(trials, 1),
         "selected_between_leaf_and_root": 1 - at_ends / max(drawn, 1),
+        **({"selected_with_weights_below_1": between / max(drawn, 1)} if fades else {}),
         "select_seconds": seconds,
         "seconds": time.perf_counter() - start,
     }

@@ -54,5 +54,5 @@ def resident_scene(scene, shifts, device="cpu"):
     return core
 
 
-def rule(tolerance=None, budget=None, min_level=0, *, cull=True):
-    return rule_of(tolerance, budget, min_level, "solid_angle", cull)
+def rule(tolerance=None, budget=None, min_level=0, fade=None, *, cull=True):
+    return rule_of(tolerance, budget, min_level, cull=cull, fade=fade)

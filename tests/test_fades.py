@@ -1,0 +1,289 @@
+"""Fades between levels: weights that add up to one, what they do to opacities, and that nothing jumps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import exact_cut
+from devices import host
+from frames import CAMERA, arrays, assert_close, assert_like_cpu, assert_same_bytes, composed_scene
+from random_bundle import random_bundle
+from reference import select as reference
+from scenes_lod import blob, group_metrics, lod_bundle, random_camera, random_scene, turned
+from v3dg import DEFAULT_FADE, Camera, Gaussians, Renderer, Scene, Selection, render, select
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
+WHOLE = exact_cut.WHOLE
+seeds = st.integers(0, 2**32 - 1)
+fades = st.sampled_from([1.01, 1.05, 1.3, 4.0])
+
+
+def same(a, b):
+    np.testing.assert_array_equal(a.instance_ids, b.instance_ids)
+    np.testing.assert_array_equal(a.cluster_ids, b.cluster_ids)
+    np.testing.assert_array_equal(a.weights, b.weights)
+    assert (a.num_gaussians, a.tolerance) == (b.num_gaussians, b.tolerance)
+
+
+def weights_of(selection, i, bundle):
+    """(C,) weights of the clusters of one instance, 0 where they are not drawn."""
+    weights, mine = np.zeros(len(bundle.clusters)), selection.instance_ids == i
+    weights[selection.cluster_ids[mine]] = selection.weights[mine]
+    return weights
+
+
+def test_many_random_trials_have_no_violation():
+    result = exact_cut.run_trials(200_000, fades=True)
+    assert result["violations"] == 0
+    assert result["selected_with_weights_below_1"] > 0.1
+
+
+@given(seed=seeds, fade=fades, tolerance=st.floats(1e-3, 1e3))
+def test_weights_add_up_to_one_on_every_path(seed, fade, tolerance):
+    rng = np.random.default_rng(seed)
+    bundle = random_bundle(seed, num_levels=4)
+    scene = random_scene(rng, bundle, 3)
+    selection = select(scene, random_camera(rng), tolerance=tolerance, fade=fade, cull=False, device="cpu")
+    assert selection.weights.min(initial=1) > 0
+    for i in range(len(scene)):
+        weights = weights_of(selection, i, bundle)
+        for path in reference.paths(bundle.clusters, bundle.groups):
+            assert weights[path].sum() == 1
+
+
+@given(seed=seeds, fade=fades, min_level=st.integers(0, 3))
+def test_weights_are_those_of_the_ramp(seed, fade, min_level):
+    rng = np.random.default_rng(seed)
+    bundle = lod_bundle(rng, blob(rng, 100), 8)
+    scene, camera = random_scene(rng, bundle, 2), random_camera(rng)
+    tolerance = float(rng.uniform(0.01, 3))
+    selection = select(
+        scene, camera, tolerance=tolerance, fade=fade, min_level=min_level, cull=False, device="cpu"
+    )
+    own, parent = bundle.clusters.own_group, bundle.clusters.parent_group
+    for i, metric in enumerate(group_metrics(scene, camera)):
+        low, high = tolerance / fade, tolerance * fade
+        ramp = (np.clip(metric.astype(np.float64), low, high) - low) / (high - low)
+        ramp = np.where(bundle.groups.level <= min_level, 0, ramp)
+        expected = np.append(ramp, 1.0)[parent] - np.append(ramp, 0.0)[own]  # -1 is no group
+        np.testing.assert_allclose(weights_of(selection, i, bundle), expected, atol=2 / WHOLE)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("fade", [None, 1.0])
+def test_no_fade_is_the_cut_of_one_cluster_a_path(device, fade):
+    scene = composed_scene(np.random.default_rng(1))
+    cut = select(scene, CAMERA, tolerance=2.0, device=device)
+    same(cut, select(scene, CAMERA, tolerance=2.0, fade=fade, device=device))
+    assert (cut.weights == 1).all()
+    assert (
+        len(replace(cut, instance_ids=cut.instance_ids[1:], cluster_ids=cut.cluster_ids[1:])) == len(cut) - 1
+    )
+    image = render(scene, CAMERA, tolerance=2.0, fade=fade, device=device)
+    assert_same_bytes(image, render(scene, CAMERA, cut=cut, device=device))
+
+
+@pytest.mark.parametrize("tolerance", [0.0, np.inf])
+def test_the_finest_and_the_coarsest_cut_have_no_fade(tolerance):
+    scene = composed_scene(np.random.default_rng(2))
+    same(*(select(scene, CAMERA, tolerance=tolerance, fade=fade, device="cpu") for fade in (None, 1.05)))
+
+
+def test_weights_follow_the_camera_without_a_jump():
+    rng = np.random.default_rng(3)
+    bundle = lod_bundle(rng, blob(rng, 500), 16)
+    away, step, fade = np.array([0.0, -30.0, 5.0]), 1e-4, 1.05
+    start = Camera.look_at(away, (0, 0, 0), width=640, height=480)
+    tolerance = float(np.median(group_metrics(bundle, start)[0]))
+    last, most, changed = None, 0.0, 0
+    for k in range(300):
+        camera = Camera.look_at(away * (1 - step) ** k, (0, 0, 0), width=640, height=480)
+        cut = select(bundle, camera, tolerance=tolerance, fade=fade, cull=False, device="cpu")
+        weights = weights_of(cut, 0, bundle)
+        if last is not None:
+            most, changed = max(most, np.abs(weights - last).max()), changed + (weights != last).any()
+        last = weights
+    # The metric grows by two steps, and by more near a ball, of a band that is 2 (fade - 1) wide.
+    assert changed > 100
+    assert most < 3 * step / (fade - 1)
+
+
+@given(seed=seeds, fade=fades, share=st.floats(0, 1), cull=st.booleans())
+def test_budget_is_kept(seed, fade, share, cull):
+    rng = np.random.default_rng(seed)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 200), 8), 5)
+    camera = random_camera(rng)
+    least, most = (
+        select(scene, camera, tolerance=t, cull=cull, device="cpu").num_gaussians for t in (np.inf, 0.0)
+    )
+    budget = round(least + share * (most - least))
+    cut = select(scene, camera, budget=budget, fade=fade, cull=cull, device="cpu")
+    assert least <= cut.num_gaussians <= budget
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_at_rest_a_budget_draws_the_same_bits_every_frame(device):
+    rng = np.random.default_rng(5)
+    scene = composed_scene(rng)
+    renderer = Renderer(scene, device=device)
+    options = {"budget": 4000, "fade": DEFAULT_FADE}
+    for _ in range(5):  # what was seen before
+        renderer.render(random_camera(rng, width=203, height=117), **options).stats  # noqa: B018
+    first, *others = (renderer.render(CAMERA, **options) for _ in range(10))
+    for image in others:
+        assert_same_bytes(image, first)
+        assert image.stats.tolerance == first.stats.tolerance
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_turning_in_place_changes_no_weight(device):
+    rng = np.random.default_rng(6)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 400), 16), 50, spread=20)
+    for _ in range(10):
+        camera = random_camera(rng, distance=30)
+        other = Camera(turned(camera, rng).viewmat, camera.K, 64, 48)
+        same(
+            *(select(scene, c, tolerance=0.5, fade=1.05, cull=False, device=device) for c in (camera, other))
+        )
+
+
+def faded(bundle, opacities, weights, device):
+    """Opacities after the weights of clusters of one gaussian each."""
+    count = len(opacities)
+    cut = Selection(
+        Scene.of(bundle),
+        np.zeros(count, np.int32),
+        np.arange(count, dtype=np.int32),
+        count,
+        0.0,
+        0.0,
+        given_weights=weights.astype(np.float32),
+    )
+    return host(cut.gaussians(device=device).opacities)
+
+
+def singles(opacities):
+    """A bundle of as many clusters of a gaussian each, side by side, all of them leaves."""
+    count = len(opacities)
+    means = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], 1).astype(np.float32)
+    asset = Gaussians(
+        means,
+        np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        np.full((count, 3), 0.1, np.float32),
+        np.asarray(opacities, np.float32),
+        np.ones((count, 1, 3), np.float32),
+    )
+    return lod_bundle(np.random.default_rng(0), asset, 1)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_gaussians_have_opacities_times_weights(device):
+    bundle = singles(np.linspace(0, 1, 64))
+    leaves = bundle.gaussians.opacities[:64]
+    for weights in (np.ones(64), np.arange(64) % 2, np.arange(64) / 64):
+        found = faded(bundle, leaves, weights, device)
+        np.testing.assert_array_equal(found, leaves * weights.astype(np.float32))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_picture_is_that_of_the_gaussians_with_faded_opacities(device):
+    """Drawn without a filter, the picture is that of an asset: any rasterizer fades."""
+    rng = np.random.default_rng(7)
+    bundle = lod_bundle(rng, blob(rng, 900), 32, filter_px2=0.0)
+    tolerance = float(np.median(group_metrics(bundle, CAMERA)[0]))
+    cut = select(bundle, CAMERA, tolerance=tolerance, fade=1.2, device=device)
+    assert 0.2 < (cut.weights < 1).mean() < 1
+    options = {"device": device, "min_transmittance": 0.0}
+    image = render(bundle, CAMERA, cut=cut, **options)
+    assert_same_bytes(image, render(bundle, CAMERA, tolerance=tolerance, fade=1.2, **options))
+    whole = render(cut.gaussians(device=device), CAMERA, **options)
+    assert_close(arrays(image)[:2], arrays(whole)[:2])
+    hard = render(bundle, CAMERA, tolerance=tolerance, **options)
+    assert np.abs(arrays(image)[0] - arrays(hard)[0]).max() > 1e-2
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_what_has_no_weight_is_not_drawn(device):
+    bundle = lod_bundle(np.random.default_rng(8), blob(np.random.default_rng(8), 900), 32)
+    cut = select(bundle, CAMERA, tolerance=2.0, fade=1.2, device="cpu")
+    weights = np.where(np.arange(len(cut)) % 3 == 0, 0, cut.weights).astype(np.float32)
+    some = np.flatnonzero(weights > 0)
+    fewer = replace(
+        cut,
+        instance_ids=cut.instance_ids[some],
+        cluster_ids=cut.cluster_ids[some],
+        given_weights=weights[some],
+    )
+    image = render(bundle, CAMERA, cut=replace(cut, given_weights=weights), device=device)
+    assert_same_bytes(image, render(bundle, CAMERA, cut=fewer, device=device))
+    assert arrays(image)[1].max() > 0.5
+
+
+@pytest.mark.parametrize("fade", [0.99, 0, -1, np.nan, np.inf, 1001, "much", [1.05]])
+def test_fades_out_of_range_are_refused(fade):
+    bundle = random_bundle(1)
+    for draw in (select, render):
+        with pytest.raises(ValueError, match=r"fade: expected None or a factor of 1 to 1000, got"):
+            draw(bundle, CAMERA, fade=fade, device="cpu")
+
+
+def test_weights_that_are_none_are_refused():
+    bundle, ids = random_bundle(1), np.zeros(1, np.int32)
+    for weights in ([-0.1], [1.1], [np.nan], [0.5, 0.5]):
+        with pytest.raises(ValueError, match="given_weights: expected 1 numbers of 0 to 1, got"):
+            Selection(Scene.of(bundle), ids, ids, 1, 0.0, 0.0, given_weights=np.float32(weights))
+
+
+def test_the_papers_footprint_has_no_fade():
+    with pytest.raises(ValueError, match="fade: expected None with the paper's footprint"):
+        select(random_bundle(1), CAMERA, footprint="paper", fade=1.05, device="cpu")
+
+
+@pytest.mark.gpu
+def test_both_devices_choose_the_same_with_the_same_weights():
+    rng = np.random.default_rng(21)
+    below = 0
+    for _ in range(60):
+        scene = random_scene(rng, lod_bundle(rng, blob(rng, 300), 8, past_root=2), 200, spread=10)
+        scene.add(random_bundle(int(rng.integers(1 << 30)), num_levels=4), positions=rng.normal(size=(5, 3)))
+        scene.set_importance(np.exp(rng.normal(size=len(scene))))
+        camera = random_camera(rng)
+        metric = np.concatenate(group_metrics(scene, camera))
+        options = {
+            "tolerance": float(rng.choice(metric[np.isfinite(metric)])) * np.exp(0.02 * rng.normal()),
+            "fade": float(rng.choice([1.01, 1.05, 1.3, 4.0])),
+            "min_level": int(rng.choice([0, 0, 2])),
+            "cull": bool(rng.random() < 0.5),
+        }
+        if rng.random() < 0.5:
+            least = select(scene, camera, **options | {"tolerance": np.inf}, device="cpu").num_gaussians
+            options["budget"] = int(least * rng.uniform(1, 4))
+        cpu, cuda = (select(scene, camera, **options, device=device) for device in ("cpu", "cuda"))
+        same(cpu, cuda)
+        below += int((cpu.weights < 1).sum())
+    assert below > 1000
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("sh_degree", [0, 1, 3])
+@pytest.mark.parametrize("fade", [1.05, 2.0])
+def test_faded_scene_looks_as_on_the_cpu(sh_degree, fade):
+    scene = composed_scene(np.random.default_rng(sh_degree), sh_degree)
+    for options in ({"tolerance": 2.0}, {"budget": 9000}, {"tolerance": np.inf}):
+        images = [render(scene, CAMERA, **options, fade=fade, device=device) for device in ("cuda", "cpu")]
+        assert_like_cpu(*images)
+    cut = select(scene, CAMERA, tolerance=2.0, fade=fade, device="cpu")
+    assert (cut.weights < 1).any()
+    drawn = render(scene, CAMERA, tolerance=2.0, fade=fade, device="cuda")
+    assert_same_bytes(render(scene, CAMERA, cut=cut, device="cuda"), drawn)
+
+
+@pytest.mark.gpu
+def test_faded_gaussians_are_the_same_on_both_devices():
+    scene = composed_scene(np.random.default_rng(9))
+    cut = select(scene, CAMERA, tolerance=2.0, fade=1.5, device="cpu")
+    cpu, cuda = (cut.gaussians(device=device) for device in ("cpu", "cuda"))
+    np.testing.assert_array_equal(cpu.opacities, host(cuda.opacities))
