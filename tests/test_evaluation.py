@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ import pytest
 import v3dg
 from benchmarks import evaluation
 from benchmarks.__main__ import PROGRAM
-from benchmarks.evaluation import measure, report
+from benchmarks.evaluation import measure, report, steadiness
 from benchmarks.evaluation.assets import hair_lines, like_trained, many_copies, sky_dome
 from benchmarks.evaluation.hierarchy import HierarchyScene, build_hierarchy
 from benchmarks.evaluation.parts import motion
@@ -171,6 +172,50 @@ def test_popping_is_what_a_frame_changes_beyond_the_truth():
     assert row["above_truth"] == pytest.approx(0.25)
     assert row["worst_above_truth"] == pytest.approx(0.3)
     assert row["above_full"] == pytest.approx(0.2)
+
+
+def frames_of(*changes):
+    """Grey pictures of 40 x 36 px, in which a tile at the right is lighter by so many 255ths."""
+    pictures = []
+    for change in changes:
+        picture = np.full((36, 40, 3), 0.5, np.float32)
+        if change:
+            picture[16:32, 32:] += change / 255
+        pictures.append(picture)
+    return pictures
+
+
+def test_worst_tile_is_what_its_error_changes_by():
+    found, truth = steadiness.Steadiness(), np.full((36, 40, 3), 0.5, np.float32)
+    for picture in frames_of(0, 0, 8, 8, 7):
+        found.add(picture, truth)
+    row = found.row()
+    assert row["tile_worst"] == pytest.approx(8, abs=1e-3)
+    assert row["tile_mean"] == pytest.approx((8 + 1) / 4, abs=1e-3)
+    assert row["tile_median"] == pytest.approx(0.5, abs=1e-3)
+    assert row["rms"] == pytest.approx((8 + 1) / 4 * math.sqrt(8 / 40 * 16 / 36), abs=1e-3)
+    moving = steadiness.Steadiness()
+    for picture in frames_of(0, 0, 8, 8, 7):  # as the truth does
+        moving.add(picture, picture - np.float32(0.125))
+    assert moving.row()["tile_worst"] < 1e-3
+    assert moving.row()["psnr"] == pytest.approx(-20 * math.log10(0.125), abs=1e-3)
+
+
+def test_paths_go_where_they_say():
+    first = eye_camera(3)
+    paths = {path.name: path for path in steadiness.paths_from(first, np.zeros(3), 5)}
+    for path in paths.values():
+        assert len(path.cameras) == 5
+        assert path.is_drift == path.name.startswith("drift")
+        np.testing.assert_allclose(path.cameras[0].viewmat, first.viewmat, atol=1e-12)
+        np.testing.assert_allclose(path.cameras[0].K, first.K)
+    far = {name: [np.linalg.norm(c.position) for c in path.cameras] for name, path in paths.items()}
+    start = far["drift in"][0]
+    np.testing.assert_allclose(far["drift in"], start * 0.9995 ** np.arange(5))
+    np.testing.assert_allclose(far["zoom"], start * 0.995 ** np.arange(5))
+    np.testing.assert_allclose(far["orbit"], start)
+    for camera in paths["turn in place"].cameras:
+        np.testing.assert_allclose(camera.position, first.position, atol=1e-12)
 
 
 def test_made_assets_are_as_many_as_asked_for_and_repeat():

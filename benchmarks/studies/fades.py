@@ -1,0 +1,145 @@
+"""Does a fade between levels remove pops? Bundles on slow paths, beside the hard cut and all gaussians.
+
+The hard cut is drawn twice: at the same tolerance, and at the lower one at which it has as many gaussians as
+the fade. docs/fades.md is about the result.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.evaluation.measure import Row
+from benchmarks.evaluation.record import write
+from benchmarks.evaluation.steadiness import Path as CameraPath
+from benchmarks.evaluation.steadiness import compare, paths_from
+from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, select
+from v3dg.cleaning import ball_of_most
+
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_HALVINGS = 24
+_FILLS = 2.0  # distance of the nearest camera, in radii of the ball of most gaussians
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bundles", nargs="+", type=Path, help=".v3dg files, each as PATH or PATH:UP (-y, z)")
+    parser.add_argument("--frames", type=int, default=60, help="of each path")
+    parser.add_argument("--size", type=int, default=160, help="sides of the pictures, px")
+    parser.add_argument("--distances", type=float, nargs="+", default=[1.0, 2.0], help="where paths begin")
+    parser.add_argument("--fades", type=float, nargs="+", default=[DEFAULT_FADE])
+    parser.add_argument("--tolerance", type=float, default=DEFAULT_TOLERANCE)
+    parser.add_argument("--paths", nargs="+", help="only these")
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--json", type=Path, help="write the result there")
+    options = parser.parse_args(arguments)
+
+    rows = []
+    for name in map(str, options.bundles):
+        path, _, up = name.partition(":")
+        bundle = Bundle.open(path)
+        for distance in options.distances:
+            for camera_path in _paths(bundle, up or "z", distance, options):
+                if options.paths and camera_path.name not in options.paths:
+                    continue
+                rows += measure(
+                    bundle, camera_path, options, {"asset": Path(path).stem, "distance": distance}
+                )
+                print(*(_line(row) for row in rows[-3 - len(options.fades) :]), sep="\n", flush=True)
+    result = {"frames": options.frames, "size": options.size, "tolerance": options.tolerance, "rows": rows}
+    result["verdict"] = [verdict(rows, fade) for fade in options.fades]
+    print(*result["verdict"], sep="\n")
+    write(options.json, result, options.device)
+    return 0
+
+
+def _paths(bundle: Bundle, up: str, distance: float, options: argparse.Namespace) -> list[CameraPath]:
+    """Paths that begin where the asset fills a picture, or so many times as far away."""
+    center, radius = ball_of_most(bundle.level_gaussians(0).means)
+    axis = np.array(_AXES[up[-1]]) * (-1 if up[0] == "-" else 1)
+    aside = np.roll(axis, 1)
+    direction = math.cos(0.45) * aside + math.sin(0.45) * axis
+    eye = center + distance * _FILLS * radius * direction / np.linalg.norm(direction)
+    size = {"width": options.size, "height": options.size}
+    camera = Camera.look_at(eye, center, axis, **size, near=1e-3 * radius)
+    return paths_from(camera, center, options.frames)
+
+
+def measure(bundle: Bundle, path: CameraPath, options: argparse.Namespace, of: Row) -> list[Row]:
+    """Rows of one path: all gaussians, the hard cut, fades, the hard cut with as many as the first fade."""
+    tolerance = options.tolerance
+    cuts: dict[str, dict[str, Any]] = {"all": {"tolerance": 0.0}, "hard": {"tolerance": tolerance}}
+    cuts |= {f"fade {fade:g}": {"tolerance": tolerance, "fade": fade} for fade in options.fades}
+    count = _mean_count(bundle, path.cameras, tolerance=tolerance, fade=options.fades[0])
+    cuts["hard, equal count"] = {"tolerance": _tolerance_of_count(bundle, path.cameras, count, tolerance)}
+    rows = compare(bundle, path.cameras, cuts, options.device)
+    return [{**of, "path": path.name, "is_drift": path.is_drift, **row} for row in rows]
+
+
+def _mean_count(bundle: Bundle, cameras: list[Camera], **how: Any) -> float:
+    cuts = select(bundle, cameras[:: max(1, len(cameras) // 8)], **how, device="cpu")
+    return float(np.mean([cut.num_gaussians for cut in cuts]))
+
+
+def _tolerance_of_count(bundle: Bundle, cameras: list[Camera], count: float, most: float) -> float:
+    """The least tolerance, up to one, at which the hard cut has at most so many gaussians a frame."""
+    low, high = most / 4, most
+    for _ in range(_HALVINGS):
+        middle = math.sqrt(low * high)
+        if _mean_count(bundle, cameras, tolerance=middle) > count:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def verdict(rows: list[Row], fade: float) -> Row:
+    """What a fade comes to, for the worst asset and distance: ratios to the hard cut and to all gaussians."""
+    starts = sorted({(row["asset"], row["distance"]) for row in rows})
+    found = []
+    for start in starts:
+        mine = [row for row in rows if (row["asset"], row["distance"]) == start]
+        cuts = {
+            "all": [r for r in mine if r["cut"] == "all"],
+            "hard": [r for r in mine if r["cut"] == "hard"],
+            "equal": [r for r in mine if r["cut"] == "hard, equal count"],
+            "fade": [r for r in mine if r.get("fade") == fade],
+        }
+        worst = {
+            name: max((r["tile_worst"] for r in cut if r["is_drift"]), default=math.nan)
+            for name, cut in cuts.items()
+        }
+        pairs = list(zip(cuts["fade"], cuts["hard"], cuts["equal"], strict=True))
+        found.append(
+            {
+                "asset": start[0],
+                "distance": start[1],
+                "drift_worst_tile": {name: worst[name] for name in worst},
+                "of_hard_at_equal_count": round(worst["fade"] / worst["equal"], 3),
+                "of_hard": round(worst["fade"] / worst["hard"], 3),
+                "of_all": round(worst["fade"] / worst["all"], 3),
+                "least_psnr_gain": round(min(f["psnr"] - h["psnr"] for f, h, _ in pairs), 3),
+                "mean_psnr_gain": round(float(np.mean([f["psnr"] - h["psnr"] for f, h, _ in pairs])), 3),
+                "gaussians": round(float(np.mean([f["gaussians"] / h["gaussians"] for f, h, _ in pairs])), 3),
+            }
+        )
+    return {"fade": fade, "starts": found}
+
+
+def _line(row: Row) -> str:
+    return (
+        f"{row['asset']:>10} {row['distance']:4g} {row['path']:14} {row['cut']:18} "
+        f"{row['gaussians']:9,.0f}  rms {row['rms']:.3f}  tile {row['tile_mean']:.3f} {row['tile_p99']:.3f} "
+        f"{row['tile_worst']:.3f}  PSNR {row['psnr']:.2f}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
