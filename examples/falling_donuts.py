@@ -64,7 +64,12 @@ def main(config: Config) -> None:
             scene.move(positions=pile.positions[order], quaternions=pile.quaternions[order])
             camera = camera_at(frame / num_frames, config)
             yield v3dg.render(
-                scene, camera, tolerance=config.tolerance, background=BACKGROUND, device=config.device
+                scene,
+                camera,
+                tolerance=config.tolerance,
+                fade=v3dg.DEFAULT_FADE,
+                background=BACKGROUND,
+                device=config.device,
             ).color
             for _ in range(STEPS_PER_FRAME):
                 pile.step(1 / (FPS * STEPS_PER_FRAME))

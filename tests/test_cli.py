@@ -242,6 +242,24 @@ def test_render_turntable(folder, tmp_path, subject):
         assert picture["gaussians_in_frustum"] > 0
 
 
+def test_turntable_of_several_views_fades_and_a_still_does_not(folder, tmp_path):
+    def picture(*options):
+        command = ("render", folder / "tuft.v3dg", "-o", tmp_path / "out.png", "--size", 64, 48)
+        done = run(*command, "--tolerance", 3, *options, "--json")
+        assert done.returncode == 0, done.stderr
+        first = json.loads(done.stdout)["pictures"][0]
+        with Image.open(first["picture"]) as image:
+            return np.asarray(image).tobytes(), first["gaussians_selected"]
+
+    for same in (
+        [("--views", 2), ("--views", 2, "--fade", 1.05), ("--fade", 1.05)],
+        [("--views", 1), ("--views", 2, "--fade", 1)],
+    ):
+        first, *others = (picture(*options) for options in same)
+        assert others == [first] * len(others)
+    assert picture("--views", 2, "--fade", 4)[1] > picture("--views", 1)[1]
+
+
 def test_render_scene(folder, tmp_path):
     done = run("render", folder / "scene.json", "-o", tmp_path / "out.png", "--tolerance", 0)
     assert done.returncode == 0, done.stderr

@@ -73,18 +73,18 @@ CALLS = {
         lambda **given: scene_of_two().set_importance(**given),
         {"importance": 1.0, "ids": [0]},
     ),
-    "select": (lambda **given: v3dg.select(BUNDLE, CAMERA, device="cpu", **given), options()),
+    "select": (lambda **given: v3dg.select(BUNDLE, CAMERA, device="cpu", **given), options(fade=1.05)),
     "render": (
         lambda **given: v3dg.render(BUNDLE, CAMERA, device="cpu", **given).stats,
-        options(background=(0, 0, 0), min_transmittance=0.001),
+        options(fade=1.05, background=(0, 0, 0), min_transmittance=0.001),
     ),
     "Renderer.render": (
         lambda **given: v3dg.Renderer(BUNDLE, device="cpu").render(CAMERA, **given).stats,
-        options(background=(0, 0, 0), min_transmittance=0.001),
+        options(fade=1.05, background=(0, 0, 0), min_transmittance=0.001),
     ),
     "Renderer.settle": (
         lambda **given: v3dg.Renderer(BUNDLE, device="cpu", memory="64MB").settle(CAMERA, **given),
-        options(timeout=30.0),
+        options(fade=1.05, timeout=30.0),
     ),
     "render of an asset": (
         lambda **given: v3dg.render(ASSET, CAMERA, device="cpu", **given).stats,

@@ -12,7 +12,7 @@ import pytest
 
 import scenes_lod
 import v3dg
-from v3dg import Camera, Gaussians, Scene, _core
+from v3dg import DEFAULT_FADE, Camera, Gaussians, Scene, _core
 from v3dg.pictures import to_8bit
 from v3dg.viewer.frame import MOST_COUNTED, Frame, SceneView, Settings, Stopped, ramp
 from v3dg.viewer.pacing import PATIENCE_SECONDS, Draft, Pacer, RenderLoop, Request, finer_sizes
@@ -100,9 +100,10 @@ def drawn(scene_view, view, device, **options):
 
 
 @pytest.mark.parametrize("shows", ["appearance", "level", "cluster"])
-def test_frame_is_the_picture_of_render(scene_view, view, device, shows):
-    frame = scene_view.frame(view, SIZE, Settings(shows=shows, tolerance=20.0))
-    picture, stats = drawn(scene_view, view, device, tolerance=20.0, color_by=shows)
+@pytest.mark.parametrize("fade", [None, DEFAULT_FADE])
+def test_frame_is_the_picture_of_render(scene_view, view, device, shows, fade):
+    frame = scene_view.frame(view, SIZE, Settings(shows=shows, tolerance=20.0, fade=fade))
+    picture, stats = drawn(scene_view, view, device, tolerance=20.0, color_by=shows, fade=fade)
     np.testing.assert_array_equal(frame.pixels, picture)
     assert frame.figures.gaussians_selected == stats.gaussians_selected
     assert frame.figures.gaussians_in_view == stats.gaussians_in_frustum
@@ -199,7 +200,7 @@ def test_split_shows_all_gaussians_on_the_left(scene_view, view, device):
     settings = Settings(tolerance=20.0, split=0.25)
     pixels = scene_view.frame(view, SIZE, settings).pixels
     fine, _ = drawn(scene_view, view, device, tolerance=0.0)
-    coarse, _ = drawn(scene_view, view, device, tolerance=20.0)
+    coarse, _ = drawn(scene_view, view, device, tolerance=20.0, fade=DEFAULT_FADE)
     np.testing.assert_array_equal(pixels[:, :23], fine[:, :23])
     np.testing.assert_array_equal(pixels[:, 25:], coarse[:, 25:])
     assert (pixels[:, 23:25] == 255).all()

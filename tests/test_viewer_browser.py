@@ -186,7 +186,7 @@ def test_tabs_have_their_own_camera_and_settings(browser, site, tab):
 def test_frozen_cut_stays_when_the_camera_goes_away(tab):
     tab.settled()
     selected = tab.figure("selected")
-    tab.page.get_by_role("checkbox").nth(1).click()
+    tab.page.get_by_role("checkbox").nth(2).click()
     tab.settled()
     tab.page.mouse.move(300, 400)
     tab.page.mouse.wheel(0, 800)

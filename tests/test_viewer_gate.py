@@ -244,7 +244,8 @@ NASTY = [
 WRITABLE = [
     ("Show", "Depth"), ("Show", "Difference to all gaussians"), ("Amplify", 30), ("Tolerance px²", 1.0),
     ("Limit gaussians", True), ("Millions", 0.1), ("Finest level", 1), ("Split", 0.5), ("Resolution %", 50),
-    ("Freeze the cut", True), ("Show all", True), ("Of the file", "aside"), ("Add this view", True),
+    ("Freeze the cut", True), ("Fade", False), ("Show all", True), ("Of the file", "aside"),
+    ("Add this view", True),
     ("Seconds a view", 0.5), ("Record", True), ("Play", True), ("Size", "as the window"), ("Stop", True),
     ("Clear", True), ("Save picture", True), ("Save cameras (transforms.json)", True),
 ]  # fmt: skip

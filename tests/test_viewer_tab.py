@@ -153,6 +153,16 @@ def test_modes_are_chosen_and_have_a_legend(tab):
     assert settled(tab, lambda: "256+" not in tab.text).max() > 30
 
 
+def test_fade_is_on_until_it_is_switched_off(tab):
+    tab.set("Tolerance px²", 4)
+    settled(tab)
+    fading = figure(tab, "selected")
+    tab.set("Fade", False)
+    settled(tab, lambda: figure(tab, "selected") < fading)
+    tab.set("Fade", True)
+    settled(tab, lambda: figure(tab, "selected") == fading)
+
+
 def test_frozen_cut_is_kept_until_it_is_let_go(tab, site):
     selected = figure(tab, "selected")
     tab.set("Freeze the cut", True)

@@ -13,6 +13,7 @@ from v3dg.cli._common import OnDevice, UsageError, finite, option, print_result,
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 from v3dg.pictures import check_picture_path, write_picture
 from v3dg.render import render
+from v3dg.select import DEFAULT_FADE
 
 
 @dataclass
@@ -29,6 +30,9 @@ class Render(OnDevice):
     """Most gaussians to draw in one picture; without a tolerance, the picture is as fine as that allows."""
     min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Draw no level finer than this, except where an asset has no coarser one."""
+    fade: Annotated[float | None, option("FACTOR")] = None
+    """Draw what is within this factor of the tolerance on two levels, one coming as the other goes, so that a
+    film does not pop. Default: 1.05 for several views of a turntable, otherwise 1, which is none."""
     color_by: Literal["appearance", "level", "cluster"] = "appearance"
     """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
@@ -46,6 +50,8 @@ def run(options: Render) -> None:
     device = _device.resolve(options.device)
     subject, own_cameras = load_subject(options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
+    is_film = own_cameras is None and options.view.cameras is None and len(cameras) > 1
+    fade = DEFAULT_FADE if options.fade is None and is_film else options.fade
     pictures: list[dict[str, Any]] = []
     for path, (name, camera) in zip(picture_paths(output, cameras), cameras.items(), strict=True):
         image = render(
@@ -54,6 +60,7 @@ def run(options: Render) -> None:
             tolerance=options.tolerance,
             budget=options.budget,
             min_level=options.min_level,
+            fade=fade,
             color_by=options.color_by,
             background=options.background,
             device=device,

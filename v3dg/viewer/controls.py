@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from v3dg.select import DEFAULT_TOLERANCE
+from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE
 from v3dg.viewer.frame import SceneView, Settings, Shows
 from v3dg.viewer.pacing import Size, scaled
 from v3dg.viewer.view import View
@@ -101,6 +101,7 @@ class Controls:
             tolerance=value_of(self._tolerance),
             budget=round(1e6 * value_of(self._budget)) if self._limits.value else None,
             min_level=round(value_of(self._min_level)),
+            fade=DEFAULT_FADE if self._fades.value else None,
             gain=value_of(self._gain),
             split=value_of(self._split),
             frozen=self._frozen,
@@ -134,6 +135,9 @@ class Controls:
         self._budget = self._slider("Millions", least, most, 0.01, millions, visible=visible and limits)
         last_level = max(self.camera.scene_view.num_levels - 1, 1)
         self._min_level = self._slider("Finest level", 0, last_level, 1, 0, visible=visible)
+        hint = "A level comes as the other goes, so that nothing pops while the camera moves."
+        self._fades = self._gui.add_checkbox("Fade", settings.fade is not None, visible=visible, hint=hint)
+        self._fades.on_update(in_order(self._changed))
         hint = "All gaussians on the left, the cut on the right."
         self._split = self._slider("Split", 0.0, 1.0, 0.01, 0.0, visible=visible, hint=hint)
         hint = "Keep what this camera needs, and fly around it."

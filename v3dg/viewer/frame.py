@@ -22,7 +22,7 @@ from v3dg.pictures import to_8bit
 from v3dg.render import render, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Scene
-from v3dg.select import DEFAULT_TOLERANCE, Selection, select
+from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select
 from v3dg.viewer.view import View
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
@@ -56,7 +56,7 @@ class Settings:
     Attributes:
         shows: The colours, those of a level or a cluster, expected depth, alpha, how many gaussians a pixel
             is blended of, or the difference to the picture of all gaussians.
-        tolerance, budget, min_level: As in `v3dg.render`, but that a tolerance is always given.
+        tolerance, budget, min_level, fade: As in `v3dg.render`, but that a tolerance is always given.
         gain: What a difference is multiplied by.
         split: Share of the width, from the left, that shows all gaussians; 0 for none.
         frozen: The view that the cut is chosen for; None for the one that is looked from.
@@ -66,6 +66,7 @@ class Settings:
     tolerance: float = DEFAULT_TOLERANCE
     budget: int | None = None
     min_level: int = 0
+    fade: float | None = DEFAULT_FADE
     gain: float = 5.0
     split: float = 0.0
     frozen: View | None = None
@@ -183,6 +184,7 @@ class SceneView:
             tolerance=settings.tolerance,
             budget=settings.budget,
             min_level=settings.min_level,
+            fade=settings.fade,
             device=self.device,
         )
         selected = time.perf_counter()
@@ -246,9 +248,8 @@ class SceneView:
             color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
             return color, alpha, depth, image.stats.gaussians_in_frustum
         frame, scene = self._frame(color_by, cut)
-        drawing = frame.draw_cut(
-            scene, camera.core.window(*window), cut.instance_ids, cut.cluster_ids, _SHADE, stop
-        )
+        pairs, part = (cut.instance_ids, cut.cluster_ids), camera.core.window(*window)
+        drawing = frame.draw_cut(scene, part, *pairs, _SHADE, stop, cut.given_weights)
         _check(stop)
         return drawing.color, drawing.alpha, drawing.depth, drawing.finish().in_frustum
 
@@ -257,14 +258,8 @@ class SceneView:
     ) -> tuple[npt.NDArray[np.float32], int]:
         """(H, W) gaussians that each pixel is blended of; drawn on the CPU on any device."""
         frame, scene = self._frame("appearance", cut)
-        drawing = frame.count_cut(
-            scene,
-            camera.core.window(*window),
-            cut.instance_ids,
-            cut.cluster_ids,
-            _SHADE,
-            stop,
-        )
+        pairs, part = (cut.instance_ids, cut.cluster_ids), camera.core.window(*window)
+        drawing = frame.count_cut(scene, part, *pairs, _SHADE, stop, cut.given_weights)
         _check(stop)
         return drawing.depth, drawing.finish().in_frustum
 

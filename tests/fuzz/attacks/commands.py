@@ -142,6 +142,7 @@ OPTIONS = {
         "-o": "o",
         **CUT,
         "--min-level": "n",
+        "--fade": "n",
         "--color-by": "w",
         "--background": "nnn",
         "--device": "w",

@@ -200,7 +200,7 @@ def _calls(shared, work):
     cut = v3dg.select(scene, camera, tolerance=1.0, device="cpu")
     arrays = {name: getattr(asset, name) for name in ("means", "quats", "scales", "opacities", "sh")}
     choice = {"tolerance": 1.0, "budget": 1000, "min_level": 0}
-    drawing = {**choice, "background": (0.0, 0.5, 1.0)}
+    drawing = {**choice, "fade": 1.05, "background": (0.0, 0.5, 1.0)}
     view = {"width": 8, "height": 6, "near": 0.01}
     looking = {"eye": (0, -9, 0), "target": (0, 0, 0), "up": (0, 0, 1), "fov_x": 0.8, **view}
     clusters = {f: getattr(bundle.clusters, f) for f in bundle.clusters.__dataclass_fields__}
