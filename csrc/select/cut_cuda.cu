@@ -27,7 +27,8 @@ struct Cut::Target {
 
 namespace {
 
-constexpr unsigned kCutBlocks = 4;      // on a multiprocessor
+constexpr unsigned kCutBlocks = 4;  // on a multiprocessor
+constexpr unsigned kReportBlocks = 64;
 constexpr unsigned kPlaceThreads = 64;  // few, so that a few thousand instances spread over the device
 
 // Scratch of one cut, cleared before it; the states of the cut are cleared by place_kernel.
@@ -131,10 +132,37 @@ __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool i
         output.finish(before_units + num_units, before_gaussians + num_gaussians);
 }
 
-template <class Output>
+// Tells which page the cluster of an instance needs.
+__device__ void tell_need(const InstanceCut<AskedGroups>& cut, int32_t c, uint32_t bundle,
+                          const NeedList& needs) {
+    if (cut.table.pages.is_whole()) return;
+    const PageNeed need = page_need(cut.table, c, [&](int32_t g) {
+        return priority_of(wanted_metric_px2(cut.table, g, cut.view, cut.rule), cut.rule);
+    });
+    if (need.page < 0 || cut.is_culled(c)) return;
+    uint32_t* word = needs.need[bundle] + need.page;
+    const uint32_t bits = __float_as_uint(need.priority);  // of a positive float, so they order as it does
+    if (*static_cast<volatile uint32_t*>(word) >= bits || atomicMax(word, bits) != 0) return;
+    const unsigned place = atomicAdd(needs.words, 1u);
+    if (place < needs.capacity) needs.list[place] = {bundle, static_cast<uint32_t>(need.page), 0.0f};
+}
+
+// A thread a page that is needed.
+__global__ void report_kernel(NeedList needs, SelectRule rule, const CutChoice* choice) {
+    const unsigned num_pages = *needs.words, count = min(num_pages, needs.capacity);
+    const unsigned first = blockIdx.x * blockDim.x + threadIdx.x;
+    if (first == 0)
+        *needs.report = {num_pages, rule.budget == kNoBudget ? rule.tolerance_px2 : choice->tolerance_px2};
+    for (unsigned i = first; i < count; i += gridDim.x * blockDim.x) {
+        const PageRequest need = needs.list[i];
+        needs.reported[i] = {need.bundle, need.page, __uint_as_float(needs.need[need.bundle][need.page])};
+    }
+}
+
+template <class Output, bool kTells>
 __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     cut_kernel(PlacedScene scene, SelectRule rule, const CutChoice* choice, const BudgetState* state,
-               Scratch scratch, Scratch second_scratch, Output output) {
+               Scratch scratch, Scratch second_scratch, NeedList needs, Output output) {
     if (state != nullptr && state->again != 0) scratch = second_scratch;
     const unsigned num_parts = *scratch.num_parts, num_tickets = blocks_for(num_parts, kCutWarps);
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
@@ -150,8 +178,13 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
                 const ClusterTable& table = mine.bundle->table;
                 const InstanceView view = scene.views[mine.instance];
                 const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
+                const uint32_t bundle = scene.instances.bundle[mine.instance];
                 mine.drawn = ask_clusters(
-                    mine, view, rule, Tolerances::this_one, [&](int32_t c) { return cut.drawn_weight(c); },
+                    mine, view, rule, Tolerances::this_one,
+                    [&](int32_t c) {
+                        if constexpr (kTells) tell_need(cut, c, bundle, needs);
+                        return cut.drawn_weight(c);
+                    },
                     Output::kFades ? &mine.weights : nullptr);
             }
         }
@@ -228,15 +261,16 @@ void copy_to_host(T* to, const T* from, size_t count, cudaStream_t stream) {
 
 template <class Output>
 void Cut::cut(const SceneTables& scene, const Camera& camera, const SelectRule& rule, const Target& target,
-              const Output& output, cudaStream_t stream) {
+              const Output& output, cudaStream_t stream, const PartlyResident* resident) {
     const size_t count = scene.num_instances(), parts = most_parts(scene);
     const size_t num_tickets = blocks_for(parts, kCutWarps), words = scratch_words(count, num_tickets);
     Count* scratch_of_rounds = scratch_.reserve(2 * words, stream);
     const Scratch scratches[2] = {scratch_in(scratch_of_rounds, count, num_tickets),
                                   scratch_in(scratch_of_rounds + words, count, num_tickets)};
     const SceneOnDevice on_device = scene.on_device();
-    const PlacedScene placed{on_device.bundles, on_device.instances, views_.reserve(count, stream),
-                             tops_.reserve(count, stream), parts_.reserve(parts, stream)};
+    const PlacedScene placed{resident == nullptr ? on_device.bundles : resident->bundles, on_device.instances,
+                             views_.reserve(count, stream), tops_.reserve(count, stream),
+                             parts_.reserve(parts, stream)};
     const unsigned blocks = static_cast<unsigned>(
         std::clamp<size_t>(num_tickets, 1, (2048 / kCutThreads) * num_multiprocessors()));
     const bool has_budget = rule.budget != kNoBudget;
@@ -258,20 +292,28 @@ void Cut::cut(const SceneTables& scene, const Camera& camera, const SelectRule& 
         choose_tolerance(placed, rule, round, blocks, scratch.num_parts, change, target.choice, state,
                          stream);
     }
-    launch("cut_kernel", cut_kernel<Output>, blocks, kCutThreads, 0, stream, placed, rule, target.choice,
-           state, scratches[0], scratches[1], output);
+    const NeedList needs = resident == nullptr ? NeedList{} : resident->needs;
+    if (needs.report == nullptr) {
+        launch("cut_kernel", cut_kernel<Output, false>, blocks, kCutThreads, 0, stream, placed, rule,
+               target.choice, state, scratches[0], scratches[1], needs, output);
+        return;
+    }
+    check(cudaMemsetAsync(needs.words, 0, needs.num_words * sizeof(uint32_t), stream), "cudaMemsetAsync");
+    launch("cut_kernel", cut_kernel<Output, true>, blocks, kCutThreads, 0, stream, placed, rule,
+           target.choice, state, scratches[0], scratches[1], needs, output);
+    launch("report_kernel", report_kernel, kReportBlocks, kCutThreads, 0, stream, needs, rule, target.choice);
 }
 
 void Cut::cut_items(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
                     const FrameImage& image, FrameImage* images, Placement* placements, const ItemList& items,
-                    cudaStream_t stream) {
+                    cudaStream_t stream, const PartlyResident* resident) {
     const DeviceGuard guard(device_);
     const StreamLock lock = scene.lock(stream);
     const Target target{image, images, placements, &items.counters->choice};
     if (rule.fade.is_on())
-        cut(scene, camera, rule, target, ItemOutput<true>{items}, stream);
+        cut(scene, camera, rule, target, ItemOutput<true>{items}, stream, resident);
     else
-        cut(scene, camera, rule, target, ItemOutput<false>{items}, stream);
+        cut(scene, camera, rule, target, ItemOutput<false>{items}, stream, resident);
 }
 
 void Cut::given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
@@ -297,7 +339,7 @@ void Cut::given_items(const SceneTables& scene, const Camera& camera, const Give
 
 template <bool kFades>
 void Cut::select_pairs(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
-                       SelectOutput& out, cudaStream_t stream) {
+                       SelectOutput& out, cudaStream_t stream, const PartlyResident* resident) {
     const DeviceGuard guard(device_);
     const StreamLock lock = scene.lock(stream);
     Pairs* on_device = pairs_.reserve(1, stream);
@@ -311,7 +353,7 @@ void Cut::select_pairs(const SceneTables& scene, const Camera& camera, const Sel
                                         &on_device->pairs,
                                         &on_device->gaussians};
         check(cudaMemsetAsync(on_device, 0, sizeof *on_device, stream), "cudaMemsetAsync");
-        cut(scene, camera, rule, {{}, nullptr, nullptr, &on_device->choice}, output, stream);
+        cut(scene, camera, rule, {{}, nullptr, nullptr, &on_device->choice}, output, stream, resident);
         copy_to_host(&counts, on_device, 1, stream);
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
         if (counts.pairs <= capacity) break;
@@ -330,11 +372,11 @@ void Cut::select_pairs(const SceneTables& scene, const Camera& camera, const Sel
 }
 
 void Cut::select(const SceneTables& scene, const Camera& camera, const SelectRule& rule, SelectOutput& out,
-                 cudaStream_t stream) {
+                 cudaStream_t stream, const PartlyResident* resident) {
     if (rule.fade.is_on())
-        select_pairs<true>(scene, camera, rule, out, stream);
+        select_pairs<true>(scene, camera, rule, out, stream, resident);
     else
-        select_pairs<false>(scene, camera, rule, out, stream);
+        select_pairs<false>(scene, camera, rule, out, stream, resident);
 }
 
 size_t Cut::bytes() const {

@@ -11,6 +11,30 @@ namespace cuda {
 struct CutPart;
 struct BudgetState;
 
+// What the host reads of the pages that a cut needs, once it is over.
+struct NeedsReport {
+    unsigned count;  // of the pages; of those that there is no room for, nothing else is told
+    float tolerance_px2;
+};
+
+// Where a cut tells which pages it needs. Everything is on the device but the report, which is memory of the
+// host that the device writes to.
+struct NeedList {
+    uint32_t* words = nullptr;  // the number of pages, then a word a page of all bundles; cleared by the cut
+    size_t num_words = 0;
+    uint32_t* const* need = nullptr;  // the words of each bundle
+    PageRequest* list = nullptr;
+    unsigned capacity = 0;  // of the list, and of the report
+    NeedsReport* report = nullptr;
+    PageRequest* reported = nullptr;
+};
+
+// The bundles of a scene of which only some pages are resident.
+struct PartlyResident {
+    const BundleOnDevice* bundles;
+    NeedList needs;  // without a report: nobody asks
+};
+
 // Cuts of scenes on the device that is current when it is made: the memory that a cut needs in between. One
 // cut uses it at a time. The cuts of one scene take turns by themselves, on any threads and streams; whoever
 // cuts several scenes orders those. Scenes and streams are of the same device.
@@ -23,7 +47,7 @@ class Cut {
     // 0, and `image` is written to images[0].
     void cut_items(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
                    const FrameImage& image, FrameImage* images, Placement* placements, const ItemList& items,
-                   cudaStream_t stream);
+                   cudaStream_t stream, const PartlyResident* resident = nullptr);
 
     // The same for pairs that were selected before, on the device.
     void given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
@@ -32,7 +56,7 @@ class Cut {
 
     // Selected clusters as pairs on the host, for which it waits.
     void select(const SceneTables& scene, const Camera& camera, const SelectRule& rule, SelectOutput& out,
-                cudaStream_t stream);
+                cudaStream_t stream, const PartlyResident* resident = nullptr);
 
     size_t bytes() const;
 
@@ -44,10 +68,10 @@ class Cut {
     struct Target;
     template <class Output>
     void cut(const SceneTables& scene, const Camera& camera, const SelectRule& rule, const Target& target,
-             const Output& output, cudaStream_t stream);
+             const Output& output, cudaStream_t stream, const PartlyResident* resident);
     template <bool kFades>
     void select_pairs(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
-                      SelectOutput& out, cudaStream_t stream);
+                      SelectOutput& out, cudaStream_t stream, const PartlyResident* resident);
 
     const int device_ = current_device();
     DeviceBuffer<InstanceView> views_;
