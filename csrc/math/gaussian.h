@@ -75,11 +75,11 @@ struct Palette {
 };
 
 // The same as a CUDA frame reads what stays on the device: four planes of (N, 4) that hold a PackedGaussian
-// each, and the SH coefficients as rows.
+// each, and the SH coefficients as rows, of which `sh_stride` floats apart begin.
 struct PackedPlanes {
     const float* plane[4];
     const float* sh;
-    int sh_degree;
+    int sh_degree, sh_stride;
     Palette palette;
 };
 

@@ -3,7 +3,7 @@
 #include "base/device.h"
 #include "frame/draw_list.h"
 #include "frame/tile_list.h"
-#include "quantize/quantize_math.h"
+#include "quantize/quantize.h"
 
 namespace v3dg {
 namespace cuda {
@@ -45,6 +45,17 @@ void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stre
 
 // `planes` has room for (4, N, 4).
 PackedPlanes pack(const GaussianRows<const float>& rows, float* planes, cudaStream_t stream);
+
+// The gaussians of a page on the device, and where they go.
+struct PageRows {
+    GaussianRows<const float> rows;   // at any multiple of 4 bytes
+    PageCodes<const uint32_t> codes;  // where they are coded; then `rows` has their number and degree alone
+    size_t first_row;
+};
+// The same for pages, into planes (4, num_rows, 4) and, where they have any, SH coefficients into rows of
+// `sh_stride` floats. `pages` is memory that the device can read.
+void pack_pages(const PageRows* pages, size_t num_pages, float* planes, size_t num_rows, float* sh,
+                int sh_stride, cudaStream_t stream);
 
 }  // namespace cuda
 }  // namespace v3dg

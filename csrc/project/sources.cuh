@@ -31,11 +31,10 @@ __device__ void color_of(const float* sh, const float mean[3], const ModelView<f
 }
 
 template <int kDegree>
-__device__ void color_of_row(const float* rows, uint32_t g, const float mean[3], const ModelView<float>& view,
+__device__ void color_of_row(const float* row, const float mean[3], const ModelView<float>& view,
                              float color[3]) {
     constexpr int kSize = 3 * num_sh_bases(kDegree);
     float sh[kSize];
-    const float* row = rows + size_t(g) * kSize;
     if constexpr (kSize % 4 == 0) {
 #pragma unroll
         for (int k = 0; k < kSize; k += 4) {
@@ -91,21 +90,21 @@ struct RowSource : OfRows<GaussianRows<const float>> {
         gaussian.quat[1] = quat.y;
         gaussian.quat[2] = quat.z;
         gaussian.quat[3] = quat.w;
-        if (m.sh_degree == 0) color_of_row<0>(m.sh, g, gaussian.mean, view, color);
+        if (m.sh_degree == 0) color_of_row<0>(m.sh + 3 * size_t(g), gaussian.mean, view, color);
         return project_gaussian(gaussian, view, in.image.camera, in.item.appearance.filter_px2,
                                 in.item.appearance.antialiased, s);
     }
     static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&, uint32_t g,
                                  float color[3]) {
-        if (m.sh_degree > 0) shade_row(m.sh, m.sh_degree, g, fetch(m, g), view, color);
+        if (m.sh_degree > 0) shade_row(m.sh + size_t(g) * m.num_sh(), m.sh_degree, fetch(m, g), view, color);
     }
-    static __device__ void shade_row(const float* sh, int sh_degree, uint32_t g, const float4& sphere,
+    static __device__ void shade_row(const float* row, int sh_degree, const float4& sphere,
                                      const ModelView<float>& view, float color[3]) {
         const float mean[3] = {sphere.x, sphere.y, sphere.z};
         switch (sh_degree) {
-            case 1: color_of_row<1>(sh, g, mean, view, color); break;
-            case 2: color_of_row<2>(sh, g, mean, view, color); break;
-            default: color_of_row<3>(sh, g, mean, view, color);
+            case 1: color_of_row<1>(row, mean, view, color); break;
+            case 2: color_of_row<2>(row, mean, view, color); break;
+            default: color_of_row<3>(row, mean, view, color);
         }
     }
 };
@@ -128,9 +127,9 @@ struct PackedSource : OfRows<PackedPlanes> {
                                  float color[3]) {
         const float anywhere[3] = {0, 0, 0};
         if (m.palette.sh != nullptr)
-            color_of_row<0>(m.palette.sh, m.palette.cluster_of(g), anywhere, view, color);
+            color_of_row<0>(m.palette.sh + 3 * size_t(m.palette.cluster_of(g)), anywhere, view, color);
         else if (m.sh_degree > 0)
-            RowSource::shade_row(m.sh, m.sh_degree, g, fetch(m, g), view, color);
+            RowSource::shade_row(m.sh + size_t(g) * m.sh_stride, m.sh_degree, fetch(m, g), view, color);
     }
 };
 
@@ -219,7 +218,7 @@ struct CodeSource {
                                  float color[3]) {
         const float anywhere[3] = {0, 0, 0};
         if (m.palette.sh != nullptr) {
-            color_of_row<0>(m.palette.sh, place.cluster, anywhere, view, color);
+            color_of_row<0>(m.palette.sh + 3 * size_t(place.cluster), anywhere, view, color);
             return;
         }
         switch (m.codes.sh_degree) {
