@@ -19,12 +19,6 @@ FINE = {"tolerance": 0.5}
 
 
 @pytest.fixture
-def device():
-    """Pools are on the CPU alone."""
-    return "cpu"
-
-
-@pytest.fixture
 def asset():
     """Of SH degree 1, about 250 pages."""
     rng = np.random.default_rng(0)
@@ -84,10 +78,15 @@ def test_settled_picture_is_that_of_all_pages(scene, device, options):
         assert_same(image, render(scene, camera, device=device, **options))
 
 
-def test_stills_are_settled(scene, device):
-    pictures = render(scene, [CAMERA, NEAR], device=device, memory="64MB", **FINE)
-    for picture, expected in zip(pictures, render(scene, [CAMERA, NEAR], device=device, **FINE), strict=True):
-        assert_same(picture, expected)
+@pytest.mark.parametrize("memory", ["64MB", 500_000])
+def test_stills_are_settled(scene, device, memory):
+    """Also those that are looked at when the pages of other views are there."""
+    cameras = [CAMERA, NEAR, AWAY]
+    pictures = render(scene, cameras, device=device, memory=memory, **FINE)
+    for camera, picture in zip(cameras, pictures, strict=True):
+        tolerance = picture.stats.tolerance
+        assert (tolerance > 0.5) == (memory != "64MB")
+        assert_same(picture, render(scene, camera, device=device, tolerance=tolerance))
 
 
 def test_pool_that_is_just_large_enough_settles_wherever_the_camera_goes(path, device):
@@ -365,6 +364,41 @@ def test_child_of_a_fork_is_told_to_make_another(path):
 
 
 @pytest.mark.gpu
-def test_pools_are_on_the_cpu_alone(scene):
-    with pytest.raises(ValueError, match="memory: expected none on cuda:0, for pools are on the CPU so far"):
-        Renderer(scene, device="cuda", memory="64MB")
+def test_devices_need_the_same_pages(scene):
+    renderers = [Renderer(scene, device=device, memory="64MB") for device in ("cpu", "cuda")]
+    for camera in (CAMERA, NEAR, AWAY):
+        for options in (FINE, {"tolerance": 20.0}, {"budget": 4000}):
+            found = [status_after(renderer, camera, **options) for renderer in renderers]
+            assert found[0].needed == found[1].needed
+            assert found[0].missing == found[1].missing == 0
+
+
+@pytest.mark.gpu
+def test_pictures_that_are_drawn_ahead_are_finished_later(scene):
+    """Many in flight, of views that need other pages each, without a look at any of them."""
+    renderer = Renderer(scene, device="cuda", memory=150_000)
+    rng = np.random.default_rng(5)
+    cameras = [
+        Camera.look_at(4 * rng.normal(size=3), (0, 0, 0), (0, 0, 1), 0.8, width=93, height=61)
+        for _ in range(60)
+    ]
+    images = [renderer.render(camera, tolerance=30.0) for camera in cameras]
+    assert all(np.isfinite(host(image.color)).all() for image in images)
+    now = status(renderer)
+    assert now.failed == 0
+    assert now.num_resident <= now.num_slots
+    renderer.settle(CAMERA, tolerance=30.0)
+    image = renderer.render(CAMERA, tolerance=30.0)
+    assert_same(image, render(scene, CAMERA, device="cuda", tolerance=image.stats.tolerance))
+
+
+@pytest.mark.gpu
+def test_graphs_of_a_pool_are_refused(scene):
+    import torch
+
+    renderer = Renderer(scene, device="cuda", memory="64MB")
+    renderer.render(CAMERA).stats  # noqa: B018
+    with torch.cuda.graph(torch.cuda.CUDAGraph()):
+        torch.zeros(1, device="cuda")  # for torch warns of graphs without work
+        with pytest.raises(RuntimeError, match="no CUDA graph of a pool"):
+            renderer.render(CAMERA)

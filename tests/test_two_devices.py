@@ -55,6 +55,16 @@ def test_picture_is_the_same_on_the_other_device(subject):
     assert there.stats.gaussians_in_frustum == here.stats.gaussians_in_frustum
 
 
+def test_pools_are_on_their_own_devices():
+    scene = composed_scene(0)
+    renderers = [Renderer(scene, device=f"cuda:{number}", memory="64MB") for number in (0, 1)]
+    for renderer in renderers:
+        renderer.settle(CAMERA)
+    here, there = (renderer.render(CAMERA) for renderer in renderers)
+    assert_same(here, render(scene, CAMERA, device="cuda:0"))
+    assert_same(there, here, "cuda:1")
+
+
 SUBJECTS = {"scene": composed_scene(2), "asset": asset(3), "empty": asset(4, 0)}
 
 

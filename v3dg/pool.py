@@ -1,11 +1,14 @@
-"""Pools: the part of a scene's bundles that is resident on the host, in memory of a fixed size."""
+"""Pools: the part of a scene's bundles that is resident, in memory of a fixed size."""
 
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 from v3dg import _core
+from v3dg._device import Device
+from v3dg.residency import residency
 
 if TYPE_CHECKING:
     from v3dg.bundle import Bundle
@@ -16,12 +19,14 @@ _WAIT_SECONDS = 0.05  # until Ctrl-C is heard
 
 
 class Pool:
-    """Pages of bundles in a fixed amount of the host's memory, which come and go as views need them."""
+    """Pages of bundles in a fixed amount of memory of one device, which come and go as views need them."""
 
-    def __init__(self, bundles: tuple[Bundle, ...], tables: list[_core.ClusterTable], num_bytes: int) -> None:
+    def __init__(
+        self, bundles: tuple[Bundle, ...], tables: list[_core.ClusterTable], device: Device, num_bytes: int
+    ) -> None:
         self.tables = tables
         sources = [bundle.page_source for bundle in bundles]
-        self.core = _core.PagePool(tables, sources, num_bytes, NUM_THREADS)
+        self.core = _core.PagePool(tables, sources, device.number, num_bytes, NUM_THREADS)
 
     def settle(
         self, resident: ResidentScene, camera: _core.Camera, rule: _core.Rule, timeout: float
@@ -37,7 +42,8 @@ class Pool:
         core.reset_tolerance()
         last, known = time.monotonic(), -1
         while True:
-            tolerance = core.ask(resident.core, camera, rule)
+            with residency.lock if resident.device.is_cuda else nullcontext():  # it stays as it is
+                tolerance = core.ask(resident.core, camera, rule)
             status = core.status()
             if status.failed:
                 raise (ValueError if status.is_damage else OSError)(status.error)

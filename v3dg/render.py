@@ -174,12 +174,11 @@ class Renderer:
     Args:
         color_by: As in `v3dg.render`; with `memory`, "appearance".
         device: As in `v3dg.render`. The renderer stays on it, whichever device is torch's current one later.
-        memory: For gaussians: bytes, or text like "2GB". All are resident if None. On the CPU alone so far.
+        memory: For gaussians on the device: bytes, or text like "2GB". All are resident if None.
 
     Raises:
         RuntimeError: Something is missing for the device.
-        ValueError: `memory` has no room for the coarsest level, or is given for a CUDA device, or the
-            coarsest page of a file is damaged.
+        ValueError: `memory` has no room for the coarsest level, or the coarsest page of a file is damaged.
     """
 
     def __init__(
@@ -223,7 +222,8 @@ class Renderer:
         """Wait until what a view needs is resident, so that its picture misses nothing.
 
         The picture is then the same, bit for bit, as if all were resident; or as it is at the tolerance that
-        it says, where there is not enough room. Returns at once where all is resident.
+        it says, where there is not enough room. That holds for the next picture, which is waited for, too, on
+        a CUDA device. Returns at once where all is resident.
 
         Args:
             timeout: Seconds after which it gives up if not a single page came in.
@@ -245,6 +245,7 @@ class _Frame:
         self._device, self._color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
         self._pool: Pool | None = None
+        self._has_settled = False  # and drawn nothing since
         self._memory = None if memory is None else in_bytes(memory)
         if isinstance(subject, Gaussians):
             check("memory", memory is None, f"None for an asset, which has no pages, got {memory}")
@@ -253,8 +254,6 @@ class _Frame:
         else:
             expected = f"'appearance' for a pool, got {color_by!r}"
             check("color_by", memory is None or color_by == "appearance", expected)
-            expected = f"none on {device}, for pools are on the CPU so far, got {memory}; take device='cpu'"
-            check("memory", memory is None or not device.is_cuda, expected)
             self._frame = _core.SceneFrame(device.number)
             with residency.reading(subject, device) as resident:
                 self._take_models(resident)
@@ -305,6 +304,9 @@ class _Frame:
 
         if not self._device.is_cuda:
             finish()
+        elif self._has_settled:
+            drawing.finish()  # which may draw again, with pages that other views put in place of its own
+        self._has_settled = False
         return RenderedImage(drawing, finish)
 
     def settle(
@@ -320,6 +322,7 @@ class _Frame:
             pool = self._take_models(resident)
         assert pool is not None
         pool.settle(resident, camera.core, rule, timeout)
+        self._has_settled = True
 
     def _take_models(self, resident: ResidentScene) -> Pool | None:
         """Have the gaussians of the scene's bundles at hand: in a pool, or all of them."""
@@ -328,7 +331,8 @@ class _Frame:
             if self._memory is not None:
                 tables = [residency.table(bundle) for bundle in bundles]
                 if self._pool is None or self._pool.tables != tables:
-                    self._pool = Pool(bundles, tables, self._memory)
+                    self._pool = None  # its memory is needed
+                    self._pool = Pool(bundles, tables, self._device, self._memory)
                 return self._pool
             if self._num_models < len(bundles):
                 residency.set_models(self._frame, bundles, self._device, self._color_by)

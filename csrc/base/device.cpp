@@ -128,6 +128,10 @@ StreamMutex::~StreamMutex() {
     if (cudaEventDestroy(done_) != cudaSuccess) cudaGetLastError();  // at exit the driver may be gone
 }
 
+void StreamMutex::wait() const noexcept {
+    if (cudaEventSynchronize(done_) != cudaSuccess) cudaGetLastError();  // at exit the driver may be gone
+}
+
 StreamLock::StreamLock(StreamMutex& mutex, cudaStream_t stream)
     : lock_(mutex.busy_), mutex_(mutex), stream_(stream), is_captured_(is_capturing(stream)) {
     if (!is_captured_ && stream != mutex.last_)

@@ -59,6 +59,8 @@ class StreamMutex {
   public:
     StreamMutex();
     ~StreamMutex();
+    // Waits until the device is done with what was enqueued under the last lock, and so with all before it.
+    void wait() const noexcept;
     StreamMutex(const StreamMutex&) = delete;
     StreamMutex& operator=(const StreamMutex&) = delete;
 

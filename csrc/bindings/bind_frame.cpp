@@ -47,11 +47,13 @@ class BoundDrawing {
 
 #if V3DG_WITH_CUDA
     // `kept` are the frame, which may have to draw again, and what it reads.
-    BoundDrawing(NewPicture picture, py::object kept, Device device, std::unique_ptr<cuda::Drawing> drawing)
+    BoundDrawing(NewPicture picture, py::object kept, Device device, std::unique_ptr<cuda::Drawing> drawing,
+                 const SelectRule& rule)
         : picture_(std::move(picture)),
           kept_(std::move(kept)),
           device_(device),
-          drawing_(std::move(drawing)) {}
+          drawing_(std::move(drawing)),
+          rule_(rule) {}
 #endif
 
     const NewPicture& picture() const { return picture_; }
@@ -72,7 +74,7 @@ class BoundDrawing {
                       c.records,
                       c.entries,
                       c.items,
-                      c.choice.tolerance_px2,
+                      rule_.budget == kNoBudget ? rule_.tolerance_px2 : c.choice.tolerance_px2,
                       exceeds,
                       times.prepare_ms,
                       times.draw_ms};
@@ -88,6 +90,7 @@ class BoundDrawing {
     py::object kept_;
     Device device_;
     std::unique_ptr<cuda::Drawing> drawing_;  // gone before what it needs
+    SelectRule rule_{};
 #endif
 };
 
@@ -144,8 +147,9 @@ class BoundSceneFrame {
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
         const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
         auto drawing = frame_->draw(scene.on_device(), camera.camera, rule, image, work.stream());
-        return std::make_unique<BoundDrawing>(
-            std::move(picture), py::make_tuple(py::cast(this), scene_object), device_, std::move(drawing));
+        return std::make_unique<BoundDrawing>(std::move(picture),
+                                              py::make_tuple(py::cast(this), scene_object), device_,
+                                              std::move(drawing), rule);
 #else
         return nullptr;
 #endif
@@ -157,10 +161,23 @@ class BoundSceneFrame {
                                                 const Shade& shade, const Stop* stop) {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         auto& pool = held<BoundPool>(pool_object, "pool");
-        require_host("draw_resident");
-        if (scene.device() != device_) throw py::value_error("scene: expected one on the frame's device");
+        if (scene.device() != device_ || pool.device() != device_)
+            throw py::value_error("scene, pool: expected them on the frame's device");
         const std::shared_ptr<const SceneState> state = scene.state();
         pool.check_scene(*state);
+#if V3DG_WITH_CUDA
+        if (!device_.is_host()) {
+            const Work work(device_);
+            NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
+            const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
+            SelectRule used = rule;
+            auto drawing = frame_->draw_resident(scene.on_device(), pool.on_device(), camera.camera, used,
+                                                 image, work.stream());
+            return std::make_unique<BoundDrawing>(std::move(picture),
+                                                  py::make_tuple(py::cast(this), scene_object, pool_object),
+                                                  device_, std::move(drawing), used);
+        }
+#endif
         const Window window = window_of(camera.camera);
         NewPicture out = picture_of(window, true);
         const Picture<float> picture = out.on_host<float>(window, shade);
@@ -197,7 +214,7 @@ class BoundSceneFrame {
         return std::make_unique<BoundDrawing>(
             std::move(picture),
             py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights), device_,
-            std::move(drawing));
+            std::move(drawing), SelectRule{});
 #else
         return nullptr;
 #endif
@@ -339,7 +356,8 @@ class BoundAssetFrame {
         const cuda::PackedModel& packed = *model.on_device().packed;
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
                                     work.stream(), &packed.packed());
-        return std::make_unique<BoundDrawing>(std::move(picture), py::cast(this), device, std::move(drawing));
+        return std::make_unique<BoundDrawing>(std::move(picture), py::cast(this), device, std::move(drawing),
+                                              SelectRule{});
 #else
         return nullptr;
 #endif

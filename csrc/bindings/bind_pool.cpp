@@ -45,8 +45,9 @@ py::array_t<bool> resident_pages(BoundPool& pool, size_t bundle) {
 
 }  // namespace
 
-BoundPool::BoundPool(const py::list& tables, const py::list& sources, size_t num_bytes, unsigned num_threads)
-    : tables_(tables), sources_(sources) {
+BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device, size_t num_bytes,
+                     unsigned num_threads)
+    : device_{device}, tables_(tables), sources_(sources) {
     std::vector<PagedBundle> bundles;
     int max_degree = 0;
     for (size_t b = 0; b < tables.size(); ++b) {
@@ -58,17 +59,44 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, size_t num
     PoolLimits limits{};
     limits.num_threads = num_threads;
     limits.block_bytes = std::min(kMostBlockBytes, num_bytes / kBlockShare);
-    const size_t row_bytes = sizeof(float) * (11 + 3 * num_sh_bases(max_degree));
+    size_t row_bytes = sizeof(float) * (11 + 3 * num_sh_bases(max_degree));
+    std::shared_ptr<BlockMemory> blocks = std::make_shared<HostBlocks>();
+    const Work work(device_);
+#if V3DG_WITH_CUDA
+    if (!device_.is_host()) {
+        row_bytes = cuda::pooled_row_bytes(max_degree);
+        blocks = std::make_shared<cuda::PinnedBlocks>();
+    }
+#endif
     limits.num_rows = (num_bytes - limits.block_bytes) / row_bytes;
     try {
         const py::gil_scoped_release unlocked;
-        pool_ = std::make_unique<PagePool>(bundles, limits, std::make_shared<HostBlocks>());
+        pool_ = std::make_unique<PagePool>(bundles, limits, std::move(blocks));
     } catch (const PageError& error) {
         raise(error);
     }
     const size_t num_rows = pool_->first_slot_row() + pool_->num_slots() * pool_->slot_rows();
-    host_ = std::make_unique<HostPages>(*pool_, num_rows);
+    if (device_.is_host()) host_ = std::make_unique<HostPages>(*pool_, num_rows);
+#if V3DG_WITH_CUDA
+    if (!device_.is_host()) make_on_device(num_rows, work);
+#endif
 }
+
+#if V3DG_WITH_CUDA
+void BoundPool::make_on_device(size_t num_rows, const Work& work) {
+    std::vector<std::shared_ptr<const cuda::BundleTables>> tables;
+    std::vector<ClusterTable> host;
+    std::vector<ClusterAppearance> appearance;
+    for (const py::handle& table : tables_) {
+        const auto& bound = held<BoundTable>(table, "tables");
+        tables.push_back(bound.on_device(work));
+        host.push_back(bound.table());
+        appearance.push_back(bound.appearance());
+    }
+    on_device_ = std::make_unique<cuda::DevicePages>(*pool_, std::move(tables), host, appearance, num_rows,
+                                                     work.stream());
+}
+#endif
 
 void BoundPool::check_scene(const SceneState& scene) const {
     bool fits = scene.bundles.size() == tables_.size();
@@ -92,6 +120,13 @@ float BoundPool::ask(const py::object& scene_object, const BoundCamera& camera, 
     const std::shared_ptr<const SceneState> state = held_scene.state();
     check_scene(*state);
     float tolerance = 0;
+#if V3DG_WITH_CUDA
+    if (!device_.is_host()) {
+        const Work work(device_);
+        const py::gil_scoped_release unlocked;
+        return on_device_->ask(held_scene.on_device(), camera.camera, rule, work.stream());
+    }
+#endif
     const py::gil_scoped_release unlocked;
     frame_on_host(*state, rule, false, [&](auto tables, const SelectRule& raised, auto needs) {
         SelectOutput out;
@@ -113,9 +148,9 @@ void bind_pool(py::module_& m) {
         .def_readonly("least_tolerance_px2", &PoolStatus::least_tolerance_px2)
         .def_readonly("error", &PoolStatus::error)
         .def_readonly("is_damage", &PoolStatus::is_damage);
-    py::class_<BoundPool>(m, "PagePool", "Pages of bundles in a fixed amount of the host's memory.")
-        .def(py::init<py::list, py::list, size_t, unsigned>(), "tables"_a, "sources"_a, "num_bytes"_a,
-             "num_threads"_a)
+    py::class_<BoundPool>(m, "PagePool", "Pages of bundles in a fixed amount of memory of one device.")
+        .def(py::init<py::list, py::list, int, size_t, unsigned>(), "tables"_a, "sources"_a, "device"_a,
+             "num_bytes"_a, "num_threads"_a)
         .def("ask", &BoundPool::ask, "scene"_a, "camera"_a, "rule"_a,
              "Brings pages and finds out what a view needs; the tolerance that was used.")
         .def("status", &BoundPool::status)

@@ -1,6 +1,6 @@
 #pragma once
 
-// The part of bundles that is resident on the host, of a size that does not grow.
+// The part of bundles that is resident, of a size that does not grow.
 
 #include <algorithm>
 #include <memory>
@@ -10,14 +10,20 @@
 #include "bindings/resident.h"
 #include "residency/host_pages.h"
 
+#if V3DG_WITH_CUDA
+#include "pipeline/device_pages.h"
+#endif
+
 namespace v3dg {
 
 class BoundPool {
   public:
     // `sources` has for each table either the arrays of gaussians in memory, or the file of the bundle: its
     // name, descriptor, SH degree, places (P+1,) and hashes (P, 16).
-    BoundPool(const py::list& tables, const py::list& sources, size_t num_bytes, unsigned num_threads);
+    BoundPool(const py::list& tables, const py::list& sources, int device, size_t num_bytes,
+              unsigned num_threads);
 
+    Device device() const { return device_; }
     PagePool& pool() { return *pool_; }
     PoolStatus status() const { return pool_->status(); }
     void check_scene(const SceneState& scene) const;
@@ -42,15 +48,26 @@ class BoundPool {
                    is_bounded);
     }
     const GaussianPlanes<float>& planes(size_t bundle) const { return host_->planes(bundle); }
+#if V3DG_WITH_CUDA
+    cuda::DevicePages& on_device() { return *on_device_; }
+#endif
+
     // Cuts the scene for a view, without drawing, and returns the tolerance that was used.
     float ask(const py::object& scene_object, const BoundCamera& camera, const SelectRule& rule);
 
   private:
+#if V3DG_WITH_CUDA
+    void make_on_device(size_t num_rows, const Work& work);
+#endif
     void note_needs(float tolerance_px2, bool adapts);
 
+    const Device device_;
     const py::list tables_, sources_;
     std::unique_ptr<PagePool> pool_;
     std::unique_ptr<HostPages> host_;
+#if V3DG_WITH_CUDA
+    std::unique_ptr<cuda::DevicePages> on_device_;
+#endif
     std::mutex busy_;
     std::vector<std::vector<uint32_t>> needs_;  // of each bundle
 };

@@ -1,6 +1,7 @@
 #include "pipeline/frame_cuda.h"
 
 #include <algorithm>
+#include <optional>
 #include <stdexcept>
 #include <string>
 
@@ -226,6 +227,8 @@ const FrameCounters& Drawing::settle() {
         is_settled_ = was_drawn();
         if (is_settled_) break;
         frame_.enlarge(*slot_->state);
+        std::optional<StreamLock> lock;
+        if (batch_.guards_models != nullptr) lock.emplace(*batch_.guards_models, stream_);
         frame_.enqueue(*this);
     }
     return slot_->state->counters;

@@ -26,6 +26,8 @@ struct FrameBatch {
     bool has_shared_items = false;           // whether there may be any; a frame that keeps a tape has none
     float min_transmittance = kStopsBefore;  // of the images
     bool has_faded_items = false;            // the same as of shared ones; these are of scenes and not shared
+    // Where the models change from frame to frame: what guards them. Whoever draws has it locked.
+    StreamMutex* guards_models = nullptr;
 };
 
 // What a frame leaves for its backward pass, valid until the next frame is drawn.

@@ -1,5 +1,6 @@
 #pragma once
 
+#include "pipeline/device_pages.h"
 #include "pipeline/frame_cuda.h"
 #include "quantize/quantize.h"
 #include "select/select_cuda.h"
@@ -70,13 +71,17 @@ class SceneFrame {
     // The scene stays as it is until the drawing is finished.
     std::unique_ptr<Drawing> draw(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
                                   const FrameImage& image, cudaStream_t stream);
+    // Draws what is resident of the bundles of a pool, with what comes in before; the pool stays, too. The
+    // rule becomes the one that is used. A frame that is drawn again has the pages that are there by then.
+    std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages, const Camera& camera,
+                                           SelectRule& rule, const FrameImage& image, cudaStream_t stream);
     // Draws pairs that were selected before; they are on the device and stay, too.
     std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera, const GivenCut& given,
                                       const FrameImage& image, cudaStream_t stream);
 
   private:
-    std::unique_ptr<Drawing> draw(const SceneTables& scene, const FrameImage& image, bool fades,
-                                  Frame::Prepare prepare, cudaStream_t stream);
+    // Of the models that were set.
+    FrameBatch batch(const SceneTables& scene, const FrameImage& image, bool fades, cudaStream_t stream);
 
     std::vector<DeviceModel> models_;
     std::vector<std::shared_ptr<const DevicePalette>> palettes_;

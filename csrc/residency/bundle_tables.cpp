@@ -35,6 +35,8 @@ class Upload {
     std::vector<std::function<void(const unsigned char*)>> moves_;
 };
 
+}  // namespace
+
 std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const ClusterAppearance& appearance) {
     std::vector<uint8_t> joins((table.num_clusters() + kClustersOfBounds - 1) / kClustersOfBounds, 0);
     for (size_t c = 0; c < table.num_clusters(); ++c) {
@@ -44,8 +46,6 @@ std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const ClusterA
     }
     return joins;
 }
-
-}  // namespace
 
 BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
                            cudaStream_t stream)

@@ -19,6 +19,9 @@ struct BundleOnDevice {
     const uint8_t* joins;
 };
 
+// A byte for each kClustersOfBounds clusters, as BundleOnDevice::joins has them.
+std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const ClusterAppearance& appearance);
+
 // The tables of one bundle on the device that is current when they are made. They never change, so the
 // scenes, threads and streams of that device share them. They have to outlive the work that reads them.
 class BundleTables {

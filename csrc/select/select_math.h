@@ -289,7 +289,8 @@ struct PageNeed {
 // The page that a cluster which is not culled tells that its instance needs, and with it those above;
 // `priority` says how urgently the page of a group does. Once all are resident whose priority is above 1, and
 // the pages above them, the cut is the one that is made if every page is: a cluster of that has its page, and
-// one that stands in for finer ones asks for theirs.
+// one that stands in for finer ones asks for theirs. It goes on asking once they are there, for all of them
+// may be culled: a page that is needed as long as it is absent would come and go without end.
 template <class Priority>
 V3DG_HD inline PageNeed page_need(const ClusterTable& table, size_t c, const Priority& priority) {
     const int32_t own = table.own_group[c], parent = table.parent_group[c];
@@ -298,8 +299,7 @@ V3DG_HD inline PageNeed page_need(const ClusterTable& table, size_t c, const Pri
     const size_t page = table.page_of(c);
     if (own >= 0 && table.pages.is_resident(page)) {
         const float below = priority(own);
-        const bool is_finer_drawn = below > 1.0f && table.pages.is_resident(own);
-        if (below > kLeastPriority && !is_finer_drawn) return {own, below};
+        if (below > kLeastPriority) return {own, below};
     }
     return {static_cast<int32_t>(page), above};
 }

@@ -38,7 +38,7 @@ class Render(OnDevice):
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Red, green and blue of the background, each 0 to 1."""
     memory: Annotated[str | None, option("SIZE")] = None
-    """Draw from so much memory, as 2GB, with pages read from the files as cameras need them (on the CPU)."""
+    """Draw from so much memory of the device, as 2GB, with pages read from the files as cameras need them."""
     view: Views = field(default_factory=ViewOptions)
 
 

@@ -1,0 +1,249 @@
+#include "pipeline/device_pages.h"
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+#include "base/launch.cuh"
+
+namespace v3dg {
+namespace cuda {
+
+namespace {
+
+// Frames whose cuts are under way at once; the next one waits for the first of them.
+constexpr size_t kMostFlights = 4;
+
+// A page on its way: bytes of the host that go to the device, and the word that says where it is.
+struct PageMove {
+    const uint4* from;
+    uint4* to;
+    size_t num_vectors;
+    int64_t* shift;
+    int64_t value;
+};
+
+// A block a page. Reads the host's memory, so that one launch brings all pages.
+__global__ void move_kernel(const PageMove* moves) {
+    const PageMove move = moves[blockIdx.x];
+    for (size_t i = threadIdx.x; i < move.num_vectors; i += blockDim.x) move.to[i] = move.from[i];
+    if (threadIdx.x == 0) *move.shift = move.value;
+}
+
+template <class T>
+Pinned<T> pinned(size_t count) {
+    void* memory = nullptr;
+    const size_t bytes = std::max<size_t>(count, 1) * sizeof(T);
+    const cudaError_t error = cudaMallocHost(&memory, bytes);
+    if (error == cudaErrorMemoryAllocation) {
+        cudaGetLastError();
+        throw OutOfMemory("cuda: out of memory: the host has no " + std::to_string(bytes) +
+                          " bytes that a device can read");
+    }
+    check(error, "cudaMallocHost");
+    return Pinned<T>(static_cast<T*>(memory));
+}
+
+// The degree 0 is in the planes. Rows begin at multiples of 16 bytes.
+int stride_of(int sh_degree) { return sh_degree == 0 ? 0 : (3 * num_sh_bases(sh_degree) + 3) / 4 * 4; }
+
+}  // namespace
+
+void FreePinned::operator()(void* memory) const noexcept {
+    if (cudaFreeHost(memory) != cudaSuccess) cudaGetLastError();  // at exit the driver may be gone before us
+}
+
+unsigned char* PinnedBlocks::allocate(size_t bytes) {
+    return blocks_.emplace_back(pinned<unsigned char>(bytes)).get();
+}
+
+size_t pooled_row_bytes(int max_sh_degree) {
+    return sizeof(float) * (16 + static_cast<size_t>(stride_of(max_sh_degree)));
+}
+
+// What the host keeps of a frame until its cut is over.
+struct DevicePages::Flight {
+    const Pinned<PageMove> moves;
+    const Pinned<PageRows> pages;
+    const Pinned<NeedsReport> report;
+    const Pinned<PageRequest> needs;
+    std::vector<unsigned char*> blocks;  // that `moves` reads
+    uint32_t frame = 0;
+    bool is_bounded = false;
+    cudaEvent_t done = nullptr;
+
+    Flight(size_t most_changes, size_t most_needs)
+        : moves(pinned<PageMove>(most_changes)),
+          pages(pinned<PageRows>(most_changes)),
+          report(pinned<NeedsReport>(1)),
+          needs(pinned<PageRequest>(most_needs)) {
+        check(cudaEventCreateWithFlags(&done, cudaEventDisableTiming), "cudaEventCreate");
+    }
+    ~Flight() {
+        if (cudaEventDestroy(done) != cudaSuccess) cudaGetLastError();  // as of memory
+    }
+};
+
+DevicePages::DevicePages(PagePool& pool, std::vector<std::shared_ptr<const BundleTables>> tables,
+                         const std::vector<ClusterTable>& host,
+                         const std::vector<ClusterAppearance>& appearance, size_t num_rows,
+                         cudaStream_t stream)
+    : pool_(pool),
+      tables_(std::move(tables)),
+      num_rows_(num_rows),
+      sh_stride_(stride_of(pool.max_sh_degree())),
+      rows_(16 * num_rows, stream),
+      sh_(static_cast<size_t>(sh_stride_) * num_rows, stream),
+      staged_(pool.most_bytes_on_their_way(), stream),
+      list_(pool.most_needs(), stream) {
+    std::vector<PackedPlanes> planes;
+    std::vector<BundleOnDevice> bundles;
+    std::vector<uint8_t> joins;
+    std::vector<int64_t> shift;
+    std::vector<size_t> first_join, first_page;
+    for (size_t b = 0; b < tables_.size(); ++b) {
+        ClusterTable table = host[b];
+        table.pages.shift = pool.shift(b);
+        const std::vector<uint8_t> own = joins_of_clusters(table, appearance[b]);
+        first_join.push_back(joins.size());
+        joins.insert(joins.end(), own.begin(), own.end());
+        first_page.push_back(shift.size());
+        shift.resize(shift.size() + table.num_pages(), kAbsentPage);
+        const float* plane = rows_.data();
+        planes.push_back({{plane, plane + 4 * num_rows, plane + 8 * num_rows, plane + 12 * num_rows},
+                          sh_.data(),
+                          pool.source(static_cast<uint32_t>(b)).sh_degree(),
+                          sh_stride_,
+                          {}});
+    }
+    joins_.copy_from({joins.data(), joins.size()}, stream);
+    shift_.copy_from({shift.data(), shift.size()}, stream);
+    num_words_ = 1 + shift.size();
+    words_.reserve(num_words_, stream);
+    std::vector<uint32_t*> need;
+    for (size_t b = 0; b < tables_.size(); ++b) {
+        BundleOnDevice bundle = tables_[b]->on_device();
+        const size_t num_pages = pool.shift(b).size;
+        bundle.table.pages.shift = {shift_.data() + first_page[b], num_pages};
+        bundle.joins = joins_.data() + first_join[b];
+        bundles.push_back(bundle);
+        shift_of_bundle_.push_back(shift_.data() + first_page[b]);
+        need.push_back(words_.data() + 1 + first_page[b]);
+    }
+    planes_on_device_.copy_from({planes.data(), planes.size()}, stream);
+    bundles_.copy_from({bundles.data(), bundles.size()}, stream);
+    need_.copy_from({need.data(), need.size()}, stream);
+    for (size_t k = 0; k < kMostFlights; ++k)
+        flights_.push_back(std::make_unique<Flight>(pool.most_changes(), pool.most_needs()));
+    check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+}
+
+// Memory goes back in the order of the stream that it was had on, and frames may be on others.
+DevicePages::~DevicePages() { busy_.wait(); }
+
+void DevicePages::note_flights(bool waits) {
+    while (!under_way_.empty()) {
+        Flight& flight = *under_way_.front();
+        if (waits) check(cudaEventSynchronize(flight.done), "a frame");
+        const cudaError_t over = cudaEventQuery(flight.done);
+        if (over == cudaErrorNotReady) {
+            cudaGetLastError();
+            return;
+        }
+        check(over, "a frame");
+        pool_.give_back(flight.blocks);
+        flight.blocks.clear();
+        const size_t count = flight.report[0].count, told = std::min(count, pool_.most_needs());
+        // Who waits asks for a tolerance that does not depend on the frames before.
+        pool_.note_needs(flight.frame, {flight.needs.get(), told}, count - told,
+                         flight.report[0].tolerance_px2, flight.is_bounded && !waits);
+        under_way_.pop_front();
+    }
+}
+
+DevicePages::Flight& DevicePages::free_flight() {
+    const auto is_free = [&](const std::unique_ptr<Flight>& flight) {
+        return std::find(under_way_.begin(), under_way_.end(), flight.get()) == under_way_.end();
+    };
+    return **std::find_if(flights_.begin(), flights_.end(), is_free);
+}
+
+void DevicePages::bring(const std::vector<PageChange>& changes, Flight& flight, cudaStream_t stream) {
+    size_t staged = 0, num_pages = 0;
+    for (size_t k = 0; k < changes.size(); ++k) {
+        const PageChange& change = changes[k];
+        PageMove& move = flight.moves[k];
+        move = {nullptr, nullptr, 0, shift_of_bundle_[change.bundle] + change.page, kAbsentPage};
+        if (change.bytes == nullptr) continue;
+        const PageSource& source = pool_.source(change.bundle);
+        move.value = change.row - source.first_row(change.page);
+        move.from = reinterpret_cast<const uint4*>(change.bytes);
+        unsigned char* bytes = staged_.data() + staged;
+        move.to = reinterpret_cast<uint4*>(bytes);
+        move.num_vectors = (source.num_bytes(change.page) + sizeof(uint4) - 1) / sizeof(uint4);
+        staged += move.num_vectors * sizeof(uint4);
+        PageRows& page = flight.pages[num_pages++];
+        page.first_row = static_cast<size_t>(change.row);
+        page.rows = rows_of_page(bytes, source.num_rows(change.page), source.sh_degree());
+        page.codes = {};
+        if (source.codec() == PageCodec::float32) continue;
+        const int64_t* offset = tables_[change.bundle]->on_device().table.offset.data;
+        page.codes = {{offset + source.first_cluster(change.page), source.clusters(change.page).size},
+                      reinterpret_cast<const uint32_t*>(bytes),
+                      source.sh_degree()};
+    }
+    constexpr unsigned kThreads = 256;
+    launch("move_kernel", move_kernel, static_cast<unsigned>(changes.size()), kThreads, 0, stream,
+           flight.moves.get());
+    pack_pages(flight.pages.get(), num_pages, rows_.data(), num_rows_, sh_.data(), sh_stride_, stream);
+}
+
+PartlyResident DevicePages::begin_frame(bool is_bounded, cudaStream_t stream) {
+    if (is_capturing(stream))
+        throw std::runtime_error(
+            "memory: expected no CUDA graph of a pool, whose pages come and go; capture a renderer without "
+            "memory");
+    if (under_way_.size() == kMostFlights) check(cudaEventSynchronize(under_way_.front()->done), "a frame");
+    note_flights(false);
+    if (current_ != nullptr) {  // its frame was given up before its cut
+        check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+        pool_.give_back(std::exchange(current_->blocks, {}));
+    }
+    Flight& flight = free_flight();
+    const std::vector<PageChange>& changes = pool_.begin_frame(is_bounded);
+    flight.frame = pool_.frame();
+    flight.is_bounded = is_bounded;
+    flight.blocks = pool_.take_blocks();
+    current_ = &flight;
+    bring(changes, flight, stream);
+    return {bundles_.data(),
+            {words_.data(), num_words_, need_.data(), list_.data(), static_cast<unsigned>(pool_.most_needs()),
+             flight.report.get(), flight.needs.get()}};
+}
+
+void DevicePages::end_frame(cudaStream_t stream) {
+    check(cudaEventRecord(current_->done, stream), "cudaEventRecord");
+    under_way_.push_back(std::exchange(current_, nullptr));
+}
+
+SelectRule DevicePages::raised(SelectRule rule) const {
+    rule.tolerance_px2 = std::max(rule.tolerance_px2, pool_.status().least_tolerance_px2);
+    return rule;
+}
+
+float DevicePages::ask(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
+                       cudaStream_t stream) {
+    const StreamLock lock(busy_, stream);
+    note_flights(true);
+    const PartlyResident resident = begin_frame(false, stream);
+    const SelectRule used = raised(rule);
+    SelectOutput out;
+    cut_.select(scene, camera, used, out, stream, &resident);
+    end_frame(stream);
+    note_flights(true);
+    return out.fits_budget ? out.tolerance_px2 : used.tolerance_px2;
+}
+
+}  // namespace cuda
+}  // namespace v3dg
