@@ -99,11 +99,14 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
     there = [closed_residency(rng, bundle, share=0.3) for bundle in scene.bundles]
     shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
     core = resident_scene(scene, shifts)  # which borrows the arrays
+    asked = [np.zeros(len(shift), bool) for shift in shifts]
     for _ in range(100):
         needs = core.page_needs(camera.core, rule(**options))
         missing = [np.flatnonzero((n > 1) & (s == ABSENT)) for n, s in zip(needs, shifts, strict=True)]
         if not any(map(len, missing)):
             break
+        for ever, pages in zip(asked, missing, strict=True):
+            ever[pages] = True
         for bundle, shift, pages in zip(scene.bundles, shifts, missing, strict=True):
             for page in pages:
                 while shift[page] == ABSENT:  # with all above it
@@ -114,6 +117,16 @@ def test_loading_what_is_missing_leads_to_the_cut_of_all_pages(seed, has_budget,
     np.testing.assert_array_equal(cut.instance_ids, whole.instance_ids)
     np.testing.assert_array_equal(cut.cluster_ids, whole.cluster_ids)
     np.testing.assert_array_equal(weights_of(cut), whole.weights)
+    # What was missed is still needed, or is above what nearly is. Else it would go, and be missed again.
+    for bundle, ever, need in zip(scene.bundles, asked, needs, strict=True):
+        above = np.append(bundle.groups.parent, -1)  # of the coarsest page nothing is
+        needed = np.zeros(len(ever), bool)
+        for asking in np.flatnonzero(need > 0):
+            page = asking if need[asking] > 1 else above[asking]
+            while page >= 0 and not needed[page]:
+                needed[page] = True
+                page = above[page]
+        assert not (ever & ~needed).any()
 
 
 def weights_of(cut):
