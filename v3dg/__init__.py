@@ -15,7 +15,7 @@ from v3dg._version import __version__
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.camera_file import read_cameras, write_cameras
-from v3dg.cameras import Camera, turntable
+from v3dg.cameras import Camera, StereoCamera, turntable
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image
 from v3dg.io import read_asset, write_asset
@@ -42,6 +42,7 @@ __all__ = [
     "Scene",
     "Selection",
     "Stats",
+    "StereoCamera",
     "__version__",
     "build_bundle",
     "pick",

@@ -33,6 +33,14 @@ class Camera:
     @property
     def position(self) -> Float64: ...
 
+class Eyes:
+    """Two cameras that look the same way and share a cut; or a camera."""
+
+    @overload
+    def __init__(self, camera: Camera) -> None: ...
+    @overload
+    def __init__(self, left: Camera, right: Camera) -> None: ...
+
 class Rule:
     """What a selection chooses."""
 
@@ -226,6 +234,16 @@ class FrameStats:
     @property
     def draw_ms(self) -> float: ...
 
+class Picture:
+    """The planes of a picture."""
+
+    @property
+    def color(self) -> Array: ...
+    @property
+    def alpha(self) -> Array: ...
+    @property
+    def depth(self) -> Array: ...
+
 class Drawing:
     """A frame that has been drawn, or enqueued on a device."""
 
@@ -235,6 +253,8 @@ class Drawing:
     def alpha(self) -> Array: ...
     @property
     def depth(self) -> Array: ...
+    @property
+    def right(self) -> Picture: ...
     def finish(self) -> FrameStats: ...
 
 class Model:
@@ -258,7 +278,7 @@ class ResidentScene:
         self, bundle: Int32, importance: Float32, positions: Array, quaternions: Array, scales: Array
     ) -> None: ...
     def set_poses(self, positions: Array, quaternions: Array, scales: Array) -> None: ...
-    def select(self, camera: Camera, rule: Rule) -> Cut: ...
+    def select(self, camera: Camera | Eyes, rule: Rule) -> Cut: ...
     def page_needs(self, camera: Camera, rule: Rule) -> list[Float32]: ...
 
 class PoolStatus:
@@ -291,7 +311,7 @@ class PagePool:
     def __init__(
         self, tables: list[ClusterTable], sources: list[Any], device: int, num_bytes: int, num_threads: int
     ) -> None: ...
-    def ask(self, scene: ResidentScene, camera: Camera, rule: Rule) -> float: ...
+    def ask(self, scene: ResidentScene, camera: Camera | Eyes, rule: Rule) -> float: ...
     def status(self) -> PoolStatus: ...
     def resident(self, bundle: int) -> NDArray[np.bool_]: ...
     def raise_tolerance(self, from_px2: float) -> bool: ...
@@ -318,7 +338,7 @@ class SceneFrame:
     def draw(
         self,
         scene: ResidentScene,
-        camera: Camera,
+        camera: Camera | Eyes,
         rule: Rule,
         shade: Shade,
         stop: Stop | None = None,
@@ -327,7 +347,7 @@ class SceneFrame:
         self,
         scene: ResidentScene,
         pool: PagePool,
-        camera: Camera,
+        camera: Camera | Eyes,
         rule: Rule,
         shade: Shade,
         stop: Stop | None = None,

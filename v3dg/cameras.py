@@ -163,6 +163,42 @@ class Camera:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class StereoCamera:
+    """Two cameras that look the same way, as the eyes in a headset do: one cut serves both.
+
+    Raises:
+        ValueError: The cameras are not turned alike.
+    """
+
+    left: Camera
+    right: Camera
+
+    def __post_init__(self) -> None:
+        rotations = self.left.viewmat[:3, :3], self.right.viewmat[:3, :3]
+        expected = "a camera of the same rotation as the left one, got another; draw such cameras one by one"
+        check("right", np.array_equal(*rotations), expected)
+
+    @classmethod
+    def of(cls, camera: Camera, eye_distance: float) -> StereoCamera:
+        """Eyes to the left and the right of a camera, so far apart in world units."""
+        aside = np.zeros((4, 4))
+        aside[0, 3] = 0.5 * positive(eye_distance, "eye_distance")
+        return cls(*(replace(camera, viewmat=camera.viewmat + sign * aside) for sign in (1, -1)))
+
+    @property
+    def eyes(self) -> tuple[Camera, Camera]:
+        return self.left, self.right
+
+    @cached_property
+    def core(self) -> _core.Eyes:
+        """The same cameras as the compiled operations take them."""
+        return _core.Eyes(self.left.core, self.right.core)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return StereoCamera, self.eyes
+
+
 def turntable(
     center: VectorLike,
     radius: float,

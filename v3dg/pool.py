@@ -29,7 +29,7 @@ class Pool:
         self.core = _core.PagePool(tables, sources, device.number, num_bytes, NUM_THREADS)
 
     def settle(
-        self, resident: ResidentScene, camera: _core.Camera, rule: _core.Rule, timeout: float
+        self, resident: ResidentScene, camera: _core.Camera | _core.Eyes, rule: _core.Rule, timeout: float
     ) -> float:
         """Bring in what the view needs; the tolerance that it then has.
 

@@ -10,7 +10,7 @@ from v3dg._device import Device
 from v3dg._numbers import check, color, real
 from v3dg.build.memory import in_bytes
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera
+from v3dg.cameras import Camera, StereoCamera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image
@@ -68,24 +68,30 @@ class RenderedImage(Image):
         stats: What it cost.
     """
 
-    def __init__(self, drawing: _core.Drawing, finish: Callable[[], Stats]) -> None:
-        self._drawing, self._finish = drawing, finish
+    def __init__(
+        self, drawing: _core.Drawing, finish: Callable[[], Stats], *, is_right: bool = False
+    ) -> None:
+        self._drawing, self._finish, self._is_right = drawing, finish, is_right
 
     @property
     def _planes(self) -> Any:
         self._finish()
-        return self._drawing
+        return self._drawing.right if self._is_right else self._drawing
 
     @property
     def stats(self) -> Stats:
         return self._finish()
 
 
-class _Options(CutOptions, total=False):
+class _FrameOptions(CutOptions, total=False):
     cut: Selection | None
-    color_by: ColorBy
     background: Sequence[float]
     min_transmittance: float | None
+
+
+class _Options(_FrameOptions, total=False):
+    device: str | Device
+    color_by: ColorBy
     memory: int | str | None
 
 
@@ -95,11 +101,15 @@ def render(
 ) -> RenderedImage: ...
 @overload
 def render(
+    subject: Scene | Bundle | Gaussians, camera: StereoCamera, **options: Unpack[_Options]
+) -> tuple[RenderedImage, RenderedImage]: ...
+@overload
+def render(
     subject: Scene | Bundle | Gaussians, camera: Sequence[Camera], **options: Unpack[_Options]
 ) -> list[RenderedImage]: ...
 def render(
     subject: Scene | Bundle | Gaussians,
-    camera: Camera | Sequence[Camera],
+    camera: Camera | StereoCamera | Sequence[Camera],
     *,
     tolerance: float | None = None,
     budget: int | None = None,
@@ -111,7 +121,7 @@ def render(
     min_transmittance: float | None = None,
     device: str | Device = "auto",
     memory: int | str | None = None,
-) -> RenderedImage | list[RenderedImage]:
+) -> RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
     Clusters whose gaussians each stand for at most `tolerance` px² are drawn in place of finer ones; level 0
@@ -120,7 +130,9 @@ def render(
 
     Args:
         subject: What to draw, in world space.
-        camera: Pinhole camera. With several, each has its own cut and its own picture, as if drawn alone.
+        camera: Pinhole camera. With several, each has its own cut and its own picture, as if drawn alone. The
+            eyes of a stereo camera share one cut, and one frame: two pictures, whose statistics are those of
+            both together but for the gaussians that were selected.
         tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
         fade: As in `v3dg.select`; weights multiply opacities. Give `v3dg.DEFAULT_FADE` for pictures that
             follow each other, as in a film.
@@ -149,12 +161,12 @@ def render(
         frame = residency.frame(subject, key, lambda: _Frame(subject, color_by, where, memory))
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
     options["cut"] = cut
-    pictures = []
-    for view in [camera] if isinstance(camera, Camera) else camera:
+    pictures: list[Any] = []
+    for view in [camera] if isinstance(camera, Camera | StereoCamera) else camera:
         if memory is not None:
             frame.settle(subject, view, **options)
         pictures.append(frame.draw(subject, view, background, min_transmittance, **options))
-    return pictures[0] if isinstance(camera, Camera) else pictures
+    return pictures[0] if isinstance(camera, Camera | StereoCamera) else pictures
 
 
 class Renderer:
@@ -192,9 +204,15 @@ class Renderer:
         self._subject = subject
         self._frame = _Frame(subject, color_by, _device.resolve(device), memory)
 
+    @overload
+    def render(self, camera: Camera, **options: Unpack[_FrameOptions]) -> RenderedImage: ...
+    @overload
+    def render(
+        self, camera: StereoCamera, **options: Unpack[_FrameOptions]
+    ) -> tuple[RenderedImage, RenderedImage]: ...
     def render(
         self,
-        camera: Camera,
+        camera: Camera | StereoCamera,
         *,
         tolerance: float | None = None,
         budget: int | None = None,
@@ -203,15 +221,18 @@ class Renderer:
         cut: Selection | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         min_transmittance: float | None = None,
-    ) -> RenderedImage:
+    ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
         """Draw as `v3dg.render` does, of what is resident."""
         options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
         options["cut"] = cut
-        return self._frame.draw(self._subject, camera, background, min_transmittance, **options)
+        drawn: RenderedImage | tuple[RenderedImage, RenderedImage] = self._frame.draw(
+            self._subject, camera, background, min_transmittance, **options
+        )
+        return drawn
 
     def settle(
         self,
-        camera: Camera,
+        camera: Camera | StereoCamera,
         *,
         tolerance: float | None = None,
         budget: int | None = None,
@@ -261,15 +282,20 @@ class _Frame:
     def draw(
         self,
         subject: _Subject,
-        camera: Camera,
+        camera: Camera | StereoCamera,
         background: Sequence[float],
         min_transmittance: float | None,
         cut: Selection | None,
         **options: Any,
-    ) -> RenderedImage:
+    ) -> Any:
+        """A picture; of a stereo camera, one for each eye."""
+        if isinstance(camera, StereoCamera) and (cut is not None or isinstance(subject, Gaussians)):
+            how = {"cut": cut, **options}
+            return tuple(self.draw(subject, eye, background, min_transmittance, **how) for eye in camera.eyes)
         shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians))
         if isinstance(subject, Gaussians):
             _check_asset(self._color_by, cut=cut, **options)
+            assert isinstance(camera, Camera)
             drawing = self._asset.draw(camera.core, shade)
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
         rule = rule_of(**options)
@@ -282,6 +308,7 @@ class _Frame:
             elif cut is None:
                 drawing = self._frame.draw(resident.core, camera.core, rule, shade)
             else:
+                assert isinstance(camera, Camera)
                 _check_cut(cut, subject, resident, **options)
                 pairs = self._here(cut.instance_ids), self._here(cut.cluster_ids)
                 weights = None if cut.given_weights is None else self._here(cut.given_weights)
@@ -307,10 +334,18 @@ class _Frame:
         elif self._has_settled:
             drawing.finish()  # which may draw again, with pages that other views put in place of its own
         self._has_settled = False
-        return RenderedImage(drawing, finish)
+        picture = RenderedImage(drawing, finish)
+        if isinstance(camera, Camera):
+            return picture
+        return picture, RenderedImage(drawing, finish, is_right=True)
 
     def settle(
-        self, subject: _Subject, camera: Camera, timeout: float = 30.0, cut: Any = None, **options: Any
+        self,
+        subject: _Subject,
+        camera: Camera | StereoCamera,
+        timeout: float = 30.0,
+        cut: Any = None,
+        **options: Any,
     ) -> None:
         """Bring in what a view needs."""
         real(timeout, "timeout", "seconds, at least 0", 0)

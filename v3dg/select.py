@@ -14,7 +14,7 @@ from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import MOST_FLOAT, check, one_of, real, vector, whole
 from v3dg.bundle import Bundle, Clusters
-from v3dg.cameras import Camera, VectorLike
+from v3dg.cameras import Camera, StereoCamera, VectorLike
 from v3dg.gaussians import Gaussians
 from v3dg.residency import residency
 from v3dg.scene import Scene
@@ -165,23 +165,25 @@ class CutOptions(TypedDict, total=False):
     budget: int | None
     min_level: int
     fade: float | None
-    device: str | Device
 
 
 class _Options(CutOptions, total=False):
+    device: str | Device
     footprint: Footprint
     cull: bool
 
 
 @overload
-def select(subject: Scene | Bundle, camera: Camera, **options: Unpack[_Options]) -> Selection: ...
+def select(
+    subject: Scene | Bundle, camera: Camera | StereoCamera, **options: Unpack[_Options]
+) -> Selection: ...
 @overload
 def select(
     subject: Scene | Bundle, camera: Sequence[Camera], **options: Unpack[_Options]
 ) -> list[Selection]: ...
 def select(
     subject: Scene | Bundle,
-    camera: Camera | Sequence[Camera],
+    camera: Camera | StereoCamera | Sequence[Camera],
     *,
     tolerance: float | None = None,
     budget: int | None = None,
@@ -198,6 +200,8 @@ def select(
     only what is left out.
 
     Args:
+        camera: Pinhole camera. For a stereo camera, what is chosen is detailed enough for the nearer eye, and
+            what either may see is left in; not with the paper's footprint.
         tolerance: Screen area in px² that one gaussian of a coarser cluster may stand for; 0 chooses the
             full detail wherever it covers anything, infinity the coarsest clusters. `DEFAULT_TOLERANCE` if
             None; with a budget, 0.
@@ -223,13 +227,17 @@ def select(
     """
     rule = rule_of(tolerance, budget, min_level, footprint, cull, fade)
     where = _device.resolve(device)
-    if not isinstance(camera, Camera):
+    if not isinstance(camera, Camera | StereoCamera):
         return [_select(subject, view, rule, budget, where) for view in camera]
     return _select(subject, camera, rule, budget, where)
 
 
 def _select(
-    subject: Scene | Bundle, camera: Camera, rule: _core.Rule, budget: int | None, device: Device
+    subject: Scene | Bundle,
+    camera: Camera | StereoCamera,
+    rule: _core.Rule,
+    budget: int | None,
+    device: Device,
 ) -> Selection:
     start = time.perf_counter()
     with residency.reading(subject, device) as resident:

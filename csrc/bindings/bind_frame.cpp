@@ -40,23 +40,28 @@ FrameStats stats_of(const SceneFrameCounts& c) {
             c.tolerance_px2, c.exceeds_budget,    1e3 * c.select_seconds, 1e3 * c.draw_seconds};
 }
 
+// The pictures of a frame: of a camera, or of two eyes, left first.
+using NewPictures = std::vector<NewPicture>;
+
 // A frame that has been drawn, or enqueued on a device, with what it reads and writes.
 class BoundDrawing {
   public:
-    BoundDrawing(NewPicture picture, const FrameStats& stats) : picture_(std::move(picture)), stats_(stats) {}
+    BoundDrawing(NewPictures pictures, const FrameStats& stats)
+        : pictures_(std::move(pictures)), stats_(stats) {}
 
 #if V3DG_WITH_CUDA
     // `kept` are the frame, which may have to draw again, and what it reads.
-    BoundDrawing(NewPicture picture, py::object kept, Device device, std::unique_ptr<cuda::Drawing> drawing,
+    BoundDrawing(NewPictures pictures, py::object kept, Device device, std::unique_ptr<cuda::Drawing> drawing,
                  const SelectRule& rule)
-        : picture_(std::move(picture)),
+        : pictures_(std::move(pictures)),
           kept_(std::move(kept)),
           device_(device),
           drawing_(std::move(drawing)),
           rule_(rule) {}
 #endif
 
-    const NewPicture& picture() const { return picture_; }
+    const NewPicture& picture() const { return pictures_.front(); }
+    const NewPicture& right() const { return pictures_.back(); }
 
     const FrameStats& finish() {
 #if V3DG_WITH_CUDA
@@ -69,7 +74,7 @@ class BoundDrawing {
             const cuda::FrameCounters& c = drawing_->finish();  // may draw, and so keeps other threads out
             const cuda::FrameTimes times = drawing_->times();
             const bool exceeds = c.choice.exceeds_budget;
-            stats_ = {static_cast<int64_t>(exceeds ? c.choice.least : c.gaussians),
+            stats_ = {static_cast<int64_t>(exceeds ? c.choice.least : c.gaussians / pictures_.size()),
                       c.in_frustum,
                       c.records,
                       c.entries,
@@ -84,7 +89,7 @@ class BoundDrawing {
     }
 
   private:
-    NewPicture picture_;
+    NewPictures pictures_;
     FrameStats stats_{};
 #if V3DG_WITH_CUDA
     py::object kept_;
@@ -97,6 +102,21 @@ class BoundDrawing {
 NewPicture picture_of(const Window& window, bool with_depth) {
     return {window.height(), window.width(), {}, {}, py::none(), with_depth};
 }
+
+// On the host, new pictures of the windows of the eyes.
+struct HostPictures {
+    NewPictures out;
+    std::vector<Picture<float>> pictures;
+
+    HostPictures(const Eyes& eyes, const Shade& shade) {
+        for (int k = 0; k < eyes.count(); ++k) {
+            const Window window = window_of(eyes.camera[k]);
+            out.push_back(picture_of(window, true));
+            pictures.push_back(out.back().on_host<float>(window, shade));
+        }
+    }
+    Span<const Picture<float>> span() const { return {pictures.data(), pictures.size()}; }
+};
 
 // Draws scenes of the same bundles, or of the first of them, on one device.
 class BoundSceneFrame {
@@ -134,20 +154,20 @@ class BoundSceneFrame {
         palettes_ = palettes;
     }
 
-    std::unique_ptr<BoundDrawing> draw(const py::object& scene_object, const BoundCamera& camera,
+    std::unique_ptr<BoundDrawing> draw(const py::object& scene_object, const BoundEyes& camera,
                                        const SelectRule& rule, const Shade& shade, const Stop* stop) {
         auto& scene = checked(scene_object);
+        const Eyes& eyes = camera.eyes;
         if (device_.is_host())
-            return on_host(scene, camera, shade, true,
-                           [&](const HostScene& host, const Picture<float>& picture) {
-                               return cpu::draw_scene(host, camera.camera, rule, picture, flag_of(stop));
-                           });
+            return on_host(scene, eyes, shade, [&](const HostScene& host, Span<const Picture<float>> out) {
+                return cpu::draw_scene(host, eyes, rule, out, flag_of(stop));
+            });
 #if V3DG_WITH_CUDA
         const Work work(device_);
-        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
-        const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
-        auto drawing = frame_->draw(scene.on_device(), camera.camera, rule, image, work.stream());
-        return std::make_unique<BoundDrawing>(std::move(picture),
+        NewPictures pictures;
+        const cuda::EyeImages images = new_images(eyes, shade, pictures);
+        auto drawing = frame_->draw(scene.on_device(), eyes, rule, images, work.stream());
+        return std::make_unique<BoundDrawing>(std::move(pictures),
                                               py::make_tuple(py::cast(this), scene_object), device_,
                                               std::move(drawing), rule);
 #else
@@ -157,7 +177,7 @@ class BoundSceneFrame {
 
     // What is resident of the bundles of a pool, with what comes in before.
     std::unique_ptr<BoundDrawing> draw_resident(const py::object& scene_object, const py::object& pool_object,
-                                                const BoundCamera& camera, const SelectRule& rule,
+                                                const BoundEyes& camera, const SelectRule& rule,
                                                 const Shade& shade, const Stop* stop) {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         auto& pool = held<BoundPool>(pool_object, "pool");
@@ -165,22 +185,21 @@ class BoundSceneFrame {
             throw py::value_error("scene, pool: expected them on the frame's device");
         const std::shared_ptr<const SceneState> state = scene.state();
         pool.check_scene(*state);
+        const Eyes& eyes = camera.eyes;
 #if V3DG_WITH_CUDA
         if (!device_.is_host()) {
             const Work work(device_);
-            NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
-            const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
+            NewPictures pictures;
+            const cuda::EyeImages images = new_images(eyes, shade, pictures);
             SelectRule used = rule;
-            auto drawing = frame_->draw_resident(scene.on_device(), pool.on_device(), camera.camera, used,
-                                                 image, work.stream());
-            return std::make_unique<BoundDrawing>(std::move(picture),
+            auto drawing =
+                frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images, work.stream());
+            return std::make_unique<BoundDrawing>(std::move(pictures),
                                                   py::make_tuple(py::cast(this), scene_object, pool_object),
                                                   device_, std::move(drawing), used);
         }
 #endif
-        const Window window = window_of(camera.camera);
-        NewPicture out = picture_of(window, true);
-        const Picture<float> picture = out.on_host<float>(window, shade);
+        HostPictures out(eyes, shade);
         std::vector<SceneModel> models;
         for (size_t b = 0; b < state->tables.size(); ++b)
             models.push_back({&pool.planes(b), state->bundle(b).appearance(), {}});
@@ -189,11 +208,11 @@ class BoundSceneFrame {
             const py::gil_scoped_release unlocked;
             pool.frame_on_host(*state, rule, true, [&](auto tables, const SelectRule& raised, auto needs) {
                 const HostScene host{tables, {models.data(), models.size()}, state->instances, needs};
-                counts = cpu::draw_scene(host, camera.camera, raised, picture, flag_of(stop));
+                counts = cpu::draw_scene(host, eyes, raised, out.span(), flag_of(stop));
                 return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
             });
         }
-        return std::make_unique<BoundDrawing>(std::move(out), stats_of(counts));
+        return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
     }
 
     std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object, const BoundCamera& camera,
@@ -202,9 +221,9 @@ class BoundSceneFrame {
         auto& scene = checked(scene_object);
         const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
         if (device_.is_host())
-            return on_host(scene, camera, shade, true,
-                           [&](const HostScene& host, const Picture<float>& picture) {
-                               return cpu::draw_cut(host, camera.camera, given, picture, flag_of(stop));
+            return on_host(scene, camera.camera, shade,
+                           [&](const HostScene& host, Span<const Picture<float>> out) {
+                               return cpu::draw_cut(host, camera.camera, given, out[0], flag_of(stop));
                            });
 #if V3DG_WITH_CUDA
         const Work work(device_);
@@ -212,7 +231,7 @@ class BoundSceneFrame {
         const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
         auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, image, work.stream());
         return std::make_unique<BoundDrawing>(
-            std::move(picture),
+            NewPictures{std::move(picture)},
             py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights), device_,
             std::move(drawing), SelectRule{});
 #else
@@ -226,8 +245,9 @@ class BoundSceneFrame {
                                             const Shade& shade, const Stop* stop, const py::object& weights) {
         require_host("count_cut");
         const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
-        return on_host(checked(scene_object), camera, shade, true,
-                       [&](const HostScene& host, Picture<float> picture) {
+        return on_host(checked(scene_object), camera.camera, shade,
+                       [&](const HostScene& host, Span<const Picture<float>> out) {
+                           Picture<float> picture = out[0];
                            std::swap(picture.depth, picture.count);
                            return cpu::draw_cut(host, camera.camera, given, picture, flag_of(stop));
                        });
@@ -277,6 +297,18 @@ class BoundSceneFrame {
     }
 
 #if V3DG_WITH_CUDA
+    // New pictures of the eyes, on the device.
+    cuda::EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures) const {
+        cuda::FrameImage image[2]{};
+        for (int k = 0; k < eyes.count(); ++k) {
+            const Camera& eye = eyes.camera[k];
+            const Window whole{0, 0, static_cast<int>(eye.width), static_cast<int>(eye.height)};
+            pictures.push_back(picture_of(whole, true));
+            image[k] = pictures.back().on_device(device_, eye, shade);
+        }
+        return eyes.are_two ? cuda::images_of_eyes(image[0], image[1]) : cuda::EyeImages{{image[0], {}}, 1};
+    }
+
     void set_models_on_device(const py::list& models, const py::list& palettes) {
         std::vector<cuda::DeviceModel> on_device;
         for (const py::handle& model : models)
@@ -305,23 +337,20 @@ class BoundSceneFrame {
         return {{scene.tables.data(), scene.tables.size()}, {models.data(), models.size()}, scene.instances};
     }
 
-    // The window of the camera, drawn by draw(host scene, picture) without Python's lock.
-    template <class DrawPicture>
-    std::unique_ptr<BoundDrawing> on_host(const BoundScene& scene, const BoundCamera& camera,
-                                          const Shade& shade, bool with_depth,
-                                          const DrawPicture& draw_picture) const {
-        const Window window = window_of(camera.camera);
-        NewPicture out = picture_of(window, with_depth);
-        const Picture<float> picture = out.on_host<float>(window, shade);
+    // The windows of the eyes, drawn by draw(host scene, pictures) without Python's lock.
+    template <class DrawPictures>
+    std::unique_ptr<BoundDrawing> on_host(const BoundScene& scene, const Eyes& eyes, const Shade& shade,
+                                          const DrawPictures& draw) const {
+        HostPictures out(eyes, shade);
         const std::shared_ptr<const SceneState> state = scene.state();
         const std::vector<SceneModel> models = models_of(*state);
         const py::list gaussians = models_, colors = palettes_;  // which another thread may replace meanwhile
         SceneFrameCounts counts;
         {
             const py::gil_scoped_release unlocked;
-            counts = draw_picture(host_scene(*state, models), picture);
+            counts = draw(host_scene(*state, models), out.span());
         }
-        return std::make_unique<BoundDrawing>(std::move(out), stats_of(counts));
+        return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
     }
 
     Device device_;
@@ -356,8 +385,8 @@ class BoundAssetFrame {
         const cuda::PackedModel& packed = *model.on_device().packed;
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
                                     work.stream(), &packed.packed());
-        return std::make_unique<BoundDrawing>(std::move(picture), py::cast(this), device, std::move(drawing),
-                                              SelectRule{});
+        return std::make_unique<BoundDrawing>(NewPictures{std::move(picture)}, py::cast(this), device,
+                                              std::move(drawing), SelectRule{});
 #else
         return nullptr;
 #endif
@@ -366,16 +395,14 @@ class BoundAssetFrame {
   private:
     static std::unique_ptr<BoundDrawing> on_host(const BoundModel& model, const BoundCamera& camera,
                                                  const Shade& shade, const Stop* stop) {
-        const Window window = window_of(camera.camera);
-        NewPicture out = picture_of(window, true);
-        const Picture<float> picture = out.on_host<float>(window, shade);
+        HostPictures out(camera.camera, shade);
         SceneFrameCounts counts;
         {
             const py::gil_scoped_release unlocked;
-            counts =
-                cpu::draw_model(*model.on_host().planes, model.size(), camera.camera, picture, flag_of(stop));
+            counts = cpu::draw_model(*model.on_host().planes, model.size(), camera.camera, out.pictures[0],
+                                     flag_of(stop));
         }
-        return std::make_unique<BoundDrawing>(std::move(out), stats_of(counts));
+        return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
     }
 
     py::object model_;
@@ -406,10 +433,15 @@ void bind_frame(py::module_& m) {
                  return Shade{background, min_transmittance};
              }),
              py::kw_only(), "background"_a, "min_transmittance"_a);
+    py::class_<NewPicture>(m, "Picture", "The planes of a picture.")
+        .def_readonly("color", &NewPicture::color)
+        .def_readonly("alpha", &NewPicture::alpha)
+        .def_readonly("depth", &NewPicture::depth);
     py::class_<BoundDrawing>(m, "Drawing", "A frame that has been drawn, or enqueued on a device.")
         .def_property_readonly("color", [](const BoundDrawing& d) { return d.picture().color; })
         .def_property_readonly("alpha", [](const BoundDrawing& d) { return d.picture().alpha; })
         .def_property_readonly("depth", [](const BoundDrawing& d) { return d.picture().depth; })
+        .def_property_readonly("right", &BoundDrawing::right, "Of two eyes: what the right one sees.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy, "Waits for the picture.");
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
         .def(py::init<int>(), "device"_a)

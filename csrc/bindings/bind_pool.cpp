@@ -115,7 +115,8 @@ void BoundPool::note_needs(float tolerance_px2, bool adapts) {
     pool_->note_needs(pool_->frame(), {needs.data(), needs.size()}, 0, tolerance_px2, adapts);
 }
 
-float BoundPool::ask(const py::object& scene_object, const BoundCamera& camera, const SelectRule& rule) {
+float BoundPool::ask(const py::object& scene_object, const BoundEyes& camera, const SelectRule& rule) {
+    const Eyes& eyes = camera.eyes;
     const auto& held_scene = held<BoundScene>(scene_object, "scene");
     const std::shared_ptr<const SceneState> state = held_scene.state();
     check_scene(*state);
@@ -124,13 +125,13 @@ float BoundPool::ask(const py::object& scene_object, const BoundCamera& camera, 
     if (!device_.is_host()) {
         const Work work(device_);
         const py::gil_scoped_release unlocked;
-        return on_device_->ask(held_scene.on_device(), camera.camera, rule, work.stream());
+        return on_device_->ask(held_scene.on_device(), eyes, rule, work.stream());
     }
 #endif
     const py::gil_scoped_release unlocked;
     frame_on_host(*state, rule, false, [&](auto tables, const SelectRule& raised, auto needs) {
         SelectOutput out;
-        cpu::select({tables, state->instances, camera.camera, raised, needs}, out);
+        cpu::select({tables, state->instances, eyes, raised, needs}, out);
         return tolerance = out.fits_budget ? out.tolerance_px2 : raised.tolerance_px2;
     });
     return tolerance;

@@ -57,6 +57,12 @@ py::array_t<double> position_of(const BoundCamera& camera) {
     return py::array_t<double>(3, camera.camera.eye);
 }
 
+BoundEyes make_eyes(const BoundCamera& left, const BoundCamera& right) {
+    if (!std::equal(left.camera.rotation, left.camera.rotation + 9, right.camera.rotation))
+        throw py::value_error("left, right: expected cameras of the same rotation");
+    return {Eyes(left.camera, right.camera)};
+}
+
 Footprint footprint_of(const std::string& name) {
     if (name == "solid_angle") return Footprint::solid_angle;
     if (name == "paper") return Footprint::paper;
@@ -167,6 +173,10 @@ void bind_types(py::module_& m) {
         .def("window", &window_of_camera, "x0"_a, "y0"_a, "x1"_a, "y1"_a,
              "The same camera, of whose image only the pixels [x0, x1) x [y0, y1) are wanted.")
         .def_property_readonly("position", &position_of, "Where it is in the world: (3,).");
+    py::class_<BoundEyes>(m, "Eyes", "Two cameras that look the same way and share a cut; or a camera.")
+        .def(py::init([](const BoundCamera& only) { return BoundEyes{only.camera}; }), "camera"_a)
+        .def(py::init(&make_eyes), "left"_a, "right"_a);
+    py::implicitly_convertible<BoundCamera, BoundEyes>();
     py::class_<SelectRule>(m, "Rule", "What a selection chooses.")
         .def(py::init(&make_rule), py::kw_only(), "tolerance_px2"_a, "budget"_a, "min_level"_a, "footprint"_a,
              "culls"_a, "fade"_a = 1.0)

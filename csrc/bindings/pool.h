@@ -53,7 +53,7 @@ class BoundPool {
 #endif
 
     // Cuts the scene for a view, without drawing, and returns the tolerance that was used.
-    float ask(const py::object& scene_object, const BoundCamera& camera, const SelectRule& rule);
+    float ask(const py::object& scene_object, const BoundEyes& camera, const SelectRule& rule);
 
   private:
 #if V3DG_WITH_CUDA

@@ -234,7 +234,9 @@ class BoundScene {
 #endif
     }
 
-    BoundCut select(const BoundCamera& camera, const SelectRule& rule) {
+    BoundCut select(const BoundEyes& camera, const SelectRule& rule) {
+        if (camera.eyes.are_two && rule.footprint == Footprint::paper)
+            throw py::value_error("footprint: expected 'solid_angle' for two eyes, got 'paper'");
         const std::shared_ptr<const SceneState> state = state_;
         SelectOutput out;
         const Work work(device_);
@@ -242,11 +244,11 @@ class BoundScene {
             const py::gil_scoped_release unlocked;
             if (device_.is_host())
                 cpu::select(
-                    {{state->tables.data(), state->tables.size()}, state->instances, camera.camera, rule, {}},
+                    {{state->tables.data(), state->tables.size()}, state->instances, camera.eyes, rule, {}},
                     out);
 #if V3DG_WITH_CUDA
             else
-                cut_->select(*on_device_, camera.camera, rule, out, work.stream());
+                cut_->select(*on_device_, camera.eyes, rule, out, work.stream());
 #endif
         }
         return BoundCut(out);

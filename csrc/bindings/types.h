@@ -22,6 +22,11 @@ struct BoundCamera {
     int height() const { return static_cast<int>(camera.height); }
 };
 
+// A camera, or the two eyes of a stereo camera.
+struct BoundEyes {
+    Eyes eyes;
+};
+
 // The arrays of gaussians, all on the host or all on one CUDA device, float32 or, on the host, float64.
 class Rows {
   public:

@@ -72,5 +72,11 @@ struct FrameImage {
     float min_transmittance;       // the same for all pictures of a frame
 };
 
+// The pictures of a scene's frame: one for each eye. Tiles of the second follow on those of the first.
+struct EyeImages {
+    FrameImage image[2];
+    uint32_t count;
+};
+
 }  // namespace cuda
 }  // namespace v3dg

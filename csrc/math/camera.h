@@ -88,6 +88,18 @@ struct Camera {
     double x0, y0, x1, y1;                       // the part of the image that is wanted, px
 };
 
+// What one cut is for: a camera, or the two eyes of a stereo camera. They look the same way: their rotations
+// are equal.
+struct Eyes {
+    Camera camera[2];  // the same twice where there is one
+    bool are_two;
+
+    Eyes() : Eyes(Camera{}) {}
+    V3DG_HD Eyes(const Camera& only) : camera{only, only}, are_two(false) {}
+    V3DG_HD Eyes(const Camera& left, const Camera& right) : camera{left, right}, are_two(true) {}
+    V3DG_HD int count() const { return are_two ? 2 : 1; }
+};
+
 // Where a camera is: what its world-to-camera matrix brings to 0. The rotation in it may be off by what
 // float32 loses.
 V3DG_HD inline void eye_of(const double viewmat[16], double eye[3]) {

@@ -232,14 +232,14 @@ SelectRule DevicePages::raised(SelectRule rule) const {
     return rule;
 }
 
-float DevicePages::ask(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
+float DevicePages::ask(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                        cudaStream_t stream) {
     const StreamLock lock(busy_, stream);
     note_flights(true);
     const PartlyResident resident = begin_frame(false, stream);
     const SelectRule used = raised(rule);
     SelectOutput out;
-    cut_.select(scene, camera, used, out, stream, &resident);
+    cut_.select(scene, eyes, used, out, stream, &resident);
     end_frame(stream);
     note_flights(true);
     return out.fits_budget ? out.tolerance_px2 : used.tolerance_px2;

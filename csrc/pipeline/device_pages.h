@@ -55,7 +55,7 @@ class DevicePages {
     SelectRule raised(SelectRule rule) const;
 
     // Cuts the scene without drawing, and waits for what that needs; the tolerance that was used.
-    float ask(const SceneTables& scene, const Camera& camera, const SelectRule& rule, cudaStream_t stream);
+    float ask(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, cudaStream_t stream);
 
   private:
     struct Flight;

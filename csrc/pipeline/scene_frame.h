@@ -30,7 +30,15 @@ struct SceneFrameCounts {
     float tolerance_px2;  // that was used
     bool exceeds_budget;  // nothing was drawn then
     double select_seconds, draw_seconds;
-    RenderCounts render;
+    RenderCounts render;  // of two pictures, the sums
+
+    // What another picture of the same frame came to.
+    void add_picture(const SceneFrameCounts& other) {
+        draw_seconds += other.draw_seconds;
+        render.in_frustum += other.render.in_frustum;
+        render.records += other.render.records;
+        render.entries += other.render.entries;
+    }
 };
 
 // Where a pixel's gaussian comes from.
@@ -41,10 +49,10 @@ struct ScenePick {
 
 namespace cpu {
 
-// Selects what the window of the camera needs, and draws it. Once `stop` is true, returns soon and leaves the
-// picture unfinished.
-SceneFrameCounts draw_scene(const HostScene& scene, const Camera& camera, const SelectRule& rule,
-                            const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
+// Selects what the windows of the eyes need, which share a cut, and draws a picture for each. Once `stop` is
+// true, returns soon and leaves the pictures unfinished.
+SceneFrameCounts draw_scene(const HostScene& scene, const Eyes& eyes, const SelectRule& rule,
+                            Span<const Picture<float>> pictures, const std::atomic<bool>* stop = nullptr);
 
 // Draws pairs that were selected before. Throws std::out_of_range where one is not of the scene.
 SceneFrameCounts draw_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,

@@ -109,19 +109,19 @@ class CutDraws {
 
 }  // namespace
 
-SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Camera& camera, const SelectRule& rule,
-                                 const Picture<float>& picture, const std::atomic<bool>* stop) {
+SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const SelectRule& rule,
+                                 Span<const Picture<float>> pictures, const std::atomic<bool>* stop) {
     const double start = now();
     SelectOutput cut;
-    select({scene.tables, scene.instances, camera, rule, scene.needs}, cut);
+    select({scene.tables, scene.instances, eyes, rule, scene.needs}, cut);
     const double select_seconds = now() - start;
     SceneFrameCounts counts{};
-    if (cut.fits_budget)
-        counts = draw_cut(scene, camera,
-                          {{cut.instance.data(), cut.instance.size()},
-                           {cut.cluster.data(), cut.cluster.size()},
-                           {cut.weight.data(), cut.weight.size()}},
-                          picture, stop);
+    for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k)
+        counts.add_picture(draw_cut(scene, eyes.camera[k],
+                                    {{cut.instance.data(), cut.instance.size()},
+                                     {cut.cluster.data(), cut.cluster.size()},
+                                     {cut.weight.data(), cut.weight.size()}},
+                                    pictures[k], stop));
     counts.gaussians = cut.num_gaussians;
     counts.tolerance_px2 = cut.tolerance_px2;
     counts.exceeds_budget = !cut.fits_budget;

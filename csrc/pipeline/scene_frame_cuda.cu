@@ -106,45 +106,50 @@ void SceneFrame::set_models(std::vector<DeviceModel> models,
     palettes_ = std::move(palettes);
 }
 
-FrameBatch SceneFrame::batch(const SceneTables& scene, const FrameImage& image, bool fades,
+EyeImages images_of_eyes(const FrameImage& left, FrameImage right) {
+    right.first_tile = num_tiles(left);
+    return {{left, right}, 2};
+}
+
+FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures, bool fades,
                              cudaStream_t stream) {
+    const FrameImage& last = pictures.image[pictures.count - 1];
     return {rows_.data(),
-            placements_.reserve(scene.num_instances(), stream),
-            images_.reserve(1, stream),
-            1,
-            num_tiles(image),
+            placements_.reserve(pictures.count * scene.num_instances(), stream),
+            images_.reserve(pictures.count, stream),
+            pictures.count,
+            last.first_tile + num_tiles(last),
             has_packed_ ? packed_.data() : nullptr,
             has_coded_ ? coded_.data() : nullptr,
             scene.num_instances() > 1,
-            image.min_transmittance,
+            last.min_transmittance,
             fades};
 }
 
-std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Camera& camera,
-                                          const SelectRule& rule, const FrameImage& image,
-                                          cudaStream_t stream) {
+std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
+                                          const EyeImages& pictures, cudaStream_t stream) {
     return frame_.draw(
-        batch(scene, image, rule.fade.is_on(), stream),
+        batch(scene, pictures, rule.fade.is_on(), stream),
         [=, &scene](const ItemList& items, cudaStream_t on) {
-            cut_.cut_items(scene, camera, rule, image, images_.data(), placements_.data(), items, on);
+            cut_.cut_items(scene, eyes, rule, pictures, images_.data(), placements_.data(), items, on);
         },
         stream);
 }
 
 std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, DevicePages& pages,
-                                                   const Camera& camera, SelectRule& rule,
-                                                   const FrameImage& image, cudaStream_t stream) {
+                                                   const Eyes& eyes, SelectRule& rule,
+                                                   const EyeImages& pictures, cudaStream_t stream) {
     const StreamLock lock(pages.mutex(), stream);
     PartlyResident resident = pages.begin_frame(true, stream);
     const SelectRule raised = rule = pages.raised(rule);
-    FrameBatch of_pages = batch(scene, image, rule.fade.is_on(), stream);
+    FrameBatch of_pages = batch(scene, pictures, rule.fade.is_on(), stream);
     of_pages.packed = pages.planes();
     of_pages.coded = nullptr;
     of_pages.guards_models = &pages.mutex();
     return frame_.draw(
         of_pages,
         [=, &scene, &pages](const ItemList& items, cudaStream_t on) mutable {
-            cut_.cut_items(scene, camera, raised, image, images_.data(), placements_.data(), items, on,
+            cut_.cut_items(scene, eyes, raised, pictures, images_.data(), placements_.data(), items, on,
                            &resident);
             // A frame that is drawn again tells nothing: another one may be telling.
             if (resident.needs.report != nullptr) pages.end_frame(on);
@@ -157,7 +162,7 @@ std::unique_ptr<Drawing> SceneFrame::draw_cut(const SceneTables& scene, const Ca
                                               const GivenCut& given, const FrameImage& image,
                                               cudaStream_t stream) {
     return frame_.draw(
-        batch(scene, image, given.weight.size > 0, stream),
+        batch(scene, {{image, {}}, 1}, given.weight.size > 0, stream),
         [=, &scene](const ItemList& items, cudaStream_t on) {
             cut_.given_items(scene, camera, given, image, images_.data(), placements_.data(), items, on);
         },

@@ -60,6 +60,9 @@ class DevicePalette {
     DeviceBuffer<float> sh_;
 };
 
+// The pictures of two eyes in one frame.
+EyeImages images_of_eyes(const FrameImage& left, FrameImage right);
+
 // Draws a scene that stays on the device: selects, then draws the cut.
 class SceneFrame {
   public:
@@ -69,19 +72,19 @@ class SceneFrame {
                     std::vector<std::shared_ptr<const DevicePalette>> palettes, cudaStream_t stream);
 
     // The scene stays as it is until the drawing is finished.
-    std::unique_ptr<Drawing> draw(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
-                                  const FrameImage& image, cudaStream_t stream);
+    std::unique_ptr<Drawing> draw(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
+                                  const EyeImages& pictures, cudaStream_t stream);
     // Draws what is resident of the bundles of a pool, with what comes in before; the pool stays, too. The
     // rule becomes the one that is used. A frame that is drawn again has the pages that are there by then.
-    std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages, const Camera& camera,
-                                           SelectRule& rule, const FrameImage& image, cudaStream_t stream);
+    std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages, const Eyes& eyes,
+                                           SelectRule& rule, const EyeImages& pictures, cudaStream_t stream);
     // Draws pairs that were selected before; they are on the device and stay, too.
     std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera, const GivenCut& given,
                                       const FrameImage& image, cudaStream_t stream);
 
   private:
     // Of the models that were set.
-    FrameBatch batch(const SceneTables& scene, const FrameImage& image, bool fades, cudaStream_t stream);
+    FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, bool fades, cudaStream_t stream);
 
     std::vector<DeviceModel> models_;
     std::vector<std::shared_ptr<const DevicePalette>> palettes_;

@@ -19,7 +19,7 @@ namespace cuda {
 
 // Where the choice of a budget goes, and what a frame wants besides: nulls where there is none.
 struct Cut::Target {
-    FrameImage image;
+    EyeImages pictures;
     FrameImage* images;
     Placement* placements;
     CutChoice* choice;
@@ -39,20 +39,29 @@ struct Scratch {
     Count *unit_state, *count_state;  // a word a ticket of cut_kernel
 };
 
+// Of an instance's model in front of an eye; of n instances, that of instance i is placement eye * n + i.
+__device__ Placement placement_of(const InstanceAxes& axes, const Pose& pose, int32_t bundle, unsigned eye) {
+    return {model_view_from_instance(axes, pose), static_cast<uint32_t>(bundle), eye};
+}
+
 // Where the cut of instance i is found. Writes what the kernels after this one need of it.
-__device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Camera& camera,
+__device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
                                     const SelectRule& rule, Placement* placements) {
     const Pose pose = scene.instances.pose(i);
     if (!is_placed(pose)) return CutSource::nowhere;
     const int32_t b = scene.instances.bundle[i];
     const ClusterTable& table = scene.bundles[b].table;
-    const InstanceAxes axes = axes_of_instance(camera, pose);
-    const InstanceView view = view_from_instance(camera, frustum_sides(camera, table.pad_px), axes, pose,
+    const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
+    const InstanceView view = view_from_instance(eyes, frustum_sides(eyes, table.pad_px), axes, pose,
                                                  scene.instances.importance[i]);
     const CutSource source = source_of_cut(table, view, rule, kLaneClusters);
     if (source == CutSource::nowhere) return source;
-    if (placements != nullptr)
-        placements[i] = {model_view_from_instance(axes, pose), static_cast<uint32_t>(b), 0};
+    if (placements != nullptr) {
+        placements[i] = placement_of(axes, pose, b, 0);
+        if (eyes.are_two)
+            placements[scene.instances.scale.size + i] =
+                placement_of(axes_of_instance(eyes.camera[1], pose), pose, b, 1);
+    }
     if (source == CutSource::table) {
         scene.views[i] = view;
         return source;
@@ -65,15 +74,15 @@ __device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Ca
     return drawn != 0 ? source : CutSource::nowhere;
 }
 
-__global__ void place_kernel(PlacedScene scene, Camera camera, SelectRule rule, FrameImage image,
+__global__ void place_kernel(PlacedScene scene, Eyes eyes, SelectRule rule, EyeImages pictures,
                              FrameImage* images, Placement* placements, BudgetRound round, Scratch scratch) {
     if (round.is_over()) return;
     rule.tolerance_px2 = round.least_tolerance(rule);
     const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
-    if (i == 0 && images != nullptr) images[0] = image;
+    if (i < pictures.count) images[i] = pictures.image[i];
     const size_t num_instances = scene.instances.scale.size;
     const CutSource source =
-        i < num_instances ? place_instance(scene, i, camera, rule, placements) : CutSource::nowhere;
+        i < num_instances ? place_instance(scene, i, eyes, rule, placements) : CutSource::nowhere;
 
     // Tops of neighbours with no table in between make one part, which the first of them writes.
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
@@ -200,8 +209,7 @@ __global__ void place_all_kernel(PlacedScene scene, Camera camera, FrameImage im
     if (i == 0) images[0] = image;
     if (i >= scene.instances.scale.size) return;
     const Pose pose = scene.instances.pose(i);
-    placements[i] = {model_view_from_instance(axes_of_instance(camera, pose), pose),
-                     static_cast<uint32_t>(scene.instances.bundle[i]), 0};
+    placements[i] = placement_of(axes_of_instance(camera, pose), pose, scene.instances.bundle[i], 0);
 }
 
 // A thread a pair. The pairs of instances without a pose are left out.
@@ -260,7 +268,7 @@ void copy_to_host(T* to, const T* from, size_t count, cudaStream_t stream) {
 }  // namespace
 
 template <class Output>
-void Cut::cut(const SceneTables& scene, const Camera& camera, const SelectRule& rule, const Target& target,
+void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, const Target& target,
               const Output& output, cudaStream_t stream, const PartlyResident* resident) {
     const size_t count = scene.num_instances(), parts = most_parts(scene);
     const size_t num_tickets = blocks_for(parts, kCutWarps), words = scratch_words(count, num_tickets);
@@ -286,8 +294,8 @@ void Cut::cut(const SceneTables& scene, const Camera& camera, const SelectRule& 
         const BudgetRound round{state, is_second};
         check(cudaMemsetAsync(scratch.place_ticket, 0, cleared_words(count) * sizeof(Count), stream),
               "cudaMemsetAsync");
-        launch("place_kernel", place_kernel, place_blocks(count), kPlaceThreads, 0, stream, placed, camera,
-               rule, target.image, target.images, target.placements, round, scratch);
+        launch("place_kernel", place_kernel, place_blocks(count), kPlaceThreads, 0, stream, placed, eyes,
+               rule, target.pictures, target.images, target.placements, round, scratch);
         if (!has_budget) break;
         choose_tolerance(placed, rule, round, blocks, scratch.num_parts, change, target.choice, state,
                          stream);
@@ -304,16 +312,19 @@ void Cut::cut(const SceneTables& scene, const Camera& camera, const SelectRule& 
     launch("report_kernel", report_kernel, kReportBlocks, kCutThreads, 0, stream, needs, rule, target.choice);
 }
 
-void Cut::cut_items(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
-                    const FrameImage& image, FrameImage* images, Placement* placements, const ItemList& items,
-                    cudaStream_t stream, const PartlyResident* resident) {
+void Cut::cut_items(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
+                    const EyeImages& pictures, FrameImage* images, Placement* placements,
+                    const ItemList& items, cudaStream_t stream, const PartlyResident* resident) {
     const DeviceGuard guard(device_);
     const StreamLock lock = scene.lock(stream);
-    const Target target{image, images, placements, &items.counters->choice};
+    const Target target{pictures, images, placements, &items.counters->choice};
+    const auto num_instances = static_cast<uint32_t>(scene.num_instances());
     if (rule.fade.is_on())
-        cut(scene, camera, rule, target, ItemOutput<true>{items}, stream, resident);
+        cut(scene, eyes, rule, target, ItemOutput<true>{items, pictures.count, num_instances}, stream,
+            resident);
     else
-        cut(scene, camera, rule, target, ItemOutput<false>{items}, stream, resident);
+        cut(scene, eyes, rule, target, ItemOutput<false>{items, pictures.count, num_instances}, stream,
+            resident);
 }
 
 void Cut::given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
@@ -331,15 +342,15 @@ void Cut::given_items(const SceneTables& scene, const Camera& camera, const Give
            stream, placed, camera, image, images, placements);
     if (given.weight.size > 0)
         launch("given_kernel", given_kernel<ItemOutput<true>>, blocks, kCutThreads, 0, stream, placed, given,
-               scratch, ItemOutput<true>{items});
+               scratch, ItemOutput<true>{items, 1, 0});
     else
         launch("given_kernel", given_kernel<ItemOutput<false>>, blocks, kCutThreads, 0, stream, placed, given,
-               scratch, ItemOutput<false>{items});
+               scratch, ItemOutput<false>{items, 1, 0});
 }
 
 template <bool kFades>
-void Cut::select_pairs(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
-                       SelectOutput& out, cudaStream_t stream, const PartlyResident* resident) {
+void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, SelectOutput& out,
+                       cudaStream_t stream, const PartlyResident* resident) {
     const DeviceGuard guard(device_);
     const StreamLock lock = scene.lock(stream);
     Pairs* on_device = pairs_.reserve(1, stream);
@@ -353,7 +364,7 @@ void Cut::select_pairs(const SceneTables& scene, const Camera& camera, const Sel
                                         &on_device->pairs,
                                         &on_device->gaussians};
         check(cudaMemsetAsync(on_device, 0, sizeof *on_device, stream), "cudaMemsetAsync");
-        cut(scene, camera, rule, {{}, nullptr, nullptr, &on_device->choice}, output, stream, resident);
+        cut(scene, eyes, rule, {{}, nullptr, nullptr, &on_device->choice}, output, stream, resident);
         copy_to_host(&counts, on_device, 1, stream);
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
         if (counts.pairs <= capacity) break;
@@ -371,12 +382,12 @@ void Cut::select_pairs(const SceneTables& scene, const Camera& camera, const Sel
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
-void Cut::select(const SceneTables& scene, const Camera& camera, const SelectRule& rule, SelectOutput& out,
+void Cut::select(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, SelectOutput& out,
                  cudaStream_t stream, const PartlyResident* resident) {
     if (rule.fade.is_on())
-        select_pairs<true>(scene, camera, rule, out, stream, resident);
+        select_pairs<true>(scene, eyes, rule, out, stream, resident);
     else
-        select_pairs<false>(scene, camera, rule, out, stream, resident);
+        select_pairs<false>(scene, eyes, rule, out, stream, resident);
 }
 
 size_t Cut::bytes() const {

@@ -93,18 +93,19 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
 }
 
 // Selected clusters as items. Neighbouring clusters are drawn by the same items, and so are the tops that
-// neighbouring instances have in common.
+// neighbouring instances have in common. Each is written for every picture.
 template <bool kHasFade>
 struct ItemOutput {
     static constexpr bool kFades = kHasFade;
     ItemList items;
+    uint32_t num_pictures, num_placements;  // of one of them
 
     __device__ WriteCount count(const LaneClusters& mine) const {
         WriteCount count{0, 0};
         for_each_drawn<kFades>(mine, [&](const DrawnRun& run) {
             const unsigned size = mine.size(run.k, run.num_clusters);
-            count.units += blocks_for(size, run.gaussians_an_item());
-            count.gaussians += run.num_instances * size;
+            count.units += num_pictures * blocks_for(size, run.gaussians_an_item());
+            count.gaussians += num_pictures * run.num_instances * size;
         });
         return count;
     }
@@ -117,20 +118,17 @@ struct ItemOutput {
             const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.first_row(cluster));
             const Appearance<float> appearance = mine.bundle->appearance[cluster];
             const float weight = kFades ? share_of(mine.weights[run.k]) : 1.0f;
-            for (unsigned skip = 0; skip < size; skip += step, ++first) {
-                const unsigned count = min(step, size - skip);
-                if (first < items.item_capacity &&
-                    record + run.num_instances * count <= items.record_capacity)
-                    items.items[first] = {placement,
-                                          gaussian + skip,
-                                          count,
-                                          static_cast<uint32_t>(record),
-                                          appearance,
-                                          run.sharers,
-                                          static_cast<uint32_t>(cluster),
-                                          weight};
-                record += run.num_instances * count;
-            }
+            for (uint32_t picture = 0; picture < num_pictures; ++picture)
+                for (unsigned skip = 0; skip < size; skip += step, ++first) {
+                    const unsigned count = min(step, size - skip);
+                    if (first < items.item_capacity &&
+                        record + run.num_instances * count <= items.record_capacity)
+                        items.items[first] = {
+                            placement + picture * num_placements, gaussian + skip, count,
+                            static_cast<uint32_t>(record),        appearance,      run.sharers,
+                            static_cast<uint32_t>(cluster),       weight};
+                    record += run.num_instances * count;
+                }
         });
     }
     __device__ void finish(Count units, Count gaussians) const {

@@ -9,7 +9,8 @@
 namespace v3dg {
 
 // Chooses the clusters of all instances that are just detailed enough for one view: exactly one on every path
-// from a leaf to its root, when balls nest and weights never decrease towards the root.
+// from a leaf to its root, when balls nest and weights never decrease towards the root. For two eyes, they
+// are detailed enough for the nearer one; not with the paper's footprint, which has one camera's depth.
 //
 // Selected pairs are in ascending order of instance, then cluster. Pairs outside the frustum are left out,
 // unless they could touch a pixel. Both halves give the same bits for any number of threads.
@@ -30,7 +31,7 @@ namespace v3dg {
 struct SelectInput {
     Span<const ClusterTable> bundles;
     InstanceTable instances;
-    Camera camera;
+    Eyes eyes;
     SelectRule rule;
     // Where it is told which pages are needed, of the bundles of which only some are resident: [G + 1] of
     // each, bits of the highest priority of each page (select_math.h), 0 where it is not needed and before.

@@ -41,7 +41,7 @@ struct View {
 
     explicit View(const SelectInput& input) : in(input) {
         for (const ClusterTable& table : in.bundles) {
-            sides.push_back(frustum_sides(in.camera, table.pad_px));
+            sides.push_back(frustum_sides(in.eyes, table.pad_px));
             most_groups = std::max(most_groups, table.ball.size);
             most_clusters = std::max(most_clusters, table.num_clusters());
         }
@@ -60,8 +60,9 @@ struct SeenInstance {
         const Pose pose = instances.pose(i);
         is_placed = v3dg::is_placed(pose);
         if (is_placed)
-            view = view_from_instance(of.in.camera, of.sides[instances.bundle[i]],
-                                      axes_of_instance(of.in.camera, pose), pose, instances.importance[i]);
+            view = view_from_instance(of.in.eyes, of.sides[instances.bundle[i]],
+                                      axes_of_instance(of.in.eyes.camera[0], pose), pose,
+                                      instances.importance[i]);
     }
 
     CutSource source(const SelectRule& rule) const {

@@ -43,19 +43,19 @@ struct PartlyResident {
 // that captured a cut goes on using the memory, and so holds until a larger scene is cut.
 class Cut {
   public:
-    // Selected clusters as the items of a frame. Instance i becomes placement i of model bundle[i] in image
-    // 0, and `image` is written to images[0].
-    void cut_items(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
-                   const FrameImage& image, FrameImage* images, Placement* placements, const ItemList& items,
-                   cudaStream_t stream, const PartlyResident* resident = nullptr);
+    // Selected clusters as the items of a frame, once for each eye. Instance i of n becomes placement i of
+    // model bundle[i] in image 0, and n + i in that of a second eye; `pictures` are written to `images`.
+    void cut_items(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
+                   const EyeImages& pictures, FrameImage* images, Placement* placements,
+                   const ItemList& items, cudaStream_t stream, const PartlyResident* resident = nullptr);
 
-    // The same for pairs that were selected before, on the device.
+    // The same for pairs that were selected before, on the device, and one camera.
     void given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
                      const FrameImage& image, FrameImage* images, Placement* placements,
                      const ItemList& items, cudaStream_t stream);
 
     // Selected clusters as pairs on the host, for which it waits.
-    void select(const SceneTables& scene, const Camera& camera, const SelectRule& rule, SelectOutput& out,
+    void select(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, SelectOutput& out,
                 cudaStream_t stream, const PartlyResident* resident = nullptr);
 
     size_t bytes() const;
@@ -67,11 +67,11 @@ class Cut {
     };
     struct Target;
     template <class Output>
-    void cut(const SceneTables& scene, const Camera& camera, const SelectRule& rule, const Target& target,
+    void cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, const Target& target,
              const Output& output, cudaStream_t stream, const PartlyResident* resident);
     template <bool kFades>
-    void select_pairs(const SceneTables& scene, const Camera& camera, const SelectRule& rule,
-                      SelectOutput& out, cudaStream_t stream, const PartlyResident* resident);
+    void select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, SelectOutput& out,
+                      cudaStream_t stream, const PartlyResident* resident);
 
     const int device_ = current_device();
     DeviceBuffer<InstanceView> views_;

@@ -33,9 +33,11 @@ struct Plane {
     float guard;
 };
 
-// One camera as one instance sees it: in the instance's own frame and units.
+// A camera, or two eyes, as one instance sees them: in the instance's own frame and units. Of two eyes the
+// nearer one counts, and planes have both frusta inside.
 struct InstanceView {
-    float eye[3];
+    float eye[3], other_eye[3];
+    bool has_other_eye;
     float forward[3];         // unit length
     float px2_per_steradian;  // times the instance's importance
     Plane plane[kNumPlanes];
@@ -59,9 +61,13 @@ struct SelectRule {
     Fade fade = {};               // not with the paper's footprint, which may decrease towards the root
 };
 
-V3DG_HD inline float distance2_to(const Ball& ball, const InstanceView& view) {
-    const float dx = ball.x - view.eye[0], dy = ball.y - view.eye[1], dz = ball.z - view.eye[2];
+V3DG_HD inline float distance2_from(const float eye[3], const Ball& ball) {
+    const float dx = ball.x - eye[0], dy = ball.y - eye[1], dz = ball.z - eye[2];
     return dx * dx + dy * dy + dz * dz;
+}
+V3DG_HD inline float distance2_to(const Ball& ball, const InstanceView& view) {
+    const float distance2 = distance2_from(view.eye, ball);
+    return view.has_other_eye ? min_of(distance2, distance2_from(view.other_eye, ball)) : distance2;
 }
 
 // Screen area, px2, of a ball whose centre is this far from the eye, squared.
