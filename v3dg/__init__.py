@@ -17,11 +17,11 @@ from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.camera_file import read_cameras, write_cameras
 from v3dg.cameras import Camera, StereoCamera, turntable
 from v3dg.gaussians import Gaussians
-from v3dg.image import Image
+from v3dg.image import Image, RenderedImage, Stats
 from v3dg.io import read_asset, write_asset
 from v3dg.pick import Pick, pick
 from v3dg.rasterize import rasterize
-from v3dg.render import RenderedImage, Renderer, Stats, render
+from v3dg.render import Renderer, render
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene, write_scene
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 from v3dg import _core, _device
@@ -13,14 +13,14 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, StereoCamera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
-from v3dg.image import Image
+from v3dg.image import RenderedImage, Stats
 from v3dg.pool import Pool
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
 from v3dg.select import CutOptions, Selection, over_budget, rule_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from typing_extensions import Unpack
 
@@ -28,59 +28,6 @@ _Subject: TypeAlias = Scene | Bundle | Gaussians
 
 # Of pictures with levels, whose own error is far larger; docs/cuda.md has what it saves.
 DEFAULT_MIN_TRANSMITTANCE = 1e-3
-
-
-@dataclass(frozen=True)
-class Stats:
-    """What a picture cost.
-
-    Attributes:
-        gaussians_selected: Gaussians of the selected clusters.
-        gaussians_in_frustum: Of them, those in front of the near plane whose extent meets the image, before
-            any finer cull.
-        tolerance: px² that one gaussian of a coarser cluster stands for at most; with a budget, those that it
-            came to; 0 for an asset.
-        select_ms: Time to choose the clusters.
-        draw_ms: Time to draw them.
-        missing: Pages that the picture misses, in place of which coarser ones are drawn; 0 where all is
-            resident, or the renderer has settled. This and the next as far as is known.
-        failed: Pages that cannot be read.
-        bytes_in: Bytes of pages that came in with this picture.
-    """
-
-    gaussians_selected: int
-    gaussians_in_frustum: int
-    tolerance: float
-    select_ms: float
-    draw_ms: float
-    missing: int = 0
-    failed: int = 0
-    bytes_in: int = 0
-
-
-class RenderedImage(Image):
-    """An `Image` that says what it cost.
-
-    One that CUDA draws may still be under way; to look at one of its attributes waits until it is there, and
-    raises what went wrong.
-
-    Attributes:
-        stats: What it cost.
-    """
-
-    def __init__(
-        self, drawing: _core.Drawing, finish: Callable[[], Stats], *, is_right: bool = False
-    ) -> None:
-        self._drawing, self._finish, self._is_right = drawing, finish, is_right
-
-    @property
-    def _planes(self) -> Any:
-        self._finish()
-        return self._drawing.right if self._is_right else self._drawing
-
-    @property
-    def stats(self) -> Stats:
-        return self._finish()
 
 
 class _FrameOptions(CutOptions, total=False):
