@@ -23,10 +23,11 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.gaussians import Gaussians
+from v3dg.image import Stats
 from v3dg.io import read_asset
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
-from v3dg.render import Stats, render
+from v3dg.render import render
 from v3dg.scene import Scene
 from v3dg.scene_file import read_scene
 from v3dg.select import DEFAULT_TOLERANCE
