@@ -55,6 +55,7 @@ MAY_INCLUDE = {
         "quantize",
         "residency",
         "select",
+        "project",
         "fit_group",
         "pipeline",
     },

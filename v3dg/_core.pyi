@@ -197,12 +197,29 @@ def rasterize(
     background: Sequence[float],
     with_depth: bool,
     keep_tape: bool,
+    plain_colors: bool = ...,
 ) -> tuple[Array, Array, Array | None, dict[str, float] | None, Tape | None]: ...
 
-# Gradients of the columns and of the background.
+# Gradients of the columns and of the background; of those by centres on the image the sum and the sizes.
 def rasterize_backward(
-    tape: Tape, d_color: Array | None, d_alpha: Array | None, d_depth: Array | None
-) -> tuple[Array, Array, Array, Array, Array, Array]: ...
+    tape: Tape,
+    d_color: Array | None,
+    d_alpha: Array | None,
+    d_depth: Array | None,
+    with_centers: bool = ...,
+    with_sizes: bool = ...,
+) -> tuple[Array, Array, Array, Array, Array, Array, Array | None, Array | None]: ...
+
+# Centres, depths, conics, opacities and radii; zeros for gaussians that are not in sight.
+def ellipses(
+    gaussians: Rows,
+    camera: Camera,
+    *,
+    filter_px2: float,
+    antialiased: bool,
+    far_depth: float,
+    min_radius_px: float,
+) -> tuple[Array, Array, Array, Array, Array]: ...
 
 # scene
 class Stop:

@@ -42,7 +42,8 @@ struct Torch {
     }
 
     const py::object& dtype(const py::dtype& wanted) const {
-        return wanted.kind() == 'f' ? float32_ : wanted.itemsize() == 8 ? int64_ : uint8_;
+        if (wanted.kind() == 'f') return float32_;
+        return wanted.itemsize() == 8 ? int64_ : wanted.itemsize() == 4 ? int32_ : uint8_;
     }
 
   private:
@@ -51,9 +52,10 @@ struct Torch {
           current_stream(py::module_::import("torch.cuda").attr("current_stream")),
           float32_(py::module_::import("torch").attr("float32")),
           int64_(py::module_::import("torch").attr("int64")),
+          int32_(py::module_::import("torch").attr("int32")),
           uint8_(py::module_::import("torch").attr("uint8")) {}
 
-    py::object float32_, int64_, uint8_;
+    py::object float32_, int64_, int32_, uint8_;
 };
 
 template <class Lengths>

@@ -4,6 +4,7 @@
 #include "bindings/picture.h"
 #include "pipeline/model.h"
 #include "pipeline/render.h"
+#include "project/ellipses.h"
 
 #if V3DG_WITH_CUDA
 #include "pipeline/render_backward_cuda.h"
@@ -18,15 +19,48 @@ struct Look {
     double filter_px2;
     bool antialiased;
     std::array<double, 3> background;
+    bool plain_colors;  // the coefficients, of degree 0, are colours as they are
+
+    template <class T>
+    GaussianRows<const T> read(const Rows& gaussians) const {
+        GaussianRows<const T> rows = gaussians.read<T>();
+        if (plain_colors) rows.sh_degree = kPlainColor;
+        return rows;
+    }
+};
+
+// What is wanted of the gradients by the gaussians' centres on the image.
+struct Centers {
+    bool sum, size;
+};
+
+// It, or nothing where it is not wanted.
+template <class T>
+struct NewCenters {
+    py::object sum = py::none(), size = py::none();
+    CenterGradients<T> spans{};
+
+    NewCenters(Centers wanted, Device device, py::ssize_t count) {
+        if (wanted.sum) spans.sum = add(device, count, sum);
+        if (wanted.size) spans.size = reinterpret_cast<CenterSize<T>*>(add(device, count, size));
+    }
+
+  private:
+    static T* add(Device device, py::ssize_t count, py::object& object) {
+        const NewArray<T> array(device, {count, 2});
+        object = array.object;
+        if (device.is_host()) std::fill(array.span.begin(), array.span.end(), T(0));
+        return array.span.data;
+    }
 };
 
 // What rasterize leaves for rasterize_backward.
 class Tape {
   public:
     virtual ~Tape() = default;
-    // Gradients of means, quats, scales, opacities, sh and background.
+    // Gradients of means, quats, scales, opacities, sh and background; sum and size of those by the centres.
     virtual py::tuple backward(const py::object& d_color, const py::object& d_alpha,
-                               const py::object& d_depth) = 0;
+                               const py::object& d_depth, Centers wanted) = 0;
 };
 
 // The gradient of a plane of the picture; where none is given, zeros.
@@ -71,8 +105,8 @@ class HostTape final : public Tape {
         return render<T>({draw_}, camera_, picture, keeps_tape, workspace_);
     }
 
-    py::tuple backward(const py::object& d_color, const py::object& d_alpha,
-                       const py::object& d_depth) override {
+    py::tuple backward(const py::object& d_color, const py::object& d_alpha, const py::object& d_depth,
+                       Centers wanted) override {
         const py::ssize_t h = height_, w = width_;
         const Plane<T> color(d_color, "d_color", {}, {h, w, 3}), alpha(d_alpha, "d_alpha", {}, {h, w});
         const PictureGradient<T> d_picture{
@@ -85,6 +119,7 @@ class HostTape final : public Tape {
         for (const Span<T>& span :
              {means.span, quats.span, scales.span, opacities.span, sh.span, background.span})
             std::fill(span.begin(), span.end(), T(0));
+        const NewCenters<T> centers(wanted, {}, n);
         const GaussianRows<T> out{
             means.span.data, quats.span.data, scales.span.data, opacities.span.data, sh.span.data,
             model_.size(),   degree};
@@ -95,10 +130,11 @@ class HostTape final : public Tape {
                                      nullptr,
                                      nullptr,
                                      nullptr};
-            render_backward<T>(draw_, camera_, picture, d_picture, workspace_, out, background.span.data);
+            render_backward<T>(draw_, camera_, picture, d_picture, workspace_, out, centers.spans,
+                               background.span.data);
         }
         return py::make_tuple(means.object, quats.object, scales.object, opacities.object, sh.object,
-                              background.object);
+                              background.object, centers.sum, centers.size);
     }
 
   private:
@@ -122,7 +158,7 @@ py::tuple rasterize_on_host(const Rows& gaussians, const BoundCamera& camera, co
     NewPicture out{camera.height(), camera.width(), {}, {}, py::none(), with_depth};
     const Picture<T> picture =
         out.on_host<T>({0, 0, camera.width(), camera.height()}, Shade{look.background});
-    const GaussianRows<const T> rows = gaussians.read<T>();
+    const GaussianRows<const T> rows = look.read<T>(gaussians);
     std::unique_ptr<HostTape<T>> tape;
     RenderCounts counts;
     {
@@ -145,8 +181,8 @@ class DeviceTape final : public Tape {
         : gaussians_(gaussians), frame_(std::move(frame)), height_(height), width_(width) {}
     ~DeviceTape() override { cuda::give_back(std::move(frame_)); }
 
-    py::tuple backward(const py::object& d_color, const py::object& d_alpha,
-                       const py::object& d_depth) override {
+    py::tuple backward(const py::object& d_color, const py::object& d_alpha, const py::object& d_depth,
+                       Centers wanted) override {
         const py::ssize_t h = height_, w = width_;
         const Device device = gaussians_.device();
         const Work work(device);
@@ -157,11 +193,12 @@ class DeviceTape final : public Tape {
             d_depth.is_none() ? nullptr : span_on<const float>(device, d_depth, "d_depth", {h, w}).data};
         const NewRows gradients(device, gaussians_.size(), gaussians_.sh_degree());
         const NewArray<float> background(device, {3});
+        const NewCenters<float> centers(wanted, device, static_cast<py::ssize_t>(gaussians_.size()));
         {
             const py::gil_scoped_release unlocked;
-            frame_->backward(d_picture, gradients.rows(), background.span.data, work.stream());
+            frame_->backward(d_picture, gradients.rows(), centers.spans, background.span.data, work.stream());
         }
-        return py::tuple(gradients.arrays() + py::make_tuple(background.object));
+        return py::tuple(gradients.arrays() + py::make_tuple(background.object, centers.sum, centers.size));
     }
 
   private:
@@ -175,7 +212,7 @@ py::tuple rasterize_on_device(const Rows& gaussians, const BoundCamera& camera, 
     const Device device = gaussians.device();
     const Work work(device);
     NewPicture out{camera.height(), camera.width(), {}, {}, py::none(), with_depth};
-    const cuda::ModelPicture in{gaussians.read<float>(), view_of_world<float>(camera.camera),
+    const cuda::ModelPicture in{look.read<float>(gaussians), view_of_world<float>(camera.camera),
                                 static_cast<float>(look.filter_px2), look.antialiased,
                                 out.on_device(device, camera.camera, Shade{look.background})};
     std::unique_ptr<cuda::DifferentiableFrame> frame;
@@ -193,8 +230,12 @@ py::tuple rasterize_on_device(const Rows& gaussians, const BoundCamera& camera, 
 #endif
 
 py::tuple rasterize(const Rows& gaussians, const BoundCamera& camera, double filter_px2, bool antialiased,
-                    const std::array<double, 3>& background, bool with_depth, bool keep_tape) {
-    const Look look{filter_px2, antialiased, background};
+                    const std::array<double, 3>& background, bool with_depth, bool keep_tape,
+                    bool plain_colors) {
+    if (plain_colors && gaussians.sh_degree() != 0)
+        throw py::value_error("sh: expected shape (N, 1, 3) for plain colours, got degree " +
+                              std::to_string(gaussians.sh_degree()));
+    const Look look{filter_px2, antialiased, background, plain_colors};
 #if V3DG_WITH_CUDA
     if (!gaussians.device().is_host())
         return rasterize_on_device(gaussians, camera, look, with_depth, keep_tape);
@@ -203,22 +244,58 @@ py::tuple rasterize(const Rows& gaussians, const BoundCamera& camera, double fil
                                  : rasterize_on_host<float>(gaussians, camera, look, with_depth, keep_tape);
 }
 
+template <class T>
+py::tuple ellipses_of(const Rows& gaussians, const Camera& camera, double filter_px2, bool antialiased,
+                      double far_depth, double min_radius_px) {
+    const Work work(gaussians.device());
+    const auto n = static_cast<py::ssize_t>(gaussians.size());
+    const NewArray<T> centers(work.device(), {n, 2}), depths(work.device(), {n}),
+        conics(work.device(), {n, 3}), opacities(work.device(), {n});
+    const NewArray<int32_t> radii(work.device(), {n, 2});
+    const Ellipses<T> out{centers.span.data, depths.span.data, conics.span.data, opacities.span.data,
+                          radii.span.data};
+    const EllipsesInput<T> in{
+        gaussians.read<T>(), view_of_world<T>(camera), pinhole_of<T>(camera), T(filter_px2), antialiased,
+        T(far_depth),        T(min_radius_px)};
+    {
+        const py::gil_scoped_release unlocked;
+        if constexpr (std::is_same<T, float>::value)
+            V3DG_DISPATCH(work, ellipses, in, out);
+        else
+            cpu::ellipses(in, out);
+    }
+    return py::make_tuple(centers.object, depths.object, conics.object, opacities.object, radii.object);
+}
+
+py::tuple ellipses(const Rows& gaussians, const BoundCamera& camera, double filter_px2, bool antialiased,
+                   double far_depth, double min_radius_px) {
+    return gaussians.is_double() ? ellipses_of<double>(gaussians, camera.camera, filter_px2, antialiased,
+                                                       far_depth, min_radius_px)
+                                 : ellipses_of<float>(gaussians, camera.camera, filter_px2, antialiased,
+                                                      far_depth, min_radius_px);
+}
+
 }  // namespace
 
 void bind_rasterize(py::module_& m) {
     py::class_<Tape>(m, "Tape", "What rasterize leaves for rasterize_backward; it keeps the gaussians.");
     m.def("rasterize", &rasterize, "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a, "antialiased"_a,
-          "background"_a, "with_depth"_a, "keep_tape"_a,
+          "background"_a, "with_depth"_a, "keep_tape"_a, "plain_colors"_a = false,
           "Draws gaussians where they are and in the precision that they have: (color, alpha, depth or None, "
           "on "
           "the host counts and times, the tape or None).");
     m.def(
         "rasterize_backward",
-        [](Tape& tape, const py::object& d_color, const py::object& d_alpha, const py::object& d_depth) {
-            return tape.backward(d_color, d_alpha, d_depth);
-        },
-        "tape"_a, "d_color"_a, "d_alpha"_a, "d_depth"_a,
-        "Gradients of means, quats, scales, opacities, sh and background.");
+        [](Tape& tape, const py::object& d_color, const py::object& d_alpha, const py::object& d_depth,
+           bool with_centers,
+           bool with_sizes) { return tape.backward(d_color, d_alpha, d_depth, {with_centers, with_sizes}); },
+        "tape"_a, "d_color"_a, "d_alpha"_a, "d_depth"_a, "with_centers"_a = false, "with_sizes"_a = false,
+        "Gradients of means, quats, scales, opacities, sh and background; by the gaussians' centres on the "
+        "image their sum and the sum of their sizes, where they are wanted.");
+    m.def("ellipses", &ellipses, "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a, "antialiased"_a,
+          "far_depth"_a, "min_radius_px"_a,
+          "Where gaussians lie on the image: centres, depths, conics, opacities, radii; zeros for those that "
+          "are not in sight.");
 }
 
 }  // namespace v3dg

@@ -13,7 +13,8 @@ namespace cuda {
 struct GradientSlots {
     const uint32_t* first;  // of each record
     RecordGradient<float>* slot;
-    uint8_t* is_touched;  // zeros at the start
+    CenterSize<float>* size;  // of each slot; null where nobody asks for it
+    uint8_t* is_touched;      // zeros at the start
 };
 
 V3DG_HD inline uint32_t tile_columns_of(const Record<float>& r) {

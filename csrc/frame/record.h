@@ -38,6 +38,26 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
 // depth, which order the list, in its high half.
 inline uint32_t record_of(uint64_t entry) { return static_cast<uint32_t>(entry); }
 
+// Sum over pixels of the size of the gradient by a record's centre, along both axes: how much pixels pull at
+// it, also where they pull apart.
+template <class V>
+struct CenterSize {
+    V u, v;
+
+    V3DG_HD V3DG_INLINE CenterSize& operator+=(const CenterSize& d) {
+        u += d.u;
+        v += d.v;
+        return *this;
+    }
+};
+
+// What is told of gradients by centres, (N, 2) each, in 1 / px; either may be null.
+template <class T>
+struct CenterGradients {
+    T* sum;
+    CenterSize<T>* size;
+};
+
 // Gradients of the ellipse and colour of one record.
 template <class T>
 struct RecordGradient {

@@ -9,8 +9,13 @@ namespace v3dg {
 
 constexpr int kMaxShDegree = 3, kMaxShBases = 16;
 constexpr double kShBase0 = 0.28209479177387814;  // the same in every direction
+// The degree of colours that are meant as they are, negative ones too: three numbers in place of
+// coefficients.
+constexpr int kPlainColor = -1;
 
-V3DG_HD constexpr int num_sh_bases(int degree) { return (degree + 1) * (degree + 1); }
+V3DG_HD constexpr int num_sh_bases(int degree) {
+    return degree == kPlainColor ? 1 : (degree + 1) * (degree + 1);
+}
 
 // Values of the bases in the unit direction (x, y, z).
 template <class V>
@@ -78,6 +83,11 @@ V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxS
 template <class V>
 V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* sh, V color[3]) {
     using L = Lane<V>;
+    if (degree == kPlainColor) {
+        const V most = all_lanes<V>(kInfinite<L>);
+        for (int c = 0; c < 3; ++c) color[c] = (sh[c] < most) & (sh[c] > -most) ? sh[c] : V{};
+        return;
+    }
     V basis[kMaxShBases];
     V dir[3] = {direction[0], direction[1], direction[2]};
     if (degree > 0) {
@@ -98,6 +108,10 @@ V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* 
 template <class V>
 V3DG_HD V3DG_INLINE void color_of_sh_vjp(int degree, const V direction[3], const V* sh, const V color[3],
                                          const V d_color[3], V d_direction[3], V* d_sh) {
+    if (degree == kPlainColor) {
+        for (int c = 0; c < 3; ++c) d_sh[c] = d_color[c];
+        return;
+    }
     V basis[kMaxShBases], d_basis[kMaxShBases];
     V dir[3] = {direction[0], direction[1], direction[2]};
     V inv = V{};

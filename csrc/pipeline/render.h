@@ -54,10 +54,10 @@ struct Pick {
 bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, int x, int y, Pick& picked);
 
 // Gradients of the gaussians of a single draw from those of the picture that `workspace` was left by. Adds to
-// nothing: `out` is overwritten for gaussians with a record and left alone for others.
+// nothing: `out` and `centers` are overwritten for gaussians with a record and left alone for others.
 template <class T>
 void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& workspace,
-                     const GaussianRows<T>& out, T d_background[3]);
+                     const GaussianRows<T>& out, const CenterGradients<T>& centers, T d_background[3]);
 
 }  // namespace v3dg

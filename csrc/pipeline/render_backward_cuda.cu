@@ -36,20 +36,22 @@ void DifferentiableFrame::draw(const ModelPicture& in, cudaStream_t stream) {
 }
 
 void DifferentiableFrame::backward(const PictureGradient<float>& d_picture, const GaussianRows<float>& out,
-                                   float* d_background, cudaStream_t stream) {
+                                   const CenterGradients<float>& centers, float* d_background,
+                                   cudaStream_t stream) {
     check(cudaStreamWaitEvent(stream, drawn_, 0), "cudaStreamWaitEvent");
     const FrameTape tape = frame_.tape();
     const DeviceBuffer<RecordGradient<float>> slot(num_slots_, stream);
+    const DeviceBuffer<CenterSize<float>> size(centers.size != nullptr ? num_slots_ : 0, stream);
     const DeviceBuffer<uint8_t> is_touched(num_slots_, stream);
     const DeviceBuffer<float> d_background_of_tile(3 * size_t(tape.lists.num_tiles), stream);
     if (num_slots_ > 0) check(cudaMemsetAsync(is_touched.data(), 0, num_slots_, stream), "cudaMemsetAsync");
-    const GradientSlots slots{tape.first_slot, slot.data(), is_touched.data()};
+    const GradientSlots slots{tape.first_slot, slot.data(), size.data(), is_touched.data()};
     rasterize_backward({in_.image, tape.lists.records, tape.lists.tile_first, tape.raster.order,
                         tape.raster.blended, tape.lists.plans, d_picture},
                        slots, d_background_of_tile.data(), d_background, stream);
     project_backward({tape.item_records, tape.lists.records, tape.source, in_.rows, in_.view,
                       in_.image.camera, in_.filter_px2, in_.antialiased},
-                     slots, out, stream);
+                     slots, out, centers, stream);
     check(cudaEventRecord(gone_back_, stream), "cudaEventRecord");
 }
 

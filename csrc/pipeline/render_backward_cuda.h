@@ -31,7 +31,7 @@ class DifferentiableFrame {
     // Enqueues the gradients of the gaussians and the background (3) of the picture last drawn; its arrays
     // and the gaussians are still as they were. Every element is written, the same on every run.
     void backward(const PictureGradient<float>& d_picture, const GaussianRows<float>& out,
-                  float* d_background, cudaStream_t stream);
+                  const CenterGradients<float>& centers, float* d_background, cudaStream_t stream);
 
   private:
     friend void give_back(std::unique_ptr<DifferentiableFrame> frame);

@@ -240,7 +240,7 @@ static uint64_t num_tiles_of(const Record<T>& r) {
 template <class T>
 void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Picture<T>& picture,
                      const PictureGradient<T>& d_picture, const Workspace<T>& ws, const GaussianRows<T>& out,
-                     T d_background[3]) {
+                     const CenterGradients<T>& centers, T d_background[3]) {
     const TileGrid grid(picture.window);
     const Record<T>* records = ws.records.data();
     const uint64_t* offset = ws.lists.offset.data();
@@ -255,23 +255,31 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
             num_slots += num_tiles_of(records[r]);
         }
     std::vector<RecordGradient<T>> d_slot(num_slots);
+    const bool with_size = centers.size != nullptr;
+    std::vector<CenterSize<T>> size_of_slot(with_size ? num_slots : 0);
     std::vector<T> d_background_of_tile(3 * grid.size(), T(0));
     const std::vector<uint32_t> order = tiles_by_load(offset, grid.size());
     std::vector<std::vector<RecordGradient<T>>> d_entries(omp_get_max_threads());
+    std::vector<std::vector<CenterSize<T>>> sizes(omp_get_max_threads());
     parallel_for(order.size(), 1, [&](size_t i) {
         const uint32_t t = order[i];
         const size_t count = offset[t + 1] - offset[t];
         const int column = grid.column(t), row = grid.row(t);
         std::vector<RecordGradient<T>>& d_entry = d_entries[omp_get_thread_num()];
         d_entry.assign(count, RecordGradient<T>{});
+        std::vector<CenterSize<T>>& size = sizes[omp_get_thread_num()];
+        size.assign(with_size ? count : 0, CenterSize<T>{});
         V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, entry + offset[t], count, kTileSize * column,
-                          kTileSize * row, picture, d_picture, d_entry.data(), &d_background_of_tile[3 * t]);
+                          kTileSize * row, picture, d_picture, d_entry.data(),
+                          with_size ? size.data() : nullptr, &d_background_of_tile[3 * t]);
         for (size_t e = 0; e < count; ++e) {
             const uint32_t r = record_of(entry[offset[t] + e]);
             const int x0 = records[r].x0 / kTileSize, x1 = records[r].x1 / kTileSize,
                       y0 = records[r].y0 / kTileSize;
-            d_slot[first_slot[r] + static_cast<uint64_t>(row - y0) * (x1 - x0 + 1) + (column - x0)] =
-                d_entry[e];
+            const uint64_t slot =
+                first_slot[r] + static_cast<uint64_t>(row - y0) * (x1 - x0 + 1) + (column - x0);
+            d_slot[slot] = d_entry[e];
+            if (with_size) size_of_slot[slot] = size[e];
         }
     });
     for (size_t t = 0; t < grid.size(); ++t)
@@ -283,8 +291,18 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
         std::vector<RecordGradient<T>> d_records(count);
         for (uint32_t i = 0; i < count; ++i) {
             const Record<T>& r = records[first + i];
-            const uint64_t slots = num_tiles_of(r);
-            for (uint64_t p = 0; p < slots; ++p) d_records[i] += d_slot[first_slot[first + i] + p];
+            const uint64_t begin = first_slot[first + i], end = begin + num_tiles_of(r);
+            for (uint64_t p = begin; p < end; ++p) d_records[i] += d_slot[p];
+            const uint32_t gaussian = ws.source.data()[first + i];
+            if (with_size) {
+                CenterSize<T> size{};
+                for (uint64_t p = begin; p < end; ++p) size += size_of_slot[p];
+                centers.size[gaussian] = size;
+            }
+            if (centers.sum != nullptr) {
+                centers.sum[2 * static_cast<size_t>(gaussian)] = d_records[i].ellipse.u;
+                centers.sum[2 * static_cast<size_t>(gaussian) + 1] = d_records[i].ellipse.v;
+            }
         }
         V3DG_DISPATCH_ISA(project_backward<T>, draw, ws.source.data() + first, d_records.data(), count,
                           camera, out);
@@ -316,7 +334,7 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
                                     Workspace<T>&, const std::atomic<bool>*);                                \
     template void render_backward<T>(const Draw<T>&, const Pinhole<T>&, const Picture<T>&,                   \
                                      const PictureGradient<T>&, const Workspace<T>&, const GaussianRows<T>&, \
-                                     T*);
+                                     const CenterGradients<T>&, T*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

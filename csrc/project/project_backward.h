@@ -29,9 +29,10 @@ struct ProjectBackwardInput {
 };
 
 // Writes the gradients of every gaussian, zeros for those without a record. Those of the SH coefficients
-// begin at a multiple of 16 bytes, as the coefficients do.
+// begin at a multiple of 16 bytes, as the coefficients do. The slots have sizes where `centers` does.
 void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots,
-                      const GaussianRows<float>& out, cudaStream_t stream);
+                      const GaussianRows<float>& out, const CenterGradients<float>& centers,
+                      cudaStream_t stream);
 
 }  // namespace cuda
 }  // namespace v3dg

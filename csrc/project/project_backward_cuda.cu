@@ -16,34 +16,36 @@ constexpr int kThreads = kItemSize;
 constexpr uint32_t kFewSlots = 16;  // a thread adds up so many by itself, a warp more
 constexpr int kWordsAtOnce = 6;     // that a thread asks for before it stores the first
 
-__device__ void add_slot(const GradientSlots& slots, uint32_t i, RecordGradient<float>& sum) {
-    static_assert(sizeof sum == 5 * sizeof(float2), "loaded as pairs");
-    RecordGradient<float> slot;
-    for (int k = 0; k < 5; ++k)
-        reinterpret_cast<float2*>(&slot)[k] = reinterpret_cast<const float2*>(slots.slot + i)[k];
+template <class Value>
+__device__ void add_slot(const Value* of_slot, uint32_t i, Value& sum) {
+    static_assert(sizeof sum % sizeof(float2) == 0, "loaded as pairs");
+    Value slot;
+    for (size_t k = 0; k < sizeof sum / sizeof(float2); ++k)
+        reinterpret_cast<float2*>(&slot)[k] = reinterpret_cast<const float2*>(of_slot + i)[k];
     sum += slot;
 }
 
 // Sum of `num` slots, in their order or, when there are many, in another that is fixed as well. All lanes of
 // the warp take part. Returns whether any was touched.
-__device__ bool sum_of_slots(const GradientSlots& slots, uint32_t first, uint32_t num,
-                             RecordGradient<float>& sum) {
+template <class Value>
+__device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, uint32_t first, uint32_t num,
+                             Value& sum) {
     const int lane = threadIdx.x % 32;
     uint32_t touched = 0;
     if (num <= kFewSlots) {
         for (uint32_t i = 0; i < num; ++i) touched |= static_cast<uint32_t>(slots.is_touched[first + i]) << i;
         for (uint32_t todo = touched; todo != 0; todo &= todo - 1)
-            add_slot(slots, first + __ffs(todo) - 1, sum);
+            add_slot(of_slot, first + __ffs(todo) - 1, sum);
     }
     for (unsigned many = __ballot_sync(kAllLanes, num > kFewSlots); many != 0; many &= many - 1) {
         const int owner = __ffs(many) - 1;
         const uint32_t begin = __shfl_sync(kAllLanes, first, owner),
                        end = begin + __shfl_sync(kAllLanes, num, owner);
-        RecordGradient<float> part{};
+        Value part{};
         bool part_touched = false;
         for (uint32_t i = begin + lane; i < end; i += 32)
             if (slots.is_touched[i] != 0) {
-                add_slot(slots, i, part);
+                add_slot(of_slot, i, part);
                 part_touched = true;
             }
         float* value = reinterpret_cast<float*>(&part);
@@ -109,7 +111,8 @@ struct ShRow {
 
 template <int kDegree>
 __global__ void __launch_bounds__(kThreads)
-    project_backward_kernel(ProjectBackwardInput in, GradientSlots slots, GaussianRows<float> out) {
+    project_backward_kernel(ProjectBackwardInput in, GradientSlots slots, GaussianRows<float> out,
+                            float* d_centers) {
     using Row = ShRow<kDegree>;
     using Word = typename Row::Word;
     Word* sh_rows = reinterpret_cast<Word*>(shared_memory());
@@ -132,9 +135,13 @@ __global__ void __launch_bounds__(kThreads)
         for (int c = 0; c < 3; ++c) color[c] = in.records[record].color[c];
     }
     RecordGradient<float> d{};
-    const bool used = sum_of_slots(slots, is_record ? slots.first[record] : 0,
+    const bool used = sum_of_slots(slots, slots.slot, is_record ? slots.first[record] : 0,
                                    is_record ? num_slots_of(in.records[record]) : 0, d);
-    if (used) is_used[i - first] = true;
+    if (used) {
+        is_used[i - first] = true;
+        const float center[2] = {d.ellipse.u, d.ellipse.v};
+        if (d_centers != nullptr) store_row<2>(d_centers, i, center);
+    }
     __syncthreads();
     const Word* sh_in = reinterpret_cast<const Word*>(in.rows.sh + Row::kValues * first);
     const auto is_wanted = [&](int k) { return k < Row::kWords * num_here && is_used[k / Row::kWords]; };
@@ -179,6 +186,7 @@ __global__ void __launch_bounds__(kThreads)
         store_row<4>(out.quats, first + threadIdx.x, zeros);
         store_row<3>(out.scales, first + threadIdx.x, zeros);
         out.opacities[first + threadIdx.x] = 0;
+        if (d_centers != nullptr) store_row<2>(d_centers, first + threadIdx.x, zeros);
     }
     __syncthreads();
     Word* sh_out = reinterpret_cast<Word*>(out.sh + Row::kValues * first);
@@ -187,12 +195,23 @@ __global__ void __launch_bounds__(kThreads)
             is_used[k / Row::kWords] ? sh_rows[k / Row::kWords * Row::kStride + k % Row::kWords] : Word{};
 }
 
+// `sizes` of the gradients by the centres of the gaussians, which start as zeros.
+__global__ void __launch_bounds__(kThreads)
+    center_sizes_kernel(ProjectBackwardInput in, GradientSlots slots, CenterSize<float>* sizes) {
+    const uint64_t record = static_cast<uint64_t>(blockIdx.x) * kItemSize + threadIdx.x;
+    const bool is_record = threadIdx.x < in.item_records[blockIdx.x];
+    CenterSize<float> size{};
+    if (sum_of_slots(slots, slots.size, is_record ? slots.first[record] : 0,
+                     is_record ? num_slots_of(in.records[record]) : 0, size))
+        sizes[in.source[record]] = size;
+}
+
 template <int kDegree>
 void start(const ProjectBackwardInput& in, const GradientSlots& slots, const GaussianRows<float>& out,
-           cudaStream_t stream) {
+           float* d_centers, cudaStream_t stream) {
     launch("project_backward_kernel", &project_backward_kernel<kDegree>, blocks_for(in.rows.size, kItemSize),
            kThreads, kThreads * ShRow<kDegree>::kStride * sizeof(typename ShRow<kDegree>::Word), stream, in,
-           slots, out);
+           slots, out, d_centers);
 }
 
 }  // namespace
@@ -204,12 +223,20 @@ void place_slots(const ItemList& items, const uint32_t* item_records, const Reco
 }
 
 void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots,
-                      const GaussianRows<float>& out, cudaStream_t stream) {
+                      const GaussianRows<float>& out, const CenterGradients<float>& centers,
+                      cudaStream_t stream) {
+    if (centers.size != nullptr) {
+        check(cudaMemsetAsync(centers.size, 0, in.rows.size * sizeof *centers.size, stream),
+              "cudaMemsetAsync");
+        launch("center_sizes_kernel", &center_sizes_kernel, blocks_for(in.rows.size, kItemSize), kThreads, 0,
+               stream, in, slots, centers.size);
+    }
     switch (in.rows.sh_degree) {
-        case 0: return start<0>(in, slots, out, stream);
-        case 1: return start<1>(in, slots, out, stream);
-        case 2: return start<2>(in, slots, out, stream);
-        default: return start<3>(in, slots, out, stream);
+        case kPlainColor: return start<kPlainColor>(in, slots, out, centers.sum, stream);
+        case 0: return start<0>(in, slots, out, centers.sum, stream);
+        case 1: return start<1>(in, slots, out, centers.sum, stream);
+        case 2: return start<2>(in, slots, out, centers.sum, stream);
+        default: return start<3>(in, slots, out, centers.sum, stream);
     }
 }
 

@@ -90,7 +90,11 @@ struct RowSource : OfRows<GaussianRows<const float>> {
         gaussian.quat[1] = quat.y;
         gaussian.quat[2] = quat.z;
         gaussian.quat[3] = quat.w;
-        if (m.sh_degree == 0) color_of_row<0>(m.sh + 3 * size_t(g), gaussian.mean, view, color);
+        const float* sh = m.sh + 3 * size_t(g);  // where there is one coefficient
+        if (m.sh_degree == 0)
+            color_of_row<0>(sh, gaussian.mean, view, color);
+        else if (m.sh_degree == kPlainColor)
+            color_of_row<kPlainColor>(sh, gaussian.mean, view, color);
         return project_gaussian(gaussian, view, in.image.camera, in.item.appearance.filter_px2,
                                 in.item.appearance.antialiased, s);
     }

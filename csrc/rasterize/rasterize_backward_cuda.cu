@@ -23,7 +23,11 @@ constexpr int kWarpColumns = kFrameTileWidth / kWarpWidth;
 constexpr int kBatch = 192;  // entries
 constexpr int kPairs = 768;  // (entry, warp) pairs of a batch
 constexpr int kHeld = 8;     // gaussians whose sums a warp makes at once
-constexpr int kValues = sizeof(RecordGradient<float>) / sizeof(float);
+constexpr int kGradientValues = sizeof(RecordGradient<float>) / sizeof(float);
+constexpr int kSizeValues = sizeof(CenterSize<float>) / sizeof(float);
+// What is summed of a gaussian.
+template <bool kWithSize>
+constexpr int kValuesOf = kGradientValues + (kWithSize ? kSizeValues : 0);
 static_assert(kHeld * kWarpHeight == 32 && kWarpHeight == 4, "a lane sums one row of one gaussian");
 constexpr int kTogether = 2;  // gaussians blended without a branch between them
 static_assert(kPairs >= kWarps, "one entry fits");
@@ -35,7 +39,7 @@ struct Share {
 };
 constexpr int kShareStride = 33;  // of the pixels of a gaussian; odd, against bank conflicts
 constexpr int kRowsStride = 40;   // of the sums of a value over rows of pixels; the same
-static_assert(kRowsStride * kValues * sizeof(float) <= kHeld * kShareStride * sizeof(Share), "");
+static_assert(kRowsStride * kValuesOf<true> * sizeof(float) <= kHeld * kShareStride * sizeof(Share), "");
 
 // What is needed of a batch's entries until their pairs are added up.
 struct Batch {
@@ -44,6 +48,7 @@ struct Batch {
     uint32_t took_part[kBatch];  // bit k: the k-th warp of those that might blend the entry did
 };
 
+template <bool kWithSize>
 struct Shared {
     Record<float> record[kBatch + 1];      // the last is one that nothing shows of
     uint32_t warps[kBatch];                // bit w: warp w may blend the entry
@@ -54,11 +59,11 @@ struct Shared {
                   [kWarpWidth + 1];  // and by depth; the spare column is against conflicts
     Share share[kWarps][kHeld * kShareStride];
     Batch batch[2];  // one is blended, the other one added up
-    float pair[kPairs][kValues];
+    float pair[kPairs][kValuesOf<kWithSize>];
     float d_background[kWarps][3];
 };
 
-static_assert(sizeof(Shared) <= 99 * 1024, "the most that a block can have on every device");
+static_assert(sizeof(Shared<true>) <= 99 * 1024, "the most that a block can have on every device");
 
 // Parts of the tile, one bit a warp, that the record may reach. Compares without rounding to pixel centres: a
 // tile marks the slots of all records that it lists for a warp, and those decide which gaussians get zeros.
@@ -114,8 +119,9 @@ __device__ PixelGradient read_pixel(const RasterizeBackwardInput& in, int column
 
 // Sums over the warp's pixels for the gaussians it holds; `entry` is the place in the batch of the one this
 // lane works on, (left, top) the centre of the warp's first pixel. Lane = row of pixels * kHeld + gaussian.
-template <bool kWithDepth>
-__device__ void add_up(Shared& s, Batch& batch, int warp, int held, int entry, float left, float top) {
+template <bool kWithDepth, bool kWithSize>
+__device__ void add_up(Shared<kWithSize>& s, Batch& batch, int warp, int held, int entry, float left,
+                       float top) {
     const int lane = threadIdx.x % 32, gaussian = lane % kHeld, row = lane / kHeld;
     __syncwarp();
     const Record<float>& g = s.record[entry];
@@ -123,6 +129,7 @@ __device__ void add_up(Shared& s, Batch& batch, int warp, int held, int entry, f
     const Share* shares = &s.share[warp][gaussian * kShareStride + kWarpWidth * row];
     const float4* d_colors = s.d_color[warp][row];
     RowSums<float> sums{};
+    CenterSize<float> size{};
     float color[3] = {0, 0, 0}, depth = 0;
     Falloff<float> f;
 #pragma unroll
@@ -131,6 +138,7 @@ __device__ void add_up(Shared& s, Batch& batch, int warp, int held, int entry, f
         const float4 d_color = d_colors[i];
         f = falloff_at(float(i), float(row), u, v, l11, l12, l22, 0.0f);
         sums.add(f, share.d_exponent);
+        if (kWithSize) size += size_of_center_vjp(l11, l12, l22, f, share.d_exponent);
         color[0] += d_color.x * share.weight;
         color[1] += d_color.y * share.weight;
         color[2] += d_color.z * share.weight;
@@ -139,8 +147,9 @@ __device__ void add_up(Shared& s, Batch& batch, int warp, int held, int entry, f
     const Ellipse<float> d = falloff_vjp(l11, l12, l22, sums.of_falloff(f));
 
     // Over the rows, in the place of the shares: lane l adds up the values l / kHeld, l / kHeld + 4, ...
-    const float value[kValues] = {d.u,   d.v,      d.l11,    d.l12,   d.l22, d.log2_opacity,
-                                  depth, color[0], color[1], color[2]};
+    constexpr int kValues = kValuesOf<kWithSize>;
+    const float value[kValuesOf<true>] = {d.u,   d.v,      d.l11,    d.l12,    d.l22,  d.log2_opacity,
+                                          depth, color[0], color[1], color[2], size.u, size.v};
     float* of_rows = reinterpret_cast<float*>(s.share[warp]);
     __syncwarp();
 #pragma unroll
@@ -173,9 +182,9 @@ __device__ Share blend_vjp(const Record<float>& g, PixelGradient& p) {
 }
 
 // Takes this warp's pixels through the batch.
-template <bool kWithDepth>
-__device__ void blend_batch_vjp(Shared& s, Batch& batch, int warp, int num, PixelGradient& p, float left,
-                                float top) {
+template <bool kWithDepth, bool kWithSize>
+__device__ void blend_batch_vjp(Shared<kWithSize>& s, Batch& batch, int warp, int num, PixelGradient& p,
+                                float left, float top) {
     const int lane = threadIdx.x % 32;
     uint8_t* list = s.list[warp];
     int count = 0;
@@ -200,15 +209,17 @@ __device__ void blend_batch_vjp(Shared& s, Batch& batch, int warp, int num, Pixe
 #pragma unroll
             for (int k = 0; k < kTogether; ++k) shares[(h + k) * kShareStride] = share[k];
         }
-        add_up<kWithDepth>(s, batch, warp, held, list[first + lane % kHeld], left, top);
+        add_up<kWithDepth, kWithSize>(s, batch, warp, held, list[first + lane % kHeld], left, top);
         alive = __any_sync(kAllLanes, p.transmittance > 0) != 0;
     }
     if (!alive && lane == 0) atomicAnd(&s.alive, ~(1u << warp));
 }
 
 // Adds up the pairs of a batch's entries into their slots; `thread` of `num_threads`.
-__device__ void add_up_pairs(const Shared& s, const Batch& batch, int num, int thread, int num_threads,
-                             const GradientSlots& slots) {
+template <bool kWithSize>
+__device__ void add_up_pairs(const Shared<kWithSize>& s, const Batch& batch, int num, int thread,
+                             int num_threads, const GradientSlots& slots) {
+    constexpr int kValues = kValuesOf<kWithSize>;
     for (int i = thread; i < num * kValues; i += num_threads) {
         const int entry = i / kValues, value = i % kValues;
         const uint32_t took_part = batch.took_part[entry];
@@ -217,15 +228,18 @@ __device__ void add_up_pairs(const Shared& s, const Batch& batch, int num, int t
         float sum = 0;
         for (uint32_t todo = took_part; todo != 0; todo &= todo - 1) sum += pair[(__ffs(todo) - 1) * kValues];
         const uint32_t slot = batch.slot[entry];
-        reinterpret_cast<float*>(slots.slot + slot)[value] = sum;
+        if (kWithSize && value >= kGradientValues)
+            reinterpret_cast<float*>(slots.size + slot)[value - kGradientValues] = sum;
+        else
+            reinterpret_cast<float*>(slots.slot + slot)[value] = sum;
         if (value == 0) slots.is_touched[slot] = 1;
     }
 }
 
-template <bool kWithDepth>
+template <bool kWithDepth, bool kWithSize>
 __global__ void __launch_bounds__(kThreads, 2)
     rasterize_backward_kernel(RasterizeBackwardInput in, GradientSlots slots, float* d_background_of_tile) {
-    Shared& s = *reinterpret_cast<Shared*>(shared_memory());
+    Shared<kWithSize>& s = *reinterpret_cast<Shared<kWithSize>*>(shared_memory());
     const int lane = threadIdx.x % 32;
     const int warp =
         __shfl_sync(kAllLanes, static_cast<int>(threadIdx.x) / 32, 0);  // tells that all lanes agree
@@ -289,10 +303,18 @@ __global__ void __launch_bounds__(kThreads, 2)
         }
         // The entries of the batch whose pairs there is room for.
         num = __syncthreads_count(i < min(kBatch, count - first) && end_pair <= kPairs);
-        blend_batch_vjp<kWithDepth>(s, batch, warp, num, p, warp_left + 0.5f, warp_top + 0.5f);
+        blend_batch_vjp<kWithDepth, kWithSize>(s, batch, warp, num, p, warp_left + 0.5f, warp_top + 0.5f);
         first += num;
         __syncthreads();
     }
+}
+
+template <bool kWithDepth, bool kWithSize>
+void start(const RasterizeBackwardInput& in, const GradientSlots& slots, float* d_background_of_tile,
+           cudaStream_t stream) {
+    launch("rasterize_backward_kernel", &rasterize_backward_kernel<kWithDepth, kWithSize>,
+           in.image.tile_columns * in.image.tile_rows, kThreads, sizeof(Shared<kWithSize>), stream, in, slots,
+           d_background_of_tile);
 }
 
 constexpr int kSumThreads = 256;
@@ -315,10 +337,11 @@ __global__ void sum_over_tiles_kernel(const float* of_tile, uint32_t num_tiles, 
 void rasterize_backward(const RasterizeBackwardInput& in, const GradientSlots& slots,
                         float* d_background_of_tile, float* d_background, cudaStream_t stream) {
     const unsigned num_tiles = in.image.tile_columns * in.image.tile_rows;
-    launch(
-        "rasterize_backward_kernel",
-        in.d_picture.depth != nullptr ? &rasterize_backward_kernel<true> : &rasterize_backward_kernel<false>,
-        num_tiles, kThreads, sizeof(Shared), stream, in, slots, d_background_of_tile);
+    const bool with_depth = in.d_picture.depth != nullptr;
+    const auto run = slots.size != nullptr ? with_depth ? &start<true, true> : &start<false, true>
+                     : with_depth          ? &start<true, false>
+                                           : &start<false, false>;
+    run(in, slots, d_background_of_tile, stream);
     launch("sum_over_tiles_kernel", &sum_over_tiles_kernel, 3, kSumThreads, 0, stream, d_background_of_tile,
            num_tiles, d_background);
 }

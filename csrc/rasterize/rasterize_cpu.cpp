@@ -64,10 +64,10 @@ void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t coun
     });
 }
 
-template <class T, bool kWithDepth>
+template <class T, bool kWithDepth, bool kWithSize>
 static void backward(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
                      const Picture<T>& picture, const PictureGradient<T>& d_picture,
-                     RecordGradient<T>* d_entry, T* d_background) {
+                     RecordGradient<T>* d_entry, CenterSize<T>* size, T* d_background) {
     TilePlanes<T> tile;
     constexpr Extra kExtra = kWithDepth ? Extra::kDepth : Extra::kNothing;
     blend_tile<T, kExtra>(records, entry, count, left, top, picture.window, StopsBefore{}, tile);
@@ -98,25 +98,27 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
         const Record<T>& g = records[record_of(entry[i])];
         const uint64_t blocks = live_blocks(g, left, top, alive);
         if (blocks != 0)
-            blend_record_vjp<T, kWithDepth>(g, blocks, left, top, pixels, grad, tile, alive, d_entry[i]);
+            blend_record_vjp<T, kWithDepth, kWithSize>(g, blocks, left, top, pixels, grad, tile, alive,
+                                                       d_entry[i], kWithSize ? size + i : nullptr);
     }
 }
 
 template <class T>
 void rasterize_tile_backward(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
                              const Picture<T>& picture, const PictureGradient<T>& d_picture,
-                             RecordGradient<T>* d_entry, T* d_background) {
-    if (d_picture.depth != nullptr)
-        backward<T, true>(records, entry, count, left, top, picture, d_picture, d_entry, d_background);
-    else
-        backward<T, false>(records, entry, count, left, top, picture, d_picture, d_entry, d_background);
+                             RecordGradient<T>* d_entry, CenterSize<T>* size, T* d_background) {
+    const bool with_depth = d_picture.depth != nullptr;
+    const auto run = size != nullptr ? with_depth ? &backward<T, true, true> : &backward<T, false, true>
+                     : with_depth    ? &backward<T, true, false>
+                                     : &backward<T, false, false>;
+    run(records, entry, count, left, top, picture, d_picture, d_entry, size, d_background);
 }
 
 #define V3DG_INSTANTIATE(T)                                                                                  \
     template void rasterize_tile<T>(const Record<T>*, const uint64_t*, size_t, int, int, const Picture<T>&); \
     template void rasterize_tile_backward<T>(const Record<T>*, const uint64_t*, size_t, int, int,            \
                                              const Picture<T>&, const PictureGradient<T>&,                   \
-                                             RecordGradient<T>*, T*);
+                                             RecordGradient<T>*, CenterSize<T>*, T*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)
 #undef V3DG_INSTANTIATE

@@ -124,6 +124,13 @@ struct RowSums {
     }
 };
 
+// What a pixel adds to the size of the gradient of the centre: both parts of falloff_vjp(), without sign.
+template <class V>
+V3DG_HD V3DG_INLINE CenterSize<V> size_of_center_vjp(V l11, V l12, V l22, const Falloff<V>& f, V d_exponent) {
+    const V d_u = 2 * l11 * f.t1 * d_exponent, d_v = 2 * (l12 * f.t1 + l22 * f.t2) * d_exponent;
+    return {max_of(d_u, -d_u), max_of(d_v, -d_v)};
+}
+
 // Gradient of the ellipse: t1 = l11 dx + l12 dy and t2 = l22 dy, with dx = x - u and dy = y - v.
 template <class T>
 V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSums<T>& d) {

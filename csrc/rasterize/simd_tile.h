@@ -165,17 +165,19 @@ V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int
 
 // Gradients of one record. Takes the same steps on the same numbers as blend_record(), front to back, so that
 // the same pixels take part: `tile` starts empty again, and its color[0] holds the running sum. Returns false
-// where no pixel of the tile took part.
-template <class T, bool kWithDepth>
+// where no pixel of the tile took part. `size` is written where kWithSize.
+template <class T, bool kWithDepth, bool kWithSize = false>
 V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left, int top,
                                   const BlockPixels<T>& pixels, const TileGradient<T>& grad,
-                                  TilePlanes<T>& tile, uint64_t& alive, RecordGradient<T>& out) {
+                                  TilePlanes<T>& tile, uint64_t& alive, RecordGradient<T>& out,
+                                  CenterSize<T>* size = nullptr) {
     using V = Vec<T>;
     const V l11 = all_lanes<V>(g.l11), l12 = all_lanes<V>(g.l12), l22 = all_lanes<V>(g.l22);
     const V log2_opacity = all_lanes<V>(g.log2_opacity);
     const T u = g.u - T(left), v = g.v - T(top);
     V s_t1 = V{}, s_t2 = V{}, s_t1_dx = V{}, s_t1_dy = V{}, s_t2_dy = V{}, s_exponent = V{};
     V s_color[3] = {V{}, V{}, V{}}, s_depth = V{};
+    CenterSize<V> s_size{V{}, V{}};
     bool took_part = false;
     while (blocks != 0) {
         const int block = __builtin_ctzll(blocks);
@@ -221,6 +223,7 @@ V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left,
             s_t1_dx += d_t1 * f.dx;
             s_t1_dy += d_t1 * f.dy;
             s_t2_dy += d_t2 * f.dy;
+            if (kWithSize) s_size += size_of_center_vjp(l11, l12, l22, f, d_exponent);
         }
         took_part |= touched != 0;
         if (live == 0) alive &= ~(uint64_t(1) << block);
@@ -231,6 +234,7 @@ V3DG_INLINE bool blend_record_vjp(const Record<T>& g, uint64_t blocks, int left,
                                              sum_of(s_t1_dy), sum_of(s_t2_dy)});
     for (int c = 0; c < 3; ++c) out.color[c] = sum_of(s_color[c]);
     out.ellipse.depth = kWithDepth ? sum_of(s_depth) : T(0);
+    if (kWithSize) *size = {sum_of(s_size.u), sum_of(s_size.v)};
     return true;
 }
 

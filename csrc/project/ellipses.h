@@ -1,0 +1,72 @@
+#pragma once
+
+// Where gaussians lie on an image, for those who train them: of each one, whether or not it is drawn.
+
+#include <cstdint>
+
+#include "base/stream.h"
+#include "project/project_math.h"
+
+namespace v3dg {
+
+// Arrays of N gaussians. Zeros for those that are not in sight: before the near plane or behind the far
+// depth, nowhere an alpha of 1/255, outside of the image, or within `min_radius_px` of their centres.
+template <class T>
+struct Ellipses {
+    T* centers;      // (N, 2) px
+    T* depths;       // (N,)
+    T* conics;       // (N, 3) inverses of the covariances as xx, xy, yy, 1 / px²
+    T* opacities;    // (N,) as they are blended, compensation included
+    int32_t* radii;  // (N, 2) px from the centre within which alpha is 1/255 or more, rounded up
+};
+
+template <class T>
+struct EllipsesInput {
+    GaussianRows<const T> rows;
+    ModelView<T> view;
+    Pinhole<T> camera;
+    T filter_px2;
+    bool antialiased;
+    T far_depth, min_radius_px;
+
+    V3DG_HD void write(size_t i, const Ellipses<T>& out) const {
+        Gaussian3d<T> g;
+        for (int k = 0; k < 3; ++k) g.mean[k] = rows.means[3 * i + k];
+        for (int k = 0; k < 4; ++k) g.quat[k] = rows.quats[4 * i + k];
+        for (int k = 0; k < 3; ++k) g.scale[k] = rows.scales[3 * i + k];
+        g.opacity = rows.opacities[i];
+        Projection<T> s;
+        to_view(view, g.mean, s.p);
+        const Ellipse<T> e = project_gaussian(g, view, camera, filter_px2, antialiased, s);
+        T half_x, half_y;
+        const bool is_drawable = extent_of(g.opacity, e, s, half_x, half_y);
+        const int32_t x = rounded_up(half_x), y = rounded_up(half_y);
+        const bool is_seen = is_drawable & (s.p[2] >= camera.near_depth) & (s.p[2] <= far_depth) &
+                             meets_image(e.u, T(x), camera.width) & meets_image(e.v, T(y), camera.height) &
+                             ((T(x) > min_radius_px) | (T(y) > min_radius_px));
+        out.centers[2 * i] = is_seen ? e.u : T(0);
+        out.centers[2 * i + 1] = is_seen ? e.v : T(0);
+        out.depths[i] = is_seen ? e.depth : T(0);
+        out.conics[3 * i] = is_seen ? s.c22 / s.det : T(0);
+        out.conics[3 * i + 1] = is_seen ? -s.c12 / s.det : T(0);
+        out.conics[3 * i + 2] = is_seen ? s.c11 / s.det : T(0);
+        out.opacities[i] = !is_seen ? T(0) : antialiased ? g.opacity * sqrt_of(s.det0 / s.det) : g.opacity;
+        out.radii[2 * i] = is_seen ? x : 0;
+        out.radii[2 * i + 1] = is_seen ? y : 0;
+    }
+
+  private:
+    // Means nothing for what is not a number.
+    static V3DG_HD int32_t rounded_up(T x) {
+        const auto whole = static_cast<int32_t>(min_of(max_of(x, T(0)), T(1 << 30)));
+        return whole + (T(whole) < x ? 1 : 0);
+    }
+};
+
+namespace cpu {
+template <class T>
+void ellipses(const EllipsesInput<T>& in, const Ellipses<T>& out);
+}  // namespace cpu
+namespace cuda { void ellipses(const EllipsesInput<float>& in, const Ellipses<float>& out, Stream stream); }
+
+}  // namespace v3dg
