@@ -50,6 +50,15 @@ def test_donuts_are_seen_and_fall(film):
     assert rows[-1] > rows[0] + 3, "further down in the picture"
 
 
+def test_what_is_trained_looks_like_the_donut(tmp_path, device):
+    example = load_example("train")
+    path = tmp_path / "trained.ply"
+    few = {"gaussians": 300, "pictures": 8, "size": (64, 48), "device": device}
+    before = example.main(example.Config(path, steps=0, **few))
+    assert example.main(example.Config(path, steps=60, **few)) > before + 6
+    assert len(v3dg.read_asset(path)) == 300
+
+
 @pytest.fixture
 def gsplat_example(tmp_path):
     """The example, and its settings for a field of small donuts."""

@@ -49,11 +49,9 @@ def rasterize(
             on a CUDA device.
         RuntimeError: The gaussians are on a CUDA device, and v3dg was built without CUDA.
     """
-    options: dict[str, Any] = {
-        "filter_px2": real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0),
-        "antialiased": bool(antialiased),
-        "with_depth": True,
-    }
+    filter_px2 = real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0)
+    options: dict[str, Any] = {"filter_px2": filter_px2, "antialiased": bool(antialiased)}
+    options["with_depth"] = True
     shade = color(background, "background")
     if isinstance(gaussians.means, np.ndarray):
         planes = _core.rasterize(gaussians.rows, camera.core, background=shade, keep_tape=False, **options)
@@ -79,7 +77,7 @@ def joined(parts: Sequence[Any]) -> Any:
     """Tensors stacked, a single one without a copy."""
     import torch
 
-    return parts[0][None] if len(parts) == 1 else torch.stack(list(parts))
+    return parts[0].unsqueeze(0) if len(parts) == 1 else torch.stack(list(parts))
 
 
 def draw_views(cameras: Any, options: dict[str, Any], inputs: Any, centers: Any = None) -> tuple[Any, ...]:

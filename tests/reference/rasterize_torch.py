@@ -42,7 +42,7 @@ def _sh_basis(directions, degree):
     return torch.stack([f for band in bands for f in band], dim=1) / math.sqrt(math.pi)
 
 
-def project(means, quats, scales, sh, camera, filter_px2=0.0):
+def project(means, quats, scales, sh, camera, filter_px2=0.0, plain_colors=False):
     """(N,2) means in px; (N,4) covariance in px² as xx, xy, yy and its determinant; depth, compensation (N,);
     colour (N,3)."""
     viewmat = torch.as_tensor(camera.viewmat, dtype=torch.float64)
@@ -67,14 +67,30 @@ def project(means, quats, scales, sh, camera, filter_px2=0.0):
     blurred = sharp + filter_px2 * (a + c) + filter_px2**2
     a, c = a + filter_px2, c + filter_px2
     compensation = (sharp / blurred).sqrt()
-    basis = _sh_basis(means - eye, math.isqrt(sh.shape[1]) - 1)
-    colors = ((basis[:, :, None] * sh).sum(1) + 0.5).clamp(min=0)
+    colors = sh[:, 0]
+    if not plain_colors:
+        basis = _sh_basis(means - eye, math.isqrt(sh.shape[1]) - 1)
+        colors = ((basis[:, :, None] * sh).sum(1) + 0.5).clamp(min=0)
     return torch.stack(image, dim=1), torch.stack([a, b, c, blurred], dim=1), depth, compensation, colors
 
 
-def rasterize(means, quats, scales, opacities, sh, background, camera, *, filter_px2=0.0, antialiased=False):
+def rasterize(
+    means,
+    quats,
+    scales,
+    opacities,
+    sh,
+    background,
+    camera,
+    *,
+    filter_px2=0.0,
+    antialiased=False,
+    plain_colors=False,
+):
     """Colour (H,W,3), alpha (H,W), expected depth (H,W); differentiable in the first six."""
-    image, covariance, depth, compensation, colors = project(means, quats, scales, sh, camera, filter_px2)
+    image, covariance, depth, compensation, colors = project(
+        means, quats, scales, sh, camera, filter_px2, plain_colors
+    )
     if antialiased:
         opacities = opacities * compensation
     a, b, _, determinant = covariance.unbind(1)

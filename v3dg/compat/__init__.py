@@ -1,0 +1,1 @@
+"""Stand-ins for functions of other packages, with their arguments and results."""
