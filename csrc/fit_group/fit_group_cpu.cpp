@@ -7,7 +7,7 @@
 #include "fit_group/fit_group_math.h"
 #include "project/project.h"
 #include "rasterize/rasterize.h"
-#include "rasterize/simd_tile.h"
+#include "rasterize/simd_blend.h"
 #include "tile_bin/tile_bin.h"
 
 // One thread fits one group, start to end. The group's frame has its ball at the origin with radius 1, so
@@ -45,15 +45,11 @@ static bool misses_tile(const Record<float>& g, int left, int top) {
 // Blends records in this order.
 static void blend_sorted(const FitScratch& scratch, const uint64_t* order, size_t count, int left, int top,
                          int size, TilePlanes<float>& tile) {
-    const BlockPixels<float> pixels;
-    uint64_t alive = clear_tile(tile, left, top, square(size), Extra::kNothing);
-    for (size_t i = 0; i < count && alive != 0; ++i) {
-        const Record<float>& g = scratch.records.data()[record_of(order[i])];
-        if (misses_tile(g, left, top)) continue;
-        const uint64_t blocks = live_blocks(g, left, top, alive);
-        if (blocks != 0)
-            blend_record<float, Extra::kNothing>(g, blocks, left, top, pixels, StopsBefore{}, tile, alive);
-    }
+    blend_tile<float, Extra::kNothing>(
+        count, left, top, square(size), StopsBefore{}, tile, [&](size_t i) -> const Record<float>* {
+            const Record<float>& g = scratch.records.data()[record_of(order[i])];
+            return misses_tile(g, left, top) ? nullptr : &g;
+        });
 }
 
 static int place_in_tile(int x, int y) {

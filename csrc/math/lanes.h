@@ -199,6 +199,16 @@ V3DG_INLINE unsigned bits_of(Mask mask) {
     return bits;
 }
 
+// Bit i is set where the sign of lane i is.
+template <class V>
+V3DG_INLINE unsigned sign_bits_of(V x) {
+    using Mask = decltype(x < x);
+#if defined(__SSE2__)
+    if constexpr (sizeof(x[0]) == 4) return bits_of((Mask)x);  // which looks at nothing else
+#endif
+    return bits_of((Mask)x >> (8 * sizeof(x[0]) - 1));
+}
+
 // 2^x for x in [-126, 127], relative error below 2^-22; anything for others. The integer part of x goes into
 // the exponent, a polynomial of least maximum relative error on [-1/2, 1/2] gives the rest.
 V3DG_INLINE Vec<float> exp2_in_range(Vec<float> x) {
@@ -322,11 +332,12 @@ V3DG_HD V3DG_INLINE V min_of(V a, V b) {
     return a < b ? a : b;
 }
 
-// The same number in every lane.
+// The same number in every lane. Zero is taken away, not added, which leaves every number what it is, so that
+// the compiler does not do it.
 template <class V>
 V3DG_HD V3DG_INLINE V all_lanes(Lane<V> x) {
     if constexpr (std::is_arithmetic<V>::value) return x;
-    return V{} + x;
+    return x - V{};
 }
 
 }  // namespace v3dg

@@ -1,12 +1,12 @@
 #include "rasterize/rasterize.h"
 
-#include "rasterize/simd_tile.h"
+#include "rasterize/simd_blend.h"
 
 namespace v3dg {
 namespace V3DG_ISA {
 
 // Far enough ahead that a record arrives from memory before it is its turn.
-constexpr size_t kPrefetch = 12;
+constexpr size_t kPrefetch = 48;
 
 template <class T>
 static V3DG_INLINE void prefetch(const Record<T>* records, const uint64_t* entry, size_t i, size_t count) {
@@ -17,16 +17,12 @@ static V3DG_INLINE void prefetch(const Record<T>* records, const uint64_t* entry
 }
 
 template <class T, Extra kExtra, class Stop>
-static void blend_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
-                       const Window& window, Stop stop, TilePlanes<T>& tile) {
-    const BlockPixels<T> pixels;
-    uint64_t alive = clear_tile(tile, left, top, window, kExtra);
-    for (size_t i = 0; i < count && alive != 0; ++i) {
+static void blend_entries(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
+                          const Window& window, Stop stop, TilePlanes<T>& tile) {
+    blend_tile<T, kExtra>(count, left, top, window, stop, tile, [&](size_t i) {
         prefetch(records, entry, i, count);
-        const Record<T>& g = records[record_of(entry[i])];
-        const uint64_t blocks = live_blocks(g, left, top, alive);
-        if (blocks != 0) blend_record<T, kExtra>(g, blocks, left, top, pixels, stop, tile, alive);
-    }
+        return records + record_of(entry[i]);
+    });
 }
 
 // Calls visit(place in the tile, place in the picture) for the pixels of a tile that are in the window.
@@ -47,11 +43,11 @@ void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t coun
     TilePlanes<T> tile;
     with_stop<T>(picture.min_transmittance, [&](auto stop) {
         if (picture.count != nullptr)
-            blend_tile<T, Extra::kCount>(records, entry, count, left, top, picture.window, stop, tile);
+            blend_entries<T, Extra::kCount>(records, entry, count, left, top, picture.window, stop, tile);
         else if (picture.depth != nullptr)
-            blend_tile<T, Extra::kDepth>(records, entry, count, left, top, picture.window, stop, tile);
+            blend_entries<T, Extra::kDepth>(records, entry, count, left, top, picture.window, stop, tile);
         else
-            blend_tile<T, Extra::kNothing>(records, entry, count, left, top, picture.window, stop, tile);
+            blend_entries<T, Extra::kNothing>(records, entry, count, left, top, picture.window, stop, tile);
     });
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
@@ -70,7 +66,7 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
                      RecordGradient<T>* d_entry, CenterSize<T>* size, T* d_background) {
     TilePlanes<T> tile;
     constexpr Extra kExtra = kWithDepth ? Extra::kDepth : Extra::kNothing;
-    blend_tile<T, kExtra>(records, entry, count, left, top, picture.window, StopsBefore{}, tile);
+    blend_entries<T, kExtra>(records, entry, count, left, top, picture.window, StopsBefore{}, tile);
     TileGradient<T> grad = {};
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];

@@ -112,7 +112,10 @@ inline uint64_t clear_tile(TilePlanes<T>& tile, int left, int top, const Window&
 template <class T>
 struct BlockPixels {
     alignas(64) T x[kBlockPixels], y[kBlockPixels];  // centres, from the block's corner
+    alignas(64) T corner[kTileBlocks][kLanes<T>];    // of a block in the tile, the same in every lane
     BlockPixels() {
+        for (int k = 0; k < kTileBlocks; ++k)
+            for (T& lane : corner[k]) lane = T(kBlockSize * k);
         for (int i = 0; i < kBlockPixels; ++i) {
             x[i] = T(i % kBlockSize) + T(0.5);
             y[i] = T(i / kBlockSize) + T(0.5);
@@ -120,50 +123,7 @@ struct BlockPixels {
     }
 };
 
-// Blends one record over the live blocks of a tile; clears the bits of blocks that have stopped.
-template <class T, Extra kExtra, class Stop>
-V3DG_INLINE void blend_record(const Record<T>& g, uint64_t blocks, int left, int top,
-                              const BlockPixels<T>& pixels, Stop stop, TilePlanes<T>& tile, uint64_t& alive) {
-    using V = Vec<T>;
-    const V l11 = all_lanes<V>(g.l11), l12 = all_lanes<V>(g.l12), l22 = all_lanes<V>(g.l22);
-    const V log2_opacity = all_lanes<V>(g.log2_opacity);
-    const V red = all_lanes<V>(g.color[0]), green = all_lanes<V>(g.color[1]), blue = all_lanes<V>(g.color[2]);
-    const T u = g.u - T(left), v = g.v - T(top);
-    while (blocks != 0) {
-        const int block = __builtin_ctzll(blocks);
-        blocks &= blocks - 1;
-        const V center_u = all_lanes<V>(u - T(kBlockSize * (block % kTileBlocks)));
-        const V center_v = all_lanes<V>(v - T(kBlockSize * (block / kTileBlocks)));
-        unsigned touched = 0;
-        V alpha[kBlockPixels / kLanes<T>];
-        for (int part = 0; part < kBlockPixels / kLanes<T>; ++part) {
-            const V x = load(pixels.x + part * kLanes<T>), y = load(pixels.y + part * kLanes<T>);
-            const Falloff<V> f = falloff_at(x, y, center_u, center_v, l11, l12, l22, log2_opacity);
-            touched |= bits_of(contributes(f));
-            alpha[part] = alpha_of(f);
-        }
-        if (touched == 0) continue;
-        unsigned live = 0;
-        for (int part = 0; part < kBlockPixels / kLanes<T>; ++part) {
-            const int p = kBlockPixels * block + part * kLanes<T>;
-            V t = load(tile.transmittance + p);
-            const V weight = blend_weight(alpha[part], t, stop);
-            store(tile.transmittance + p, t);
-            live |= bits_of(t > V{});
-            store(tile.color[0] + p, load(tile.color[0] + p) + weight * red);
-            store(tile.color[1] + p, load(tile.color[1] + p) + weight * green);
-            store(tile.color[2] + p, load(tile.color[2] + p) + weight * blue);
-            if (kExtra == Extra::kDepth) store(tile.extra + p, load(tile.extra + p) + weight * g.depth);
-            if (kExtra == Extra::kCount) {
-                const V one = weight > V{} ? all_lanes<V>(T(1)) : V{};
-                store(tile.extra + p, load(tile.extra + p) + one);
-            }
-        }
-        if (live == 0) alive &= ~(uint64_t(1) << block);
-    }
-}
-
-// Gradients of one record. Takes the same steps on the same numbers as blend_record(), front to back, so that
+// Gradients of one record. Takes the same steps on the same numbers as blend_block(), front to back, so that
 // the same pixels take part: `tile` starts empty again, and its color[0] holds the running sum. Returns false
 // where no pixel of the tile took part. `size` is written where kWithSize.
 template <class T, bool kWithDepth, bool kWithSize = false>

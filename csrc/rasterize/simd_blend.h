@@ -1,0 +1,148 @@
+#pragma once
+
+// Blending one tile, front to back: a batch of records is sorted into the blocks that they may change, then
+// each block takes its own, with its pixels in registers.
+
+#include "rasterize/simd_tile.h"
+
+namespace v3dg {
+namespace V3DG_ISA {
+
+// So many that a block finds several of its own, so few that all stay in the first-level cache.
+constexpr int kBatchSize = 256;
+// And so few blocks of theirs in all, that where records are large, not many are taken that turn out to be
+// hidden.
+constexpr int kBatchBlocks = 1024;
+
+// What blending reads of a record; its centre is in px from the tile's corner.
+template <class T>
+struct BatchRecord {
+    T u, v, l11, l12, l22, log2_opacity;
+    T color[3];
+    T depth;
+};
+
+// Records of a tile, front to back, and places among them by block.
+template <class T>
+struct Batch {
+    int size;
+    const Record<T>* source[kBatchSize];
+    uint64_t blocks[kBatchSize];  // that a record may change
+    BatchRecord<T> record[kBatchSize];
+    uint16_t count[kTileBlocks * kTileBlocks];
+    uint8_t place[kTileBlocks * kTileBlocks][kBatchSize];
+};
+
+// Takes records from the i-th on until the batch is full: those whose boxes meet live blocks. Whether one
+// does is as good as random, so there is no branch on it.
+template <class T, class RecordAt>
+V3DG_INLINE size_t take_live(size_t i, size_t count, int left, int top, uint64_t alive,
+                             const RecordAt& record_at, Batch<T>& batch) {
+    int size = 0, num_blocks = 0;
+    for (; i < count && size < kBatchSize && num_blocks < kBatchBlocks; ++i) {
+        const Record<T>* g = record_at(i);
+        if (g == nullptr) continue;
+        const uint64_t blocks = blocks_of(*g, left, top) & alive;
+        batch.source[size] = g;
+        batch.blocks[size] = blocks;
+        size += blocks != 0;
+        num_blocks += __builtin_popcountll(blocks);
+    }
+    batch.size = size;
+    return i;
+}
+
+// Leaves of each record's blocks what its ellipse reaches, and sorts the records into the blocks.
+template <class T>
+V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
+    uint8_t many[kBatchSize];
+    int num_many = 0;
+    for (int i = 0; i < batch.size; ++i) {
+        many[num_many] = static_cast<uint8_t>(i);
+        num_many += __builtin_popcountll(batch.blocks[i]) >= kFewBlocks;
+    }
+    for (int k = 0; k < num_many; ++k) {
+        uint64_t& blocks = batch.blocks[many[k]];
+        blocks = blocks_of_ellipse(*batch.source[many[k]], left, top, blocks);
+    }
+    for (uint16_t& n : batch.count) n = 0;
+    for (int i = 0; i < batch.size; ++i) {
+        const Record<T>& g = *batch.source[i];
+        batch.record[i] = {g.u - T(left),
+                           g.v - T(top),
+                           g.l11,
+                           g.l12,
+                           g.l22,
+                           g.log2_opacity,
+                           {g.color[0], g.color[1], g.color[2]},
+                           g.depth};
+        for (uint64_t blocks = batch.blocks[i]; blocks != 0; blocks &= blocks - 1) {
+            const int block = __builtin_ctzll(blocks);
+            batch.place[block][batch.count[block]++] = static_cast<uint8_t>(i);
+        }
+    }
+}
+
+// Blends a batch's records over one block. Returns whether a pixel of it goes on.
+template <class T, Extra kExtra, class Stop>
+V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels<T>& pixels, Stop stop,
+                             TilePlanes<T>& tile) {
+    using V = Vec<T>;
+    constexpr unsigned kAllStopped = (1u << kLanes<T>)-1;
+    const V block_u = load(pixels.corner[block % kTileBlocks]),
+            block_v = load(pixels.corner[block / kTileBlocks]);
+    const uint8_t* place = batch.place[block];
+    const uint8_t* end = place + batch.count[block];
+    bool goes_on = false;
+    for (int part = 0; part < kBlockPixels / kLanes<T>; ++part) {
+        const int p = kBlockPixels * block + part * kLanes<T>;
+        const V x = load(pixels.x + part * kLanes<T>), y = load(pixels.y + part * kLanes<T>);
+        V t = load(tile.transmittance + p), red = load(tile.color[0] + p), green = load(tile.color[1] + p),
+          blue = load(tile.color[2] + p), extra = kExtra == Extra::kNothing ? V{} : load(tile.extra + p);
+        if (sign_bits_of(t) == kAllStopped) continue;
+        for (const uint8_t* at = place; at != end; ++at) {
+            const BatchRecord<T>& g = batch.record[*at];
+            const Falloff<V> f = falloff_at(x, y, all_lanes<V>(g.u) - block_u, all_lanes<V>(g.v) - block_v,
+                                            all_lanes<V>(g.l11), all_lanes<V>(g.l12), all_lanes<V>(g.l22),
+                                            all_lanes<V>(g.log2_opacity));
+            // Where a vector is a block, few are not reached.
+            if (kLanes<T> < kBlockPixels && bits_of(contributes(f)) == 0) continue;
+            const V weight = blend_weight(alpha_of(f), t, stop);
+            red += weight * all_lanes<V>(g.color[0]);
+            green += weight * all_lanes<V>(g.color[1]);
+            blue += weight * all_lanes<V>(g.color[2]);
+            if (kExtra == Extra::kDepth) extra += weight * all_lanes<V>(g.depth);
+            if (kExtra == Extra::kCount) extra += weight > V{} ? all_lanes<V>(T(1)) : V{};
+            if (sign_bits_of(t) == kAllStopped) break;
+        }
+        store(tile.transmittance + p, t);
+        store(tile.color[0] + p, red);
+        store(tile.color[1] + p, green);
+        store(tile.color[2] + p, blue);
+        if (kExtra != Extra::kNothing) store(tile.extra + p, extra);
+        goes_on |= sign_bits_of(t) != kAllStopped;
+    }
+    return goes_on;
+}
+
+// Blends `count` records front to back over a tile, which starts empty. record_at(i) points to one, or is
+// null where its box does not meet the tile.
+template <class T, Extra kExtra, class Stop, class RecordAt>
+V3DG_INLINE void blend_tile(size_t count, int left, int top, const Window& window, Stop stop,
+                            TilePlanes<T>& tile, const RecordAt& record_at) {
+    const BlockPixels<T> pixels;
+    uint64_t alive = clear_tile(tile, left, top, window, kExtra);
+    Batch<T> batch;
+    for (size_t i = 0; i < count && alive != 0;) {
+        i = take_live(i, count, left, top, alive, record_at, batch);
+        sort_into_blocks(left, top, batch);
+        for (uint64_t blocks = alive; blocks != 0; blocks &= blocks - 1) {
+            const int block = __builtin_ctzll(blocks);
+            if (batch.count[block] != 0 && !blend_block<T, kExtra>(batch, block, pixels, stop, tile))
+                alive &= ~(uint64_t(1) << block);
+        }
+    }
+}
+
+}  // namespace V3DG_ISA
+}  // namespace v3dg
