@@ -2,6 +2,8 @@
 
 // Memory on the host that grows by forgetting what it held.
 
+#include <sys/mman.h>
+
 #include <cstdlib>
 #include <new>
 #include <utility>
@@ -9,6 +11,19 @@
 #include "base/span.h"
 
 namespace v3dg {
+
+// Memory that begins at a cache line, or null; much of it in huge pages where the system has them, because
+// what is read here and there would wait for the table of pages.
+inline void* allocate_pages(size_t bytes) {
+    constexpr size_t kHugePage = size_t(2) << 20;
+    const size_t alignment = bytes < 2 * kHugePage ? 64 : kHugePage;
+    bytes = (bytes + alignment - 1) / alignment * alignment;
+    void* memory = std::aligned_alloc(alignment, bytes);
+#ifdef MADV_HUGEPAGE
+    if (memory != nullptr && alignment == kHugePage) madvise(memory, bytes, MADV_HUGEPAGE);
+#endif
+    return memory;
+}
 
 // Owned elements of a plain type, not initialised. Grows by forgetting what it held.
 template <class T>
@@ -31,8 +46,7 @@ class Buffer {
             std::free(data_);
             data_ = nullptr;
             capacity_ = 0;
-            const size_t bytes = (size * sizeof(T) + 63) / 64 * 64;
-            data_ = static_cast<T*>(std::aligned_alloc(64, bytes));
+            data_ = static_cast<T*>(allocate_pages(size * sizeof(T)));
             if (data_ == nullptr) throw std::bad_alloc();
             capacity_ = size;
         }

@@ -14,17 +14,15 @@ namespace v3dg {
 // What one picture needs in between; reused from picture to picture.
 template <class T>
 struct Workspace {
-    // Records of a chunk lie side by side in the order of the draws, chunks in any order.
+    // Records of a chunk lie side by side in the order of the draws, chunks in any order and with gaps.
     Buffer<Record<T>> records;
     Buffer<uint32_t> source;
     Buffer<uint64_t> chunk_first;
     Buffer<uint32_t> chunk_count;
     TileLists lists;
     size_t num_chunks = 0;
-    uint64_t num_records = 0;
-    // A chunk of each thread, before it is known where its records go.
-    Buffer<Record<T>> thread_records;
-    Buffer<uint32_t> thread_source;
+    uint64_t room = 0;       // of the records, gaps included
+    uint64_t most_room = 0;  // that there was: what of theirs may be in memory
 };
 
 struct RenderCounts {
@@ -37,7 +35,7 @@ struct RenderCounts {
 // Draws the picture's window of everything in `draws`: project, bin, sort, blend. Equal depths are blended in
 // the order of the draws. What is too much for memory at once is drawn in bands of tile rows, with the same
 // result. With `keep_source` it is one band, and the workspace can go to render_backward: `source` is then
-// each record's place among the gaussians of all draws. Throws std::length_error past 2^32 gaussians.
+// each record's place among the gaussians of all draws. Throws std::length_error past about 3e9 gaussians.
 // Once `stop` is true, returns soon and leaves the picture and the counts unfinished.
 template <class T>
 RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera, const Picture<T>& picture,

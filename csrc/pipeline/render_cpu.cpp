@@ -47,9 +47,6 @@ static std::vector<Piece> pieces_of(const std::vector<Draw<T>>& draws) {
             pieces.push_back({d, skip, count, total, {}});
             total += count;
         }
-    if (total > UINT32_MAX)
-        throw std::length_error("gaussians: expected at most 4294967295 in one picture, got " +
-                                std::to_string(total));
     return pieces;
 }
 
@@ -66,6 +63,48 @@ static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num
     return chunks;
 }
 
+// Where the records of chunks go. A thread takes a strip of the room and puts one chunk behind the other, so
+// that the memory that is used has few gaps, and that which no record reaches is never touched.
+class RecordRoom {
+  public:
+    RecordRoom(const std::vector<Piece>& pieces, const std::vector<Chunk>& chunks)
+        : mine_(omp_get_max_threads()) {
+        uint64_t total = 0;
+        for (const Chunk& c : chunks) {
+            const uint64_t end = pieces[c.last - 1].first + pieces[c.last - 1].count;
+            longest_ = std::max(longest_, end - pieces[c.first].first);
+            total = end;
+        }
+        // All strips but a thread's last are filled up to the longest chunk.
+        strip_ = 8 * longest_;
+        size_ = total + total / 7 + (mine_.size() + 1) * strip_;
+        if (size_ > UINT32_MAX)
+            throw std::length_error("gaussians: expected at most about 3000000000 in one picture, got " +
+                                    std::to_string(total));
+    }
+    uint64_t size() const { return size_; }
+    uint64_t used() const { return used_; }
+    // Where this thread's next chunk goes, and how many records it has.
+    uint64_t take() {
+        Strip& mine = mine_[omp_get_thread_num()];
+        if (mine.left < longest_) mine = {used_.fetch_add(strip_, std::memory_order_relaxed), strip_};
+        return mine.next;
+    }
+    void keep(uint64_t count) {
+        Strip& mine = mine_[omp_get_thread_num()];
+        mine.next += count;
+        mine.left -= count;
+    }
+
+  private:
+    struct Strip {
+        uint64_t next = 0, left = 0;
+    };
+    uint64_t longest_ = 0, strip_ = 0, size_ = 0;
+    std::atomic<uint64_t> used_{0};
+    std::vector<Strip> mine_;
+};
+
 // Most crowded tiles first, so that no thread is left with one of them at the end.
 static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_tiles) {
     std::vector<uint32_t> order(num_tiles);
@@ -76,10 +115,9 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
     return order;
 }
 
-// Bytes of records and entries that a frame holds at once, or about.
-constexpr double kBandBytes = 768 << 20;
-// With a stop, which is seldom looked at while a band is binned.
-constexpr double kStoppableBandBytes = 96 << 20;
+// Bytes of records and entries that a frame holds at once, or about: few, because they are read here and
+// there.
+constexpr double kBandBytes = 96 << 20;
 // So few gaussians need no look at how much they cover.
 constexpr uint64_t kFewGaussians = 65536;
 
@@ -87,7 +125,7 @@ constexpr uint64_t kFewGaussians = 65536;
 // gaussians of a piece tell where it is drawn and how much it covers.
 template <class T>
 static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
-                                    const Pinhole<T>& camera, const Window& window, double band_bytes) {
+                                    const Pinhole<T>& camera, const Window& window) {
     if (pieces.empty() || pieces.back().first + pieces.back().count <= kFewGaussians) return {window};
     constexpr uint64_t kFew = 16;
     std::vector<Reach> reach(pieces.size());
@@ -112,7 +150,7 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std
             bytes += share;
         }
     }
-    const double num_bands = std::ceil(bytes / band_bytes);
+    const double num_bands = std::ceil(bytes / kBandBytes);
     std::vector<Window> bands{window};
     double above = 0;
     for (int r = 0; r + 1 < grid.rows; ++r) {
@@ -139,51 +177,40 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
     const Window& window = picture.window;
     const TileGrid grid(window);
     const std::vector<Chunk> chunks = chunks_of(pieces, grid.size());
-    uint64_t longest = 0, total = 0;
-    for (const Chunk& c : chunks) {
-        const uint64_t end = pieces[c.last - 1].first + pieces[c.last - 1].count;
-        longest = std::max(longest, end - pieces[c.first].first);
-        total = end;
-    }
-    // Room for the worst case; pages that no record reaches are never touched.
     ws.num_chunks = chunks.size();
-    Record<T>* records = ws.records.reserve(total);
-    uint32_t* source = ws.source.reserve(keep_source ? total : 0);
+    RecordRoom room(pieces, chunks);
+    Record<T>* records = ws.records.reserve(room.size());
+    uint32_t* source = ws.source.reserve(keep_source ? room.size() : 0);
     uint64_t* chunk_first = ws.chunk_first.reserve(chunks.size());
     uint32_t* chunk_count = ws.chunk_count.reserve(chunks.size());
-    const size_t num_threads = omp_get_max_threads();
-    ws.thread_records.reserve(num_threads * longest);
-    ws.thread_source.reserve(keep_source ? num_threads * longest : 0);
-    std::atomic<uint64_t> num_records{0};
+    ws.lists.start(chunks.size(), grid);
     parallel_for(chunks.size(), 1, [&](size_t c) {
-        chunk_first[c] = chunk_count[c] = 0;
-        if (is_stopped(stop)) return;
-        const size_t room = omp_get_thread_num() * longest;
-        Record<T>* mine = ws.thread_records.data() + room;
-        uint32_t* my_source = keep_source ? ws.thread_source.data() + room : nullptr;
+        const uint64_t first = room.take();
         size_t count = 0;
-        for (size_t p = chunks[c].first; p < chunks[c].last; ++p) {
+        for (size_t p = chunks[c].first; p < chunks[c].last && !is_stopped(stop); ++p) {
             Piece& piece = pieces[p];
             if (!is_first && (piece.reach.bottom < window.y0 || piece.reach.top >= window.y1)) continue;
             Reach reach;
-            count += V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, piece.count, camera, window,
-                                       mine + count, keep_source ? my_source + count : nullptr,
-                                       static_cast<uint32_t>(piece.first), reach);
+            count +=
+                V3DG_DISPATCH_ISA(project<T>, draws[piece.draw], piece.skip, piece.count, camera, window,
+                                  records + first + count, keep_source ? source + first + count : nullptr,
+                                  static_cast<uint32_t>(piece.first), reach);
             piece.reach = reach;
         }
-        chunk_first[c] = num_records.fetch_add(count, std::memory_order_relaxed);
+        chunk_first[c] = first;
         chunk_count[c] = static_cast<uint32_t>(count);
-        std::copy_n(mine, count, records + chunk_first[c]);
-        if (keep_source) std::copy_n(my_source, count, source + chunk_first[c]);
+        room.keep(count);
+        bin_chunk(records, first, chunk_count[c], grid, c, ws.lists);
     });
-    ws.num_records = num_records;
+    ws.room = room.used();
+    ws.most_room = std::max(ws.most_room, ws.room);
     const double projected = now();
-    tile_bin(records, RecordChunks{chunk_first, chunk_count, chunks.size()}, grid, ws.lists);
+    join_chunks(chunks.size(), grid, ws.lists);
     const double binned = now();
 
     const uint64_t* offset = ws.lists.offset.data();
     const std::vector<uint32_t> order = tiles_by_load(offset, grid.size());
-    std::vector<Buffer<uint64_t>> scratch(num_threads);
+    std::vector<Buffer<uint64_t>> scratch(omp_get_max_threads());
     parallel_for(order.size(), 1, [&](size_t i) {
         if (is_stopped(stop)) return;
         const uint32_t t = order[i];
@@ -218,10 +245,8 @@ RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
                     bool keep_source, Workspace<T>& ws, const std::atomic<bool>* stop) {
     RenderCounts counts{};
     std::vector<Piece> pieces = pieces_of(draws);
-    const std::vector<Window> bands = keep_source
-                                          ? std::vector<Window>{picture.window}
-                                          : bands_of(draws, pieces, camera, picture.window,
-                                                     stop == nullptr ? kBandBytes : kStoppableBandBytes);
+    const std::vector<Window> bands =
+        keep_source ? std::vector<Window>{picture.window} : bands_of(draws, pieces, camera, picture.window);
     for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b)
         render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws, stop, counts);
     for (const Piece& piece : pieces) {
@@ -247,7 +272,7 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
     const uint64_t* entry = ws.lists.entry.data();
     // Each tile of a record has a gradient slot, the slots of a record side by side in the order of the
     // tiles, so the sum over tiles does not depend on which thread came first.
-    std::vector<uint64_t> first_slot(ws.num_records);
+    std::vector<uint64_t> first_slot(ws.room);
     uint64_t num_slots = 0;
     for (size_t c = 0; c < ws.num_chunks; ++c)
         for (uint64_t r = ws.chunk_first.data()[c], end = r + ws.chunk_count.data()[c]; r < end; ++r) {

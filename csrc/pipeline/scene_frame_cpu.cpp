@@ -25,9 +25,8 @@ class SharedWorkspace {
     }
     // Keeps what the next frame is likely to need, but does not sit on the memory of an exceptional one.
     void give_back(std::unique_ptr<Workspace<float>> workspace) {
-        constexpr size_t kMostRecords = size_t(16) << 20;
-        if (workspace->records.capacity() <= kMostRecords)
-            workspace.reset(kept_.exchange(workspace.release()));
+        constexpr uint64_t kMostRoom = uint64_t(8) << 20;
+        if (workspace->most_room <= kMostRoom) workspace.reset(kept_.exchange(workspace.release()));
     }
 
   private:

@@ -2,6 +2,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <vector>
 
 #include "base/buffer.h"
 #include "frame/image.h"
@@ -23,24 +24,30 @@ struct TileGrid {
     int row(size_t tile) const { return first_row + static_cast<int>(tile / columns); }
 };
 
-// Records in runs, one run a chunk of the draw list: chunk c holds records[first[c] .. first[c] + count[c]).
-struct RecordChunks {
-    const uint64_t* first;
-    const uint32_t* count;
-    size_t size;
-};
-
-// The records that touch each tile t, in the order of the chunks: entries offset[t] to offset[t + 1]. Entries
-// are those of frame/record.h.
+// The records that touch each tile t, in the order of the chunks that they came in: entries offset[t] to
+// offset[t + 1]. Entries are those of frame/record.h.
 struct TileLists {
     Buffer<uint64_t> offset;
     Buffer<uint64_t> entry;
-    Buffer<uint64_t> cursor;  // scratch: (chunk, tile)
     uint64_t num_entries = 0;
+    // The same of each chunk alone.
+    Buffer<uint32_t> chunk_offset;  // (chunk, tile + 1)
+    std::vector<Buffer<uint64_t>> chunk_entry;
+
+    void start(size_t num_chunks, const TileGrid& grid) {
+        chunk_offset.reserve(num_chunks * (grid.size() + 1));
+        if (chunk_entry.size() < num_chunks) chunk_entry.resize(num_chunks);
+    }
 };
 
+// Bins the records of one chunk, which are records[first .. first + count). Best done while they are in the
+// cache. Chunks may be binned at the same time.
 template <class T>
-void tile_bin(const Record<T>* records, const RecordChunks& chunks, const TileGrid& grid, TileLists& out);
+void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid, size_t chunk,
+               TileLists& out);
+
+// Makes one list a tile of those of the chunks.
+void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out);
 
 // Sorts one tile's entries by depth; equal depths stay in their order. `scratch` has room for as many.
 // Double-precision records are ordered by their own depth, which float32 bits do not hold.

@@ -5,8 +5,8 @@
 
 #include "base/parallel_for.h"
 
-// Count, scan, scatter. A chunk counts into a row of its own, so the order of the entries does not depend on
-// which thread took which chunk.
+// Each chunk is counted, scanned and scattered alone, and most reach few tiles; then each tile takes what is
+// its own, chunk by chunk, so the order of the entries does not depend on which thread took which chunk.
 
 namespace v3dg {
 
@@ -19,37 +19,55 @@ static void for_each_tile(const Record<T>& r, const TileGrid& grid, const Visit&
 }
 
 template <class T>
-void tile_bin(const Record<T>* records, const RecordChunks& chunks, const TileGrid& grid, TileLists& out) {
+void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid, size_t chunk,
+               TileLists& out) {
     const size_t num_tiles = grid.size();
-    uint64_t* cursor = out.cursor.reserve(num_tiles * chunks.size);
-    uint64_t* offset = out.offset.reserve(num_tiles + 1);
-    parallel_for(chunks.size, 1, [&](size_t c) {
-        uint64_t* row = cursor + c * num_tiles;
-        std::memset(row, 0, num_tiles * sizeof *row);
-        const Record<T>* record = records + chunks.first[c];
-        for (uint32_t i = 0; i < chunks.count[c]; ++i)
-            for_each_tile(record[i], grid, [&](size_t t) { ++row[t]; });
-    });
+    // Counts, then where a tile's entries begin, then where the next one goes, which ends where the next
+    // tile's begin.
+    uint32_t* offset = out.chunk_offset.data() + chunk * (num_tiles + 1);
     std::memset(offset, 0, (num_tiles + 1) * sizeof *offset);
-    for (size_t c = 0; c < chunks.size; ++c)
-        for (size_t t = 0; t < num_tiles; ++t) {
-            const uint64_t count = cursor[c * num_tiles + t];
-            cursor[c * num_tiles + t] = offset[t + 1];  // entries of earlier chunks in this tile
-            offset[t + 1] += count;
-        }
+    const Record<T>* record = records + first;
+    for (uint32_t i = 0; i < count; ++i) for_each_tile(record[i], grid, [&](size_t t) { ++offset[t + 1]; });
+    uint32_t sum = 0;
+    for (size_t t = 1; t <= num_tiles; ++t) {
+        const uint32_t here = offset[t];
+        offset[t] = sum;
+        sum += here;
+    }
+    uint64_t* entry = out.chunk_entry[chunk].reserve(sum);
+    for (uint32_t i = 0; i < count; ++i) {
+        const float depth = static_cast<float>(record[i].depth);
+        uint32_t bits;  // positive floats order as their bits do
+        std::memcpy(&bits, &depth, sizeof bits);
+        for_each_tile(record[i], grid,
+                      [&](size_t t) { entry[offset[t + 1]++] = uint64_t(bits) << 32 | (first + i); });
+    }
+}
+
+void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out) {
+    const size_t num_tiles = grid.size(), stride = num_tiles + 1;
+    const uint32_t* from = out.chunk_offset.data();
+    uint64_t* offset = out.offset.reserve(stride);
+    std::memset(offset, 0, stride * sizeof *offset);
+    for (size_t c = 0; c < num_chunks; ++c)
+        for (size_t t = 0; t < num_tiles; ++t)
+            offset[t + 1] += from[c * stride + t + 1] - from[c * stride + t];
     for (size_t t = 0; t < num_tiles; ++t) offset[t + 1] += offset[t];
     out.num_entries = offset[num_tiles];
     uint64_t* entry = out.entry.reserve(out.num_entries);
-    parallel_for(chunks.size, 1, [&](size_t c) {
-        uint64_t* row = cursor + c * num_tiles;
-        for (size_t t = 0; t < num_tiles; ++t) row[t] += offset[t];
-        for (uint32_t i = 0; i < chunks.count[c]; ++i) {
-            const uint64_t place = chunks.first[c] + i;
-            const float depth = static_cast<float>(records[place].depth);
-            uint32_t bits;  // positive floats order as their bits do
-            std::memcpy(&bits, &depth, sizeof bits);
-            for_each_tile(records[place], grid,
-                          [&](size_t t) { entry[row[t]++] = uint64_t(bits) << 32 | place; });
+    constexpr size_t kTogether = 16;  // tiles whose offsets in a chunk share a cache line
+    parallel_for((num_tiles + kTogether - 1) / kTogether, 1, [&](size_t group) {
+        const size_t first = group * kTogether, last = std::min(first + kTogether, num_tiles);
+        uint64_t next[kTogether];
+        std::copy(offset + first, offset + last, next);
+        for (size_t c = 0; c < num_chunks; ++c) {
+            const uint32_t* here = from + c * stride;
+            if (here[first] == here[last]) continue;
+            const uint64_t* source = out.chunk_entry[c].data();
+            for (size_t t = first; t < last; ++t) {
+                std::copy(source + here[t], source + here[t + 1], entry + next[t - first]);
+                next[t - first] += here[t + 1] - here[t];
+            }
         }
     });
 }
@@ -67,28 +85,34 @@ void sort_tile<float>(const Record<float>*, uint64_t* entry, size_t count, uint6
         for (size_t i = 0; i < count; ++i) entry[i] = (entry[i] & ~kLow) | scratch[entry[i] & kLow];
         return;
     }
-    // Least significant digit first over the depth bits that differ; stable.
-    constexpr int kDigit = 11;
-    uint64_t any = 0, all = ~uint64_t(0);
+    // Least significant digit first over the bits in which depths differ once the least is taken away;
+    // stable.
+    constexpr int kMostBits = 12;
+    const int most_bits = count < 1024 ? 8 : kMostBits;  // few entries for few counters
+    uint64_t least = ~uint64_t(0), most = 0;
     for (size_t i = 0; i < count; ++i) {
-        any |= entry[i];
-        all &= entry[i];
+        least = std::min(least, entry[i]);
+        most = std::max(most, entry[i]);
     }
-    const uint64_t differ = (any ^ all) >> 32;
+    least = least >> 32 << 32;
+    int bits = 0;
+    while (bits < 32 && (most - least) >> (32 + bits) != 0) ++bits;
+    const int passes = (bits + most_bits - 1) / most_bits;
     uint64_t* from = entry;
     uint64_t* to = scratch;
-    for (int shift = 32; shift < 64; shift += kDigit) {
-        constexpr uint64_t kMask = (1u << kDigit) - 1;
-        if ((differ >> (shift - 32) & kMask) == 0) continue;
-        uint32_t start[1u << kDigit] = {};
-        for (size_t i = 0; i < count; ++i) ++start[from[i] >> shift & kMask];
+    for (int pass = 0; pass < passes; ++pass) {
+        const int digit = (bits + passes - 1) / passes, shift = 32 + pass * digit;
+        const uint64_t mask = (uint64_t(1) << digit) - 1;
+        uint32_t start[1u << kMostBits];
+        std::fill_n(start, mask + 1, 0);
+        for (size_t i = 0; i < count; ++i) ++start[(from[i] - least) >> shift & mask];
         uint32_t sum = 0;
-        for (uint32_t& s : start) {
-            const uint32_t here = s;
-            s = sum;
+        for (uint64_t d = 0; d <= mask; ++d) {
+            const uint32_t here = start[d];
+            start[d] = sum;
             sum += here;
         }
-        for (size_t i = 0; i < count; ++i) to[start[from[i] >> shift & kMask]++] = from[i];
+        for (size_t i = 0; i < count; ++i) to[start[(from[i] - least) >> shift & mask]++] = from[i];
         std::swap(from, to);
     }
     if (from != entry) std::memcpy(entry, from, count * sizeof *entry);
@@ -101,7 +125,8 @@ void sort_tile<double>(const Record<double>* records, uint64_t* entry, size_t co
     });
 }
 
-template void tile_bin<float>(const Record<float>*, const RecordChunks&, const TileGrid&, TileLists&);
-template void tile_bin<double>(const Record<double>*, const RecordChunks&, const TileGrid&, TileLists&);
+template void bin_chunk<float>(const Record<float>*, uint64_t, uint32_t, const TileGrid&, size_t, TileLists&);
+template void bin_chunk<double>(const Record<double>*, uint64_t, uint32_t, const TileGrid&, size_t,
+                                TileLists&);
 
 }  // namespace v3dg
