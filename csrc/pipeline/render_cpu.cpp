@@ -116,8 +116,13 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
 }
 
 // Bytes of records and entries that a frame holds at once, or about: few, because they are read here and
-// there.
-constexpr double kBandBytes = 96 << 20;
+// there, but so many that a band has tiles for all threads. With a stop, which is seldom looked at while a
+// band is binned, the least.
+constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20, kThreadBandBytes = 48 << 20;
+static double band_bytes_of(const std::atomic<bool>* stop) {
+    if (stop != nullptr) return kLeastBandBytes;
+    return std::clamp(kThreadBandBytes * omp_get_max_threads(), kLeastBandBytes, kMostBandBytes);
+}
 // So few gaussians need no look at how much they cover.
 constexpr uint64_t kFewGaussians = 65536;
 
@@ -125,7 +130,7 @@ constexpr uint64_t kFewGaussians = 65536;
 // gaussians of a piece tell where it is drawn and how much it covers.
 template <class T>
 static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
-                                    const Pinhole<T>& camera, const Window& window) {
+                                    const Pinhole<T>& camera, const Window& window, double band_bytes) {
     if (pieces.empty() || pieces.back().first + pieces.back().count <= kFewGaussians) return {window};
     constexpr uint64_t kFew = 16;
     std::vector<Reach> reach(pieces.size());
@@ -150,7 +155,7 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std
             bytes += share;
         }
     }
-    const double num_bands = std::ceil(bytes / kBandBytes);
+    const double num_bands = std::ceil(bytes / band_bytes);
     std::vector<Window> bands{window};
     double above = 0;
     for (int r = 0; r + 1 < grid.rows; ++r) {
@@ -246,7 +251,8 @@ RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
     RenderCounts counts{};
     std::vector<Piece> pieces = pieces_of(draws);
     const std::vector<Window> bands =
-        keep_source ? std::vector<Window>{picture.window} : bands_of(draws, pieces, camera, picture.window);
+        keep_source ? std::vector<Window>{picture.window}
+                    : bands_of(draws, pieces, camera, picture.window, band_bytes_of(stop));
     for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b)
         render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws, stop, counts);
     for (const Piece& piece : pieces) {

@@ -25,7 +25,7 @@ class SharedWorkspace {
     }
     // Keeps what the next frame is likely to need, but does not sit on the memory of an exceptional one.
     void give_back(std::unique_ptr<Workspace<float>> workspace) {
-        constexpr uint64_t kMostRoom = uint64_t(8) << 20;
+        constexpr uint64_t kMostRoom = uint64_t(16) << 20;
         if (workspace->most_room <= kMostRoom) workspace.reset(kept_.exchange(workspace.release()));
     }
 
