@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from v3dg._numbers import check
+
 _PIECE_BYTES = 16 << 20
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
@@ -76,8 +78,7 @@ def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
         return None
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
-    if not stat.S_ISREG(status.st_mode):
-        raise ValueError(f"{os.fspath(path)}: expected the path of a file, got a device or a pipe")
+    check(path, stat.S_ISREG(status.st_mode), "the path of a file, got a device or a pipe")
     # Renaming asks the folder alone; that the file itself may be written to, opening it finds out.
     os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
     return status
@@ -115,8 +116,7 @@ def read_at(descriptor: int, out: npt.NDArray[Any], offset: int) -> bool:
 
 def check_folder(path: Path) -> None:
     """Refuse, with ValueError, a place to write to whose folder is not there."""
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: expected an existing folder, got {path.parent}; create it first")
+    check(path, path.parent.is_dir(), f"an existing folder, got {path.parent}; create it first")
 
 
 def open_regular(path: str | os.PathLike[str]) -> int:

@@ -45,8 +45,8 @@ def vector(values: Any, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
 def color(values: Any, name: str) -> list[float]:
     """Three numbers that the core can hold."""
     array = vector(values, name)
-    if not (np.abs(array) <= MOST_FLOAT).all():
-        raise ValueError(f"{name}: expected numbers that a float32 can hold, got {np.abs(array).max()}")
+    largest = np.abs(array).max()
+    check(name, largest <= MOST_FLOAT, f"numbers that a float32 can hold, got {largest}")
     return [float(value) for value in array]
 
 
@@ -60,8 +60,7 @@ def real(
         number = math.inf if value > 0 else -math.inf
     except (TypeError, ValueError, RuntimeError):
         number = math.nan
-    if not least <= number <= most:
-        raise ValueError(f"{name}: expected {what}, got {shown(value)}")
+    check(name, least <= number <= most, f"{what}, got {shown(value)}")
     return number
 
 
@@ -76,10 +75,8 @@ def whole(value: Any, name: str, what: str, least: int, most: int = MOST_INT) ->
         number = least - 1 if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = least - 1
-    if number < least:
-        raise ValueError(f"{name}: expected {what}, got {shown(value)}")
-    if number > most:
-        raise ValueError(f"{name}: expected at most {most}, got {shown(value)}")
+    check(name, number >= least, f"{what}, got {shown(value)}")
+    check(name, number <= most, f"at most {most}, got {shown(value)}")
     return number
 
 
@@ -105,8 +102,8 @@ def check_all(name: str, values: npt.NDArray[Any], good: npt.NDArray[np.bool_], 
 
 def one_of(value: Any, name: str, choices: tuple[str, ...]) -> None:
     """Raise ValueError unless it is one of these texts."""
-    if not (isinstance(value, str) and value in choices):
-        raise ValueError(f"{name}: expected {' or '.join(map(repr, choices))}, got {shown(value)}")
+    is_one = isinstance(value, str) and value in choices
+    check(name, is_one, f"{' or '.join(map(repr, choices))}, got {shown(value)}")
 
 
 def shown(value: Any) -> str:

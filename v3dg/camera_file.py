@@ -93,9 +93,9 @@ def _data_of(run: Path) -> Path:
     folders = [folder / data for data in named for folder in (Path(), *list(run.resolve().parents)[:4])]
     files = [folder if folder.suffix == ".json" else folder / "transforms.json" for folder in folders]
     found = next((file for file in files if file.is_file()), None)
-    if found is None:
-        tried = " or ".join(map(str, dict.fromkeys(files))) or "a path under data:, which it has not"
-        raise ValueError(f"{run / _RUN}: expected the run's data at {tried}, got none; put it there")
+    tried = " or ".join(map(str, dict.fromkeys(files))) or "a path under data:, which it has not"
+    check(run / _RUN, found, f"the run's data at {tried}, got none; put it there")
+    assert found is not None
     return found
 
 
@@ -113,9 +113,8 @@ def _trained(run: Path) -> tuple[Floats, float]:
 def _read_colmap(folder: Path, distortion: str) -> dict[str, Camera]:
     places = [folder / part for part in ("", "sparse/0", "sparse")]
     models = [place for place in places for end in ("bin", "txt") if (place / f"images.{end}").is_file()]
-    if not models:
-        expected = "a model of COLMAP (images.bin or images.txt) or a run of nerfstudio (config.yml)"
-        raise ValueError(f"{folder}: expected {expected}, got a folder without")
+    expected = "a model of COLMAP (images.bin or images.txt) or a run of nerfstudio (config.yml)"
+    check(folder, models, f"{expected}, got a folder without")
     try:
         import pycolmap
     except ImportError:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
+from v3dg._numbers import check
 from v3dg.gaussians import Gaussians
 
 # Radii: of the circle in the tube's middle, of the tube without and with icing.
@@ -35,8 +36,7 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
     Raises:
         ValueError: ``num_gaussians`` is below 1,000.
     """
-    if num_gaussians < 1000:
-        raise ValueError(f"num_gaussians: expected at least 1000, got {num_gaussians}")
+    check("num_gaussians", num_gaussians >= 1000, f"at least 1000, got {num_gaussians}")
     rng = np.random.default_rng(seed)
     count = num_gaussians // 5 // _SPRINKLES  # in each sprinkle
     on_tube = num_gaussians - count * _SPRINKLES
@@ -131,8 +131,7 @@ def place_field(count: int = 2000, *, seed: int = 0) -> tuple[Any, Any, Any]:
     Raises:
         ValueError: ``count`` is below 1.
     """
-    if count < 1:
-        raise ValueError(f"count: expected at least 1, got {count}")
+    check("count", count >= 1, f"at least 1, got {count}")
     rng = np.random.default_rng(seed)
     away, angle = 1.15 * np.sqrt(np.arange(count)), _GOLDEN_ANGLE * np.arange(count)
     height = -0.16 * away**2 / max(away[-1], 1.0) + _TUBE

@@ -145,11 +145,11 @@ def write_asset(
         write = partial(spz.write, version=version)
     if write is ply.write:
         one_of(encoding, "encoding", get_args(PlyEncoding))
-        ply.write(path, gaussians, encoding)
-    elif encoding == "binary_little_endian":
-        write(path, gaussians)
+        write = partial(ply.write, encoding=encoding)
     else:
-        raise ValueError(f"encoding: expected none for {os.fspath(path)}, which is no .ply, got {encoding!r}")
+        expected = f"none for {os.fspath(path)}, which is no .ply, got {encoding!r}"
+        check("encoding", encoding == "binary_little_endian", expected)
+    write(path, gaussians)
 
 
 def _by_name(path: Path, formats: Mapping[str, Format]) -> Format:

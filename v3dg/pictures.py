@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
+from v3dg._numbers import check
 
 Picture: TypeAlias = NDArray[np.uint8]
 """(H, W, 3)"""
@@ -68,8 +69,8 @@ def check_picture_path(path: str | os.PathLike[str]) -> Path:
         ValueError: The suffix is not one of ``SUFFIXES``, or the folder does not exist.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{path}: expected a file name ending in {', '.join(SUFFIXES)}; choose one of them")
+    is_known = path.suffix.lower() in SUFFIXES
+    check(path, is_known, f"a file name ending in {', '.join(SUFFIXES)}; choose one of them")
     _files.check_folder(path)
     return path
 
@@ -80,11 +81,9 @@ def check_size(name: str, width: int, height: int, most_pixels: int = MOST_PIXEL
     Raises:
         ValueError: A side has more than ``MOST_SIDE`` px, or the picture more than ``most_pixels``.
     """
-    if max(width, height) > MOST_SIDE or width * height > most_pixels:
-        raise ValueError(
-            f"{name}: expected a picture of at most {MOST_SIDE:,} px a side and {most_pixels:,} px in all, "
-            f"got {width} x {height}"
-        )
+    expected = f"a picture of at most {MOST_SIDE:,} px a side and {most_pixels:,} px in all"
+    fits = max(width, height) <= MOST_SIDE and width * height <= most_pixels
+    check(name, fits, f"{expected}, got {width} x {height}")
 
 
 def read_picture(path: str | os.PathLike[str]) -> Picture:
@@ -102,8 +101,7 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
         with _naming_damage(name):
             image = Image.open(file, formats=("PNG", "JPEG"))  # of others, Pillow starts programs
         check_size(name, *image.size, MOST_PIXELS_COMPARED)
-        if image.mode.startswith("I"):
-            raise ValueError(f"{name}: expected 8 bits a channel, got 16; convert it first")
+        check(name, not image.mode.startswith("I"), "8 bits a channel, got 16; convert it first")
         with _naming_damage(name):
             return np.asarray(image.convert("RGB"))
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from v3dg import _files
+from v3dg._numbers import check
 from v3dg.pictures import to_8bit
 
 
@@ -32,8 +33,7 @@ def write_video(
         import av
     except ImportError as error:
         raise ImportError("videos need PyAV, which is not installed; pip install 'v3dg[video]'") from error
-    if not os.fspath(path).endswith(".mp4"):
-        raise ValueError(f"{os.fspath(path)}: expected a file name ending in .mp4")
+    check(path, os.fspath(path).endswith(".mp4"), "a file name ending in .mp4")
     count, size = 0, None
     with _files.replacing(path) as temporary, av.open(temporary, "w", format="mp4") as video:
         stream = video.add_stream("h264", rate=fps, options={"crf": str(quality)})
@@ -43,12 +43,11 @@ def write_video(
             if size is None:
                 size = pixels.shape
                 stream.height, stream.width = size[:2]
-            if pixels.shape != size or len(size) != 3 or size[0] % 2 or size[1] % 2:
-                expected = "an even height and width" if pixels.shape == size else f"{size} as before"
-                raise ValueError(f"pictures: expected {expected}, got {pixels.shape}")
+            check("pictures", pixels.shape == size, f"{size} as before, got {pixels.shape}")
+            is_even = len(size) == 3 and size[0] % 2 == 0 == size[1] % 2
+            check("pictures", is_even, f"an even height and width, got {pixels.shape}")
             video.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
             count += 1
-        if not count:
-            raise ValueError("pictures: expected at least one, got none")
+        check("pictures", count, "at least one, got none")
         video.mux(stream.encode())
     return count

@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from typing import Literal
 
 from v3dg._device import Device
+from v3dg._numbers import check
 from v3dg.build.config import BuildConfig
 from v3dg.build.files import build_file, levels_path
 from v3dg.build.leaves import MemoryLeaves
@@ -65,6 +66,6 @@ def build_bundle(
     config = config or BuildConfig()
     devices = devices_for(device, asset)
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
-    if executor is not None and resume_path is None:
-        raise ValueError("resume_path: expected a file that all workers of the executor reach, got None")
+    has_place = executor is None or resume_path is not None
+    check("resume_path", has_place, "a file that all workers of the executor reach, got None")
     return build_into(resume_path, leaves, config, seed, devices, progress, codec=codec, executor=executor)

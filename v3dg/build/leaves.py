@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from v3dg import _core, _device, cleaning
 from v3dg._device import Device
-from v3dg._numbers import one_of
+from v3dg._numbers import check, one_of
 from v3dg.build.config import BuildConfig
 from v3dg.build.digest import digest_of
 from v3dg.bundle.codec import Codec
@@ -46,8 +46,8 @@ class MemoryLeaves(Leaves):
     def __init__(
         self, asset: Gaussians, config: BuildConfig, unusable: Unusable = "drop", device: Device = _device.CPU
     ) -> None:
-        if str(asset.means.dtype).endswith("64"):
-            raise ValueError("asset: expected float32 arrays, got float64; convert them first")
+        is_single = str(asset.means.dtype).endswith("32")
+        check("asset", is_single, "float32 arrays, got float64; convert them first")
         one_of(unusable, "unusable", get_args(Unusable))
         tally = Tally()
         with _device.memory_errors():
@@ -80,8 +80,7 @@ class MemoryLeaves(Leaves):
 def made_with(leaves: Leaves, config: BuildConfig, seed: int, codec: str) -> dict[str, Any]:
     """What the config of a bundle says of how it was made."""
     seed = operator.index(seed)
-    if not 0 <= seed < 2**58:
-        raise ValueError(f"seed: expected 0 to 2^58 - 1, got {seed}")
+    check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {seed}")
     return {
         "build": asdict(config),
         "seed": seed,
@@ -115,11 +114,9 @@ class Tally:
     def check(self, unusable: Unusable) -> None:
         """Refuse an asset that cannot be built, and warn of what is left out."""
         text = cleaning.summary(self.num_gaussians - self.num_drawable, self.num_gaussians, self.counts)
-        if self.num_gaussians == 0:
-            raise ValueError("asset: expected at least one gaussian, got none")
-        if self.num_wrong and unusable == "refuse":
-            raise ValueError(f"asset: expected gaussians that can be drawn, got others: {text}")
-        if self.num_drawable == 0:
-            raise ValueError(f"asset: expected a gaussian that can be drawn, got none: {text}")
+        check("asset", self.num_gaussians, "at least one gaussian, got none")
+        is_allowed = not self.num_wrong or unusable != "refuse"
+        check("asset", is_allowed, f"gaussians that can be drawn, got others: {text}")
+        check("asset", self.num_drawable, f"a gaussian that can be drawn, got none: {text}")
         if self.num_wrong:
             warnings.warn(f"asset: {text}; they are left out", cleaning.AssetWarning, stacklevel=4)

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from v3dg import _core
 from v3dg._device import CPU, Device
+from v3dg._numbers import check
 from v3dg.build import external_split
 from v3dg.build.config import BuildConfig
 from v3dg.build.digest import PIECE, digest_of_hashes, hash_of, new_pool, pieces_of
@@ -39,7 +40,7 @@ _MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few are rea
 _MOST_IN_BLOCK_BYTES = 1 << 28  # more would not be faster: rows are taken from all over a block
 _SENT_AT_ONCE = 1 << 12  # gaussians that a thread brings to a bucket
 _OVERHEAD_BYTES = 24 << 20
-_CHANGED = "expected the file not to change while it is read, got another one"
+_CHANGED = "the file not to change while it is read, got another one"
 _NAMES = ("points", "spare", "order", "rows")
 
 _Blocks = Iterator[tuple[int, Gaussians]]
@@ -92,8 +93,7 @@ def leaves_on_disk(
     """
     tiles = [_Tile.of(path) for path in paths]
     count = sum(tile.num_gaussians for tile in tiles)
-    if count >= 1 << 32:
-        raise ValueError(f"asset: expected fewer than 2^32 gaussians, got {count:,}")
+    check("asset", count < 1 << 32, f"fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
     sizes = _Sizes.of(memory, reserved(count, degree), degree, tiles)
     folder = Path(folder)
@@ -130,8 +130,8 @@ class _Tile:
 
     def open(self) -> AssetFile:
         file = open_asset(self.path)
-        if (file.num_gaussians, file.sh_degree) != (self.num_gaussians, self.sh_degree):
-            raise ValueError(f"{os.fspath(self.path)}: {_CHANGED}")
+        is_same = (file.num_gaussians, file.sh_degree) == (self.num_gaussians, self.sh_degree)
+        check(self.path, is_same, _CHANGED)
         return file
 
 
@@ -152,13 +152,10 @@ class _Sizes:
         overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
         largest = max(tiles, key=lambda tile: tile.whole_bytes)
         least = reserved + overhead + largest.whole_bytes + PIECE * gaussian
-        if memory < least:
-            why = (
-                f" for {os.fspath(largest.path)}, whose format can only be read whole (or convert it to .ply)"
-                if largest.whole_bytes
-                else ""
-            )
-            raise ValueError(f"memory: expected at least {in_mib(least)}{why}, got {in_mib(memory)}")
+        name = os.fspath(largest.path)
+        why = f" for {name}, whose format can only be read whole (or convert it to .ply)"
+        expected = f"at least {in_mib(least)}{why if largest.whole_bytes else ''}"
+        check("memory", memory >= least, f"{expected}, got {in_mib(memory)}")
         memory -= reserved
         for_block = memory - overhead - largest.whole_bytes
         for_split = memory - _OVERHEAD_BYTES
@@ -254,9 +251,7 @@ def _sort_on_disk(
         blocks = _blocks(tiles, Codec(degree).empty(sizes.in_block), bar)
         again = _write_rows(blocks, order_file, ends, row_file)
     order.unlink()
-    if again != digest:
-        which = os.fspath(tiles[0].path) if len(tiles) == 1 else f"one of {len(tiles)} files"
-        raise ValueError(f"{which}: {_CHANGED}")
+    check(tiles[0].path if len(tiles) == 1 else f"one of {len(tiles)} files", again == digest, _CHANGED)
     bar.close()
     bucket_bytes = int(np.diff(offset).max()) * _bytes_in_bucket(degree)
     about = count, tally.num_gaussians, degree, tally.counts, digest, bucket_bytes

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from v3dg import _device, _files
 from v3dg._device import Device
+from v3dg._numbers import check
 from v3dg._version import __version__
 from v3dg.build.plan import LevelPlan
 from v3dg.build.scratch import lock
@@ -78,8 +79,8 @@ class PageFile:
         with _files.naming_errors(self.path):
             descriptor = os.open(self.path, flags | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
-                if os.pread(descriptor, len(self.head), 0) != self.head:
-                    raise ValueError(f"{self.path}: expected the unfinished bundle of this build")
+                head = os.pread(descriptor, len(self.head), 0)
+                check(self.path, head == self.head, "the unfinished bundle of this build")
                 yield descriptor
             finally:
                 os.close(descriptor)
@@ -105,8 +106,7 @@ class Unfinished:
         self._lock = threading.Lock()
 
     def __enter__(self) -> Unfinished:
-        if not self._path.parent.is_dir():
-            raise ValueError(f"resume_path: expected a file in an existing folder, got {self._path}")
+        check("resume_path", self._path.parent.is_dir(), f"a file in an existing folder, got {self._path}")
         self._file = _open_locked(self._path)
         try:
             with _files.naming_errors(self._path):
@@ -257,14 +257,12 @@ def _open_locked(path: str | os.PathLike[str]) -> FileIO:
     # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
     while True:
-        if os.path.islink(path):
-            raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a link; remove it")
+        check(path, not os.path.islink(path), "a file of levels, got a link; remove it")
         # Whoever may see the bundle is settled when it replaces what is there.
         file = FileIO(path, "r+", opener=lambda name, _: os.open(name, flags, 0o600))
         try:
             status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise ValueError(f"{os.fspath(path)}: expected a file of levels, got a device or a pipe")
+            check(path, stat.S_ISREG(status.st_mode), "a file of levels, got a device or a pipe")
             lock(file.fileno(), path)
             # The build that had the lock before may have removed the file.
             with suppress(FileNotFoundError):

@@ -186,18 +186,16 @@ class BundleFile:
 
     def _read_header_and_tables(self) -> None:
         self.num_bytes = os.fstat(self._fd).st_size
-        if self.num_bytes < 8:
-            self._fail(f"expected a bundle, got a file of {self.num_bytes} bytes")
+        check(self.path, self.num_bytes >= 8, f"a bundle, got a file of {self.num_bytes} bytes")
         length = np.empty(8, np.uint8)
         self._read([length], 0)
         header_bytes = int.from_bytes(length.tobytes(), "little")
-        if header_bytes == 0:
-            self._fail("expected a bundle, got one that is not finished, or another kind of file")
-        if header_bytes > min(self.num_bytes - 8, MAX_HEADER_BYTES):
-            self._fail(
-                f"header: expected a bundle (safetensors), got a header length of {header_bytes} in a file "
-                f"of {self.num_bytes} bytes; it is another kind of file or it is truncated"
-            )
+        is_finished = header_bytes > 0
+        check(self.path, is_finished, "a bundle, got one that is not finished, or another kind of file")
+        found = f"a header length of {header_bytes} in a file of {self.num_bytes} bytes"
+        fits = header_bytes <= min(self.num_bytes - 8, MAX_HEADER_BYTES)
+        expected = f"a bundle (safetensors), got {found}; it is another kind of file or it is truncated"
+        self._check("header", fits, expected)
         text = np.empty(header_bytes, np.uint8)
         self._read([text], 8)
         header = self._object("header", text.tobytes())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from v3dg._numbers import check_type
+from v3dg._numbers import check, check_type
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -97,9 +97,8 @@ def header_of(entries: dict[str, Any], codec: Codec, config: dict[str, Any]) -> 
     metadata["config"] = config_to_json(config)
     text = json.dumps({"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")).encode()
     text += b" " * (-(8 + len(text)) % codec.alignment)
-    if len(text) > MAX_HEADER_BYTES:
-        size = len(metadata["config"])
-        raise ValueError(f"config: expected at most {MAX_HEADER_BYTES} bytes of JSON, got {size}; shorten it")
+    found = f"{len(metadata['config'])}; shorten it"
+    check("config", len(text) <= MAX_HEADER_BYTES, f"at most {MAX_HEADER_BYTES} bytes of JSON, got {found}")
     return len(text).to_bytes(8, "little") + text
 
 

@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from v3dg import _files
-from v3dg._numbers import one_of
+from v3dg._numbers import check, one_of
 from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
 from v3dg.rotations import rotation_from_quaternion
@@ -97,12 +97,11 @@ def replacing_folder(folder: Path, keep: str = "") -> Iterator[Path]:
 
     What is there by the name `keep` moves along.
     """
-    if folder.exists() and not (
-        folder.is_dir() and (any((folder / mark).is_file() for mark in MARKS) or not any(folder.iterdir()))
-    ):
-        raise ValueError(
-            f"{folder}: expected a new folder, or one with an earlier export, got something else"
-        )
+    is_ours = folder.is_dir() and (
+        any((folder / mark).is_file() for mark in MARKS) or not any(folder.iterdir())
+    )
+    expected = "a new folder, or one with an earlier export, got something else"
+    check(folder, is_ours or not folder.exists(), expected)
     target = folder.resolve()
     missing = [parent for parent in target.parents if not parent.exists()]  # the lowest first
     temporary, old = (

@@ -182,10 +182,8 @@ class Plan:
             if largest > chunk:
                 break
             top, ancestor = level, above
-        if top == 0:
-            raise ValueError(
-                f"chunk: expected at least {largest} gaussians, the size of a group of the asset, got {chunk}"
-            )
+        expected = f"at least {largest} gaussians, the size of a group of the asset"
+        check("chunk", top > 0, f"{expected}, got {chunk}")
         number = np.full(len(groups), -1, np.int64)
         tops = np.flatnonzero(groups.level == top)
         number[tops] = np.arange(len(tops))
