@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import tyro
 
+from v3dg._numbers import check
 from v3dg.bundle import Bundle
 from v3dg.io import SUFFIXES
 
@@ -55,12 +56,14 @@ Threads: TypeAlias = Annotated[int | None, option("N")]
 
 @dataclass(kw_only=True)
 class Common:
-    """Options of every command that takes long."""
+    """Options of every command."""
 
     threads: Threads = None
     """CPU threads; all if not given."""
     json: Flag = False
     """Print the result as JSON."""
+    quiet: Flag = False
+    """Show no progress."""
 
 
 @dataclass(kw_only=True)
@@ -69,16 +72,29 @@ class OnDevice(Common):
     """Where to compute; auto is a CUDA device where there is one and torch can use it."""
 
 
+@dataclass(kw_only=True)
+class Cut:
+    """Which cut of a bundle or a scene is drawn."""
+
+    tolerance: Annotated[float | None, option("PX2")] = None
+    """Screen area in px² that one gaussian of a coarser cluster may stand for; 3 if not given, 0: all."""
+    budget: Annotated[int | None, option("N")] = None
+    """Most gaussians to draw in one picture; without a tolerance, the picture is as fine as that allows."""
+
+
+def check_usage(name: str, holds: object, expected: str) -> None:
+    """Raise UsageError, which names an option and says what was expected and found, unless it holds."""
+    if not holds:
+        raise UsageError(f"{name}: expected {expected}")
+
+
 def check_range(name: str, value: int, least: int, most: int) -> None:
-    if not least <= value <= most:
-        raise UsageError(f"{name}: expected {least:,} to {most:,}, got {value}")
+    check_usage(name, least <= value <= most, f"{least:,} to {most:,}, got {value}")
 
 
 def require_file(path: Path, *suffixes: str) -> None:
-    if not path.exists():
-        raise ValueError(f"{path}: expected a file, got a path where there is none; check it")
-    if not path.name.lower().endswith(suffixes):
-        raise ValueError(f"{path}: expected a file ending in {', '.join(suffixes)}")
+    check(path, path.exists(), "a file, got a path where there is none; check it")
+    check(path, path.name.lower().endswith(suffixes), f"a file ending in {', '.join(suffixes)}")
 
 
 def require_subject(path: Path) -> None:

@@ -11,11 +11,12 @@ from typing import Annotated, Literal, TypeAlias
 import numpy as np
 import tyro
 
+from v3dg._numbers import check
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import DEFAULT_FOV_X, Camera, turntable
 from v3dg.cleaning import ball_of_most
-from v3dg.cli._common import UsageError, check_range, level_size, option, require_subject
+from v3dg.cli._common import check_range, check_usage, level_size, option, require_subject
 from v3dg.export import Axis
 from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, read_asset
@@ -58,11 +59,11 @@ class ViewOptions:
         check_range("--views", self.views, 1, _MOST_VIEWS)
         for side in self.size:
             check_range("--size", side, 1, MOST_SIDE)
-        if not -90 <= self.elevation <= 90:
-            raise UsageError(f"--elevation: expected -90 to 90 degrees, got {self.elevation}")
+        is_angle = -90 <= self.elevation <= 90
+        check_usage("--elevation", is_angle, f"-90 to 90 degrees, got {self.elevation}")
         is_from_file = self.cameras is not None or any(map(is_scene, subjects))
-        if self.camera is not None and not is_from_file:
-            raise UsageError("--camera: expected --cameras or a scene (.json) to take it from; leave it out")
+        expected = "--cameras or a scene (.json) to take it from; leave it out"
+        check_usage("--camera", self.camera is None or is_from_file, expected)
 
 
 # Field of a command's options that holds them; on the command line they stand beside the others.
@@ -89,10 +90,7 @@ def choose_cameras(
         own = read_cameras(options.cameras, size=options.size, distortion=options.distortion)
     if own is None:
         own = _turntable(subject, options)
-    if not own:
-        raise ValueError(
-            f"{options.cameras or path}: expected cameras, got a file without any; add some to it"
-        )
+    check(options.cameras or path, own, "cameras, got a file without any; add some to it")
     if options.camera is not None:
         own = _one_camera(own, options.camera)
     for name, camera in own.items():
@@ -105,9 +103,8 @@ def _one_camera(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
     names = list(cameras)
     if name not in cameras and name.isdecimal() and int(name) < len(names):
         name = names[int(name)]
-    if name not in cameras:
-        known = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
-        raise ValueError(f"--camera: expected one of {known}, or 0 to {len(names) - 1}, got {name}")
+    known = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+    check("--camera", name in cameras, f"one of {known}, or 0 to {len(names) - 1}, got {name}")
     return {name: cameras[name]}
 
 

@@ -15,21 +15,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from v3dg._numbers import check
 from v3dg.build import BuildConfig, build_file, levels_path
 from v3dg.cleaning import AssetWarning, describe
-from v3dg.cli._common import (
-    FAILURES,
-    Flag,
-    OnDevice,
-    UsageError,
-    bytes_text,
-    failure_text,
-    option,
-    print_result,
-    require_file,
-    table_lines,
-    tell,
-)
+from v3dg.cli import _common
 from v3dg.io import SUFFIXES
 
 _PATIENCE_S = 20  # for a scheduler's answer
@@ -37,47 +26,43 @@ _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
 
 @dataclass
-class Build(OnDevice):
+class Build(_common.OnDevice):
     """Build a bundle from a trained asset, or from each of many; one that fails does not stop the others."""
 
     assets: Annotated[tuple[Path, ...], tyro.conf.Positional, _SEVERAL]
     """Files of trained gaussians, or folders of such files. With an --output that ends in .v3dg they make
     one asset together."""
-    output: Annotated[Path | None, option("PATH", "-o")] = None
+    output: Annotated[Path | None, _common.option("PATH", "-o")] = None
     """Bundle to write, or the folder for those of many assets; if not given, beside each asset."""
     config: Literal["default", "paper"] = "default"
     """Settings to start from: ours, or those of the V3DG paper."""
-    cluster_size: Annotated[int | None, option("N")] = None
+    cluster_size: Annotated[int | None, _common.option("N")] = None
     """Most gaussians in a cluster; the config's own if not given."""
     codec: Literal["float32", "quantized"] = "float32"
     """How gaussians are kept: every bit, or rounded to 16 to 40 bytes (docs/format.md has the error)."""
     seed: int = 0
     """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
-    strict: Flag = False
+    strict: _common.Flag = False
     """Refuse an asset with wrong values, instead of leaving out the gaussians that have them."""
-    resume: Flag = False
+    resume: _common.Flag = False
     """Continue after the last finished level; keep bundles of these gaussians and settings."""
-    memory: Annotated[str | None, option("SIZE")] = None
+    memory: Annotated[str | None, _common.option("SIZE")] = None
     """Memory of the host for the build, as 8GiB; half of what is free if not given. An asset that does not
     fit is brought into order on the disk of the output."""
-    scheduler: Annotated[str | None, option("ADDRESS")] = None
+    scheduler: Annotated[str | None, _common.option("ADDRESS")] = None
     """Build on the workers of a dask scheduler, as tcp://host:8786, which reach the output's folder, too;
     needs v3dg[cluster]."""
-    quiet: Flag = False
-    """Show no progress."""
 
 
 def run(options: Build) -> None:
-    if not options.assets:
-        raise UsageError(
-            "PATH: expected one or more assets, or a folder of them, got nothing; run v3dg build --help"
-        )
+    expected = "one or more assets, or a folder of them, got nothing; run v3dg build --help"
+    _common.check_usage("PATH", options.assets, expected)
     is_one = options.output is not None and options.output.suffix == ".v3dg"
     with _executor_at(options.scheduler) as executor:
         if is_one or (len(options.assets) == 1 and not options.assets[0].is_dir()):
             assets = _files_of(options.assets)
             result = _build(options, assets, options.output or assets[0].with_suffix(".v3dg"), executor)
-            print_result(options.json, result, _lines(result))
+            _common.print_result(options.json, result, _lines(result))
         else:
             _run_many(options, executor)
 
@@ -117,13 +102,13 @@ def _run_many(options: Build, executor: Executor | None) -> None:
     results: list[dict[str, Any]] = []
     for asset, output in outputs.items():
         if not options.quiet:
-            tell(f"[{len(results) + 1}/{len(outputs)}] {asset}")
+            _common.tell(f"[{len(results) + 1}/{len(outputs)}] {asset}")
         try:
             results.append(_build(options, [asset], output, executor))
-        except FAILURES as error:
-            results.append({"asset": str(asset), "status": "failed", "error": failure_text(error)})
+        except _common.FAILURES as error:
+            results.append({"asset": str(asset), "status": "failed", "error": _common.failure_text(error)})
             if not options.quiet:
-                tell(f"failed: {results[-1]['error']}")
+                _common.tell(f"failed: {results[-1]['error']}")
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"interrupted with {len(results)} of {len(outputs)} assets done; `--resume` continues"
@@ -140,15 +125,15 @@ def _run_many(options: Build, executor: Executor | None) -> None:
         "size": "{size}",
         "time": "{seconds:.1f} s",
     }
-    shown = [
-        {**r, "left_out": sum(r["dropped"].values()), "size": bytes_text(r["bytes"])} if "bytes" in r else r
-        for r in results
-    ]
+    shown = [{**result} for result in results]
+    for row in shown:
+        if "bytes" in row:
+            row |= {"left_out": sum(row["dropped"].values()), "size": _common.bytes_text(row["bytes"])}
     last = ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
-    print_result(
+    _common.print_result(
         options.json,
         {**summary, "seconds": seconds, "assets": results},
-        [*table_lines(columns, shown), "", last],
+        [*_common.table_lines(columns, shown), "", last],
     )
     failed = [result for result in results if result["status"] == "failed"]
     if failed:
@@ -163,10 +148,7 @@ def _files_of(paths: Sequence[Path]) -> list[Path]:
         found = [path]
         if path.is_dir():
             found = sorted(p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file())
-            if not found:
-                raise ValueError(
-                    f"{path}: expected a folder with assets ({', '.join(SUFFIXES)}), got one without"
-                )
+            check(path, found, f"a folder with assets ({', '.join(SUFFIXES)}), got one without")
         assets += found
     return list(dict.fromkeys(assets))
 
@@ -180,11 +162,8 @@ def _outputs(options: Build) -> dict[Path, Path]:
     asset_of: dict[Path, Path] = {}
     for asset in assets:
         output = (asset if folder is None else folder / asset.name).with_suffix(".v3dg")
-        if output in asset_of:
-            raise ValueError(
-                f"{output}: expected one asset for it, got {asset_of[output]} and {asset}; rename one"
-            )
-        asset_of[output] = asset
+        other = asset_of.setdefault(output, asset)
+        check(output, other == asset, f"one asset for it, got {other} and {asset}; rename one")
     return {asset: output for output, asset in asset_of.items()}
 
 
@@ -193,9 +172,8 @@ def _build(
 ) -> dict[str, Any]:
     """Build and write one bundle; what was done, as JSON values."""
     for path in asset_paths:
-        require_file(path, *SUFFIXES)
-    if output.suffix != ".v3dg":
-        raise ValueError(f"{output}: expected a file name ending in .v3dg")
+        _common.require_file(path, *SUFFIXES)
+    check(output, output.suffix == ".v3dg", "a file name ending in .v3dg")
     start = time.perf_counter()
     config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
     if options.cluster_size is not None:
@@ -244,6 +222,6 @@ def _lines(result: dict[str, Any]) -> list[str]:
     line = (
         f"{result['output']}: {result['levels']} levels, {result['clusters']:,} clusters, "
         f"{result['gaussians']:,} gaussians ({result['asset_gaussians']:,} in the asset), "
-        f"{bytes_text(result['bytes'])}, {how}"
+        f"{_common.bytes_text(result['bytes'])}, {how}"
     )
     return [line, *(["left out: " + describe(result["dropped"])] if result["dropped"] else [])]

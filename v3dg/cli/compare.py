@@ -14,18 +14,9 @@ import tyro
 
 from v3dg import _device, pictures
 from v3dg._judges import Judges, mean_of
+from v3dg._numbers import check
 from v3dg.bundle import Bundle
-from v3dg.cli._common import (
-    Flag,
-    OnDevice,
-    UsageError,
-    check_range,
-    level_size,
-    option,
-    print_result,
-    printable,
-    table_lines,
-)
+from v3dg.cli import _common
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 from v3dg.metrics import FLIP_MISSING, MIN_TRANSMITTANCE, draw_truth, error_image, errors_of
 from v3dg.pictures import Picture, to_8bit
@@ -39,7 +30,7 @@ _LEAST_WIDTH = 300
 
 
 @dataclass
-class Compare(OnDevice):
+class Compare(_common.Cut, _common.OnDevice):
     """Draw two subjects from the same cameras, or take two pictures, and measure how far apart they look.
 
     By PSNR and SSIM, and by FLIP where the extra `flip` is installed.
@@ -48,19 +39,13 @@ class Compare(OnDevice):
     reference: tyro.conf.Positional[Path]
     """An asset, a bundle (.v3dg) or a scene (.json), to be drawn with all gaussians; or a picture (.png)."""
     test: tyro.conf.Positional[Path]
-    """What to compare with it: any of those, or a picture of the same size."""
+    """What to compare with it: any of those, drawn with a tolerance, or a picture of the same size."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("compare.png")
     """Picture to write, .png or .jpg: reference, test and, where FLIP is installed, a map of it."""
     pictures: Literal["worst", "all"] = "worst"
     """Show the view that differs most, or write a picture of every view."""
-    tolerance: Annotated[float | None, option("PX2")] = None
-    """Screen area in px² that one gaussian of the test's coarser clusters may stand for; 3 if not given."""
-    budget: Annotated[int | None, option("N")] = None
-    """Most gaussians of the test to draw in one picture."""
     supersample: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Draw the reference this many times larger and average it; with 2, aliasing is not taken for detail."""
-    quiet: Flag = False
-    """Show no progress."""
     view: Views = field(default_factory=lambda: ViewOptions(views=8))
 
 
@@ -79,11 +64,11 @@ def run(options: Compare) -> None:
 
     output = pictures.check_picture_path(options.output)
     subjects = (options.reference, options.test)
-    if output.resolve() in [path.resolve() for path in subjects]:
-        raise UsageError(f"--output: expected another file than those to compare, got {output}")
+    is_another = output.resolve() not in [path.resolve() for path in subjects]
+    _common.check_usage("--output", is_another, f"another file than those to compare, got {output}")
     are_pictures = [path.suffix.lower() in pictures.SUFFIXES for path in subjects]
-    if any(are_pictures) and not all(are_pictures):
-        raise UsageError("PATH: expected two pictures, or two subjects to draw, got one of each")
+    is_pair = any(are_pictures) == all(are_pictures)
+    _common.check_usage("PATH", is_pair, "two pictures, or two subjects to draw, got one of each")
     names, pairs, finest = _read_pictures(options) if all(are_pictures) else _draw(options)
     paths = picture_paths(output, names) if options.pictures == "all" else [output] * len(names)
     rows: list[dict[str, Any]] = []
@@ -123,7 +108,7 @@ def run(options: Compare) -> None:
     }
     shown = "reference and test" if mean["flip"] is None else "reference, test and FLIP"
     lines = [
-        *table_lines(columns, rows if len(rows) == 1 else [*rows, {"camera": "mean", **mean}]),
+        *_common.table_lines(columns, rows if len(rows) == 1 else [*rows, {"camera": "mean", **mean}]),
         "",
         f"{worst[1]['picture']}: {shown} of view {worst[1]['camera']}, which differs most",
     ]
@@ -131,17 +116,14 @@ def run(options: Compare) -> None:
         lines.append(FLIP_MISSING)
     if finest is not None and all(row["gaussians_selected"] == finest for row in rows):
         lines.append("every view needs the finest level; `--size 100 100` shows the test as from far away")
-    print_result(options.json, result, lines)
+    _common.print_result(options.json, result, lines)
 
 
 def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair], None]:
     reference, test = map(pictures.read_picture, (options.reference, options.test))
-    if reference.shape != test.shape:
-        (height, width, _), (test_height, test_width, _) = reference.shape, test.shape
-        raise ValueError(
-            f"{options.test}: expected {width} x {height} px like {options.reference}, "
-            f"got {test_width} x {test_height}"
-        )
+    (height, width, _), (test_height, test_width, _) = reference.shape, test.shape
+    expected = f"{width} x {height} px like {options.reference}, got {test_width} x {test_height}"
+    check(options.test, reference.shape == test.shape, expected)
     name = options.test.stem
     return [name], iter([_Pair(name, reference, test)]), None
 
@@ -149,7 +131,7 @@ def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair], None]:
 def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair], int | None]:
     """The names of the views, pictures of one after the other, gaussians of the test's finest level."""
     options.view.check(options.reference, options.test)
-    check_range("--supersample", options.supersample, 1, 16)
+    _common.check_range("--supersample", options.supersample, 1, 16)
     device = _device.resolve(options.device)
     reference, reference_cameras = load_subject(options.reference)
     test, test_cameras = load_subject(options.test)
@@ -162,7 +144,7 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair], int | None]:
         sides = (side * options.supersample for side in (camera.width, camera.height))
         pictures.check_size(f"camera {name}, supersampled", *sides)
 
-    finest = level_size(test, 0) if isinstance(test, Bundle) and test.num_levels else None
+    finest = _common.level_size(test, 0) if isinstance(test, Bundle) and test.num_levels else None
 
     def pairs() -> Iterator[_Pair]:
         for name, camera in cameras.items():
@@ -193,7 +175,7 @@ def _difference(row: dict[str, Any]) -> float:
 
 def _write(options: Compare, pair: _Pair, row: dict[str, Any]) -> None:
     named = ((options.reference, pair.reference), (options.test, pair.test))
-    shown = [(printable(path.name), picture) for path, picture in named]
+    shown = [(_common.printable(path.name), picture) for path, picture in named]
     if row["flip"] is not None:
         floats = (picture / np.float32(255) for _, picture in shown)
         shown.append((f"FLIP {row['flip']:.4f}", to_8bit(error_image(*floats))))

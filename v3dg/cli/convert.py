@@ -11,17 +11,10 @@ import tyro
 
 from v3dg import _files
 from v3dg._device import CPU
+from v3dg._numbers import check
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
-from v3dg.cli._common import (
-    Common,
-    UsageError,
-    bytes_text,
-    check_range,
-    finite,
-    option,
-    print_result,
-)
+from v3dg.cli import _common
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, is_scene, load_subject
 from v3dg.gaussians import Gaussians
 from v3dg.io import WRITE_SUFFIXES, write_asset
@@ -30,24 +23,24 @@ from v3dg.select import select
 
 
 @dataclass
-class Convert(Common):
+class Convert(_common.Common):
     """Write an asset, a level of a bundle, or its cut for a camera, in another format; or a bundle anew."""
 
     subject: tyro.conf.Positional[Path]
     """An asset in any format that is read (docs/formats.md), a bundle (.v3dg) or a scene (.json)."""
     output: tyro.conf.Positional[Path]
     """File to write, .ply, .compressed.ply, .spz, .sog or .glb; of a bundle also .v3dg, with all levels."""
-    codec: Annotated[Literal["float32", "quantized"] | None, option("{float32,quantized}")] = None
+    codec: Annotated[Literal["float32", "quantized"] | None, _common.option("{float32,quantized}")] = None
     """How a .v3dg that is written keeps gaussians, as for `v3dg build`; as the bundle does if not given."""
-    level: Annotated[int | None, option("N")] = None
+    level: Annotated[int | None, _common.option("N")] = None
     """Write this level of a bundle; 0, the asset itself, if no cut is asked for."""
-    tolerance: Annotated[float | None, option("PX2")] = None
+    tolerance: Annotated[float | None, _common.option("PX2")] = None
     """Write the cut of this tolerance, the px² that one gaussian of a coarser cluster may stand for."""
-    budget: Annotated[int | None, option("N")] = None
+    budget: Annotated[int | None, _common.option("N")] = None
     """Write the cut with at most this many gaussians."""
     outside: Literal["drop", "keep"] = "drop"
     """What becomes of the part of the cut that the camera does not see."""
-    spz_version: Annotated[Literal[2, 3, 4] | None, option("{2,3,4}")] = None
+    spz_version: Annotated[Literal[2, 3, 4] | None, _common.option("{2,3,4}")] = None
     """Version of a .spz; 3 if not given."""
     view: Views = field(default_factory=ViewOptions)
 
@@ -55,55 +48,53 @@ class Convert(Common):
 def run(options: Convert) -> None:
     view = options.view
     view.check(options.subject)
-    to_bundle = options.output.name.lower().endswith(".v3dg")
-    if not (to_bundle or options.output.name.lower().endswith(WRITE_SUFFIXES)):
-        suffixes = ", ".join((*WRITE_SUFFIXES, ".v3dg"))
-        raise ValueError(f"{options.output}: expected a file name that ends in {suffixes}")
-    if options.codec is not None and not to_bundle:
-        raise UsageError(f"--codec: expected an output that ends in .v3dg, got {options.output}")
-    if options.spz_version and not options.output.name.lower().endswith(".spz"):
-        raise UsageError(f"--spz-version: expected a .spz to write, got {options.output}; leave it out")
-    _files.check_folder(options.output)
+    output, name = options.output, options.output.name.lower()
+    to_bundle, suffixes = name.endswith(".v3dg"), (*WRITE_SUFFIXES, ".v3dg")
+    check(output, name.endswith(suffixes), f"a file name that ends in {', '.join(suffixes)}")
+    fits = options.codec is None or to_bundle
+    _common.check_usage("--codec", fits, f"an output that ends in .v3dg, got {output}")
+    fits = not options.spz_version or name.endswith(".spz")
+    _common.check_usage("--spz-version", fits, f"a .spz to write, got {output}; leave it out")
+    _files.check_folder(output)
     given = (options.tolerance, options.budget, view.cameras, view.camera)
     is_cut = is_scene(options.subject) or any(value is not None for value in given)
-    if options.level is not None and is_cut:
-        raise UsageError(
-            "--level: expected no scene, camera, tolerance or budget with it; leave out one or the other"
-        )
+    expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
+    _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
     subject, own_cameras = load_subject(options.subject)
     told: dict[str, Any] = {}
     if to_bundle:
         if not isinstance(subject, Bundle) or is_cut or options.level is not None:
-            raise UsageError(f"{options.output}: expected a bundle to write anew, and no level or cut of it")
+            raise _common.UsageError(f"{output}: expected a bundle to write anew, and no level or cut of it")
         gaussians, codec = subject.gaussians, options.codec or subject.codec
-        Bundle(subject.clusters, subject.groups, gaussians, subject.config, codec).write(options.output)
+        Bundle(subject.clusters, subject.groups, gaussians, subject.config, codec).write(output)
         told = {"codec": codec}
     elif isinstance(subject, Gaussians):
-        if is_cut or options.level is not None:
-            raise UsageError("--level, --tolerance, --budget: expected a bundle or a scene; build one first")
+        is_whole, names = not is_cut and options.level is None, "--level, --tolerance, --budget"
+        _common.check_usage(names, is_whole, "a bundle or a scene; build one first")
         gaussians = subject
     elif isinstance(subject, Bundle) and not is_cut:
         level = options.level or 0
-        check_range("--level", level, 0, max(0, subject.num_levels - 1))
+        _common.check_range("--level", level, 0, max(0, subject.num_levels - 1))
         gaussians, told = subject.level_gaussians(level), {"level": level}
     else:
         cameras = choose_cameras(view, options.subject, subject, own_cameras)
-        if len(cameras) != 1:
-            raise UsageError(f"--camera: expected one of {len(cameras)} cameras; give its name or its place")
+        expected = f"one of {len(cameras)} cameras; give its name or its place"
+        _common.check_usage("--camera", len(cameras) == 1, expected)
         gaussians, told = _cut(options, subject, *cameras.items())
     if not to_bundle:
-        write_asset(options.output, gaussians, version=options.spz_version)
+        write_asset(output, gaussians, version=options.spz_version)
     result = {
-        "output": str(options.output),
+        "output": str(output),
         "gaussians": len(gaussians),
         "sh_degree": gaussians.sh_degree,
-        "bytes": options.output.stat().st_size,
+        "bytes": output.stat().st_size,
         "seconds": time.perf_counter() - start,
         **told,
     }
-    text = f"{len(gaussians):,} gaussians, SH degree {gaussians.sh_degree}, {bytes_text(result['bytes'])}"
-    print_result(options.json, result, [f"{options.output}: {text}"])
+    size = _common.bytes_text(output.stat().st_size)
+    text = f"{output}: {len(gaussians):,} gaussians, SH degree {gaussians.sh_degree}, {size}"
+    _common.print_result(options.json, result, [text])
 
 
 def _cut(
@@ -118,5 +109,5 @@ def _cut(
         gaussians = Gaussians.concatenate([subject.cluster_gaussians(int(c)) for c in selection.cluster_ids])
     else:
         gaussians = selection.gaussians(device=CPU)
-    told = {"camera": name, "tolerance": finite(selection.tolerance), "clusters": len(selection)}
+    told = {"camera": name, "tolerance": _common.finite(selection.tolerance), "clusters": len(selection)}
     return gaussians, told

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from v3dg.cli._common import Common, Flag, check_range, print_result, table_lines
+from v3dg.cli._common import Common, check_range, print_result, table_lines
 from v3dg.demo import run_demo
 from v3dg.select import DEFAULT_TOLERANCE
 
@@ -29,8 +29,6 @@ class Demo(Common):
     """Screen area in px² that one gaussian of a coarser cluster may stand for."""
     seed: int = 0
     """Seed of the asset, of the field and of the build."""
-    quiet: Flag = False
-    """Show no progress."""
 
 
 def run(options: Demo) -> None:

@@ -13,7 +13,7 @@ import tyro
 from v3dg import export
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
-from v3dg.cli._common import Common, Flag, UsageError, bytes_text, option, print_result, require_file
+from v3dg.cli._common import Common, bytes_text, check_usage, option, print_result, require_file
 from v3dg.export import Axis
 from v3dg.formats.usd import SUFFIXES as USD_SUFFIXES
 from v3dg.scene import Scene
@@ -35,14 +35,11 @@ class Export(Common):
     """Most gaussians of an asset in a chunk of streamed SOG, for which the viewer chooses a level."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
     """Direction that is up; z for a scene and -y, as in most trained assets, for a bundle if not given."""
-    quiet: Flag = False
-    """Show no progress."""
 
 
 def run(options: Export) -> None:
     require_file(options.subject, ".v3dg", ".json")
-    if options.chunk < 1:
-        raise UsageError(f"--chunk: expected at least 1, got {options.chunk}")
+    check_usage("--chunk", options.chunk >= 1, f"at least 1, got {options.chunk}")
     folder = options.output or options.subject.with_name(f"{options.subject.stem}_web")
     start = time.perf_counter()
     subject, cameras = _read(options.subject)

@@ -16,15 +16,7 @@ from v3dg.build import BuildConfig
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
-from v3dg.cli._common import (
-    Flag,
-    bytes_text,
-    level_size,
-    print_result,
-    printable,
-    require_subject,
-    table_lines,
-)
+from v3dg.cli import _common
 from v3dg.cli._views import load_subject
 from v3dg.gaussians import Gaussians
 from v3dg.io import asset_bytes
@@ -35,17 +27,15 @@ _Description = tuple[dict[str, Any], list[str]]
 
 
 @dataclass
-class Info:
+class Info(_common.Common):
     """Describe an asset (.ply, .spz, ...), a bundle (.v3dg) or a scene (.json)."""
 
     file: tyro.conf.Positional[Path]
     """File to describe."""
-    json: Flag = False
-    """Print the description as JSON."""
 
 
 def run(options: Info) -> None:
-    require_subject(options.file)
+    _common.require_subject(options.file)
     subject, cameras = load_subject(options.file)
     if isinstance(subject, Scene):
         description = _scene_info(options.file, subject, cameras or {})
@@ -53,7 +43,7 @@ def run(options: Info) -> None:
         description = _bundle_info(options.file, subject)
     else:
         description = _asset_info(options.file, subject)
-    print_result(options.json, *description)
+    _common.print_result(options.json, *description)
 
 
 def _asset_info(path: Path, asset: Gaussians) -> _Description:
@@ -77,7 +67,7 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
         "percentiles_5_50_95": spread,
     }
     lines = [
-        f"{path}: asset, {bytes_text(num_bytes)}",
+        f"{path}: asset, {_common.bytes_text(num_bytes)}",
         f"{len(asset):,} gaussians, SH degree {asset.sh_degree}",
     ]
     if findings.counts:
@@ -114,15 +104,16 @@ def _bundle_info(path: Path, bundle: Bundle) -> _Description:
         "colour error": "{error_color:.4f}",
         "alpha error": "{error_alpha:.4f}",
     }
-    leaves = level_size(bundle, 0) if len(bundle.level_range(0)) else 0
+    levels = [{**level, "size": _common.bytes_text(level["bytes"])} for level in result["levels"]]
+    leaves = _common.level_size(bundle, 0) if len(bundle.level_range(0)) else 0
     each = f", {result['bytes'] / leaves:.1f} bytes a gaussian of level 0" if leaves else ""
     lines = [
         f"{path}: bundle, version {result['version']} ({result['codec']}), "
-        f"{bytes_text(result['bytes'])}{each}",
+        f"{_common.bytes_text(result['bytes'])}{each}",
         f"{bundle.num_gaussians:,} gaussians, SH degree {bundle.sh_degree}, "
         f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, {result['num_pages']:,} pages",
         "",
-        *table_lines(columns, [{**level, "size": bytes_text(level["bytes"])} for level in result["levels"]]),
+        *_common.table_lines(columns, levels),
         "",
         "errors: what the fits were left with, a pixel, at the size at which a level is drawn",
     ]
@@ -134,7 +125,7 @@ def _bundle_info(path: Path, bundle: Bundle) -> _Description:
             if name not in usual or value != usual[name]
         ]
         text = f"built with {', '.join(others)}, all else by default" if others else "built by default"
-        lines += textwrap.wrap(printable(text), 100, break_on_hyphens=False)
+        lines += textwrap.wrap(_common.printable(text), 100, break_on_hyphens=False)
     return result, lines
 
 
@@ -143,7 +134,7 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
         {
             "path": bundle.path,
             "instances": int((scene.instance_bundle == number).sum()),
-            "asset_gaussians": level_size(bundle, 0) if len(bundle.level_range(0)) else 0,
+            "asset_gaussians": _common.level_size(bundle, 0) if len(bundle.level_range(0)) else 0,
         }
         for number, bundle in enumerate(scene.bundles)
     ]
@@ -163,10 +154,10 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
     lines = [
         f"{path}: scene, {len(scene):,} instances, {total:,} gaussians at full detail",
         "",
-        *table_lines(columns, bundles),
+        *_common.table_lines(columns, bundles),
     ]
     if sizes:
-        lines += ["", *table_lines({"camera": "{name}", "size": "{width} x {height}"}, sizes)]
+        lines += ["", *_common.table_lines({"camera": "{name}", "size": "{width} x {height}"}, sizes)]
     return result, lines
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from v3dg import _device
-from v3dg.cli._common import OnDevice, UsageError, finite, option, print_result, table_lines
+from v3dg.cli._common import Cut, OnDevice, check_usage, finite, option, print_result, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 from v3dg.pictures import check_picture_path, write_picture
 from v3dg.render import render
@@ -17,17 +17,13 @@ from v3dg.select import DEFAULT_FADE
 
 
 @dataclass
-class Render(OnDevice):
+class Render(Cut, OnDevice):
     """Draw a scene from its cameras, a bundle or an asset from a turntable, or any from a camera file."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg) or an asset (.ply, .spz, ...)."""
     output: Annotated[Path | None, option("PATH", "-o")] = None
     """Picture to write, .png or .jpg; several get a number or the camera's name. Default: as the subject."""
-    tolerance: Annotated[float | None, option("PX2")] = None
-    """Screen area in px² that one gaussian of a coarser cluster may stand for; 0 draws everything."""
-    budget: Annotated[int | None, option("N")] = None
-    """Most gaussians to draw in one picture; without a tolerance, the picture is as fine as that allows."""
     min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Draw no level finer than this, except where an asset has no coarser one."""
     fade: Annotated[float | None, option("FACTOR")] = None
@@ -44,8 +40,8 @@ class Render(OnDevice):
 
 def run(options: Render) -> None:
     options.view.check(options.subject)
-    if not all(0 <= part <= 1 for part in options.background):
-        raise UsageError(f"--background: expected three numbers from 0 to 1, got {options.background}")
+    is_color = all(0 <= part <= 1 for part in options.background)
+    check_usage("--background", is_color, f"three numbers from 0 to 1, got {options.background}")
     output = check_picture_path(options.output or Path(options.subject.with_suffix(".png").name))
     device = _device.resolve(options.device)
     subject, own_cameras = load_subject(options.subject)
