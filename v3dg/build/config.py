@@ -1,45 +1,30 @@
 """How a bundle is built."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 # A target is drawn in one go that cannot be interrupted: in about a second.
 _MOST_SIDE = 8192
 # Of all views of a group: they are kept, by each thread that fits one, in 16 bytes each.
 _MOST_PIXELS_KEPT = 1 << 26
 
-# What a setting may be. Whole numbers are 32 bits wide in the core, other numbers float32, whose squares and
-# products with each other must be finite, and not 0 where they are divided by.
-_RANGES: dict[str, tuple[float, float]] = {
-    "cluster_size": (2, 1 << 30),
-    "group_size": (2, 1 << 30),
-    "min_clusters": (1, 1 << 62),  # counts that the core does not see; so many make level 0 the only one
-    "min_gaussians": (1, 1 << 62),
-    "prune_growth": (0.001, 1000),  # of scales, once a level
-    "steps": (0, 1_000_000),  # some hours
-    "first_steps": (0, 1_000_000),
-    "views_per_step": (1, 1024),  # a step is not interrupted
-    "num_views": (0, 1 << 16),  # all are drawn before the first step
-    "supersample": (1, 64),  # more samples than a pixel has values
-    "image_size": (0, _MOST_SIDE),
-    "px2_per_gaussian": (0.001, 1_000_000),  # a picture for each, at most
-    "distance": (1.1, 1000),  # outside the ball; from farther, float32 depths are coarser than gaussians
-    "filter_px2": (0, 1_000_000),
-    "asset_filter_px2": (0, 1_000_000),
-    **dict.fromkeys(("loss_l1", "loss_dssim", "loss_alpha"), (0, 1_000_000)),
-    **dict.fromkeys(("step_position", "step_log_scale", "step_quat", "step_logit"), (0, 1_000_000_000)),
-    **dict.fromkeys(("step_sh0", "step_sh_rest"), (0, 1_000_000_000)),
-    "final_step": (1e-6, 1_000_000),
-    "beta2": (0, 0.999999),
+_KINDS: dict[Any, tuple[Any, str]] = {
+    int: (int, "a whole number"),
+    float: ((int, float), "a number"),
+    bool: (bool, "True or False"),
 }
+_Weight = Annotated[float, (0, 1_000_000)]
+_StepSize = Annotated[float, (0, 1_000_000_000)]
 
 
 @dataclass(frozen=True)
 class BuildConfig:
     """How a bundle is built. The defaults are ours, with the reasons in docs/levels.md; `paper()` is V3DG's.
+
+    Numbers have their least and their greatest value beside their type. Whole numbers are 32 bits wide in the
+    core, others float32, whose squares and products with each other must be finite, and not 0 where they are
+    divided by.
 
     Attributes:
         cluster_size: Most gaussians in a cluster of level 0.
@@ -72,55 +57,52 @@ class BuildConfig:
             pixels to be kept.
     """
 
-    cluster_size: int = 256
-    group_size: int = 2
-    min_clusters: int = 1
-    min_gaussians: int = 4
+    cluster_size: Annotated[int, (2, 1 << 30)] = 256
+    group_size: Annotated[int, (2, 1 << 30)] = 2
+    # Counts that the core does not see; so many make level 0 the only one.
+    min_clusters: Annotated[int, (1, 1 << 62)] = 1
+    min_gaussians: Annotated[int, (1, 1 << 62)] = 4
     init: Literal["merge", "prune"] = "merge"
-    prune_growth: float = 2 ** (1 / 6)
+    prune_growth: Annotated[float, (0.001, 1000)] = 2 ** (1 / 6)  # once a level
     targets: Literal["finest", "previous"] = "finest"
-    steps: int = 600
-    first_steps: int = 150
-    views_per_step: int = 2
-    num_views: int = 64
-    supersample: int = 3
-    image_size: int = 0
-    px2_per_gaussian: float = 2.0
-    distance: float = 4.0
-    filter_px2: float = 0.05
-    asset_filter_px2: float = 0.0
+    steps: Annotated[int, (0, 1_000_000)] = 600  # at most some hours
+    first_steps: Annotated[int, (0, 1_000_000)] = 150
+    views_per_step: Annotated[int, (1, 1024)] = 2  # a step is not interrupted
+    num_views: Annotated[int, (0, 1 << 16)] = 64  # all are drawn before the first step
+    supersample: Annotated[int, (1, 64)] = 3  # at most more samples than a pixel has values
+    image_size: Annotated[int, (0, _MOST_SIDE)] = 0
+    px2_per_gaussian: Annotated[float, (0.001, 1_000_000)] = 2.0  # a picture for each, at most
+    # Outside the ball; from farther, float32 depths are coarser than gaussians.
+    distance: Annotated[float, (1.1, 1000)] = 4.0
+    filter_px2: _Weight = 0.05
+    asset_filter_px2: _Weight = 0.0
     asset_antialiased: bool = False
-    loss_l1: float = 1.0
-    loss_dssim: float = 0.0
-    loss_alpha: float = 0.5
-    step_position: float = 0.0028
+    loss_l1: _Weight = 1.0
+    loss_dssim: _Weight = 0.0
+    loss_alpha: _Weight = 0.5
+    step_position: _StepSize = 0.0028
     position_in_world: bool = False
-    step_log_scale: float = 0.032
-    step_quat: float = 0.011
-    step_logit: float = 0.04
-    step_sh0: float = 0.032
-    step_sh_rest: float = 0.008
-    final_step: float = 0.1
-    beta2: float = 0.99
+    step_log_scale: _StepSize = 0.032
+    step_quat: _StepSize = 0.011
+    step_logit: _StepSize = 0.04
+    step_sh0: _StepSize = 0.032
+    step_sh_rest: _StepSize = 0.008
+    final_step: Annotated[float, (1e-6, 1_000_000)] = 0.1
+    beta2: Annotated[float, (0, 0.999999)] = 0.99
 
     def __post_init__(self) -> None:
-        kinds: dict[Any, tuple[Any, str]] = {
-            "int": (int, "a whole number"),
-            "float": ((int, float), "a number"),
-            "bool": (bool, "True or False"),
-        }
         for field in fields(self):
-            value = getattr(self, field.name)
-            kind, expected = kinds.get(field.type, (str, "a name"))
-            self._require(
-                field.name, isinstance(value, kind) and isinstance(value, bool) == (kind is bool), expected
-            )
-        for name, (least, most) in _RANGES.items():
-            self._require(name, least <= getattr(self, name) <= most, f"{least:,} to {most:,}")
-        size = self.group_size
-        self._require("group_size", size & (size - 1) == 0, "a power of two")
-        self._require("init", self.init in ("merge", "prune"), "'merge' or 'prune'")
-        self._require("targets", self.targets in ("finest", "previous"), "'finest' or 'previous'")
+            name, value, of = field.name, getattr(self, field.name), get_args(field.type)
+            if get_origin(field.type) is Literal:
+                self._require(name, value in of, " or ".join(map(repr, of)))
+                continue
+            kind, *ranges = of or (field.type,)
+            classes, expected = _KINDS[kind]
+            is_kind = isinstance(value, classes) and isinstance(value, bool) == (kind is bool)
+            self._require(name, is_kind, expected)
+            for least, most in ranges:
+                self._require(name, least <= value <= most, f"{least:,} to {most:,}")
+        self._require("group_size", self.group_size.bit_count() == 1, "a power of two")
         self.check_views(1)
 
     def _require(self, name: str, is_good: bool, expected: str) -> None:
@@ -174,7 +156,7 @@ class BuildConfig:
         return 1 + max(1, math.ceil(math.log2(px2 * self.supersample**2)))
 
     @staticmethod
-    def paper(**changes: Any) -> BuildConfig:
+    def paper(**changes: Any) -> "BuildConfig":
         """The settings of the paper and its code (V3DG, section 3.2 and 5.1), with `changes` to them.
 
         4,096 gaussians a cluster, two clusters a group, stop at two clusters; prune, grow scales by 2^(1/6);
