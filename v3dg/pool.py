@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import time
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
 
 from v3dg import _core
 from v3dg._device import Device
-from v3dg.residency import residency
-
-if TYPE_CHECKING:
-    from v3dg.bundle import Bundle
-    from v3dg.residency import ResidentScene
+from v3dg.bundle import Bundle
+from v3dg.residency import ResidentScene, residency
 
 NUM_THREADS = 8  # that read pages; a disk answers several at once
 _WAIT_SECONDS = 0.05  # until Ctrl-C is heard

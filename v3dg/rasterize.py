@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +13,6 @@ from v3dg._numbers import color, real
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 
 def rasterize(

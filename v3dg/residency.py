@@ -12,9 +12,10 @@ import threading
 import weakref
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _core
 from v3dg._device import Device
@@ -22,9 +23,6 @@ from v3dg.bundle import Bundle
 from v3dg.false_color import ColorBy, palette_of
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _Kept = TypeVar("_Kept")
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _core, _files
 from v3dg._json import parse_json
@@ -17,9 +18,6 @@ from v3dg.bundle.format import HASH_BYTES, config_to_json, page_tables
 from v3dg.bundle.pages import CodePages, FilePages, MemoryPages, PageLayout, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _Pages: TypeAlias = MemoryPages | CodePages | FilePages
 _BYTES_AT_ONCE = 64 << 20

@@ -11,37 +11,21 @@ import hashlib
 import os
 import re
 import weakref
-from typing import TYPE_CHECKING, Any, NoReturn
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg._json import parse_json, shown
 from v3dg._numbers import check
+from v3dg.bundle import format as file_format
 from v3dg.bundle.codec import CODECS, Codec
-from v3dg.bundle.format import (
-    DTYPES,
-    FORMAT,
-    HASH_BYTES,
-    MAX_HEADER_BYTES,
-    VERSION,
-    entries_of,
-    header_of,
-    page_hash,
-    page_tables,
-    schema_of,
-)
-from v3dg.bundle.pages import DAMAGED, on_threads, runs_of_pages
-from v3dg.bundle.tables import check_tables
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from v3dg.bundle.pages import PageLayout, PageRun
-    from v3dg.bundle.tables import Clusters, Groups
-    from v3dg.gaussians import Gaussians
+from v3dg.bundle.format import DTYPES, HASH_BYTES, entries_of, page_hash, page_tables, schema_of
+from v3dg.bundle.pages import DAMAGED, PageLayout, PageRun, on_threads, runs_of_pages
+from v3dg.bundle.tables import Clusters, Groups, check_tables
+from v3dg.gaussians import Gaussians
 
 _BYTES_PER_TASK = 16 << 20
 _FIRST_BYTES = 4096  # of the header: what a disk writes at once
@@ -56,7 +40,7 @@ class BundlePlan:
         pages_bytes = int(layout.page_bytes(codec).sum())
         num_clusters, num_pages = int(layout.first_cluster[-1]), layout.num_pages
         entries = entries_of(codec.version, num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
-        self.header = header_of(entries, codec, config)
+        self.header = file_format.header_of(entries, codec, config)
         ends = (entries[name]["data_offsets"][1] for name in ("pages", "hash"))
         self._pages_end, self.num_bytes = (len(self.header) + int(end) for end in ends)
         self._places = np.append(len(self.header) + self._page_tables["pages.offset"], self._pages_end)
@@ -193,7 +177,7 @@ class BundleFile:
         is_finished = header_bytes > 0
         check(self.path, is_finished, "a bundle, got one that is not finished, or another kind of file")
         found = f"a header length of {header_bytes} in a file of {self.num_bytes} bytes"
-        fits = header_bytes <= min(self.num_bytes - 8, MAX_HEADER_BYTES)
+        fits = header_bytes <= min(self.num_bytes - 8, file_format.MAX_HEADER_BYTES)
         expected = f"a bundle (safetensors), got {found}; it is another kind of file or it is truncated"
         self._check("header", fits, expected)
         text = np.empty(header_bytes, np.uint8)
@@ -209,11 +193,12 @@ class BundleFile:
         metadata = metadata if isinstance(metadata, dict) else {}
         names = ("format", "version", "sh_degree", "config", "codec")
         kind, version, degree, config, codec = map(metadata.get, names)
-        self._check("format", kind == FORMAT, f"'{FORMAT}', got {shown(kind)}; not a bundle")
+        is_ours = kind == file_format.FORMAT
+        self._check("format", is_ours, f"'{file_format.FORMAT}', got {shown(kind)}; not a bundle")
         is_number = isinstance(version, str) and re.fullmatch("[1-9][0-9]{0,8}", version)
         self._check("version", is_number, f"a number of 1 or more, got {shown(version)}")
-        if int(version) > VERSION:
-            self._fail(f"version {int(version)}, this build reads up to {VERSION}; update v3dg")
+        if int(version) > file_format.VERSION:
+            self._fail(f"version {int(version)}, this build reads up to {file_format.VERSION}; update v3dg")
         self._check("sh_degree", degree in ("0", "1", "2", "3"), f"'0' to '3', got {shown(degree)}")
         name = codec if int(version) > 1 else Codec.name
         known = [kind for kind in CODECS.values() if kind.version == int(version) and kind.name == name]

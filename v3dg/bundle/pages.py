@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import os
 from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _core
 from v3dg.bundle.codec import Codec
+from v3dg.bundle.tables import Clusters
+from v3dg.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from numpy.typing import NDArray
-
     from v3dg.bundle.file import BundleFile
-    from v3dg.bundle.tables import Clusters
-    from v3dg.gaussians import Gaussians
 
 _Item = TypeVar("_Item")
 _THREADS = 8

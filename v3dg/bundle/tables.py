@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg._numbers import check, check_all, check_type
 from v3dg.bundle.format import DTYPES, SCHEMA
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 NESTING_MARGIN = 4e-6
 """A group's ball contains the balls of the groups below it with this relative margin; see docs/format.md."""

@@ -16,22 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
+from v3dg.formats import _packing
 from v3dg.formats._asset_file import AssetFile, File
-from v3dg.formats._packing import (
-    DEGREES,
-    SH_C0,
-    SQRT2,
-    Floats,
-    assemble,
-    blocks,
-    check_writable,
-    log_scales,
-    morton_order,
-    opacity_bytes,
-    quats_from_three,
-    three_of_quats,
-    to_integers,
-)
+from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
 from v3dg.formats._reading import Claims, Path, check
 from v3dg.gaussians import Gaussians
 
@@ -123,7 +110,7 @@ def _decoded(
         color = (within("color", rgba[:, :3]) - 0.5) / SH_C0
         means = within("", _fractions(block["packed_position"], _XYZ_SHIFT, _XYZ_MAX))
         scales = np.exp(within("scale_", _fractions(block["packed_scale"], _XYZ_SHIFT, _XYZ_MAX)))
-        quats = quats_from_three(three, rotation >> 30)
+        quats = _packing.quats_from_three(three, rotation >> 30)
         higher = _REST_VALUE[rest[rows]].reshape(len(block), 3, -1).transpose(0, 2, 1)
         return means, quats, scales, rgba[:, 3], np.concatenate([color[:, None], higher], axis=1)
 
@@ -132,13 +119,13 @@ def _decoded(
 
 def write(path: Path, gaussians: Gaussians) -> None:
     """Write a `.compressed.ply` file; gaussians are put in an order that keeps neighbours together."""
-    host = check_writable(gaussians)
-    order = morton_order(host.means)
+    host = _packing.check_writable(gaussians)
+    order = _packing.morton_order(host.means)
     count, num_rest = len(host), 3 * (host.sh.shape[1] - 1)
     num_chunks = -(-count // _CHUNK)
     values = {
         "": host.means[order].astype(np.float64),
-        "scale_": np.minimum(log_scales(host.scales[order]), 20.0),
+        "scale_": np.minimum(_packing.log_scales(host.scales[order]), 20.0),
         "color": host.sh[order, 0].astype(np.float64) * SH_C0 + 0.5,
     }
     starts = np.arange(num_chunks) * _CHUNK
@@ -159,17 +146,17 @@ def write(path: Path, gaussians: Gaussians) -> None:
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode())
         file.write(np.concatenate(ranges, axis=1).astype("<f4").tobytes())
-        for block in blocks(count):
+        for block in _packing.blocks(count):
             rows = order[block]
-            three, largest = three_of_quats(host.quats[rows])
+            three, largest = _packing.three_of_quats(host.quats[rows])
             words = np.empty((len(rows), 4), "<u4")
             words[:, 0] = _word(fractions[""][block], _XYZ_SHIFT, _XYZ_MAX)
             words[:, 1] = _word(three / SQRT2 + 0.5, _THREE_SHIFT, _THREE_MAX) | (largest.astype("u4") << 30)
             words[:, 2] = _word(fractions["scale_"][block], _XYZ_SHIFT, _XYZ_MAX)
             rgb = _word(fractions["color"][block], _RGBA_SHIFT[:3], _RGBA_MAX[:3])
-            words[:, 3] = rgb | opacity_bytes(host.opacities[rows])
+            words[:, 3] = rgb | _packing.opacity_bytes(host.opacities[rows])
             file.write(words.tobytes())
-        for block in blocks(count if num_rest else 0):
+        for block in _packing.blocks(count if num_rest else 0):
             rest = host.sh[order[block], 1:].transpose(0, 2, 1).astype(np.float64)
             file.write(np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
 
@@ -188,7 +175,7 @@ def _fractions(words: NDArray[Any], shifts: tuple[int, ...], largest: tuple[int,
 def _word(fractions: Floats, shifts: tuple[int, ...], largest: tuple[int, ...]) -> NDArray[np.uint32]:
     word = np.zeros(len(fractions), np.uint32)
     for column, shift, most in zip(fractions.T, shifts, largest, strict=True):
-        word |= to_integers(column * most, most) << np.uint32(shift)
+        word |= _packing.to_integers(column * most, most) << np.uint32(shift)
     return word
 
 
@@ -212,7 +199,7 @@ def _degree(path: Path, sh: _Element | None, count: int) -> int:
     if sh is None:
         return 0
     names = [f"f_rest_{i}" for i in range(len(sh.names))]
-    degree = DEGREES.get(len(names) // 3, -1) if len(names) % 3 == 0 else -1
+    degree = _packing.DEGREES.get(len(names) // 3, -1) if len(names) % 3 == 0 else -1
     check(path, degree >= 0, f"0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {len(names)}")
     _require(path, "sh", sh, names, "uchar")
     check(path, sh.count == count, f"{count} rows of element sh like vertex, got {sh.count}")

@@ -22,20 +22,10 @@ from numpy.typing import NDArray
 from v3dg import _files
 from v3dg._json import Node, parse_json
 from v3dg._version import __version__
+from v3dg.formats import _packing
 from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._codebook import nearest, palette_of, table_of
-from v3dg.formats._packing import (
-    SQRT2,
-    Floats,
-    assemble,
-    check_writable,
-    log_scales,
-    morton_order,
-    opacity_bytes,
-    quats_from_three,
-    three_of_quats,
-    to_integers,
-)
+from v3dg.formats._packing import SQRT2, Floats, assemble, opacity_bytes
 from v3dg.formats._reading import Archive, Claims, check, least_bytes, telling, whole
 from v3dg.gaussians import Gaussians
 
@@ -119,7 +109,7 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
         three = (quats[rows, :3] / 255.0 * 2.0 - 1.0) / SQRT2
         widths = np.exp(scale_table[scales[rows, :3]])
         sh = np.concatenate([color_table[color[rows, :3]][:, None], table[palette[labels[rows]]]], axis=1)
-        return means, quats_from_three(three, tags[rows] - 252), widths, color[rows, 3] / 255.0, sh
+        return means, _packing.quats_from_three(three, tags[rows] - 252), widths, color[rows, 3] / 255.0, sh
 
     return assemble(count, degree, decode)
 
@@ -206,8 +196,8 @@ def _size_of_webp(content: bytes) -> tuple[int, int]:
 
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.sog` file; gaussians are put in an order that keeps neighbours together."""
-    host = check_writable(gaussians)
-    contents = encode(host.subset(morton_order(host.means)))
+    host = _packing.check_writable(gaussians)
+    contents = encode(host.subset(_packing.morton_order(host.means)))
     # Gaussians that are all alike take too little to be believed.
     missing = least_bytes(len(host)) - sum(map(len, contents.values()))
     if missing > 0:
@@ -231,15 +221,15 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
     means = gaussians.means.astype(np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = (logs.min(axis=0), logs.max(axis=0)) if count else (np.zeros(3), np.zeros(3))
-    whole = to_integers((logs - low) / np.where(high > low, high - low, 1.0) * 65535.0, 65535)
-    three, largest = three_of_quats(gaussians.quats)
-    log_widths = log_scales(gaussians.scales)
+    whole = _packing.to_integers((logs - low) / np.where(high > low, high - low, 1.0) * 65535.0, 65535)
+    three, largest = _packing.three_of_quats(gaussians.quats)
+    log_widths = _packing.log_scales(gaussians.scales)
     scale_table, color_table = table_of(log_widths), table_of(gaussians.sh[:, 0])
     contents = {
         "means_l.webp": picture(*(whole & 255).T),
         "means_u.webp": picture(*(whole >> 8).T),
         "scales.webp": picture(*nearest(scale_table, log_widths).T),
-        "quats.webp": picture(*to_integers((three * SQRT2 + 1.0) * 127.5, 255).T, largest + 252),
+        "quats.webp": picture(*_packing.to_integers((three * SQRT2 + 1.0) * 127.5, 255).T, largest + 252),
         "sh0.webp": picture(*nearest(color_table, gaussians.sh[:, 0]).T, opacity_bytes(gaussians.opacities)),
     }
     meta: dict[str, Any] = {

@@ -18,20 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
+from v3dg.formats import _packing
 from v3dg.formats._asset_file import AssetFile, whole_file
-from v3dg.formats._packing import (
-    SQRT2,
-    Floats,
-    assemble,
-    blocks,
-    check_writable,
-    log_scales,
-    normalised,
-    opacity_bytes,
-    quats_from_three,
-    three_of_quats,
-    to_integers,
-)
+from v3dg.formats._packing import SQRT2, Floats, assemble
 from v3dg.formats._reading import Claims, Path, check, least_bytes, telling
 from v3dg.gaussians import Gaussians
 
@@ -76,7 +65,7 @@ def decode(path: Path, content: bytes, claims: Claims) -> Gaussians:
 def write(path: Path, gaussians: Gaussians, version: int = 3) -> None:
     """Write a `.spz` file of version 2, 3 or 4; the order stays."""
     check("version", version in (2, 3, 4), f"2, 3 or 4 for .spz, got {version}")
-    host = check_writable(gaussians)
+    host = _packing.check_writable(gaussians)
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
         for part in encode(host, version):
             file.write(part)
@@ -98,9 +87,9 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
     rotations = _rotation_bytes if version == 2 else _rotation_words
     sections: list[Callable[[slice], bytes]] = [
         fixed,
-        lambda rows: opacity_bytes(host.opacities[rows]).astype(np.uint8).tobytes(),
+        lambda rows: _packing.opacity_bytes(host.opacities[rows]).astype(np.uint8).tobytes(),
         lambda rows: _bytes((host.sh[rows, 0] * _COLOR_SCALE + 0.5) * 255.0),
-        lambda rows: _bytes((log_scales(host.scales[rows]) + 10.0) * 16.0),
+        lambda rows: _bytes((_packing.log_scales(host.scales[rows]) + 10.0) * 16.0),
         lambda rows: rotations(host.quats[rows]),
         lambda rows: _bytes(host.sh[rows, 1:] * 128.0 + 128.0),
     ]
@@ -111,7 +100,7 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
     compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
     yield compressor.compress(header)
     for section in sections:
-        for rows in blocks(len(host)):
+        for rows in _packing.blocks(len(host)):
             yield compressor.compress(section(rows))
     yield compressor.flush()
 
@@ -120,7 +109,7 @@ def _zstd_parts(header: bytes, count: int, sections: list[Callable[[slice], byte
     """The header with the number of streams and the place of the table of their sizes, the table, streams."""
     import zstandard
 
-    raw = [b"".join(map(section, blocks(count))) for section in sections]
+    raw = [b"".join(map(section, _packing.blocks(count))) for section in sections]
     packed = [zstandard.ZstdCompressor(level=12).compress(stream) for stream in raw]
     yield header[:15] + struct.pack("<BI12x", len(raw), _ZSTD_HEADER_BYTES)
     yield b"".join(_STREAM_SIZES.pack(len(a), len(b)) for a, b in zip(packed, raw, strict=True))
@@ -128,7 +117,7 @@ def _zstd_parts(header: bytes, count: int, sections: list[Callable[[slice], byte
 
 
 def _bytes(values: Floats) -> bytes:
-    return to_integers(values, 255).astype(np.uint8).tobytes()
+    return _packing.to_integers(values, 255).astype(np.uint8).tobytes()
 
 
 def _fraction_bits(reach: float) -> int:
@@ -139,14 +128,14 @@ def _fraction_bits(reach: float) -> int:
 
 def _rotation_bytes(quats: Floats) -> bytes:
     """x y z of the quaternion whose w is not negative."""
-    unit = normalised(quats)
+    unit = _packing.normalised(quats)
     return _bytes((unit[:, 1:] * np.where(unit[:, :1] < 0, -1.0, 1.0) + 1.0) * 127.5)
 
 
 def _rotation_words(quats: Floats) -> bytes:
     # Components are numbered x y z w here.
-    three, largest = three_of_quats(np.roll(quats, -1, axis=1))
-    magnitude = to_integers(np.abs(three) * SQRT2 * 511.0, 511)
+    three, largest = _packing.three_of_quats(np.roll(quats, -1, axis=1))
+    magnitude = _packing.to_integers(np.abs(three) * SQRT2 * 511.0, 511)
     words = largest.astype("<u4")
     for column in range(3):
         field = magnitude[:, column] | ((three[:, column] < 0).astype(np.uint32) << 9)
@@ -185,11 +174,11 @@ def _quats(rotations: NDArray[Any]) -> Floats:
         xyz = rotations / 127.5 - 1.0
         w = np.sqrt(np.maximum(0.0, 1.0 - np.square(xyz).sum(axis=1, keepdims=True)))
         quats = np.concatenate([w, xyz], axis=1)
-        return normalised(quats)
+        return _packing.normalised(quats)
     words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
     three = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511.0 * SQRT2)
-    return np.roll(quats_from_three(three, words >> 30), 1, axis=1)
+    return np.roll(_packing.quats_from_three(three, words >> 30), 1, axis=1)
 
 
 def _checked_header(path: Path, header: bytes, claims: Claims) -> tuple[int, int, int, list[int]]:
