@@ -77,7 +77,7 @@ def test_folders_without_cameras_are_refused(tmp_path, cameras):
 def test_without_pycolmap_the_error_says_how_to_get_it(tmp_path, cameras, monkeypatch):
     write_model(tmp_path / "a", cameras)
     monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
-    with pytest.raises(ImportError, match=r"expected pycolmap, got none; pip install 'v3dg\[colmap\]'"):
+    with pytest.raises(ImportError, match=r"cameras of COLMAP: expected .*pip install 'pycolmap>=4.0'"):
         read_cameras(tmp_path / "a")
 
 

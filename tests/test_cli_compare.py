@@ -255,4 +255,4 @@ def test_without_flip_views_are_compared_by_psnr(folder, tmp_path, monkeypatch, 
     worst = min(result["views"], key=lambda view: view["psnr"])
     assert result["worst"] == worst["camera"]
     assert cli.main(["compare", *subjects, *options]) == 0
-    assert "pip install 'v3dg[flip]'" in capsys.readouterr().out
+    assert "pip install 'flip-evaluator>=1.6'" in capsys.readouterr().out

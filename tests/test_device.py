@@ -100,8 +100,8 @@ def test_missing_torch_is_named(tmp_path):
     run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert run.stdout == "cpu\n"
     assert run.stderr.splitlines()[-1] == (
-        "RuntimeError: device: expected torch, which owns arrays on CUDA devices; "
-        "pip install 'v3dg[torch]'; or use 'cpu'"
+        "RuntimeError: device: CUDA and gradients: expected torch>=2.2, got none or an older one; "
+        "pip install 'torch>=2.2'; or use 'cpu'"
     )
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import v3dg
+from v3dg._extras import EXTRAS
 
 ROOT = Path(__file__).parent.parent
 CSRC = ROOT / "csrc"
@@ -296,3 +297,9 @@ def test_loading_the_package_loads_no_torch(tmp_path):
     command = "import sys, v3dg; sys.exit('torch' in sys.modules)"
     environment = os.environ | {"PYTHONPATH": str(Path(v3dg.__file__).parent.parent)}
     subprocess.run([sys.executable, "-c", command], cwd=tmp_path, env=environment, check=True)
+
+
+def test_extras_are_told_as_pip_has_them():
+    settings = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    extras = settings.partition("[project.optional-dependencies]")[2].partition("\ntest = [")[0]
+    assert [requirement for requirement, _ in EXTRAS.values() if f'"{requirement}' not in extras] == []

@@ -150,6 +150,6 @@ def test_bad_files_are_refused(tmp_path):
 def test_without_usd_core_the_error_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     v3dg.formats.usd.pxr.cache_clear()
-    with pytest.raises(ImportError, match=r"expected usd-core 26.11 or newer.*pip install 'v3dg\[usd\]'"):
+    with pytest.raises(ImportError, match=r"OpenUSD: expected .*pip install 'usd-core>=26.11'"):
         v3dg.write_asset(tmp_path / "a.usdc", random_gaussians(np.random.default_rng(0), 3))
     assert os.listdir(tmp_path) == []

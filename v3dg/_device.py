@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _core
+from v3dg import _core, _extras
 from v3dg.gaussians import Array, Gaussians
 
 _MUCH_MEMORY = 1 << 30
@@ -76,7 +76,7 @@ def missing_for_cuda() -> str | None:
     try:
         import torch
     except ImportError:
-        return "expected torch, which owns arrays on CUDA devices; pip install 'v3dg[torch]'"
+        return _extras.missing("torch")
     if not torch.cuda.is_available():
         found = f"{torch.__version__}; install one with CUDA"
         return f"expected a torch that can use the CUDA device, got {found}"

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from v3dg import _extras
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import check, one_of
 from v3dg.cameras import Camera, Floats, intrinsics, is_rotation, viewmat_from_blender
@@ -115,11 +116,7 @@ def _read_colmap(folder: Path, distortion: str) -> dict[str, Camera]:
     models = [place for place in places for end in ("bin", "txt") if (place / f"images.{end}").is_file()]
     expected = "a model of COLMAP (images.bin or images.txt) or a run of nerfstudio (config.yml)"
     check(folder, models, f"{expected}, got a folder without")
-    try:
-        import pycolmap
-    except ImportError:
-        raise ImportError("COLMAP: expected pycolmap, got none; pip install 'v3dg[colmap]'") from None
-    cameras = {}
+    pycolmap, cameras = _extras.load("pycolmap"), {}
     try:
         model = pycolmap.Reconstruction(os.fspath(models[0]))
     except (RuntimeError, ValueError, IndexError) as error:

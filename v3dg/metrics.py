@@ -1,4 +1,4 @@
-"""How far apart two pictures are: PSNR, SSIM and FLIP; FLIP wants the extra `flip`.
+"""How far apart two pictures are: PSNR, SSIM and FLIP; FLIP needs the extra `flip`.
 
 All take a reference and a test picture (H,W,3), display values in [0,1] (sRGB as shown, not linear light), as
 NumPy arrays or torch tensors, and are means over the whole picture. Nothing is cropped.
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from v3dg import _extras
 from v3dg._device import Device
 from v3dg._numbers import check
 from v3dg.cameras import Camera
@@ -24,7 +25,7 @@ FLIP_PIXELS_PER_DEGREE = 67.0
 MIN_TRANSMITTANCE = 1e-4
 """Where pixels of the truth stop, a tenth of where those of pictures do."""
 
-FLIP_MISSING = "FLIP wants flip-evaluator, which is not installed; pip install 'v3dg[flip]'"
+FLIP_MISSING = _extras.missing("flip_evaluator")
 
 _SSIM_SIGMA_PX = 1.5
 _SSIM_REACH_PX = 5  # an 11 px window: 3.5 sigma to either side, rounded
@@ -111,11 +112,7 @@ def has_flip() -> bool:
 
 
 def _flip(reference: Any, test: Any, *, magma: bool) -> NDArray[np.float32]:
-    try:
-        import flip_evaluator
-    except ImportError as missing:
-        raise ImportError(FLIP_MISSING) from missing
-
+    flip_evaluator = _extras.load("flip_evaluator")
     # Fresh arrays: the evaluator is free to write into what it gets.
     a, b = (np.clip(x, 0, 1).astype(np.float32, order="C") for x in _pair(reference, test))
     parameters = {"ppd": FLIP_PIXELS_PER_DEGREE}

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable
 from typing import Any
 
-from v3dg import _files
+from v3dg import _extras, _files
 from v3dg._numbers import check
 from v3dg.pictures import to_8bit
 
@@ -29,10 +29,7 @@ def write_video(
         ImportError: The extra is not installed.
         ValueError: Another suffix, no pictures, or pictures of an odd or a changing size.
     """
-    try:
-        import av
-    except ImportError as error:
-        raise ImportError("videos need PyAV, which is not installed; pip install 'v3dg[video]'") from error
+    av = _extras.load("av")
     check(path, os.fspath(path).endswith(".mp4"), "a file name ending in .mp4")
     count, size = 0, None
     with _files.replacing(path) as temporary, av.open(temporary, "w", format="mp4") as video:

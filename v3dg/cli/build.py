@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from v3dg import _extras
 from v3dg._numbers import check
 from v3dg.build import BuildConfig, build_file, levels_path
 from v3dg.cleaning import AssetWarning, describe
@@ -51,7 +52,7 @@ class Build(_common.OnDevice):
     fit is brought into order on the disk of the output."""
     scheduler: Annotated[str | None, _common.option("ADDRESS")] = None
     """Build on the workers of a dask scheduler, as tcp://host:8786, which reach the output's folder, too;
-    needs v3dg[cluster]."""
+    needs the extra `cluster`."""
 
 
 def run(options: Build) -> None:
@@ -75,20 +76,16 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
         return
     import asyncio
 
-    try:
-        from distributed import Client
-        from distributed.comm import connect
-    except ImportError:
-        raise ImportError("--scheduler: expected distributed; pip install 'v3dg[cluster]'") from None
+    distributed, comm = (_extras.load(name) for name in ("distributed", "distributed.comm"))
     for name in ("distributed", "distributed.client"):  # errors are told once, by the command
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
     async def greet() -> None:
-        (await asyncio.wait_for(connect(address), _PATIENCE_S)).abort()
+        (await asyncio.wait_for(comm.connect(address), _PATIENCE_S)).abort()
 
     try:
         asyncio.run(greet())  # a client would wait for ever for one that listens and says nothing
-        client = Client(address, timeout=_PATIENCE_S)
+        client = distributed.Client(address, timeout=_PATIENCE_S)
     except (OSError, ValueError, asyncio.TimeoutError) as error:
         found = f"none ({' '.join(str(error).split()) or 'no answer'})"
         raise RuntimeError(f"{address}: expected a dask scheduler that answers, got {found}") from None

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from v3dg import _files
+from v3dg import _extras, _files
 from v3dg.cameras import is_rotation
 from v3dg.formats._asset_file import AssetFile
 from v3dg.formats._packing import check_writable, normalised
@@ -31,13 +31,9 @@ _SH = "radiance:sphericalHarmonics"
 @cache
 def pxr() -> Any:
     """The package `pxr`; ImportError says how to get it."""
-    try:
-        import pxr
-        from pxr import Usd, UsdGeom, UsdLod, UsdVol, Vt  # noqa: F401 (they become attributes)
-    except ImportError:
-        expected = "usd-core 26.11 or newer, got none or an older one; pip install 'v3dg[usd]'"
-        raise ImportError(f"OpenUSD: expected {expected}") from None
-    return pxr
+    for part in ("Usd", "UsdGeom", "UsdLod", "UsdVol", "Vt"):  # which become its attributes
+        _extras.load(f"pxr.{part}")
+    return _extras.load("pxr")
 
 
 def open_file(path: AnyPath) -> AssetFile:

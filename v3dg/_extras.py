@@ -1,0 +1,31 @@
+"""Packages that v3dg can do without: what each is for, and how to get it."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+EXTRAS = {
+    "torch": ("torch>=2.2", "CUDA and gradients"),
+    "viser": ("viser>=1.1", "the viewer"),
+    "flip_evaluator": ("flip-evaluator>=1.6", "errors by FLIP"),
+    "av": ("av>=12", "videos"),
+    "pxr": ("usd-core>=26.11", "OpenUSD"),
+    "pycolmap": ("pycolmap>=4.0", "cameras of COLMAP"),
+    "distributed": ("distributed>=2024.1", "builds on many machines"),
+}
+"""By module: what pip is to install, and what it is for."""
+
+
+def missing(module: str) -> str:
+    """What to say where one is not installed, or too old."""
+    requirement, purpose = EXTRAS[module]
+    return f"{purpose}: expected {requirement}, got none or an older one; pip install '{requirement}'"
+
+
+def load(module: str) -> Any:
+    """The module; ImportError says how to get it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(missing(module.partition(".")[0])) from error
