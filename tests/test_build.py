@@ -1,6 +1,7 @@
 """Whole builds: what a bundle is made of, and how well its levels look."""
 
 import hashlib
+import itertools
 import math
 import os
 import re
@@ -442,7 +443,7 @@ def test_views_that_are_too_large_for_the_clusters_are_refused(asset):
 def test_wrong_options_are_named(asset):
     with pytest.raises(ValueError, match="device: expected 'auto', 'cpu', 'cuda' or 'cuda:1', got 'gpu'"):
         build(asset, device="gpu")
-    with pytest.raises(TypeError, match="progress: expected True or False, got 'yes'"):
+    with pytest.raises(TypeError, match="progress: expected True, False or a function, got 'yes'"):
         build_bundle(asset, progress="yes")
     with pytest.raises(TypeError):
         build(asset, seed=0.5)
@@ -504,19 +505,39 @@ def test_fit_gains_over_merging_alone(asset, device):
 # ---- progress
 
 
-def test_bar_counts_all_levels_ahead(asset, capsys, device):
-    bundle = build_bundle(asset, config=replace(SMALL, group_size=4), progress=True, device=device)
-    out, err = capsys.readouterr()
+def test_progress_counts_all_levels_ahead(asset, device):
+    """It ends complete: all coarser gaussians, all levels, the last group, its loss."""
+    told = []
+    config = replace(SMALL, group_size=4)
+    bundle = build_bundle(asset, config=config, progress=lambda *state: told.append(state), device=device)
+    done, total, text = told[-1]
+    assert done == total == bundle.num_gaussians - len(asset)
+    assert all(before[0] <= after[0] for before, after in itertools.pairwise(told))
+    top = bundle.num_levels - 1
+    expected = rf"build, level {top}/{top}, groups (\d+)/(\d+), loss 0\.0\d+"
+    groups, of_all = re.fullmatch(expected, text).groups()
+    assert groups == of_all
+
+
+def test_progress_is_four_lines_where_there_is_no_terminal(asset, capfd, device, caplog):
+    with caplog.at_level("INFO"):
+        build_bundle(asset, config=SMALL, progress=True, device=device)
+    out, err = capfd.readouterr()
     assert out == ""
-    # One bar that ends complete: all coarser gaussians, all levels, the last group, its loss.
-    last = err.strip().split("\r")[-1]
-    coarser = bundle.num_gaussians - len(asset)
-    assert last.startswith(f"level {bundle.num_levels - 1}/{bundle.num_levels - 1}: 100%")
-    assert f"{coarser / 1000:.2f}k/{coarser / 1000:.2f}k" in last
-    done, of_all = re.search(r"groups (\d+)/(\d+), loss 0\.0", last).groups()
-    assert done == of_all
+    lines = err.splitlines()
+    assert 1 <= len(lines) <= 4
+    assert lines[-1].endswith(": 100 %")
+    assert caplog.messages == lines
 
 
-def test_no_bar_unless_wanted(asset, capfd, device):
+def test_no_progress_unless_wanted(asset, capfd, device):
     build_bundle(asset, config=SMALL, progress=False, device=device)
     assert capfd.readouterr() == ("", "")
+
+
+def test_what_progress_raises_ends_the_build(asset, device, tmp_path):
+    def give_up(*_):
+        raise InterruptedError("enough")
+
+    with pytest.raises(InterruptedError, match="enough"):
+        build_bundle(asset, config=SMALL, progress=give_up, device=device)

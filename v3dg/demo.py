@@ -13,6 +13,7 @@ from typing import Any
 
 from v3dg import _device
 from v3dg._device import Device
+from v3dg._progress import Progress, counted
 from v3dg.build import build_bundle
 from v3dg.cameras import Camera
 from v3dg.donut import make_donut, place_field
@@ -37,7 +38,7 @@ def run_demo(
     tolerance: float = DEFAULT_TOLERANCE,
     seed: int = 0,
     views: tuple[tuple[float, float], ...] = VIEWS,
-    progress: bool = True,
+    progress: Progress = True,
     device: str = "auto",
 ) -> dict[str, Any]:
     """Make an asset, build and place it, draw and measure every distance, and write the picture.
@@ -54,8 +55,6 @@ def run_demo(
     Raises:
         ValueError: The picture cannot be written to ``output``, or an argument is out of range.
     """
-    from tqdm import tqdm
-
     path = check_picture_path(output)
     where = _device.resolve(device)
     start = time.perf_counter()
@@ -67,7 +66,7 @@ def run_demo(
     scene.add(bundle, positions=positions, quaternions=quaternions, scales=scales)
     columns: list[dict[str, Any]] = []
     rows: tuple[list[tuple[str, Picture]], ...] = ([], [])
-    for distance, elevation in tqdm(views, "draw", unit="distance", leave=False, disable=not progress):
+    for distance, elevation in counted(views, len(views), "draw", progress):
         camera = _camera(distance, elevation, *size)
         truth = draw_truth(scene, camera, where, background=_SKY)
         columns.append({"distance": distance})

@@ -8,6 +8,7 @@ from typing import Literal
 
 from v3dg._device import Device
 from v3dg._numbers import check
+from v3dg._progress import Progress
 from v3dg.build.config import BuildConfig
 from v3dg.build.files import build_file, levels_path
 from v3dg.build.leaves import MemoryLeaves
@@ -24,7 +25,7 @@ def build_bundle(
     *,
     config: BuildConfig | None = None,
     seed: int = 0,
-    progress: bool = True,
+    progress: Progress = True,
     device: str | Device = "auto",
     resume_path: str | os.PathLike[str] | None = None,
     unusable: Literal["drop", "refuse"] = "drop",
@@ -40,7 +41,10 @@ def build_bundle(
         asset: At least one gaussian that can be drawn.
         config: Settings; ours by default.
         seed: Of the views that groups are fitted to.
-        progress: Show a bar with the level, its groups done, the time left and their mean loss.
+        progress: Show a bar with the level, its groups done, the time left and their mean loss; four lines
+            where stderr is no terminal. Or a function that is called with the gaussians that are fitted, of
+            how many, and a text; what it raises ends the build. The four lines are also logged in any case,
+            as INFO of the logger `v3dg`.
         device: Where to compute; the bundle is on the host in any case. "auto" and "cuda" are the asset's or
             the current CUDA device and all others of its kind, where torch can use it; "auto" else the CPU.
         resume_path: The file of the bundle, which is written there as it is built, and opened from there; a

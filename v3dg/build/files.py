@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from v3dg import _files
 from v3dg._device import Device
+from v3dg._progress import Progress
 from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import MemoryLeaves, made_with
 from v3dg.build.leaves_on_disk import leaves_on_disk
@@ -30,7 +31,7 @@ def build_file(
     asset: Gaussians | None = None,
     config: BuildConfig | None = None,
     seed: int = 0,
-    progress: bool = True,
+    progress: Progress = True,
     device: str | Device = "auto",
     resume: bool = False,
     unusable: Literal["drop", "refuse"] = "drop",

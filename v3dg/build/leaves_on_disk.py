@@ -23,13 +23,13 @@ import numpy.typing as npt
 from v3dg import _core
 from v3dg._device import CPU, Device
 from v3dg._numbers import check
+from v3dg._progress import Bar, Progress
 from v3dg.build import external_split
 from v3dg.build.config import BuildConfig
 from v3dg.build.digest import PIECE, digest_of_hashes, hash_of, new_pool, pieces_of
 from v3dg.build.leaves import Leaves, MemoryLeaves, Tally, Unusable
 from v3dg.build.memory import in_mib
 from v3dg.build.plan import halved
-from v3dg.build.progress import bar_of_gaussians
 from v3dg.build.scratch import RowFile, scratch_folder
 from v3dg.bundle.codec import Codec
 from v3dg.formats._asset_file import AssetFile
@@ -83,7 +83,7 @@ def leaves_on_disk(
     unusable: Unusable = "drop",
     reserved: Callable[[int, int], int] = lambda num_gaussians, sh_degree: 0,
     device: Device = CPU,
-    progress: bool = False,
+    progress: Progress = False,
     most_in_memory: int = 1 << 32,
 ) -> Iterator[Leaves]:
     """The leaves of the asset that some files make together, one after the other, within so much memory.
@@ -100,7 +100,7 @@ def leaves_on_disk(
     fits = count <= min(sizes.in_memory, most_in_memory)
     # Where none is needed, what a killed build left is removed.
     scratch = nullcontext() if fits and not os.path.lexists(folder) else scratch_folder(folder, _NAMES)
-    with scratch, bar_of_gaussians(2 * count, progress and not fits, desc="reading", leave=False) as bar:
+    with scratch, Bar(2 * count, "reading", progress if not fits else False) as bar:
         if fits:
             buffer = Codec(degree).empty(count)
             for _ in _blocks(tiles, buffer, bar):

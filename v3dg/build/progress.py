@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
 
-from v3dg import _core
+from v3dg import _core, _progress
+from v3dg._progress import Progress
 from v3dg.build.plan import Plan
 from v3dg.build.simplify import Show
-
-
-def bar_of_gaussians(total: int, is_visible: bool, **options: Any) -> Any:
-    """Tqdm's, which counts gaussians."""
-    from tqdm import tqdm
-
-    options |= {"unit": " gaussians", "unit_scale": True, "dynamic_ncols": True}
-    return tqdm(total=total, disable=not is_visible, **options)
 
 
 class Stopped(Exception):
@@ -25,13 +17,13 @@ class Stopped(Exception):
 class Bar:
     """One bar over all levels; it advances by fitted gaussians, which is what time goes with."""
 
-    def __init__(self, plan: Plan, initial: int, is_visible: bool) -> None:
+    def __init__(self, plan: Plan, initial: int, progress: Progress) -> None:
         total = sum(level.num_gaussians for level in plan.levels[1:])
         self._last_level = len(plan.levels) - 1
         self._initial = initial
         self._fitted: dict[tuple[int, int], float] = {}  # by part and first level
         self._lock = threading.Lock()
-        self._bar = bar_of_gaussians(total, is_visible, initial=initial, smoothing=0.1)
+        self._bar = _progress.Bar(total, "build", progress, initial=initial)
         self._is_stopped = False
 
     def __enter__(self) -> Bar:
@@ -50,12 +42,10 @@ class Bar:
         def show(levels: range, num_groups: int, num_gaussians: int, state: _core.FitProgress) -> None:
             if self._is_stopped:
                 raise Stopped
-            self._update((part, levels[0]), num_gaussians * state.groups_done / num_groups)
-            with self._lock:
-                self._bar.set_description(f"level {levels[-1]}/{self._last_level}", refresh=False)
-                if (done := state.groups_done) > 0:
-                    text = f"groups {done}/{num_groups}, loss {state.loss_sum / done:.4f}"
-                    self._bar.set_postfix_str(text, refresh=False)
+            text, done = f"level {levels[-1]}/{self._last_level}", state.groups_done
+            if done > 0:
+                text += f", groups {done}/{num_groups}, loss {state.loss_sum / done:.4f}"
+            self._update((part, levels[0]), num_gaussians * done / num_groups, text)
 
         return show
 
@@ -64,7 +54,7 @@ class Bar:
         if level > 0:
             self._update((part, level), num_gaussians)
 
-    def _update(self, key: tuple[int, int], num_gaussians: float) -> None:
+    def _update(self, key: tuple[int, int], num_gaussians: float, text: str = "") -> None:
         with self._lock:
             self._fitted[key] = num_gaussians
-            self._bar.update(self._initial + int(sum(self._fitted.values())) - self._bar.n)
+            self._bar.update(self._initial + int(sum(self._fitted.values())) - self._bar.done, text)

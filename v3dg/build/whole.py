@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from v3dg import _device
 from v3dg._device import Device
+from v3dg._progress import Progress
 from v3dg.build.assemble import assemble
 from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
@@ -54,7 +55,7 @@ def build_into(
     config: BuildConfig,
     seed: int,
     devices: Sequence[Device],
-    progress: bool,
+    progress: Progress,
     *,
     codec: str,
     bundle_path: Path | None = None,
@@ -62,8 +63,6 @@ def build_into(
     executor: Executor | None = None,
 ) -> Bundle:
     """Build all levels of an asset, in memory or in a file that replaces `bundle_path`; as `build_bundle`."""
-    if not isinstance(progress, bool):
-        raise TypeError(f"progress: expected True or False, got {progress!r}")
     plan = Plan.of(leaves.num_gaussians, config)
     config.check_views(max((np.diff(made.group_offset).max() for made in plan.levels[1:]), default=1))
     units = plan.units(UNIT_LEAVES)

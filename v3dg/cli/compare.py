@@ -15,6 +15,7 @@ import tyro
 from v3dg import _device, pictures
 from v3dg._judges import Judges, mean_of
 from v3dg._numbers import check
+from v3dg._progress import counted
 from v3dg.bundle import Bundle
 from v3dg.cli import _common
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
@@ -60,8 +61,6 @@ class _Pair:
 
 
 def run(options: Compare) -> None:
-    from tqdm import tqdm
-
     output = pictures.check_picture_path(options.output)
     subjects = (options.reference, options.test)
     is_another = output.resolve() not in [path.resolve() for path in subjects]
@@ -79,7 +78,7 @@ def run(options: Compare) -> None:
             if len(names) >= _ENOUGH_TO_SHARE
             else ((pair, _errors(pair)) for pair in pairs)
         )
-        for pair, errors in tqdm(judged, total=len(names), unit="view", leave=False, disable=options.quiet):
+        for pair, errors in counted(judged, len(names), "compare", not options.quiet):
             row = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
             if options.pictures == "all":
                 row["picture"] = str(paths[len(rows)])

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from v3dg import _device
+from v3dg._progress import counted
 from v3dg.cli._common import Cut, OnDevice, check_usage, finite, option, print_result, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
 from v3dg.pictures import check_picture_path, write_picture
@@ -49,7 +50,9 @@ def run(options: Render) -> None:
     is_film = own_cameras is None and options.view.cameras is None and len(cameras) > 1
     fade = DEFAULT_FADE if options.fade is None and is_film else options.fade
     pictures: list[dict[str, Any]] = []
-    for path, (name, camera) in zip(picture_paths(output, cameras), cameras.items(), strict=True):
+    views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
+    show = len(views) > 1 and not options.quiet
+    for path, (name, camera) in counted(views, len(views), "render", show):
         image = render(
             subject,
             camera,

@@ -17,6 +17,7 @@ import numpy as np
 
 from v3dg import _files
 from v3dg._numbers import check
+from v3dg._progress import Bar, Progress
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.export import _common
@@ -59,7 +60,7 @@ def write_site(
     *,
     chunk: int = DEFAULT_CHUNK,
     up: Axis | None = None,
-    progress: bool = False,
+    progress: Progress = False,
 ) -> Site:
     """Write a scene or a bundle as a web page, replacing an earlier export once all is written.
 
@@ -76,8 +77,6 @@ def write_site(
         ValueError: As `write_streamed_sog`, or a scene without instances.
         OSError: A file cannot be written.
     """
-    from tqdm import tqdm
-
     folder = Path(folder)
     is_scene = isinstance(subject, Scene)
     axis: Axis = up or ("z" if is_scene else "-y")
@@ -89,7 +88,7 @@ def write_site(
     with _common.replacing_folder(folder) as place:
         total = sum(bundle.num_gaussians for bundle in scene.bundles)
         listed, counts = [], []
-        with tqdm(None, "export", total, unit=" gaussians", unit_scale=True, disable=not progress) as bar:
+        with Bar(total, "export", progress) as bar:
             for name, plan in zip(_common.names_of(scene) if is_scene else ["."], plans, strict=True):
                 (place / name).mkdir(exist_ok=True)
                 done = write_levels(plan, place / name, turn, bar.update)

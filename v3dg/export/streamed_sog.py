@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg._numbers import check
+from v3dg._progress import Bar, Progress
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
@@ -63,7 +64,7 @@ def write_streamed_sog(
     *,
     chunk: int = DEFAULT_CHUNK,
     up: Axis = "-y",
-    progress: bool = False,
+    progress: Progress = False,
 ) -> Export:
     """Write a bundle as streamed SOG, replacing an earlier export in one step once all is written.
 
@@ -75,7 +76,7 @@ def write_streamed_sog(
             of their levels go together exactly, whichever each of them has.
         up: What is up in the asset, which is turned to what viewers take to be up. Trained assets mostly have
             y down, so nothing is turned.
-        progress: Show a bar.
+        progress: As in `v3dg.build_bundle`.
 
     Raises:
         ValueError: There is something else at ``folder``, ``chunk`` is too small for the bundle's groups, or
@@ -84,12 +85,10 @@ def write_streamed_sog(
 
     Source: PlayCanvas, the streamed SOG format, version 1.
     """
-    from tqdm import tqdm
-
     turn, plan = _common.turn_upright(up), Plan.of(bundle, chunk)
     with _common.replacing_folder(Path(folder)) as place:
         total = bundle.num_gaussians
-        with tqdm(None, "export", total, unit=" gaussians", unit_scale=True, disable=not progress) as bar:
+        with Bar(total, "export", progress) as bar:
             done = write_levels(plan, place, turn, bar.update)
     return done
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg._numbers import check
+from v3dg._progress import Bar, Progress
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
 from v3dg.cameras import Floats
@@ -65,7 +66,7 @@ def write_tiles(
     folder: str | os.PathLike[str],
     *,
     up: Axis | None = None,
-    progress: bool = False,
+    progress: Progress = False,
 ) -> Tiles:
     """Write a scene or a bundle as 3D Tiles, replacing an earlier export once all is written.
 
@@ -83,8 +84,6 @@ def write_tiles(
 
     Source: OGC, 3D Tiles 1.1; Khronos, KHR_gaussian_splatting and its compression by SPZ.
     """
-    from tqdm import tqdm
-
     root = np.eye(4)
     root[:3, :3] = _common.rotation_to(up or ("z" if isinstance(subject, Scene) else "-y"), "z")
     scene = Scene.of(subject)
@@ -94,7 +93,7 @@ def write_tiles(
     names, trees = _common.names_of(scene), []
     with _common.replacing_folder(Path(folder), keep=CESIUM) as place:
         total = sum(bundle.num_gaussians for bundle in scene.bundles)
-        with tqdm(None, "export", total, unit=" gaussians", unit_scale=True, disable=not progress) as bar:
+        with Bar(total, "export", progress) as bar:
             for name, bundle in zip(names, scene.bundles, strict=True):
                 (place / name).mkdir()
                 writer = _Writer(bundle, place / name, bar.update)

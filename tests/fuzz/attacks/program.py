@@ -23,7 +23,7 @@ COMMAND = [sys.executable, "-m", "v3dg"]
 MOST_BYTES = 8 << 30  # of addresses: more is the machine's end, not the program's
 # What is no error: OpenMP's runtime on what it was told, assets that a command goes through, bars, and that
 # there was no memory for the thread that watches these.
-PROGRESS = re.compile(r"libgomp: |v3dg: warning: tqdm:|\[\d+/\d+\] |failed: |.*\d%\||$")
+PROGRESS = re.compile(r"libgomp: |v3dg: warning: tqdm:|\[\d+/\d+\] |failed: |.*: \d+ %$|$")
 ERROR = "v3dg: error: "
 
 
