@@ -11,7 +11,6 @@ import v3dg
 from command_line import fails, run
 from random_bundle import random_bundle, random_gaussians
 from v3dg.export import write_usd
-from v3dg.rotations import placed
 
 pytest.importorskip("pxr")
 from pxr import Gf, Usd, UsdGeom, UsdLod, UsdValidation
@@ -56,7 +55,7 @@ def test_prims_stand_where_their_transforms_put_them(tmp_path):
     scale = prim.AddScaleOp()
     scale.Set(Gf.Vec3f(2, 2, 2))
     stage.GetRootLayer().Save()
-    wanted = placed(asset, (0.5, 0.5, -0.5, 0.5), (1, 2, 3), 2.0)
+    wanted = asset.transform((0.5, 0.5, -0.5, 0.5), (1, 2, 3), 2.0)
     found = v3dg.read_asset(tmp_path / "a.usda")
     np.testing.assert_allclose(found.means, wanted.means, atol=1e-5)
     np.testing.assert_allclose(found.sh, wanted.sh, atol=1e-5)

@@ -7,7 +7,7 @@ import v3dg
 from benchmarks import worlds
 from benchmarks.__main__ import PROGRAM
 from v3dg.build import build_file
-from v3dg.scene import rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
 
 
 @pytest.fixture(scope="module")

@@ -16,44 +16,32 @@ from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle, Clusters, Groups
 from v3dg.camera_file import read_cameras, write_cameras
 from v3dg.cameras import Camera, StereoCamera, turntable
+from v3dg.export import write_site, write_streamed_sog, write_tiles, write_usd
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image, RenderedImage, Stats
 from v3dg.io import read_asset, write_asset
+from v3dg.opening import open as open  # not in __all__: with `*` it would hide the one of Python
 from v3dg.pick import Pick, pick
 from v3dg.rasterize import rasterize
 from v3dg.render import Renderer, render
 from v3dg.scene import Scene
-from v3dg.scene_file import read_scene, write_scene
+from v3dg.scene.file import read_scene, write_scene
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select
+from v3dg.view import view
 
-__all__ = [
+__all__ = ["BuildConfig", "Bundle", "Clusters", "Gaussians", "Groups"]
+__all__ += ["__version__", "build_bundle", "read_asset", "write_asset"]
+__all__ += ["Camera", "Scene", "read_cameras", "read_scene", "turntable", "write_cameras", "write_scene"]
+__all__ += [
     "DEFAULT_FADE",
     "DEFAULT_TOLERANCE",
-    "BuildConfig",
-    "Bundle",
-    "Camera",
-    "Clusters",
-    "Gaussians",
-    "Groups",
     "Image",
     "Pick",
     "RenderedImage",
     "Renderer",
-    "Scene",
     "Selection",
     "Stats",
     "StereoCamera",
-    "__version__",
-    "build_bundle",
-    "pick",
-    "rasterize",
-    "read_asset",
-    "read_cameras",
-    "read_scene",
-    "render",
-    "select",
-    "turntable",
-    "write_asset",
-    "write_cameras",
-    "write_scene",
 ]
+__all__ += ["pick", "rasterize", "render", "select", "view"]
+__all__ += ["write_site", "write_streamed_sog", "write_tiles", "write_usd"]

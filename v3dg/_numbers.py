@@ -89,7 +89,10 @@ def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
 def check_type(name: str, value: object, kind: type, expected: str) -> None:
     """Raise TypeError unless a value is of a kind, as which it is expected."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}")
+        is_file = isinstance(value, str | os.PathLike) and kind.__module__.startswith("v3dg.")
+        reader = "read_cameras" if kind.__name__ == "Camera" else "open"
+        advice = f"; v3dg.{reader} reads files" if is_file else ""
+        raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}{advice}")
 
 
 def check_all(name: str, values: npt.NDArray[Any], good: npt.NDArray[np.bool_], expected: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 
 from v3dg import _core
-from v3dg._numbers import check, check_type
+from v3dg._numbers import check, check_type, positive, vector
 
 Array: TypeAlias = Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
 
@@ -124,6 +124,41 @@ class Gaussians:
             if index.is_cuda:
                 _check_range(index, len(self))
         return self._map(lambda tensor: tensor[index].contiguous())
+
+    def transform(
+        self, quaternion: Any = (1.0, 0.0, 0.0, 0.0), position: Any = (0.0, 0.0, 0.0), scale: float = 1.0
+    ) -> Gaussians:
+        """Return the gaussians in another frame: p goes to scale * rotation p + position, colours turn along.
+
+        They are of the same kind and on the same device, without gradients.
+
+        Args:
+            quaternion: (4,) w x y z of any length but zero.
+            position: (3,).
+            scale: > 0.
+
+        Raises:
+            ValueError: A shape or a value is not as above.
+        """
+        turn = vector(quaternion, "quaternion", (4,))
+        check("quaternion", turn.any(), "a rotation, got a quaternion of zeros")
+        turn /= np.abs(turn).max()  # so that squares neither overflow nor vanish
+        rows = _core.gather(
+            bundles=[self.rows],
+            instances=_core.Instances(
+                bundle=np.zeros(1, np.int32),
+                positions=vector(position, "position")[None],
+                quaternions=turn[None] / np.linalg.norm(turn),
+                scales=np.array([positive(scale, "scale")]),
+                importance=np.ones(1, np.float32),
+            ),
+            instance=np.zeros(1, np.int32),
+            first_row=np.zeros(1, np.int64),
+            offset=np.array([0, len(self)]),
+            device=self.means.device.index if getattr(self.means, "is_cuda", False) else -1,
+        )
+        moved = Gaussians(*rows)
+        return moved.torch() if _is_tensor(self.means) else moved
 
     @staticmethod
     def concatenate(parts: Sequence[Gaussians]) -> Gaussians:

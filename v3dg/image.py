@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
     from v3dg import _core
 
+from v3dg.pictures import encode_png
+
 
 class Image:
     """A picture of H x W pixels: NumPy arrays, or torch tensors on the device that drew it.
@@ -27,6 +29,10 @@ class Image:
     @property
     def _planes(self) -> Any:
         return self._own
+
+    def _repr_png_(self) -> bytes:
+        """The picture, for notebooks."""
+        return encode_png(self.color)
 
     @property
     def color(self) -> Any:

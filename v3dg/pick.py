@@ -9,7 +9,7 @@ import numpy as np
 
 from v3dg import _core
 from v3dg._device import CPU
-from v3dg._numbers import check, whole
+from v3dg._numbers import check, check_type, whole
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.residency import residency
@@ -60,6 +60,7 @@ def pick(
     Raises:
         ValueError: The pixel is not in the image, or another argument is not as in `v3dg.render`.
     """
+    check_type("camera", camera, Camera, "a Camera")
     x, y = whole(x, "x", "a column", 0), whole(y, "y", "a row", 0)
     is_inside = x < camera.width and y < camera.height
     check("x, y", is_inside, f"a pixel of {camera.width} x {camera.height}, got ({x}, {y})")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import warnings
 from collections.abc import Iterator, Sequence
@@ -118,6 +119,15 @@ def _naming_damage(name: str) -> Iterator[None]:
         raise ValueError(f"{name}: expected a PNG or a JPEG, got another file") from None
     except Exception as error:  # Pillow raises many kinds
         raise ValueError(f"{name}: expected a PNG or a JPEG, got one that cannot be read: {error}") from error
+
+
+def encode_png(image: Any) -> bytes:
+    """A PNG of (H,W,3) floats in [0,1]."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(to_8bit(image)).save(stream, "PNG")
+    return stream.getvalue()
 
 
 def write_picture(path: str | os.PathLike[str], image: Any) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from v3dg import _core, _device
-from v3dg._numbers import color, real
+from v3dg._numbers import check_type, color, real
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image
@@ -47,6 +47,8 @@ def rasterize(
             on a CUDA device.
         RuntimeError: The gaussians are on a CUDA device, and v3dg was built without CUDA.
     """
+    check_type("gaussians", gaussians, Gaussians, "Gaussians")
+    check_type("camera", camera, Camera, "a Camera")
     filter_px2 = real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0)
     options: dict[str, Any] = {"filter_px2": filter_px2, "antialiased": bool(antialiased)}
     options["with_depth"] = True

@@ -1,12 +1,10 @@
-"""Rotations and quaternions, and gaussians that similarities move."""
+"""Rotations and quaternions."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from v3dg import _core, _device
-from v3dg.cameras import Floats, VectorLike
-from v3dg.gaussians import Gaussians
+from v3dg.cameras import Floats
 
 
 def rotation_from_quaternion(quaternions: Floats) -> Floats:
@@ -29,24 +27,3 @@ def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, flo
     symmetric[1:, 1:] = r + r.T - np.trace(r) * np.eye(3)
     w, x, y, z = np.linalg.eigh(symmetric, UPLO="L")[1][:, -1].tolist()
     return (-w, -x, -y, -z) if w < 0 else (w, x, y, z)
-
-
-def placed(
-    gaussians: Gaussians, quaternion: VectorLike, position: VectorLike = (0.0, 0.0, 0.0), scale: float = 1.0
-) -> Gaussians:
-    """Gaussians in another frame: p is taken to scale * rotation p + position, and colours turn along."""
-    rows = _core.gather(
-        bundles=[gaussians.rows],
-        instances=_core.Instances(
-            bundle=np.zeros(1, np.int32),
-            positions=np.array([position], np.float64),
-            quaternions=np.array([quaternion], np.float64),
-            scales=np.array([scale], np.float64),
-            importance=np.ones(1, np.float32),
-        ),
-        instance=np.zeros(1, np.int32),
-        first_row=np.zeros(1, np.int64),
-        offset=np.array([0, len(gaussians)]),
-        device=_device.of(gaussians.means).number,
-    )
-    return Gaussians(*rows)

@@ -26,7 +26,7 @@ from benchmarks.worlds.procedural import make_asset
 from v3dg import _core, metrics
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
-from v3dg.scene_file import read_scene
+from v3dg.scene.file import read_scene
 
 # px², past which every instance is drawn from its last level.
 _MOST_TOLERANCE = 1e4

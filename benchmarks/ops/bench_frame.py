@@ -24,7 +24,7 @@ from benchmarks.worlds.procedural import make_asset
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.render import Renderer
-from v3dg.scene_file import read_scene
+from v3dg.scene.file import read_scene
 
 
 @dataclass

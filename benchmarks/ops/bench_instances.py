@@ -29,7 +29,7 @@ from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import Renderer
 from v3dg.scene import Scene
-from v3dg.scene_file import read_scene
+from v3dg.scene.file import read_scene
 from v3dg.select import DEFAULT_TOLERANCE
 
 # An instance of a field can be smaller than a pixel, and its gaussians are not filtered.

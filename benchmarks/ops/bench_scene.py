@@ -17,7 +17,7 @@ from benchmarks.evaluation import record
 from v3dg import metrics
 from v3dg.bundle import Bundle
 from v3dg.render import render
-from v3dg.scene_file import read_scene
+from v3dg.scene.file import read_scene
 
 
 @dataclass

@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 from benchmarks.evaluation import record
-from v3dg.scene_file import read_scene
+from v3dg.scene.file import read_scene
 from v3dg.viewer.frame import SceneView
 from v3dg.viewer.server import Site
 from v3dg.viewer.view import View, look_at

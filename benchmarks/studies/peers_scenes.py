@@ -18,7 +18,7 @@ from benchmarks.worlds.procedural import make_asset
 from v3dg import _core
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
-from v3dg.scene_file import read_scene
+from v3dg.scene.file import read_scene
 
 TRAINED_PX2 = 0.3
 """The filter of the original 3DGS code, with which assets are trained."""

@@ -230,7 +230,7 @@ def main() -> None:
     }
     run.frames("random", bundle, ring)
     if arguments.layout:
-        from v3dg.scene_file import read_scene
+        from v3dg import read_scene
 
         read_asset = getattr(v3dg, "read_asset", None) or v3dg.load  # as an older version calls it
         asset = read_asset(arguments.layout.parent / json.loads(arguments.layout.read_text())["asset"])

@@ -31,7 +31,7 @@ from v3dg.cameras import Camera, Floats
 from v3dg.gaussians import Gaussians
 from v3dg.io import read_asset, write_asset
 from v3dg.scene import Scene
-from v3dg.scene_file import write_scene
+from v3dg.scene.file import write_scene
 
 
 @dataclass(frozen=True)

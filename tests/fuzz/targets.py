@@ -16,7 +16,7 @@ from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
 from v3dg.formats import sog
 from v3dg.io import open_asset, read_asset
-from v3dg.scene_file import read_scene
+from v3dg.scene.file import read_scene
 
 BUNDLES = {"a": random_bundle(0), "a.v3dg": random_bundle(1), "sub/b.v3dg": random_bundle(2)}
 

@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 from typing import Literal
 
 from v3dg._device import Device
-from v3dg._numbers import check
+from v3dg._numbers import check, check_type
 from v3dg._progress import Progress
 from v3dg.build.config import BuildConfig
 from v3dg.build.files import build_file, levels_path
@@ -67,6 +67,7 @@ def build_bundle(
         MemoryError: The device has too little memory; the message has the numbers.
         KeyboardInterrupt: Ctrl-C; threads have stopped, what is finished is at `resume_path`.
     """
+    check_type("asset", asset, Gaussians, "Gaussians")
     config = config or BuildConfig()
     devices = devices_for(device, asset)
     leaves = MemoryLeaves(asset, config, unusable, devices[0])

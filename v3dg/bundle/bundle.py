@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import os
 from dataclasses import fields, replace
 from typing import Any, TypeAlias
@@ -162,6 +163,13 @@ class Bundle:
             f"Bundle(num_gaussians={self.num_gaussians}, num_clusters={len(self.clusters)}, "
             f"num_levels={self.num_levels}, sh_degree={self.sh_degree}{where})"
         )
+
+    def _repr_html_(self) -> str:
+        """What it is and a table of its levels, for notebooks."""
+        names = ("level", "clusters", "gaussians", "bytes")
+        rows = [names, *([f"{level[name]:,}" for name in names] for level in self.info()["levels"])]
+        cells = "".join(f"<tr><td>{'<td>'.join(row)}" for row in rows)
+        return f"<p>{html.escape(repr(self))}<table>{cells}</table>"
 
     def level_range(self, level: int) -> range:
         """Ids of the clusters of one level."""

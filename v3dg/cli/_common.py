@@ -113,7 +113,7 @@ def finite(number: float) -> float | None:
 
 
 def print_result(as_json: bool, result: dict[str, Any], lines: Iterable[str]) -> None:
-    print(json.dumps(result, indent=1) if as_json else "\n".join(map(printable, lines)))
+    print(json.dumps(result, indent=1) if as_json else "\n".join(map(printable, lines)), flush=True)
 
 
 def table_lines(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> list[str]:

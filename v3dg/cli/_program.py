@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import functools
 import io
 import operator
 import os
+import re
 import signal
 import sys
 import warnings
@@ -55,16 +57,21 @@ class Program:
         except SystemExit as stop:
             if not stop.code:
                 raise
-            raise UsageError(self._one_line(caught.getvalue())) from None
+            raise UsageError(self._one_line(caught.getvalue(), arguments)) from None
 
-    def _one_line(self, boxed: str) -> str:
-        """The text of the first box that tyro drew, without its rules and its title."""
+    def _one_line(self, boxed: str, arguments: Sequence[str]) -> str:
+        """The text of the first box that tyro drew, without rules and title, and what may be meant."""
         lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
         rule = next((i for i, line in enumerate(lines) if not line), len(lines))
         rest = " ".join(line for line in lines[rule:] if line).replace("run:", "run")
         help_at = rest.find(f"run {self.name}")
         hint = rest[help_at:].split("--help")[0] if help_at >= 0 else f"run {self.name} "
-        return " ".join(lines[:rule]).rstrip(".") + f"; {hint}--help"
+        similar = "\n".join(lines[rule:]).partition("Perhaps you meant:")[2]
+        meant = [name for name in re.findall(r"^--[a-z-]+", similar, re.M) if name not in arguments]
+        if arguments and arguments[0] not in self.commands:
+            meant = difflib.get_close_matches(arguments[0], self.commands)
+        advice = f"; perhaps you meant {meant[0]}" if meant else ""
+        return " ".join(lines[:rule]).rstrip(".") + f"{advice}; {hint}--help"
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """Run one command, by default the one this program was started with, and return its exit code."""

@@ -19,12 +19,8 @@ from v3dg.cleaning import ball_of_most
 from v3dg.cli._common import check_range, check_usage, level_size, option, require_subject
 from v3dg.export import Axis
 from v3dg.gaussians import Gaussians
-from v3dg.io import SUFFIXES, read_asset
+from v3dg.opening import Subject, is_scene
 from v3dg.pictures import MOST_SIDE, check_size
-from v3dg.scene import Scene
-from v3dg.scene_file import read_scene
-
-Subject: TypeAlias = Scene | Bundle | Gaussians
 
 # Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
 _ENOUGH_TO_FRAME = 50_000
@@ -68,18 +64,6 @@ class ViewOptions:
 
 # Field of a command's options that holds them; on the command line they stand beside the others.
 Views: TypeAlias = Annotated[ViewOptions, tyro.conf.OmitArgPrefixes]
-
-
-def is_scene(path: Path) -> bool:
-    """Whether a file is a scene by its name: JSON, but not the `meta.json` of an asset in SOG."""
-    return path.suffix == ".json" and not path.name.endswith(SUFFIXES)
-
-
-def load_subject(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
-    """A scene with its cameras, or a bundle or an asset, which have none."""
-    if is_scene(path):
-        return read_scene(path)
-    return Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path), None
 
 
 def choose_cameras(

@@ -18,8 +18,9 @@ from v3dg._numbers import check
 from v3dg._progress import counted
 from v3dg.bundle import Bundle
 from v3dg.cli import _common
-from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
+from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths
 from v3dg.metrics import FLIP_MISSING, MIN_TRANSMITTANCE, draw_truth, error_image, errors_of
+from v3dg.opening import open_with_cameras
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 
@@ -132,8 +133,8 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair], int | None]:
     options.view.check(options.reference, options.test)
     _common.check_range("--supersample", options.supersample, 1, 16)
     device = _device.resolve(options.device)
-    reference, reference_cameras = load_subject(options.reference)
-    test, test_cameras = load_subject(options.test)
+    reference, reference_cameras = open_with_cameras(options.reference)
+    test, test_cameras = open_with_cameras(options.test)
     own, path = reference_cameras, options.reference
     if own is None and test_cameras is not None:
         own, path = test_cameras, options.test

@@ -15,9 +15,10 @@ from v3dg._numbers import check
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cli import _common
-from v3dg.cli._views import ViewOptions, Views, choose_cameras, is_scene, load_subject
+from v3dg.cli._views import ViewOptions, Views, choose_cameras
 from v3dg.gaussians import Gaussians
 from v3dg.io import WRITE_SUFFIXES, write_asset
+from v3dg.opening import is_scene, open_with_cameras
 from v3dg.scene import Scene
 from v3dg.select import select
 
@@ -61,7 +62,7 @@ def run(options: Convert) -> None:
     expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
-    subject, own_cameras = load_subject(options.subject)
+    subject, own_cameras = open_with_cameras(options.subject)
     told: dict[str, Any] = {}
     if to_bundle:
         if not isinstance(subject, Bundle) or is_cut or options.level is not None:

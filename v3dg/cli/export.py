@@ -17,7 +17,7 @@ from v3dg.cli._common import Common, bytes_text, check_usage, option, print_resu
 from v3dg.export import Axis
 from v3dg.formats.usd import SUFFIXES as USD_SUFFIXES
 from v3dg.scene import Scene
-from v3dg.scene_file import read_scene
+from v3dg.scene.file import read_scene
 
 
 @dataclass

@@ -17,9 +17,9 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import OUTLIER_DISTANCE, describe, examine, outliers
 from v3dg.cli import _common
-from v3dg.cli._views import load_subject
 from v3dg.gaussians import Gaussians
 from v3dg.io import asset_bytes
+from v3dg.opening import open_with_cameras
 from v3dg.scene import Scene
 
 # JSON values, and lines of text.
@@ -36,7 +36,7 @@ class Info(_common.Common):
 
 def run(options: Info) -> None:
     _common.require_subject(options.file)
-    subject, cameras = load_subject(options.file)
+    subject, cameras = open_with_cameras(options.file)
     if isinstance(subject, Scene):
         description = _scene_info(options.file, subject, cameras or {})
     elif isinstance(subject, Bundle):

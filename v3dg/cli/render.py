@@ -11,7 +11,8 @@ import tyro
 from v3dg import _device
 from v3dg._progress import counted
 from v3dg.cli._common import Cut, OnDevice, check_usage, finite, option, print_result, table_lines
-from v3dg.cli._views import ViewOptions, Views, choose_cameras, load_subject, picture_paths
+from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths
+from v3dg.opening import open_with_cameras
 from v3dg.pictures import check_picture_path, write_picture
 from v3dg.render import render
 from v3dg.select import DEFAULT_FADE
@@ -45,7 +46,7 @@ def run(options: Render) -> None:
     check_usage("--background", is_color, f"three numbers from 0 to 1, got {options.background}")
     output = check_picture_path(options.output or Path(options.subject.with_suffix(".png").name))
     device = _device.resolve(options.device)
-    subject, own_cameras = load_subject(options.subject)
+    subject, own_cameras = open_with_cameras(options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
     is_film = own_cameras is None and options.view.cameras is None and len(cameras) > 1
     fade = DEFAULT_FADE if options.fade is None and is_film else options.fade

@@ -16,9 +16,10 @@ import tyro
 
 from v3dg._start import SIGNALS
 from v3dg.camera_file import read_cameras
-from v3dg.cli._common import Threads, UsageError, option, require_subject
-from v3dg.cli._views import direction_of, load_subject
+from v3dg.cli._common import OnDevice, UsageError, option, print_result, require_subject, tell
+from v3dg.cli._views import direction_of
 from v3dg.export import Axis
+from v3dg.opening import open_with_cameras
 
 # Between looks for a signal: a wait without an end misses one that comes just before it.
 _SECONDS = 0.1
@@ -26,7 +27,7 @@ _SIZE = (800, 800)  # px, of cameras whose file has none; the page has its own
 
 
 @dataclass
-class View:
+class View(OnDevice):
     """Look at a scene, a bundle or an asset in a web browser."""
 
     subject: tyro.conf.Positional[Path]
@@ -45,10 +46,6 @@ class View:
     """Screen area in px² that a coarser cluster's gaussian may stand for, at first; 3, or 0 with a budget."""
     budget: Annotated[int | None, option("N")] = None
     """Most gaussians to draw in one picture, at first."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to draw; auto is a CUDA device where there is one and torch can use it."""
-    threads: Threads = None
-    """CPU threads; all if not given."""
 
 
 def run(options: View) -> None:
@@ -66,7 +63,7 @@ def run(options: View) -> None:
     rule_of(tolerance, options.budget, 0, "solid_angle", True)
     if not math.isfinite(tolerance):
         raise UsageError(f"--tolerance: expected a number, got {tolerance}")
-    subject, cameras = load_subject(options.subject)
+    subject, cameras = open_with_cameras(options.subject)
     if options.cameras is not None:
         cameras = read_cameras(options.cameras, size=_SIZE, distortion=options.distortion)
     if isinstance(subject, Gaussians) and options.budget is not None:
@@ -88,9 +85,10 @@ def run(options: View) -> None:
             up=direction_of(options.up),
         )
         try:
-            if options.port not in (0, site.port):
-                print(f"port {options.port} is taken, listening at {site.port}")
-            print(f"{site.url} shows {options.subject}; Ctrl-C ends it", flush=True)
+            if options.port not in (0, site.port) and not options.quiet:
+                tell(f"port {options.port} is taken, listening at {site.port}")
+            told = {"url": site.url, "subject": str(options.subject)}
+            print_result(options.json, told, [f"{site.url} shows {options.subject}; Ctrl-C ends it"])
             while not interrupts:
                 time.sleep(_SECONDS)
         finally:

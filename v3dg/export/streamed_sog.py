@@ -31,7 +31,7 @@ from v3dg.export._common import Axis
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable, morton_order
 from v3dg.gaussians import Gaussians
-from v3dg.rotations import placed, rotation_from_quaternion
+from v3dg.rotations import rotation_from_quaternion
 
 INDEX = "lod-meta.json"
 SETTINGS = "settings.json"
@@ -107,7 +107,7 @@ def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int],
     }
     _common.write_document(place / INDEX, index)
     _common.write_document(
-        place / SETTINGS, _viewer_settings(placed(plan.bundle.level_gaussians(plan.top), turn))
+        place / SETTINGS, _viewer_settings(plan.bundle.level_gaussians(plan.top).transform(turn))
     )
     return Export(counts, plan.num_chunks, len(names), _common.bytes_below(place))
 
@@ -123,7 +123,7 @@ def _write_folders(
         parts: list[Gaussians] = []
         first, size = len(names), 0
         for number, part in enumerate(plan.parts(level)):
-            chunk = placed(check_writable(part), turn)
+            chunk = check_writable(part).transform(turn)
             lods[number][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
             parts.append(chunk.subset(morton_order(chunk.means)))
             size += len(chunk)

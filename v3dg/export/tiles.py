@@ -27,7 +27,6 @@ from v3dg.export._common import Axis
 from v3dg.formats import gltf
 from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
-from v3dg.rotations import placed
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 
@@ -151,7 +150,7 @@ class _Writer:
         gaussians = Gaussians.concatenate([self._bundle.cluster_gaussians(int(c)) for c in clusters])
         self._advance(len(gaussians))
         if len(gaussians):
-            content = gltf.encode(placed(check_writable(gaussians), _TO_Y_UP), compressed=True)
+            content = gltf.encode(check_writable(gaussians).transform(_TO_Y_UP), compressed=True)
             (self._folder / f"{name}.glb").write_bytes(content)
             tile["content"] = {"uri": f"{name}.glb"}
         return tile | ({"children": children} if children else {})

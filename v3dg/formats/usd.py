@@ -22,7 +22,7 @@ from v3dg.formats._packing import check_writable, normalised
 from v3dg.formats._reading import Path as AnyPath
 from v3dg.formats._reading import telling
 from v3dg.gaussians import Gaussians
-from v3dg.rotations import placed, quaternion_from_rotation
+from v3dg.rotations import quaternion_from_rotation
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 _SH = "radiance:sphericalHarmonics"
@@ -84,7 +84,7 @@ def _gaussians_of(usd: Any, prim: Any) -> Gaussians:
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not (scale > 0 and is_rotation(matrix[:3, :3] / scale)):
         raise ValueError(f"a transform of {prim.GetPath()} that is no rotation, translation and one scale")
-    return placed(gaussians, quaternion_from_rotation(matrix[:3, :3] / scale), matrix[:3, 3], scale)
+    return gaussians.transform(quaternion_from_rotation(matrix[:3, :3] / scale), matrix[:3, 3], scale)
 
 
 def write(path: AnyPath, gaussians: Gaussians) -> None:

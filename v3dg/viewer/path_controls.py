@@ -12,7 +12,7 @@ from typing import Any
 from v3dg import _core
 from v3dg.camera_file import write_cameras
 from v3dg.cameras import Camera
-from v3dg.scene_file import write_scene
+from v3dg.scene.file import write_scene
 from v3dg.video import write_video
 from v3dg.viewer.controls import Controls, add_button, in_order, value_of
 from v3dg.viewer.exports import Exporter, bundle_names

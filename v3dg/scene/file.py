@@ -53,14 +53,24 @@ def read_scene(
 def write_scene(
     path: str | os.PathLike[str],
     scene: Scene,
-    bundle_paths: list[str],
+    bundle_paths: list[str] | None = None,
     cameras: Mapping[str, Camera] | None = None,
 ) -> None:
     """Write a scene and named cameras as JSON (docs/scene.md); reading it back gives the same numbers.
 
     Args:
-        bundle_paths: One path for each of ``scene.bundles``, relative to the file's folder.
+        bundle_paths: One path for each of ``scene.bundles``, relative to the file's folder; where they were
+            opened from if None.
+
+    Raises:
+        ValueError: There is another number of paths, or a bundle has none: write it, and open that.
     """
+    if bundle_paths is None:
+        found = "one in memory; write it and open that"
+        for number, bundle in enumerate(scene.bundles):
+            check(f"scene.bundles[{number}]", bundle.path, f"one that was opened from a file, got {found}")
+        folder = os.path.dirname(os.path.abspath(path))
+        bundle_paths = [os.path.relpath(bundle.path or "", folder) for bundle in scene.bundles]
     if isinstance(bundle_paths, str) or not isinstance(bundle_paths, Sequence):
         raise TypeError(f"bundle_paths: expected a list of paths, got {type(bundle_paths).__name__}")
     count, given = len(scene.bundles), len(bundle_paths)

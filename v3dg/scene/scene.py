@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from v3dg import _device
 from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, check_type, floats
 from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
 from v3dg.rotations import rotation_from_quaternion
 
 # Held by whoever changes a scene, and by fork(), so that a child finds it free.
@@ -60,9 +61,23 @@ class Scene:
         """Return a scene as it is, and a bundle as a scene of one instance at the origin."""
         if isinstance(subject, Scene):
             return subject
+        check_type("subject", subject, Bundle, "a Scene or a Bundle")
         scene = cls()
         scene.add(subject)
         return scene
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Scene:
+        """Read a scene as `v3dg.read_scene` does, which also has its cameras."""
+        from v3dg.scene.file import read_scene
+
+        return read_scene(path)[0]
+
+    def save(self, path: str | os.PathLike[str], cameras: Mapping[str, Camera] | None = None) -> None:
+        """Write the scene as `v3dg.write_scene` does; bundles stay in the files they were opened from."""
+        from v3dg.scene.file import write_scene
+
+        write_scene(path, self, cameras=cameras)
 
     def add(
         self,

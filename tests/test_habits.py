@@ -1,0 +1,142 @@
+"""What people who know Python and its notebooks expect."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import v3dg
+from random_bundle import random_bundle, random_gaussians
+from v3dg import cli
+from v3dg.cli._common import UsageError
+from v3dg.rotations import rotation_from_quaternion
+
+
+@pytest.fixture
+def bundle():
+    return random_bundle(0)
+
+
+@pytest.fixture
+def camera():
+    return v3dg.turntable((0, 0, 0), 4, 1, width=48, height=32)[0]
+
+
+def test_pictures_show_themselves_in_notebooks(bundle, camera):
+    drawn = v3dg.rasterize(bundle.level_gaussians(0), camera)
+    for picture in (v3dg.render(bundle, camera, device="cpu"), drawn):
+        shown = np.asarray(Image.open(io.BytesIO(picture._repr_png_())))
+        np.testing.assert_array_equal(shown, v3dg.pictures.to_8bit(picture.color))
+
+
+def test_bundles_show_their_levels_in_notebooks(bundle):
+    shown = bundle._repr_html_()
+    assert shown.count("<tr>") == 1 + bundle.num_levels
+    for level in bundle.info()["levels"]:
+        assert f"<td>{level['level']}<td>{level['clusters']:,}<td>{level['gaussians']:,}<td>" in shown
+
+
+def test_open_gives_what_the_name_says(bundle, camera, tmp_path):
+    v3dg.write_asset(tmp_path / "a.ply", bundle.level_gaussians(0))
+    bundle.write(tmp_path / "a.v3dg")
+    scene = v3dg.Scene()
+    scene.add(v3dg.open(tmp_path / "a.v3dg"), positions=[[0, 0, 0], [3, 0, 0]])
+    scene.save(tmp_path / "a.json", {"front": camera})
+    assert isinstance(v3dg.open(str(tmp_path / "a.ply")), v3dg.Gaussians)
+    assert isinstance(v3dg.open(tmp_path / "a.v3dg"), v3dg.Bundle)
+    assert len(v3dg.open(tmp_path / "a.json")) == 2
+    with pytest.raises(ValueError, match=r"a\.txt: expected a file name that ends in"):
+        v3dg.open(tmp_path / "a.txt")
+
+
+def test_scenes_are_saved_and_loaded(bundle, camera, tmp_path):
+    (tmp_path / "bundles").mkdir()
+    bundle.write(tmp_path / "bundles" / "a.v3dg")
+    scene = v3dg.Scene()
+    scene.add(v3dg.open(tmp_path / "bundles" / "a.v3dg"), positions=[[0, 1, 2], [3, 4, 5]], scales=2)
+    scene.save(tmp_path / "a.json", {"front": camera})
+    again = v3dg.Scene.load(tmp_path / "a.json")
+    np.testing.assert_array_equal(again.positions, scene.positions)
+    assert again.bundles[0].path == str(tmp_path / "bundles" / "a.v3dg")
+    assert list(v3dg.read_scene(tmp_path / "a.json")[1]) == ["front"]
+
+
+def test_a_scene_of_bundles_in_memory_says_what_to_do_first(bundle, tmp_path):
+    with pytest.raises(ValueError, match=r"scene.bundles\[0\]: .* got one in memory; write it and open that"):
+        v3dg.Scene.of(bundle).save(tmp_path / "a.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["numpy", "torch"])
+def test_transform_moves_turns_and_scales(kind):
+    asset = random_gaussians(np.random.default_rng(0), 5)
+    given = asset if kind == "numpy" else asset.torch("cpu")
+    turn = np.array([2.0, 0, 0, 2.0])  # a quarter about z, of any length
+    moved = given.transform(turn, (1, 2, 3), 3.0)
+    assert type(moved.means) is type(given.means)
+    rotation = rotation_from_quaternion(turn / np.linalg.norm(turn))
+    np.testing.assert_allclose(moved.numpy().means, 3 * asset.means @ rotation.T + (1, 2, 3), atol=1e-5)
+    np.testing.assert_allclose(moved.numpy().scales, 3 * asset.scales, rtol=1e-6)
+    np.testing.assert_array_equal(moved.numpy().opacities, asset.opacities)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (((0, 0, 0, 0),), "quaternion: expected a rotation, got a quaternion of zeros"),
+        (((1, 0, 0, 0), (0, 0)), "position: expected shape"),
+        (((1, 0, 0, 0), (0, 0, 0), 0), "scale: expected a positive number, got 0"),
+    ],
+)
+def test_transform_names_what_is_wrong(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        random_gaussians(np.random.default_rng(0), 5).transform(*arguments)
+
+
+def test_paths_in_place_of_objects_are_told_what_to_call(bundle, camera):
+    for call in (
+        lambda: v3dg.render("a.v3dg", camera),
+        lambda: v3dg.select("a.v3dg", camera),
+        lambda: v3dg.Renderer("a.json"),
+        lambda: v3dg.Scene().add("a.v3dg"),
+        lambda: v3dg.build_bundle("a.ply"),
+        lambda: v3dg.rasterize("a.ply", camera),
+        lambda: v3dg.write_asset("a.ply", "b.ply"),
+        lambda: v3dg.write_site("a.v3dg", "folder"),
+    ):
+        with pytest.raises(TypeError, match=r"got str; v3dg\.open reads files"):
+            call()
+    for call in (
+        lambda: v3dg.render(bundle, "a.json"),
+        lambda: v3dg.select(bundle, "a.json"),
+        lambda: v3dg.pick(bundle, "a.json", 0, 0),
+        lambda: v3dg.rasterize(bundle.level_gaussians(0), "a.json"),
+    ):
+        with pytest.raises(TypeError, match=r"camera: .* got str; v3dg\.read_cameras reads files"):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        ("rendr a.v3dg", "perhaps you meant render; run v3dg --help"),
+        ("render a.v3dg --tolerence 3", "perhaps you meant --tolerance; run v3dg"),
+        ("build a.ply --cluster-sise 3", "perhaps you meant --cluster-size; run v3dg"),
+    ],
+)
+def test_slips_on_the_command_line_are_told_what_may_be_meant(typed, message):
+    with pytest.raises(UsageError, match=message):
+        cli.parse(typed.split())
+
+
+def test_nothing_is_guessed_where_nothing_is_alike():
+    with pytest.raises(UsageError) as error:
+        cli.parse(["xyzzy"])
+    assert "perhaps" not in str(error.value)
+
+
+@pytest.mark.parametrize("command", [name for name in cli.COMMANDS if name != "completion"])
+def test_every_command_can_be_quiet_and_print_json(command):
+    options = cli.COMMANDS[command][0].__dataclass_fields__
+    assert {"quiet", "json"} <= options.keys()

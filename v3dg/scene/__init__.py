@@ -1,0 +1,3 @@
+"""Scenes: bundles placed many times, and their files."""
+
+from v3dg.scene.scene import Scene as Scene
