@@ -1,6 +1,7 @@
 """What people who know Python and its notebooks expect."""
 
 import io
+import json
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from PIL import Image
 
 import v3dg
 from random_bundle import random_bundle, random_gaussians
-from v3dg import cli
+from v3dg import _extras, cli
 from v3dg.cli._common import UsageError
 from v3dg.rotations import rotation_from_quaternion
 
@@ -140,3 +141,29 @@ def test_nothing_is_guessed_where_nothing_is_alike():
 def test_every_command_can_be_quiet_and_print_json(command):
     options = cli.COMMANDS[command][0].__dataclass_fields__
     assert {"quiet", "json"} <= options.keys()
+
+
+def test_doctor_says_what_is_there_and_how_to_get_the_rest(monkeypatch, capsys, tmp_path):
+    compiler = tmp_path / "c++"
+    compiler.write_text("#!/bin/sh\necho g++ 99.1\n")
+    compiler.chmod(0o755)
+    for name in ("CXX", "CUDACXX"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(_extras.EXTRAS, "nowhere", ("nowhere-at-all>=7", "nothing"))
+    assert cli.main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    told = dict(line.split("  ", 1) for line in lines)
+    assert told["compiler"].strip() == "g++ 99.1"
+    assert told["GPU, driver"].strip().startswith("missing, to draw and build with CUDA")
+    assert told["nowhere-at-all"].strip() == "missing, for nothing: pip install 'nowhere-at-all>=7'"
+    assert v3dg.__version__ in told["v3dg"]
+
+
+def test_doctor_prints_json(capsys):
+    assert cli.main(["doctor", "--json"]) == 0
+    parts = json.loads(capsys.readouterr().out)["parts"]
+    assert all(
+        (part["found"] is None) == (part["missing"] is not None) for part in parts if part["part"] != "CUDA"
+    )
+    assert {"v3dg", "Python", "compiler", "CUDA", "torch", "web browser"} <= {part["part"] for part in parts}

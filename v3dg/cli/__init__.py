@@ -6,7 +6,7 @@ stdout.
 
 from __future__ import annotations
 
-from v3dg.cli import build, compare, completion, convert, demo, export, info, render, view
+from v3dg.cli import build, compare, completion, convert, demo, doctor, export, info, render, view
 from v3dg.cli._program import Commands, Program
 
 COMMANDS: Commands = {
@@ -18,6 +18,7 @@ COMMANDS: Commands = {
     "convert": (convert.Convert, convert.run),
     "export": (export.Export, export.run),
     "demo": (demo.Demo, demo.run),
+    "doctor": (doctor.Doctor, doctor.run),
     "completion": (completion.Completion, completion.run),
 }
 
@@ -28,7 +29,7 @@ Level of detail for 3D Gaussian Splatting, in four steps:
     v3dg view donut.v3dg               shows it in a web browser
     v3dg compare donut.ply donut.v3dg  says what that costs in quality
 
-No asset at hand? `v3dg demo` makes one.
+No asset at hand? `v3dg demo` makes one. `v3dg doctor` says what is installed and what is missing.
 `v3dg COMMAND --help` has the options, `v3dg --version` prints the version.
 """
 
