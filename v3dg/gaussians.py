@@ -34,7 +34,7 @@ def _kind(value: object) -> str:
 class Gaussians:
     """N 3D Gaussians: NumPy arrays or torch tensors, float32, C-contiguous, all of one kind on one device.
 
-    Torch tensors may all be float64 instead, which `rasterize` then computes in; all else wants float32.
+    Torch tensors may all be float64 instead, which `rasterize` then computes in; all else takes float32.
 
     Args:
         means: (N, 3) centres, in world units of the asset's own frame.

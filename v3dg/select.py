@@ -43,7 +43,7 @@ class Selection:
         instance_ids: (S,) int32, not to be written to.
         cluster_ids: (S,) int32, within the instance's bundle, not to be written to.
         num_gaussians: Gaussians in all selected clusters.
-        tolerance: px² that were used; with a budget, those that it came to.
+        tolerance: px² that were used; with a budget, those with which it is met.
         seconds: Wall time of the selection.
         revision: Of the scene, when its instances were looked at; as it is now if None.
         given_weights: As `weights`, not to be written to; None where all are 1, as they are without a fade.

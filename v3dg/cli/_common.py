@@ -108,7 +108,7 @@ def level_size(bundle: Bundle, level: int) -> int:
 
 
 def finite(number: float) -> float | None:
-    """A number as JSON has it, which knows no infinity: a budget can come to that."""
+    """A number as JSON has it, which knows no infinity: that of a budget can be infinite."""
     return number if math.isfinite(number) else None
 
 

@@ -139,7 +139,7 @@ def _write_folders(
 
 
 def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
-    """What SuperSplat's viewer wants beside an asset: a camera that shows most of it, and no effects."""
+    """What SuperSplat's viewer reads beside an asset: a camera that shows most of it, and no effects."""
     # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn about z.
     means = gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0)
     centre, radius = ball_of_most(means)

@@ -190,12 +190,12 @@ def _followed(pickle: bytes) -> Any:
                 module, _, name = argument.partition(" ")
                 stack.append(_Named(f"{module[:60]}.{name[:60]}"))
                 if module not in _KNOWN:
-                    raise ValueError(f"one that wants more: {stack[-1].name}")
+                    raise ValueError(f"one that needs more: {stack[-1].name}")
             case "REDUCE" | "NEWOBJ":
                 arguments = stack.pop()
                 stack[-1] = _called(stack[-1].name, arguments)
             case _:
-                raise ValueError(f"one that wants more: the operation {opcode.name}")
+                raise ValueError(f"one that needs more: the operation {opcode.name}")
     return stack.pop()
 
 
