@@ -3,6 +3,7 @@
 import inspect
 import math
 import re
+import tempfile
 
 import numpy as np
 import pytest
@@ -31,6 +32,11 @@ def options(**more):
 
 def selection():
     return v3dg.select(scene_of_two(), CAMERA, device="cpu")
+
+
+def exported(write, **given):
+    with tempfile.TemporaryDirectory() as folder:
+        write(BUNDLE, folder, **given)
 
 
 # Each function with arguments that are right; those that are numbers, or arrays of them, are tried.
@@ -95,6 +101,12 @@ CALLS = {
         lambda **given: v3dg.rasterize(ASSET, CAMERA, **given),
         {"filter_px2": 0.3, "background": (0, 0, 0)},
     ),
+    "Gaussians.transform": (
+        lambda **given: ASSET.transform(**given),
+        {"quaternion": (1, 0, 0, 0), "position": (1, 2, 3), "scale": 2.0},
+    ),
+    "write_site": (lambda **given: exported(v3dg.write_site, **given), {"chunk": 1 << 20}),
+    "write_streamed_sog": (lambda **given: exported(v3dg.write_streamed_sog, **given), {"chunk": 1 << 20}),
     "Selection.gaussians": (
         lambda **given: selection().gaussians(device="cpu", **given),
         {"origin": (0, 0, 0)},
@@ -162,6 +174,7 @@ def test_every_public_function_with_numbers_is_tried():
         "build_bundle",
         "read_cameras",
         "Selection.check",
+        "view",
     }  # a seed of any size; files have tests of their own
     assert with_numbers - others - tried == set()
 

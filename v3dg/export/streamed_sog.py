@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg._numbers import check
+from v3dg._numbers import check, whole
 from v3dg._progress import Bar, Progress
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
@@ -169,6 +169,7 @@ class Plan:
     @classmethod
     def of(cls, bundle: Bundle, chunk: int) -> Plan:
         check("bundle", bundle.num_gaussians, "gaussians to export, got none")
+        chunk = whole(chunk, "chunk", "gaussians, 1 or more", 1, 1 << 62)
         clusters, groups = bundle.clusters, bundle.groups
         if bundle.num_levels == 1:
             return cls(bundle, 0, 1, np.zeros(len(clusters), np.int64), np.zeros(0, np.int64))
