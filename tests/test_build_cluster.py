@@ -102,7 +102,7 @@ def test_a_process_that_dies_leaves_what_can_be_gone_on_with(folder, tmp_path, a
 
 def test_an_executor_goes_on_in_the_midst_of_units(folder, tmp_path, monkeypatch):
     """Where one process was interrupted."""
-    output, left, simplify = tmp_path / "out.v3dg", [8], v3dg.build.simplify._simplify
+    output, left, simplify = tmp_path / "out.v3dg", [8], v3dg.build.simplify.LevelBuilder._simplify
 
     def some(*arguments):
         left[0] -= 1
@@ -111,7 +111,7 @@ def test_an_executor_goes_on_in_the_midst_of_units(folder, tmp_path, monkeypatch
         return simplify(*arguments)
 
     with small_units(), monkeypatch.context() as patch:
-        patch.setattr("v3dg.build.simplify._simplify", some)
+        patch.setattr("v3dg.build.simplify.LevelBuilder._simplify", some)
         with pytest.raises(KeyboardInterrupt):
             build_file(folder / "a.ply", output, **OPTIONS)
     with ThreadPoolExecutor(2) as executor:

@@ -15,7 +15,7 @@ from v3dg.build.assemble import assemble
 from v3dg.build.fit import fit_config
 from v3dg.build.leaves import MemoryLeaves
 from v3dg.build.plan import Plan
-from v3dg.build.simplify import Level, LevelTables, build_levels
+from v3dg.build.simplify import Level, LevelBuilder, LevelTables
 from v3dg.bundle.codec import CODECS, codec_of
 from v3dg.bundle.file import BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES
@@ -68,7 +68,7 @@ def build_subtree(leaves, plan, config, codec, level, first_group, last_group):
     bottom = part.levels[0].first_group
     rows = plan.levels[0].offset[[bottom, bottom + part.levels[0].num_groups]]
     own = Gaussians(*(np.array(getattr(leaves, name)[slice(*rows)]) for name in scenes.NAMES))
-    return list(build_levels(own, part, config, SEED, codec)), part
+    return list(LevelBuilder(part, config, SEED, codec).levels(own)), part
 
 
 def joined(levels):
@@ -126,7 +126,7 @@ def test_a_subtree_alone_is_that_of_the_whole(asset, name, codec):
     config = CONFIGS[name]
     leaves, plan = in_split_order(asset, config), Plan.of(len(asset), config)
     codec = codec_of(codec, asset.sh_degree)
-    whole = list(build_levels(leaves, plan, config, SEED, codec))
+    whole = list(LevelBuilder(plan, config, SEED, codec).levels(leaves))
     num_compared = 0
     for level in (3, 1, 2):
         num_groups = plan.levels[level].num_groups
@@ -168,7 +168,7 @@ def test_subtrees_in_any_order_make_the_same_file(asset, name, codec, tmp_path):
             subtrees[group] = levels
         in_order = zip(*(subtrees[group] for group in range(num_groups)), strict=True)
         finished = [joined(levels) for levels in in_order][1:]
-        whole = list(build_levels(leaves, plan, config, SEED, codec, finished=finished))
+        whole = list(LevelBuilder(plan, config, SEED, codec).levels(leaves, finished))
         for number in range(level, len(whole)):
             write(first_page[number], first_page[number + 1], whole[number].gaussians)
         tables = assemble(plan, [level.tables for level in whole], config)
@@ -202,9 +202,9 @@ def test_units_are_the_same_on_any_number_of_threads(asset, name, codec, monkeyp
             raise KeyboardInterrupt
         return simplify(*arguments)
 
-    simplify = v3dg.build.simplify._simplify
+    simplify = v3dg.build.simplify.LevelBuilder._simplify
     with monkeypatch.context() as patch:
-        patch.setattr("v3dg.build.simplify._simplify", some)
+        patch.setattr("v3dg.build.simplify.LevelBuilder._simplify", some)
         with pytest.raises(KeyboardInterrupt):
             build_bundle(asset, resume_path=tmp_path / "levels", **three)
     build_bundle(asset, resume_path=tmp_path / "levels", **three).write(tmp_path / "resumed.v3dg")
@@ -289,7 +289,7 @@ def test_an_interrupted_file_leaves_its_levels_alone(asset, tmp_path, monkeypatc
         with pytest.raises(KeyboardInterrupt):
             build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", **options)
     assert {p.name for p in tmp_path.iterdir()} == {"asset.ply", levels_path("out.v3dg").name}
-    monkeypatch.setattr("v3dg.build.simplify._simplify", interrupt)
+    monkeypatch.setattr("v3dg.build.simplify.LevelBuilder._simplify", interrupt)
     bundle, is_built = build_file(tmp_path / "asset.ply", tmp_path / "out.v3dg", resume=True, **options)
     assert is_built
     assert bundle.num_levels == len(Plan.of(len(asset), SMALL).levels)

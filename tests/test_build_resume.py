@@ -169,7 +169,7 @@ def test_finished_levels_are_not_built_again(asset, checkpoint, monkeypatch):
     def fail(*_):
         raise AssertionError("built a level again")
 
-    monkeypatch.setattr("v3dg.build.simplify._simplify", fail)
+    monkeypatch.setattr("v3dg.build.simplify.LevelBuilder._simplify", fail)
     assert build_bundle(asset, config=QUICK, progress=False, resume_path=checkpoint).num_levels > 3
 
 
@@ -217,7 +217,7 @@ def test_a_kill_while_it_becomes_a_bundle_loses_nothing(
     def fail(*_):
         raise AssertionError("built a level again")
 
-    monkeypatch.setattr("v3dg.build.simplify._simplify", fail)
+    monkeypatch.setattr("v3dg.build.simplify.LevelBuilder._simplify", fail)
     with monkeypatch.context() as patch:
         patch.setattr(target, killed)
         with pytest.raises(KeyboardInterrupt):

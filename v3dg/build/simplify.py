@@ -41,112 +41,98 @@ class Level:
     tables: LevelTables
 
 
-def build_levels(
-    leaves: Gaussians,
-    plan: Plan,
-    config: BuildConfig,
-    seed: int,
-    codec: Codec,
-    *,
-    finished: Iterable[Level] = (),
-    show: Show = lambda levels, num_groups, num_gaussians, state: None,
-) -> Iterator[Level]:
-    """Yield all levels of a plan, one after another: the leaves first, as level 0; some may be `finished`.
+@dataclass(frozen=True, eq=False)
+class LevelBuilder:
+    """Makes the levels of a plan: of a whole asset, or of any subtree of it.
 
     What a group becomes depends on the leaves under it, the config, the seed, its level and its number in
-    the level, and on nothing else. So the plan may be of the whole asset or of any subtree: on the CPU, the
-    same groups get the same bits. On CUDA, how many groups are fitted at once can change how a group is
-    spread over the GPU, and thereby the last bits.
+    the level, and on nothing else. So on the CPU the same groups get the same bits, whatever the plan. On
+    CUDA, how many groups are fitted at once can change how a group is spread over the GPU, and thereby the
+    last bits.
     """
-    here = plan.levels[0]
-    leaves = codec.rounded(leaves, here.offset)
-    ball = _core.bound_spheres(_spheres(leaves), here.leaf_offset)
-    box, ball = (_device.to_host(array) for array in (_core.bound_by_boxes(leaves.rows, here.offset), ball))
-    level = Level(leaves, LevelTables(box, ball, ball, np.zeros((here.num_groups, 2), np.float32)))
-    del leaves
-    yield level
-    below = {0: level}
-    del level
-    yield from build_above(below, plan, config, seed, codec, finished, show)
 
+    plan: Plan
+    config: BuildConfig
+    seed: int
+    codec: Codec
 
-def build_above(
-    below: dict[int, Level],
-    plan: Plan,
-    config: BuildConfig,
-    seed: int,
-    codec: Codec,
-    finished: Iterable[Level],
-    show: Show,
-) -> Iterator[Level]:
-    """Yield the levels of a plan above those of `below`, which keeps those that the next are fitted to."""
-    saved = iter(finished)
-    last = max(below)
-    where = _device.of(below[last].gaussians.means)
-    while last + 1 < len(plan.levels):
-        levels = config.levels_at_once(last + 1, len(plan.levels))
-        made = list(islice(saved, len(levels)))
-        if len(made) < len(levels):
-            made = _simplify(below, plan, levels, config, seed, codec, show)
-        for number, level in zip(levels, made, strict=True):
-            below[number] = Level(_device.place(level.gaussians, where), level.tables)
-        last = levels[-1]
-        for number in [number for number in below if number < min(last, config.target_of(last + 1))]:
-            del below[number]
-        while made:
-            yield made.pop(0)
+    def levels(
+        self,
+        leaves: Gaussians,
+        finished: Iterable[Level] = (),
+        show: Show = lambda levels, num_groups, num_gaussians, state: None,
+    ) -> Iterator[Level]:
+        """Yield all levels, one after another: the leaves first, as level 0; some may be `finished`."""
+        here = self.plan.levels[0]
+        leaves = self.codec.rounded(leaves, here.offset)
+        ball = _device.to_host(_core.bound_spheres(_spheres(leaves), here.leaf_offset))
+        box = _device.to_host(_core.bound_by_boxes(leaves.rows, here.offset))
+        level = Level(leaves, LevelTables(box, ball, ball, np.zeros((here.num_groups, 2), np.float32)))
+        del leaves
+        yield level
+        below = {0: level}
+        del level
+        yield from self.levels_above(below, finished, show)
 
+    def levels_above(self, below: dict[int, Level], finished: Iterable[Level], show: Show) -> Iterator[Level]:
+        """Yield the levels above those of `below`, which keeps those that the next are fitted to."""
+        saved, config, num_levels = iter(finished), self.config, len(self.plan.levels)
+        last = max(below)
+        where = _device.of(below[last].gaussians.means)
+        while last + 1 < num_levels:
+            levels = config.levels_at_once(last + 1, num_levels)
+            made = list(islice(saved, len(levels)))
+            if len(made) < len(levels):
+                made = self._simplify(below, levels, show)
+            for number, level in zip(levels, made, strict=True):
+                below[number] = Level(_device.place(level.gaussians, where), level.tables)
+            last = levels[-1]
+            for number in [number for number in below if number < min(last, config.target_of(last + 1))]:
+                del below[number]
+            while made:
+                yield made.pop(0)
 
-def _simplify(
-    below: Mapping[int, Level],
-    plan: Plan,
-    levels: range,
-    config: BuildConfig,
-    seed: int,
-    codec: Codec,
-    show: Show,
-) -> list[Level]:
-    """Make the next levels, whose groups are fitted together."""
-    plans = [plan.levels[number] for number in levels]
-    starts, chain = [], below[levels[0] - 1].gaussians
-    for number, here in zip(levels, plans, strict=True):
-        under = plan.levels[number - 1]
-        offset = np.ascontiguousarray(under.offset[:: under.num_clusters // here.num_groups])
-        chain = _start(chain, offset, here.group_offset, config)
-        starts.append(chain)
-    gaussians = starts[0] if len(starts) == 1 else Gaussians.concatenate(starts)
-    del starts, chain
-    targets = range(config.target_of(levels[0]), config.target_of(levels[-1]) + 1)
-    target = _target(below, targets, config)
-    views = [_view(below[config.target_of(number)], plan, number, config) for number in levels]
-    offsets, balls = zip(*views, strict=True)
-    rows, groups = (
-        np.cumsum([0, *counts])
-        for counts in ([here.num_gaussians for here in plans], [here.num_groups for here in plans])
-    )
-    where = _device.of(gaussians.means)
-    _device.spare_memory(where)
-    error = run_fit(
-        lambda progress: _core.fit_level(
-            fit_config(config, seed, levels[0]),
-            target,
-            _ranges(offsets, [len(below[number].gaussians) for number in targets]),
-            gaussians.rows,
-            _ranges([here.group_offset for here in plans], np.diff(rows)),
-            np.concatenate(balls),
-            np.concatenate([_streams(number, here) for number, here in zip(levels, plans, strict=True)]),
-            progress,
-        ),
-        where,
-        lambda state: show(levels, int(groups[-1]), len(gaussians), state),
-    )
-    made: list[Level] = []
-    ball = below[levels[0] - 1].tables.ball
-    for i, number in enumerate(levels):
-        ball = _core.bound_spheres(ball, _children(plan, number - 1, number))
-        part = gaussians.subset(slice(int(rows[i]), int(rows[i + 1])))
-        made.append(_level(part, plans[i], codec, ball, balls[i], error[groups[i] : groups[i + 1]]))
-    return made
+    def _simplify(self, below: Mapping[int, Level], levels: range, show: Show) -> list[Level]:
+        """Make the next levels, whose groups are fitted together."""
+        plan, config = self.plan, self.config
+        plans = [plan.levels[number] for number in levels]
+        starts, chain = [], below[levels[0] - 1].gaussians
+        for number, here in zip(levels, plans, strict=True):
+            under = plan.levels[number - 1]
+            offset = np.ascontiguousarray(under.offset[:: under.num_clusters // here.num_groups])
+            chain = _start(chain, offset, here.group_offset, config)
+            starts.append(chain)
+        gaussians = starts[0] if len(starts) == 1 else Gaussians.concatenate(starts)
+        del starts, chain
+        targets = range(config.target_of(levels[0]), config.target_of(levels[-1]) + 1)
+        target = _target(below, targets, config)
+        views = [_view(below[config.target_of(number)], plan, number, config) for number in levels]
+        offsets, balls = zip(*views, strict=True)
+        rows = np.cumsum([0, *(here.num_gaussians for here in plans)])
+        groups = np.cumsum([0, *(here.num_groups for here in plans)])
+        where = _device.of(gaussians.means)
+        _device.spare_memory(where)
+        error = run_fit(
+            lambda progress: _core.fit_level(
+                fit_config(config, self.seed, levels[0]),
+                target,
+                _ranges(offsets, [len(below[number].gaussians) for number in targets]),
+                gaussians.rows,
+                _ranges([here.group_offset for here in plans], np.diff(rows)),
+                np.concatenate(balls),
+                np.concatenate([_streams(*level) for level in zip(levels, plans, strict=True)]),
+                progress,
+            ),
+            where,
+            lambda state: show(levels, int(groups[-1]), len(gaussians), state),
+        )
+        made: list[Level] = []
+        ball = below[levels[0] - 1].tables.ball
+        for i, number in enumerate(levels):
+            ball = _core.bound_spheres(ball, _children(plan, number - 1, number))
+            part = gaussians.subset(slice(int(rows[i]), int(rows[i + 1])))
+            made.append(_level(part, plans[i], self.codec, ball, balls[i], error[groups[i] : groups[i + 1]]))
+        return made
 
 
 def _streams(number: int, plan: LevelPlan) -> npt.NDArray[np.int64]:

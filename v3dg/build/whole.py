@@ -23,7 +23,7 @@ from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.build.plan import Plan
 from v3dg.build.progress import Bar
-from v3dg.build.simplify import Level, LevelTables, Show, build_above, build_levels
+from v3dg.build.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.build.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 from v3dg.bundle import Bundle
 from v3dg.bundle.codec import codec_of
@@ -136,8 +136,8 @@ class _Build:
         for n in range(first, self.num_low):  # what the levels above begin with
             level = finished[n].read(pages, self.file.run(*self.plan.first_page[n : n + 2]))
             below[n] = Level(_device.place(level.gaussians, devices[0]), level.tables)
-        how = (self.plan, self.config, self.seed, self.file.codec)
-        above = build_above(below, *how, saved, self.bar.show_of(top))
+        builder = LevelBuilder(self.plan, self.config, self.seed, self.file.codec)
+        above = builder.levels_above(below, saved, self.bar.show_of(top))
         for number, level in enumerate(above, self.num_low):
             if (top, number) not in levels:
                 hashes = pages.write(runs[number], level.gaussians)
@@ -212,7 +212,8 @@ class _Build:
         finished = {n: level for (part, n), level in self.store.levels.items() if part == unit}
         read = partial(leaves.read, first, first + plan.levels[0].num_gaussians)
         runs = [run for _, run in self.parts[unit].values()]
-        return UnitTask(read, plan, runs, self.config, self.seed, finished, self.store.pages)
+        builder = LevelBuilder(plan, self.config, self.seed, self.file.codec)
+        return UnitTask(read, builder, runs, finished, self.store.pages)
 
     def _joined(self, number: int) -> FinishedLevel:
         """A level of all units."""
@@ -227,10 +228,8 @@ class UnitTask:
     """All that the work on a unit needs; it can be pickled where `leaves` and `pages` can."""
 
     leaves: Callable[[], Gaussians]
-    plan: Plan
+    builder: LevelBuilder
     runs: Sequence[PageRun]  # pages of its levels
-    config: BuildConfig
-    seed: int
     finished: Mapping[int, FinishedLevel]  # levels that are built already
     pages: PageFile | MemoryStore
 
@@ -239,8 +238,7 @@ class UnitTask:
         finished = (self.finished[n].read(self.pages, self.runs[n]) for n in sorted(self.finished))
         leaves = next(finished).gaussians if self.finished else self.leaves()
         own = _device.place(leaves, device)
-        how = (self.plan, self.config, self.seed, self.pages.codec)
-        levels = build_levels(own, *how, finished=finished, show=show)
+        levels = self.builder.levels(own, finished, show)
         del leaves, own
         for number, level in enumerate(levels):
             if number not in self.finished:
