@@ -202,5 +202,5 @@ def test_what_is_no_scene_is_refused(where):
         lambda: Renderer("donut", device=where),
         lambda: select("donut", CAMERA, device=where),
     ):
-        with pytest.raises(TypeError, match="bundle: expected a Bundle, got str"):
+        with pytest.raises(TypeError, match="subject: expected a Scene or a Bundle, got str"):
             call()
