@@ -47,7 +47,8 @@ def rasterize(
             on a CUDA device.
         RuntimeError: The gaussians are on a CUDA device, and v3dg was built without CUDA.
     """
-    check_type("gaussians", gaussians, Gaussians, "Gaussians")
+    if not hasattr(gaussians, "means"):  # whatever has their arrays will do
+        check_type("gaussians", gaussians, Gaussians, "Gaussians")
     check_type("camera", camera, Camera, "a Camera")
     filter_px2 = real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0)
     options: dict[str, Any] = {"filter_px2": filter_px2, "antialiased": bool(antialiased)}
