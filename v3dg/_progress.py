@@ -42,7 +42,7 @@ class Bar:
     def _num_lines(self) -> int:
         return _LINES * self.done // max(self.total, 1)
 
-    def __enter__(self) -> Bar:
+    def __enter__(self: T) -> T:
         return self
 
     def __exit__(self, *_: object) -> None:

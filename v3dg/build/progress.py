@@ -14,23 +14,17 @@ class Stopped(Exception):
     """Another thread of the build has failed."""
 
 
-class Bar:
+class Bar(_progress.Bar):
     """One bar over all levels; it advances by fitted gaussians, which is what time goes with."""
 
     def __init__(self, plan: Plan, initial: int, progress: Progress) -> None:
         total = sum(level.num_gaussians for level in plan.levels[1:])
+        super().__init__(total, "build", progress, initial=initial)
         self._last_level = len(plan.levels) - 1
         self._initial = initial
         self._fitted: dict[tuple[int, int], float] = {}  # by part and first level
         self._lock = threading.Lock()
-        self._bar = _progress.Bar(total, "build", progress, initial=initial)
         self._is_stopped = False
-
-    def __enter__(self) -> Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
 
     def stop(self) -> None:
         """Let every thread that shows something find out that the build has failed."""
@@ -57,4 +51,4 @@ class Bar:
     def _update(self, key: tuple[int, int], num_gaussians: float, text: str = "") -> None:
         with self._lock:
             self._fitted[key] = num_gaussians
-            self._bar.update(self._initial + int(sum(self._fitted.values())) - self._bar.done, text)
+            self.update(self._initial + int(sum(self._fitted.values())) - self.done, text)

@@ -27,39 +27,38 @@ class Doctor(Common):
 
 def run(options: Doctor) -> None:
     findings = list(_findings())
-    result = [{"part": part, "found": found, "missing": advice} for part, found, advice in findings]
+    result = [
+        {"part": part, "found": found, "missing": None if found else advice}
+        for part, found, advice in findings
+    ]
     width = max(len(part) for part, _, _ in findings)
     lines = [f"{part:<{width}}  {found or f'missing, {advice}'}" for part, found, advice in findings]
     print_result(options.json, {"parts": result}, lines)
 
 
-def _findings() -> Iterator[tuple[str, str | None, str | None]]:
+def _findings() -> Iterator[tuple[str, str | None, str]]:
     """Each part's name, and what there is of it, or else what it would be for and how to get it."""
     built = f"{'with' if _core.has_cuda else 'without'} CUDA, {_core.isa()}, {os.cpu_count()} CPU cores"
-    yield "v3dg", f"{__version__} {built}, in {os.path.dirname(_core.__file__)}", None
-    yield "Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}", None
+    yield "v3dg", f"{__version__} {built}, in {os.path.dirname(_core.__file__)}", ""
+    yield "Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}", ""
     compiler = _answer(os.environ.get("CXX", "c++"), "--version")
-    yield _part("compiler", compiler, "to build from source: apt install g++, or as your system has it")
+    yield "compiler", compiler, "to build from source: apt install g++, or as your system has it"
     nvcc = os.environ.get("CUDACXX") or shutil.which("nvcc") or "/usr/local/cuda/bin/nvcc"
     advice = "12.4 or newer, to build with CUDA: https://developer.nvidia.com/cuda-downloads"
-    yield _part("CUDA toolkit", _answer(nvcc, "--version", line=-2), advice)
+    yield "CUDA toolkit", _answer(nvcc, "--version", line=-2), advice
     gpu = _answer("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
-    yield _part("GPU, driver", gpu, "to draw and build with CUDA; the CPU can do all of it, too")
+    yield "GPU, driver", gpu, "to draw and build with CUDA; the CPU can do all of it, too"
     missing = _device.missing_for_cuda()
-    yield _part("CUDA", None if missing else "works", f"for which the next step is: {missing}")
+    yield "CUDA", None if missing else "works", f"for which the next step is: {missing}"
     for requirement, purpose in EXTRAS.values():
         name, version = requirement.partition(">=")[0], None
         with contextlib.suppress(metadata.PackageNotFoundError):
             version = metadata.version(name)
-        yield _part(name, version, f"for {purpose}: pip install '{requirement}'")
+        yield name, version, f"for {purpose}: pip install '{requirement}'"
     browser = None
     with contextlib.suppress(webbrowser.Error):
         browser = getattr(webbrowser.get(), "name", "there")
-    yield _part("web browser", browser, "for `v3dg view`, whose address any machine's browser can open")
-
-
-def _part(name: str, found: str | None, advice: str) -> tuple[str, str | None, str | None]:
-    return name, found, None if found else advice
+    yield "web browser", browser, "for `v3dg view`, whose address any machine's browser can open"
 
 
 def _answer(*command: str, line: int = 0) -> str | None:
