@@ -288,7 +288,7 @@ def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
 
     with (
         pytest.raises(
-            ImportError, match="builds on many machines: expected .*pip install 'distributed>=2024.1'"
+            ImportError, match=r"builds on many machines: expected .*pip install 'distributed>=2024.1'"
         ),
         build._executor_at("tcp://127.0.0.1:8786"),
     ):

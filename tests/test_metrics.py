@@ -154,7 +154,7 @@ def test_box_downsample_refuses_what_does_not_divide():
 def test_without_its_extra_flip_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     assert not metrics.has_flip()
-    with pytest.raises(ImportError, match="pip install 'flip-evaluator>=1.6'"):
+    with pytest.raises(ImportError, match=r"pip install 'flip-evaluator>=1.6'"):
         metrics.flip(picture(0), picture(1))
 
 

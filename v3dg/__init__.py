@@ -32,16 +32,6 @@ from v3dg.view import view
 __all__ = ["BuildConfig", "Bundle", "Clusters", "Gaussians", "Groups"]
 __all__ += ["__version__", "build_bundle", "read_asset", "write_asset"]
 __all__ += ["Camera", "Scene", "read_cameras", "read_scene", "turntable", "write_cameras", "write_scene"]
-__all__ += [
-    "DEFAULT_FADE",
-    "DEFAULT_TOLERANCE",
-    "Image",
-    "Pick",
-    "RenderedImage",
-    "Renderer",
-    "Selection",
-    "Stats",
-    "StereoCamera",
-]
-__all__ += ["pick", "rasterize", "render", "select", "view"]
+__all__ += ["DEFAULT_FADE", "DEFAULT_TOLERANCE", "Image", "Pick", "RenderedImage", "Renderer", "Stats"]
+__all__ += ["Selection", "StereoCamera", "pick", "rasterize", "render", "select", "view"]
 __all__ += ["write_site", "write_streamed_sog", "write_tiles", "write_usd"]
