@@ -55,8 +55,8 @@ class Stats:
         gaussians_selected: Gaussians of the selected clusters.
         gaussians_in_frustum: Of them, those in front of the near plane whose extent meets the image, before
             any finer cull.
-        tolerance: px² that one gaussian of a coarser cluster stands for at most; with a budget, those that it
-            came to; 0 for an asset.
+        tolerance: px² that one gaussian of a coarser cluster stands for at most; with a budget, those with
+            which it is met; 0 for an asset.
         select_ms: Time to choose the clusters.
         draw_ms: Time to draw them.
         missing: Pages that the picture misses, in place of which coarser ones are drawn; 0 where all is

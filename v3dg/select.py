@@ -239,7 +239,8 @@ def _select(
     budget: int | None,
     device: Device,
 ) -> Selection:
-    check_type("camera", camera, Camera, "a Camera")
+    if not isinstance(camera, StereoCamera):
+        check_type("camera", camera, Camera, "a Camera")
     start = time.perf_counter()
     with residency.reading(subject, device) as resident:
         cut = resident.core.select(camera.core, rule)
