@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from v3dg import _core
 from v3dg._numbers import Floats as Floats
-from v3dg._numbers import check, positive, real, vector, whole
+from v3dg._numbers import check, check_type, positive, real, vector, whole
 
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
@@ -197,6 +197,12 @@ class StereoCamera:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return StereoCamera, self.eyes
+
+
+def check_camera(camera: Any) -> None:
+    """Raise TypeError for what is neither a camera nor a stereo camera."""
+    if not isinstance(camera, StereoCamera):
+        check_type("camera", camera, Camera, "a Camera")
 
 
 def turntable(

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check, check_type, color, real
+from v3dg._numbers import check, color, real
 from v3dg.build.memory import in_bytes
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera, StereoCamera
+from v3dg.cameras import Camera, StereoCamera, check_camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage, Stats
@@ -236,8 +236,7 @@ class _Frame:
         **options: Any,
     ) -> Any:
         """A picture; of a stereo camera, one for each eye."""
-        if not isinstance(camera, StereoCamera):
-            check_type("camera", camera, Camera, "a Camera")
+        check_camera(camera)
         if isinstance(camera, StereoCamera) and (cut is not None or isinstance(subject, Gaussians)):
             how = {"cut": cut, **options}
             return tuple(self.draw(subject, eye, background, min_transmittance, **how) for eye in camera.eyes)

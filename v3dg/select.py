@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import MOST_FLOAT, check, check_type, one_of, real, vector, whole
+from v3dg._numbers import MOST_FLOAT, check, one_of, real, vector, whole
 from v3dg.bundle import Bundle, Clusters
-from v3dg.cameras import Camera, StereoCamera, VectorLike
+from v3dg.cameras import Camera, StereoCamera, VectorLike, check_camera
 from v3dg.gaussians import Gaussians
 from v3dg.residency import residency
 from v3dg.scene import Scene
@@ -239,8 +239,7 @@ def _select(
     budget: int | None,
     device: Device,
 ) -> Selection:
-    if not isinstance(camera, StereoCamera):
-        check_type("camera", camera, Camera, "a Camera")
+    check_camera(camera)
     start = time.perf_counter()
     with residency.reading(subject, device) as resident:
         cut = resident.core.select(camera.core, rule)
