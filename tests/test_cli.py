@@ -252,7 +252,7 @@ def test_turntable_of_several_views_fades_and_a_still_does_not(folder, tmp_path)
             return np.asarray(image).tobytes(), first["gaussians_selected"]
 
     for same in (
-        [("--views", 2), ("--views", 2, "--fade", 1.05), ("--fade", 1.05)],
+        [("--views", 2), ("--views", 2, "--fade", 1.02), ("--fade", 1.02)],
         [("--views", 1), ("--views", 2, "--fade", 1)],
     ):
         first, *others = (picture(*options) for options in same)

@@ -30,7 +30,7 @@ Footprint: TypeAlias = Literal["solid_angle", "paper"]
 DEFAULT_TOLERANCE = 3.0
 
 # Fade of pictures that follow each other; docs/fades.md has what it costs and what it gains.
-DEFAULT_FADE = 1.05
+DEFAULT_FADE = 1.02
 
 
 @dataclass(frozen=True, eq=False)

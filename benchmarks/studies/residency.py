@@ -3,14 +3,18 @@
 Copies of a bundle are written with the colours of all gaussians changed a little, so that no two share a
 page, and stand in a grid. For pools of several sizes, as shares of what a view needs: how long frames take,
 how many bytes come in and how many pages are missing, and how far the picture is from the settled one. The
-size of a pool is a choice here: whether all would fit is said by the row without a pool.
+size of a pool is a choice here: whether all would fit is said by the row without a pool. On a GPU, rows say
+what the process has on it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
 import os
 import time
+from collections.abc import Collection
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,6 +43,8 @@ class Config:
     """Frames a second that a flight is paced to; as many as there can be if 0."""
     shares: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     """Slots of each pool, over those that the neediest view of the flight takes."""
+    pools: tuple[str, ...] = ()
+    """Sizes of more pools, such as 2GB."""
     device: str = "cpu"
     is_whole_drawn: bool = True
     """Whether everything is drawn without a pool, too."""
@@ -49,17 +55,21 @@ class Config:
 
 def write_copies(config: Config, folder: Path) -> list[Path]:
     """Bundles like the given one, each with colours of its own."""
-    bundle, paths = v3dg.Bundle.open(config.bundle), []
-    for number in range(config.side**2):
-        path = folder / f"copy_{number}.v3dg"
-        paths.append(path)
-        if path.exists():
-            continue
-        sh = bundle.gaussians.sh.copy()
-        sh[:, 0] += np.random.default_rng(number).normal(0, 0.05, sh[:, 0].shape).astype(np.float32)
-        changed = dataclasses.replace(bundle.gaussians, sh=sh)
-        v3dg.Bundle(bundle.clusters, bundle.groups, changed, bundle.config, bundle.codec).write(path)
+    paths = [folder / f"copy_{number}.v3dg" for number in range(config.side**2)]
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as processes:
+        list(processes.map(write_copy, [config.bundle] * len(paths), range(len(paths)), paths))
     return paths
+
+
+def write_copy(of: Path, number: int, path: Path) -> None:
+    if path.exists():
+        return
+    bundle = v3dg.Bundle.open(of)
+    gaussians = bundle.gaussians
+    sh = gaussians.sh.copy()
+    sh[:, 0] += np.random.default_rng(number).normal(0, 0.05, sh[:, 0].shape).astype(np.float32)
+    changed = dataclasses.replace(gaussians, sh=sh)
+    v3dg.Bundle(bundle.clusters, bundle.groups, changed, bundle.config, bundle.codec).write(path)
 
 
 class Field:
@@ -110,8 +120,10 @@ class Field:
         return num_bytes + min(64 << 20, num_bytes // 7) + 4096
 
 
-def timed(config: Config, renderer: v3dg.Renderer, cameras: list[v3dg.Camera]) -> list[dict[str, Any]]:
-    """Draw one picture after the other; what each took, and its stats."""
+def timed(
+    config: Config, renderer: v3dg.Renderer, cameras: list[v3dg.Camera], kept: Collection[int] = ()
+) -> list[dict[str, Any]]:
+    """Draw one picture after the other; what each took, and its stats. Some of the pictures are kept."""
     frames, start = [], time.perf_counter()
     for number, camera in enumerate(cameras):
         if config.hz:
@@ -119,7 +131,9 @@ def timed(config: Config, renderer: v3dg.Renderer, cameras: list[v3dg.Camera]) -
         begin = time.perf_counter()
         image = renderer.render(camera, tolerance=config.tolerance)
         stats = dataclasses.asdict(image.stats)
-        frames.append({"image": image, "ms": 1e3 * (time.perf_counter() - begin), **stats})
+        frames.append({"ms": 1e3 * (time.perf_counter() - begin), **stats})
+        if number in kept:
+            frames[-1]["picture"] = pixels(image)
     return frames
 
 
@@ -134,12 +148,18 @@ def summary(frames: list[dict[str, Any]]) -> dict[str, Any]:
 
 def errors(frames: list[dict[str, Any]], truth: dict[int, np.ndarray]) -> dict[str, Any]:
     """PSNR of some pictures against the settled ones; equal pictures count as 100 dB."""
-    values = [decibels(truth[number], frames[number]["image"]) for number in truth]
+    values = [min(100.0, float(psnr(truth[number], frames[number]["picture"]))) for number in truth]
     return {"mean_psnr": float(np.mean(values)), "least_psnr": float(np.min(values))}
 
 
-def decibels(settled: np.ndarray, image: v3dg.Image) -> float:
-    return min(100.0, float(psnr(settled, pixels(image))))
+def bytes_on_device(config: Config) -> int | None:
+    """What is taken of a GPU, which nobody else should use meanwhile."""
+    if config.device == "cpu":
+        return None
+    import torch
+
+    free, total = torch.cuda.mem_get_info()
+    return total - free
 
 
 def pixels(image: v3dg.Image) -> np.ndarray:
@@ -168,6 +188,7 @@ def teleport(config: Config, field: Field, memory: int, *, cold: bool) -> dict[s
 
 
 def main(config: Config) -> None:
+    idle = bytes_on_device(config)
     with TemporaryDirectory() as temporary:
         folder = config.folder or Path(temporary)
         folder.mkdir(exist_ok=True)
@@ -196,17 +217,23 @@ def main(config: Config) -> None:
         if config.is_whole_drawn:
             renderer = v3dg.Renderer(field.scene, device=config.device)
             timed(config, renderer, cameras[:3])
-            frames = timed(config, renderer, cameras)
+            frames = timed(config, renderer, cameras, truth)
             result["flights"].append({"share": None, **summary(frames), **errors(frames, truth)})
+            print(result["flights"][-1], flush=True)
             del renderer
-        for share in config.shares:
-            memory = field.memory(int(share * most_needed))
+            v3dg.residency.residency.clear()
+        pools: list[tuple[float | None, int | str]] = [(None, memory) for memory in config.pools]
+        pools += [(share, field.memory(int(share * most_needed))) for share in config.shares]
+        for share, memory in pools:
             renderer = v3dg.Renderer(field.scene, device=config.device, memory=memory)
             renderer.settle(cameras[0], tolerance=config.tolerance)
-            frames = timed(config, renderer, cameras)
+            frames = timed(config, renderer, cameras, truth)
             row = {"share": share, "memory": memory, **summary(frames), **errors(frames, truth)}
+            if idle is not None:
+                row["bytes_of_process"] = (bytes_on_device(config) or 0) - idle
             result["flights"].append(row)
             print(row, flush=True)
+            del renderer
         for cold in (False, True):
             row = teleport(config, field, field.memory(2 * most_needed), cold=cold)
             result["teleports"].append(row)

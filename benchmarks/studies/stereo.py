@@ -1,0 +1,92 @@
+"""How long do both eyes of a headset take? One frame of two pictures that share a cut, beside two frames."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.evaluation.record import write
+from v3dg import Bundle, Camera, Renderer, StereoCamera, read_scene
+
+_FOV = 1.57  # rad, of each eye
+_EYE_DISTANCE = 0.064
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--bundle", type=Path, required=True, help=".v3dg file of the layout's asset")
+    parser.add_argument("--layout", type=Path, required=True, help="scene file of instances and cameras")
+    parser.add_argument(
+        "--cameras", type=int, nargs=2, default=(40, 60), help="the first, and that after the last"
+    )
+    parser.add_argument("--side", type=int, default=2160, help="of the pictures, px")
+    parser.add_argument("--tolerances", type=float, nargs="+", default=[9.4, 20.0])
+    parser.add_argument("--repeats", type=int, default=11)
+    parser.add_argument("--json", type=Path, help="write the result there")
+    options = parser.parse_args(arguments)
+
+    asset = json.loads(options.layout.read_text(encoding="utf-8"))["asset"]
+    scene, cameras = read_scene(options.layout, bundles={asset: Bundle.open(options.bundle)})
+    renderer = Renderer(scene, device="cuda")
+    rows = []
+    for tolerance in options.tolerances:
+        for name, camera in list(cameras.items())[slice(*options.cameras)]:
+            stereo = headset(camera, options.side)
+            rows.append(
+                {"tolerance": tolerance, "camera": name, **measure(renderer, stereo, tolerance, options)}
+            )
+            print(rows[-1], flush=True)
+    result = {"side": options.side, "fov_x": _FOV, "eye_distance": _EYE_DISTANCE, "rows": rows}
+    write(options.json, result, "cuda")
+    return 0
+
+
+def headset(camera: Camera, side: int) -> StereoCamera:
+    """Eyes where a camera is, that look where it looks."""
+    ahead, top = camera.viewmat[2, :3], -camera.viewmat[1, :3]
+    middle = Camera.look_at(camera.position, camera.position + ahead, top, _FOV, width=side, height=side)
+    return StereoCamera.of(middle, _EYE_DISTANCE)
+
+
+def measure(renderer: Renderer, stereo: StereoCamera, tolerance: float, repeats: int) -> dict[str, Any]:
+    """Milliseconds from the call to both pictures, of one frame and of two; gaussians of the shared cut."""
+
+    def one_frame() -> list[Any]:
+        return [picture.color for picture in renderer.render(stereo, tolerance=tolerance)]
+
+    def two_frames() -> list[Any]:
+        return [renderer.render(eye, tolerance=tolerance).color for eye in stereo.eyes]
+
+    return {
+        "one_frame_ms": _milliseconds(one_frame, repeats),
+        "two_frames_ms": _milliseconds(two_frames, repeats),
+        "gaussians": renderer.render(stereo, tolerance=tolerance)[0].stats.gaussians_selected,
+    }
+
+
+def _milliseconds(draw: Callable[[], Any], repeats: int) -> float:
+    """The median, of an idle device."""
+    for _ in range(3):
+        draw()
+    seconds = []
+    for _ in range(repeats):
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        draw()
+        torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    return round(1e3 * statistics.median(seconds), 3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
