@@ -228,7 +228,7 @@ def test_info_of_a_scene(folder):
 def test_render_turntable(folder, tmp_path, subject):
     done = run(
         *("render", folder / subject, "-o", tmp_path / "out.png", "--views", 2, "--size", 64, 48),
-        *("--background", 1, 1, 1, "--json"),
+        *("--background", 1, 1, 1, "--up", "z", "--json"),
     )
     assert done.returncode == 0, done.stderr
     pictures = json.loads(done.stdout)["pictures"]

@@ -1,11 +1,9 @@
 """The viewer in Chromium, as a person uses it. Wants playwright, and Chromium where PATH finds it."""
 
+import base64
 import io
 import itertools
 import json
-import re
-import socket
-import time
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -18,7 +16,7 @@ import v3dg
 from v3dg.viewer.frame import SceneView
 from v3dg.viewer.server import Site
 
-pytest.importorskip("viser")
+pytest.importorskip("websockets")
 pytest.importorskip("playwright.sync_api")
 
 pytestmark = [
@@ -27,6 +25,15 @@ pytestmark = [
 ]
 
 SECONDS = 60
+SHOWS = (
+    "Colour",
+    "Level",
+    "Cluster",
+    "Depth",
+    "Alpha",
+    "Gaussians per pixel",
+    "Difference to all gaussians",
+)
 
 
 @pytest.fixture(scope="module")
@@ -48,43 +55,62 @@ def site(tmp_path_factory):
 class Tab:
     """A tab and what can be seen and done there."""
 
-    def __init__(self, browser, url):
+    def __init__(self, browser, url, size=(900, 600), **options):
         self.errors = []
-        self.page = browser.new_page(viewport={"width": 900, "height": 600})
+        context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **options)
+        context.grant_permissions(["clipboard-read", "clipboard-write"])
+        self.page = context.new_page()
         self.page.on("console", lambda m: m.type == "error" and self.errors.append(m.text))
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.goto(url + ("&" if "?" in url else "?") + "fixedDpr=1")
+        self.page.goto(url)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.page.context.close()
+        assert self.errors == []
 
     def figure(self, name):
-        found = re.search(rf"{name}\s+([\d,.]+)", self.page.inner_text("body"))
-        return float(found[1].replace(",", "")) if found else None
+        cell = self.page.locator(f"#panel tr:has(td:text-is('{name}')) td").last
+        return float(cell.inner_text().split()[0].replace(",", ""))
 
     def settled(self):
-        """The picture, 8 bit, once it is drawn in full."""
-        canvas = self.page.locator("canvas").first
-        end = time.monotonic() + SECONDS
-        self.page.wait_for_timeout(600)  # until what was done before has come to the tab
-        while abs((self.figure("picture") or 0) - canvas.bounding_box()["width"]) > 1:
-            assert time.monotonic() < end, self.page.inner_text("body")
-            self.page.wait_for_timeout(200)
+        """The picture, 8 bit, once it is drawn in full and the page says so."""
+        self.page.wait_for_timeout(300)  # until what was done before is on its way
+        self.page.wait_for_selector("body[data-state=ready]", timeout=1000 * SECONDS)
         self.page.wait_for_timeout(300)  # until the browser has drawn it
         return self.seen()
 
     def seen(self):
-        box = self.page.locator("canvas").first.bounding_box()
-        # Below the notices that the tab begins with.
-        png = self.page.screenshot(clip=box | {"y": 200, "height": box["height"] - 200})
-        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+        """The middle of the picture, where nothing lies over it."""
+        box = self.page.locator("#stage").bounding_box()
+        clip = box | {"y": 90, "height": box["height"] - 220}
+        return np.asarray(Image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("RGB")).astype(int)
 
-    def drag(self):
-        self.page.mouse.move(200, 400)
-        self.page.mouse.down()
-        self.page.mouse.move(300, 380, steps=8)
-        self.page.mouse.up()
+    def view(self):
+        """What the address says of the camera and the settings."""
+        self.page.wait_for_timeout(700)  # until it rests
+        hash = self.page.evaluate("location.hash").removeprefix("#")
+        return dict(part.split("=", 1) for part in hash.split("&"))
 
-    def show(self, before, after):
-        self.page.locator(f'input[value="{before}"]').first.click()
-        self.page.get_by_role("option", name=after, exact=True).click()
+    def position(self):
+        return np.array([float(x) for x in self.view()["at"].split(",")])
+
+    def drag(self, start=(200, 400), end=(300, 380), **options):
+        self.page.mouse.move(*start)
+        self.page.mouse.down(**options)
+        self.page.mouse.move(*end, steps=8)
+        self.page.mouse.up(**options)
+
+    def open(self, folder):
+        self.page.locator("#panel summary", has_text=folder).click()
+
+    def set(self, slider, value):
+        """Give a slider its own value, as its keys do."""
+        self.page.get_by_role("slider", name=slider, exact=True).evaluate(
+            "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", value
+        )
 
     def press(self, name):
         self.page.get_by_role("button", name=name, exact=True).click()
@@ -98,10 +124,9 @@ class Tab:
 
 @pytest.fixture
 def tab(browser, site):
-    tab = Tab(browser, f"{site.url}/")
-    yield tab
-    tab.page.close()
-    assert tab.errors == []
+    with Tab(browser, site.url) as tab:
+        tab.settled()
+        yield tab
 
 
 def differ(first, second):
@@ -116,7 +141,7 @@ def test_picture_is_there_and_follows_the_camera_and_a_slider(tab):
     turned = tab.settled()
     assert differ(first, turned) > 0.02
     selected = tab.figure("selected")
-    tab.page.get_by_role("slider").first.press("End")
+    tab.set("Tolerance px²", 32)
     coarse = tab.settled()
     assert tab.figure("selected") < 0.7 * selected
     assert differ(turned, coarse) > 0.001
@@ -125,96 +150,363 @@ def test_picture_is_there_and_follows_the_camera_and_a_slider(tab):
 def test_page_of_a_token_reaches_the_viewer(browser, site):
     elsewhere = Site(site.scene_view, host="0.0.0.0", port=0)
     try:
-        tab = Tab(browser, f"http://127.0.0.1:{elsewhere.port}{urlsplit(elsewhere.url).path}")
-        assert (tab.settled().max(axis=2) > 30).mean() > 0.05
-        tab.page.close()
+        path = urlsplit(elsewhere.url).path
+        with Tab(browser, f"http://127.0.0.1:{elsewhere.port}{path}") as tab:
+            assert (tab.settled().max(axis=2) > 30).mean() > 0.05
     finally:
         elsewhere.close()
 
 
-def test_page_talks_to_no_other_server(browser, site):
-    """Which could have it run anything in the name of this one."""
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        other.settimeout(3)
-        tab = Tab(browser, f"{site.url}/?websocket=ws://127.0.0.1:{other.getsockname()[1]}")
-        with pytest.raises(TimeoutError):
-            other.accept()
-        tab.page.close()
-
-
-def test_picture_comes_while_the_mouse_is_still_down(tab):
+def test_drag_is_answered_while_the_mouse_is_still_down(tab):
+    """First by the picture that is there, moved; then by drafts, which say what they are."""
     first = tab.settled()
     tab.page.mouse.move(200, 400)
     tab.page.mouse.down()
     tab.page.mouse.move(400, 380, steps=8)
-    tab.page.wait_for_timeout(2000)
+    assert tab.page.locator("body").get_attribute("data-state") in ("moving", "refining")
     assert differ(first, tab.seen()) > 0.02
+    tab.page.wait_for_selector("body[data-state=ready]", timeout=1000 * SECONDS)
+    assert differ(first, tab.seen()) > 0.02
+    assert tab.page.locator("#picture").evaluate("e => e.style.transform") == "none"
     tab.page.mouse.up()
 
 
+def test_moved_picture_is_nearly_the_one_that_follows(browser, site):
+    """From the same place, turned: where both have something, they show the same."""
+    with Tab(browser, site.url) as tab:
+        tab.settled()
+        tab.page.get_by_role("radio", name="Fly").click()
+        first = tab.settled()
+        tab.page.evaluate("viewer.link.send = () => {}")  # so that no picture follows
+        tab.drag((200, 300), (260, 300))
+        moved = tab.seen()
+        assert differ(first, moved) > 0.02
+        tab.page.evaluate("delete viewer.link.send; viewer.asked = null; viewer.redraw()")
+        after = tab.settled()
+    middle = np.s_[:, 100:400]
+    assert abs(moved[middle] - after[middle]).mean() < 0.2 * abs(first[middle] - after[middle]).mean()
+
+
 def test_every_mode_looks_different(tab):
-    names = [
-        "Colour",
-        "Level",
-        "Cluster",
-        "Depth",
-        "Alpha",
-        "Gaussians per pixel",
-        "Difference to all gaussians",
-    ]
-    pictures = [tab.settled()]
-    for before, after in itertools.pairwise(names):
-        tab.show(before, after)
+    pictures = []
+    for name in SHOWS:
+        tab.page.get_by_label("Show", exact=True).select_option(name)
         pictures.append(tab.settled())
-    for i, first in enumerate(pictures):
-        for second in pictures[:i]:
-            assert differ(first, second) > 0.01
+    for first, second in itertools.combinations(pictures, 2):
+        assert differ(first, second) > 0.01
 
 
 def test_tabs_have_their_own_camera_and_settings(browser, site, tab):
-    other = Tab(browser, site.url)
-    first = other.settled()
-    tab.settled()
-    tab.drag()
-    tab.show("Colour", "Depth")
-    tab.settled()
-    assert differ(first, other.settled()) == 0
-    other.page.close()
-    assert other.errors == []
+    with Tab(browser, site.url) as other:
+        first = other.settled()
+        tab.drag()
+        tab.page.get_by_label("Show", exact=True).select_option("Depth")
+        tab.settled()
+        assert differ(first, other.settled()) == 0
 
 
 def test_frozen_cut_stays_when_the_camera_goes_away(tab):
-    tab.settled()
     selected = tab.figure("selected")
-    tab.page.get_by_role("checkbox").nth(2).click()
+    tab.page.get_by_label("Freeze the cut").check()
     tab.settled()
     tab.page.mouse.move(300, 400)
     tab.page.mouse.wheel(0, 800)
-    tab.page.wait_for_timeout(500)
     tab.settled()
     assert tab.figure("selected") == selected
 
 
 def test_budget_is_kept(tab):
-    tab.settled()
     assert tab.figure("selected") > 10_000
-    tab.page.get_by_role("checkbox").first.click()
-    tab.page.get_by_text("Millions").wait_for()
-    tab.page.get_by_role("slider").nth(1).press("Home")
+    tab.page.get_by_label("Limit gaussians").check()
+    tab.set("Millions", np.log(0.01))
     tab.settled()
     assert 0 < tab.figure("selected") <= 10_000
     assert tab.figure("tolerance") > 3
 
 
-def test_pictures_paths_and_scenes_are_saved(tab, site, tmp_path):
+def test_keys_fly_at_a_pace_that_suits_the_scene(browser, site):
+    """As many of the scene's radii in a second, whether it is a donut or a world."""
+    shares = []
+    for scale in (1e-3, 1.0, 1e4):
+        scene = v3dg.Scene()
+        rows = np.random.default_rng(1).normal(size=(50, 3)) * scale
+        scene.add(site.scene_view.scene.bundles[0], positions=rows, scales=np.full(50, 0.3 * scale))
+        scene_view = SceneView(scene, device="cpu")
+        world = Site(scene_view, port=0)
+        try:
+            with Tab(browser, world.url) as tab:
+                tab.settled()
+                before = tab.position()
+                for key in ("w", "d"):
+                    tab.page.keyboard.down(key)
+                    tab.page.wait_for_timeout(1000)
+                    tab.page.keyboard.up(key)
+                tab.settled()
+                shares.append(np.linalg.norm(tab.position() - before) / scene_view.radius)
+        finally:
+            world.close()
+    assert min(shares) > 0.2
+    assert max(shares) < 3 * min(shares)
+
+
+def test_speed_slider_and_keys_change_the_pace(tab):
+    pace = tab.page.evaluate("viewer.camera.pace")
+    tab.set("Speed", np.log(4))
+    assert tab.page.evaluate("viewer.camera.pace") == pytest.approx(4 * pace, rel=0.02)
+    tab.page.keyboard.press("+")
+    assert tab.page.evaluate("viewer.camera.pace") == pytest.approx(6 * pace, rel=0.02)
+
+
+def test_walking_keeps_its_height_and_flying_does_not(tab):
+    def after_w(mode):
+        tab.page.get_by_role("radio", name=mode).click()
+        before = tab.position()
+        tab.page.keyboard.down("w")
+        tab.page.wait_for_timeout(500)
+        tab.page.keyboard.up("w")
+        tab.settled()
+        return tab.position() - before
+
+    walked = after_w("Walk")
+    assert np.linalg.norm(walked[:2]) > 0.1
+    assert abs(walked[2]) < 1e-5
+    assert after_w("Fly")[2] < -0.05  # looking down from above
+
+
+def test_gamepad_moves_and_turns(browser, site):
+    stick = "[0, -1, 0.5, 0]"
+    buttons = "Array(16).fill({ value: 0, pressed: false })"
+    pad = f"{{ connected: true, mapping: 'standard', axes: {stick}, buttons: {buttons} }}"
+    with Tab(browser, site.url) as tab:
+        tab.settled()
+        before = tab.view()
+        tab.page.evaluate(
+            f"navigator.getGamepads = () => [{pad}]; window.dispatchEvent(new Event('gamepadconnected'))"
+        )
+        tab.page.wait_for_timeout(500)
+        tab.page.evaluate("navigator.getGamepads = () => []")
+        after = tab.view()
+    assert before["at"] != after["at"]
+    assert before["turn"] != after["turn"]
+
+
+def test_up_axis_is_changed_in_the_page(tab):
     tab.settled()
+    tab.page.get_by_label("Up", exact=True).select_option("y")
+    tab.press("Show all")
+    tab.settled()
+    down = tab.page.evaluate("viewer.camera.down")
+    assert down[1] < -0.8
+    assert tab.view()["up"] == "y"
+
+
+def test_link_leads_to_the_same_picture(browser, site, tab):
+    tab.drag()
+    tab.page.get_by_label("Show", exact=True).select_option("Level")
+    tab.set("Tolerance px²", 12)
+    tab.page.get_by_role("radio", name="Fly").click()
+    first = tab.settled()
+    tab.open("Places")
+    tab.press("Copy link")
+    link = tab.page.evaluate("navigator.clipboard.readText()")
+    assert "show=level" in link
+    with Tab(browser, link) as other:
+        assert differ(first, other.settled()) < 0.002
+        assert other.page.get_by_role("slider", name="Tolerance px²").input_value() == "12"
+        assert other.page.get_by_role("radio", name="Fly").get_attribute("aria-checked") == "true"
+
+
+@pytest.mark.parametrize(
+    "hash", ["#at=1,2&turn=x&show=nothing&mode=fall&fov=NaN&up=q", "#%E0%A4%A", "#at=1e999,0,0&turn=0,0,0,0"]
+)
+def test_wrong_links_show_the_scene(browser, site, hash):
+    with Tab(browser, site.url + "/" + hash) as tab:
+        assert (tab.settled().max(axis=2) > 30).mean() > 0.05
+
+
+def test_bookmarks_outlive_the_page_and_lead_back(tab):
+    tab.drag()
+    first = tab.settled()
+    tab.page.keyboard.press("b")
+    tab.open("Places")
+    tab.press("Show all")
+    assert differ(first, tab.settled()) > 0.02
+    tab.page.reload()
+    tab.settled()
+    tab.page.keyboard.press("1")
+    tab.page.wait_for_timeout(900)
+    assert differ(first, tab.settled()) < 0.01
+
+
+def test_go_to_a_point_an_instance_and_a_camera(tab):
+    tab.open("Places")
+
+    def go(where):
+        tab.page.get_by_label("Go to").fill(where)
+        tab.press("Go")
+        tab.page.wait_for_timeout(900)
+        tab.settled()
+        return [float(x) for x in tab.view()["focus"].split(",")]
+
+    assert go("1 2 3") == [1, 2, 3]
+    scene = tab.page.evaluate("viewer.scene.instances")
+    assert scene == 200
+    go("#7")
+    assert tab.page.evaluate("viewer.selected.instance") == 7
+    go("from the side")
+    np.testing.assert_allclose(tab.position(), (6, 0, 0))
+    go("nowhere")
+    assert "Go to: expected" in tab.page.inner_text("#notices")
+
+
+def test_clicked_instance_is_selected_moved_undone_and_saved(browser, site):
+    scene = v3dg.Scene()
+    scene.add(site.scene_view.scene.bundles[0], positions=[(0, 0, 0), (4, 0, 0)], scales=[0.5, 0.5])
+    pair = Site(SceneView(scene, device="cpu"), name="pair", port=0)
+    try:
+        with Tab(browser, pair.url + "/#at=2,-14,0&turn=0.70710678,-0.70710678,0,0&focus=2,0,0") as tab:
+            before = tab.settled()
+            at = tab.page.evaluate("viewer.overlay.place([4, 0, 0])")
+            tab.page.mouse.click(*at)
+            tab.page.wait_for_function("() => viewer.selected?.instance === 1")
+            tip = tab.page.evaluate("viewer.overlay.place(viewer.overlay.tip(2))")
+            tab.drag(tip, (tip[0], tip[1] - 60))
+            tab.page.get_by_role("radio", name="Turn").click()
+            ring = tab.page.evaluate("viewer.overlay.place(viewer.overlay.ring(1)[6])")
+            tab.drag(ring, (ring[0] - 60, ring[1]))
+            tab.page.get_by_role("radio", name="Scale").click()
+            middle = tab.page.evaluate("viewer.overlay.place(viewer.selected.pose.position)")
+            tab.drag((middle[0] + 59, middle[1]), (middle[0] + 118, middle[1]))
+            assert differ(before, tab.settled()) > 0.01
+            np.testing.assert_allclose(scene.positions[0], 0)
+            assert 1 < scene.positions[1, 2] < 4
+            np.testing.assert_allclose(scene.positions[1, :2], (4, 0), atol=1e-6)
+            assert abs(scene.quaternions[1, 2]) > 0.1
+            assert 0.8 < scene.scales[1] < 1.2
+            tab.open("Instances")
+            name, content = tab.saved("Save scene (.json)")
+            (site.folder / name).write_bytes(content)
+            np.testing.assert_array_equal(v3dg.read_scene(site.folder / name)[0].positions, scene.positions)
+            for _ in range(3):
+                tab.page.keyboard.press("Control+z")
+            tab.page.keyboard.press("Escape")
+            assert differ(before, tab.settled()) < 0.002
+            np.testing.assert_allclose(scene.positions[1], (4, 0, 0))
+    finally:
+        pair.close()
+
+
+def test_double_click_flies_to_what_is_there(tab):
+    box = tab.page.locator("#stage").bounding_box()
+    before = tab.position()
+    tab.page.mouse.dblclick(box["width"] / 2, box["height"] / 2)
+    tab.page.wait_for_timeout(1500)
+    tab.settled()
+    assert np.linalg.norm(tab.position()) < 0.6 * np.linalg.norm(before)
+
+
+def test_dropped_file_is_shown(tab, tmp_path):
+    v3dg.write_asset(tmp_path / "few.ply", scenes_lod.blob(np.random.default_rng(3), 300, size=0.5))
+    content = base64.b64encode((tmp_path / "few.ply").read_bytes()).decode()
+    tab.page.evaluate(
+        """async (content) => {
+            const bytes = Uint8Array.from(atob(content), (c) => c.charCodeAt(0));
+            const transfer = new DataTransfer();
+            transfer.items.add(new File([bytes], "few.ply"));
+            window.dispatchEvent(new DragEvent("drop", { dataTransfer: transfer, cancelable: true }));
+        }""",
+        content,
+    )
+    tab.page.wait_for_selector("#panel h1:text-is('few')", timeout=1000 * SECONDS)
+    tab.page.wait_for_timeout(900)  # until the camera is there
+    assert tab.settled().max() > 60
+    assert tab.figure("selected") == tab.figure("in view") == 300
+
+
+def test_photographs_lie_over_the_picture_of_their_camera(browser, site, tmp_path):
+    Image.fromarray(np.full((48, 64, 3), (0, 200, 0), np.uint8)).save(tmp_path / "side.png")
+    camera = v3dg.Camera.look_at((0, 3, 0), (0, 0, 0), width=64, height=48)
+    captured = Site(
+        site.scene_view, cameras={"side": camera}, photographs={"side": tmp_path / "side.png"}, port=0
+    )
+    try:
+        with Tab(browser, captured.url) as tab:
+            tab.settled()
+            at = tab.page.evaluate(
+                "viewer.overlay.place([0, 3 - viewer.frustumSize * viewer.scene.radius, 0])"
+            )
+            tab.page.mouse.click(*at)
+            tab.page.wait_for_selector("#photograph:visible")
+            tab.settled()
+            tab.open("Cameras of the file")
+            tab.set("Photograph %", 100)
+            tab.page.wait_for_timeout(300)
+            assert abs(tab.seen()[200, 300] - (0, 200, 0)).max() < 12
+            tab.drag()
+            tab.settled()
+            assert not tab.page.locator("#photograph").is_visible()
+    finally:
+        captured.close()
+
+
+def test_phone_has_the_picture_to_itself(browser, site):
+    with Tab(browser, site.url, (390, 760), has_touch=True, is_mobile=True, device_scale_factor=2) as tab:
+        picture = tab.settled()
+        assert tab.page.locator("#stage").bounding_box()["width"] == 390
+        assert not tab.page.locator("#panel").is_visible()
+        assert (picture.max(axis=2) > 30).mean() > 0.03
+        tab.page.touchscreen.tap(195, 300)
+        tab.page.get_by_role("button", name="Panel").tap()
+        assert tab.page.locator("#panel").bounding_box()["y"] > 380
+        tab.page.get_by_role("button", name="Panel").tap()
+        assert not tab.page.locator("#panel").is_visible()
+        tab.page.get_by_role("radio", name="Fly").tap()
+        pad = tab.page.locator("#pad").bounding_box()
+        before = tab.position()
+        tab.page.evaluate(
+            """([x, y]) => {
+                const pad = document.getElementById("pad");
+                pad.setPointerCapture = () => {};
+                const at = { clientX: x, clientY: y, pointerId: 1, bubbles: true };
+                pad.dispatchEvent(new PointerEvent("pointerdown", at));
+                setTimeout(() => pad.dispatchEvent(new PointerEvent("pointerup", at)), 500);
+            }""",
+            [pad["x"] + 55, pad["y"] + 10],
+        )
+        tab.page.wait_for_timeout(800)
+        tab.settled()
+        assert np.linalg.norm(tab.position() - before) > 0.1
+
+
+def test_panel_is_folded_away(tab):
+    wide = tab.page.locator("#stage").bounding_box()["width"]
+    tab.page.keyboard.press("p")
+    tab.settled()
+    assert tab.page.locator("#stage").bounding_box()["width"] > wide + 200
+
+
+def test_page_says_when_the_viewer_is_gone_and_comes_back_with_it(browser, site):
+    first = Site(site.scene_view, port=0)
+    with Tab(browser, first.url) as tab:
+        tab.settled()
+        first.close()
+        tab.page.wait_for_selector("body[data-state=connecting]")
+        again = Site(site.scene_view, port=first.port)
+        try:
+            assert again.port == first.port
+            tab.page.wait_for_selector("body[data-state=ready]", timeout=1000 * SECONDS)
+        finally:
+            again.close()
+        tab.errors = [error for error in tab.errors if "ERR_CONNECTION_REFUSED" not in error]
+
+
+def test_pictures_paths_and_scenes_are_saved(tab, site, tmp_path):
     name, png = tab.saved("Save picture")
     assert name == "blobs.png"
     width, height = Image.open(io.BytesIO(png)).size
-    box = tab.page.locator("canvas").first.bounding_box()
-    assert abs(width - box["width"]) <= 1
-    assert abs(height - box["height"]) <= 1
-    tab.page.get_by_text("Path", exact=True).click()
+    box = tab.page.locator("#stage").bounding_box()
+    assert (width, height) == (box["width"], box["height"])
+    tab.open("Path")
     tab.press("Add this view")
     tab.drag()
     tab.settled()
@@ -225,6 +517,8 @@ def test_pictures_paths_and_scenes_are_saved(tab, site, tmp_path):
     assert len(cameras) == 61
     first, *_, last = cameras.values()
     assert np.linalg.norm(first.position - last.position) > 0.1
+    np.testing.assert_allclose(last.position, tab.position(), rtol=1e-5)
+    tab.open("Instances")
     name, content = tab.saved("Save scene (.json)")
     (site.folder / name).write_bytes(content)
     scene, cameras = v3dg.read_scene(site.folder / name)
@@ -233,10 +527,26 @@ def test_pictures_paths_and_scenes_are_saved(tab, site, tmp_path):
     assert json.loads(content)["format"] == "v3dg-scene"
 
 
+def test_flight_is_recorded_and_played(tab):
+    tab.open("Path")
+    tab.page.get_by_label("Record").check()
+    start = tab.position()
+    tab.drag()
+    tab.page.wait_for_timeout(300)
+    tab.page.get_by_label("Record").uncheck()
+    end = tab.position()
+    tab.press("Show all")
+    tab.page.wait_for_timeout(900)
+    np.testing.assert_allclose(tab.position(), start, rtol=1e-3)
+    tab.press("Play")
+    tab.page.wait_for_timeout(3000)
+    tab.settled()
+    np.testing.assert_allclose(tab.position(), end, rtol=1e-5)
+
+
 def test_film_of_a_path_is_saved(tab, tmp_path):
     av = pytest.importorskip("av")
-    tab.settled()
-    tab.page.get_by_text("Path", exact=True).click()
+    tab.open("Path")
     tab.press("Add this view")
     tab.drag()
     tab.settled()
@@ -252,11 +562,11 @@ def test_film_of_a_path_is_saved(tab, tmp_path):
 
 def test_camera_goes_to_one_of_the_file_and_back(tab):
     first = tab.settled()
-    tab.page.get_by_text("Camera", exact=True).click()
-    tab.page.wait_for_timeout(800)  # until the folder is open
-    tab.page.locator('input[class*="Select-input"]:visible').last.click()
-    tab.page.get_by_role("option", name="from the side", exact=True).click()
+    tab.open("Cameras of the file")
+    tab.page.get_by_label("Of the file").select_option("from the side")
+    tab.page.wait_for_timeout(900)
     aside = tab.settled()
     assert differ(first, aside) > 0.02
     tab.press("Show all")
+    tab.page.wait_for_timeout(900)
     assert differ(first, tab.settled()) < 0.01

@@ -20,12 +20,10 @@ import v3dg.cli
 from v3dg.viewer.frame import Settings
 from v3dg.viewer.server import Site, start_view
 
-pytest.importorskip("viser")
 websockets = pytest.importorskip("websockets")
 
 pytestmark = [
-    # A site that closes while somebody is just connecting leaves viser's end of the connection to the
-    # collector.
+    # A site that closes while somebody is just connecting leaves its end of the connection to the collector.
     pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
     pytest.mark.usefixtures("collected_connections"),
 ]
@@ -64,7 +62,8 @@ def test_address_of_another_machine_is_refused(blob_view):
 
 
 def test_missing_extra_is_named(blob_view, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.setitem(sys.modules, "websockets.http11", None)
+    monkeypatch.delitem(sys.modules, "v3dg.viewer.gate", raising=False)
     with pytest.raises(ImportError, match=r"pip install 'v3dg\[viewer\]'"):
         Site(blob_view)
 
@@ -125,8 +124,53 @@ def test_command_says_where_and_ends_with_an_interrupt(blob_bundle, tmp_path):
         ends(process, signal.SIGINT)
 
 
+@pytest.mark.parametrize(
+    ("options", "environment", "opens"),
+    [
+        ((), {}, True),
+        (("--no-browser",), {}, False),
+        (("--host", "0.0.0.0"), {}, False),
+        ((), {"SSH_CONNECTION": "1"}, False),
+        ((), {"BROWSER": ""}, False),
+    ],
+)
+def test_command_opens_a_browser_where_there_is_one(
+    blob_bundle, tmp_path, monkeypatch, options, environment, opens
+):
+    browser = tmp_path / "browser"
+    browser.write_text('#!/bin/sh\necho "$1" > "$(dirname "$0")/opened"\n')
+    browser.chmod(0o755)
+    usual = {"BROWSER": str(browser), "DISPLAY": "", "WAYLAND_DISPLAY": ""}
+    for name, value in {**usual, **environment}.items():
+        monkeypatch.setenv(name, value)
+    if "SSH_CONNECTION" not in environment:
+        monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    with viewing(blob_bundle, tmp_path, *options) as (process, line):
+        end = time.monotonic() + (30 if opens else 1)
+        while not (tmp_path / "opened").exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        time.sleep(0.1)  # until it is written
+        ends(process, signal.SIGINT)
+    assert (tmp_path / "opened").exists() == opens
+    if opens:
+        assert (tmp_path / "opened").read_text().strip() == line.split()[0]
+
+
+def test_photographs_of_cameras_are_found(tmp_path):
+    from v3dg.cli.view import _photographs
+
+    (tmp_path / "images").mkdir()
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    for name in ("a.jpg", "b.png"):
+        (tmp_path / "images" / name).write_bytes(b"")
+    names = ("a.jpg", "images/b", "images/c.png", "x" * 5000)
+    by_colmap = _photographs(tmp_path / "sparse" / "0", names)
+    assert {name: path.name for name, path in by_colmap.items()} == {"a.jpg": "a.jpg", "images/b": "b.png"}
+    assert _photographs(tmp_path / "transforms.json", names).keys() == {"a.jpg", "images/b"}
+
+
 INTERRUPTS = int(os.environ.get("V3DG_INTERRUPTS", "1"))
-JOBS = ("Add this view", "Save film (.mp4)", "Save picture", "Stop", "Play")
+JOBS = ("film", "picture", "play", "cameras")
 
 
 @pytest.mark.parametrize("signals", [(signal.SIGINT,), (signal.SIGINT,) * 2, (signal.SIGTERM, signal.SIGINT)])
@@ -140,8 +184,10 @@ def test_command_ends_at_once_whatever_a_tab_does(blob_bundle, blob_view, tmp_pa
         while time.monotonic() < end:
             tab.look(home, (3000, 2000))
             tab.pictures(time.perf_counter() + 0.05)
-            for label in set(JOBS) & set(tab.uuids):
-                tab.set(label, True)
+            for job in JOBS:
+                tab.save(job, [(1.0, home), (1.0, home)])
+            if random.random() < 0.3:
+                tab.send({"type": "stop"})
         began = time.monotonic()
         ends(process, *signals)
         assert time.monotonic() - began < 10  # a film of 3000 x 2000 takes longer

@@ -1,8 +1,8 @@
-"""A tab of the viewer, from the browser's side of its connection, which viewer_client plays."""
+"""A tab of the viewer, from the page's side of its connection, which viewer_client plays."""
 
 import io
-import re
 import time
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -10,17 +10,13 @@ from PIL import Image
 
 import scenes_lod
 import v3dg
-from v3dg.viewer.figures import figures_html
-from v3dg.viewer.frame import Figures, Frame, SceneView
+from v3dg.viewer.frame import SceneView
 from v3dg.viewer.server import Site, start_view
 from v3dg.viewer.view import look_at
 
-pytest.importorskip("viser")
 viewer_client = pytest.importorskip("viewer_client")
 
 pytestmark = [
-    # A site that closes while somebody is just connecting leaves viser's end of the connection to the
-    # collector.
     pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
     pytest.mark.usefixtures("collected_connections"),
 ]
@@ -37,10 +33,10 @@ def site(blob_bundle, tmp_path_factory):
     scene.add(v3dg.Bundle.open(path), positions=positions, scales=np.full(30, 0.5))
     cameras = {"aside": v3dg.Camera.look_at((9, 0, 0), (0, 0, 0), width=64, height=48)}
     site = Site(SceneView(scene, device="cpu"), name="blobs", cameras=cameras, port=0)
-    site.folder = path.parent
+    site.folder, site.scene = path.parent, scene
     site.home = start_view(SceneView(scene, device="cpu"), (0, 0, 1), SIZE[0] / SIZE[1])
     yield site
-    site.close()
+    assert site.close()
 
 
 @pytest.fixture
@@ -51,63 +47,76 @@ def tab(site):
         yield tab
 
 
-def settled(tab, until=lambda: True):
-    """The picture at rest: full, and nothing comes after it."""
-    last = None
-    end = time.monotonic() + 60
+def settled(tab):
+    """The picture at rest: in full, and of what was asked for last."""
+    last, end = None, time.monotonic() + 60
     while time.monotonic() < end:
-        pictures = tab.pictures(time.perf_counter() + 0.6)
-        if pictures:
-            last = pictures[-1][1]
-        elif last is not None and last.size == SIZE and until():
+        pictures = tab.pictures(time.perf_counter() + 0.1)
+        last = pictures[-1][1] if pictures else last
+        if last is not None and tab.is_answered:
             return np.asarray(last).astype(int)
-    pytest.fail(f"no picture in full: {tab.text} {tab.notices}")
-
-
-def figure(tab, name):
-    found = re.search(rf">{name}</td><td[^>]*>([\d.,e+-]+)", tab.text)
-    return float(found[1].replace(",", ""))
+    pytest.fail(f"no picture in full: {tab.figures} {tab.failures} {tab.notices}")
 
 
 def wait_for(tab, condition):
     end = time.monotonic() + 60
     while not condition():
-        assert time.monotonic() < end, (tab.text, tab.notices)
+        assert time.monotonic() < end, (tab.figures, tab.notices, tab.answers)
         tab.pictures(time.perf_counter() + 0.1)
 
 
-def saved(tab, button, name):
-    tab.set(button, True)
+def saved(tab, what, name, path=()):
+    tab.save(what, path)
     wait_for(tab, lambda: name in tab.files)
     return tab.files[name]
 
 
-def add_to_path(tab, count):
-    tab.set("Add this view", True)
-    wait_for(tab, lambda: any(f"{count} views" in update for update in tab.updates))
+def beside(site):
+    """The view from a quarter of a turn on."""
+    x, y, z = site.home.position
+    return look_at((-y, x, z), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect)
+
+
+def test_page_is_told_what_there_is(tab, site):
+    assert tab.hello["settings"] == {"tolerance": 3.0, "budget": None, "fade": v3dg.DEFAULT_FADE}
+    assert tab.hello["up"] == [0, 0, 1]
+    assert [camera["name"] for camera in tab.hello["cameras"]] == ["aside"]
+    assert tab.hello["cameras"][0]["view"]["position"] == [9, 0, 0]
+    assert (tab.scene["name"], tab.scene["instances"], tab.scene["has_files"]) == ("blobs", 30, True)
+    assert len({tuple(color) for color in tab.scene["level_colors"]}) == site.scene.bundles[0].num_levels
 
 
 def test_tab_gets_a_small_picture_and_then_the_full_one(site):
     with viewer_client.Tab(site.port) as tab:
         tab.look(site.home, SIZE)
         sizes = []
-        while SIZE not in sizes:
-            sizes += [picture.size for _, picture in tab.pictures(time.perf_counter() + 1)]
+        while not tab.is_answered:
+            sizes += [picture.size for _, picture in tab.pictures(time.perf_counter() + 0.1)]
     assert sizes[0][0] < SIZE[0]
     assert sizes == sorted(sizes)
+    assert sizes[-1] == SIZE
 
 
-def test_asset_has_no_controls_of_levels():
+def test_picture_tells_where_it_is_seen_from_and_how_far(tab, site):
+    tab.look(beside(site), SIZE)
+    settled(tab)
+    assert tab.figures["view"]["position"] == list(beside(site).position)
+    away = np.linalg.norm(beside(site).position)
+    assert 0.5 * away < tab.figures["distance"] < 1.5 * away
+    tab.look(look_at((50, 0, 0), (60, 0, 0), (0, 0, 1), 0.8, 1.5), SIZE)
+    settled(tab)
+    assert tab.figures["distance"] is None
+
+
+def test_asset_has_one_level():
     scene_view = SceneView(scenes_lod.blob(np.random.default_rng(0), 500), device="cpu")
     site = Site(scene_view, port=0)
     try:
         with viewer_client.Tab(site.port) as tab:
+            assert len(tab.scene["level_colors"]) == 1
+            assert not tab.scene["has_files"]
             tab.look(start_view(scene_view, (0, 0, 1)), SIZE)
-            settled(tab)
-            assert tab.visible("Resolution %")
-            assert not tab.visible("Tolerance px²")
-            assert "Level" not in tab.options("Show")
-            tab.set("Show", "Cluster")
+            tab.change(shows="cluster")
             assert settled(tab).max() > 30
     finally:
         site.close()
@@ -117,149 +126,188 @@ def test_picture_follows_the_camera(tab, site):
     tab.look(site.home, SIZE)
     first = settled(tab)
     assert (first.max(axis=2) > 30).mean() > 0.03
-    x, y, z = site.home.position
-    tab.look(look_at((-y, x, z), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect), SIZE)
+    tab.look(beside(site), SIZE)
     assert (abs(first - settled(tab)).max(axis=2) > 30).mean() > 0.02
 
 
-def test_controls_change_the_cut(tab):
-    everything = figure(tab, "selected")
-    tab.set("Tolerance px²", 32)
-    settled(tab)
-    assert figure(tab, "selected") < 0.7 * everything
-    tab.set("Tolerance px²", 0)
-    tab.set("Finest level", 2)
-    settled(tab)
-    assert figure(tab, "selected") < 0.7 * everything
-    tab.set("Finest level", 0)
-    settled(tab)
-    tab.set("Limit gaussians", True)
-    tab.set("Millions", 0.01)
-    settled(tab)
-    assert 0 < figure(tab, "selected") <= 10_000
-    assert figure(tab, "tolerance") > 0
+def test_settings_change_the_cut(tab):
+    def selected(**settings):
+        tab.change(**settings)
+        settled(tab)
+        return tab.figures["gaussians_selected"]
+
+    everything = selected(tolerance=0)
+    assert sum(tab.figures["levels"]) == everything
+    assert selected(tolerance=32) < 0.7 * everything
+    assert selected(tolerance=0, min_level=2) < 0.7 * everything
+    assert 0 < selected(min_level=0, budget=10_000) <= 10_000
+    assert tab.figures["tolerance"] > 0
 
 
-def test_modes_are_chosen_and_have_a_legend(tab):
-    tab.set("Show", "Depth")
-    settled(tab, lambda: "near" in tab.text)
-    tab.set("Show", "Gaussians per pixel")
-    settled(tab, lambda: "256+" in tab.text)
-    tab.set("Show", "Difference to all gaussians")
-    tab.set("Amplify", 30)
-    tab.set("Tolerance px²", 32)
+def test_modes_have_ranges(tab):
+    for shows, values in (("depth", (float, float)), ("count", (1.0, 256.0)), ("appearance", None)):
+        tab.change(shows=shows)
+        settled(tab)
+        given = tab.figures["range"]
+        if shows == "depth":
+            assert given[0] > given[1] > 0
+        else:
+            assert given == (None if values is None else list(values))
+    tab.change(shows="difference", gain=30, tolerance=32)
     assert settled(tab).max() > 30
-    tab.set("Split", 1)
-    assert settled(tab, lambda: "256+" not in tab.text).max() > 30
+    tab.change(split=1)
+    assert settled(tab).max() > 30
 
 
 def test_fade_is_on_until_it_is_switched_off(tab):
-    tab.set("Tolerance px²", 4)
-    settled(tab)
-    fading = figure(tab, "selected")
-    tab.set("Fade", False)
-    settled(tab, lambda: figure(tab, "selected") < fading)
-    tab.set("Fade", True)
-    settled(tab, lambda: figure(tab, "selected") == fading)
+    selected = []
+    for fade in (v3dg.DEFAULT_FADE, None, v3dg.DEFAULT_FADE):
+        tab.change(tolerance=4, fade=fade)
+        settled(tab)
+        selected.append(tab.figures["gaussians_selected"])
+    assert selected[1] < selected[0] == selected[2]
 
 
 def test_frozen_cut_is_kept_until_it_is_let_go(tab, site):
-    selected = figure(tab, "selected")
-    tab.set("Freeze the cut", True)
-    settled(tab)
+    selected = tab.figures["gaussians_selected"]
     x, y, z = site.home.position
-    away = look_at((6 * x, 6 * y, 6 * z), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect)
-    tab.look(away, SIZE)
+    tab.change(frozen=asdict(site.home))
+    tab.look(look_at((6 * x, 6 * y, 6 * z), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect), SIZE)
     settled(tab)
-    assert figure(tab, "selected") == selected
-    tab.set("Freeze the cut", False)
+    assert tab.figures["gaussians_selected"] == selected
+    tab.change(frozen=None)
     settled(tab)
-    assert figure(tab, "selected") < selected
+    assert tab.figures["gaussians_selected"] < selected
 
 
 def test_what_cannot_be_drawn_is_explained(blob_view):
     site = Site(blob_view, port=0, budget=3)
     try:
         with viewer_client.Tab(site.port) as tab:
+            assert tab.hello["settings"]["budget"] == 3
+            tab.settings["budget"] = 3
             tab.look(start_view(blob_view, (0, 0, 1)), SIZE)
-            wait_for(tab, lambda: "budget: expected at least" in tab.text)
-            tab.set("Millions", 1.0)
+            wait_for(tab, lambda: tab.failures)
+            assert "budget: expected at least" in tab.failures[0]
+            tab.change(budget=1_000_000)
             settled(tab)
     finally:
         site.close()
 
 
+def test_click_finds_an_instance_and_its_point(site):
+    (one,) = site.scene.bundles
+    scene = v3dg.Scene()
+    scene.add(one, positions=[(0, 0, 0), (0, 30, 0), (0, 60, 5)], scales=np.full(3, 2.0))
+    lonely = Site(SceneView(scene, device="cpu"), port=0)
+    try:
+        with viewer_client.Tab(lonely.port) as tab:
+            tab.look(look_at((-60, 30, 0), (0, 30, 0), (0, 0, 1), 0.9, SIZE[0] / SIZE[1]), SIZE)
+            tab.pick(at=(0.5, 0.5))
+            wait_for(tab, lambda: "picked" in tab.answers)
+            found = tab.answers.pop("picked")
+            assert (found["instance"], found["pose"]["position"]) == (1, [0, 30, 0])
+            assert found["pose"]["scale"] == 2
+            assert abs(found["point"][1] - 30) < 1
+            low, high = np.array(found["box"])
+            assert (low < high).all()
+            tab.pick(at=(0.5, 0.01))
+            wait_for(tab, lambda: "picked" in tab.answers)
+            assert "instance" not in tab.answers.pop("picked")
+            tab.pick(instance=2)
+            wait_for(tab, lambda: "picked" in tab.answers)
+            assert tab.answers["picked"]["pose"]["position"] == [0, 60, 5]
+            tab.pick(instance=3)
+            wait_for(tab, lambda: tab.notices)
+            assert tab.notices == ["instance: expected 0 to 2, got 3"]
+    finally:
+        lonely.close()
+
+
+def test_moved_instance_is_seen_in_every_tab_and_saved(site, tmp_path):
+    scene = v3dg.Scene()
+    scene.add(site.scene.bundles[0], positions=[(0, 0, 0), (1, 0, 0)])
+    shared = Site(SceneView(scene, device="cpu"), name="pair", port=0)
+    view = look_at((0, -9, 0), (0, 0, 0), (0, 0, 1), 0.8, SIZE[0] / SIZE[1])
+    try:
+        with viewer_client.Tab(shared.port) as tab, viewer_client.Tab(shared.port) as other:
+            tab.look(view, SIZE)
+            other.look(view, SIZE)
+            before = settled(other)
+            other.figures = {}
+            tab.move(1, (1.5, 0.5, 2), (0, 0, 0, 1), 0.5)
+            assert (abs(settled(other) - before).max(axis=2) > 30).mean() > 0.02
+            content = saved(tab, "scene", "pair.json", [(0.5, view)])
+        (site.folder / "pair.json").write_bytes(content)
+        moved, cameras = v3dg.read_scene(site.folder / "pair.json")
+        assert moved.positions.tolist() == [[0, 0, 0], [1.5, 0.5, 2]]
+        assert moved.quaternions[1].tolist() == [0, 0, 0, 1]
+        assert moved.scales.tolist() == [1, 0.5]
+        assert len(cameras) == 2
+    finally:
+        shared.close()
+
+
+def test_dropped_file_is_shown_in_its_tab_alone(tab, site, tmp_path):
+    tab.change()
+    before = settled(tab)
+    v3dg.write_asset(tmp_path / "few.ply", scenes_lod.blob(np.random.default_rng(5), 400, size=0.5))
+    with viewer_client.Tab(site.port) as other:
+        other.look(site.home, SIZE)
+        other.drop("few.ply", (tmp_path / "few.ply").read_bytes(), piece=1000)
+        wait_for(other, lambda: other.scene["name"] == "few")
+        assert (other.scene["instances"], len(other.scene["level_colors"])) == (1, 1)
+        other.look(site.home, SIZE)
+        settled(other)
+        assert other.figures["gaussians_selected"] == 400
+        other.drop("broken.v3dg", b"no bundle")
+        wait_for(other, lambda: other.notices)
+        assert "broken.v3dg" in other.notices[0]
+        assert "/" not in other.notices[0]
+        assert other.scene["name"] == "few"
+    tab.change()
+    assert abs(settled(tab) - before).max() == 0
+    assert tab.scene["name"] == "blobs"
+
+
 def test_path_is_saved_as_cameras_a_scene_and_a_film(tab, site, tmp_path):
-    tab.set("Save cameras (transforms.json)", True)
+    tab.save("cameras")
     wait_for(tab, lambda: tab.notices)
     assert "path: expected at least one view" in tab.notices[0]
-    tab.set("Seconds a view", 0.5)
-    add_to_path(tab, 1)
-    x, y, z = site.home.position
-    tab.look(look_at((-y, x, z), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect), SIZE)
-    settled(tab)
-    add_to_path(tab, 2)
+    path = [(0.5, site.home), (0.5, beside(site))]
 
-    (tmp_path / "cameras.json").write_bytes(saved(tab, "Save cameras (transforms.json)", "transforms.json"))
+    (tmp_path / "cameras.json").write_bytes(saved(tab, "cameras", "transforms.json", path))
     cameras = list(v3dg.read_cameras(tmp_path / "cameras.json").values())
     assert len(cameras) == 16
-    np.testing.assert_allclose(cameras[0].position, (x, y, z), atol=1e-9)
-    np.testing.assert_allclose(cameras[-1].position, (-y, x, z), atol=1e-9)
+    np.testing.assert_allclose(cameras[0].position, site.home.position, atol=1e-9)
+    np.testing.assert_allclose(cameras[-1].position, beside(site).position, atol=1e-9)
 
-    beside = site.folder / "scene.json"
-    beside.write_bytes(saved(tab, "Save scene (.json)", "blobs.json"))
-    scene, cameras = v3dg.read_scene(beside)
+    (site.folder / "scene.json").write_bytes(saved(tab, "scene", "blobs.json", path))
+    scene, cameras = v3dg.read_scene(site.folder / "scene.json")
     assert (len(scene), len(cameras)) == (30, 16)
 
     av = pytest.importorskip("av")
-    tab.set("Size", "as the window")
-    with av.open(io.BytesIO(saved(tab, "Save film (.mp4)", "blobs.mp4"))) as film:
+    with av.open(io.BytesIO(saved(tab, "film", "blobs.mp4", path))) as film:
         pictures = [frame.to_ndarray(format="rgb24").astype(int) for frame in film.decode(video=0)]
     assert len(pictures) == 16
     assert pictures[0].shape == (SIZE[1], SIZE[0], 3)
     assert (abs(pictures[0] - pictures[-1]).max(axis=2) > 30).mean() > 0.02
 
 
-def test_flight_is_recorded_and_played(tab, site):
-    x, y, z = site.home.position
-    tab.set("Record", True)
-    tab.pictures(time.perf_counter() + 0.3)
-    for step in range(1, 6):
-        away = look_at((x, y, z + 0.2 * step), (0, 0, 0), (0, 0, 1), site.home.fov_y, site.home.aspect)
-        tab.look(away, SIZE)
-        tab.pictures(time.perf_counter() + 0.1)
-    tab.set("Record", False)
-    wait_for(tab, lambda: re.search(r"[2-9] views", str(tab.updates)))
-    tab.positions.clear()
-    tab.set("Play", True)
-    wait_for(tab, lambda: tab.positions and abs(tab.positions[-1][2] - z - 1) < 1e-6)
-    heights = [position[2] for position in tab.positions]
-    assert len(heights) > 3
-    assert np.diff(heights).min() > -0.05
+def test_path_is_played_smoothly(tab, site):
+    tab.save("play", [(0.1, site.home), (0.5, beside(site))])
+    wait_for(tab, lambda: "play" in tab.answers)
+    positions = np.array([view["position"] for view in tab.answers["play"]["views"]])
+    assert len(positions) == 16
+    np.testing.assert_allclose(positions[[0, -1]], [site.home.position, beside(site).position])
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    assert 0 < steps.min() < steps.max() < 2 * np.median(steps)
 
 
 def test_picture_is_saved_in_full(tab, site):
     tab.look(site.home, SIZE)
     shown = settled(tab)
-    with Image.open(io.BytesIO(saved(tab, "Save picture", "blobs.png"))) as picture:
+    with Image.open(io.BytesIO(saved(tab, "picture", "blobs.png"))) as picture:
         pixels = np.asarray(picture).astype(int)
     assert pixels.shape == shown.shape
     assert abs(pixels - shown).mean() < 3  # but for JPEG
-
-
-def test_figures_are_in_the_panel():
-    figures = Figures(1234567, 7654, 3.0, 1.25, 45.6, np.array([10, 0, 40]), 300 << 20)
-    frame = Frame(np.zeros((9, 16, 3), np.uint8), figures, "depth", (8.0, 2.0))
-    text = figures_html(frame)
-    for expected in (
-        "1,234,567",
-        "7,654",
-        "3 px²",
-        "1.2 ms",
-        "45.6 ms",
-        "16 x 9",
-        "300 MiB",
-        "8",
-        "level 2: 40",
-    ):
-        assert expected in text

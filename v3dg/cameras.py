@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ from v3dg._numbers import check, check_type, positive, real, vector, whole
 
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
+Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
+AXES: tuple[Axis, ...] = get_args(Axis)
 
 DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
 _MOST_CAMERAS = 1_000_000  # of a turntable; more is a slip that would take minutes

@@ -13,8 +13,8 @@ from v3dg.bundle import Bundle
 
 ColorBy: TypeAlias = Literal["appearance", "level", "cluster"]
 
-# From fine to coarse, and around again: neighbours differ in hue and in lightness.
-LEVEL_COLORS = np.array(
+# Hues from fine to coarse, of which neighbours differ in lightness, too.
+_LEVEL_COLORS = np.array(
     [
         (0.90, 0.24, 0.22),
         (0.98, 0.60, 0.17),
@@ -30,13 +30,25 @@ LEVEL_COLORS = np.array(
 )
 
 
+def level_colors(count: int) -> npt.NDArray[np.float32]:
+    """Return (count, 3) colours of levels, from fine to coarse; no two are the same.
+
+    After nine come the hues between those, darker; then both again, ever nearer to white.
+    """
+    level, hues = np.arange(count), len(_LEVEL_COLORS)
+    turn, place = np.divmod(level, hues)
+    between = 0.6 * (_LEVEL_COLORS + np.roll(_LEVEL_COLORS, -1, axis=0)) / 2
+    colors = np.where((turn % 2 == 0)[:, None], _LEVEL_COLORS[place], between[place])
+    return np.asarray(1 - (1 - colors) * 0.6 ** (turn // 2)[:, None], np.float32)
+
+
 def palette_of(bundle: Bundle, by: ColorBy) -> npt.NDArray[np.float32] | None:
     """Constant SH coefficients (C, 3) that clusters are drawn with; None for what they appear as."""
     one_of(by, "color_by", get_args(ColorBy))
     if by == "appearance":
         return None
     level = bundle.clusters.level
-    colors = LEVEL_COLORS[level % len(LEVEL_COLORS)] if by == "level" else _scattered_colors(len(level))
+    colors = level_colors(bundle.num_levels)[level] if by == "level" else _scattered_colors(len(level))
     return np.ascontiguousarray((colors - 0.5) / _core.sh_base0, np.float32)
 
 

@@ -1,11 +1,9 @@
-"""Make viewer_*.jpg: a tab of the viewer in Chromium, in each of its modes. Needs playwright.
+"""Make viewer_*.jpg: the viewer in Chromium, in each mode, and at the size of a phone. Needs playwright.
 
 python docs/images/make_viewer.py donutsea.json 048_camera_8
 """
 
 import io
-import itertools
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -28,93 +26,99 @@ def main(scene_path: str, camera: str) -> None:
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
         page = browser.new_page(viewport={"width": 1120, "height": 640})
-        page.goto(f"http://127.0.0.1:{site.port}/?fixedDpr=1")
-        settle(page)
-        page.locator('[class*="Notification"] button').first.click()
-        page.get_by_text("Camera", exact=True).click()
-        page.wait_for_timeout(800)  # until the folder is open
-        page.locator('input[class*="Select-input"]:visible').last.click()
-        page.keyboard.type(camera)
-        page.get_by_role("option", name=camera, exact=True).click()
-        page.get_by_text("Camera", exact=True).click()
+        page.goto(site.url)
+        look_through(page, camera)
         save("tab", shot(page))
-        modes = {MODES[0]: shot(page, canvas_only=True)}
-        for before, after in itertools.pairwise(MODES):
-            choose(page, before, after)
-            modes[after] = shot(page, canvas_only=True)
-        choose(page, MODES[-1], MODES[0])
-        sliders = page.get_by_role("slider")
-        sliders.nth(0).press("End")
-        set_text(page, "0.5", 2)
-        modes["Split: all gaussians, tolerance 32"] = shot(page, canvas_only=True)
-        save("modes", sheet(modes))
-        set_text(page, "0", 2)
-        set_text(page, "3", 0)
-        choose(page, MODES[0], MODES[1])
-        page.get_by_role("checkbox").nth(1).click()
+        page.mouse.click(330, 400)
+        page.wait_for_function("() => viewer.selected")
         settle(page)
-        page.mouse.move(300, 250)
+        save("instance", shot(page))
+        page.keyboard.press("Escape")
+        pictures = []
+        for mode in MODES:
+            page.get_by_label("Show", exact=True).select_option(mode)
+            settle(page)
+            pictures.append(shown(page))
+        page.get_by_label("Show", exact=True).select_option(MODES[0])
+        for slider, value in (("Split", 0.5), ("Tolerance px²", 32)):
+            page.get_by_role("slider", name=slider).evaluate(
+                "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", value
+            )
+        settle(page)
+        pictures.append(shown(page))
+        save("modes", sheet(pictures, [*MODES, "Split, tolerance 32"], columns=2))
+        page.get_by_role("slider", name="Split").evaluate(
+            "e => { e.value = 0; e.dispatchEvent(new Event('input')); }"
+        )
+        page.evaluate("viewer.change({ tolerance: 3 })")
+        page.get_by_label("Show", exact=True).select_option("Level")
+        page.get_by_label("Freeze the cut").check()
+        page.keyboard.press("h")
+        page.wait_for_timeout(1000)
+        page.mouse.move(400, 300)
         page.mouse.down()
-        page.mouse.move(440, 330, steps=10)
+        page.mouse.move(470, 320, steps=5)
         page.mouse.up()
-        for _ in range(14):
-            page.mouse.wheel(0, 200)
-            page.wait_for_timeout(300)
+        settle(page)
         save("frozen", shot(page))
+        phone = browser.new_context(
+            viewport={"width": 390, "height": 700}, device_scale_factor=1, is_mobile=True, has_touch=True
+        ).new_page()
+        phone.goto(site.url)
+        look_through(phone, camera)
+        folded = shot(phone)
+        phone.get_by_role("button", name="Panel").tap()
+        settle(phone)
+        save("phone", sheet([folded, shot(phone)], ["", ""], columns=2))
         browser.close()
     site.close()
 
 
-def settle(page: Page) -> None:
-    """Wait until the picture is drawn in full."""
-    page.wait_for_timeout(800)
-    while True:
-        found = re.search(r"picture\s+(\d+) x", page.inner_text("body"))
-        width = page.locator("canvas").first.bounding_box()["width"]
-        if found and abs(int(found[1]) - width) <= 1:
-            page.wait_for_timeout(600)
-            return
-        page.wait_for_timeout(200)
-
-
-def choose(page: Page, before: str, after: str) -> None:
-    page.locator(f'input[value="{before}"]').first.click()
-    page.get_by_role("option", name=after, exact=True).click()
-
-
-def set_text(page: Page, text: str, place: int) -> None:
-    """Write into the number beside a slider."""
-    field = page.locator('input[class*="NumberInput-input"]:visible').nth(place)
-    field.fill(text)
-    field.press("Enter")
-
-
-def shot(page: Page, canvas_only: bool = False) -> Image.Image:
+def look_through(page: Page, camera: str) -> None:
     settle(page)
-    box = page.locator("canvas").first.bounding_box()
-    page.mouse.move(200, 600)  # off the controls, which would show their hints
-    page.wait_for_timeout(500)
-    png = page.screenshot(clip=box) if canvas_only else page.screenshot()
-    return Image.open(io.BytesIO(png)).convert("RGB")
+    place = f"viewer.cameras.findIndex(({{ name }}) => name === {camera!r})"
+    page.evaluate(f"viewer.lookThrough({place})")
+    settle(page)
 
 
-def sheet(pictures: dict[str, Image.Image]) -> Image.Image:
-    """Pictures in two columns, each with its name."""
-    width, height = 480, 386
-    out = Image.new("RGB", (2 * width, -(-len(pictures) // 2) * height))
-    font = ImageFont.load_default(size=18)
-    for place, (name, picture) in enumerate(pictures.items()):
-        corner = (place % 2 * width, place // 2 * height)
-        out.paste(picture.resize((width, height), Image.Resampling.LANCZOS), corner)
-        draw, at = ImageDraw.Draw(out), (corner[0] + 10, corner[1] + 8)
-        left, top, right, bottom = draw.textbbox(at, name, font)
-        draw.rectangle((left - 6, top - 4, right + 6, bottom + 4), "black")
-        draw.text(at, name, "white", font)
-    return out
+def settle(page: Page) -> None:
+    """Until the picture is there in full."""
+    page.wait_for_timeout(1000)
+    page.wait_for_selector("body[data-state=ready]", timeout=300_000)
+    page.wait_for_timeout(300)
+
+
+def shot(page: Page) -> Image.Image:
+    return Image.open(io.BytesIO(page.screenshot()))
+
+
+def shown(page: Page) -> Image.Image:
+    box = page.locator("#stage").bounding_box()
+    return Image.open(io.BytesIO(page.screenshot(clip=box))).resize(
+        (360, round(360 * box["height"] / box["width"]))
+    )
+
+
+def sheet(pictures: list[Image.Image], names: list[str], columns: int) -> Image.Image:
+    """The pictures in rows, with their names on them."""
+    width, height = pictures[0].size
+    rows = -(-len(pictures) // columns)
+    whole = Image.new("RGB", (columns * width + 6 * (columns - 1), rows * height + 6 * (rows - 1)))
+    draw, font = ImageDraw.Draw(whole), ImageFont.load_default(16)
+    for place, (picture, name) in enumerate(zip(pictures, names, strict=True)):
+        corner = place % columns * (width + 6), place // columns * (height + 6)
+        whole.paste(picture.convert("RGB"), corner)
+        draw.text((corner[0] + 10, corner[1] + 8), name, "white", font, stroke_width=2, stroke_fill="black")
+    return whole
 
 
 def save(name: str, picture: Image.Image) -> None:
-    picture.save(FOLDER / f"viewer_{name}.jpg", quality=82)
+    """At most 150 kB."""
+    path = FOLDER / f"viewer_{name}.jpg"
+    for quality in (86, 78, 70, 60, 50):
+        picture.convert("RGB").save(path, quality=quality, optimize=True)
+        if path.stat().st_size <= 150_000:
+            return
 
 
 if __name__ == "__main__":

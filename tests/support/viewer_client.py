@@ -1,12 +1,10 @@
-"""A browser's side of the viewer's connection: moves a camera and controls, takes pictures."""
+"""A page's side of the viewer's connection: moves a camera, changes settings, takes pictures."""
 
 import io
+import json
 import time
+from dataclasses import asdict
 
-import msgspec
-import numpy as np
-import viser
-import zstandard
 from PIL import Image
 from websockets.sync.client import connect
 
@@ -15,26 +13,20 @@ class Tab:
     """What a browser tab is to the server.
 
     Attributes:
-        uuids: Of the controls, by their labels.
-        text: The HTML of the panel's figures.
-        updates: What the server changed of its controls.
-        positions: Where the server took the camera.
+        hello, scene: What the server says first.
+        figures: Of the last picture, and all else that came with it.
+        failures: Why pictures could not be drawn.
         notices: Notices that popped up.
+        answers: Other messages, by their types; the last of each.
         files: Contents of the files that were downloaded, by name.
     """
 
-    def __init__(self, port, path="", **options):
-        self._connection = connect(
-            f"ws://127.0.0.1:{port}{path}",
-            subprotocols=[f"viser-v{viser.__version__}"],
-            compression=None,
-            max_size=None,
-            **options,
-        )
-        self.uuids, self._props, self._figures = {}, {}, None
-        self._names, self._parts = {}, {}
-        self.text, self.updates, self.notices, self.files = "", [], [], {}
-        self.positions = []
+    def __init__(self, port, path="/", **options):
+        url = f"ws://127.0.0.1:{port}{path}connection"
+        self._connection = connect(url, compression=None, max_size=None, **options)
+        self.hello, self.scene = (json.loads(self._connection.recv(timeout=60)) for _ in range(2))
+        self.figures, self.failures, self.notices, self.answers, self.files = {}, [], [], {}, {}
+        self.settings, self._look, self._number = {}, None, 0
 
     def __enter__(self):
         return self
@@ -44,34 +36,40 @@ class Tab:
 
     def look(self, view, size):
         """Say that the camera is there now, in a window of that size."""
-        forward = view.camera(1, 1, 0.01).viewmat[2, :3]
-        message = {
-            "type": "ViewerCameraMessage",
-            "wxyz": list(view.wxyz),
-            "position": list(view.position),
-            "fov": view.fov_y,
-            "near": 0.01,
-            "far": 1000.0,
-            "image_height": size[1],
-            "image_width": size[0],
-            "look_at": (np.array(view.position) + forward).tolist(),
-            "up_direction": [0.0, 0.0, 1.0],
-        }
+        self._look = {"type": "look", "view": asdict(view), "size": size}
+        return self.change()
+
+    def change(self, **settings):
+        """Change settings of what is shown; returns what was said."""
+        self.settings |= settings
+        self._number += 1
+        self._look |= {"settings": self.settings, "number": self._number}
+        self.send(self._look)
+        return self._look
+
+    def pick(self, **where):
+        message = {"type": "pick", "look": self._look, **where}
         self.send(message)
         return message
 
-    def set(self, label, value):
-        """Give the control with that label a value; True presses a button."""
-        message = {"type": "GuiUpdateMessage", "uuid": self.uuids[label], "updates": {"value": value}}
+    def move(self, instance, position, quaternion=(1, 0, 0, 0), scale=1.0):
+        pose = {"position": position, "quaternion": quaternion, "scale": scale}
+        message = {"type": "move", "instance": instance, **pose}
         self.send(message)
         return message
 
-    def visible(self, label):
-        """Whether the control with that label is shown at first."""
-        return self._props[label]["visible"]
+    def save(self, what, path=(), up="z"):
+        """Ask for a file of views with the seconds to each."""
+        stops = [(seconds, asdict(view)) for seconds, view in path]
+        message = {"type": "save", "what": what, "look": self._look, "up": up, "path": stops}
+        self.send(message)
+        return message
 
-    def options(self, label):
-        return self._props[label]["options"]
+    def drop(self, name, content, piece=1 << 16):
+        """Drop a file onto the page."""
+        self.send({"type": "open", "name": name, "size": len(content)})
+        for first in range(0, len(content), piece):
+            self.send(content[first : first + piece])
 
     def pictures(self, until):
         """Take what comes until then; (time, picture) of each picture, 8 bit."""
@@ -81,48 +79,40 @@ class Tab:
                 data = self._connection.recv(timeout=left)
             except TimeoutError:
                 break
-            found += [
-                (time.perf_counter(), picture) for picture in map(self._take, messages(data)) if picture
-            ]
+            picture = self._take(data)
+            if picture is not None:
+                found.append((time.perf_counter(), picture))
         return found
 
-    def _take(self, message):
+    def _take(self, data):
         """Keep what a message says; return the picture in it if there is one."""
+        content = b""
+        if isinstance(data, bytes):
+            size = int.from_bytes(data[:4], "little")
+            data, content = data[4 : 4 + size], data[4 + size :]
+        message = json.loads(data)
         kind = message["type"]
-        if kind == "BackgroundImageMessage" and message["rgb_data"]:
-            return Image.open(io.BytesIO(message["rgb_data"]))
-        if kind == "GuiHtmlMessage":
-            self._figures, self.text = message["uuid"], message["props"]["content"]
-        elif kind.startswith("Gui") and "label" in message.get("props", {}):
-            self.uuids[message["props"]["label"]] = message["uuid"]
-            self._props[message["props"]["label"]] = message["props"]
-        elif kind == "GuiUpdateMessage":
-            self.updates.append(str(message["updates"]))
-            if message["uuid"] == self._figures:
-                self.text = message["updates"].get("content", self.text)
-        elif kind == "SetCameraPositionMessage":
-            self.positions.append(message["position"])
-        elif kind == "NotificationShowMessage":
-            self.notices.append(message["props"]["body"])
-        elif kind == "FileTransferStartDownload":
-            self._names[message["transfer_uuid"]] = (message["filename"], message["part_count"])
-        elif kind == "FileTransferPart":
-            transfer = message["transfer_uuid"]
-            parts = self._parts.setdefault(transfer, {})
-            parts[message["part_index"]] = message["content"]
-            name, count = self._names[transfer]
-            if len(parts) == count:
-                self.files[name] = b"".join(parts[i] for i in range(count))
+        if kind == "picture":
+            self.figures = message | message["figures"]
+            return Image.open(io.BytesIO(content))
+        if kind == "file":
+            self.files[message["name"]] = content
+        elif kind == "failed":
+            self.failures.append(message["text"])
+        elif kind == "notice":
+            self.notices.append(message["text"])
+        elif kind == "scene":
+            self.scene = message
+        else:
+            self.answers[kind] = message
         return None
 
+    @property
+    def is_answered(self):
+        """Whether the last picture is the final one of what was asked for last."""
+        return bool(self.figures) and self.figures["final"] and self.figures["number"] == self._number
+
     def send(self, message):
-        """Send what becomes MessagePack, or else a text or bytes as they are."""
+        """Send what becomes JSON, or else a text or bytes as they are."""
         raw = isinstance(message, (str, bytes))
-        self._connection.send(message if raw else msgspec.msgpack.encode(message))
-
-
-def messages(data):
-    """Those of one frame of the connection: sizes, then compressed MessagePack."""
-    size = int.from_bytes(data[8:16], "little")
-    envelope = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + size]))
-    return envelope["messages"]
+        self._connection.send(message if raw else json.dumps(message))

@@ -19,6 +19,7 @@ from v3dg.build.memory import in_bytes, most_units, unit_bytes
 from v3dg.build.unfinished import discard_levels
 from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle
+from v3dg.cameras import Axis
 from v3dg.gaussians import Gaussians
 
 AssetPath = str | os.PathLike[str]
@@ -38,6 +39,7 @@ def build_file(
     memory: int | str | None = None,
     executor: Executor | None = None,
     codec: Literal["float32", "quantized"] = "float32",
+    up: Axis | None = None,
 ) -> tuple[Bundle, bool]:
     """Build the bundle of an asset's file, or of several that make one asset, straight into a file.
 
@@ -48,8 +50,8 @@ def build_file(
         asset: What is in the asset's file, where it is in memory already.
         resume: Keep a bundle that says that it was made of these gaussians with these settings, and go on
             from the levels of a build that was interrupted; otherwise all is made anew.
-        memory: Of the host, for the build beside what the process has: bytes, or text like "8GiB". By default
-            half of what is free.
+        memory: Of the host, beside what the process has: bytes, or text like "8GiB". Else half of the free.
+        up: What is up in the asset, which the bundle then says to viewers and exports.
         config, seed, progress, device, unusable, executor, codec: As for `build_bundle`.
 
     Returns:
@@ -61,8 +63,7 @@ def build_file(
     """
     paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
     bundle_path, config = Path(bundle_path), config or BuildConfig()
-    levels = levels_path(bundle_path)
-    _files.check_folder(levels)
+    _files.check_folder(levels := levels_path(bundle_path))
     _files.status_of_replaced(bundle_path)
     devices, num_bytes = devices_for(device, asset), in_bytes(memory)  # before anything is read
     if not resume:
@@ -77,12 +78,12 @@ def build_file(
         else leaves_on_disk(paths, levels.with_suffix(".scratch"), **bounds, **where) as leaves,
     ):
         del asset
-        if resume and _is_made_with(bundle_path, made_with(leaves, config, seed, codec), codec):
+        if resume and _is_made_with(bundle_path, made_with(leaves, config, seed, codec, up), codec):
             with suppress(RuntimeError):  # another build to the same place has begun
                 discard_levels(levels)
             return Bundle.open(bundle_path), False
         at: dict[str, Any] = {"bundle_path": bundle_path, "most_units": most_units(num_bytes, leaves)}
-        at |= {"codec": codec, "executor": executor}
+        at |= {"codec": codec, "executor": executor, "up": up}
         return build_into(levels, leaves, config, seed, devices, progress, **at), True
 
 

@@ -19,6 +19,7 @@ from v3dg._numbers import check, one_of
 from v3dg.build.config import BuildConfig
 from v3dg.build.digest import digest_of
 from v3dg.bundle.codec import Codec
+from v3dg.cameras import Axis
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
 Unusable = Literal["drop", "refuse"]
@@ -77,7 +78,9 @@ class MemoryLeaves(Leaves):
         return np.take(rows, _device.to_host(order))
 
 
-def made_with(leaves: Leaves, config: BuildConfig, seed: int, codec: str) -> dict[str, Any]:
+def made_with(
+    leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None = None
+) -> dict[str, Any]:
     """What the config of a bundle says of how it was made."""
     seed = operator.index(seed)
     check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {seed}")
@@ -88,6 +91,7 @@ def made_with(leaves: Leaves, config: BuildConfig, seed: int, codec: str) -> dic
         "asset_digest": leaves.digest,
         "dropped": leaves.dropped,
         **({} if codec == Codec.name else {"codec": codec}),
+        **({} if up is None else {"up": up}),
     }
 
 

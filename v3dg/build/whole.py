@@ -29,6 +29,7 @@ from v3dg.bundle import Bundle
 from v3dg.bundle.codec import codec_of
 from v3dg.bundle.file import BundlePlan
 from v3dg.bundle.pages import PageRun
+from v3dg.cameras import Axis
 from v3dg.gaussians import Gaussians
 
 # Leaves of a unit: enough to keep a GPU busy, and little memory. The last bits of a bundle depend on it.
@@ -61,13 +62,14 @@ def build_into(
     bundle_path: Path | None = None,
     most_units: int | None = None,
     executor: Executor | None = None,
+    up: Axis | None = None,
 ) -> Bundle:
     """Build all levels of an asset, in memory or in a file that replaces `bundle_path`; as `build_bundle`."""
     plan = Plan.of(leaves.num_gaussians, config)
     config.check_views(max((np.diff(made.group_offset).max() for made in plan.levels[1:]), default=1))
     units = plan.units(UNIT_LEAVES)
     kept = codec_of(codec, leaves.sh_degree)
-    file = BundlePlan(plan.layout, kept, made_with(leaves, config, seed, codec))
+    file = BundlePlan(plan.layout, kept, made_with(leaves, config, seed, codec, up))
     parts = _parts(plan, units, file)
     with (
         _device.memory_errors(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
@@ -14,13 +14,13 @@ import tyro
 from v3dg._numbers import check
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
-from v3dg.cameras import DEFAULT_FOV_X, Camera, turntable
+from v3dg.cameras import DEFAULT_FOV_X, Axis, Camera, turntable
 from v3dg.cleaning import ball_of_most
 from v3dg.cli._common import check_range, check_usage, level_size, option, require_subject
-from v3dg.export import Axis
 from v3dg.gaussians import Gaussians
 from v3dg.opening import Subject, is_scene
 from v3dg.pictures import MOST_SIDE, check_size
+from v3dg.upright import direction_of, up_of
 
 # Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
 _ENOUGH_TO_FRAME = 50_000
@@ -45,8 +45,8 @@ class ViewOptions:
     """Width and height in px of a turntable's pictures, and of cameras whose file gives them no size."""
     elevation: float = 20.0
     """Height of the turntable's cameras above the horizon in degrees."""
-    up: Axis = "z"
-    """The turntable's axis."""
+    up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
+    """The turntable's axis; what the file says or what is guessed from it if not given."""
 
     def check(self, *subjects: Path) -> None:
         """Refuse, before anything is read, subjects that are none, and what cannot be meant for them."""
@@ -73,7 +73,7 @@ def choose_cameras(
     if options.cameras is not None:
         own = read_cameras(options.cameras, size=options.size, distortion=options.distortion)
     if own is None:
-        own = _turntable(subject, options)
+        own = _turntable(subject, options, options.up or up_of(subject, path=path)[0])
     check(options.cameras or path, own, "cameras, got a file without any; add some to it")
     if options.camera is not None:
         own = _one_camera(own, options.camera)
@@ -92,7 +92,7 @@ def _one_camera(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
     return {name: cameras[name]}
 
 
-def _turntable(subject: Subject, options: ViewOptions) -> dict[str, Camera]:
+def _turntable(subject: Subject, options: ViewOptions, up: Axis) -> dict[str, Camera]:
     """Cameras around where most of the gaussians are, at a distance that shows nearly all of it."""
     if isinstance(subject, Gaussians):
         means = subject.means
@@ -109,7 +109,7 @@ def _turntable(subject: Subject, options: ViewOptions) -> dict[str, Camera]:
         distance,
         options.views,
         math.radians(options.elevation),
-        up=direction_of(options.up),
+        up=direction_of(up),
         width=options.size[0],
         height=options.size[1],
         near=min(0.01, 0.01 * distance),
@@ -118,10 +118,12 @@ def _turntable(subject: Subject, options: ViewOptions) -> dict[str, Camera]:
     return {f"{i:0{digits}}": camera for i, camera in enumerate(cameras)}
 
 
-def direction_of(axis: Axis) -> tuple[float, float, float]:
-    """The unit vector along an axis."""
-    x, y, z = ((-1.0 if axis[0] == "-" else 1.0) * (axis[-1] == name) for name in "xyz")
-    return x, y, z
+def up_lines(
+    given: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None = None, *, path: Path
+) -> list[str]:
+    """What is said of the axis that was taken to be up, unless --up gave it."""
+    axis, how = up_of(subject, cameras, path)
+    return [] if given else [f"{path.name}: {axis} is up, {how}; --up says otherwise"]
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:

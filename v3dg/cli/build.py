@@ -18,6 +18,7 @@ import tyro
 from v3dg import _extras
 from v3dg._numbers import check
 from v3dg.build import BuildConfig, build_file, levels_path
+from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
 from v3dg.io import SUFFIXES
@@ -41,6 +42,8 @@ class Build(_common.OnDevice):
     """Most gaussians in a cluster; the config's own if not given."""
     codec: Literal["float32", "quantized"] = "float32"
     """How gaussians are kept: every bit, or rounded to 16 to 40 bytes (docs/format.md has the error)."""
+    up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
+    """What is up in the asset, which the bundle then says to `view`, `render` and `export`."""
     seed: int = 0
     """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
     strict: _common.Flag = False
@@ -189,6 +192,7 @@ def _build(
                 config=config,
                 seed=options.seed,
                 codec=options.codec,
+                up=options.up,
                 progress=not options.quiet,
                 device=options.device,
                 resume=options.resume,

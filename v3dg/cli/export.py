@@ -12,12 +12,13 @@ import tyro
 
 from v3dg import export
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera
+from v3dg.cameras import Axis, Camera
 from v3dg.cli._common import Common, bytes_text, check_usage, option, print_result, require_file
-from v3dg.export import Axis
+from v3dg.cli._views import up_lines
 from v3dg.formats.usd import SUFFIXES as USD_SUFFIXES
 from v3dg.scene import Scene
 from v3dg.scene.file import read_scene
+from v3dg.upright import up_of
 
 
 @dataclass
@@ -34,7 +35,7 @@ class Export(Common):
     chunk: int = export.DEFAULT_CHUNK
     """Most gaussians of an asset in a chunk of streamed SOG, for which the viewer chooses a level."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
-    """Direction that is up; z for a scene and -y, as in most trained assets, for a bundle if not given."""
+    """Which way is up; what the file says or what is guessed from it or its cameras if not given."""
 
 
 def run(options: Export) -> None:
@@ -43,12 +44,15 @@ def run(options: Export) -> None:
     folder = options.output or options.subject.with_name(f"{options.subject.stem}_web")
     start = time.perf_counter()
     subject, cameras = _read(options.subject)
+    up = options.up or up_of(subject, cameras, options.subject)[0]
+    notes = up_lines(options.up, subject, cameras, path=options.subject)
     if folder.suffix.lower() in USD_SUFFIXES:
-        size = export.write_usd(subject, folder, up=options.up)
+        size = export.write_usd(subject, folder, up=up)
         written = {"output": str(folder), "bytes": size, "seconds": time.perf_counter() - start}
-        print_result(options.json, written, [f"{folder}: {bytes_text(size)}, {written['seconds']:.1f} s"])
+        line = f"{folder}: {bytes_text(size)}, {written['seconds']:.1f} s"
+        print_result(options.json, written, [line, *notes])
         return
-    common: dict[str, Any] = {"up": options.up, "progress": not options.quiet}
+    common: dict[str, Any] = {"up": up, "progress": not options.quiet}
     there = shlex.quote(str(folder))
     done: export.Site | export.Tiles
     needs: tuple[str, ...]
@@ -62,7 +66,7 @@ def run(options: Export) -> None:
     result = {"output": str(folder), **asdict(done), "seconds": time.perf_counter() - start}
     seconds = f"{result['seconds']:.1f} s"
     instances = f"{done.instances:,} instance{'s' * (done.instances != 1)}"
-    lines = [f"{folder}: {instances}, {text}, {bytes_text(done.bytes)}, {seconds}"]
+    lines = [f"{folder}: {instances}, {text}, {bytes_text(done.bytes)}, {seconds}", *notes]
     if needs:
         lines += ["it needs its engine beside it, once:", *(f"  {line.format(there)}" for line in needs)]
     lines += [f"to look at it: python -m http.server --bind 127.0.0.1 --directory {there}"]

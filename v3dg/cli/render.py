@@ -11,7 +11,7 @@ import tyro
 from v3dg import _device
 from v3dg._progress import counted
 from v3dg.cli._common import Cut, OnDevice, check_usage, finite, option, print_result, table_lines
-from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths
+from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths, up_lines
 from v3dg.opening import open_with_cameras
 from v3dg.pictures import check_picture_path, write_picture
 from v3dg.render import render
@@ -86,4 +86,6 @@ def run(options: Render) -> None:
         "draw ms": "{draw_ms:.1f}",
     }
     result = {"subject": str(options.subject), "pictures": pictures}
-    print_result(options.json, result, table_lines(columns, pictures))
+    is_turntable = options.view.cameras is None and own_cameras is None
+    notes = up_lines(options.view.up, subject, path=options.subject) if is_turntable else []
+    print_result(options.json, result, [*table_lines(columns, pictures), *notes])

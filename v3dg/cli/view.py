@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 import importlib
 import math
+import os
 import signal
+import sys
+import threading
 import time
-from collections.abc import Iterator
+import webbrowser
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,10 +20,11 @@ import tyro
 
 from v3dg._start import SIGNALS
 from v3dg.camera_file import read_cameras
-from v3dg.cli._common import OnDevice, UsageError, option, print_result, require_subject, tell
-from v3dg.cli._views import direction_of
-from v3dg.export import Axis
+from v3dg.cameras import Axis
+from v3dg.cli._common import Flag, OnDevice, UsageError, option, print_result, require_subject, tell
+from v3dg.cli._views import up_lines
 from v3dg.opening import open_with_cameras
+from v3dg.upright import direction_of, up_of
 
 # Between looks for a signal: a wait without an end misses one that comes just before it.
 _SECONDS = 0.1
@@ -36,10 +41,13 @@ class View(OnDevice):
     """Address to listen at; by default for this machine alone, at 0.0.0.0 for all who have the URL."""
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
-    up: Axis = "z"
-    """Which way is up."""
+    no_browser: Flag = False
+    """Open no browser; none is opened over ssh, without a display, or where other machines can connect."""
+    up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
+    """Which way is up at first; what the file says or what is guessed from it or its cameras if not given."""
     cameras: Annotated[Path | None, option("PATH")] = None
-    """Offer the cameras of this nerfstudio transforms.json, run of nerfstudio, or model of COLMAP."""
+    """Offer the cameras of this nerfstudio transforms.json, run of nerfstudio, or model of COLMAP, with their
+    photographs."""
     distortion: Literal["refuse", "ignore"] = "refuse"
     """Whether lens distortion of those is an error, or left out of the pictures."""
     tolerance: Annotated[float | None, option("PX2")] = None
@@ -64,36 +72,65 @@ def run(options: View) -> None:
     if not math.isfinite(tolerance):
         raise UsageError(f"--tolerance: expected a number, got {tolerance}")
     subject, cameras = open_with_cameras(options.subject)
+    photographs = None
     if options.cameras is not None:
         cameras = read_cameras(options.cameras, size=_SIZE, distortion=options.distortion)
+        photographs = _photographs(options.cameras, cameras)
     if isinstance(subject, Gaussians) and options.budget is not None:
         raise UsageError(
             f"--budget: expected a bundle or a scene, got the asset {options.subject}; build a bundle of it"
         )
+    up = options.up or up_of(subject, cameras, options.subject)[0]
     scene_view = SceneView(subject, device=options.device)
     with contextlib.suppress(ImportError):  # of which the site tells; it takes long
-        importlib.import_module("v3dg.viewer.gate")
+        importlib.import_module("v3dg.viewer.tab")
     with _interrupts() as interrupts:
         site = Site(
             scene_view,
             name=options.subject.stem,
             cameras=cameras,
+            photographs=photographs,
             host=options.host,
             port=options.port,
             tolerance=tolerance,
             budget=options.budget,
-            up=direction_of(options.up),
+            up=direction_of(up),
         )
         try:
             if options.port not in (0, site.port) and not options.quiet:
                 tell(f"port {options.port} is taken, listening at {site.port}")
+            lines = up_lines(options.up, subject, cameras, path=options.subject)
             told = {"url": site.url, "subject": str(options.subject)}
-            print_result(options.json, told, [f"{site.url} shows {options.subject}; Ctrl-C ends it"])
+            print_result(options.json, told, [f"{site.url} shows {options.subject}; Ctrl-C ends it", *lines])
+            if not options.no_browser and not site.is_secret and _has_browser():
+                threading.Thread(target=webbrowser.open, args=(site.url,), daemon=True).start()
             while not interrupts:
                 time.sleep(_SECONDS)
         finally:
             site.close()
     raise KeyboardInterrupt
+
+
+def _has_browser() -> bool:
+    """Whether a browser would open: over ssh on the wrong machine, and without a display as text."""
+    if "SSH_CONNECTION" in os.environ:
+        return False
+    has_display = any(os.environ.get(name) for name in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY"))
+    return has_display or sys.platform in ("darwin", "win32")
+
+
+def _photographs(cameras: Path, names: Iterable[str]) -> dict[str, Path]:
+    """The pictures that cameras took, by name: beside their file, or in a folder `images` there or above."""
+    folder = cameras if cameras.is_dir() else cameras.parent
+    near = (folder, *folder.resolve().parents[:2])
+    places = [place / part for place in near for part in ("", "images")]
+    found = {}
+    for name in names:
+        # Names may lack the suffix, as in NeRF's synthetic scenes.
+        files = (place / (name + suffix) for place in places for suffix in ("", ".png", ".jpg"))
+        with contextlib.suppress(StopIteration, OSError, ValueError):
+            found[name] = next(file for file in files if file.is_file())
+    return found
 
 
 @contextlib.contextmanager

@@ -11,18 +11,16 @@ import shutil
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 
 from v3dg import _files
 from v3dg._numbers import check, one_of
 from v3dg.bundle import Bundle
-from v3dg.cameras import Floats
+from v3dg.cameras import Axis, Floats
 from v3dg.rotations import rotation_from_quaternion
 from v3dg.scene import Scene
-
-Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 # Quaternions w x y z that turn an axis to -y, which is up where y is down, as viewers take it.
 _HALF = math.sqrt(0.5)

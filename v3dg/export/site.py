@@ -19,12 +19,12 @@ from v3dg import _files
 from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera
+from v3dg.cameras import Axis, Camera
 from v3dg.export import _common
-from v3dg.export._common import Axis
 from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, Plan, write_levels
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
+from v3dg.upright import up_of
 
 SITE = "site.json"
 ENGINE = "playcanvas.min.mjs"
@@ -71,7 +71,7 @@ def write_site(
         folder: Where to; new, empty, or with an earlier export. Folders above it are made.
         cameras: From where to look, by name; the page begins with the first.
         chunk: As in `write_streamed_sog`.
-        up: What is up in the world; z for a scene and -y for a bundle if None.
+        up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
 
     Raises:
         ValueError: As `write_streamed_sog`, or a scene without instances.
@@ -79,7 +79,7 @@ def write_site(
     """
     folder = Path(folder)
     is_scene = isinstance(subject, Scene)
-    axis: Axis = up or ("z" if is_scene else "-y")
+    axis = up or up_of(subject, cameras)[0]
     # A bundle alone is turned to what viewers take to be up; a scene's stay as its instances have them.
     turn = _common.turn_upright("-y" if is_scene else axis)
     scene = Scene.of(subject)

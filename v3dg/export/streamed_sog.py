@@ -24,14 +24,14 @@ from v3dg._numbers import check, whole
 from v3dg._progress import Bar, Progress
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
-from v3dg.cameras import Floats
+from v3dg.cameras import Axis, Floats
 from v3dg.cleaning import ball_of_most
 from v3dg.export import _common
-from v3dg.export._common import Axis
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable, morton_order
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import rotation_from_quaternion
+from v3dg.upright import up_of
 
 INDEX = "lod-meta.json"
 SETTINGS = "settings.json"
@@ -63,7 +63,7 @@ def write_streamed_sog(
     folder: str | os.PathLike[str],
     *,
     chunk: int = DEFAULT_CHUNK,
-    up: Axis = "-y",
+    up: Axis | None = None,
     progress: Progress = False,
 ) -> Export:
     """Write a bundle as streamed SOG, replacing an earlier export in one step once all is written.
@@ -85,7 +85,7 @@ def write_streamed_sog(
 
     Source: PlayCanvas, the streamed SOG format, version 1.
     """
-    turn, plan = _common.turn_upright(up), Plan.of(bundle, chunk)
+    turn, plan = _common.turn_upright(up or up_of(bundle)[0]), Plan.of(bundle, chunk)
     with _common.replacing_folder(Path(folder)) as place:
         total = bundle.num_gaussians
         with Bar(total, "export", progress) as bar:

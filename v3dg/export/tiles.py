@@ -21,14 +21,14 @@ from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
-from v3dg.cameras import Floats
+from v3dg.cameras import Axis, Floats
 from v3dg.export import _common
-from v3dg.export._common import Axis
 from v3dg.formats import gltf
 from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
+from v3dg.upright import up_of
 
 TILESET = "tileset.json"
 CESIUM = "cesium"
@@ -74,7 +74,7 @@ def write_tiles(
 
     Args:
         folder: Where to; new, empty, or with an earlier export. Folders above it are made.
-        up: What is up in the world; z for a scene and -y for a bundle if None.
+        up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
 
     Raises:
         ValueError: There is something else at ``folder``, nothing to export, or a gaussian has values that
@@ -84,7 +84,7 @@ def write_tiles(
     Source: OGC, 3D Tiles 1.1; Khronos, KHR_gaussian_splatting and its compression by SPZ.
     """
     root = np.eye(4)
-    root[:3, :3] = _common.rotation_to(up or ("z" if isinstance(subject, Scene) else "-y"), "z")
+    root[:3, :3] = _common.rotation_to(up or up_of(subject)[0], "z")
     scene = Scene.of(subject)
     check("scene", len(scene), "instances to export, got none")
     for bundle in scene.bundles:

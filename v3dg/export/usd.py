@@ -10,13 +10,14 @@ import numpy as np
 
 from v3dg._numbers import check, one_of
 from v3dg.bundle import Bundle
+from v3dg.cameras import Axis
 from v3dg.export import _common
-from v3dg.export._common import Axis
 from v3dg.formats import usd
 from v3dg.formats._packing import check_writable
 from v3dg.rotations import quaternion_from_rotation
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
+from v3dg.upright import up_of
 
 _PIXELS = 1920 * 1080  # of the picture for which levels have the default tolerance
 _LEAST = 1e-30  # of a distance
@@ -32,7 +33,7 @@ def write_usd(subject: Scene | Bundle, path: str | os.PathLike[str], *, up: Axis
 
     Args:
         path: File to write, .usd, .usda or .usdc.
-        up: What is up in the world, which is turned to z; z for a scene and -y for a bundle if None.
+        up: What is up in the world, which is turned to z; as `v3dg.upright.up_of` takes it if None.
 
     Raises:
         ImportError: usd-core is not installed.
@@ -47,7 +48,7 @@ def write_usd(subject: Scene | Bundle, path: str | os.PathLike[str], *, up: Axis
     stage = usd.new_stage("Z")
     world = pxr.UsdGeom.Xform.Define(stage, "/world")
     stage.SetDefaultPrim(world.GetPrim())
-    turn = _common.rotation_to(up or ("z" if isinstance(subject, Scene) else "-y"), "z")
+    turn = _common.rotation_to(up or up_of(subject)[0], "z")
     w, *xyz = quaternion_from_rotation(turn)
     world.AddOrientOp().Set(pxr.Gf.Quatf(w, *xyz))
     above = "/world/instances" if isinstance(subject, Scene) else "/world"

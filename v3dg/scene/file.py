@@ -12,9 +12,9 @@ from typing import TypeAlias
 import numpy as np
 
 from v3dg._json import Node, read_json, write_json
-from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check, one_of
 from v3dg.bundle import Bundle
-from v3dg.cameras import DEFAULT_FOV_X, Camera
+from v3dg.cameras import AXES, DEFAULT_FOV_X, Camera
 from v3dg.scene import Scene
 
 FORMAT = "v3dg-scene"
@@ -74,6 +74,8 @@ def write_scene(
     if isinstance(bundle_paths, str) or not isinstance(bundle_paths, Sequence):
         raise TypeError(f"bundle_paths: expected a list of paths, got {type(bundle_paths).__name__}")
     count, given = len(scene.bundles), len(bundle_paths)
+    if scene.up is not None:
+        one_of(scene.up, "scene.up", AXES)
     check("bundle_paths", given == count, f"{count} paths, got {given}")
     scene = copy.copy(scene)  # which stays as it is
     names = [f"bundle_{b}" for b in range(len(bundle_paths))]
@@ -82,6 +84,7 @@ def write_scene(
     document = {
         "format": FORMAT,
         "version": VERSION,
+        **({} if scene.up is None else {"up": scene.up}),
         "bundles": dict(zip(names, bundle_paths, strict=True)),
         "instances": [
             {
@@ -109,7 +112,7 @@ def write_scene(
 
 
 def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Scene, dict[str, Camera]]:
-    top = root.fields(("format", "version", "bundles", "instances"), ("cameras",))
+    top = root.fields(("format", "version", "bundles", "instances"), ("cameras", "up"))
     if top["format"].value != FORMAT:
         raise top["format"].error(f'"{FORMAT}"')
     if top["version"].value != VERSION or isinstance(top["version"].value, bool):
@@ -132,7 +135,12 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
         if name in cameras:
             raise fields["name"].error("a name that no other camera has")
         cameras[name] = _read_camera(node, fields)
-    return _scene_of(instances), cameras
+    scene = _scene_of(instances)
+    if "up" in top:
+        if top["up"].value not in AXES:
+            raise top["up"].error("one of " + ", ".join(AXES))
+        scene.up = top["up"].value
+    return scene, cameras
 
 
 def _instance(bundle: Bundle, fields: Mapping[str, Node]) -> _Instance:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from v3dg import _device
 from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, check_type, floats
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera
+from v3dg.cameras import Axis, Camera
 from v3dg.rotations import rotation_from_quaternion
 
 # Held by whoever changes a scene, and by fork(), so that a child finds it free.
@@ -45,7 +45,12 @@ class Scene:
     Poses may be given as NumPy arrays, or as torch tensors on the host or on a CUDA device. Those of a device
     stay there, without a look at their values: an instance whose pose is not finite, or of no size, is not
     drawn.
+
+    Attributes:
+        up: The axis that is up, or None where nobody said: for viewers and exports, which may guess it.
     """
+
+    up: Axis | None = None
 
     def __init__(self) -> None:
         poses = np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from v3dg import _core
 from v3dg.scene import Scene
-from v3dg.viewer.controls import BrowserCamera
 
 
 def bundle_names(scene: Scene) -> list[str]:
@@ -21,10 +22,15 @@ def bundle_names(scene: Scene) -> list[str]:
 
 
 class Exporter:
-    """Does one thing at a time, in a thread, until it is done or stopped."""
+    """Does one thing at a time, in a thread, until it is done or stopped.
 
-    def __init__(self, camera: BrowserCamera) -> None:
-        self._client, self._scene_view = camera.client, camera.scene_view
+    Args:
+        tell: Called with a dictionary for the page, and bytes that come with it; in any thread.
+        explain: Makes an error a line for the page.
+    """
+
+    def __init__(self, tell: Callable[..., None], explain: Callable[[Exception], str]) -> None:
+        self._tell, self._explain = tell, explain
         self._lock, self._is_closed = threading.Lock(), False
         self._thread: threading.Thread | None = None
         self._stop = _core.Stop()
@@ -34,28 +40,30 @@ class Exporter:
         with self._lock:
             if self._is_closed:
                 return
-            if self._thread is not None and self._thread.is_alive():
-                self._notify("Still at work", "Stop it first, or wait.")
+            if self._thread is None or not self._thread.is_alive():
+                self._stop = _core.Stop()
+                self._thread = threading.Thread(
+                    target=self._run, args=(work,), name="v3dg export", daemon=True
+                )
+                self._thread.start()
                 return
-            self._stop = _core.Stop()
-            self._thread = threading.Thread(target=self._run, args=(work,), name="v3dg export", daemon=True)
-            self._thread.start()
+        self._run(lambda _: self._tell({"type": "notice", "text": "Still at work: stop it first, or wait."}))
 
     def _run(self, work: Callable[[_core.Stop], None]) -> None:
+        answer: dict[str, Any] = {"type": "done"}
         try:
             work(self._stop)
         except Exception as error:
-            self._notify("Not done", self._scene_view.explain(error))
-
-    def _notify(self, title: str, text: str) -> None:
-        self._client.add_notification(title, text, auto_close_seconds=8)
+            answer = {"type": "notice", "text": f"Not done: {self._explain(error)}"}
+        with contextlib.suppress(Exception):  # whoever asked may be gone
+            self._tell(answer)
 
     def save(self, name: str, write: Callable[[Path], object]) -> None:
         """Have the browser save a file that is written now."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, name)
             write(path)
-            self._client.send_file_download(name, path.read_bytes(), save_immediately=True)
+            self._tell({"type": "file", "name": name}, path.read_bytes())
 
     def stop(self) -> None:
         """Ask the work under way to end."""

@@ -101,12 +101,16 @@ class Frame:
         figures: What it cost.
         shows: As in its settings.
         value_range: The values of the darkest and the brightest colour, where colours are values.
+        view: From where it is seen.
+        distance: How deep what is in its middle mostly is, world units; None where nothing is, or not known.
     """
 
     pixels: Pixels
     figures: Figures
     shows: Shows
     value_range: tuple[float, float] | None
+    view: View
+    distance: float | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -191,10 +195,12 @@ class SceneView:
         width, height = size
         edge = round(settings.split * width)
         window = (edge, 0, width, height)
-        value_range, in_view = None, 0
+        value_range, in_view, distance = None, 0, None
         picture = np.zeros((height, width, 3), np.float32)
         if edge < width:
-            picture[:, edge:], value_range, in_view = self._shown(cut, camera, window, settings, stop)
+            picture[:, edge:], value_range, in_view, distance = self._shown(
+                cut, camera, window, settings, stop
+            )
         if edge > 0:
             picture[:, :edge] = self._all_gaussians(camera, (0, 0, edge, height), stop)
             picture[:, max(edge - 1, 0) : edge + 1] = 1.0
@@ -207,31 +213,32 @@ class SceneView:
             levels=self._levels(cut),
             memory_bytes=_resident_bytes(),
         )
-        return Frame(to_8bit(picture), figures, settings.shows, value_range)
+        return Frame(to_8bit(picture), figures, settings.shows, value_range, view, distance)
 
     def _shown(
         self, cut: Selection, camera: Camera, window: Window, settings: Settings, stop: _core.Stop | None
-    ) -> tuple[npt.NDArray[np.float32], tuple[float, float] | None, int]:
-        """The window's colours, the values of the darkest and the brightest if any, gaussians in view."""
+    ) -> tuple[npt.NDArray[np.float32], tuple[float, float] | None, int, float | None]:
+        """The window's colours, the values of the darkest and brightest, gaussians in view, the distance."""
         shows = settings.shows
         if shows == "count":
             count, in_view = self._count(cut, camera, window, stop)
             values = np.log2(np.maximum(count, 1)) / np.log2(MOST_COUNTED)
-            return ramp(values) * (count > 0)[..., None], (1.0, MOST_COUNTED), in_view
+            return ramp(values) * (count > 0)[..., None], (1.0, MOST_COUNTED), in_view, None
         color_by: ColorBy = shows if shows in ("level", "cluster") else "appearance"
         color, alpha, depth, in_view = self._draw(cut, camera, window, color_by, stop)
+        distance = _distance(alpha, depth)
         if shows == "alpha":
-            return np.repeat(alpha[..., None], 3, axis=2), (0.0, 1.0), in_view
+            return np.repeat(alpha[..., None], 3, axis=2), (0.0, 1.0), in_view, distance
         if shows == "depth":
             covered = depth[alpha > 0.5]
             # A few gaussians far from all others would take all the colours.
             near, far = np.percentile(covered, (1, 99)) if covered.size else (0.0, 1.0)
             values = np.clip((far - depth) / max(far - near, 1e-12), 0, 1)
-            return ramp(values) * alpha[..., None], (float(far), float(near)), in_view
+            return ramp(values) * alpha[..., None], (float(far), float(near)), in_view, distance
         if shows == "difference":
             difference = np.abs(color - self._all_gaussians(camera, window, stop))
-            return np.minimum(settings.gain * difference, np.float32(1)), None, in_view
-        return color, None, in_view
+            return np.minimum(settings.gain * difference, np.float32(1)), None, in_view, distance
+        return color, None, in_view, distance
 
     def _all_gaussians(self, camera: Camera, window: Window, stop: _core.Stop | None) -> Any:
         cut = select(self.scene, camera, tolerance=0.0, device=self.device)
@@ -274,6 +281,13 @@ class SceneView:
         """(L,) selected gaussians by level."""
         level, size = cut._per_pair(lambda c: c.level), cut._per_pair(lambda c: np.diff(c.offset))
         return np.bincount(level, size, self.num_levels).astype(np.int64)
+
+
+def _distance(alpha: npt.NDArray[np.float32], depth: npt.NDArray[np.float32]) -> float | None:
+    """How far what is in the middle of a picture mostly is; None where nothing is."""
+    middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
+    covered = depth[middle][alpha[middle] > 0.5]
+    return float(np.median(covered)) if covered.size else None
 
 
 def _check(stop: _core.Stop | None) -> None:

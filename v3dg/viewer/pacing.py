@@ -24,8 +24,8 @@ REST_SECONDS = 0.15
 # A draft that has taken so long is given up for what is asked for now.
 PATIENCE_SECONDS = 4e-3 * TARGET_MS
 # Smaller ones show nothing; from there on the cut gets coarser, which shows less.
-_SMALLEST = 1 / 6
-_COARSEST = 32.0
+_SMALLEST = 1 / 4
+_COARSEST = 64.0
 # Sizes are this far apart, so that they do not change from picture to picture.
 _STEPS_AN_OCTAVE = 4
 
@@ -82,11 +82,12 @@ def finer_sizes(drawn: Size, full: Size) -> list[Size]:
 
 
 class Request(NamedTuple):
-    """What a tab wants to see: full size in px, a view, settings."""
+    """What a tab wants to see: a view, full size in px, settings; and the number by which it knows that."""
 
     view: View
     size: Size
     settings: Settings
+    number: int = 0
 
 
 class RenderLoop:
@@ -97,14 +98,15 @@ class RenderLoop:
     smaller; the smallest is always finished, so that something is seen.
 
     Args:
-        send: Called with each picture and whether it is the final one; in the loop's thread.
+        send: Called with each picture, whether it is the final one, and the request's number; in the loop's
+            thread.
         fail: Called with what could not be drawn or sent; in the loop's thread.
     """
 
     def __init__(
         self,
         scene_view: SceneView,
-        send: Callable[[Frame, bool], None],
+        send: Callable[[Frame, bool, int], None],
         fail: Callable[[Exception], None],
         pacer: Pacer | None = None,
     ) -> None:
@@ -163,13 +165,13 @@ class RenderLoop:
         sizes = finer_sizes(draft.size, request.size)
         if settings != request.settings and not sizes:
             sizes = [draft.size]
-        self._send(frame, not sizes)
+        self._send(frame, not sizes, request.number)
         with self._changed:
             if self._changed.wait_for(self._has_news, REST_SECONDS):
                 return
         for size in sizes:
             frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0))
-            self._send(frame, size == sizes[-1])
+            self._send(frame, size == sizes[-1], request.number)
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
         """What of the settings there is time for."""

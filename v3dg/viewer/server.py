@@ -1,30 +1,54 @@
-"""The viewer's web server, viser's, which gives every browser tab a camera and settings of its own."""
+"""The viewer's web server: it hands out the page, and gives every browser tab a connection of its own."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import http
 import io
+import json
+import logging
 import math
+import threading
 import time
-import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from PIL import Image
 
+from v3dg._version import __version__
 from v3dg.cameras import Camera, VectorLike
-from v3dg.select import DEFAULT_TOLERANCE
-from v3dg.viewer.controls import BrowserCamera
-from v3dg.viewer.frame import SceneView, Settings
-from v3dg.viewer.tab import Tab
+from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE
+from v3dg.viewer.frame import SceneView
 from v3dg.viewer.view import View, look_at
 
 if TYPE_CHECKING:
-    import viser
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+    from v3dg.viewer.tab import Tab
 
 _FOV_Y = math.radians(45)
 # What is still at work after so long is left behind.
 _CLOSE_SECONDS = 1.0
+# Of the longer side of photographs, at most, by the folder that the page asks for them in.
+_PHOTOGRAPH_PIXELS = {"photograph": 1600, "thumbnail": 240}
+# What goes wrong in a connection is its client's fault: for those who set up logging, not for the terminal.
+_LOG = logging.getLogger(__name__)
+_LOG.addHandler(logging.NullHandler())
+_KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+# The page is shown in no other page, runs nothing but its own files, and talks to no other server.
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "img-src 'self' blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
 
 
 class Site:
@@ -33,6 +57,7 @@ class Site:
     Args:
         name: Title of the tabs, and of the files that they save.
         cameras: Named cameras to jump to.
+        photographs: Files of the pictures that cameras took, by the cameras' names.
         host, port: As of its `Gate`, whose port and URL it has, and whose errors it raises.
         tolerance, budget: What a tab begins with.
         up: (3,) direction in the world.
@@ -47,6 +72,7 @@ class Site:
         *,
         name: str = "v3dg",
         cameras: Mapping[str, Camera] | None = None,
+        photographs: Mapping[str, Path] | None = None,
         host: str = "127.0.0.1",
         port: int = 8080,
         tolerance: float = DEFAULT_TOLERANCE,
@@ -54,51 +80,141 @@ class Site:
         up: VectorLike = (0.0, 0.0, 1.0),
     ) -> None:
         try:
-            import viser
-
             from v3dg.viewer.gate import Gate
+            from v3dg.viewer.tab import Tab
         except ImportError as error:
             raise ImportError(
-                "the viewer needs viser, which is not installed; pip install 'v3dg[viewer]'"
+                f"the viewer needs {error.name}, which is not installed; pip install 'v3dg[viewer]'"
             ) from error
-        # A tab may be closed while a picture is on its way to it.
-        warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
-        self._tabs: dict[int, Tab] = {}
-        self._ending: list[Tab] = []
+        self._make_tab = Tab
+        self._scene_view, self._name = scene_view, name
+        self._photographs = [dict(photographs or {}).get(camera) for camera in cameras or {}]
+        self._greeting = {
+            "type": "hello",
+            "version": __version__,
+            "up": np.asarray(up, np.float64).tolist(),
+            "home": asdict(start_view(scene_view, up)),
+            "settings": {"tolerance": tolerance, "budget": budget, "fade": DEFAULT_FADE},
+            "cameras": [
+                {"name": camera, "photograph": photograph is not None, "view": asdict(View.of_camera(at))}
+                for (camera, at), photograph in zip((cameras or {}).items(), self._photographs, strict=True)
+            ],
+        }
+        self._page = {
+            path.name: path.read_bytes() for path in files("v3dg.viewer").joinpath("page").iterdir()
+        }
+        self._tabs: set[Tab] = set()
         self._gate = Gate(host, port)
-        self.port, self.url = self._gate.port, self._gate.url
-        with contextlib.redirect_stdout(io.StringIO()), self._gate.guarding():  # who tells it where to listen
-            self._server = viser.ViserServer(host="127.0.0.1", port=0, label=name, verbose=False)
-        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        self._server.gui.main_panel.dock_right()  # beside the picture, not over it
-        start, upwards = start_view(scene_view, up), np.asarray(up, np.float64)
-        self._server.scene.set_up_direction(upwards)
-        first = self._server.initial_camera
-        first.position, first.look_at = start.position, scene_view.center
-        first.up, first.fov = upwards, _FOV_Y
-        settings = Settings(tolerance=tolerance, budget=budget)
-
-        # Both are called on the event loop, one after the other.
-        async def connect(client: viser.ClientHandle) -> None:
-            camera = BrowserCamera(client, scene_view)
-            self._tabs[client.client_id] = Tab(camera, name, cameras or {}, settings, start)
-
-        async def disconnect(client: viser.ClientHandle) -> None:
-            tabs = (*self._ending, self._tabs.pop(client.client_id))
-            self._ending = [tab for tab in tabs if not tab.close(0.0)]
-
-        self._server.on_client_connect(connect)
-        self._server.on_client_disconnect(disconnect)
+        self.port, self.url, self.is_secret = self._gate.port, self._gate.url, self._gate.is_secret
+        self._loop, self._closing = asyncio.new_event_loop(), asyncio.Event()
+        is_serving = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(is_serving,), name="v3dg viewer", daemon=True)
+        self._thread.start()
+        is_serving.wait()
 
     def close(self) -> bool:
         """End all tabs and the server in about two seconds; returns whether all their threads have ended."""
-        for tab in tuple(self._tabs.values()):
-            tab.close(0.0)
-        with contextlib.redirect_stdout(io.StringIO()):  # the command says what there is to say
-            self._server.stop()
+        with contextlib.suppress(RuntimeError):  # it is closed already
+            self._loop.call_soon_threadsafe(self._closing.set)
+        self._thread.join(3 * _CLOSE_SECONDS)
+        return not self._thread.is_alive() and not self._tabs
+
+    def _run(self, is_serving: threading.Event) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._serve(is_serving))
+        finally:
+            self._loop.close()
+
+    async def _serve(self, is_serving: threading.Event) -> None:
+        from websockets.asyncio.server import serve
+
+        from v3dg.viewer.messages import MOST_BYTES
+
+        self._loop.set_exception_handler(
+            lambda _, context: _LOG.error(context["message"], exc_info=context.get("exception"))
+        )
+        options: dict[str, Any] = {
+            "logger": _LOG,
+            "max_size": MOST_BYTES,
+            "compression": None,  # pictures are compressed
+            "close_timeout": 0.5,  # a client that does not answer does not hold up the end
+        }
+        async with serve(self._talk, sock=self._gate.socket, process_request=self._answer, **options):
+            is_serving.set()
+            await self._closing.wait()
+        await asyncio.to_thread(self._end_tabs)
+
+    def _end_tabs(self) -> None:
+        """Have the threads of all tabs end, of those that are gone, too."""
         end = time.monotonic() + _CLOSE_SECONDS
-        tabs = (*self._tabs.values(), *self._ending)
-        return all([tab.close(max(end - time.monotonic(), 0.0)) for tab in tabs])
+        self._tabs = {tab for tab in self._tabs if not tab.close(max(end - time.monotonic(), 0.0))}
+
+    async def _talk(self, connection: ServerConnection) -> None:
+        """Serve one tab for as long as it is open."""
+
+        def send(data: str | bytes) -> None:
+            away = connection.send(data)
+            try:
+                sending = asyncio.run_coroutine_threadsafe(away, self._loop)
+            except RuntimeError:  # the server has ended
+                away.close()
+                raise
+            if threading.current_thread() is not self._thread:  # which would wait for itself
+                sending.result()
+
+        def moved(scene_view: SceneView) -> None:
+            for other in self._tabs:
+                if other.scene_view is scene_view:
+                    other.ask_again()
+
+        tab = self._make_tab(self._scene_view, self._name, send, moved)
+        self._tabs.add(tab)
+        try:
+            await connection.send(json.dumps(self._greeting))
+            await connection.send(json.dumps(tab.describe_scene()))
+            async for data in connection:
+                with contextlib.suppress(Exception):  # whatever is wrong with what it says
+                    tab.take(data)
+        finally:
+            if tab.close(0.0):
+                self._tabs.discard(tab)
+
+    async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer a request for a part of the page; None where a connection begins."""
+        refusal = self._gate.refusal(request)
+        if refusal is not None:
+            return connection.respond(http.HTTPStatus.FORBIDDEN, refusal)
+        name = request.path.removeprefix("/") or "index.html"
+        if "Upgrade" in request.headers and name == "connection":
+            return None
+        body, kind = self._page.get(name), _KINDS.get(Path(name).suffix, "text/plain")
+        folder, _, place = name.partition("/")
+        if folder in _PHOTOGRAPH_PIXELS:
+            side = _PHOTOGRAPH_PIXELS[folder]
+            body, kind = await asyncio.to_thread(self._photograph, place, side), "image/jpeg"
+        if body is None:
+            return connection.respond(http.HTTPStatus.NOT_FOUND, "There is no such page.\n")
+        response = connection.respond(http.HTTPStatus.OK, "")
+        for header in ("Content-Type", "Content-Length"):
+            del response.headers[header]
+        response.headers.update({**_HEADERS, "Content-Type": kind, "Content-Length": str(len(body))})
+        response.body = body
+        return response
+
+    def _photograph(self, place: str, side: int) -> bytes | None:
+        """JPEG of what the camera at that place took, if that can be read."""
+        try:
+            path = self._photographs[int(place)] if place.isdecimal() else None
+            if path is None:
+                return None
+            with Image.open(path) as picture:
+                picture.thumbnail((side, side))
+                file = io.BytesIO()
+                picture.convert("RGB").save(file, "jpeg", quality=85)
+                return file.getvalue()
+        except (IndexError, OSError, ValueError, Image.DecompressionBombError):
+            return None
 
 
 def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) -> View:

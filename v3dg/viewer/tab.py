@@ -1,85 +1,256 @@
-"""A browser tab: its camera and controls, and the loop that draws what they ask for."""
+"""A browser tab: what its page asks for, the loop that draws it, and what the page is told."""
 
 from __future__ import annotations
 
-import html
+import contextlib
+import copy
+import functools
+import io
+import os
+import tempfile
+import threading
 import time
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import IO, Any
 
+import msgspec
+import numpy as np
 from PIL import Image
 
 from v3dg import _core
-from v3dg.cameras import Camera
-from v3dg.viewer.controls import BrowserCamera, Controls, add_button, in_order
-from v3dg.viewer.exports import Exporter
-from v3dg.viewer.figures import box, figures_html
-from v3dg.viewer.frame import Frame, Settings
-from v3dg.viewer.pacing import RenderLoop, Request
-from v3dg.viewer.path_controls import PathControls
-from v3dg.viewer.view import View
+from v3dg.bundle import Bundle
+from v3dg.camera_file import write_cameras
+from v3dg.false_color import level_colors
+from v3dg.io import read_asset
+from v3dg.pick import pick
+from v3dg.scene.file import write_scene
+from v3dg.video import write_video
+from v3dg.viewer import messages
+from v3dg.viewer.exports import Exporter, bundle_names
+from v3dg.viewer.frame import MOST_COUNTED, Frame, Pixels, SceneView, ramp
+from v3dg.viewer.pacing import RenderLoop
 
-_NO_CAMERA = ""
 # Pictures that pass by, and those that stay.
 _DRAFT_QUALITY, _FINAL_QUALITY = 75, 94
-_SECONDS_BETWEEN_FIGURES = 0.2
+_FPS = 30
+# Of a pixel, for a click to mean the gaussian: what is fainter is hardly seen.
+_LEAST_WEIGHT = 0.05
 
 
 class Tab:
-    """One browser tab of a `Site`, until `close`; ``home`` is the view of the button that shows all."""
+    """What a page that is connected to a `Site` sees and does, until `close`.
+
+    Args:
+        scene_view: What it shows, until a file is dropped onto it.
+        name: Of the files that it saves.
+        send: Sends text or bytes to the page; waits until they are away, but not in the server's thread.
+        moved: Called with a scene view of which an instance has another pose.
+    """
 
     def __init__(
-        self, camera: BrowserCamera, name: str, cameras: Mapping[str, Camera], settings: Settings, home: View
+        self,
+        scene_view: SceneView,
+        name: str,
+        send: Callable[[str | bytes], None],
+        moved: Callable[[SceneView], None],
     ) -> None:
-        self._camera, self._name = camera, name
-        self._client, self._scene_view = client, scene_view = camera.client, camera.scene_view
-        self._exporter = Exporter(camera)
-        # The panel shows them in the order in which they are made.
-        self._figures, self._last_figures = client.gui.add_html(box("drawing ...")), 0.0
-        self._controls = Controls(camera, settings, self._ask)
-        add_button(client.gui, "Save picture", lambda: self._exporter.begin(self._save_picture))
-        self._add_camera_controls(cameras, home)
-        path = PathControls(name, self._controls, self._exporter)
+        self.scene_view, self._name, self._send, self._moved = scene_view, name, send, moved
+        self._exporter = Exporter(self._tell, lambda error: self.scene_view.explain(error))
         self._loop = RenderLoop(scene_view, self._show, self._fail)
-        client.camera.on_update(in_order(path.camera_moved))
-        client.camera.on_update(in_order(self._ask))
-        self._ask()
+        self._look: messages.Look | None = None
+        self._picking = threading.Lock()
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._dropped: IO[bytes] | None = None
+        self._missing_bytes = 0
 
     def close(self, seconds: float) -> bool:
         """Stop drawing and saving; returns whether the threads have ended, waiting so long for each."""
-        return all([self._loop.close(seconds), self._exporter.close(seconds)])
+        has_ended = all([self._loop.close(seconds), self._exporter.close(seconds)])
+        if has_ended and self._folder is not None:
+            self._folder.cleanup()
+        return has_ended
 
-    def _wanted(self) -> Request:
-        return Request(self._camera.view, self._controls.size, self._controls.settings)
+    def ask_again(self) -> None:
+        """Draw once more what is shown, which has changed."""
+        if self._look is not None:
+            self._loop.ask(self._look.request())
 
-    def _ask(self) -> None:
-        self._loop.ask(self._wanted())
+    def take(self, data: str | bytes) -> None:
+        """Do what a message says; ValueError and its like where it is none of `messages`."""
+        if isinstance(data, bytes):
+            self._take_bytes(data)
+            return
+        message = messages.read_message(data)
+        if isinstance(message, messages.Look):
+            self._look = message
+            self.ask_again()
+        elif isinstance(message, messages.Pick):
+            if self._picking.acquire(blocking=False):  # one at a time
+                threading.Thread(target=self._pick, args=(message,), name="v3dg pick", daemon=True).start()
+        elif isinstance(message, messages.Move):
+            pose = {"quaternions": message.quaternion, "scales": message.scale}
+            self.scene_view.scene.move([message.instance], positions=[message.position], **pose)
+            self._moved(self.scene_view)
+        elif isinstance(message, messages.Save):
+            self._exporter.begin(functools.partial(getattr(self, f"_save_{message.what}"), message))
+        elif isinstance(message, messages.Stop):
+            self._exporter.stop()
+        else:
+            self._begin_file(message)
 
-    def _show(self, frame: Frame, is_final: bool) -> None:
-        quality = _FINAL_QUALITY if is_final else _DRAFT_QUALITY
-        self._client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=quality)
-        self._client.flush()  # which viser would wait for a sixtieth of a second with
-        now = time.monotonic()
-        if is_final or now - self._last_figures > _SECONDS_BETWEEN_FIGURES:
-            self._figures.content, self._last_figures = figures_html(frame), now
+    def describe_scene(self) -> dict[str, Any]:
+        """Return what the page has to know of what it shows."""
+        shown = self.scene_view
+        legend = [[round(255 * float(part)) for part in color] for color in ramp(np.linspace(0, 1, 7))]
+        levels = [[round(255 * float(c)) for c in color] for color in level_colors(shown.num_levels)]
+        return {
+            "type": "scene",
+            "name": self._name,
+            "center": shown.center.tolist(),
+            "radius": shown.radius,
+            "near": shown.near,
+            "instances": len(shown.scene),
+            "has_files": all(bundle.path is not None for bundle in shown.scene.bundles)
+            and self._folder is None,
+            "level_colors": levels,
+            "ramp": legend,
+            "most_counted": MOST_COUNTED,
+        }
+
+    def _tell(self, message: dict[str, Any], data: bytes = b"") -> None:
+        """Send a message, with bytes behind it: its length, itself, the bytes."""
+        text = msgspec.json.encode(message)
+        self._send(len(text).to_bytes(4, "little") + text + data if data else text.decode())
+
+    def _show(self, frame: Frame, is_final: bool, number: int) -> None:
+        picture, quality = io.BytesIO(), _FINAL_QUALITY if is_final else _DRAFT_QUALITY
+        Image.fromarray(frame.pixels).save(picture, "jpeg", quality=quality, subsampling=0 if is_final else 2)
+        figures = asdict(frame.figures) | {"levels": frame.figures.levels.tolist()}
+        message = {
+            "type": "picture",
+            "final": is_final,
+            "number": number,
+            "size": frame.size,
+            "view": asdict(frame.view),
+            "shows": frame.shows,
+            "range": frame.value_range,
+            "distance": frame.distance,
+            "figures": figures,
+        }
+        self._tell(message, picture.getvalue())
 
     def _fail(self, error: Exception) -> None:
-        reason = html.escape(self._scene_view.explain(error))
-        self._figures.content = box(f"<b>Not drawn.</b> {reason}")
+        self._tell({"type": "failed", "text": self.scene_view.explain(error)})
 
-    def _add_camera_controls(self, cameras: Mapping[str, Camera], home: View) -> None:
-        gui: Any = self._client.gui  # whose types let no value be set
-        with gui.add_folder("Camera", expand_by_default=False):
-            add_button(gui, "Show all", lambda: self._camera.look(home))
-            if cameras:
-                names = gui.add_dropdown("Of the file", (_NO_CAMERA, *cameras))
-                names.on_update(in_order(lambda: self._look_from(cameras.get(names.value))))
-            gui.add_markdown("Drag to turn, right button to move, wheel to go near, W A S D Q E to fly.")
+    def _pick(self, message: messages.Pick) -> None:
+        """Tell what is at a place of the picture."""
+        try:
+            view, (width, height), settings, _ = message.look.request()
+            answer: dict[str, Any] = {"type": "picked"}
+            if message.instance is None:
+                camera = view.camera(width, height, self.scene_view.near)
+                x, y = (
+                    min(int(message.at[0] * width), width - 1),
+                    min(int(message.at[1] * height), height - 1),
+                )
+                names = ("tolerance", "budget", "min_level")
+                cut = {name: getattr(settings, name) for name in names}
+                found = pick(self.scene_view.scene, camera, x, y, **cut)
+                if found is not None and found.weight >= _LEAST_WEIGHT:
+                    answer |= self._instance(found.instance) | {"point": found.position.tolist()}
+            else:
+                answer |= self._instance(message.instance)
+            self._tell(answer)
+        except Exception as error:
+            with contextlib.suppress(Exception):  # whoever asked may be gone
+                self._tell({"type": "notice", "text": self.scene_view.explain(error)})
+        finally:
+            self._picking.release()
 
-    def _look_from(self, camera: Camera | None) -> None:
-        if camera is not None:
-            self._camera.look(View.of_camera(camera))
+    def _instance(self, number: int) -> dict[str, Any]:
+        scene = self.scene_view.scene
+        if number >= len(scene):
+            raise ValueError(f"instance: expected 0 to {len(scene) - 1}, got {number}")
+        bundle = scene.bundles[scene.instance_bundle[number]]
+        boxes = bundle.clusters.box[: bundle.level_range(0).stop]
+        return {
+            "instance": number,
+            "pose": {
+                "position": scene.positions[number].tolist(),
+                "quaternion": scene.quaternions[number].tolist(),
+                "scale": float(scene.scales[number]),
+            },
+            "box": [boxes[:, 0].min(axis=0).tolist(), boxes[:, 1].max(axis=0).tolist()],
+            "bundle": Path(bundle.path or "").name,
+        }
 
-    def _save_picture(self, stop: _core.Stop) -> None:
-        frame = self._scene_view.frame(*self._wanted(), stop)
+    def _save_picture(self, message: messages.Save, stop: _core.Stop) -> None:
+        frame = self.scene_view.frame(*message.look.request()[:3], stop)
         self._exporter.save(f"{self._name}.png", Image.fromarray(frame.pixels).save)
+
+    def _save_play(self, message: messages.Save, _: _core.Stop) -> None:
+        views = [asdict(view) for view in message.camera_path().film(_FPS)]
+        self._tell({"type": "play", "fps": _FPS, "views": views})
+
+    def _save_film(self, message: messages.Save, stop: _core.Stop) -> None:
+        request, views = message.look.request(), message.camera_path().film(_FPS)
+        width, height = request.size
+        size = max(width // 2 * 2, 2), max(height // 2 * 2, 2)  # as H.264 wants it
+
+        def pictures() -> Iterator[Pixels]:
+            told = 0.0
+            for place, view in enumerate(views):
+                if time.monotonic() - told > 0.2:
+                    self._tell({"type": "progress", "share": place / len(views)})
+                    told = time.monotonic()
+                view = replace(view, aspect=size[0] / size[1])
+                yield self.scene_view.frame(view, size, request.settings, stop).pixels
+
+        self._exporter.save(f"{self._name}.mp4", lambda file: write_video(file, pictures(), fps=_FPS))
+
+    def _save_cameras(self, message: messages.Save, _: _core.Stop) -> None:
+        size = message.look.request().size
+        cameras = message.camera_path().cameras(_FPS, *size, self.scene_view.near)
+        self._exporter.save("transforms.json", lambda file: write_cameras(file, cameras))
+
+    def _save_scene(self, message: messages.Save, _: _core.Stop) -> None:
+        """The instances as they stand now, what is up, and the cameras of a path if there is one."""
+        size, path = message.look.request().size, message.camera_path()
+        cameras = path.cameras(_FPS, *size, self.scene_view.near) if len(path) else {}
+        scene = copy.copy(self.scene_view.scene)
+        scene.up = message.up
+        names = bundle_names(scene)
+        self._exporter.save(f"{self._name}.json", lambda file: write_scene(file, scene, names, cameras))
+
+    def _begin_file(self, message: messages.Open) -> None:
+        """Keep the bytes that come now, until they are all there, in a folder that goes with the tab."""
+        self._folder = self._folder or tempfile.TemporaryDirectory(prefix="v3dg_")
+        if self._dropped is not None:
+            self._dropped.close()
+        folder = tempfile.mkdtemp(dir=self._folder.name)
+        self._dropped = open(Path(folder, message.name), "wb")  # noqa: SIM115  # until all of it is there
+        self._missing_bytes = message.size
+
+    def _take_bytes(self, data: bytes) -> None:
+        file = self._dropped
+        if file is None:
+            raise ValueError("expected a file's name before its bytes")
+        file.write(data[: self._missing_bytes])
+        self._missing_bytes -= min(len(data), self._missing_bytes)
+        if self._missing_bytes == 0:
+            self._dropped = None
+            file.close()
+            self._exporter.begin(lambda _: self._open(Path(file.name)))
+
+    def _open(self, path: Path) -> None:
+        try:
+            subject = Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path)
+        except (OSError, ValueError) as error:  # which names a folder that is nobody's business
+            raise ValueError(str(error).replace(f"{path.parent}{os.sep}", "")) from None
+        shown, before = SceneView(subject, device=self.scene_view.device), self._loop
+        self.scene_view, self._name = shown, path.stem
+        self._loop = RenderLoop(shown, self._show, self._fail)
+        before.close(0.0)
+        self._tell(self.describe_scene())
