@@ -42,7 +42,7 @@ class Build(_common.OnDevice):
     """Most gaussians in a cluster; the config's own if not given."""
     codec: Literal["float32", "quantized"] = "float32"
     """How gaussians are kept: every bit, or rounded to 16 to 40 bytes (docs/format.md has the error)."""
-    up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
+    up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
     """What is up in the asset, which the bundle then says to `view`, `render` and `export`."""
     seed: int = 0
     """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
