@@ -78,11 +78,10 @@ def write_site(
         OSError: A file cannot be written.
     """
     folder = Path(folder)
-    is_scene = isinstance(subject, Scene)
+    is_scene, scene = isinstance(subject, Scene), Scene.of(subject)
     axis = up or up_of(subject, cameras)[0]
     # A bundle alone is turned to what viewers take to be up; a scene's stay as its instances have them.
     turn = _common.turn_upright("-y" if is_scene else axis)
-    scene = Scene.of(subject)
     check("scene", len(scene), "instances to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
     with _common.replacing_folder(folder) as place:
