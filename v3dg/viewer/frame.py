@@ -140,12 +140,7 @@ class SceneView:
         center, radius: A ball that holds nearly all of it, world units.
     """
 
-    def __init__(
-        self,
-        subject: Scene | Bundle | Gaussians,
-        *,
-        device: str | Device = "auto",
-    ) -> None:
+    def __init__(self, subject: Scene | Bundle | Gaussians, *, device: str | Device = "auto") -> None:
         if isinstance(subject, Gaussians):
             only_leaves = BuildConfig(min_clusters=1 << 31)
             subject = build_bundle(subject, config=only_leaves, device="cpu", progress=False)
@@ -194,13 +189,11 @@ class SceneView:
         selected = time.perf_counter()
         width, height = size
         edge = round(settings.split * width)
-        window = (edge, 0, width, height)
         value_range, in_view, distance = None, 0, None
         picture = np.zeros((height, width, 3), np.float32)
         if edge < width:
-            picture[:, edge:], value_range, in_view, distance = self._shown(
-                cut, camera, window, settings, stop
-            )
+            shown = self._shown(cut, camera, (edge, 0, width, height), settings, stop)
+            picture[:, edge:], value_range, in_view, distance = shown
         if edge > 0:
             picture[:, :edge] = self._all_gaussians(camera, (0, 0, edge, height), stop)
             picture[:, max(edge - 1, 0) : edge + 1] = 1.0

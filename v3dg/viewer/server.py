@@ -83,9 +83,8 @@ class Site:
             from v3dg.viewer.gate import Gate
             from v3dg.viewer.tab import Tab
         except ImportError as error:
-            raise ImportError(
-                f"the viewer needs {error.name}, which is not installed; pip install 'v3dg[viewer]'"
-            ) from error
+            advice = "which is not installed; pip install 'v3dg[viewer]'"
+            raise ImportError(f"the viewer needs {error.name}, {advice}") from error
         self._make_tab = Tab
         self._scene_view, self._name = scene_view, name
         self._photographs = [dict(photographs or {}).get(camera) for camera in cameras or {}]
@@ -100,9 +99,8 @@ class Site:
                 for (camera, at), photograph in zip((cameras or {}).items(), self._photographs, strict=True)
             ],
         }
-        self._page = {
-            path.name: path.read_bytes() for path in files("v3dg.viewer").joinpath("page").iterdir()
-        }
+        page = files("v3dg.viewer").joinpath("page")
+        self._page = {path.name: path.read_bytes() for path in page.iterdir()}
         self._tabs: set[Tab] = set()
         self._gate = Gate(host, port)
         self.port, self.url, self.is_secret = self._gate.port, self._gate.url, self._gate.is_secret

@@ -151,10 +151,8 @@ class Tab:
             answer: dict[str, Any] = {"type": "picked"}
             if message.instance is None:
                 camera = view.camera(width, height, self.scene_view.near)
-                x, y = (
-                    min(int(message.at[0] * width), width - 1),
-                    min(int(message.at[1] * height), height - 1),
-                )
+                x = min(int(message.at[0] * width), width - 1)
+                y = min(int(message.at[1] * height), height - 1)
                 names = ("tolerance", "budget", "min_level")
                 cut = {name: getattr(settings, name) for name in names}
                 found = pick(self.scene_view.scene, camera, x, y, **cut)
