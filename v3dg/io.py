@@ -41,8 +41,7 @@ _READERS: dict[str, Callable[[Path], AssetFile]] = {
     ".sog": sog.open_file,
     "lod-meta.json": streamed_sog.open_file,
     "meta.json": sog.open_file,
-    ".ckpt": checkpoint.open_file,
-    ".pt": checkpoint.open_file,
+    **dict.fromkeys((".ckpt", ".pt"), checkpoint.open_file),
 }
 _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
     ".compressed.ply": compressed_ply.write,

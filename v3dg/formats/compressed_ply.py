@@ -167,9 +167,8 @@ _REST_VALUE[[0, 255]] = -4.0, 4.0
 
 
 def _fractions(words: NDArray[Any], shifts: tuple[int, ...], largest: tuple[int, ...]) -> Floats:
-    return np.stack(
-        [((words >> shift) & most) / float(most) for shift, most in zip(shifts, largest, strict=True)], axis=1
-    )
+    fields = zip(shifts, largest, strict=True)
+    return np.stack([((words >> shift) & most) / float(most) for shift, most in fields], axis=1)
 
 
 def _word(fractions: Floats, shifts: tuple[int, ...], largest: tuple[int, ...]) -> NDArray[np.uint32]:

@@ -125,12 +125,10 @@ class _Glb:
                 raise ValueError(f"{content[:20].hex(' ')} at the start of {len(content)} bytes")
             self._root = Node(parse_json(content[20 : 20 + size].decode("utf-8")), str(path), "")
         self._blob = memoryview(content)[28 + size :]
-        self._arrays = {
-            name: list(self._root.field(name).items()) for name in ("accessors", "bufferViews", "buffers")
-        }
-        primitives = (
-            p for mesh in self._root.field("meshes").items() for p in mesh.field("primitives").items()
-        )
+        kinds = ("accessors", "bufferViews", "buffers")
+        self._arrays = {kind: list(self._root.field(kind).items()) for kind in kinds}
+        meshes = self._root.field("meshes").items()
+        primitives = (p for mesh in meshes for p in mesh.field("primitives").items())
         self.primitives = [p for p in primitives if p.has("extensions") and p.field("extensions").has(_NAME)]
         check(path, self.primitives, f"a primitive with {_NAME}, got none; meshes are not read")
         for node in self._root.field("nodes").items() if self._root.has("nodes") else ():
@@ -170,12 +168,9 @@ class _Glb:
         def column(name: str, width: int) -> Callable[[slice], Floats]:
             return self._column(self._item("accessors", attributes, name), count, width)
 
-        mean, scale, opacity = (
-            column("POSITION", 3),
-            column(f"{_NAME}:SCALE", 3),
-            column(f"{_NAME}:OPACITY", 1),
-        )
-        quat, sh = column(f"{_NAME}:ROTATION", 4), [column(name, 3) for name in _coefficients(self.degree)]
+        mean, scale = column("POSITION", 3), column(f"{_NAME}:SCALE", 3)
+        opacity, quat = column(f"{_NAME}:OPACITY", 1), column(f"{_NAME}:ROTATION", 4)
+        sh = [column(name, 3) for name in _coefficients(self.degree)]
 
         def decode(rows: slice) -> tuple[NDArray[np.floating[Any]], ...]:
             widths = scale(rows)

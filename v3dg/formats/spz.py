@@ -42,7 +42,6 @@ def open_file(path: Path) -> AssetFile:
     if header[:2] == b"\x1f\x8b":
         with telling(path, "a gzip stream that is not damaged"):
             header = zlib.decompressobj(31).decompress(header, _HEADER.size)
-    check(path, len(header) >= _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
     _, degree, _, sizes = _checked_header(path, header, claims)
     return whole_file(path, sizes[1], degree, read)
 
@@ -173,8 +172,7 @@ def _quats(rotations: NDArray[Any]) -> Floats:
     if rotations.shape[1] == 3:
         xyz = rotations / 127.5 - 1.0
         w = np.sqrt(np.maximum(0.0, 1.0 - np.square(xyz).sum(axis=1, keepdims=True)))
-        quats = np.concatenate([w, xyz], axis=1)
-        return _packing.normalised(quats)
+        return _packing.normalised(np.concatenate([w, xyz], axis=1))
     words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
     three = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511.0 * SQRT2)
@@ -183,6 +181,7 @@ def _quats(rotations: NDArray[Any]) -> Floats:
 
 def _checked_header(path: Path, header: bytes, claims: Claims) -> tuple[int, int, int, list[int]]:
     """Version, SH degree, fraction bits, and the bytes of each section."""
+    check(path, len(header) >= _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
     magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack_from(header)
     check(path, magic == _MAGIC, f".spz, which begins with NGSP, got {header[:4].hex(' ')}")
     check(path, 1 <= version <= 4, f".spz of version 1 to 4, got {version}")
@@ -197,7 +196,6 @@ def _sections_of_gzip(path: Path, content: bytes, claims: Claims) -> tuple[int, 
     stream = zlib.decompressobj(31)
     with telling(path, "a gzip stream that is not damaged"):
         header = stream.decompress(content, _HEADER.size)
-    check(path, len(header) == _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
     version, degree, fraction_bits, sizes = _checked_header(path, header, claims)
     check(path, version <= 3, f"version 1 to 3 in gzip, got {version}")
     total = sum(sizes)
