@@ -95,16 +95,14 @@ def replacing_folder(folder: Path, keep: str = "") -> Iterator[Path]:
 
     What is there by the name `keep` moves along.
     """
-    is_ours = folder.is_dir() and (
-        any((folder / mark).is_file() for mark in MARKS) or not any(folder.iterdir())
-    )
+    has_mark = any((folder / mark).is_file() for mark in MARKS)
+    is_ours = folder.is_dir() and (has_mark or not any(folder.iterdir()))
     expected = "a new folder, or one with an earlier export, got something else"
     check(folder, is_ours or not folder.exists(), expected)
     target = folder.resolve()
     missing = [parent for parent in target.parents if not parent.exists()]  # the lowest first
-    temporary, old = (
-        target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.{end}") for end in ("tmp", "old")
-    )
+    hidden = f".{target.name[:40]}.{secrets.token_hex(8)}"
+    temporary, old = target.with_name(f"{hidden}.tmp"), target.with_name(f"{hidden}.old")
     with _files.naming_errors(folder, os.fspath(temporary)):
         try:
             temporary.mkdir(parents=True)

@@ -86,11 +86,9 @@ def write_streamed_sog(
     Source: PlayCanvas, the streamed SOG format, version 1.
     """
     turn, plan = _common.turn_upright(up or up_of(bundle)[0]), Plan.of(bundle, chunk)
-    with _common.replacing_folder(Path(folder)) as place:
-        total = bundle.num_gaussians
-        with Bar(total, "export", progress) as bar:
-            done = write_levels(plan, place, turn, bar.update)
-    return done
+    total = bundle.num_gaussians
+    with _common.replacing_folder(Path(folder)) as place, Bar(total, "export", progress) as bar:
+        return write_levels(plan, place, turn, bar.update)
 
 
 def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int], Any]) -> Export:
@@ -106,9 +104,8 @@ def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int],
         "tree": plan.tree(lods, turn),
     }
     _common.write_document(place / INDEX, index)
-    _common.write_document(
-        place / SETTINGS, _viewer_settings(plan.bundle.level_gaussians(plan.top).transform(turn))
-    )
+    shown = plan.bundle.level_gaussians(plan.top).transform(turn)
+    _common.write_document(place / SETTINGS, _viewer_settings(shown))
     return Export(counts, plan.num_chunks, len(names), _common.bytes_below(place))
 
 
@@ -199,11 +196,8 @@ class Plan:
             for ids in self.by_chunk(clusters):
                 yield Gaussians.concatenate([self.bundle.cluster_gaussians(int(c)) for c in ids])
             return
-        gaussians, table, groups = (
-            self.bundle.level_gaussians(level),
-            self.bundle.clusters,
-            self.bundle.groups,
-        )
+        gaussians = self.bundle.level_gaussians(level)
+        table, groups = self.bundle.clusters, self.bundle.groups
         tops = np.flatnonzero(self.chunk_of_group >= 0)
         above: NDArray[Any] = tops
         for _ in range(level - self.top):

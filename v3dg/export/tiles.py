@@ -143,10 +143,8 @@ class _Writer:
     ) -> dict[str, Any]:
         boxes = self._bundle.clusters.box[np.asarray(clusters)].astype(np.float64)
         bounds = [np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])]
-        tile: dict[str, Any] = {
-            "boundingVolume": _box(bounds + [_bounds(child) for child in children]),
-            "geometricError": error,
-        }
+        volume = _box(bounds + [_bounds(child) for child in children])
+        tile: dict[str, Any] = {"boundingVolume": volume, "geometricError": error}
         gaussians = Gaussians.concatenate([self._bundle.cluster_gaussians(int(c)) for c in clusters])
         self._advance(len(gaussians))
         if len(gaussians):
