@@ -140,19 +140,9 @@ def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -
         to_world = np.eye(4)
         to_world[:3, :3] = camera.viewmat[:3, :3].T @ _FLIP
         to_world[:3, 3] = camera.position
-        frames.append(
-            {
-                "file_path": name,
-                "w": camera.width,
-                "h": camera.height,
-                "fl_x": camera.fx,
-                "fl_y": camera.fy,
-                "cx": camera.cx,
-                "cy": camera.cy,
-                "near": camera.near,
-                "transform_matrix": to_world.tolist(),
-            }
-        )
+        size = {"w": camera.width, "h": camera.height}
+        lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "near": camera.near}
+        frames.append({"file_path": name, **size, **lens, "transform_matrix": to_world.tolist()})
     write_json(path, {"camera_model": "PINHOLE", "frames": frames})
 
 

@@ -160,9 +160,8 @@ class Camera:
         return replace(self, K=K, width=self.width * factor, height=self.height * factor)
 
     def __repr__(self) -> str:
-        return (
-            f"Camera({self.width}x{self.height}, eye={_text(self.position)}, fx={self.fx:g}, fy={self.fy:g})"
-        )
+        lens = f"fx={self.fx:g}, fy={self.fy:g}"
+        return f"Camera({self.width}x{self.height}, eye={_text(self.position)}, {lens})"
 
 
 @dataclass(frozen=True, eq=False)

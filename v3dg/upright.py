@@ -44,10 +44,8 @@ def up_of(
         cameras: That look at it, by name.
         path: Of its file, whose kind may tell.
     """
-    if isinstance(subject, Scene):
-        noted: Any = subject.up
-    else:
-        noted = subject.config.get("up") if isinstance(subject, Bundle) else None
+    config = subject.config if isinstance(subject, Bundle) else {}
+    noted: Any = subject.up if isinstance(subject, Scene) else config.get("up")
     if noted in AXES:
         return noted, "as its file says"
     tops = np.array([-camera.viewmat[1, :3] for camera in (cameras or {}).values()]).reshape(-1, 3)

@@ -57,9 +57,8 @@ class DiskLeaves(Leaves):
     def read(self, first: int, last: int) -> Gaussians:
         result = Codec(self.sh_degree).empty(last - first)
         offset = self._bucket_offset
-        buckets = range(
-            int(np.searchsorted(offset, first, "right")) - 1, int(np.searchsorted(offset, last, "left"))
-        )
+        of_first = int(np.searchsorted(offset, first, "right")) - 1
+        buckets = range(of_first, int(np.searchsorted(offset, last, "left")))
         with RowFile(self.path, gaussian_bytes(self.sh_degree) // 4, np.float32) as file:
             for begin, end in ((int(offset[b]), int(offset[b + 1])) for b in buckets):
                 low, high = max(first, begin), min(last, end)

@@ -303,9 +303,8 @@ def _like(array: Any, values: Any) -> Any:
     import torch
 
     # Copied, for torch warns of arrays that are not to be written to.
-    return torch.as_tensor(
-        np.array(values) if isinstance(values, np.ndarray) else values, device=array.device
-    )
+    values = np.array(values) if isinstance(values, np.ndarray) else values
+    return torch.as_tensor(values, device=array.device)
 
 
 def _alike(first: Any, second: Any) -> tuple[Any, Any]:
