@@ -107,12 +107,11 @@ def render(
         key = color_by, where, memory
         frame = residency.frame(subject, key, lambda: _Frame(subject, color_by, where, memory))
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
-    options["cut"] = cut
     pictures: list[Any] = []
     for view in [camera] if isinstance(camera, Camera | StereoCamera) else camera:
-        if memory is not None:
+        if memory is not None and cut is None:
             frame.settle(subject, view, **options)
-        pictures.append(frame.draw(subject, view, background, min_transmittance, **options))
+        pictures.append(frame.draw(subject, view, background, min_transmittance, cut, **options))
     return pictures[0] if isinstance(camera, Camera | StereoCamera) else pictures
 
 
@@ -171,9 +170,8 @@ class Renderer:
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
         """Draw as `v3dg.render` does, of what is resident."""
         options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
-        options["cut"] = cut
         drawn: RenderedImage | tuple[RenderedImage, RenderedImage] = self._frame.draw(
-            self._subject, camera, background, min_transmittance, **options
+            self._subject, camera, background, min_transmittance, cut, **options
         )
         return drawn
 
@@ -251,7 +249,7 @@ class _Frame:
             pool = self._take_models(resident)
             if pool is not None:
                 check("cut", cut is None, "none for a pool, which has its own, got one")
-                before = pool.core.status()
+                before = pool.core.status().bytes_in
                 drawing = self._frame.draw_resident(resident.core, pool.core, camera.core, rule, shade)
             elif cut is None:
                 drawing = self._frame.draw(resident.core, camera.core, rule, shade)
@@ -263,8 +261,8 @@ class _Frame:
                 drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade, weights=weights)
             if pool is not None:
                 now = pool.core.status()
-                came_in = {"missing": now.missing, "failed": now.failed}
-                came_in["bytes_in"] = now.bytes_in - before.bytes_in
+                bytes_in = now.bytes_in - before
+                came_in = {"missing": now.missing, "failed": now.failed, "bytes_in": bytes_in}
             resident.add_drawing(drawing)
         budget = options["budget"]
 
@@ -288,17 +286,12 @@ class _Frame:
         return picture, RenderedImage(drawing, finish, is_right=True)
 
     def settle(
-        self,
-        subject: _Subject,
-        camera: Camera | StereoCamera,
-        timeout: float = 30.0,
-        cut: Any = None,
-        **options: Any,
+        self, subject: _Subject, camera: Camera | StereoCamera, timeout: float = 30.0, **options: Any
     ) -> None:
         """Bring in what a view needs."""
         real(timeout, "timeout", "seconds, at least 0", 0)
         rule = rule_of(**options)
-        if self._memory is None or cut is not None:
+        if self._memory is None:
             return
         assert not isinstance(subject, Gaussians)
         with residency.reading(subject, self._device) as resident:
