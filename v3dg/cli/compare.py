@@ -74,11 +74,8 @@ def run(options: Compare) -> None:
     rows: list[dict[str, Any]] = []
     worst: tuple[_Pair, dict[str, Any]] | None = None
     with contextlib.closing(Judges()) as judges:
-        judged = (
-            judges.measured(pairs, _errors)
-            if len(names) >= _ENOUGH_TO_SHARE
-            else ((pair, _errors(pair)) for pair in pairs)
-        )
+        is_long = len(names) >= _ENOUGH_TO_SHARE
+        judged = judges.measured(pairs, _errors) if is_long else ((pair, _errors(pair)) for pair in pairs)
         for pair, errors in counted(judged, len(names), "compare", not options.quiet):
             row = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
             if options.pictures == "all":

@@ -48,7 +48,8 @@ def run(options: Render) -> None:
     device = _device.resolve(options.device)
     subject, own_cameras = open_with_cameras(options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
-    is_film = own_cameras is None and options.view.cameras is None and len(cameras) > 1
+    is_turntable = options.view.cameras is None and own_cameras is None
+    is_film = is_turntable and len(cameras) > 1
     fade = DEFAULT_FADE if options.fade is None and is_film else options.fade
     pictures: list[dict[str, Any]] = []
     views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
@@ -67,16 +68,9 @@ def run(options: Render) -> None:
             memory=options.memory,
         )
         write_picture(path, _device.to_host(image.color))
-        pictures.append(
-            {
-                "picture": str(path),
-                "camera": name,
-                "width": camera.width,
-                "height": camera.height,
-                **asdict(image.stats),
-                "tolerance": finite(image.stats.tolerance),
-            }
-        )
+        view = {"camera": name, "width": camera.width, "height": camera.height}
+        cost = asdict(image.stats) | {"tolerance": finite(image.stats.tolerance)}
+        pictures.append({"picture": str(path), **view, **cost})
     columns = {
         "picture": "{picture}",
         "size": "{width} x {height}",
@@ -86,6 +80,5 @@ def run(options: Render) -> None:
         "draw ms": "{draw_ms:.1f}",
     }
     result = {"subject": str(options.subject), "pictures": pictures}
-    is_turntable = options.view.cameras is None and own_cameras is None
     notes = up_lines(options.view.up, subject, path=options.subject) if is_turntable else []
     print_result(options.json, result, [*table_lines(columns, pictures), *notes])

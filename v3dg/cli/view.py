@@ -21,7 +21,7 @@ import tyro
 from v3dg._start import SIGNALS
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import Axis
-from v3dg.cli._common import Flag, OnDevice, UsageError, option, print_result, require_subject, tell
+from v3dg.cli._common import Flag, OnDevice, check_usage, option, print_result, require_subject, tell
 from v3dg.cli._views import up_lines
 from v3dg.opening import open_with_cameras
 from v3dg.upright import direction_of, up_of
@@ -58,8 +58,7 @@ class View(OnDevice):
 
 def run(options: View) -> None:
     require_subject(options.subject)
-    if not 0 <= options.port <= 65535:
-        raise UsageError(f"--port: expected 0 to 65535, got {options.port}")
+    check_usage("--port", 0 <= options.port <= 65535, f"0 to 65535, got {options.port}")
     from v3dg.gaussians import Gaussians
     from v3dg.select import DEFAULT_TOLERANCE, rule_of
     from v3dg.viewer.frame import SceneView
@@ -69,17 +68,15 @@ def run(options: View) -> None:
     if tolerance is None:
         tolerance = DEFAULT_TOLERANCE if options.budget is None else 0.0
     rule_of(tolerance, options.budget, 0, "solid_angle", True)
-    if not math.isfinite(tolerance):
-        raise UsageError(f"--tolerance: expected a number, got {tolerance}")
+    check_usage("--tolerance", math.isfinite(tolerance), f"a number, got {tolerance}")
     subject, cameras = open_with_cameras(options.subject)
     photographs = None
     if options.cameras is not None:
         cameras = read_cameras(options.cameras, size=_SIZE, distortion=options.distortion)
         photographs = _photographs(options.cameras, cameras)
-    if isinstance(subject, Gaussians) and options.budget is not None:
-        raise UsageError(
-            f"--budget: expected a bundle or a scene, got the asset {options.subject}; build a bundle of it"
-        )
+    has_levels = not isinstance(subject, Gaussians)
+    expected = f"a bundle or a scene, got the asset {options.subject}; build a bundle of it"
+    check_usage("--budget", has_levels or options.budget is None, expected)
     up = options.up or up_of(subject, cameras, options.subject)[0]
     scene_view = SceneView(subject, device=options.device)
     with contextlib.suppress(ImportError):  # of which the site tells; it takes long
@@ -141,10 +138,8 @@ def _interrupts() -> Iterator[list[int]]:
     takes none.
     """
     came: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, _: came.append(number))
-        for number in (*SIGNALS, signal.SIGTERM)
-    }
+    numbers = (*SIGNALS, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in numbers}
     try:
         yield came
     finally:
