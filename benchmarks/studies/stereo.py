@@ -42,9 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
     for tolerance in options.tolerances:
         for name, camera in list(cameras.items())[slice(*options.cameras)]:
             stereo = headset(camera, options.side)
-            rows.append(
-                {"tolerance": tolerance, "camera": name, **measure(renderer, stereo, tolerance, options)}
-            )
+            row = measure(renderer, stereo, tolerance, options.repeats)
+            rows.append({"tolerance": tolerance, "camera": name, **row})
             print(rows[-1], flush=True)
     result = {"side": options.side, "fov_x": _FOV, "eye_distance": _EYE_DISTANCE, "rows": rows}
     write(options.json, result, "cuda")
