@@ -20,15 +20,15 @@ constexpr double kRoomyShare = 0.7;
 // A page above one that is asked for is more urgent by so much.
 constexpr float kAbove = 2.0f;
 constexpr int kTries = 3;
+constexpr std::ptrdiff_t kMostLeaving = 4096;  // slots that make room before they are looked for again
 
 enum class PageState : uint8_t { absent, loading, loaded, resident, failed };
 
 struct Page {
     int32_t parent = -1;
     int32_t slot = -1;
-    uint32_t num_children = 0;  // that are resident
-    uint32_t stamp = 0;         // frame that asked for it last
-    float priority = 0;         // then
+    uint32_t stamp = 0;  // frame that asked for it last
+    float priority = 0;  // then
     int32_t level = 0;
     PageState state = PageState::absent;
 };
@@ -43,7 +43,15 @@ struct Bundle {
 struct Slot {
     int32_t bundle = -1;
     uint32_t page = 0;
-    uint32_t last_needed = 0, last_used = 0;  // one more than the frame; used: needed, or nearly
+};
+// What is looked through in every frame, of all slots: 0 where there is no page.
+struct SlotUses {
+    std::vector<uint32_t> last_needed, last_used;  // one more than the frame; used: needed, or nearly
+    std::vector<uint32_t> num_children;            // that are resident
+
+    void resize(size_t count) {
+        for (auto* of_slots : {&last_needed, &last_used, &num_children}) of_slots->resize(count);
+    }
 };
 
 struct Loaded {
@@ -58,6 +66,7 @@ struct PagePool::State {
     const pid_t process = getpid();
     std::vector<Bundle> bundles;
     std::vector<Slot> slots;
+    SlotUses uses;
     std::vector<uint32_t> free_slots;
     size_t slot_rows = 1, first_slot_row = 0, block_size = 1;
     int max_sh_degree = 0;
@@ -79,7 +88,8 @@ struct PagePool::State {
     float least_tolerance = 0;
     std::string error;
     bool is_damage = false;
-    std::vector<uint32_t> leaving;  // a heap of slots that may go, those first that were not used for longest
+    // A heap of slots that may go, those first that were not used for longest; of many, the first.
+    std::vector<uint32_t> leaving;
 
     Page& page(const PageRequest& r) { return bundles[r.bundle].pages[r.page]; }
     Page& page(const Loaded& l) { return bundles[l.bundle].pages[l.page]; }
@@ -91,7 +101,12 @@ struct PagePool::State {
     bool read_next(std::unique_lock<std::mutex>& lock);
     void use(uint32_t bundle, int32_t page, bool is_needed);
     bool is_old(uint32_t last) const { return last + kKeptFrames < noted + 1; }
-    bool may_go(uint32_t slot) const;
+    size_t num_old(const std::vector<uint32_t>& last) const;
+    bool may_go(uint32_t slot) const {
+        return is_old(uses.last_needed[slot]) && uses.num_children[slot] == 0;
+    }
+    bool goes_later(uint32_t a, uint32_t b) const;
+    void find_leaving();
     int32_t block_above(const PageRequest& r) const;
     size_t ask(PageRequest r, std::vector<PageRequest>& wanted);
     void choose_pages(std::vector<PageRequest>& wanted);
@@ -144,6 +159,7 @@ void PagePool::State::plan_memory() {
                                     "room for " +
                                     std::to_string(limits.num_rows));
     slots.resize(std::min((limits.num_rows - root_rows) / slot_rows, num_pages));
+    uses.resize(slots.size());
     for (size_t s = slots.size(); s > 0; --s) free_slots.push_back(static_cast<uint32_t>(s - 1));
 }
 
@@ -217,17 +233,15 @@ void PagePool::State::use(uint32_t b, int32_t p, bool is_needed) {
     for (; p >= 0; p = bundles[b].pages[p].parent, is_needed = true) {
         const Page& page = bundles[b].pages[p];
         if (page.slot < 0) return;  // the root
-        Slot& slot = slots[page.slot];
-        if (slot.last_needed == noted + 1) return;
-        slot.last_used = noted + 1;
-        if (is_needed) slot.last_needed = noted + 1;
+        if (uses.last_needed[page.slot] == noted + 1) return;
+        uses.last_used[page.slot] = noted + 1;
+        if (is_needed) uses.last_needed[page.slot] = noted + 1;
     }
 }
 
-bool PagePool::State::may_go(uint32_t s) const {
-    const Slot& slot = slots[s];
-    return slot.bundle >= 0 && is_old(slot.last_needed) &&
-           bundles[slot.bundle].pages[slot.page].num_children == 0;
+// Slots without a page that was needed, or used, lately: free ones, too.
+size_t PagePool::State::num_old(const std::vector<uint32_t>& last) const {
+    return std::count_if(last.begin(), last.end(), [this](uint32_t frame) { return is_old(frame); });
 }
 
 // A page that cannot be had, itself or above a page; -1: none.
@@ -264,11 +278,7 @@ size_t PagePool::State::ask(PageRequest r, std::vector<PageRequest>& wanted) {
 
 // From all pages that are wanted those that are read next: no more than there will be room for.
 void PagePool::State::choose_pages(std::vector<PageRequest>& wanted) {
-    size_t unneeded = free_slots.size(), unused = unneeded;
-    for (const Slot& slot : slots) {
-        unneeded += slot.bundle >= 0 && is_old(slot.last_needed);
-        unused += slot.bundle >= 0 && is_old(slot.last_used);
-    }
+    const size_t unneeded = num_old(uses.last_needed), unused = num_old(uses.last_used);
     const size_t num_missed =
         std::count_if(wanted.begin(), wanted.end(), [](const PageRequest& r) { return r.priority > 1; });
     const size_t room = num_missed > unused ? std::min(num_missed, unneeded) : unused;
@@ -304,24 +314,37 @@ void PagePool::State::evict(uint32_t s) {
     bundle.shift[slot.page] = kAbsentPage;
     page.state = PageState::absent;
     page.slot = -1;
-    --bundle.pages[page.parent].num_children;
+    const int32_t above = bundle.pages[page.parent].slot;
+    if (above >= 0) --uses.num_children[above];
     slot = {};
+    uses.last_needed[s] = uses.last_used[s] = 0;
     free_slots.push_back(s);
+}
+
+bool PagePool::State::goes_later(uint32_t a, uint32_t b) const {
+    return uses.last_used[a] != uses.last_used[b] ? uses.last_used[a] > uses.last_used[b] : a > b;
+}
+
+// Where no slot is free.
+void PagePool::State::find_leaving() {
+    for (uint32_t s = 0; s < slots.size(); ++s)
+        if (may_go(s)) leaving.push_back(s);
+    if (leaving.size() > static_cast<size_t>(kMostLeaving)) {
+        std::nth_element(leaving.begin(), leaving.begin() + kMostLeaving, leaving.end(),
+                         [this](uint32_t a, uint32_t b) { return goes_later(b, a); });
+        leaving.resize(kMostLeaving);
+    }
+    std::make_heap(leaving.begin(), leaving.end(),
+                   [this](uint32_t a, uint32_t b) { return goes_later(a, b); });
 }
 
 // Sees to it that there is a free slot, for a page that the cut misses or one that it nearly does. `leaving`
 // is empty before the first page of a frame.
 bool PagePool::State::make_room(bool is_missed) {
     if (!free_slots.empty()) return true;
-    const auto is_newer = [&](uint32_t a, uint32_t b) {
-        return slots[a].last_used != slots[b].last_used ? slots[a].last_used > slots[b].last_used : a > b;
-    };
-    if (leaving.empty()) {
-        for (uint32_t s = 0; s < slots.size(); ++s)
-            if (may_go(s)) leaving.push_back(s);
-        std::make_heap(leaving.begin(), leaving.end(), is_newer);
-    }
-    if (leaving.empty() || (!is_missed && !is_old(slots[leaving.front()].last_used))) return false;
+    const auto is_newer = [this](uint32_t a, uint32_t b) { return goes_later(a, b); };
+    if (leaving.empty()) find_leaving();
+    if (leaving.empty() || (!is_missed && !is_old(uses.last_used[leaving.front()]))) return false;
     std::pop_heap(leaving.begin(), leaving.end(), is_newer);
     const uint32_t s = leaving.back();
     leaving.pop_back();
@@ -339,11 +362,13 @@ void PagePool::State::bring(const Loaded& next, uint32_t s) {
     Bundle& bundle = bundles[next.bundle];
     Page& page = bundle.pages[next.page];
     const auto row = static_cast<int64_t>(first_slot_row + s * slot_rows);
-    slots[s] = {static_cast<int32_t>(next.bundle), next.page, frame + 1, frame + 1};
+    slots[s] = {static_cast<int32_t>(next.bundle), next.page};
+    uses.last_needed[s] = uses.last_used[s] = frame + 1;
+    uses.num_children[s] = 0;
     page.slot = static_cast<int32_t>(s);
     page.state = PageState::resident;
-    page.num_children = 0;
-    ++bundle.pages[page.parent].num_children;
+    const int32_t above = bundle.pages[page.parent].slot;
+    if (above >= 0) ++uses.num_children[above];
     bundle.shift[next.page] = row - bundle.source->first_row(next.page);
     changes.push_back({next.bundle, next.page, row, next.block});
     taken.push_back(next.block);
@@ -478,7 +503,8 @@ void PagePool::note_needs(uint32_t frame, Span<const PageRequest> needs, size_t 
     }
     for (PageRequest& r : wanted) r.priority = state.page(r).priority;
     state.needed = state.missing;
-    for (const Slot& slot : state.slots) state.needed += slot.bundle >= 0 && slot.last_needed == frame + 1;
+    const std::vector<uint32_t>& needed = state.uses.last_needed;
+    state.needed += std::count(needed.begin(), needed.end(), frame + 1);
     state.choose_pages(wanted);
     if (adapts) state.adapt_tolerance(tolerance_px2);
 }
