@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <functional>
 #include <stdexcept>
 #include <thread>
 #include <utility>
@@ -20,7 +21,7 @@ constexpr double kRoomyShare = 0.7;
 // A page above one that is asked for is more urgent by so much.
 constexpr float kAbove = 2.0f;
 constexpr int kTries = 3;
-constexpr std::ptrdiff_t kMostLeaving = 4096;  // slots that make room before they are looked for again
+constexpr size_t kMostLeaving = 4096;  // slots that make room before they are looked for again
 
 enum class PageState : uint8_t { absent, loading, loaded, resident, failed };
 
@@ -52,6 +53,16 @@ struct SlotUses {
     void resize(size_t count) {
         for (auto* of_slots : {&last_needed, &last_used, &num_children}) of_slots->resize(count);
     }
+};
+
+// A slot that may go, as long as its page was not used again.
+struct Leaving {
+    uint32_t last_used, slot;
+
+    bool operator<(const Leaving& other) const {
+        return last_used != other.last_used ? last_used < other.last_used : slot < other.slot;
+    }
+    bool operator>(const Leaving& other) const { return other < *this; }
 };
 
 struct Loaded {
@@ -88,8 +99,9 @@ struct PagePool::State {
     float least_tolerance = 0;
     std::string error;
     bool is_damage = false;
-    // A heap of slots that may go, those first that were not used for longest; of many, the first.
-    std::vector<uint32_t> leaving;
+    // A heap, those first that were not used for longest. It lasts from frame to frame: what comes to be old
+    // meanwhile is younger than what it has.
+    std::vector<Leaving> leaving;
 
     Page& page(const PageRequest& r) { return bundles[r.bundle].pages[r.page]; }
     Page& page(const Loaded& l) { return bundles[l.bundle].pages[l.page]; }
@@ -105,8 +117,9 @@ struct PagePool::State {
     bool may_go(uint32_t slot) const {
         return is_old(uses.last_needed[slot]) && uses.num_children[slot] == 0;
     }
-    bool goes_later(uint32_t a, uint32_t b) const;
+    void add_leaving(uint32_t slot);
     void find_leaving();
+    bool has_leaving();
     int32_t block_above(const PageRequest& r) const;
     size_t ask(PageRequest r, std::vector<PageRequest>& wanted);
     void choose_pages(std::vector<PageRequest>& wanted);
@@ -321,40 +334,45 @@ void PagePool::State::evict(uint32_t s) {
     free_slots.push_back(s);
 }
 
-bool PagePool::State::goes_later(uint32_t a, uint32_t b) const {
-    return uses.last_used[a] != uses.last_used[b] ? uses.last_used[a] > uses.last_used[b] : a > b;
+void PagePool::State::add_leaving(uint32_t s) {
+    leaving.push_back({uses.last_used[s], s});
+    std::push_heap(leaving.begin(), leaving.end(), std::greater<>());
 }
 
 // Where no slot is free.
 void PagePool::State::find_leaving() {
     for (uint32_t s = 0; s < slots.size(); ++s)
-        if (may_go(s)) leaving.push_back(s);
-    if (leaving.size() > static_cast<size_t>(kMostLeaving)) {
-        std::nth_element(leaving.begin(), leaving.begin() + kMostLeaving, leaving.end(),
-                         [this](uint32_t a, uint32_t b) { return goes_later(b, a); });
+        if (may_go(s)) leaving.push_back({uses.last_used[s], s});
+    if (leaving.size() > kMostLeaving) {
+        std::nth_element(leaving.begin(), leaving.begin() + kMostLeaving, leaving.end());
         leaving.resize(kMostLeaving);
     }
-    std::make_heap(leaving.begin(), leaving.end(),
-                   [this](uint32_t a, uint32_t b) { return goes_later(a, b); });
+    std::make_heap(leaving.begin(), leaving.end(), std::greater<>());
 }
 
-// Sees to it that there is a free slot, for a page that the cut misses or one that it nearly does. `leaving`
-// is empty before the first page of a frame.
+// Whether the first of the heap may go; those that were used again are dropped.
+bool PagePool::State::has_leaving() {
+    while (!leaving.empty()) {
+        const Leaving& first = leaving.front();
+        if (uses.last_used[first.slot] == first.last_used && may_go(first.slot)) return true;
+        std::pop_heap(leaving.begin(), leaving.end(), std::greater<>());
+        leaving.pop_back();
+    }
+    return false;
+}
+
+// Sees to it that there is a free slot, for a page that the cut misses or one that it nearly does.
 bool PagePool::State::make_room(bool is_missed) {
     if (!free_slots.empty()) return true;
-    const auto is_newer = [this](uint32_t a, uint32_t b) { return goes_later(a, b); };
-    if (leaving.empty()) find_leaving();
-    if (leaving.empty() || (!is_missed && !is_old(uses.last_used[leaving.front()]))) return false;
-    std::pop_heap(leaving.begin(), leaving.end(), is_newer);
-    const uint32_t s = leaving.back();
+    if (!has_leaving()) find_leaving();
+    if (leaving.empty() || (!is_missed && !is_old(leaving.front().last_used))) return false;
+    std::pop_heap(leaving.begin(), leaving.end(), std::greater<>());
+    const uint32_t s = leaving.back().slot;
     leaving.pop_back();
     const Bundle& bundle = bundles[slots[s].bundle];
     const int32_t above = bundle.pages[bundle.pages[slots[s].page].parent].slot;
     evict(s);
-    if (above >= 0 && may_go(above)) {
-        leaving.push_back(static_cast<uint32_t>(above));
-        std::push_heap(leaving.begin(), leaving.end(), is_newer);
-    }
+    if (above >= 0 && may_go(above)) add_leaving(above);
     return true;
 }
 
@@ -384,7 +402,6 @@ void PagePool::State::bring_loaded(bool is_bounded) {
         if (x.priority != y.priority) return x.priority > y.priority;
         return a.bundle != b.bundle ? a.bundle < b.bundle : a.page < b.page;
     });
-    leaving.clear();
     size_t bytes = 0;
     std::vector<Loaded> left;
     for (const Loaded& next : loaded) {
