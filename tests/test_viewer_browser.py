@@ -420,7 +420,7 @@ def test_dropped_file_is_shown(tab, tmp_path):
     tab.page.wait_for_selector("#panel h1:text-is('few')", timeout=1000 * SECONDS)
     tab.page.wait_for_timeout(900)  # until the camera is there
     assert tab.settled().max() > 60
-    assert tab.figure("selected") == tab.figure("in view") == 300
+    assert tab.figure("selected") == tab.figure("in the frustum") == 300
 
 
 def test_photographs_lie_over_the_picture_of_their_camera(browser, site, tmp_path):

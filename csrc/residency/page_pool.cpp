@@ -128,10 +128,12 @@ struct PagePool::State {
     bool make_room(bool is_missed);
     void bring(const Loaded& next, uint32_t slot);
     void bring_loaded(bool is_bounded);
-    void check_process() const {
+    // A thread that another process has may hold the lock for ever in this one.
+    std::unique_lock<std::mutex> locked() const {
         if (getpid() != process)
             throw std::runtime_error(
                 "memory: expected a renderer of this process, got one from before a fork; make another");
+        return std::unique_lock<std::mutex>(busy);
     }
 };
 
@@ -485,20 +487,19 @@ size_t PagePool::most_bytes_on_their_way() const { return state_->most_bytes; }
 
 const std::vector<PageChange>& PagePool::begin_frame(bool is_bounded) {
     State& state = *state_;
-    state.check_process();
-    const std::lock_guard<std::mutex> lock(state.busy);
+    const auto lock = state.locked();
     if (++state.frame > 1) state.changes.clear();
     state.bring_loaded(is_bounded);
     return state.changes;
 }
 
 std::vector<unsigned char*> PagePool::take_blocks() {
-    const std::lock_guard<std::mutex> lock(state_->busy);
+    const auto lock = state_->locked();
     return std::exchange(state_->taken, {});
 }
 
 void PagePool::give_back(const std::vector<unsigned char*>& blocks) {
-    const std::lock_guard<std::mutex> lock(state_->busy);
+    const auto lock = state_->locked();
     state_->free_blocks.insert(state_->free_blocks.end(), blocks.begin(), blocks.end());
     state_->to_read.notify_all();
 }
@@ -508,7 +509,7 @@ void PagePool::release() { give_back(take_blocks()); }
 void PagePool::note_needs(uint32_t frame, Span<const PageRequest> needs, size_t num_left_out,
                           float tolerance_px2, bool adapts) {
     State& state = *state_;
-    const std::lock_guard<std::mutex> lock(state.busy);
+    const auto lock = state.locked();
     state.noted = frame;
     std::vector<PageRequest> wanted;
     state.missing = num_left_out;
@@ -527,21 +528,20 @@ void PagePool::note_needs(uint32_t frame, Span<const PageRequest> needs, size_t 
 }
 
 bool PagePool::raise_tolerance_at_once(float tolerance_px2) {
-    const std::lock_guard<std::mutex> lock(state_->busy);
+    const auto lock = state_->locked();
     if (state_->needed <= state_->slots.size()) return false;
     state_->least_tolerance = std::max(tolerance_px2, 1e-6f) * kToleranceLeap;
     return true;
 }
 
 void PagePool::reset_tolerance() {
-    const std::lock_guard<std::mutex> lock(state_->busy);
+    const auto lock = state_->locked();
     state_->least_tolerance = 0;
 }
 
 bool PagePool::wait(double seconds) {
     State& state = *state_;
-    state.check_process();
-    std::unique_lock<std::mutex> lock(state.busy);
+    auto lock = state.locked();
     state.has_read.wait_for(lock, std::chrono::duration<double>(seconds), [&] {
         return state.free_blocks.empty() || (state.todo.empty() && state.num_loading == 0);
     });
@@ -549,13 +549,13 @@ bool PagePool::wait(double seconds) {
 }
 
 bool PagePool::read_one() {
-    std::unique_lock<std::mutex> lock(state_->busy);
+    auto lock = state_->locked();
     return state_->read_next(lock);
 }
 
 void PagePool::forget_failures() {
     State& state = *state_;
-    const std::lock_guard<std::mutex> lock(state.busy);
+    const auto lock = state.locked();
     if (state.failed == 0) return;
     for (Bundle& bundle : state.bundles)
         for (Page& page : bundle.pages)
@@ -566,7 +566,7 @@ void PagePool::forget_failures() {
 
 PoolStatus PagePool::status() const {
     const State& state = *state_;
-    const std::lock_guard<std::mutex> lock(state.busy);
+    const auto lock = state.locked();
     return {state.slots.size(), state.slots.size() - state.free_slots.size(),
             state.needed,       state.missing,
             state.failed,       state.pages_in,

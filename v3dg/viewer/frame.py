@@ -211,7 +211,7 @@ class SceneView:
     def _shown(
         self, cut: Selection, camera: Camera, window: Window, settings: Settings, stop: _core.Stop | None
     ) -> tuple[npt.NDArray[np.float32], tuple[float, float] | None, int, float | None]:
-        """The window's colours, the values of the darkest and brightest, gaussians in view, the distance."""
+        """Colours of the window, values of darkest and brightest, gaussians in the frustum, the distance."""
         shows = settings.shows
         if shows == "count":
             count, in_view = self._count(cut, camera, window, stop)
@@ -240,7 +240,7 @@ class SceneView:
     def _draw(
         self, cut: Selection, camera: Camera, window: Window, color_by: ColorBy, stop: _core.Stop | None
     ) -> tuple[Any, Any, Any, int]:
-        """Colour, alpha and depth of the window, and the gaussians in view of the whole picture."""
+        """Colour, alpha and depth of the window, and the gaussians in the frustum of the whole picture."""
         if self.device.is_cuda:
             image = render(self.scene, camera, cut=cut, color_by=color_by, device=self.device)
             x0, y0, x1, y1 = window
