@@ -77,15 +77,14 @@ class Program:
         """Run one command, by default the one this program was started with, and return its exit code."""
         if arguments is None:
             warnings.showwarning = _warn
-        code = self._run(arguments)
+        code = 0
         try:
-            sys.stdout.flush()
-        except OSError as error:
-            # Python flushes once more at its end, and has to find a place for it.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            # Where the reader of our output has gone, nobody is left to tell.
-            is_to_tell = code == 0 and not isinstance(error, BrokenPipeError)
-            code = _fail(f"stdout: {error.strerror}", 1) if is_to_tell else code or 1
+            code = self._run(arguments)
+            code = _flush(code)
+        except KeyboardInterrupt:  # when the command was over, or had been interrupted before
+            if arguments is not None:
+                raise
+            code = code or _fail("interrupted", INTERRUPTED)
         if arguments is None:
             for number in _start.SIGNALS:  # what was to be done is done
                 signal.signal(number, signal.SIG_IGN)
@@ -128,6 +127,19 @@ def _set_threads(threads: int | None) -> None:
         # Until the next process is ready to hear Ctrl-C, it waits.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+
+def _flush(code: int) -> int:
+    """Write out what was printed; the exit code, which says if that fails."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        # Python flushes once more at its end, and has to find a place for it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # Where the reader of our output has gone, nobody is left to tell.
+        is_to_tell = code == 0 and not isinstance(error, BrokenPipeError)
+        code = _fail(f"stdout: {error.strerror}", 1) if is_to_tell else code or 1
+    return code
 
 
 def _fail(message: str, code: int) -> int:
