@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
-
+from benchmarks.evaluation.measure import time_ms
 from benchmarks.evaluation.record import write
 from v3dg import Bundle, Camera, Renderer, StereoCamera, read_scene
 
@@ -67,24 +63,10 @@ def measure(renderer: Renderer, stereo: StereoCamera, tolerance: float, repeats:
         return [renderer.render(eye, tolerance=tolerance).color for eye in stereo.eyes]
 
     return {
-        "one_frame_ms": _milliseconds(one_frame, repeats),
-        "two_frames_ms": _milliseconds(two_frames, repeats),
+        "one_frame_ms": round(time_ms(one_frame, "cuda", repeats).median, 3),
+        "two_frames_ms": round(time_ms(two_frames, "cuda", repeats).median, 3),
         "gaussians": renderer.render(stereo, tolerance=tolerance)[0].stats.gaussians_selected,
     }
-
-
-def _milliseconds(draw: Callable[[], Any], repeats: int) -> float:
-    """The median, of an idle device."""
-    for _ in range(3):
-        draw()
-    seconds = []
-    for _ in range(repeats):
-        torch.cuda.synchronize()
-        start = time.perf_counter()
-        draw()
-        torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - start)
-    return round(1e3 * statistics.median(seconds), 3)
 
 
 if __name__ == "__main__":

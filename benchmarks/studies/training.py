@@ -7,7 +7,6 @@ the two, and compared on pictures that were held out. Needs a GPU, and gsplat 1.
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -20,11 +19,13 @@ import torch
 from torch.nn.functional import conv2d
 
 import v3dg
+from benchmarks.evaluation.measure import time_ms
 from benchmarks.evaluation.record import write
 from benchmarks.studies.peers_scenes import random as random_scene
 from v3dg.compat.gsplat import rasterization
 
 _DRAWN_BY: dict[str, Callable[..., Any]] = {"v3dg": rasterization, "gsplat": gsplat.rasterization}
+_REPEATS = 31  # of a step that is timed
 _SIDE = 512  # px of a training picture
 _STEP = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 
@@ -83,23 +84,10 @@ def times(count: int, num_cameras: int) -> list[dict[str, Any]]:
             ((picture() - target) ** 2).mean().backward()
 
         with torch.no_grad():
-            forward = milliseconds(picture)
-        row = {"gaussians": count, "cameras": num_cameras, "drawn_by": name, "forward_ms": forward}
-        rows.append(row | {"both_ms": milliseconds(gradients)})
+            forward = time_ms(picture, "cuda", _REPEATS).median
+        row = {"gaussians": count, "cameras": num_cameras, "drawn_by": name, "forward_ms": round(forward, 3)}
+        rows.append(row | {"both_ms": round(time_ms(gradients, "cuda", _REPEATS).median, 3)})
     return rows
-
-
-def milliseconds(run: Callable[[], Any]) -> float:
-    for _ in range(5):
-        run()
-    seconds = []
-    for _ in range(31):
-        torch.cuda.synchronize()
-        start = time.perf_counter()
-        run()
-        torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - start)
-    return round(1e3 * statistics.median(seconds), 3)
 
 
 class Views:
