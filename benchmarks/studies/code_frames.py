@@ -34,6 +34,8 @@ class Config:
     """Further assets, each as NAME=FILE."""
     rounds: int = 30
     """Frames of each kind at each view."""
+    decodes_once: bool = False
+    """Decode small bundles once, as renderers do; else all are drawn from codes."""
 
 
 def memory():
@@ -148,6 +150,8 @@ def views_of(gaussians):
 
 
 def main(config):
+    if not config.decodes_once:
+        v3dg.residency.MOST_DECODED_BYTES = 0
     donut = v3dg.read_asset(config.asset)
     kinds = kinds_of(donut)
     report = {
