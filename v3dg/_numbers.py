@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 import os
-from typing import Any, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +44,8 @@ def vector(values: Any, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
 
 def color(values: Any, name: str) -> list[float]:
     """Three numbers that the core can hold."""
+    if type(values) is tuple and len(values) == 3 and all(type(v) is float and 0 <= v <= 1 for v in values):
+        return list(values)  # of every frame, and quickly
     array = vector(values, name)
     largest = np.abs(array).max()
     check(name, largest <= MOST_FLOAT, f"numbers that a float32 can hold, got {largest}")
@@ -60,7 +62,8 @@ def real(
         number = math.inf if value > 0 else -math.inf
     except (TypeError, ValueError, RuntimeError):
         number = math.nan
-    check(name, least <= number <= most, f"{what}, got {shown(value)}")
+    if not least <= number <= most:
+        refuse(name, f"{what}, got {shown(value)}")
     return number
 
 
@@ -75,15 +78,20 @@ def whole(value: Any, name: str, what: str, least: int, most: int = MOST_INT) ->
         number = least - 1 if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = least - 1
-    check(name, number >= least, f"{what}, got {shown(value)}")
-    check(name, number <= most, f"at most {most}, got {shown(value)}")
+    if not least <= number <= most:
+        refuse(name, f"{what if number < least else f'at most {most}'}, got {shown(value)}")
     return number
 
 
 def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
     """Raise ValueError, which names the value and says what was expected and found, unless it holds."""
     if not holds:
-        raise ValueError(f"{os.fspath(name)}: expected {expected}")
+        refuse(name, expected)
+
+
+def refuse(name: str | os.PathLike[str], expected: str) -> NoReturn:
+    """Raise the ValueError of `check`, whose message is then not made in vain."""
+    raise ValueError(f"{os.fspath(name)}: expected {expected}")
 
 
 def check_type(name: str, value: object, kind: type, expected: str) -> None:
@@ -105,8 +113,8 @@ def check_all(name: str, values: npt.NDArray[Any], good: npt.NDArray[np.bool_], 
 
 def one_of(value: Any, name: str, choices: tuple[str, ...]) -> None:
     """Raise ValueError unless it is one of these texts."""
-    is_one = isinstance(value, str) and value in choices
-    check(name, is_one, f"{' or '.join(map(repr, choices))}, got {shown(value)}")
+    if not (isinstance(value, str) and value in choices):
+        refuse(name, f"{' or '.join(map(repr, choices))}, got {shown(value)}")
 
 
 def shown(value: Any) -> str:

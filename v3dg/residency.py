@@ -120,14 +120,13 @@ class Residency:
         with self.lock:
             resident = self._once(subject, ("scene", device), lambda: ResidentScene(device))
             is_new = resident.revision[0] < 0
-            if not is_new and isinstance(subject, Bundle):
+            if not is_new and (isinstance(subject, Bundle) or resident.revision == subject.revision):
                 return resident  # a bundle stays as it is
             scene = copy.copy(Scene.of(subject))
-            if resident.revision != scene.revision:
-                if not is_new and not device.is_cuda:
-                    resident = ResidentScene(device)
-                resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
-                self._kept[subject]["scene", device] = resident
+            if not is_new and not device.is_cuda:
+                resident = ResidentScene(device)
+            resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
+            self._kept[subject]["scene", device] = resident
             return resident
 
     @contextmanager

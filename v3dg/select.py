@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import MOST_FLOAT, check, one_of, real, vector, whole
+from v3dg._numbers import MOST_FLOAT, check, one_of, real, refuse, vector, whole
 from v3dg.bundle import Bundle, Clusters
 from v3dg.cameras import Camera, StereoCamera, VectorLike, check_camera
 from v3dg.gaussians import Gaussians
@@ -269,8 +269,9 @@ def rule_of(
         budget = whole(budget, "budget", "0 gaussians or more", 0, most=(1 << 63) - 1)
     one_of(footprint, "footprint", get_args(Footprint))
     factor = 1.0 if fade is None else real(fade, "fade", "None or a factor of 1 to 1000", 1, 1000)
-    expected = "None with the paper's footprint, which can decrease towards the root"
-    check("fade", factor == 1 or footprint != "paper", f"{expected}, got {factor:g}")
+    if factor != 1 and footprint == "paper":
+        expected = "None with the paper's footprint, which can decrease towards the root"
+        refuse("fade", f"{expected}, got {factor:g}")
     return _core.Rule(
         tolerance_px2=tolerance if tolerance == np.inf else min(tolerance, MOST_FLOAT),
         budget=budget,
