@@ -110,6 +110,22 @@ min_radius: float
 
 def num_halvings(count: int, cluster_size: int) -> int: ...
 def median_split(means: Array, offset: Int64, depth: int) -> tuple[Array, Int64]: ...
+def check_tables(
+    offset: Int64,
+    level: Int32,
+    own_group: Int32,
+    parent_group: Int32,
+    box: Float32,
+    filter_px2: Float32,
+    antialiased: Uint8,
+    ball: Float32,
+    weight: Float32,
+    parent: Int32,
+    group_level: Int32,
+    error: Float32,
+    *,
+    num_gaussians: int,
+) -> None: ...
 def bound_spheres(spheres: Array, offset: Int64) -> Array: ...
 def bound_by_boxes(gaussians: Rows, offset: Int64) -> Array: ...
 

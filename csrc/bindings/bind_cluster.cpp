@@ -1,8 +1,10 @@
 #include <cmath>
+#include <map>
 
 #include "bindings/operations.h"
 #include "bindings/types.h"
 #include "cluster/box.h"
+#include "cluster/check_tables.h"
 #include "cluster/cluster.h"
 
 namespace v3dg {
@@ -71,6 +73,53 @@ py::object bound_by_boxes(const Rows& gaussians, const py::array& offset) {
     return box.object;
 }
 
+void check_bundle_tables(const py::array& offset, const py::array& level, const py::array& own_group,
+                         const py::array& parent_group, const py::array& box, const py::array& filter_px2,
+                         const py::array& antialiased, const py::array& ball, const py::array& weight,
+                         const py::array& parent, const py::array& group_level, const py::array& error,
+                         int64_t num_gaussians) {
+    const py::ssize_t c = level.size(), g = parent.size();
+    const Span<const float> boxes = span_of<const float>(box, "clusters.box", {c, 2, 3}),
+                            balls = span_of<const float>(ball, "groups.ball", {g, 4});
+    const GivenTables tables{span_of<const int64_t>(offset, "clusters.offset", {c + 1}),
+                             span_of<const int32_t>(level, "clusters.level", {c}),
+                             span_of<const int32_t>(own_group, "clusters.own_group", {c}),
+                             span_of<const int32_t>(parent_group, "clusters.parent_group", {c}),
+                             {reinterpret_cast<const Box*>(boxes.data), static_cast<size_t>(c)},
+                             span_of<const float>(filter_px2, "clusters.filter_px2", {c}),
+                             span_of<const uint8_t>(antialiased, "clusters.antialiased", {c}),
+                             {reinterpret_cast<const Ball*>(balls.data), static_cast<size_t>(g)},
+                             span_of<const float>(weight, "groups.weight", {g}),
+                             span_of<const int32_t>(parent, "groups.parent", {g}),
+                             span_of<const int32_t>(group_level, "groups.level", {g}),
+                             span_of<const float>(error, "groups.error", {g, 2})};
+    try {
+        const py::gil_scoped_release unlocked;
+        check_tables(tables, num_gaussians);
+    } catch (const TableFault& fault) {
+        const std::map<std::string, py::array> arrays = {
+            {"clusters.offset", offset},
+            {"clusters.level", level},
+            {"clusters.own_group", own_group},
+            {"clusters.parent_group", parent_group},
+            {"clusters.box", box},
+            {"clusters.filter_px2", filter_px2},
+            {"clusters.antialiased", antialiased},
+            {"groups.ball", ball},
+            {"groups.weight", weight},
+            {"groups.parent", parent},
+            {"groups.level", group_level},
+            {"groups.error", error},
+        };
+        const auto found = arrays.find(fault.table);
+        const py::int_ row(fault.row);
+        const py::object got = found == arrays.end() ? py::object(row) : found->second[row].attr("tolist")();
+        const py::str message =
+            py::str("{}[{}]: expected {}, got {}").format(fault.table, row, fault.expected, got);
+        throw py::value_error(message.cast<std::string>());
+    }
+}
+
 }  // namespace
 
 void bind_cluster(py::module_& m) {
@@ -84,6 +133,10 @@ void bind_cluster(py::module_& m) {
         "is on the host).");
     m.def("bound_spheres", &bound_spheres, "spheres"_a, "offset"_a,
           "Ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps balls nested.");
+    m.def("check_tables", &check_bundle_tables, "offset"_a, "level"_a, "own_group"_a, "parent_group"_a,
+          "box"_a, "filter_px2"_a, "antialiased"_a, "ball"_a, "weight"_a, "parent"_a, "group_level"_a,
+          "error"_a, py::kw_only(), "num_gaussians"_a,
+          "Raise ValueError unless the tables of a bundle fit each other, and its cuts will be exact.");
     m.def("bound_by_boxes", &bound_by_boxes, "gaussians"_a, "offset"_a,
           "Lower and upper corner of what each cluster draws: (C, 2, 3).");
 }

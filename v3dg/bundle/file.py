@@ -24,7 +24,7 @@ from v3dg.bundle import format as file_format
 from v3dg.bundle.codec import CODECS, Codec
 from v3dg.bundle.format import DTYPES, HASH_BYTES, entries_of, page_hash, page_tables, schema_of
 from v3dg.bundle.pages import DAMAGED, PageLayout, PageRun, on_threads, runs_of_pages
-from v3dg.bundle.tables import Clusters, Groups, check_tables
+from v3dg.bundle.tables import Clusters, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
 _BYTES_PER_TASK = 16 << 20
@@ -54,9 +54,7 @@ class BundlePlan:
     ) -> None:
         """Write the tables, which are checked, behind the pages; those have these hashes, (P, 16)."""
         check_tables(clusters, groups, int(self.layout.first_gaussian[-1]))
-        tables = self._page_tables | {"pages.hash": hashes}
-        for prefix, part in (("clusters", clusters), ("groups", groups)):
-            tables |= {f"{prefix}.{name}": array for name, array in vars(part).items()}
+        tables = self._page_tables | columns_of(clusters, groups) | {"pages.hash": hashes}
         schema = schema_of(self.codec.version)
         end = b"".join(tables[name].astype(DTYPES[kind], copy=False).tobytes() for name, kind, _, _ in schema)
         end += hashlib.blake2b(self.header + end, digest_size=HASH_BYTES).digest()

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg._numbers import check, check_all, check_type
+from v3dg import _core
+from v3dg._numbers import check, check_type
 from v3dg.bundle.format import DTYPES, SCHEMA
 
-NESTING_MARGIN = 4e-6
+NESTING_MARGIN = _core.nesting_margin
 """A group's ball contains the balls of the groups below it with this relative margin; see docs/format.md."""
-
-_MIN_RADIUS = 1e-15  # its square is a normal float32 number
-_ROUNDING = 1e-9  # two ways to compute the same double need not agree to the last bit
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,99 +95,13 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
             object.__setattr__(part, name.removeprefix(prefix), own)
 
 
-def _ascends(values: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which rows are at least all before them."""
-    return np.asarray(values >= np.maximum.accumulate(values))
+def columns_of(clusters: Clusters, groups: Groups) -> dict[str, NDArray[Any]]:
+    """All tables, by the names that files have for them."""
+    parts = {"clusters": clusters, "groups": groups}
+    return {f"{part}.{name}": array for part, of in parts.items() for name, array in vars(of).items()}
 
 
 def check_tables(clusters: Clusters, groups: Groups, num_gaussians: int) -> None:
     """Raise ValueError unless the tables fit each other and the gaussians, and the cut will be exact."""
-    _check_offsets(clusters, num_gaussians)
-    _check_tree(clusters, groups)
-    _check_values(clusters, groups)
-    _check_nesting(groups)
-
-
-def _check_offsets(clusters: Clusters, num_gaussians: int) -> None:
-    offset, level = clusters.offset, clusters.level
     check("clusters", len(clusters) < 1 << 31, f"fewer than 2^31, got {len(clusters)}")
-    check("clusters.offset[0]", offset[0] == 0, f"0, got {offset[0]}")
-    check_all("clusters.offset", offset, _ascends(offset), "offsets that never decrease")
-    check("clusters.offset[-1]", offset[-1] == num_gaussians, f"{num_gaussians} gaussians, got {offset[-1]}")
-    first = level[0] if len(level) else 0
-    check("clusters.level[0]", first == 0, f"0, got {first}")
-    step = np.diff(level.astype(np.int64), prepend=level[:1])
-    check_all("clusters.level", level, (step == 0) | (step == 1), "the level before, or one more")
-
-
-def _check_tree(clusters: Clusters, groups: Groups) -> None:
-    """Every group replaces the clusters of one page and makes clusters of the next level for one parent."""
-    num_groups = len(groups)
-    level = clusters.level.astype(np.int64)
-    last_level = level[-1] if len(level) else 0
-    own, parent = clusters.own_group.astype(np.int64), clusters.parent_group.astype(np.int64)
-    group_level, group_parent = groups.level.astype(np.int64), groups.parent.astype(np.int64)
-
-    def check_links(name: str, links: Any, expect_none: Any, link_level: Any) -> None:
-        inside = (links >= 0) & (links < num_groups)
-        found = np.append(group_level, 0)[np.where(inside, links, -1)]
-        good = np.where(expect_none, links == -1, inside & (found == link_level))
-        check_all(
-            name, links, good, lambda i: "-1" if expect_none[i] else f"a group of level {link_level[i]}"
-        )
-
-    check_links("clusters.own_group", own, level == 0, level)
-    check_links("clusters.parent_group", parent, level == last_level, level + 1)
-    is_coarse = (group_level >= 1) & (group_level <= last_level)
-    check_all("groups.level", group_level, is_coarse, f"1 to {last_level}")
-    check_links("groups.parent", group_parent, group_level == last_level, group_level + 1)
-
-    # The last level's clusters count as having a parent of their own past the others.
-    order = np.where(level == last_level, num_groups, parent)
-    expected = "parents in ascending order, so that groups are in the order of the clusters they replace"
-    check_all("clusters.parent_group", parent, _ascends(order), expected)
-    for name, links in (("own_group", own), ("parent_group", parent)):
-        num_clusters = np.bincount(links[links >= 0], minlength=num_groups)
-        check_all("groups", np.arange(num_groups), num_clusters > 0, f"a cluster with it as {name}")
-    of_own = np.where(own >= 0, np.append(group_parent, -1)[own], parent)
-    agree = parent == of_own
-    check_all("clusters.parent_group", parent, agree, lambda c: f"{of_own[c]}, its own group's parent")
-
-
-def _check_values(clusters: Clusters, groups: Groups) -> None:
-    box = clusters.box
-    filled = clusters.offset[1:] > clusters.offset[:-1]
-    check_all("clusters.box", box, np.isfinite(box), "finite numbers")
-    ordered = (box[:, 0] <= box[:, 1]).all(1) | ~filled
-    check_all("clusters.box", box, ordered, "a lower corner not above the upper")
-    filter_px2 = clusters.filter_px2
-    check_all("clusters.filter_px2", filter_px2, np.isfinite(filter_px2) & (filter_px2 >= 0), "0 or more")
-    check_all("clusters.antialiased", clusters.antialiased, clusters.antialiased <= 1, "0 or 1")
-    ball, weight = groups.ball, groups.weight
-    check_all("groups.ball", ball, np.isfinite(ball), "finite numbers")
-    is_wide = ball[:, 3] >= np.float32(_MIN_RADIUS)
-    check_all("groups.ball", ball, is_wide, f"a radius of {_MIN_RADIUS} or more")
-    check_all("groups.weight", weight, np.isfinite(weight) & (weight > 0), "a positive number")
-    bad_error = (groups.error < 0) | np.isinf(groups.error)
-    check_all("groups.error", groups.error, ~bad_error, "0 or more, or not a number where unknown")
-
-
-def _check_nesting(groups: Groups) -> None:
-    """Ball and weight contain those below, so the metric never decreases towards the root."""
-    below = np.flatnonzero(groups.parent >= 0)
-    above = groups.parent[below]
-    ball = groups.ball.astype(np.float64)
-    needed = np.zeros(len(groups))
-    distance = np.sqrt(np.square(ball[below, :3] - ball[above, :3]).sum(1))
-    needed[below] = (distance + ball[below, 3]) * (1 + NESTING_MARGIN)
-    held = np.ones(len(groups), bool)
-    held[below] = ball[above, 3] >= needed[below] * (1 - _ROUNDING)
-
-    def expected(g: int) -> str:
-        radius = f"whose radius must be at least {needed[g]:.9g}"
-        return f"a ball inside that of group {groups.parent[g]}, {radius}"
-
-    check_all("groups.ball", groups.ball, held, expected)
-    heavier = np.ones(len(groups), bool)
-    heavier[below] = groups.weight[above] >= groups.weight[below]
-    check_all("groups.weight", groups.weight, heavier, "at most the weight of the group above")
+    _core.check_tables(*columns_of(clusters, groups).values(), num_gaussians=num_gaussians)

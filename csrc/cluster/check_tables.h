@@ -1,0 +1,40 @@
+// Whether the tables of a bundle fit each other, and guarantee that every cut of them is exact.
+#pragma once
+
+#include <cstdint>
+#include <string>
+
+#include "base/span.h"
+#include "math/bounds.h"
+
+namespace v3dg {
+
+// C clusters, by level, then by parent group; G groups, in the order of the clusters that they replace.
+// Group -1 is none.
+struct GivenTables {
+    Span<const int64_t> offset;        // [C + 1]
+    Span<const int32_t> level;         // [C]
+    Span<const int32_t> own_group;     // [C]
+    Span<const int32_t> parent_group;  // [C]
+    Span<const Box> box;               // [C]
+    Span<const float> filter_px2;      // [C]
+    Span<const uint8_t> antialiased;   // [C]
+    Span<const Ball> ball;             // [G]
+    Span<const float> weight;          // [G]
+    Span<const int32_t> parent;        // [G]
+    Span<const int32_t> group_level;   // [G]
+    Span<const float> error;           // [G * 2]
+};
+
+// What is thrown for the first row that is wrong; row -1 is the last.
+struct TableFault {
+    std::string table;  // as files have it; "groups" for a group that clusters lack
+    int64_t row;
+    std::string expected;
+};
+
+// Nothing in the tables is believed. A group's ball and weight have to contain those below, so that the
+// metric never decreases towards the root.
+void check_tables(const GivenTables& tables, int64_t num_gaussians);
+
+}  // namespace v3dg
