@@ -94,6 +94,9 @@ class PlyFile:
     def sh_degree(self) -> int: ...
     def read(self, first: int, last: int) -> tuple[Float32, Float32, Float32, Float32, Float32]: ...
 
+def ply_header(
+    path: str | PathLike[str],
+) -> tuple[str, int, list[tuple[str, int, list[tuple[str, str]]]]]: ...
 def ply_write(
     path: str | PathLike[str],
     means: Float32,

@@ -10,6 +10,13 @@ namespace v3dg {
 
 namespace {
 
+// A name as text that can be shown; bytes that are no ASCII become question marks.
+std::string printable(std::string name) {
+    for (char& c : name)
+        if (c < ' ' || c > '~') c = '?';
+    return name;
+}
+
 // The name of a file as the system wants it, and as messages show it.
 struct Path {
     explicit Path(py::object path) : shown(path) {
@@ -70,10 +77,27 @@ class BoundPlyFile {
     PlyPlace next_;
 };
 
+constexpr const char* kEncodings[] = {"ascii", "binary_little_endian", "binary_big_endian"};
+constexpr const char* kTypes[] = {"char", "uchar", "short", "ushort", "int", "uint", "float", "double"};
+
+py::tuple ply_header(const py::object& path) {
+    const PlyHeader header =
+        with_path(Path(path), [](const char* name) { return read_ply_header(open_ply_file(name)); });
+    py::list elements;
+    for (const PlyElement& element : header.elements) {
+        py::list properties;
+        for (const PlyProperty& property : element.properties) {
+            const char* type = property.is_list ? "list" : kTypes[static_cast<size_t>(property.type)];
+            properties.append(py::make_tuple(printable(property.name), type));
+        }
+        elements.append(py::make_tuple(printable(element.name), element.count, properties));
+    }
+    return py::make_tuple(kEncodings[static_cast<size_t>(header.encoding)], header.size, elements);
+}
+
 PlyEncoding encoding_of(const std::string& name) {
-    if (name == "ascii") return PlyEncoding::ascii;
-    if (name == "binary_little_endian") return PlyEncoding::binary_little_endian;
-    if (name == "binary_big_endian") return PlyEncoding::binary_big_endian;
+    for (size_t i = 0; i < std::size(kEncodings); ++i)
+        if (name == kEncodings[i]) return static_cast<PlyEncoding>(i);
     throw py::value_error("encoding: expected binary_little_endian, binary_big_endian or ascii, got " +
                           quoted(name));
 }
@@ -101,6 +125,8 @@ void bind_ply(py::module_& m) {
         .def_property_readonly("num_gaussians", &BoundPlyFile::num_gaussians)
         .def_property_readonly("sh_degree", &BoundPlyFile::sh_degree)
         .def("read", &BoundPlyFile::read, "first"_a, "last"_a);
+    m.def("ply_header", &ply_header, "path"_a,
+          "Encoding, bytes of the header, and elements: name, count, and properties' names and types.");
     m.def("ply_write", ply_write, "path"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh"_a,
           "encoding"_a);
 }

@@ -48,6 +48,9 @@ struct PlyHeader {
     size_t size = 0;  // bytes, up to and with the line end of end_header
 };
 
+// Throws std::system_error, or PlyError for what is no regular file.
+PosixFile open_ply_file(const char* path);
+
 // Reads and checks the header; nothing in it is believed about the size of what follows.
 PlyHeader read_ply_header(const PosixFile& file);
 

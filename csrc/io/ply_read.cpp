@@ -494,13 +494,10 @@ PlyPlace read_text(const PlyFile& ply, PlyPlace at, const PlyGaussians<float>& o
 }  // namespace
 
 PlyFile open_ply(const char* path) {
-    PosixFile file = PosixFile::open(path);
-    const struct stat status = file.status();
-    if (S_ISDIR(status.st_mode)) throw std::system_error(EISDIR, std::generic_category());
-    if (!S_ISREG(status.st_mode)) throw PlyError("expected a regular file, got a device or a pipe");
-
+    PosixFile file = open_ply_file(path);
+    const auto size = static_cast<size_t>(file.status().st_size);
     const PlyHeader header = read_ply_header(file);
-    PlyFile ply = {std::move(file), static_cast<size_t>(status.st_size), header.encoding, {}, header.size, 1};
+    PlyFile ply = {std::move(file), size, header.encoding, {}, header.size, 1};
     const auto is_vertex = [](const PlyElement& element) { return element.name == "vertex"; };
     const auto num_found = std::count_if(header.elements.begin(), header.elements.end(), is_vertex);
     if (num_found != 1) throw PlyError("expected one element 'vertex', got " + std::to_string(num_found));

@@ -15,16 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _files
+from v3dg import _core, _files
 from v3dg.formats import _packing
 from v3dg.formats._asset_file import AssetFile, File
 from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
-from v3dg.formats._reading import Claims, Path, check
+from v3dg.formats._reading import Path, check
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256
-_MAX_HEADER = 1 << 16
-_PLY_TYPES = {"float": "<f4", "float32": "<f4", "uint": "<u4", "uint32": "<u4", "uchar": "u1", "uint8": "u1"}
+_PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
 # Where the fields of a word begin, and the largest value of each.
@@ -47,16 +46,6 @@ class _Element:
 
     def rows(self, file: File, first: int, last: int) -> NDArray[Any]:
         return file.rows(self.dtype, self.offset + first * self.dtype.itemsize, last - first)
-
-
-def is_compressed(path: Path) -> bool:
-    """Whether a `.ply` has packed positions. What is wrong with other files is for their reader to say."""
-    try:
-        with Claims().open(path) as file:
-            header = file.read(_MAX_HEADER).split(b"end_header", 1)[0]
-    except ValueError:  # a folder or a pipe
-        return False
-    return any(line.split()[-1:] == [b"packed_position"] for line in header.splitlines())
 
 
 def open_file(path: Path) -> AssetFile:
@@ -214,34 +203,17 @@ def _require(path: Path, shown: str, element: _Element, names: Sequence[str], ki
 def _elements(file: File) -> dict[str, _Element]:
     """Where the rows of each element are, as the header lists them."""
     path, given = file.path, file.num_bytes
-    start = file.rows(np.dtype(np.uint8), 0, min(_MAX_HEADER, given)).tobytes()
-    head, mark, _ = start.partition(b"end_header\n")
-    if not mark:
-        head, mark, _ = start.partition(b"end_header\r\n")
-    check(path, mark, f"end_header within the first {_MAX_HEADER} bytes, got none")
-    lines = head.decode("ascii", "replace").splitlines()
-    check(path, lines[:1] == ["ply"], "a first line 'ply'")
-    wanted = "format binary_little_endian 1.0"
-    check(path, wanted in lines, f"{wanted!r} in a compressed .ply, got another format")
-    elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
-    for line in lines:
-        words, shown = line.split(), f"{line[:60]!a}"
-        if words[:1] == ["element"]:
-            is_count = len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 12
-            is_new = is_count and words[1] not in elements
-            check(path, is_new, f"'element NAME COUNT', each once, got {shown}")
-            fields: list[tuple[str, str]] = []
-            elements[words[1]] = int(words[2]), fields
-        elif words[:1] == ["property"]:
-            is_known = len(words) == 3 and words[1] in _PLY_TYPES and elements
-            check(path, is_known, f"'property float|uint|uchar NAME', got {shown}")
-            fields.append((words[2], _PLY_TYPES[words[1]]))
+    encoding, offset, listed = _core.ply_header(path)
+    wanted = "'format binary_little_endian 1.0' in a compressed .ply"
+    check(path, encoding == "binary_little_endian", f"{wanted}, got {encoding}")
     found: dict[str, _Element] = {}
-    offset = len(head) + len(mark)
-    for name, (count, fields) in elements.items():
+    for name, count, fields in listed:
         shown = f"element {name[:40]!a}"
-        check(path, 0 < len(dict(fields)) == len(fields), f"properties of {shown}, each once")
-        dtype, left = np.dtype(fields), given - offset
+        other = next((kind for _, kind in fields if kind not in _PLY_TYPES), None)
+        check(path, other is None, f"'property float|uint|uchar NAME' in {shown}, got {other}")
+        is_clear = name not in found and 0 < len(dict(fields)) == len(fields)
+        check(path, is_clear, f"properties of {shown}, each once")
+        dtype, left = np.dtype([(field, _PLY_TYPES[kind]) for field, kind in fields]), given - offset
         wanted = f"{count} rows of {shown} with {dtype.itemsize} bytes each"
         check(path, count * dtype.itemsize <= left, f"{wanted}, got {left} bytes")
         found[name] = _Element(dtype, count, offset)

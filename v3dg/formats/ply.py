@@ -16,9 +16,11 @@ PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 
 def open_file(path: Path) -> AssetFile:
     """A `.ply` file; one that has packed positions as a compressed one, whatever its name."""
-    if compressed_ply.is_compressed(path):
+    name = os.fspath(path)
+    _, _, elements = _core.ply_header(name)
+    if any("packed_position" in dict(properties) for _, _, properties in elements):
         return compressed_ply.open_file(path)
-    file = _core.PlyFile(os.fspath(path))
+    file = _core.PlyFile(name)
     return AssetFile(
         path, file.num_gaussians, file.sh_degree, lambda first, last: Gaussians(*file.read(first, last))
     )
