@@ -6,6 +6,7 @@
 #include "cluster/box.h"
 #include "cluster/check_tables.h"
 #include "cluster/cluster.h"
+#include "cluster/morton.h"
 
 namespace v3dg {
 
@@ -43,6 +44,18 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
         V3DG_DISPATCH(work, median_split, points, offsets, depth, order.span, leaf_offset.span);
     }
     return py::make_tuple(order.object, leaf_offset.object);
+}
+
+py::object order_along_curve(const py::array& means) {
+    const auto values = span_of<const float>(means, "means", {-1, 3});
+    const Span<const Point> points{reinterpret_cast<const Point*>(values.data), values.size / 3};
+    check_finite(values);
+    const NewArray<int64_t> order({}, {static_cast<py::ssize_t>(points.size)});
+    {
+        const py::gil_scoped_release unlocked;
+        morton_order(points, order.span);
+    }
+    return order.object;
 }
 
 py::object bound_spheres(const py::object& spheres, const py::array& offset) {
@@ -131,6 +144,8 @@ void bind_cluster(py::module_& m) {
         "median_split", &median_split, "means"_a, "offset"_a, "depth"_a,
         "Perfect binary tree of each segment's points: (order (N,) int64, leaf_offset (L + 1,) int64, which "
         "is on the host).");
+    m.def("morton_order", &order_along_curve, "means"_a,
+          "Indices (N,) that put points on the host along a curve that keeps neighbours together.");
     m.def("bound_spheres", &bound_spheres, "spheres"_a, "offset"_a,
           "Ball (S, 4) around each segment of spheres (N, 4), with the margin that keeps balls nested.");
     m.def("check_tables", &check_bundle_tables, "offset"_a, "level"_a, "own_group"_a, "parent_group"_a,

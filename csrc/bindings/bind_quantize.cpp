@@ -1,5 +1,6 @@
 #include "bindings/codes.h"
 #include "bindings/operations.h"
+#include "quantize/codebook.h"
 
 namespace v3dg {
 
@@ -39,6 +40,30 @@ void decode_rows(const py::array& page, const py::array& offset, const Rows& out
     cpu::decode_page({clusters, reinterpret_cast<const uint32_t*>(words.data), rows.sh_degree}, rows);
 }
 
+py::object codebook_of(const py::array& values) {
+    const auto in = span_of<const double>(values, "values", {-1});
+    const NewArray<double> table({}, {static_cast<py::ssize_t>(kCodebookSize)});
+    {
+        const py::gil_scoped_release unlocked;
+        make_codebook(in, table.span);
+    }
+    return table.object;
+}
+
+py::tuple palette_of(const py::array& vectors, size_t size) {
+    const auto in = span_of<const float>(vectors, "vectors", {-1, -1});
+    const auto width = static_cast<size_t>(vectors.shape(1));
+    VectorPalette palette;
+    {
+        const py::gil_scoped_release unlocked;
+        palette = make_palette(in, width, size);
+    }
+    const py::ssize_t count = width ? palette.vectors.size() / width : 1;
+    return py::make_tuple(
+        py::array_t<double>({count, vectors.shape(1)}, palette.vectors.data()),
+        py::array_t<uint32_t>(static_cast<py::ssize_t>(palette.labels.size()), palette.labels.data()));
+}
+
 }  // namespace
 
 void bind_quantize(py::module_& m) {
@@ -49,6 +74,11 @@ void bind_quantize(py::module_& m) {
           "their clusters, which begin at `offset` (K+1,).");
     m.def("decode_page", &decode_rows, "page"_a, "offset"_a, "out"_a,
           "Writes the gaussians of a page of codes to rows from offset[0] on.");
+    m.def("codebook_of", &codebook_of, "values"_a,
+          "256 ascending numbers near the values (N,), by Lloyd's algorithm; if there are no more different "
+          "values, these.");
+    m.def("palette_of", &palette_of, "vectors"_a, "size"_a,
+          "At most `size` vectors (K, D) that stand for many (N, D), and which of them for each (N,).");
     py::class_<BoundCodes>(m, "Codes", "All pages of a bundle as codes, on the host; borrows the arrays.")
         .def(py::init<py::array, py::array, py::array, int>(), "pages"_a, "first_cluster"_a, "offset"_a,
              "sh_degree"_a);

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from v3dg import _core
 from v3dg._numbers import check, whole
 from v3dg._progress import Bar, Progress
 from v3dg._version import __version__
@@ -28,7 +29,7 @@ from v3dg.cameras import Axis, Floats
 from v3dg.cleaning import ball_of_most
 from v3dg.export import _common
 from v3dg.formats import sog
-from v3dg.formats._packing import check_writable, morton_order
+from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import rotation_from_quaternion
 from v3dg.upright import up_of
@@ -122,7 +123,7 @@ def _write_folders(
         for number, part in enumerate(plan.parts(level)):
             chunk = check_writable(part).transform(turn)
             lods[number][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
-            parts.append(chunk.subset(morton_order(chunk.means)))
+            parts.append(chunk.subset(_core.morton_order(chunk.means)))
             size += len(chunk)
             if size >= _FOLDER_GAUSSIANS or number == plan.num_chunks - 1:
                 names.append(f"{level}_{len(names) - first}")

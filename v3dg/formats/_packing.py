@@ -24,7 +24,6 @@ DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 
 _BLOCK = 1 << 16  # gaussians decoded at once: the double precision of a block stays in the cache's reach
 _MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
-_MORTON_BITS = 21
 _LEAST_SEEN = np.float32(_core.min_alpha)
 
 # The components that stay when one is left out, in ascending order.
@@ -96,16 +95,3 @@ def check_writable(gaussians: Gaussians) -> Gaussians:
     check_all("scales", host.scales, host.scales >= 0, "values >= 0")
     check_all("opacities", host.opacities, abs(host.opacities - 0.5) <= 0.5, "values in [0, 1]")
     return host
-
-
-def morton_order(means: Floats) -> NDArray[np.intp]:
-    """Indices that put points (N, 3) along a curve that keeps neighbours together; the same on every run."""
-    if not len(means):
-        return np.zeros(0, np.intp)
-    low = means.min(axis=0).astype(np.float64)
-    extent = np.maximum(means.max(axis=0) - low, np.finfo(np.float32).tiny)
-    cells = ((means - low) / extent * ((1 << _MORTON_BITS) - 1)).astype(np.uint64)
-    code = np.zeros(len(means), np.uint64)
-    for bit in range(3 * _MORTON_BITS):
-        code |= (cells[:, bit % 3] >> np.uint64(bit // 3) & np.uint64(1)) << np.uint64(bit)
-    return np.argsort(code, kind="stable")

@@ -109,7 +109,7 @@ def _decoded(
 def write(path: Path, gaussians: Gaussians) -> None:
     """Write a `.compressed.ply` file; gaussians are put in an order that keeps neighbours together."""
     host = _packing.check_writable(gaussians)
-    order = _packing.morton_order(host.means)
+    order = _core.morton_order(host.means)
     count, num_rest = len(host), 3 * (host.sh.shape[1] - 1)
     num_chunks = -(-count // _CHUNK)
     values = {

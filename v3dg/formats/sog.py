@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _files
+from v3dg import _core, _files
 from v3dg._json import Node, parse_json
 from v3dg._version import __version__
 from v3dg.formats import _packing
 from v3dg.formats._asset_file import AssetFile, whole_file
-from v3dg.formats._codebook import nearest, palette_of, table_of
 from v3dg.formats._packing import SQRT2, Floats, assemble, opacity_bytes
 from v3dg.formats._reading import Archive, Claims, check, least_bytes, telling, whole
 from v3dg.gaussians import Gaussians
@@ -197,7 +196,7 @@ def _size_of_webp(content: bytes) -> tuple[int, int]:
 def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.sog` file; gaussians are put in an order that keeps neighbours together."""
     host = _packing.check_writable(gaussians)
-    contents = encode(host.subset(_packing.morton_order(host.means)))
+    contents = encode(host.subset(_core.morton_order(host.means)))
     # Gaussians that are all alike take too little to be believed.
     missing = least_bytes(len(host)) - sum(map(len, contents.values()))
     if missing > 0:
@@ -224,13 +223,13 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
     whole = _packing.to_integers((logs - low) / np.where(high > low, high - low, 1.0) * 65535.0, 65535)
     three, largest = _packing.three_of_quats(gaussians.quats)
     log_widths = _packing.log_scales(gaussians.scales)
-    scale_table, color_table = table_of(log_widths), table_of(gaussians.sh[:, 0])
+    scale_table, color_table = _table_of(log_widths), _table_of(gaussians.sh[:, 0])
     contents = {
         "means_l.webp": picture(*(whole & 255).T),
         "means_u.webp": picture(*(whole >> 8).T),
-        "scales.webp": picture(*nearest(scale_table, log_widths).T),
+        "scales.webp": picture(*_nearest(scale_table, log_widths).T),
         "quats.webp": picture(*_packing.to_integers((three * SQRT2 + 1.0) * 127.5, 255).T, largest + 252),
-        "sh0.webp": picture(*nearest(color_table, gaussians.sh[:, 0]).T, opacity_bytes(gaussians.opacities)),
+        "sh0.webp": picture(*_nearest(color_table, gaussians.sh[:, 0]).T, opacity_bytes(gaussians.opacities)),
     }
     meta: dict[str, Any] = {
         "version": 2,
@@ -245,11 +244,12 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         coefficients = _COEFFICIENTS[gaussians.sh_degree]
         # A quarter of the gaussians, but enough for a small asset to keep all its coefficients, and 16 bits.
         size = min(max(1024, count // 4), 65536)
-        palette, labels = palette_of(gaussians.sh[:, 1:].reshape(count, 3 * coefficients), size)
-        table = table_of(palette)
+        vectors = np.ascontiguousarray(gaussians.sh[:, 1:]).reshape(count, 3 * coefficients)
+        palette, labels = _core.palette_of(vectors, size)
+        table = _table_of(palette)
         rows = -(-len(palette) // _PALETTE_COLUMNS)
         pixels = np.full((rows * _PALETTE_COLUMNS, coefficients, 4), 255, np.uint8)
-        pixels[: len(palette), :, :3] = nearest(table, palette).reshape(-1, coefficients, 3)
+        pixels[: len(palette), :, :3] = _nearest(table, palette).reshape(-1, coefficients, 3)
         contents["shN_centroids.webp"] = _webp(pixels.reshape(rows, _PALETTE_COLUMNS * coefficients, 4))
         contents["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
         meta["shN"] = {
@@ -259,6 +259,16 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
     return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **contents}
+
+
+def _table_of(values: Floats) -> Floats:
+    """256 ascending numbers near the values."""
+    return _core.codebook_of(values.astype(np.float64).ravel())
+
+
+def _nearest(table: Floats, values: Floats) -> NDArray[np.uint8]:
+    """Index of the entry of an ascending table that is nearest to each value."""
+    return np.searchsorted((table[1:] + table[:-1]) / 2, values).astype(np.uint8)
 
 
 def _webp(pixels: NDArray[np.uint8]) -> bytes:
