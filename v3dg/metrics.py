@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _extras
+from v3dg import _core, _extras
 from v3dg._device import Device
 from v3dg._numbers import check
 from v3dg.cameras import Camera
@@ -26,10 +26,6 @@ MIN_TRANSMITTANCE = 1e-4
 """Where pixels of the truth stop, a tenth of where those of pictures do."""
 
 FLIP_MISSING = _extras.missing("flip_evaluator")
-
-_SSIM_SIGMA_PX = 1.5
-_SSIM_REACH_PX = 5  # an 11 px window: 3.5 sigma to either side, rounded
-_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2  # the constants of the SSIM paper for values in [0,1]
 
 
 def _picture(name: str, image: Any) -> NDArray[np.floating[Any]]:
@@ -62,22 +58,6 @@ def psnr(reference: Any, test: Any) -> float:
     return float("inf") if mean_square == 0 else -10 * float(np.log10(mean_square))
 
 
-def _gaussian_blur(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Blur over the first two axes with SSIM's window; the border is mirrored without repeating the edge."""
-    offsets = np.arange(-_SSIM_REACH_PX, _SSIM_REACH_PX + 1)
-    weights = np.exp(-0.5 * (offsets / _SSIM_SIGMA_PX) ** 2)
-    weights /= weights.sum()
-    for axis in (0, 1):
-        padding = [(0, 0)] * image.ndim
-        padding[axis] = (_SSIM_REACH_PX, _SSIM_REACH_PX)
-        padded = np.pad(image, padding, mode="reflect")
-        size = image.shape[axis]
-        image = np.zeros_like(image)
-        for k, weight in enumerate(weights):
-            image += weight * (padded[k : k + size] if axis == 0 else padded[:, k : k + size])
-    return image
-
-
 def ssim(reference: Any, test: Any) -> float:
     """Compute the structural similarity, 1 for equal pictures.
 
@@ -89,21 +69,10 @@ def ssim(reference: Any, test: Any) -> float:
 
     Source: Wang et al., Image quality assessment: from error visibility to structural similarity, 2004.
     """
-    pair = _pair(reference, test)
-    shape, least = pair[0].shape, _SSIM_REACH_PX + 1
-    check("reference", min(shape[:2]) >= least, f"at least {least} px a side, got {shape}")
-    # A channel after the other, because this takes ten pictures' memory.
-    return float(np.mean([_ssim(*(x[..., c].astype(np.float64) for x in pair)) for c in range(3)]))
-
-
-def _ssim(a: NDArray[np.float64], b: NDArray[np.float64]) -> np.floating[Any]:
-    mean_a, mean_b = _gaussian_blur(a), _gaussian_blur(b)
-    variance_a = np.maximum(_gaussian_blur(a * a) - mean_a * mean_a, 0)
-    variance_b = np.maximum(_gaussian_blur(b * b) - mean_b * mean_b, 0)
-    covariance = _gaussian_blur(a * b) - mean_a * mean_b
-    luminance = (2 * mean_a * mean_b + _SSIM_C1) / (mean_a**2 + mean_b**2 + _SSIM_C1)
-    structure = (2 * covariance + _SSIM_C2) / (variance_a + variance_b + _SSIM_C2)
-    return np.mean(luminance * structure)
+    a, b = _pair(reference, test)
+    check("reference", min(a.shape[:2]) >= 6, f"at least 6 px a side, got {a.shape}")
+    dtype = np.float32 if a.dtype == b.dtype == np.float32 else np.float64
+    return _core.ssim(np.ascontiguousarray(a, dtype), np.ascontiguousarray(b, dtype))
 
 
 def has_flip() -> bool:

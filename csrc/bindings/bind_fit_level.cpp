@@ -4,6 +4,7 @@
 #include "bindings/operations.h"
 #include "bindings/types.h"
 #include "fit_group/dssim.h"
+#include "fit_group/ssim.h"
 #include "pipeline/fit_level.h"
 #include "pipeline/fit_level_cuda.h"
 #include "pipeline/model.h"
@@ -138,6 +139,24 @@ py::tuple dssim_of(const py::array& picture, const py::array& target) {
     return py::make_tuple(value, gradient.object);
 }
 
+template <class T>
+double mean_ssim_of(const py::array& picture, const py::array& target) {
+    const Span<const T> p = span_of<const T>(picture, "picture", {-1, -1, -1});
+    const py::ssize_t height = picture.shape(0), width = picture.shape(1), channels = picture.shape(2);
+    const Span<const T> t = span_of<const T>(target, "target", {height, width, channels});
+    if (std::min(height, width) <= kSsimRadius || channels == 0)
+        throw py::value_error("picture: expected at least " + std::to_string(kSsimRadius + 1) +
+                              " px a side, got shape " + shape_text(picture));
+    const auto side = [](py::ssize_t size) { return static_cast<size_t>(size); };
+    const py::gil_scoped_release unlocked;
+    return mean_ssim<T>({p.data, t.data, side(height), side(width), side(channels)});
+}
+
+double ssim_of_pictures(const py::array& picture, const py::array& target) {
+    const bool is_double = py::isinstance<py::array_t<double>>(picture);
+    return is_double ? mean_ssim_of<double>(picture, target) : mean_ssim_of<float>(picture, target);
+}
+
 }  // namespace
 
 void bind_fit_level(py::module_& m) {
@@ -161,6 +180,8 @@ void bind_fit_level(py::module_& m) {
           "Returns the residuals (G, 2) in colour and alpha.");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
           "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
+    m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,
+          "Mean of SSIM of pictures (H, W, C), both float32 or both float64; the border is mirrored.");
 }
 
 }  // namespace v3dg

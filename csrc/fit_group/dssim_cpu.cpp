@@ -42,7 +42,7 @@ float dssim(const float* picture, const float* target, int width, int height, fl
     double sum = 0;
     const float scale = -weight / static_cast<float>(n);
     for (int i = 0; i < n; ++i) {
-        const Ssim ssim = ssim_of({mx[i], my[i], xx[i], yy[i], xy[i]});
+        const auto ssim = ssim_of<float>({mx[i], my[i], xx[i], yy[i], xy[i]});
         sum += 1 - ssim.value;
         d_mx[i] = scale * ssim.d_x;
         d_xx[i] = scale * ssim.d_xx;

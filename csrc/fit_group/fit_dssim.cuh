@@ -36,7 +36,7 @@ __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int nu
     for_each_pixel([&](uint32_t plane, uint32_t i, float* maps) {
         const float* picture = pictures + static_cast<size_t>(plane) * num_pixels;
         const int column = i % size;
-        SsimSums sums{};
+        SsimSums<float> sums{};
 #pragma unroll
         for (int k = -kSsimRadius; k <= kSsimRadius; ++k) {
             if (column + k < 0 || column + k >= size) continue;
@@ -56,7 +56,7 @@ __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int nu
     for_each_pixel([&](uint32_t, uint32_t i, float* maps) {
         float sums[5] = {0, 0, 0, 0, 0};
         blur(maps, i, i / size, size, sums);
-        const Ssim ssim = ssim_of({sums[0], sums[1], sums[2], sums[3], sums[4]});
+        const auto ssim = ssim_of<float>({sums[0], sums[1], sums[2], sums[3], sums[4]});
         maps[5 * num_pixels + i] = scale * ssim.d_x;
         maps[6 * num_pixels + i] = scale * ssim.d_xx;
         maps[7 * num_pixels + i] = scale * ssim.d_xy;

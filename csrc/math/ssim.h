@@ -1,6 +1,6 @@
 #pragma once
 
-// What both halves need of the loss: a pixel at a time.
+// What both halves need of the loss, and SSIM of whole pictures: a pixel at a time.
 
 #include "math/lanes.h"
 
@@ -16,22 +16,25 @@ V3DG_HD V3DG_INLINE float ssim_weight(int offset) {
 }
 
 // The window's sums around a pixel over a picture x and its target y.
+template <class T>
 struct SsimSums {
-    float x, y, xx, yy, xy;
+    T x, y, xx, yy, xy;
 };
 
 // Structural similarity (Wang et al. 2004, constants 0.01² and 0.03²), and its derivatives by the sums of x,
 // x² and xy.
+template <class T>
 struct Ssim {
-    float value, d_x, d_xx, d_xy;
+    T value, d_x, d_xx, d_xy;
 };
 
-V3DG_HD inline Ssim ssim_of(const SsimSums& s) {
-    constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
-    const float a1 = 2 * s.x * s.y + kC1, a2 = 2 * (s.xy - s.x * s.y) + kC2;
-    const float b1 = s.x * s.x + s.y * s.y + kC1;
-    const float b2 = s.xx - s.x * s.x + s.yy - s.y * s.y + kC2;
-    Ssim out;
+template <class T>
+V3DG_HD inline Ssim<T> ssim_of(const SsimSums<T>& s) {
+    constexpr T kC1 = T(0.01) * T(0.01), kC2 = T(0.03) * T(0.03);
+    const T a1 = 2 * s.x * s.y + kC1, a2 = 2 * (s.xy - s.x * s.y) + kC2;
+    const T b1 = s.x * s.x + s.y * s.y + kC1;
+    const T b2 = s.xx - s.x * s.x + s.yy - s.y * s.y + kC2;
+    Ssim<T> out;
     out.value = a1 * a2 / (b1 * b2);
     out.d_x = 2 * s.y * (a2 - a1) / (b1 * b2) - 2 * s.x * out.value * (1 / b1 - 1 / b2);
     out.d_xx = -out.value / b2;
