@@ -29,14 +29,21 @@ _ENOUGH_TO_FRAME = 50_000
 _MOST_VIEWS = 10_000
 
 
-@dataclass
-class ViewOptions:
-    """From where to look: a scene's own cameras, those of a camera file, or a turntable."""
+@dataclass(kw_only=True)
+class CameraFile:
+    """Cameras of another program to look from."""
 
     cameras: Annotated[Path | None, option("PATH")] = None
-    """Draw from the cameras of this nerfstudio transforms.json, run of nerfstudio, or model of COLMAP."""
+    """Look from the cameras of this nerfstudio transforms.json, run of nerfstudio, or model of COLMAP; `view`
+    offers them with their photographs."""
     distortion: Literal["refuse", "ignore"] = "refuse"
     """Whether lens distortion in that file is an error, or left out of the pictures."""
+
+
+@dataclass
+class ViewOptions(CameraFile):
+    """From where to look: a scene's own cameras, those of a camera file, or a turntable."""
+
     camera: Annotated[str | None, option("NAME")] = None
     """Draw only this camera of a file with cameras: its name, or its place in the file, from 0."""
     views: int = 1

@@ -24,7 +24,7 @@ from v3dg.select import select
 
 
 @dataclass
-class Convert(_common.Common):
+class Convert(_common.Cut, _common.Common):
     """Write an asset, a level of a bundle, or its cut for a camera, in another format; or a bundle anew."""
 
     subject: tyro.conf.Positional[Path]
@@ -35,10 +35,6 @@ class Convert(_common.Common):
     """How a .v3dg that is written keeps gaussians, as for `v3dg build`; as the bundle does if not given."""
     level: Annotated[int | None, _common.option("N")] = None
     """Write this level of a bundle; 0, the asset itself, if no cut is asked for."""
-    tolerance: Annotated[float | None, _common.option("PX2")] = None
-    """Write the cut of this tolerance, the px² that one gaussian of a coarser cluster may stand for."""
-    budget: Annotated[int | None, _common.option("N")] = None
-    """Write the cut with at most this many gaussians."""
     outside: Literal["drop", "keep"] = "drop"
     """What becomes of the part of the cut that the camera does not see."""
     spz_version: Annotated[Literal[2, 3, 4] | None, _common.option("{2,3,4}")] = None

@@ -14,15 +14,15 @@ import webbrowser
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from v3dg._start import SIGNALS
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import Axis
-from v3dg.cli._common import Flag, OnDevice, check_usage, option, print_result, require_subject, tell
-from v3dg.cli._views import up_lines
+from v3dg.cli._common import Cut, Flag, OnDevice, check_usage, option, print_result, require_subject, tell
+from v3dg.cli._views import CameraFile, up_lines
 from v3dg.opening import open_with_cameras
 from v3dg.upright import direction_of, up_of
 
@@ -32,7 +32,7 @@ _SIZE = (800, 800)  # px, of cameras whose file has none; the page has its own
 
 
 @dataclass
-class View(OnDevice):
+class View(CameraFile, Cut, OnDevice):
     """Look at a scene, a bundle or an asset in a web browser."""
 
     subject: tyro.conf.Positional[Path]
@@ -45,15 +45,6 @@ class View(OnDevice):
     """Open no browser; none is opened over ssh, without a display, or where other machines can connect."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
     """Which way is up at first; what the file says or what is guessed from it or its cameras if not given."""
-    cameras: Annotated[Path | None, option("PATH")] = None
-    """Offer the cameras of this nerfstudio transforms.json, run of nerfstudio, or model of COLMAP, with their
-    photographs."""
-    distortion: Literal["refuse", "ignore"] = "refuse"
-    """Whether lens distortion of those is an error, or left out of the pictures."""
-    tolerance: Annotated[float | None, option("PX2")] = None
-    """Screen area in px² that a coarser cluster's gaussian may stand for, at first; 3, or 0 with a budget."""
-    budget: Annotated[int | None, option("N")] = None
-    """Most gaussians to draw in one picture, at first."""
 
 
 def run(options: View) -> None:
