@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,12 @@ import numpy as np
 import v3dg
 from v3dg import _core
 from v3dg.rotations import rotation_from_quaternion
+
+
+def read_layout(path: str | Path, bundle: v3dg.Bundle) -> tuple[v3dg.Scene, dict[str, v3dg.Camera]]:
+    """A published layout of one asset, of which this is the bundle, and its cameras."""
+    name = json.loads(Path(path).read_text(encoding="utf-8"))["asset"]
+    return v3dg.read_scene(path, bundles={name: bundle})
 
 
 def many_copies(asset: v3dg.Gaussians, num_copies: int, *, seed: int = 0) -> v3dg.Gaussians:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import worlds
+from benchmarks.evaluation.assets import read_layout
 from benchmarks.evaluation.measure import Judge, Row, Time, time_ms
 from benchmarks.evaluation.settings import Settings
 from benchmarks.worlds.procedural import make_asset
@@ -29,7 +30,6 @@ from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 from v3dg.scene import Scene
-from v3dg.scene.file import read_scene
 from v3dg.select import DEFAULT_TOLERANCE
 
 FOV_X = math.pi / 4  # the paper's
@@ -202,8 +202,7 @@ class Evaluation:
             placement = world.placements["donut"]
             views = views_of(world.cameras(width=size[0], height=size[1]).values())
             return (placement.positions, placement.quaternions, placement.scales), views
-        name = json.loads(self.layout_path.read_text(encoding="utf-8"))["asset"]
-        scene, cameras = read_scene(self.layout_path, bundles={name: self.build(BuildConfig(steps=0)).bundle})
+        scene, cameras = read_layout(self.layout_path, self.build(BuildConfig(steps=0)).bundle)
         views = views_of(resized(camera, size) for camera in cameras.values())
         return (scene.positions, scene.quaternions, scene.scales), views
 

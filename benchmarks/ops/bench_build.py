@@ -7,7 +7,6 @@ first two are also drawn at several numbers of gaussians in the frustum.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from dataclasses import dataclass
@@ -21,12 +20,11 @@ from PIL import Image
 
 import v3dg
 from benchmarks.evaluation import gpu, record
-from benchmarks.evaluation.assets import many_copies
+from benchmarks.evaluation.assets import many_copies, read_layout
 from benchmarks.worlds.procedural import make_asset
 from v3dg import _core, metrics
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
-from v3dg.scene.file import read_scene
 
 # px², past which every instance is drawn from its last level.
 _MOST_TOLERANCE = 1e4
@@ -121,8 +119,7 @@ def pictures(bundle: Bundle, config: Config) -> list[dict[str, Any]]:
     """FLIP and PSNR of the layout from this bundle, by the number of gaussians in the frustum."""
     if config.layout is None or config.truth is None:
         return []
-    name = json.loads(config.layout.read_text())["asset"]
-    scene, cameras = read_scene(config.layout, bundles={name: bundle})
+    scene, cameras = read_layout(config.layout, bundle)
     camera = list(cameras.values())[config.camera]
     truth = np.asarray(Image.open(config.truth).convert("RGB"), np.float32) / 255
 

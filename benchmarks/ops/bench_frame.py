@@ -6,7 +6,6 @@ sizes that training leaves, and one asset that fills the picture.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +17,12 @@ from bench_rasterize import camera_that_fills
 
 import v3dg
 from benchmarks.evaluation import gpu, record
-from benchmarks.evaluation.assets import like_trained
+from benchmarks.evaluation.assets import like_trained, read_layout
 from benchmarks.evaluation.measure import time_ms
 from benchmarks.worlds.procedural import make_asset
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.render import Renderer
-from v3dg.scene.file import read_scene
 
 
 @dataclass
@@ -70,8 +68,7 @@ def main(config: Config) -> None:
     if config.layout is not None:
         # One level is all that is drawn.
         bundle = build_bundle(asset, config=BuildConfig(min_clusters=1 << 30), progress=False, device="cpu")
-        name = json.loads(config.layout.read_text())["asset"]
-        scene, cameras = read_scene(config.layout, bundles={name: bundle})
+        scene, cameras = read_layout(config.layout, bundle)
         placed = gpu.placed_gaussians(scene)
         for index in config.cameras:
             name, camera = list(cameras.items())[index]

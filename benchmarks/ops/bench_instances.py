@@ -6,7 +6,6 @@ in view at once, whose error is measured on crops, since nothing draws all of th
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import gpu, record
+from benchmarks.evaluation.assets import read_layout
 from benchmarks.evaluation.measure import Judge, Row, time_ms
 from benchmarks.worlds.procedural import make_asset
 from v3dg._judges import mean_of
@@ -29,7 +29,6 @@ from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import Renderer
 from v3dg.scene import Scene
-from v3dg.scene.file import read_scene
 from v3dg.select import DEFAULT_TOLERANCE
 
 # An instance of a field can be smaller than a pixel, and its gaussians are not filtered.
@@ -63,8 +62,7 @@ def main(config: Config) -> None:
     result: dict[str, Any] = {"repeats": config.repeats}
     judge = Judge()
     if config.layout is not None:
-        name = json.loads(config.layout.read_text())["asset"]
-        scene, cameras = read_scene(config.layout, bundles={name: bundle})
+        scene, cameras = read_layout(config.layout, bundle)
         chosen = list(cameras.values())[slice(*config.cameras)]
         result["layout"] = layout(scene, chosen, config, judge)
     result["fields"] = [field(bundle, count, config, judge) for count in config.fields]

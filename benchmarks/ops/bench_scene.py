@@ -14,10 +14,10 @@ import tyro
 from PIL import Image
 
 from benchmarks.evaluation import record
+from benchmarks.evaluation.assets import read_layout
 from v3dg import metrics
 from v3dg.bundle import Bundle
 from v3dg.render import render
-from v3dg.scene.file import read_scene
 
 
 @dataclass
@@ -38,8 +38,7 @@ class Config:
 
 def main(config: Config) -> None:
     bundle = Bundle.open(config.bundle)
-    asset = next(iter(_assets(config.layout)))
-    scene, cameras = read_scene(config.layout, bundles={asset: bundle})
+    scene, cameras = read_layout(config.layout, bundle)
     name, camera = list(cameras.items())[config.camera]
     if config.truth is not None:
         truth = np.asarray(Image.open(config.truth).convert("RGB"), np.float32) / 255
@@ -78,13 +77,6 @@ def main(config: Config) -> None:
             "frames": rows,
         },
     )
-
-
-def _assets(layout: Path) -> list[str]:
-    """Names of the assets of a published layout."""
-    import json
-
-    return [json.loads(layout.read_text())["asset"]]
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import torch
 import tyro
 
 import v3dg
+from benchmarks.evaluation.assets import read_layout
 from v3dg import Bundle, Renderer, Scene, _device
 from v3dg.residency import residency
 
@@ -172,10 +173,8 @@ def main(config):
         name, path = pair.split("=", 1)
         made[name] = v3dg.read_asset(path)
     scene_of, cameras = {}, {}
-    with open(config.layout) as file:
-        named = json.load(file)["asset"]
     for name, bundle in kinds.items():
-        scene_of[name], cameras = v3dg.read_scene(config.layout, bundles={named: bundle})
+        scene_of[name], cameras = read_layout(config.layout, bundle)
     residency.clear()
     views = list(cameras.values())
     picked = views[:: max(1, len(views) // 6)][:6] + views[-1:]

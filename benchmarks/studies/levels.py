@@ -6,7 +6,6 @@ tolerances, and the processor seconds of the build.
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from PIL import Image
 
 import v3dg
 from benchmarks.evaluation import record
+from benchmarks.evaluation.assets import read_layout
 from v3dg import metrics
 
 CHANGES: dict[str, dict[str, Any]] = {
@@ -58,7 +58,6 @@ class Config:
 def main(config: Config) -> None:
     asset = v3dg.read_asset(config.asset)
     truth = np.asarray(Image.open(config.truth).convert("RGB"), np.float32) / 255
-    name = json.loads(config.layout.read_text())["asset"]
     rows = []
     for change in config.only or tuple(CHANGES):
         start = time.process_time()
@@ -66,7 +65,7 @@ def main(config: Config) -> None:
             asset, config=replace(v3dg.BuildConfig(), **CHANGES[change]), progress=False
         )
         row: dict[str, Any] = {"change": change, "build_cpu_seconds": round(time.process_time() - start, 1)}
-        scene, cameras = v3dg.read_scene(config.layout, bundles={name: bundle})
+        scene, cameras = read_layout(config.layout, bundle)
         camera = list(cameras.values())[config.camera]
         row["frames"] = []
         for tolerance in config.tolerances:

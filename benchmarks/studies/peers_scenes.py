@@ -13,12 +13,11 @@ import numpy as np
 
 import v3dg
 from benchmarks.evaluation import gpu
-from benchmarks.evaluation.assets import like_trained
+from benchmarks.evaluation.assets import like_trained, read_layout
 from benchmarks.worlds.procedural import make_asset
 from v3dg import _core
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
-from v3dg.scene.file import read_scene
 
 TRAINED_PX2 = 0.3
 """The filter of the original 3DGS code, with which assets are trained."""
@@ -71,8 +70,7 @@ def one_level(asset: v3dg.Gaussians, filter_px2: float) -> v3dg.Bundle:
 
 
 def _placed(layout: Path, asset: v3dg.Gaussians, filter_px2: float) -> tuple[v3dg.Scene, dict[str, Camera]]:
-    name = json.loads(layout.read_text())["asset"]
-    return read_scene(layout, bundles={name: one_level(asset, filter_px2)})
+    return read_layout(layout, one_level(asset, filter_px2))
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:

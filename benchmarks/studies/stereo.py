@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
+from benchmarks.evaluation.assets import read_layout
 from benchmarks.evaluation.measure import time_ms
 from benchmarks.evaluation.record import write
-from v3dg import Bundle, Camera, Renderer, StereoCamera, read_scene
+from v3dg import Bundle, Camera, Renderer, StereoCamera
 
 _FOV = 1.57  # rad, of each eye
 _EYE_DISTANCE = 0.064
@@ -31,8 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="write the result there")
     options = parser.parse_args(arguments)
 
-    asset = json.loads(options.layout.read_text(encoding="utf-8"))["asset"]
-    scene, cameras = read_scene(options.layout, bundles={asset: Bundle.open(options.bundle)})
+    scene, cameras = read_layout(options.layout, Bundle.open(options.bundle))
     renderer = Renderer(scene, device="cuda")
     rows = []
     for tolerance in options.tolerances:
