@@ -110,7 +110,9 @@ def ply_write(
 # cluster
 nesting_margin: float
 min_radius: float
+most_length: float
 
+def examine(gaussians: Rows) -> NDArray[np.uint16]: ...
 def num_halvings(count: int, cluster_size: int) -> int: ...
 def median_split(means: Array, offset: Int64, depth: int) -> tuple[Array, Int64]: ...
 def check_tables(

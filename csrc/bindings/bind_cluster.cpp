@@ -6,6 +6,7 @@
 #include "cluster/box.h"
 #include "cluster/check_tables.h"
 #include "cluster/cluster.h"
+#include "cluster/examine.h"
 #include "cluster/morton.h"
 
 namespace v3dg {
@@ -44,6 +45,18 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
         V3DG_DISPATCH(work, median_split, points, offsets, depth, order.span, leaf_offset.span);
     }
     return py::make_tuple(order.object, leaf_offset.object);
+}
+
+py::object findings_of(const Rows& gaussians) {
+    const GaussianRows<const float> rows = gaussians.read<float>();
+    if (!gaussians.device().is_host())
+        throw py::value_error("gaussians: expected arrays on the host, got others; bring them there");
+    const NewArray<uint16_t> findings({}, {static_cast<py::ssize_t>(rows.size)});
+    {
+        const py::gil_scoped_release unlocked;
+        examine(rows, findings.span);
+    }
+    return findings.object;
 }
 
 py::object order_along_curve(const py::array& means) {
@@ -138,6 +151,9 @@ void check_bundle_tables(const py::array& offset, const py::array& level, const 
 void bind_cluster(py::module_& m) {
     m.attr("nesting_margin") = kNestingMargin;
     m.attr("min_radius") = kMinRadius;
+    m.attr("most_length") = kMostLength;
+    m.def("examine", &findings_of, "gaussians"_a,
+          "Why gaussians on the host cannot be drawn: (N,) uint16 of bits, 0 where they can.");
     m.def("num_halvings", &halvings, "count"_a, "cluster_size"_a,
           "How often points are halved until no part holds more than cluster_size.");
     m.def(

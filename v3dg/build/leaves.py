@@ -51,13 +51,13 @@ class MemoryLeaves(Leaves):
         check("asset", is_single, "float32 arrays, got float64; convert them first")
         one_of(unusable, "unusable", get_args(Unusable))
         tally = Tally()
-        with _device.memory_errors():
-            asset = _device.place(asset, _device.of(asset.means))
-            self._drawable = tally.add(asset)
+        host = asset.numpy()
+        self._drawable = tally.add(host)
         tally.check(unusable)
         count, degree = len(asset), asset.sh_degree
         num_bytes = count * (gaussian_bytes(degree) + 4)
-        super().__init__(tally.num_drawable, count, degree, tally.counts, digest_of(asset), num_bytes)
+        super().__init__(tally.num_drawable, count, degree, tally.counts, digest_of(host), num_bytes)
+        asset = _device.place(asset, _device.of(asset.means))  # without gradients
         self._asset, self._config, self._device = asset, config, device
         self._order: npt.NDArray[np.integer[Any]] | None = None
         self._lock = threading.Lock()
