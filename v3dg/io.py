@@ -22,7 +22,7 @@ from v3dg.formats import (
     streamed_sog,
     usd,
 )
-from v3dg.formats._asset_file import AssetFile, bytes_of
+from v3dg.formats._reading import AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
 

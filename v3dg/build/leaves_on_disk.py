@@ -32,7 +32,7 @@ from v3dg.build.memory import in_mib
 from v3dg.build.plan import halved
 from v3dg.build.scratch import RowFile, scratch_folder
 from v3dg.bundle.codec import Codec
-from v3dg.formats._asset_file import AssetFile
+from v3dg.formats._reading import AssetFile
 from v3dg.gaussians import Gaussians, gaussian_bytes
 from v3dg.io import open_asset
 

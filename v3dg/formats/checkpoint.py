@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._packing import DEGREES, Floats, assemble, normalised
-from v3dg.formats._reading import Archive, Claims, Path, check, telling
+from v3dg.formats._reading import Archive, AssetFile, Claims, Path, check, telling, whole_file
 from v3dg.gaussians import Gaussians
 
 _FIELDS = ("means", "scales", "quats", "opacities", "sh0", "shN")

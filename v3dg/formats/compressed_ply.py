@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from v3dg import _core, _files
 from v3dg.formats import _packing
-from v3dg.formats._asset_file import AssetFile, File
 from v3dg.formats._packing import SH_C0, SQRT2, Floats, assemble
-from v3dg.formats._reading import Path, check
+from v3dg.formats._reading import AssetFile, File, Path, check
 from v3dg.gaussians import Gaussians
 
 _CHUNK = 256

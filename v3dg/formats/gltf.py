@@ -20,9 +20,8 @@ from v3dg._json import Node, parse_json
 from v3dg._numbers import Floats
 from v3dg._version import __version__
 from v3dg.formats import spz
-from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._packing import SH_C0, assemble, check_writable, normalised
-from v3dg.formats._reading import Claims, check, telling, whole
+from v3dg.formats._reading import AssetFile, Claims, check, telling, whole, whole_file
 from v3dg.formats._reading import Path as AnyPath
 from v3dg.gaussians import Gaussians
 

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.formats._asset_file import AssetFile, File
 from v3dg.formats._packing import assemble, normalised
-from v3dg.formats._reading import Path, check
+from v3dg.formats._reading import AssetFile, File, Path, check
 from v3dg.gaussians import Gaussians
 
 _INT = np.dtype("<i4")

@@ -17,9 +17,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
-from v3dg.formats._reading import Claims, Path, check
+from v3dg.formats._reading import AssetFile, Claims, Path, check, whole_file
 from v3dg.gaussians import Gaussians
 
 _HEADER_BYTES = 4096

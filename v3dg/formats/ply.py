@@ -7,8 +7,7 @@ from typing import Literal
 
 from v3dg import _core, _files
 from v3dg.formats import compressed_ply
-from v3dg.formats._asset_file import AssetFile
-from v3dg.formats._reading import Path
+from v3dg.formats._reading import AssetFile, Path
 from v3dg.gaussians import Gaussians
 
 PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]

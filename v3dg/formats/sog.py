@@ -23,9 +23,8 @@ from v3dg import _core, _files
 from v3dg._json import Node, parse_json
 from v3dg._version import __version__
 from v3dg.formats import _packing
-from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._packing import SQRT2, Floats, assemble, opacity_bytes
-from v3dg.formats._reading import Archive, Claims, check, least_bytes, telling, whole
+from v3dg.formats._reading import Archive, AssetFile, Claims, check, least_bytes, telling, whole, whole_file
 from v3dg.gaussians import Gaussians
 
 _MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.formats._asset_file import AssetFile, File
 from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
-from v3dg.formats._reading import Path, check
+from v3dg.formats._reading import AssetFile, File, Path, check
 from v3dg.gaussians import Gaussians
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg.formats import _packing
-from v3dg.formats._asset_file import AssetFile, whole_file
 from v3dg.formats._packing import SQRT2, Floats, assemble
-from v3dg.formats._reading import Claims, Path, check, least_bytes, telling
+from v3dg.formats._reading import AssetFile, Claims, Path, check, least_bytes, telling, whole_file
 from v3dg.gaussians import Gaussians
 
 _MAGIC = 0x5053474E  # NGSP

@@ -13,8 +13,7 @@ import numpy as np
 
 from v3dg._json import Node, parse_json
 from v3dg.formats import sog
-from v3dg.formats._asset_file import AssetFile, whole_file
-from v3dg.formats._reading import Claims, check, telling, whole
+from v3dg.formats._reading import AssetFile, Claims, check, telling, whole, whole_file
 from v3dg.gaussians import Gaussians
 
 _LEVEL = re.compile(r"[0-9]{1,9}")

@@ -17,10 +17,9 @@ import numpy as np
 
 from v3dg import _extras, _files
 from v3dg.cameras import is_rotation
-from v3dg.formats._asset_file import AssetFile
 from v3dg.formats._packing import check_writable, normalised
+from v3dg.formats._reading import AssetFile, telling
 from v3dg.formats._reading import Path as AnyPath
-from v3dg.formats._reading import telling
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import quaternion_from_rotation
 
