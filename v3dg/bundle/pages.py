@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
+from v3dg._device import CPU
 from v3dg.bundle.codec import Codec
 from v3dg.bundle.tables import Clusters
 from v3dg.gaussians import Gaussians
@@ -106,13 +107,14 @@ class CodePages:
     """Quantised pages that are all in memory, as codes; rows are made of them where they are asked for."""
 
     def __init__(self, layout: PageLayout, words: NDArray[np.int32], codec: Codec) -> None:
-        self.layout, self.codec, self._words = layout, codec, words
+        self.layout, self.codec = layout, codec
         self.codes = _core.Codes(words, layout.first_cluster, layout.offset, codec.sh_degree)
 
     @staticmethod
     def of(layout: PageLayout, gaussians: Gaussians, codec: Codec) -> CodePages:
         """The pages of gaussians on the host."""
-        places = _places(layout, codec)
+        ends = np.cumsum(layout.page_bytes(codec) // 4)  # of the words of each page
+        places = np.concatenate([np.zeros(1, np.int64), ends])
         words = np.empty(int(places[-1]), np.int32)
 
         def encode(page: int) -> None:
@@ -123,20 +125,8 @@ class CodePages:
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Gaussians of a run of pages."""
-        places, first_row = _places(self.layout, self.codec), self.layout.first_gaussian
-        result = self.codec.empty(int(first_row[last_page] - first_row[first_page]))
-
-        def decode(page: int) -> None:
-            words = self._words[places[page] : places[page + 1]]
-            self.codec.decode([words], result, self.layout.clusters_of(page) - first_row[first_page])
-
-        on_threads(decode, range(first_page, last_page))
-        return result
-
-
-def _places(layout: PageLayout, codec: Codec) -> NDArray[np.int64]:
-    """(P+1,) words before each page."""
-    return np.concatenate([np.zeros(1, np.int64), np.cumsum(layout.page_bytes(codec) // 4)])
+        clusters = np.arange(*self.layout.first_cluster[[first_page, last_page]], dtype=np.int32)
+        return Gaussians(*_core.Model(self.codes, CPU.number).decode(clusters))
 
 
 class FilePages:
