@@ -7,6 +7,7 @@ import pytest
 
 import v3dg
 from devices import host
+from frames import arrays
 from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, lod_bundle, random_camera, random_scene
@@ -22,8 +23,8 @@ def pairs(selection):
 
 
 def same_picture(a, b):
-    for name in ("color", "alpha", "depth"):
-        np.testing.assert_array_equal(host(getattr(a, name)), host(getattr(b, name)))
+    for one, other in zip(arrays(a), arrays(b), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def step_from(tolerance, steps):
@@ -348,6 +349,19 @@ def test_false_colors_show_what_was_chosen(device, by):
         render(bundle.level_gaussians(0), camera, color_by=by, device=device)
 
 
+def test_depth_is_drawn_where_it_is_asked_for(device):
+    rng = np.random.default_rng(11)
+    bundle = lod_bundle(rng, blob(rng, 500), 32)
+    for subject in (bundle, blob(rng, 500)):
+        camera = random_camera(rng)
+        with_depth, without = (render(subject, camera, depth=asked, device=device) for asked in (True, False))
+        assert host(with_depth.depth).shape == host(with_depth.alpha).shape
+        for one, other in zip(arrays(without), arrays(with_depth), strict=False):
+            np.testing.assert_array_equal(one, other)
+        with pytest.raises(AttributeError, match="depth: expected a picture that was drawn with depth=True"):
+            without.depth  # noqa: B018
+
+
 def test_asset_and_bundle_are_seen_from_the_same_place(device):
     """Also with a rotation that is off by what float32 text loses, far from the origin."""
     rng = np.random.default_rng(20)
@@ -362,8 +376,8 @@ def test_asset_and_bundle_are_seen_from_the_same_place(device):
     # Where the rotation is taken for one, the eye is elsewhere, and colours change with the direction.
     np.testing.assert_allclose(camera.position, exact.position, atol=1e-9)
     assert np.linalg.norm(-viewmat[:3, :3].T @ viewmat[:3, 3] - camera.position) > 5e-3
-    as_bundle = render(bundle, camera, tolerance=0.0, device=device)
-    as_asset = render(asset, camera, device=device)
+    as_bundle = render(bundle, camera, tolerance=0.0, depth=True, device=device)
+    as_asset = render(asset, camera, depth=True, device=device)
     raster = v3dg.rasterize(asset.torch("cuda") if device == "cuda" else asset, camera)
     assert host(as_bundle.alpha).max() > 0.9
     for picture in (as_asset, raster):

@@ -108,7 +108,7 @@ def test_maps_keep_their_detail(device):
     near, far = (v3dg.Camera.look_at(at + eye, at, **lens) for at in (np.zeros(3), place))
     scene = v3dg.Scene()
     scene.add(bundle, positions=place[None])
-    got = v3dg.render(scene, far, tolerance=0.0, device=device)
+    got = v3dg.render(scene, far, tolerance=0.0, depth=True, device=device)
     raster = v3dg.Image(*host((got.color, got.alpha, got.depth)))
     expected = reference_rasterize.rasterize(asset, near, min_transmittance=1e-3)
     assert (expected.alpha > 0.5).mean() > 0.3
@@ -132,7 +132,7 @@ def test_assets_far_from_their_zero_keep_their_detail(device, distance):
     eye = scene.rotations[0].T @ (camera.position - scene.positions[0]) / scale
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     own = v3dg.Camera(viewmat, camera.K, 70, 50, camera.near / scale)
-    got = v3dg.render(scene, camera, tolerance=0.0, device=device)
+    got = v3dg.render(scene, camera, tolerance=0.0, depth=True, device=device)
     raster = v3dg.Image(*host((got.color, got.alpha, got.depth / scale)))
     expected = reference_rasterize.rasterize(asset, own, min_transmittance=1e-3)
     assert (expected.alpha > 0.5).mean() > 0.1

@@ -8,6 +8,7 @@ import pytest
 
 import v3dg.pool
 from devices import host
+from frames import arrays
 from random_bundle import random_bundle
 from scenes_lod import blob, lod_bundle
 from v3dg import Bundle, Camera, Renderer, Scene, render
@@ -44,16 +45,12 @@ def scene(path):
     return scene
 
 
-def planes(image):
-    return host((image.color, image.alpha, image.depth))
-
-
 def status(renderer):
     return renderer._frame._pool.core.status()
 
 
 def assert_same(image, expected):
-    for one, other in zip(planes(image), planes(expected), strict=True):
+    for one, other in zip(arrays(image), arrays(expected), strict=True):
         np.testing.assert_array_equal(one, other)
 
 

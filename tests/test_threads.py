@@ -52,7 +52,7 @@ def crowd(seed=0):
 
 def frame(scene, device="cpu"):
     camera = v3dg.Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
-    image = v3dg.render(scene, camera, tolerance=1.0, device=device)
+    image = v3dg.render(scene, camera, tolerance=1.0, depth=True, device=device)
     return digest(image.color, image.alpha, image.depth)
 
 

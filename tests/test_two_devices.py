@@ -188,5 +188,5 @@ def test_frame_refuses_what_is_on_the_other_device():
     rule = _core.Rule(tolerance_px2=1.0, budget=None, min_level=0, footprint="solid_angle", culls=True)
     with pytest.raises(ValueError, match="scene: expected one on the frame's device"):
         frame.draw(
-            residency.scene(scene, Device(1)).core, CAMERA.core, rule, shade_of([0, 0, 0], None, False)
+            residency.scene(scene, Device(1)).core, CAMERA.core, rule, shade_of([0, 0, 0], None, False, True)
         )

@@ -12,7 +12,7 @@ from v3dg._device import CPU
 from v3dg.residency import residency
 
 CAMERA = {"viewmat": np.eye(4), "K": np.diag([50.0, 50.0, 1.0]), "width": 64, "height": 48, "near": 0.01}
-SHADE = _core.Shade(background=[0, 0, 0], min_transmittance=1e-3)
+SHADE = _core.Shade(background=[0, 0, 0], min_transmittance=1e-3, with_depth=True)
 RULE = {
     "tolerance_px2": 3.0,
     "budget": None,
@@ -288,4 +288,4 @@ def test_frame_refuses_a_scene_of_other_bundles():
 def test_background_has_three_numbers():
     for background in ([0, 0], [0, 0, 0, 0], None, "red"):
         with pytest.raises(TypeError, match="incompatible constructor arguments"):
-            _core.Shade(background=background, min_transmittance=1e-3)
+            _core.Shade(background=background, min_transmittance=1e-3, with_depth=True)

@@ -132,7 +132,8 @@ def test_budget_is_kept_and_one_too_small_is_an_error(scene_view, view):
 
 
 def test_alpha_and_depth_are_shown(scene_view, view, device):
-    image = v3dg.render(scene_view.scene, view.camera(*SIZE, scene_view.near), tolerance=0.0, device=device)
+    camera = view.camera(*SIZE, scene_view.near)
+    image = v3dg.render(scene_view.scene, camera, tolerance=0.0, depth=True, device=device)
     alpha, depth = (np.asarray(p if device == "cpu" else p.cpu()) for p in (image.alpha, image.depth))
     shown = scene_view.frame(view, SIZE, Settings(shows="alpha", tolerance=0.0))
     np.testing.assert_array_equal(shown.pixels, np.repeat(to_8bit(alpha)[..., None], 3, axis=2))

@@ -31,13 +31,13 @@ def draw_window(scene, camera, window):
         camera.core.window(*window),
         selection.instance_ids,
         selection.cluster_ids,
-        shade_of((0.1, 0.2, 0.3), None, False),
+        shade_of((0.1, 0.2, 0.3), None, False, True),
     )
     return drawing.color, drawing.alpha, drawing.depth, drawing.finish()
 
 
 def assert_windows_are_parts(scene, camera, windows):
-    image = render(scene, camera, tolerance=0.0, background=(0.1, 0.2, 0.3), device="cpu")
+    image = render(scene, camera, tolerance=0.0, background=(0.1, 0.2, 0.3), depth=True, device="cpu")
     assert (image.alpha > 0.5).mean() > 0.1
     for x0, y0, x1, y1 in windows:
         *part, stats = draw_window(scene, camera, (x0, y0, x1, y1))

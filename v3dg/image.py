@@ -20,7 +20,8 @@ class Image:
     Attributes:
         color: (H, W, 3) premultiplied colour, the background composed last.
         alpha: (H, W) coverage.
-        depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn.
+        depth: (H, W) expected depth along the camera's axis, 0 where nothing was drawn; an AttributeError
+            unless it was asked for.
     """
 
     def __init__(self, color: Any, alpha: Any, depth: Any) -> None:
@@ -44,7 +45,10 @@ class Image:
 
     @property
     def depth(self) -> Any:
-        return self._planes.depth
+        depth = self._planes.depth
+        if depth is None:
+            raise AttributeError("depth: expected a picture that was drawn with depth=True, got one without")
+        return depth
 
 
 @dataclass(frozen=True)

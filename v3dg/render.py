@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 from v3dg import _core, _device
@@ -34,6 +35,7 @@ class _FrameOptions(CutOptions, total=False):
     cut: Selection | None
     background: Sequence[float]
     min_transmittance: float | None
+    depth: bool
 
 
 class _Options(_FrameOptions, total=False):
@@ -66,6 +68,7 @@ def render(
     color_by: ColorBy = "appearance",
     background: Sequence[float] = (0.0, 0.0, 0.0),
     min_transmittance: float | None = None,
+    depth: bool = False,
     device: str | Device = "auto",
     memory: int | str | None = None,
 ) -> RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
@@ -90,6 +93,7 @@ def render(
         min_transmittance: A pixel stops behind the gaussian that lets no more than this share of light
             through, 0 to 0.99, so that no channel misses more than this times what lies behind. None is 0.001
             for scenes and bundles, and draws assets as `v3dg.rasterize` does.
+        depth: Draw the expected depth, too.
         device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws torch tensors there, on
             the stream that is torch's current one, and keeps on the device what the next picture of the same
             scene or bundle needs. Use a `Renderer` to say how long. "auto" is "cuda" where that works.
@@ -101,17 +105,15 @@ def render(
         RuntimeError: `device` is "cuda" and something is missing for it.
     """
     where = _device.resolve(device)
-    if isinstance(subject, Gaussians):
-        frame = _Frame(subject, color_by, where, memory)
-    else:
-        key = color_by, where, memory
-        frame = residency.frame(subject, key, lambda: _Frame(subject, color_by, where, memory))
+    make, key = partial(_Frame, subject, color_by, where, memory), (color_by, where, memory)
+    frame = make() if isinstance(subject, Gaussians) else residency.frame(subject, key, make)
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
+    shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
     pictures: list[Any] = []
     for view in [camera] if isinstance(camera, Camera | StereoCamera) else camera:
         if memory is not None and cut is None:
             frame.settle(subject, view, **options)
-        pictures.append(frame.draw(subject, view, background, min_transmittance, cut, **options))
+        pictures.append(frame.draw(subject, view, shade, cut, **options))
     return pictures[0] if isinstance(camera, Camera | StereoCamera) else pictures
 
 
@@ -167,11 +169,13 @@ class Renderer:
         cut: Selection | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         min_transmittance: float | None = None,
+        depth: bool = False,
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
         """Draw as `v3dg.render` does, of what is resident."""
+        shade = shade_of(background, min_transmittance, isinstance(self._subject, Gaussians), depth)
         options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
         drawn: RenderedImage | tuple[RenderedImage, RenderedImage] = self._frame.draw(
-            self._subject, camera, background, min_transmittance, cut, **options
+            self._subject, camera, shade, cut, **options
         )
         return drawn
 
@@ -228,8 +232,7 @@ class _Frame:
         self,
         subject: _Subject,
         camera: Camera | StereoCamera,
-        background: Sequence[float],
-        min_transmittance: float | None,
+        shade: _core.Shade,
         cut: Selection | None,
         **options: Any,
     ) -> Any:
@@ -237,8 +240,7 @@ class _Frame:
         check_camera(camera)
         if isinstance(camera, StereoCamera) and (cut is not None or isinstance(subject, Gaussians)):
             how = {"cut": cut, **options}
-            return tuple(self.draw(subject, eye, background, min_transmittance, **how) for eye in camera.eyes)
-        shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians))
+            return tuple(self.draw(subject, eye, shade, **how) for eye in camera.eyes)
         if isinstance(subject, Gaussians):
             _check_asset(self._color_by, cut=cut, **options)
             assert isinstance(camera, Camera)
@@ -323,13 +325,16 @@ class _Frame:
         return torch.tensor(ids, device=str(self._device))
 
 
-def shade_of(background: Sequence[float], min_transmittance: float | None, is_asset: bool) -> _core.Shade:
+def shade_of(
+    background: Sequence[float], min_transmittance: float | None, is_asset: bool, depth: bool
+) -> _core.Shade:
     """What `render` says of the two, as the core has it: below 0, pixels stop as `rasterize` has them."""
     if min_transmittance is None:
         stop = -1.0 if is_asset else DEFAULT_MIN_TRANSMITTANCE
     else:
         stop = real(min_transmittance, "min_transmittance", "a share of light, 0 to 0.99", 0, 0.99)
-    return _core.Shade(background=color(background, "background"), min_transmittance=stop)
+    behind = color(background, "background")
+    return _core.Shade(background=behind, min_transmittance=stop, with_depth=bool(depth))
 
 
 def _stats(stats: _core.FrameStats, tolerance: float) -> Stats:

@@ -112,7 +112,7 @@ class Run:
                 if tolerance == 0.0 and self.device == "cpu":
                     continue
                 image = self.time(f"frame, {label}", partial(v3dg.render, scene, camera, **options))
-                self.digests[f"picture, {label}"] = digest(image.color, image.alpha, image.depth)
+                self.digests[f"picture, {label}"] = digest(image.color, image.alpha)
             budget = v3dg.select(scene, camera, tolerance=3.0, device=self.device).num_gaussians // 2
             cut = v3dg.select(scene, camera, budget=budget, device=self.device)
             self.digests[f"budget, {name} {key}"] = digest(cut.instance_ids, cut.cluster_ids)

@@ -111,7 +111,7 @@ struct HostPictures {
     HostPictures(const Eyes& eyes, const Shade& shade) {
         for (int k = 0; k < eyes.count(); ++k) {
             const Window window = window_of(eyes.camera[k]);
-            out.push_back(picture_of(window, true));
+            out.push_back(picture_of(window, shade.with_depth));
             pictures.push_back(out.back().on_host<float>(window, shade));
         }
     }
@@ -227,7 +227,7 @@ class BoundSceneFrame {
                            });
 #if V3DG_WITH_CUDA
         const Work work(device_);
-        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
+        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, shade.with_depth);
         const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
         auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, image, work.stream());
         return std::make_unique<BoundDrawing>(
@@ -242,9 +242,10 @@ class BoundSceneFrame {
     // As draw_cut(), with the number of gaussians that each pixel is blended of in place of depth.
     std::unique_ptr<BoundDrawing> count_cut(const py::object& scene_object, const BoundCamera& camera,
                                             const py::array& instance_ids, const py::array& cluster_ids,
-                                            const Shade& shade, const Stop* stop, const py::object& weights) {
+                                            Shade shade, const Stop* stop, const py::object& weights) {
         require_host("count_cut");
         const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
+        shade.with_depth = true;
         return on_host(checked(scene_object), camera.camera, shade,
                        [&](const HostScene& host, Span<const Picture<float>> out) {
                            Picture<float> picture = out[0];
@@ -303,7 +304,7 @@ class BoundSceneFrame {
         for (int k = 0; k < eyes.count(); ++k) {
             const Camera& eye = eyes.camera[k];
             const Window whole{0, 0, static_cast<int>(eye.width), static_cast<int>(eye.height)};
-            pictures.push_back(picture_of(whole, true));
+            pictures.push_back(picture_of(whole, shade.with_depth));
             image[k] = pictures.back().on_device(device_, eye, shade);
         }
         return eyes.are_two ? cuda::images_of_eyes(image[0], image[1]) : cuda::EyeImages{{image[0], {}}, 1};
@@ -380,7 +381,7 @@ class BoundAssetFrame {
 #if V3DG_WITH_CUDA
         const Device device = model.device();
         const Work work(device);
-        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, true);
+        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, shade.with_depth);
         const cuda::FrameImage image = picture.on_device(device, camera.camera, shade);
         const cuda::PackedModel& packed = *model.on_device().packed;
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
@@ -428,11 +429,12 @@ void bind_frame(py::module_& m) {
         .def_readonly("exceeds_budget", &FrameStats::exceeds_budget)
         .def_readonly("select_ms", &FrameStats::select_ms)
         .def_readonly("draw_ms", &FrameStats::draw_ms);
-    py::class_<Shade>(m, "Shade", "What is behind a picture, and when its pixels stop.")
-        .def(py::init([](const std::array<double, 3>& background, float min_transmittance) {
-                 return Shade{background, min_transmittance};
+    py::class_<Shade>(m, "Shade",
+                      "What is behind a picture, when its pixels stop, and whether their depth is drawn.")
+        .def(py::init([](const std::array<double, 3>& background, float min_transmittance, bool with_depth) {
+                 return Shade{background, min_transmittance, with_depth};
              }),
-             py::kw_only(), "background"_a, "min_transmittance"_a);
+             py::kw_only(), "background"_a, "min_transmittance"_a, "with_depth"_a);
     py::class_<NewPicture>(m, "Picture", "The planes of a picture.")
         .def_readonly("color", &NewPicture::color)
         .def_readonly("alpha", &NewPicture::alpha)

@@ -9,10 +9,12 @@
 
 namespace v3dg {
 
-// What is behind the gaussians of a pixel, and when it stops (frame/image.h).
+// What is behind the gaussians of a pixel, when it stops (frame/image.h), and whether its depth is drawn,
+// too.
 struct Shade {
     std::array<double, 3> background;
     float min_transmittance = kStopsBefore;
+    bool with_depth = true;
 };
 
 // The planes of a new picture, to be filled in: colour (H, W, 3), alpha and, where it is wanted, depth (H,

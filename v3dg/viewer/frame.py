@@ -33,7 +33,7 @@ Shows: TypeAlias = Literal["appearance", "level", "cluster", "depth", "alpha", "
 MOST_COUNTED = 256
 # So many gaussians are drawn whole while the camera moves, too.
 _FEW_GAUSSIANS = 500_000
-_SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False)
+_SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
 # From dark to bright, even in lightness.
 _RAMP = np.array(
     [
@@ -242,7 +242,7 @@ class SceneView:
     ) -> tuple[Any, Any, Any, int]:
         """Colour, alpha and depth of the window, and the gaussians in the frustum of the whole picture."""
         if self.device.is_cuda:
-            image = render(self.scene, camera, cut=cut, color_by=color_by, device=self.device)
+            image = render(self.scene, camera, cut=cut, color_by=color_by, depth=True, device=self.device)
             x0, y0, x1, y1 = window
             planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
             color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
@@ -261,6 +261,7 @@ class SceneView:
         pairs, part = (cut.instance_ids, cut.cluster_ids), camera.core.window(*window)
         drawing = frame.count_cut(scene, part, *pairs, _SHADE, stop, cut.given_weights)
         _check(stop)
+        assert drawing.depth is not None
         return drawing.depth, drawing.finish().in_frustum
 
     def _frame(self, color_by: ColorBy, cut: Selection) -> tuple[_core.SceneFrame, _core.ResidentScene]:

@@ -47,7 +47,7 @@ def _poses(rng, count):
 
 
 def _drawn(scene):
-    image = v3dg.render(scene, CAMERA, tolerance=1.0, device="cpu")
+    image = v3dg.render(scene, CAMERA, tolerance=1.0, depth=True, device="cpu")
     planes = (image.color, image.alpha, image.depth)
     return hashlib.sha256(b"".join(np.ascontiguousarray(plane).tobytes() for plane in planes)).hexdigest()
 
