@@ -34,7 +34,7 @@ py::object interface_of(const py::handle& array) {
 // What is asked of torch for every frame, looked up once. It stays to the end of the process, which may come
 // after Python's.
 struct Torch {
-    py::object empty, current_stream;
+    py::object empty, current_stream;  // the stream as a number
 
     static const Torch& get() {
         PYBIND11_CONSTINIT static py::gil_safe_call_once_and_store<Torch> known;
@@ -49,11 +49,17 @@ struct Torch {
   private:
     Torch()
         : empty(py::module_::import("torch").attr("empty")),
-          current_stream(py::module_::import("torch.cuda").attr("current_stream")),
+          current_stream(initialised_cuda().attr("_C").attr("_cuda_getCurrentRawStream")),
           float32_(py::module_::import("torch").attr("float32")),
           int64_(py::module_::import("torch").attr("int64")),
           int32_(py::module_::import("torch").attr("int32")),
           uint8_(py::module_::import("torch").attr("uint8")) {}
+
+    // Torch, with CUDA ready for what does not see to that itself.
+    static py::module_ initialised_cuda() {
+        py::module_::import("torch.cuda").attr("init")();
+        return py::module_::import("torch");
+    }
 
     py::object float32_, int64_, int32_, uint8_;
 };
@@ -186,8 +192,7 @@ struct Work::Guard {
 Work::Work(Device device) : device_(device) {
     if (device.is_host()) return;
     guard_ = std::make_unique<Guard>(device.number);
-    const py::object stream = Torch::get().current_stream(device.number);
-    stream_ = reinterpret_cast<cuda::Stream>(stream.attr("cuda_stream").cast<uintptr_t>());
+    stream_ = reinterpret_cast<cuda::Stream>(Torch::get().current_stream(device.number).cast<uintptr_t>());
 }
 
 #else
