@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from v3dg.select import DEFAULT_TOLERANCE
 
 # An instance of a field can be smaller than a pixel, and its gaussians are not filtered.
 _CROP_SUPERSAMPLING = 16
+_STEP = 0.005
 
 
 @dataclass
@@ -75,6 +76,7 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
     runs = [frames(scene, cameras, {"tolerance": t}, config.repeats) for t in config.tolerances]
     runs.append(frames(scene, cameras, {"budget": config.budget}, config.repeats))
     moving = movement(scene, cameras[-1], config)
+    flown = [flight(scene, cameras, {"tolerance": t}, config.repeats) for t in config.tolerances]
     truths = [draw_truth(scene, camera, gpu.DEVICE) for camera in cameras]
     peer_ms, peer_pictures = gsplat(scene, cameras, config) if config.gsplat else ([], [])
     rows = []
@@ -88,7 +90,8 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
         print({k: v for k, v in row.items() if not k.endswith("of_each")}, flush=True)
         print("  farthest:", row["frame_ms_of_each"][-1], "ms, FLIP", row["flip_of_each"][-1], flush=True)
         rows.append(row)
-    result: Row = {"instances": len(scene), "cameras": config.cameras, "frames": rows, "moving": moving}
+    about: Row = {"instances": len(scene), "cameras": config.cameras}
+    result: Row = {**about, "frames": rows, "moving": moving, "flights": flown}
     if peer_ms:
         errors = judge.errors(zip(truths, peer_pictures, strict=True))
         result["gsplat"] = {
@@ -98,7 +101,7 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
             "flip_of_each": [e["flip"] for e in errors],
         }
         print("gsplat", result["gsplat"]["frame_ms"], result["gsplat"]["flip"], flush=True)
-    print(moving, flush=True)
+    print(moving, *flown, sep="\n", flush=True)
     return result
 
 
@@ -106,7 +109,7 @@ def frames(
     scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
 ) -> tuple[Row, list[Picture]]:
     """Every camera, near to far, with one renderer: as a flight through the scene finds it."""
-    ms, select_ms, counts, pictures = [], [], [], []
+    ms, device_ms, select_ms, counts, pictures = [], [], [], [], []
     with gpu.PeakMemory() as peak:
         renderer = Renderer(scene, device=gpu.DEVICE)
         for camera in cameras:
@@ -118,12 +121,14 @@ def frames(
 
             ms.append(time_ms(frame, gpu.DEVICE, repeats).median)
             stats = [frame().stats for _ in range(repeats)]
+            device_ms.append(statistics.median(s.select_ms + s.draw_ms for s in stats))
             select_ms.append(statistics.median(s.select_ms for s in stats))
             counts.append(stats[-1].gaussians_in_frustum)
             pictures.append(to_8bit(frame().color))
     row = {
         **options,
         "frame_ms": round(statistics.fmean(ms), 3),
+        "host_ms": round(statistics.fmean(ms) - statistics.fmean(device_ms), 3),
         "select_ms": round(statistics.fmean(select_ms), 4),
         "gaussians_in_frustum": round(statistics.fmean(counts)),
         "peak_gigabytes": round(peak.gigabytes, 2),
@@ -132,6 +137,27 @@ def frames(
         "gaussians_in_frustum_of_each": counts,
     }
     return row, pictures
+
+
+def flight(scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int) -> Row:
+    """Each camera on its way to the side, by 0.5 % of its distance to the middle of the scene a frame."""
+    renderer, middle = Renderer(scene, device=gpu.DEVICE), scene.positions.mean(axis=0)
+    ms = []
+    for camera in cameras:
+        step = _STEP * float(np.linalg.norm(camera.position - middle))
+        views = iter(_aside(camera, step * k) for k in range(3 + repeats))
+
+        def frame(views: Iterator[Camera] = views) -> None:
+            renderer.render(next(views), **options).stats  # noqa: B018  waits for the picture
+
+        ms.append(time_ms(frame, gpu.DEVICE, repeats).median)
+    return {**options, "frame_ms": round(statistics.fmean(ms), 3), "step": _STEP}
+
+
+def _aside(camera: Camera, distance: float) -> Camera:
+    viewmat = camera.viewmat.copy()
+    viewmat[0, 3] -= distance
+    return replace(camera, viewmat=viewmat)
 
 
 def movement(scene: Scene, camera: Camera, config: Config) -> Row:
