@@ -201,7 +201,8 @@ def test_tiles_lose_no_pixel_of_any_gaussian(gaussian, size, center, filter_px2)
 
 
 def draw_stopped(device, gaussians, camera, min_transmittance, **mode):
-    raster = v3dg.render(gaussians, camera, min_transmittance=min_transmittance, device=device, **mode)
+    options = {"min_transmittance": min_transmittance, "depth": True, "device": device}
+    raster = v3dg.render(gaussians, camera, **options, **mode)
     return v3dg.Image(*host((raster.color, raster.alpha, raster.depth)))
 
 

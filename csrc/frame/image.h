@@ -21,7 +21,8 @@ struct Window {
 // A pixel stops where hardly any light gets through, and what is behind is left out. As gsplat's do: before a
 // gaussian that would leave kMinTransmittance or less, which is left out too.
 struct StopsBefore {};
-// Behind the gaussian that leaves this much or less, so that no more is left out.
+// Behind the gaussian that leaves this much or less. That light goes to what was blended, in proportion: so
+// no channel is off by more than this much of the difference between what was blended and what is behind it.
 template <class T>
 struct StopsBehind {
     T transmittance;

@@ -50,13 +50,16 @@ void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t coun
             blend_entries<T, Extra::kNothing>(records, entry, count, left, top, picture.window, stop, tile);
     });
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
-        const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
-        for (int c = 0; c < 3; ++c) picture.color[3 * out + c] = tile.color[c][p] + t * picture.background[c];
-        picture.alpha[out] = 1 - t;
+        const Finished<T> of = finished(tile.transmittance[p], picture.min_transmittance);
+        const T alpha = 1 - of.transmittance;
+        for (int c = 0; c < 3; ++c)
+            picture.color[3 * out + c] =
+                of.gain * tile.color[c][p] + of.transmittance * picture.background[c];
+        picture.alpha[out] = alpha;
         if (picture.count != nullptr)
             picture.count[out] = tile.extra[p];
         else if (picture.depth != nullptr)
-            picture.depth[out] = t < 1 ? tile.extra[p] / (1 - t) : T(0);
+            picture.depth[out] = alpha > 0 ? of.gain * tile.extra[p] / alpha : T(0);
     });
 }
 

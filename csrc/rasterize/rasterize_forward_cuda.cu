@@ -297,11 +297,13 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
     for_each_pixel([&](int sub, int x, int y) {
         if (x >= image.width || y >= image.height) return;
         const size_t out = static_cast<size_t>(y) * image.width + x;
-        const float t = fabsf(s.pixels.transmittance[sub][lane]);
+        const Finished<float> of = finished(s.pixels.transmittance[sub][lane], image.min_transmittance);
+        const float alpha = 1 - of.transmittance;
         for (int c = 0; c < 3; ++c)
-            image.color[3 * out + c] = s.pixels.color[c][sub][lane] + t * image.background[c];
-        image.alpha[out] = 1 - t;
-        if (kWithDepth) image.depth[out] = t < 1 ? s.pixels.depth[sub][lane] / (1 - t) : 0.0f;
+            image.color[3 * out + c] =
+                of.gain * s.pixels.color[c][sub][lane] + of.transmittance * image.background[c];
+        image.alpha[out] = alpha;
+        if (kWithDepth) image.depth[out] = alpha > 0 ? of.gain * s.pixels.depth[sub][lane] / alpha : 0.0f;
     });
 }
 

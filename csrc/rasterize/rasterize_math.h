@@ -59,6 +59,19 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBefore = {}) {
     return weight;
 }
 
+// Of a pixel that was blended to the end: how much light reaches the background, and what its colour is
+// multiplied by.
+template <class T>
+struct Finished {
+    T transmittance, gain;
+};
+template <class T>
+V3DG_HD V3DG_INLINE Finished<T> finished(T t, float min_transmittance) {
+    const bool has_stopped = t < 0;
+    if (has_stopped && min_transmittance >= 0) return {T(0), 1 / (1 + t)};
+    return {has_stopped ? -t : t, T(1)};
+}
+
 // blend_weight() for several gaussians, one behind the other; `before` is the transmittance at each. Most
 // pixels do not stop among them, and then the product of all tells that.
 template <int kCount, class T>

@@ -38,7 +38,9 @@ def rasterize(
     sh_degree=None,
     min_transmittance=None,
 ) -> Picture:
-    """Pixels stop before TRANSMITTANCE_MIN; behind the gaussian that leaves `min_transmittance` if given."""
+    """Pixels stop before TRANSMITTANCE_MIN; behind the gaussian that leaves `min_transmittance` if given, and
+    what is left goes to what was blended.
+    """
     stop = TRANSMITTANCE_MIN if min_transmittance is None else min_transmittance
     projection = project(gaussians, camera, filter_px2=filter_px2)
     colors = reference_sh.color(gaussians.sh, np.asarray(gaussians.means) - camera.position, sh_degree)
@@ -90,7 +92,12 @@ def rasterize(
         transmittance = np.where(blends, left, transmittance)
         num_blended += blends
 
+    blended = 1 - transmittance
+    depth = np.divide(weighted_depth, blended, out=np.zeros_like(blended), where=blended > 0)
+    if min_transmittance is not None:
+        filled = ~is_open & (transmittance > 0)
+        color[filled] /= blended[filled][:, None]
+        transmittance[filled] = 0
     alpha = 1 - transmittance
-    depth = np.divide(weighted_depth, alpha, out=np.zeros_like(alpha), where=alpha > 0)
     color = color + transmittance[..., None] * np.asarray(background, np.float64)
     return Picture(color, alpha, depth, num_blended, ~is_open, cutoff_distance, clamp_distance, contribution)
