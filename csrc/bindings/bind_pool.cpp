@@ -66,6 +66,7 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
     if (!device_.is_host()) {
         row_bytes = cuda::pooled_row_bytes(max_degree);
         blocks = std::make_shared<cuda::PinnedBlocks>();
+        limits.most_frames = cuda::kMostFlights;
     }
 #endif
     limits.num_rows = (num_bytes - limits.block_bytes) / row_bytes;
@@ -104,15 +105,20 @@ void BoundPool::check_scene(const SceneState& scene) const {
     if (!fits) throw py::value_error("scene: expected one of the bundles that the pool is of");
 }
 
-void BoundPool::note_needs(float tolerance_px2, bool adapts) {
-    std::vector<PageRequest> needs;
+void BoundPool::note_needs(float tolerance_px2, bool is_bounded) {
+    FrameNeeds* needs = pool_->lend_needs();
+    size_t count = 0;
     for (uint32_t b = 0; b < needs_.size(); ++b)
         for (uint32_t p = 0; p < needs_[b].size(); ++p) {
-            if (needs_[b][p] == 0) continue;
-            needs.push_back({b, p, 0});
-            std::memcpy(&needs.back().priority, &needs_[b][p], sizeof(float));
+            if (needs_[b][p] == 0 || count++ >= pool_->most_needs()) continue;
+            PageRequest& need = needs->list[count - 1] = {b, p, 0};
+            std::memcpy(&need.priority, &needs_[b][p], sizeof(float));
         }
-    pool_->note_needs(pool_->frame(), {needs.data(), needs.size()}, 0, tolerance_px2, adapts);
+    needs->count = std::min(count, pool_->most_needs());
+    needs->num_left_out = count - needs->count;
+    needs->tolerance_px2 = tolerance_px2;
+    needs->adapts = is_bounded;
+    pool_->note_needs(needs, !is_bounded);
 }
 
 float BoundPool::ask(const py::object& scene_object, const BoundEyes& camera, const SelectRule& rule) {

@@ -42,7 +42,7 @@ class BoundPool {
             needs_[b].assign(tables[b].num_pages(), 0);
             needs.push_back({needs_[b].data(), needs_[b].size()});
         }
-        rule.tolerance_px2 = std::max(rule.tolerance_px2, pool_->status().least_tolerance_px2);
+        rule.tolerance_px2 = std::max(rule.tolerance_px2, pool_->least_tolerance_px2());
         note_needs(cut(Span<const ClusterTable>{tables.data(), tables.size()}, rule,
                        Span<const Span<uint32_t>>{needs.data(), needs.size()}),
                    is_bounded);
@@ -59,7 +59,7 @@ class BoundPool {
 #if V3DG_WITH_CUDA
     void make_on_device(size_t num_rows, const Work& work);
 #endif
-    void note_needs(float tolerance_px2, bool adapts);
+    void note_needs(float tolerance_px2, bool is_bounded);
 
     const Device device_;
     const py::list tables_, sources_;

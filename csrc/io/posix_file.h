@@ -49,6 +49,14 @@ class PosixFile {
         return done;
     }
 
+    // Has the system begin to read what will be asked for; a hint, where it takes any.
+    void expect(size_t offset, size_t size) const {
+#ifdef POSIX_FADV_WILLNEED
+        static_cast<void>(::posix_fadvise(descriptor_, static_cast<off_t>(offset), static_cast<off_t>(size),
+                                          POSIX_FADV_WILLNEED));
+#endif
+    }
+
     void write_at(size_t offset, const char* bytes, size_t size) const {
         size_t done = 0;
         while (done < size) {

@@ -12,9 +12,6 @@ namespace cuda {
 
 namespace {
 
-// Frames whose cuts are under way at once; the next one waits for the first of them.
-constexpr size_t kMostFlights = 4;
-
 // A page on its way: bytes of the host that go to the device, and the word that says where it is.
 struct PageMove {
     const uint4* from;
@@ -67,17 +64,15 @@ struct DevicePages::Flight {
     const Pinned<PageMove> moves;
     const Pinned<PageRows> pages;
     const Pinned<NeedsReport> report;
-    const Pinned<PageRequest> needs;
+    FrameNeeds* needs = nullptr;
     std::vector<unsigned char*> blocks;  // that `moves` reads
-    uint32_t frame = 0;
     bool is_bounded = false;
     cudaEvent_t done = nullptr;
 
-    Flight(size_t most_changes, size_t most_needs)
+    explicit Flight(size_t most_changes)
         : moves(pinned<PageMove>(most_changes)),
           pages(pinned<PageRows>(most_changes)),
-          report(pinned<NeedsReport>(1)),
-          needs(pinned<PageRequest>(most_needs)) {
+          report(pinned<NeedsReport>(1)) {
         check(cudaEventCreateWithFlags(&done, cudaEventDisableTiming), "cudaEventCreate");
     }
     ~Flight() {
@@ -135,7 +130,7 @@ DevicePages::DevicePages(PagePool& pool, std::vector<std::shared_ptr<const Bundl
     bundles_.copy_from({bundles.data(), bundles.size()}, stream);
     need_.copy_from({need.data(), need.size()}, stream);
     for (size_t k = 0; k < kMostFlights; ++k)
-        flights_.push_back(std::make_unique<Flight>(pool.most_changes(), pool.most_needs()));
+        flights_.push_back(std::make_unique<Flight>(pool.most_changes()));
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
@@ -154,10 +149,13 @@ void DevicePages::note_flights(bool waits) {
         check(over, "a frame");
         pool_.give_back(flight.blocks);
         flight.blocks.clear();
-        const size_t count = flight.report[0].count, told = std::min(count, pool_.most_needs());
+        FrameNeeds* needs = std::exchange(flight.needs, nullptr);
+        needs->count = std::min<size_t>(flight.report[0].count, pool_.most_needs());
+        needs->num_left_out = flight.report[0].count - needs->count;
+        needs->tolerance_px2 = flight.report[0].tolerance_px2;
         // Who waits asks for a tolerance that does not depend on the frames before.
-        pool_.note_needs(flight.frame, {flight.needs.get(), told}, count - told,
-                         flight.report[0].tolerance_px2, flight.is_bounded && !waits);
+        needs->adapts = flight.is_bounded && !waits;
+        pool_.note_needs(needs, waits);
         under_way_.pop_front();
     }
 }
@@ -208,18 +206,19 @@ PartlyResident DevicePages::begin_frame(bool is_bounded, cudaStream_t stream) {
     note_flights(false);
     if (current_ != nullptr) {  // its frame was given up before its cut
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+        pool_.give_up(std::exchange(current_->needs, nullptr));
         pool_.give_back(std::exchange(current_->blocks, {}));
     }
     Flight& flight = free_flight();
     const std::vector<PageChange>& changes = pool_.begin_frame(is_bounded);
-    flight.frame = pool_.frame();
+    flight.needs = pool_.lend_needs();
     flight.is_bounded = is_bounded;
     flight.blocks = pool_.take_blocks();
     current_ = &flight;
     bring(changes, flight, stream);
     return {bundles_.data(),
             {words_.data(), num_words_, need_.data(), list_.data(), static_cast<unsigned>(pool_.most_needs()),
-             flight.report.get(), flight.needs.get()}};
+             flight.report.get(), flight.needs->list}};
 }
 
 void DevicePages::end_frame(cudaStream_t stream) {
@@ -228,7 +227,7 @@ void DevicePages::end_frame(cudaStream_t stream) {
 }
 
 SelectRule DevicePages::raised(SelectRule rule) const {
-    rule.tolerance_px2 = std::max(rule.tolerance_px2, pool_.status().least_tolerance_px2);
+    rule.tolerance_px2 = std::max(rule.tolerance_px2, pool_.least_tolerance_px2());
     return rule;
 }
 

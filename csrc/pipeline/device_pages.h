@@ -28,6 +28,9 @@ class PinnedBlocks : public BlockMemory {
     std::vector<Pinned<unsigned char>> blocks_;
 };
 
+// Frames whose cuts are under way at once; the next one waits for the first of them.
+constexpr size_t kMostFlights = 4;
+
 // Bytes that a row of a pool takes.
 size_t pooled_row_bytes(int max_sh_degree);
 

@@ -1,51 +1,38 @@
 #pragma once
 
-// The policy of residency, the same for every device: which pages are loaded, which make room, and in what
-// order. It knows pages as bytes that are brought somewhere; whoever draws brings them to their slots.
+// Pages in memory of a fixed size, the same for every device. It knows them as bytes that are brought
+// somewhere; whoever draws brings them to their slots.
 //
-// Memory is rows of gaussians: the coarsest pages of all bundles first, which stay, then slots that hold any
-// other page. What is resident is closed towards the root at every moment: a page comes after the page above
-// it, and goes when none below it is there.
-//
-// Threads read pages from their sources into blocks. A frame takes what has been read, of a bounded number of
-// bytes, and waits for nothing; after its cut it says which pages it used and which it missed.
+// A frame hands over what its cut needed and takes the pages that are to come and go before it. Threads of
+// the pool's own decide which those are (page_policy.h) and read them into blocks. They share with frames a
+// lock that is held for swaps of buffers only, and a frame that finds it taken does without.
 
-#include <condition_variable>
 #include <memory>
-#include <mutex>
 #include <string>
 #include <vector>
 
-#include "residency/cluster_table.h"
-#include "residency/page_source.h"
+#include "residency/page_blocks.h"
+#include "residency/page_policy.h"
 
 namespace v3dg {
-
-// A bundle of which pages are resident: its tables, of which only those of groups and clusters are read and
-// only at the start, and where its pages come from.
-struct PagedBundle {
-    ClusterTable table;
-    std::shared_ptr<const PageSource> source;
-};
 
 struct PoolLimits {
     size_t num_rows;                               // of memory
     size_t block_bytes = size_t(64) << 20;         // for what has been read and is not resident yet
     size_t most_bytes_a_frame = size_t(32) << 20;  // that become resident
-    unsigned num_threads = 8;                      // none: pages are read by read_one() alone
+    size_t most_frames = 1;                        // that borrow memory for their needs at once
+    unsigned num_threads = 8;  // that read; none: read_one() does, and all is decided in threads that call
 };
 
-// A page that comes to its slot, or leaves it.
-struct PageChange {
-    uint32_t bundle, page;
-    int64_t row;                 // where its rows begin; kAbsentPage: it leaves
-    const unsigned char* bytes;  // of what comes
-};
-
-// Where blocks of bytes come from; kinds of memory differ by device.
-struct BlockMemory {
-    virtual ~BlockMemory() = default;
-    virtual unsigned char* allocate(size_t bytes) = 0;  // lives as long as this
+// What the cut of a frame needed, absent or resident, in any order.
+struct FrameNeeds {
+    PageRequest* list;    // room for most_needs()
+    size_t count;         // there
+    size_t num_left_out;  // more than there is room for
+    float tolerance_px2;  // that it was drawn with
+    bool adapts;          // the tolerance follows, from frame to frame
+    uint32_t frame;       // which lend_needs() tells
+    float least_px2;      // its least tolerance, likewise
 };
 
 struct PoolStatus {
@@ -59,6 +46,7 @@ struct PoolStatus {
     bool is_damage;                  // of a file, as PageError has it
 };
 
+// Frames are one thread at a time: begin_frame() to give_back(), lend_needs() and note_needs().
 class PagePool {
   public:
     // Reads the coarsest pages. Throws PageError, or std::invalid_argument where there is no room for those
@@ -84,20 +72,22 @@ class PagePool {
     size_t most_needs() const;
 
     // Begins a frame: what comes and goes before it, in this order. The first time the coarsest pages come.
-    // Their bytes stay until release() or the next call.
+    // Their bytes stay until release() or the next call. A bounded frame waits for nothing; one that is not
+    // takes all that was read, and waits until that is decided.
     const std::vector<PageChange>& begin_frame(bool is_bounded);
     void release();
     // The same in two steps, for who copies later: takes away the blocks, which give_back() returns.
     std::vector<unsigned char*> take_blocks();
     void give_back(const std::vector<unsigned char*>& blocks);
 
-    // The number of the frame that began last.
-    uint32_t frame() const;
-    // What the cut of a frame needed, absent or resident, in any order. `tolerance_px2` is what it was drawn
-    // with; `adapts`: the tolerance follows, from frame to frame. So many more pages are needed as are left
-    // out, which is more than there is room for.
-    void note_needs(uint32_t frame, Span<const PageRequest> needs, size_t num_left_out, float tolerance_px2,
-                    bool adapts);
+    // Memory for what the frame needs that began last, which note_needs() returns.
+    FrameNeeds* lend_needs();
+    // Of several frames that are noted before one is decided about, the last one counts. Waits for that to be
+    // over if so told.
+    void note_needs(FrameNeeds* needs, bool waits);
+    void give_up(FrameNeeds* needs);  // of a frame without a cut
+    // What the tolerance of the frame that began last is raised to; 0: it is not.
+    float least_tolerance_px2() const;
     // Raises the tolerance at once, unless there is room for what the last view needs: for a picture that
     // shall not depend on the frames before, from one to the next of which it changes little. Returns whether
     // it did.
@@ -111,6 +101,7 @@ class PagePool {
     bool read_one();
     // Forgets which pages failed, so that they are tried again.
     void forget_failures();
+    // Of the last view that was decided about. Waits for nothing, unless pages failed.
     PoolStatus status() const;
 
   private:

@@ -1,0 +1,302 @@
+#include "residency/page_policy.h"
+
+#include <algorithm>
+#include <cstring>
+#include <functional>
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+namespace v3dg {
+
+namespace {
+
+// A page above one that is asked for is more urgent by so much, and none below it is as urgent: those around
+// the eye, whose priority has no bound, count as this.
+constexpr float kAbove = 2.0f, kMostPriority = 1073741824.0f;
+constexpr size_t kMostLeaving = 4096;            // slots that make room before they are looked for again
+constexpr size_t kMostChosen = size_t(1) << 14;  // that are read before the next choice
+constexpr int32_t kRootSlot = -2, kNoSlot = -1;
+constexpr size_t kAhead = 16;  // needs whose memory is fetched before their turn
+
+// Urgencies are told apart by a sixteenth of a power of two, from 1/2 on.
+constexpr uint32_t kNumKeys = 1024, kKeyShift = 19, kFirstKey = 0x3f000000u >> kKeyShift;
+
+uint32_t key_of(float priority) {
+    uint32_t bits;  // of a positive float, so they order as it does
+    std::memcpy(&bits, &priority, sizeof bits);
+    return std::clamp(bits >> kKeyShift, kFirstKey, kFirstKey + kNumKeys - 1) - kFirstKey;
+}
+
+}  // namespace
+
+void PagesComing::clear() {
+    changes.clear();
+    dropped.clear();
+    bytes = num_left = 0;
+}
+
+PagePolicy::PagePolicy(const std::vector<PagedBundle>& bundles, size_t num_rows) : places_of_key_(kNumKeys) {
+    size_t num_pages = 0;
+    for (const PagedBundle& bundle : bundles) num_pages += bundle.table.num_pages();
+    if (num_pages > INT32_MAX)
+        throw std::invalid_argument("memory: expected bundles of fewer than 2^31 pages together, got " +
+                                    std::to_string(num_pages));
+    slot_of_page_.assign(num_pages, kNoSlot);
+    pages_.resize(num_pages);
+    states_ = std::make_unique<std::atomic<PageState>[]>(num_pages);
+    uint32_t first_page = 0;
+    for (const PagedBundle& bundle : bundles) {
+        bundles_.push_back({bundle.source, first_page, 0});
+        add_bundle(bundle);
+        first_page += static_cast<uint32_t>(bundle.table.num_pages());
+    }
+    plan_memory(num_rows);
+}
+
+void PagePolicy::add_bundle(const PagedBundle& given) {
+    const ClusterTable& table = given.table;
+    const uint32_t first = bundles_.back().first_page;
+    for (size_t c = 0; c < table.num_clusters(); ++c)
+        if (table.own_group[c] >= 0)
+            pages_[first + table.own_group[c]].parent = static_cast<int32_t>(first + table.page_of(c));
+    const size_t root = first + table.num_pages() - 1;
+    slot_of_page_[root] = kRootSlot;
+    if (table.num_clusters() > 0) states_[root] = PageState::resident;
+}
+
+void PagePolicy::plan_memory(size_t num_rows) {
+    size_t root_rows = 0, num_pages = 0;
+    for (Bundle& bundle : bundles_) {
+        const size_t root = bundle.source->num_pages() - 1;
+        bundle.root_row = static_cast<int64_t>(root_rows);
+        root_rows += bundle.source->num_rows(root);
+        num_pages += root;
+        for (size_t p = 0; p < root; ++p) {
+            slot_rows_ = std::max(slot_rows_, bundle.source->num_rows(p));
+            most_page_bytes_ = std::max(most_page_bytes_, bundle.source->num_bytes(p));
+        }
+    }
+    first_slot_row_ = root_rows;
+    const size_t least = root_rows + (num_pages > 0 ? bundles_.size() * slot_rows_ : 0);
+    if (num_rows < least)
+        throw std::invalid_argument("memory: expected room for at least " + std::to_string(least) +
+                                    " gaussians, the coarsest of all bundles and a page more of each, got "
+                                    "room for " +
+                                    std::to_string(num_rows));
+    const size_t num_slots = std::min((num_rows - root_rows) / slot_rows_, num_pages);
+    slots_.resize(num_slots);
+    uses_.resize(num_slots);
+    leaving_.reserve(num_slots);
+    for (size_t s = num_slots; s > 0; --s) free_slots_.push_back(static_cast<uint32_t>(s - 1));
+}
+
+void PagePolicy::forget_failures() {
+    for (size_t id = 0; id < num_pages(); ++id) {
+        PageState failed = PageState::failed;
+        states_[id].compare_exchange_strong(failed, PageState::absent);
+    }
+}
+
+void PagePolicy::touch(uint32_t& last, uint32_t value, Kept& kept) {
+    kept.now -= last == noted_ + 1;
+    kept.before -= last == noted_;
+    kept.now += value == noted_ + 1;
+    last = value;
+}
+
+// Marks a page as used by the noted view, and those above it as needed.
+void PagePolicy::use(int32_t slot, bool is_needed) {
+    for (; slot >= 0; slot = uses_[slot].above, is_needed = true) {
+        Use& of = uses_[slot];
+        if (of.last_needed == noted_ + 1) return;
+        touch(of.last_used, noted_ + 1, used_);
+        if (is_needed) touch(of.last_needed, noted_ + 1, needed_);
+    }
+}
+
+// The topmost page that cannot be had, itself or above a page; -1: none.
+int32_t PagePolicy::block_above(int32_t id) const {
+    int32_t blocked = -1;
+    for (; id >= 0; id = pages_[id].parent)
+        if (state_of(id) == PageState::failed) blocked = id;
+    return blocked;
+}
+
+// Adds an absent page and those above it to what is wanted. Returns how many of them the cut misses that it
+// was not known to miss.
+size_t PagePolicy::ask(const PageRequest& request, bool has_failures) {
+    auto id = static_cast<int32_t>(id_of(request.bundle, request.page));
+    const int32_t blocked = has_failures ? block_above(id) : -1;
+    if (blocked >= 0) id = pages_[blocked].parent;
+    float priority = std::min(request.priority, kMostPriority);
+    size_t num_missing = 0;
+    for (; id >= 0; id = pages_[id].parent, priority *= kAbove) {
+        if (slot_of_page_[id] != kNoSlot) {
+            use(slot_of_page_[id], true);
+            break;
+        }
+        Page& page = pages_[id];
+        const bool is_new = page.stamp != noted_;
+        if (!is_new && page.priority >= priority) break;
+        num_missing += priority > 1 && (is_new || page.priority <= 1);
+        if (is_new && state_of(id) == PageState::absent)
+            wanted_.push_back({request.bundle, id - bundles_[request.bundle].first_page, 0});
+        page.stamp = noted_;
+        page.priority = priority;
+    }
+    return num_missing;
+}
+
+void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool has_failures) {
+    ++noted_;
+    needed_ = {0, needed_.now};
+    used_ = {0, used_.now};
+    missing_ = num_left_out;
+    finds_none_ = false;
+    wanted_.clear();
+    for (size_t i = 0; i < needs.size; ++i) {
+        if (i + kAhead < needs.size) {
+            const PageRequest& later = needs[i + kAhead];
+            __builtin_prefetch(&slot_of_page_[id_of(later.bundle, later.page)]);
+        }
+        const PageRequest& need = needs[i];
+        const int32_t slot = slot_of_page_[id_of(need.bundle, need.page)];
+        if (slot != kNoSlot)
+            use(slot, need.priority > 1);
+        else
+            missing_ += ask(need, has_failures);
+    }
+    num_needed_ = needed_.now;
+}
+
+void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
+    size_t num_missed = 0;
+    std::fill(places_of_key_.begin(), places_of_key_.end(), Places{});
+    for (Wanted& w : wanted_) {
+        const float priority = pages_[id_of(w.bundle, w.page)].priority;
+        num_missed += priority > 1;
+        w.key = key_of(priority);
+        ++places_of_key_[w.key].count;
+    }
+    const size_t unneeded = num_old(needed_), unused = num_old(used_);
+    const size_t room = num_missed > unused ? std::min(num_missed, unneeded) : unused;
+    const size_t most = std::min(room > under_way ? room - under_way : 0, kMostChosen);
+    // The least urgent first; what there is no room for is left out.
+    size_t num_left_out = wanted_.size() > most ? wanted_.size() - most : 0;
+    todo.resize(wanted_.size() - num_left_out);
+    uint32_t end = 0;
+    for (Places& places : places_of_key_) {
+        const auto left_out = static_cast<uint32_t>(std::min<size_t>(places.count, num_left_out));
+        num_left_out -= left_out;
+        places.count -= left_out;
+        places.end = end += places.count;
+    }
+    for (const Wanted& w : wanted_) {
+        Places& places = places_of_key_[w.key];
+        if (places.count == 0) continue;
+        --places.count;
+        todo[--places.end] = {w.bundle, w.page, 0};
+    }
+}
+
+void PagePolicy::evict(uint32_t s, PagesComing& out) {
+    const Slot slot = std::exchange(slots_[s], {});
+    const uint32_t id = id_of(slot.bundle, slot.page);
+    out.changes.push_back({static_cast<uint32_t>(slot.bundle), slot.page, kAbsentPage, nullptr});
+    slot_of_page_[id] = kNoSlot;
+    states_[id].store(PageState::absent, std::memory_order_release);
+    Use& of = uses_[s];
+    if (of.above >= 0) --uses_[of.above].num_children;
+    touch(of.last_needed, 0, needed_);
+    touch(of.last_used, 0, used_);
+    free_slots_.push_back(s);
+}
+
+// Where no slot is free.
+void PagePolicy::find_leaving() {
+    for (uint32_t s = 0; s < slots_.size(); ++s)
+        if (may_go(s)) leaving_.push_back({uses_[s].last_used, s});
+    if (leaving_.size() > kMostLeaving) {
+        std::nth_element(leaving_.begin(), leaving_.begin() + kMostLeaving, leaving_.end());
+        leaving_.resize(kMostLeaving);
+    }
+    std::make_heap(leaving_.begin(), leaving_.end(), std::greater<>());
+    finds_none_ = leaving_.empty();
+}
+
+// Whether the first of the heap may go; those that were used again are dropped.
+bool PagePolicy::has_leaving() {
+    while (!leaving_.empty()) {
+        const Leaving& first = leaving_.front();
+        if (uses_[first.slot].last_used == first.last_used && may_go(first.slot)) return true;
+        std::pop_heap(leaving_.begin(), leaving_.end(), std::greater<>());
+        leaving_.pop_back();
+    }
+    return false;
+}
+
+// Sees to it that there is a free slot, for a page that the cut misses or one that it nearly does.
+bool PagePolicy::make_room(bool is_missed, PagesComing& out) {
+    if (!free_slots_.empty()) return true;
+    if (!has_leaving() && !finds_none_) find_leaving();
+    if (leaving_.empty() || (!is_missed && !is_old(leaving_.front().last_used))) return false;
+    std::pop_heap(leaving_.begin(), leaving_.end(), std::greater<>());
+    const uint32_t s = leaving_.back().slot;
+    leaving_.pop_back();
+    const int32_t above = uses_[s].above;
+    evict(s, out);
+    if (above >= 0 && may_go(above)) {
+        leaving_.push_back({uses_[above].last_used, static_cast<uint32_t>(above)});
+        std::push_heap(leaving_.begin(), leaving_.end(), std::greater<>());
+    }
+    return true;
+}
+
+void PagePolicy::occupy(const LoadedPage& loaded, PagesComing& out) {
+    const uint32_t s = free_slots_.back(), id = id_of(loaded.bundle, loaded.page);
+    free_slots_.pop_back();
+    const auto row = static_cast<int64_t>(first_slot_row_ + s * slot_rows_);
+    slots_[s] = {static_cast<int32_t>(loaded.bundle), loaded.page};
+    Use& of = uses_[s];
+    touch(of.last_needed, noted_ + 1, needed_);
+    touch(of.last_used, noted_ + 1, used_);
+    of.above = slot_of_page_[pages_[id].parent];
+    of.num_children = 0;
+    if (of.above >= 0) ++uses_[of.above].num_children;
+    slot_of_page_[id] = static_cast<int32_t>(s);
+    states_[id].store(PageState::resident, std::memory_order_release);
+    out.changes.push_back({loaded.bundle, loaded.page, row, loaded.block});
+    out.bytes += bundles_[loaded.bundle].source->num_bytes(loaded.page);
+}
+
+void PagePolicy::bring(std::vector<LoadedPage>& loaded, size_t most_bytes, PagesComing& out) {
+    for (LoadedPage& next : loaded) next.priority = pages_[id_of(next.bundle, next.page)].priority;
+    std::sort(loaded.begin(), loaded.end(), [](const LoadedPage& a, const LoadedPage& b) {
+        if (a.priority != b.priority) return a.priority > b.priority;
+        return a.bundle != b.bundle ? a.bundle < b.bundle : a.page > b.page;  // those above first
+    });
+    left_.clear();
+    for (const LoadedPage& next : loaded) {
+        const Page& page = pages_[id_of(next.bundle, next.page)];
+        const PageState above = state_of(page.parent);
+        const bool is_above_coming = above == PageState::loading || above == PageState::loaded;
+        const size_t size = bundles_[next.bundle].source->num_bytes(next.page);
+        const bool is_full = out.bytes > 0 && out.bytes + size > most_bytes;
+        if (is_above_coming || is_full) {
+            left_.push_back(next);
+            out.num_left += !is_above_coming;
+            continue;
+        }
+        const bool is_wanted = page.stamp + 1 >= noted_;
+        if (above == PageState::resident && is_wanted && make_room(page.priority > 1, out)) {
+            occupy(next, out);
+            continue;
+        }
+        state(next.bundle, next.page).store(PageState::absent, std::memory_order_release);
+        out.dropped.push_back(next.block);
+    }
+    loaded.swap(left_);
+}
+
+}  // namespace v3dg
