@@ -164,6 +164,29 @@ def test_frames_become_finer_until_nothing_is_missing(scene, device):
     assert status(renderer).bytes_in > 0
 
 
+@pytest.mark.parametrize(("memory", "most"), [("64MB", 1), ("8MB", 3), ("4MB", 5)])
+def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, most):
+    """No more than their bytes call for, of which an eighth of the pool is on the way at once, and one more.
+
+    Pages of all levels are asked for at once: there are 13 of them.
+    """
+    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
+    rng = np.random.default_rng(0)
+    bundle = lod_bundle(rng, blob(rng, 20_000), 32)
+    assert bundle.num_levels == 13
+    renderer = Renderer(bundle, device=device, memory=memory)
+    renderer.render(AWAY, tolerance=20.0).stats  # noqa: B018
+    num_missed, missing = 0, 1
+    while missing and num_missed <= most:
+        renderer.render(NEAR, tolerance=1.0).stats  # noqa: B018
+        missing = status(renderer).missing
+        num_missed += missing > 0
+        while renderer._frame._pool.core.read_one():
+            pass
+    assert 0 < num_missed <= most
+    assert status(renderer).needed > 900
+
+
 def test_shortage_raises_the_tolerance_from_frame_to_frame(scene, device):
     renderer = Renderer(scene, device=device, memory=150_000)
     tolerances = [renderer.render(CAMERA, **FINE).stats.tolerance for _ in range(300)]

@@ -52,11 +52,12 @@ class BoundDrawing {
 #if V3DG_WITH_CUDA
     // `kept` are the frame, which may have to draw again, and what it reads.
     BoundDrawing(NewPictures pictures, py::object kept, Device device, std::unique_ptr<cuda::Drawing> drawing,
-                 const SelectRule& rule)
+                 const SelectRule& rule, cuda::DevicePages* pages = nullptr)
         : pictures_(std::move(pictures)),
           kept_(std::move(kept)),
           device_(device),
           drawing_(std::move(drawing)),
+          pages_(pages),
           rule_(rule) {}
 #endif
 
@@ -72,6 +73,7 @@ class BoundDrawing {
                 drawing_->wait();
             }
             const cuda::FrameCounters& c = drawing_->finish();  // may draw, and so keeps other threads out
+            if (pages_ != nullptr) pages_->note_frames(work.stream());
             const cuda::FrameTimes times = drawing_->times();
             const bool exceeds = c.choice.exceeds_budget;
             stats_ = {static_cast<int64_t>(exceeds ? c.choice.least : c.gaussians / pictures_.size()),
@@ -95,6 +97,7 @@ class BoundDrawing {
     py::object kept_;
     Device device_;
     std::unique_ptr<cuda::Drawing> drawing_;  // gone before what it needs
+    cuda::DevicePages* pages_ = nullptr;      // of the pool that it draws from, which `kept_` has
     SelectRule rule_{};
 #endif
 };
@@ -196,7 +199,7 @@ class BoundSceneFrame {
                 frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images, work.stream());
             return std::make_unique<BoundDrawing>(std::move(pictures),
                                                   py::make_tuple(py::cast(this), scene_object, pool_object),
-                                                  device_, std::move(drawing), used);
+                                                  device_, std::move(drawing), used, &pool.on_device());
         }
 #endif
         HostPictures out(eyes, shade);

@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cstring>
+#include <thread>
 
 #include "bindings/operations.h"
 #include "bindings/pool.h"
@@ -8,8 +9,11 @@ namespace v3dg {
 
 namespace {
 
-// At most so much of a pool's memory is for pages on their way.
-constexpr size_t kMostBlockBytes = size_t(64) << 20, kBlockShare = 8;
+// At most so much of a pool's memory is for pages on their way: what comes in while a few frames are drawn.
+constexpr size_t kMostBlockBytes = size_t(64) << 20, kMostBlockBytesOnDevice = size_t(128) << 20;
+constexpr size_t kBlockShare = 8;
+// Threads that read do more than wait for the disk: they hash. There are more of them where there are cores.
+constexpr unsigned kMostThreads = 16;
 
 [[noreturn]] void raise(const PageError& error) {
     PyErr_SetString(error.is_damage ? PyExc_ValueError : PyExc_OSError, error.what());
@@ -58,7 +62,11 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
     }
     PoolLimits limits{};
     limits.num_threads = num_threads;
-    limits.block_bytes = std::min(kMostBlockBytes, num_bytes / kBlockShare);
+    if (num_threads > 0)
+        limits.num_threads =
+            std::max(num_threads, std::min(kMostThreads, std::thread::hardware_concurrency()));
+    const size_t most_block_bytes = device_.is_host() ? kMostBlockBytes : kMostBlockBytesOnDevice;
+    limits.block_bytes = std::min(most_block_bytes, num_bytes / kBlockShare);
     size_t row_bytes = sizeof(float) * (11 + 3 * num_sh_bases(max_degree));
     std::shared_ptr<BlockMemory> blocks = std::make_shared<HostBlocks>();
     const Work work(device_);

@@ -12,6 +12,10 @@ namespace cuda {
 
 namespace {
 
+// Pages come in for so long before a frame, and so many bytes at least are brought before that is measured.
+constexpr float kBringMs = 2.0f;
+constexpr size_t kLeastMeasured = size_t(4) << 20, kLeastBytesAFrame = size_t(8) << 20;
+
 // A page on its way: bytes of the host that go to the device, and the word that says where it is.
 struct PageMove {
     const uint4* from;
@@ -67,16 +71,20 @@ struct DevicePages::Flight {
     FrameNeeds* needs = nullptr;
     std::vector<unsigned char*> blocks;  // that `moves` reads
     bool is_bounded = false;
-    cudaEvent_t done = nullptr;
+    size_t bytes_in = 0;
+    cudaEvent_t done = nullptr, begun = nullptr, brought = nullptr;  // bringing pages begins, and is over
 
     explicit Flight(size_t most_changes)
         : moves(pinned<PageMove>(most_changes)),
           pages(pinned<PageRows>(most_changes)),
           report(pinned<NeedsReport>(1)) {
         check(cudaEventCreateWithFlags(&done, cudaEventDisableTiming), "cudaEventCreate");
+        for (cudaEvent_t* event : {&begun, &brought}) check(cudaEventCreate(event), "cudaEventCreate");
     }
     ~Flight() {
-        if (cudaEventDestroy(done) != cudaSuccess) cudaGetLastError();  // as of memory
+        for (cudaEvent_t event : {done, begun, brought})
+            if (event != nullptr && cudaEventDestroy(event) != cudaSuccess)
+                cudaGetLastError();  // as of memory
     }
 };
 
@@ -147,6 +155,7 @@ void DevicePages::note_flights(bool waits) {
             return;
         }
         check(over, "a frame");
+        measure(flight);
         pool_.give_back(flight.blocks);
         flight.blocks.clear();
         FrameNeeds* needs = std::exchange(flight.needs, nullptr);
@@ -158,6 +167,21 @@ void DevicePages::note_flights(bool waits) {
         pool_.note_needs(needs, waits);
         under_way_.pop_front();
     }
+}
+
+void DevicePages::note_frames(cudaStream_t stream) {
+    const StreamLock lock(busy_, stream);
+    note_flights(false);
+}
+
+// How many bytes frames may bring, from how long those of one took.
+void DevicePages::measure(const Flight& flight) {
+    if (flight.bytes_in < kLeastMeasured) return;
+    float ms = 0;
+    check(cudaEventElapsedTime(&ms, flight.begun, flight.brought), "cudaEventElapsedTime");
+    const double bytes = kBringMs / std::max(ms, 1e-3f) * static_cast<double>(flight.bytes_in);
+    pool_.set_most_bytes_a_frame(
+        std::clamp(static_cast<size_t>(bytes), kLeastBytesAFrame, staged_.capacity()));
 }
 
 DevicePages::Flight& DevicePages::free_flight() {
@@ -192,9 +216,12 @@ void DevicePages::bring(const std::vector<PageChange>& changes, Flight& flight, 
                       source.sh_degree()};
     }
     constexpr unsigned kThreads = 256;
+    flight.bytes_in = staged;
+    if (staged >= kLeastMeasured) check(cudaEventRecord(flight.begun, stream), "cudaEventRecord");
     launch("move_kernel", move_kernel, static_cast<unsigned>(changes.size()), kThreads, 0, stream,
            flight.moves.get());
     pack_pages(flight.pages.get(), num_pages, rows_.data(), num_rows_, sh_.data(), sh_stride_, stream);
+    if (staged >= kLeastMeasured) check(cudaEventRecord(flight.brought, stream), "cudaEventRecord");
 }
 
 PartlyResident DevicePages::begin_frame(bool is_bounded, cudaStream_t stream) {

@@ -52,6 +52,8 @@ class DevicePages {
     PartlyResident begin_frame(bool is_bounded, cudaStream_t stream);
     // The cut is enqueued. Under the lock.
     void end_frame(cudaStream_t stream);
+    // Takes note of what frames needed whose cuts are over, before the next one begins.
+    void note_frames(cudaStream_t stream);
     // Of the models of all bundles, on the device.
     const PackedPlanes* planes() const { return planes_on_device_.data(); }
     // What the pool says that a frame may be drawn with.
@@ -63,6 +65,7 @@ class DevicePages {
   private:
     struct Flight;
     void note_flights(bool waits);
+    void measure(const Flight& flight);
     Flight& free_flight();
     void bring(const std::vector<PageChange>& changes, Flight& flight, cudaStream_t stream);
 

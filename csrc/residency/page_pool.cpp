@@ -19,7 +19,7 @@ namespace {
 constexpr float kToleranceStep = 1.02f, kToleranceLeap = 1.189207f;
 constexpr double kRoomyShare = 0.7;
 constexpr int kTries = 3;
-constexpr size_t kMostAtOnce = 8;     // pages that a thread asks the disk for together
+constexpr size_t kMostAtOnce = 16;    // pages that a thread asks the disk for together
 constexpr size_t kSamples = 1 << 14;  // of the sizes of pages
 constexpr int kSpins = 64;            // before a frame does without what another thread holds
 
@@ -39,6 +39,7 @@ struct PagePool::State {
     }
 
     const PoolLimits limits;
+    std::atomic<size_t> most_bytes_a_frame{limits.most_bytes_a_frame};
     const pid_t process = getpid();
     int max_sh_degree = 0;
     size_t most_needs = 0, most_bytes = 0;  // most_bytes: of blocks and the coarsest pages
@@ -94,6 +95,7 @@ struct PagePool::State {
     void decide_always();
 
     bool read_some(std::unique_lock<std::mutex>& lock, size_t most);
+    void expect(Reading* batch, size_t count) const;
     void read_page(const Reading& reading, std::unique_lock<std::mutex>& lock);
     void read_always();
 
@@ -186,7 +188,7 @@ void PagePool::State::stop_threads() {
 // Under the lock, as all from here to who reads.
 bool PagePool::State::has_to_decide() const {
     return wants_round || noted != nullptr || frees_readers ||
-           ((num_left > 0 || !read.empty()) && ready_bytes < limits.most_bytes_a_frame);
+           ((num_left > 0 || !read.empty()) && ready_bytes < most_bytes_a_frame);
 }
 
 // Decides without the lock about what is there; what threads and frames do meanwhile is seen the next time.
@@ -198,7 +200,7 @@ void PagePool::State::decide(std::unique_lock<std::mutex>& lock) {
     loaded.insert(loaded.end(), read.begin(), read.end());
     read.clear();
     const size_t under_way = num_loading + loaded.size();
-    const size_t most_bytes_ready = takes_all ? SIZE_MAX : limits.most_bytes_a_frame;
+    const size_t most_bytes_ready = takes_all ? SIZE_MAX : most_bytes_a_frame.load();
     const size_t bytes_left = most_bytes_ready - std::min(most_bytes_ready, ready_bytes);
     lock.unlock();
 
@@ -289,10 +291,24 @@ bool PagePool::State::read_some(std::unique_lock<std::mutex>& lock, size_t most)
     num_loading += count;
     if (count == 0) return false;
     lock.unlock();
-    for (size_t k = 1; k < count; ++k) policy.source(batch[k].page.bundle).expect(batch[k].page.page);
+    if (count > 1) expect(batch, count);
     for (size_t k = 0; k < count; ++k) read_page(batch[k], lock);
     lock.lock();
     return true;
+}
+
+// Without the lock: has the disk begin with all of them, those that lie side by side as one.
+void PagePool::State::expect(Reading* batch, size_t count) const {
+    std::sort(batch, batch + count, [](const Reading& a, const Reading& b) {
+        return a.page.bundle != b.page.bundle ? a.page.bundle < b.page.bundle : a.page.page < b.page.page;
+    });
+    for (size_t first = 0, end = 1; first < count; first = end++) {
+        const PageRequest& page = batch[first].page;
+        while (end < count && batch[end].page.bundle == page.bundle &&
+               batch[end].page.page == page.page + (end - first))
+            ++end;
+        policy.source(page.bundle).expect(page.page, end - first);
+    }
 }
 
 // Without the lock. A page is read, and is then either loaded or failed.
@@ -424,6 +440,8 @@ const std::vector<PageChange>& PagePool::begin_frame(bool is_bounded) {
     state.take_ready();
     return state.changes;
 }
+
+void PagePool::set_most_bytes_a_frame(size_t bytes) { state_->most_bytes_a_frame = bytes; }
 
 std::vector<unsigned char*> PagePool::take_blocks() { return std::exchange(state_->taken, {}); }
 

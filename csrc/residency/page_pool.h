@@ -19,7 +19,7 @@ namespace v3dg {
 struct PoolLimits {
     size_t num_rows;                               // of memory
     size_t block_bytes = size_t(64) << 20;         // for what has been read and is not resident yet
-    size_t most_bytes_a_frame = size_t(32) << 20;  // that become resident
+    size_t most_bytes_a_frame = size_t(32) << 20;  // that become resident, at first
     size_t most_frames = 1;                        // that borrow memory for their needs at once
     unsigned num_threads = 8;  // that read; none: read_one() does, and all is decided in threads that call
 };
@@ -75,6 +75,7 @@ class PagePool {
     // Their bytes stay until release() or the next call. A bounded frame waits for nothing; one that is not
     // takes all that was read, and waits until that is decided.
     const std::vector<PageChange>& begin_frame(bool is_bounded);
+    void set_most_bytes_a_frame(size_t bytes);
     void release();
     // The same in two steps, for who copies later: takes away the blocks, which give_back() returns.
     std::vector<unsigned char*> take_blocks();

@@ -42,8 +42,10 @@ class PageSource {
     virtual size_t num_bytes(size_t page) const = 0;
     // Writes all bytes of a page, verified. Throws PageError.
     virtual void read(size_t page, unsigned char* bytes) const = 0;
-    // It will be read soon.
-    virtual void expect(size_t) const {}
+    // A run of pages will be read soon.
+    virtual void expect(size_t first_page, size_t num_pages) const {
+        static_cast<void>(first_page), static_cast<void>(num_pages);
+    }
 
     // The rows of a page, given its bytes: borrowed from them, or from `decoded`.
     GaussianRows<const float> rows(size_t page, const unsigned char* bytes,
@@ -65,7 +67,9 @@ class FilePages : public PageSource {
               Span<const int64_t> place, Span<const uint8_t> hash);
     size_t num_bytes(size_t page) const override { return place_[page + 1] - place_[page]; }
     void read(size_t page, unsigned char* bytes) const override;
-    void expect(size_t page) const override { file_.expect(place_[page], num_bytes(page)); }
+    void expect(size_t first_page, size_t num_pages) const override {
+        file_.expect(place_[first_page], place_[first_page + num_pages] - place_[first_page]);
+    }
 
   private:
     const std::string name_;
