@@ -2,6 +2,7 @@
 #include <cstring>
 #include <thread>
 
+#include "base/parallel_for.h"
 #include "bindings/operations.h"
 #include "bindings/pool.h"
 
@@ -20,20 +21,41 @@ constexpr unsigned kMostThreads = 16;
     throw py::error_already_set();
 }
 
-std::shared_ptr<const PageSource> source_of(const py::handle& source, const ClusterTable& table) {
-    if (py::isinstance<Rows>(source))
-        return std::make_shared<MemoryPages>(table, source.cast<const Rows&>().read<float>());
+// What a source is made of, borrowed from objects of Python.
+struct GivenSource {
+    const Rows* rows = nullptr;  // in memory; else a file:
+    std::string name;
+    int descriptor = -1, sh_degree = 0;
+    PageCodec codec = PageCodec::float32;
+    Span<const int64_t> places;
+    Span<const uint8_t> hashes;
+};
+
+GivenSource given_source(const py::handle& source, const ClusterTable& table) {
+    GivenSource given;
+    if (py::isinstance<Rows>(source)) {
+        given.rows = &source.cast<const Rows&>();
+        return given;
+    }
     const auto file = source.cast<py::tuple>();
     const auto codec = file[2].cast<std::string>();
     if (codec != "float32" && codec != "quantized")
         throw py::value_error("codec: expected float32 or quantized, got " + codec);
+    if (codec == "quantized") given.codec = PageCodec::quantized;
+    given.name = file[0].cast<std::string>();
+    given.descriptor = file[1].cast<int>();
+    given.sh_degree = file[3].cast<int>();
     const py::array places = file[4], hashes = file[5];
     const auto num_pages = static_cast<py::ssize_t>(table.num_clusters() > 0 ? table.num_pages() : 0);
-    return std::make_shared<FilePages>(table, file[3].cast<int>(),
-                                       codec == "float32" ? PageCodec::float32 : PageCodec::quantized,
-                                       file[0].cast<std::string>(), file[1].cast<int>(),
-                                       span_of<const int64_t>(places, "places", {num_pages + 1}),
-                                       span_of<const uint8_t>(hashes, "hashes", {num_pages, 16}));
+    given.places = span_of<const int64_t>(places, "places", {num_pages + 1});
+    given.hashes = span_of<const uint8_t>(hashes, "hashes", {num_pages, 16});
+    return given;
+}
+
+std::shared_ptr<const PageSource> source_of(const GivenSource& given, const ClusterTable& table) {
+    if (given.rows != nullptr) return std::make_shared<MemoryPages>(table, given.rows->read<float>());
+    return std::make_shared<FilePages>(table, given.sh_degree, given.codec, given.name, given.descriptor,
+                                       given.places, given.hashes);
 }
 
 py::array_t<bool> resident_pages(BoundPool& pool, size_t bundle) {
@@ -53,13 +75,19 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
                      unsigned num_threads)
     : device_{device}, tables_(tables), sources_(sources) {
     std::vector<PagedBundle> bundles;
-    int max_degree = 0;
+    std::vector<GivenSource> given;
     for (size_t b = 0; b < tables.size(); ++b) {
-        const ClusterTable& table = held<BoundTable>(tables[b], "tables").table();
-        bundles.push_back({table, source_of(sources[b], table)});
-        max_degree = std::max(max_degree, bundles.back().source->sh_degree());
-        needs_.emplace_back();
+        bundles.push_back({held<BoundTable>(tables[b], "tables").table(), nullptr});
+        given.push_back(given_source(sources[b], bundles[b].table));
     }
+    {
+        const py::gil_scoped_release unlocked;
+        parallel_for(bundles.size(), 1,
+                     [&](size_t b) { bundles[b].source = source_of(given[b], bundles[b].table); });
+    }
+    int max_degree = 0;
+    for (const PagedBundle& bundle : bundles) max_degree = std::max(max_degree, bundle.source->sh_degree());
+    needs_.resize(bundles.size());
     PoolLimits limits{};
     limits.num_threads = num_threads;
     if (num_threads > 0)

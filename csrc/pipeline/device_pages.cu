@@ -105,14 +105,18 @@ DevicePages::DevicePages(PagePool& pool, std::vector<std::shared_ptr<const Bundl
     std::vector<uint8_t> joins;
     std::vector<int64_t> shift;
     std::vector<size_t> first_join, first_page;
+    size_t num_pages = 0;
+    for (size_t b = 0; b < tables_.size(); ++b) num_pages += pool.shift(b).size;
+    shift.assign(num_pages, kAbsentPage);
+    num_pages = 0;
     for (size_t b = 0; b < tables_.size(); ++b) {
         ClusterTable table = host[b];
         table.pages.shift = pool.shift(b);
         const std::vector<uint8_t> own = joins_of_clusters(table, appearance[b]);
         first_join.push_back(joins.size());
         joins.insert(joins.end(), own.begin(), own.end());
-        first_page.push_back(shift.size());
-        shift.resize(shift.size() + table.num_pages(), kAbsentPage);
+        first_page.push_back(num_pages);
+        num_pages += table.num_pages();
         const float* plane = rows_.data();
         planes.push_back({{plane, plane + 4 * num_rows, plane + 8 * num_rows, plane + 12 * num_rows},
                           sh_.data(),
@@ -127,8 +131,8 @@ DevicePages::DevicePages(PagePool& pool, std::vector<std::shared_ptr<const Bundl
     std::vector<uint32_t*> need;
     for (size_t b = 0; b < tables_.size(); ++b) {
         BundleOnDevice bundle = tables_[b]->on_device();
-        const size_t num_pages = pool.shift(b).size;
-        bundle.table.pages.shift = {shift_.data() + first_page[b], num_pages};
+        const size_t count = pool.shift(b).size;
+        bundle.table.pages.shift = {shift_.data() + first_page[b], count};
         bundle.joins = joins_.data() + first_join[b];
         bundles.push_back(bundle);
         shift_of_bundle_.push_back(shift_.data() + first_page[b]);

@@ -1,49 +1,56 @@
 #include "residency/bundle_tables.h"
 
-#include <cstring>
+#include <algorithm>
 #include <functional>
 #include <vector>
+
+#include "base/parallel_for.h"
 
 namespace v3dg {
 namespace cuda {
 
 namespace {
 
-// Collects arrays of the host, which then go to the device as one piece of memory.
+// Arrays of the host, which go to one piece of memory on the device.
 class Upload {
   public:
     // `span` is the host's until finish() makes it the device's.
     template <class T>
     void add(Span<const T>& span) {
-        const size_t first = (bytes_.size() + kAlignment - 1) / kAlignment * kAlignment;
-        bytes_.resize(first + span.size * sizeof(T));
-        if (span.size > 0) std::memcpy(bytes_.data() + first, span.data, span.size * sizeof(T));
-        moves_.push_back([&span, first](const unsigned char* start) {
+        const size_t first = (num_bytes_ + kAlignment - 1) / kAlignment * kAlignment;
+        num_bytes_ = first + span.size * sizeof(T);
+        moves_.push_back([&span, first](unsigned char* start, cudaStream_t stream) {
+            if (span.size > 0)
+                check(cudaMemcpyAsync(start + first, span.data, span.size * sizeof(T), cudaMemcpyHostToDevice,
+                                      stream),
+                      "cudaMemcpyAsync");
             span.data = reinterpret_cast<const T*>(start + first);
         });
     }
     void finish(DeviceBuffer<unsigned char>& storage, cudaStream_t stream) {
-        storage.copy_from({bytes_.data(), bytes_.size()}, stream);
+        storage.reserve(num_bytes_, stream);
+        for (const auto& move : moves_) move(storage.data(), stream);
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
-        for (const auto& move : moves_) move(storage.data());
     }
 
   private:
     static constexpr size_t kAlignment = 256;  // as of memory from the device's allocator
 
-    std::vector<unsigned char> bytes_;
-    std::vector<std::function<void(const unsigned char*)>> moves_;
+    size_t num_bytes_ = 0;
+    std::vector<std::function<void(unsigned char*, cudaStream_t)>> moves_;
 };
 
 }  // namespace
 
 std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const ClusterAppearance& appearance) {
     std::vector<uint8_t> joins((table.num_clusters() + kClustersOfBounds - 1) / kClustersOfBounds, 0);
-    for (size_t c = 0; c < table.num_clusters(); ++c) {
-        const size_t k = c % kClustersOfBounds;
-        if (k > 0 && table.follows(c) && appearance[c - 1] == appearance[c])
-            joins[c / kClustersOfBounds] |= 1 << k;
-    }
+    parallel_for(joins.size(), 512, [&](size_t i) {
+        const size_t first = i * kClustersOfBounds;
+        const size_t count = std::min(kClustersOfBounds, table.num_clusters() - first);
+        for (size_t k = 1; k < count; ++k)
+            if (table.follows(first + k) && appearance[first + k - 1] == appearance[first + k])
+                joins[i] |= 1 << k;
+    });
     return joins;
 }
 

@@ -3,16 +3,18 @@
 #include <algorithm>
 #include <cmath>
 
+#include "base/parallel_for.h"
+
 namespace v3dg {
 
 namespace {
 
 // Contains the centres of the balls. At the origin where there are none.
-Ball ball_of_centers(const std::vector<Ball>& balls) {
+Ball ball_of_centers(Span<const Ball> balls) {
     double middle[3] = {0, 0, 0}, radius2 = 0;
     for (const Ball& b : balls) {
         const float center[3] = {b.x, b.y, b.z};
-        for (int a = 0; a < 3; ++a) middle[a] += center[a] / static_cast<double>(balls.size());
+        for (int a = 0; a < 3; ++a) middle[a] += center[a] / static_cast<double>(balls.size);
     }
     const float m[3] = {float(middle[0]), float(middle[1]), float(middle[2])};
     for (const Ball& b : balls) {
@@ -24,35 +26,39 @@ Ball ball_of_centers(const std::vector<Ball>& balls) {
 
 ClusterBounds bounds_of(const ClusterTable& table, size_t first, size_t last) {
     ClusterBounds bounds{no_box(), {}, {}, 0, 0, INFINITY, INFINITY, INT32_MAX, false, false};
-    std::vector<Ball> parents, owns;
+    Ball parents[kClustersOfBounds], owns[kClustersOfBounds];
+    size_t num_parents = 0, num_owns = 0;
     for (size_t c = first; c < last; ++c) {
         grow(bounds.box, table.box[c]);
         const int32_t own = table.own_group[c], parent = table.parent_group[c];
         bounds.has_leaf |= own < 0;
         bounds.has_root |= parent < 0;
         if (own >= 0) {
-            owns.push_back(table.ball[own]);
+            owns[num_owns++] = table.ball[own];
             bounds.least_own_radius = std::min(bounds.least_own_radius, table.ball[own].radius);
             bounds.least_own_weight = std::min(bounds.least_own_weight, table.weight[own]);
             bounds.least_own_level = std::min(bounds.least_own_level, table.level[own]);
         }
         if (parent >= 0) {
-            parents.push_back(table.ball[parent]);
+            parents[num_parents++] = table.ball[parent];
             bounds.most_parent_radius = std::max(bounds.most_parent_radius, table.ball[parent].radius);
             bounds.most_parent_weight = std::max(bounds.most_parent_weight, table.weight[parent]);
         }
     }
-    bounds.parents = ball_of_centers(parents);
-    bounds.owns = ball_of_centers(owns);
+    bounds.parents = ball_of_centers({parents, num_parents});
+    bounds.owns = ball_of_centers({owns, num_owns});
     return bounds;
 }
 
 }  // namespace
 
 std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table) {
-    std::vector<ClusterBounds> bounds;
-    for (size_t first = 0; first < table.num_clusters(); first += kClustersOfBounds)
-        bounds.push_back(bounds_of(table, first, std::min(first + kClustersOfBounds, table.num_clusters())));
+    const size_t count = table.num_clusters();
+    std::vector<ClusterBounds> bounds((count + kClustersOfBounds - 1) / kClustersOfBounds);
+    parallel_for(bounds.size(), 128, [&](size_t k) {
+        const size_t first = k * kClustersOfBounds;
+        bounds[k] = bounds_of(table, first, std::min(first + kClustersOfBounds, count));
+    });
     return bounds;
 }
 

@@ -7,6 +7,8 @@
 #include <string>
 #include <utility>
 
+#include "base/parallel_for.h"
+
 namespace v3dg {
 
 namespace {
@@ -42,27 +44,32 @@ PagePolicy::PagePolicy(const std::vector<PagedBundle>& bundles, size_t num_rows)
     if (num_pages > INT32_MAX)
         throw std::invalid_argument("memory: expected bundles of fewer than 2^31 pages together, got " +
                                     std::to_string(num_pages));
-    slot_of_page_.assign(num_pages, kNoSlot);
-    pages_.resize(num_pages);
+    slot_of_page_ = {slot_storage_.reserve(num_pages), num_pages};
+    pages_ = {page_storage_.reserve(num_pages), num_pages};
     states_ = std::make_unique<std::atomic<PageState>[]>(num_pages);
     uint32_t first_page = 0;
     for (const PagedBundle& bundle : bundles) {
-        bundles_.push_back({bundle.source, first_page, 0});
-        add_bundle(bundle);
+        bundles_.push_back({bundle.source, first_page});
         first_page += static_cast<uint32_t>(bundle.table.num_pages());
     }
+    parallel_for(bundles.size(), 1, [&](size_t b) { add_pages(bundles_[b], bundles[b].table); });
     plan_memory(num_rows);
 }
 
-void PagePolicy::add_bundle(const PagedBundle& given) {
-    const ClusterTable& table = given.table;
-    const uint32_t first = bundles_.back().first_page;
+void PagePolicy::add_pages(Bundle& bundle, const ClusterTable& table) {
+    const uint32_t first = bundle.first_page;
+    const size_t root = table.num_pages() - 1;
+    std::fill_n(slot_of_page_.data + first, root, kNoSlot);
+    std::fill_n(pages_.data + first, root + 1, Page{});
     for (size_t c = 0; c < table.num_clusters(); ++c)
         if (table.own_group[c] >= 0)
             pages_[first + table.own_group[c]].parent = static_cast<int32_t>(first + table.page_of(c));
-    const size_t root = first + table.num_pages() - 1;
-    slot_of_page_[root] = kRootSlot;
-    if (table.num_clusters() > 0) states_[root] = PageState::resident;
+    slot_of_page_[first + root] = kRootSlot;
+    if (table.num_clusters() > 0) states_[first + root] = PageState::resident;
+    for (size_t p = 0; p < root; ++p) {
+        bundle.most_rows = std::max(bundle.most_rows, bundle.source->num_rows(p));
+        bundle.most_bytes = std::max(bundle.most_bytes, bundle.source->num_bytes(p));
+    }
 }
 
 void PagePolicy::plan_memory(size_t num_rows) {
@@ -72,10 +79,8 @@ void PagePolicy::plan_memory(size_t num_rows) {
         bundle.root_row = static_cast<int64_t>(root_rows);
         root_rows += bundle.source->num_rows(root);
         num_pages += root;
-        for (size_t p = 0; p < root; ++p) {
-            slot_rows_ = std::max(slot_rows_, bundle.source->num_rows(p));
-            most_page_bytes_ = std::max(most_page_bytes_, bundle.source->num_bytes(p));
-        }
+        slot_rows_ = std::max(slot_rows_, bundle.most_rows);
+        most_page_bytes_ = std::max(most_page_bytes_, bundle.most_bytes);
     }
     first_slot_row_ = root_rows;
     const size_t least = root_rows + (num_pages > 0 ? bundles_.size() * slot_rows_ : 0);

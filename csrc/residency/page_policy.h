@@ -12,6 +12,7 @@
 #include <memory>
 #include <vector>
 
+#include "base/buffer.h"
 #include "residency/cluster_table.h"
 #include "residency/page_source.h"
 
@@ -60,7 +61,7 @@ class PagePolicy {
     size_t slot_rows() const { return slot_rows_; }
     size_t first_slot_row() const { return first_slot_row_; }
     int64_t root_row(size_t bundle) const { return bundles_[bundle].root_row; }
-    size_t num_pages() const { return slot_of_page_.size(); }
+    size_t num_pages() const { return slot_of_page_.size; }
     size_t most_page_bytes() const { return most_page_bytes_; }
     const PageSource& source(size_t bundle) const { return *bundles_[bundle].source; }
 
@@ -89,6 +90,7 @@ class PagePolicy {
         std::shared_ptr<const PageSource> source;
         uint32_t first_page = 0;
         int64_t root_row = 0;
+        size_t most_rows = 1, most_bytes = 1;  // of its pages but the coarsest
     };
     struct Page {
         int32_t parent = -1;  // all pages are numbered together; -1: the coarsest has none
@@ -126,7 +128,7 @@ class PagePolicy {
         bool operator>(const Leaving& other) const { return other < *this; }
     };
 
-    void add_bundle(const PagedBundle& given);
+    void add_pages(Bundle& bundle, const ClusterTable& table);
     void plan_memory(size_t num_rows);
     uint32_t id_of(size_t bundle, size_t page) const {
         return bundles_[bundle].first_page + static_cast<uint32_t>(page);
@@ -152,8 +154,10 @@ class PagePolicy {
     size_t slot_rows_ = 1, first_slot_row_ = 0, most_page_bytes_ = 1;
 
     // Of pages. A page that is in no slot is absent, on its way, or the coarsest of its bundle.
-    std::vector<int32_t> slot_of_page_;
-    std::vector<Page> pages_;
+    Buffer<int32_t> slot_storage_;
+    Buffer<Page> page_storage_;
+    Span<int32_t> slot_of_page_;
+    Span<Page> pages_;
     std::unique_ptr<std::atomic<PageState>[]> states_;
 
     std::vector<Slot> slots_;

@@ -11,6 +11,8 @@
 #include <thread>
 #include <utility>
 
+#include "base/parallel_for.h"
+
 namespace v3dg {
 
 namespace {
@@ -122,19 +124,28 @@ struct PagePool::State {
 };
 
 void PagePool::State::read_roots(size_t num_bundles) {
+    std::vector<size_t> first{0};
     for (uint32_t b = 0; b < num_bundles; ++b) {
         const PageSource& source = policy.source(b);
         const size_t root = source.num_pages() - 1;
-        shift.emplace_back(source.num_pages(), kAbsentPage);
         max_sh_degree = std::max(max_sh_degree, source.sh_degree());
+        first.push_back(first.back());
         if (source.num_clusters() == 0) continue;
-        const size_t size = (source.num_bytes(root) + 15) / 16 * 16;
-        unsigned char* bytes = memory->allocate(size);
-        most_bytes += size;
-        source.read(root, bytes);
-        shift[b][root] = policy.root_row(b) - source.first_row(root);
-        changes.push_back({b, static_cast<uint32_t>(root), policy.root_row(b), bytes});
+        changes.push_back({b, static_cast<uint32_t>(root), policy.root_row(b), nullptr});
+        first.back() += (source.num_bytes(root) + 15) / 16 * 16;
     }
+    most_bytes = first.back();
+    unsigned char* bytes = memory->allocate(std::max<size_t>(most_bytes, 1));
+    for (PageChange& change : changes) change.bytes = bytes + first[change.bundle];
+    shift.resize(num_bundles);
+    parallel_for(num_bundles, 1,
+                 [&](size_t b) { shift[b].assign(policy.source(b).num_pages(), kAbsentPage); });
+    parallel_for(changes.size(), 1, [&](size_t k) {
+        const PageChange& change = changes[k];
+        const PageSource& source = policy.source(change.bundle);
+        source.read(change.page, bytes + first[change.bundle]);
+        shift[change.bundle][change.page] = change.row - source.first_row(change.page);
+    });
 }
 
 // All that threads write to, so that they never want for memory.
