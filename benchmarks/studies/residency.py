@@ -40,7 +40,7 @@ class Config:
     frames: int = 120
     """Of a flight across the field."""
     hz: float = 0.0
-    """Frames a second that a flight is paced to; as many as there can be if 0."""
+    """Frames a second that flights and teleports are paced to; as many as there can be if 0."""
     shares: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     """Slots of each pool, over those that the neediest view of the flight takes."""
     pools: tuple[str, ...] = ()
@@ -175,6 +175,8 @@ def teleport(config: Config, field: Field, memory: int, *, cold: bool) -> dict[s
         field.drop_cached_pages()
     start, curve = time.perf_counter(), []
     while time.perf_counter() - start < 20:
+        if config.hz:
+            time.sleep(max(0.0, start + len(curve) / config.hz - time.perf_counter()))
         image = renderer.render(field.camera(0.8), tolerance=config.tolerance)
         missing, seconds = image.stats.missing, time.perf_counter() - start
         curve.append({"seconds": seconds, "missing": missing, "picture": pixels(image)})
