@@ -307,7 +307,7 @@ def test_any_asset_is_built_selected_and_drawn(name, init, device):
         camera = camera_at(center, radius, [1, 0.3, 0.2], 300.0)
         num = select(bundle, camera, tolerance=tolerance, device="cpu").num_gaussians
         assert 1 <= num <= len(asset)
-        image = render(bundle, camera, tolerance=tolerance, device="cpu")
+        image = render(bundle, camera, tolerance=tolerance, depth=True, device="cpu")
         assert all(np.isfinite(picture).all() for picture in (image.color, image.alpha, image.depth))
 
 

@@ -297,7 +297,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
     for_each_pixel([&](int sub, int x, int y) {
         if (x >= image.width || y >= image.height) return;
         const size_t out = static_cast<size_t>(y) * image.width + x;
-        const Finished<float> of = finished(s.pixels.transmittance[sub][lane], image.min_transmittance);
+        const Finished<float> of = finished(s.pixels.transmittance[sub][lane], lists.min_transmittance);
         const float alpha = 1 - of.transmittance;
         for (int c = 0; c < 3; ++c)
             image.color[3 * out + c] =

@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 # A target is drawn in one go that cannot be interrupted: in about a second.
 _MOST_SIDE = 8192
+# Of a pixel's side in targets of deep levels; beyond, nothing is gained.
+_MOST_SAMPLES, _DEEP = 8, 64
 # Of all views of a group: they are kept, by each thread that fits one, in 16 bytes each.
 _MOST_PIXELS_KEPT = 1 << 26
 
@@ -39,7 +41,8 @@ class BuildConfig:
         first_steps: Steps at level 1; each level takes twice as many as the one below, up to `steps`.
         views_per_step: Views that one step looks at.
         num_views: Views of a group, drawn once; 0 draws a fresh random one each time.
-        supersample: Targets are drawn this much larger and box-averaged.
+        supersample: Targets of level 1 are drawn this much larger and box-averaged; each two levels take one
+            more, up to 8, for what they show is finer: but for targets of the previous level.
         image_size: Side of the views in px; 0 shows a group at the size at which it will be selected.
         px2_per_gaussian: That size: px² of the group's footprint for each gaussian that it is simplified to.
         distance: From the camera to the centre of the group, in radii.
@@ -117,7 +120,7 @@ class BuildConfig:
             footprint_of_focal = 2 * math.pi * (1 - math.sqrt(1 - x2))
             radius2 = most_gaussians * self.px2_per_gaussian / footprint_of_focal * x2 / (1 - x2)
             side = math.ceil(2 * math.sqrt(radius2)) + 8
-        if side * self.supersample > _MOST_SIDE or side * side * self.num_views > _MOST_PIXELS_KEPT:
+        if side * self.samples_at(_DEEP) > _MOST_SIDE or side * side * self.num_views > _MOST_PIXELS_KEPT:
             raise ValueError(
                 f"{name}: expected views of at most {_MOST_SIDE} px a side with `supersample`, and "
                 f"{_MOST_PIXELS_KEPT} px in all `num_views`, got {side} px a side; reduce one of them, "
@@ -127,6 +130,11 @@ class BuildConfig:
     def steps_at(self, level: int) -> int:
         """Steps of the groups of a level."""
         return min(self.steps, self.first_steps << min(max(level - 1, 0), 32))
+
+    def samples_at(self, level: int) -> int:
+        """How much larger targets of a level are drawn."""
+        more = 0 if self.targets == "previous" else (level - 1) // 2
+        return max(self.supersample, min(self.supersample + more, _MOST_SAMPLES))
 
     def target_of(self, level: int) -> int:
         """The level that the groups of a level are fitted to.

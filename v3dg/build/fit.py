@@ -27,7 +27,8 @@ _OF_LEVELS = {
 def fit_config(config: BuildConfig, seed: int, level: int) -> _core.FitConfig:
     """The settings of the core's fit, which refuses one that it does not know or misses."""
     settings = {name: value for name, value in asdict(config).items() if name not in _OF_LEVELS}
-    return _core.FitConfig(**settings | {"steps": config.steps_at(level)}, antialiased=True, seed=seed)
+    settings |= {"steps": config.steps_at(level), "supersample": config.samples_at(level)}
+    return _core.FitConfig(**settings, antialiased=True, seed=seed)
 
 
 def run_fit(
