@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <utility>
 
 namespace v3dg {
 
@@ -37,6 +38,23 @@ void mix(uint64_t& a, uint64_t& b, uint64_t& c, uint64_t& d, uint64_t x, uint64_
     b = rotated(b ^ c, 63);
 }
 
+void mix_round(uint64_t v[16], const uint64_t m[16], const uint8_t s[16]) {
+    mix(v[0], v[4], v[8], v[12], m[s[0]], m[s[1]]);
+    mix(v[1], v[5], v[9], v[13], m[s[2]], m[s[3]]);
+    mix(v[2], v[6], v[10], v[14], m[s[4]], m[s[5]]);
+    mix(v[3], v[7], v[11], v[15], m[s[6]], m[s[7]]);
+    mix(v[0], v[5], v[10], v[15], m[s[8]], m[s[9]]);
+    mix(v[1], v[6], v[11], v[12], m[s[10]], m[s[11]]);
+    mix(v[2], v[7], v[8], v[13], m[s[12]], m[s[13]]);
+    mix(v[3], v[4], v[9], v[14], m[s[14]], m[s[15]]);
+}
+
+// One after another without a loop: then the compiler knows which words go where.
+template <size_t... kRounds>
+void mix_rounds(uint64_t v[16], const uint64_t m[16], std::index_sequence<kRounds...>) {
+    (mix_round(v, m, kOrder[kRounds % 10]), ...);
+}
+
 void add_block(uint64_t h[8], const unsigned char* block, uint64_t end, bool is_last) {
     uint64_t m[16], v[16];
     std::memcpy(m, block, sizeof m);
@@ -46,17 +64,7 @@ void add_block(uint64_t h[8], const unsigned char* block, uint64_t end, bool is_
     }
     v[12] ^= end;
     if (is_last) v[14] = ~v[14];
-    for (int round = 0; round < 12; ++round) {
-        const uint8_t* s = kOrder[round % 10];
-        mix(v[0], v[4], v[8], v[12], m[s[0]], m[s[1]]);
-        mix(v[1], v[5], v[9], v[13], m[s[2]], m[s[3]]);
-        mix(v[2], v[6], v[10], v[14], m[s[4]], m[s[5]]);
-        mix(v[3], v[7], v[11], v[15], m[s[6]], m[s[7]]);
-        mix(v[0], v[5], v[10], v[15], m[s[8]], m[s[9]]);
-        mix(v[1], v[6], v[11], v[12], m[s[10]], m[s[11]]);
-        mix(v[2], v[7], v[8], v[13], m[s[12]], m[s[13]]);
-        mix(v[3], v[4], v[9], v[14], m[s[14]], m[s[15]]);
-    }
+    mix_rounds(v, m, std::make_index_sequence<12>());
     for (int i = 0; i < 8; ++i) h[i] ^= v[i] ^ v[8 + i];
 }
 
