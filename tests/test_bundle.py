@@ -74,21 +74,33 @@ def saved(tmp_path, request):
     return bundle, path
 
 
+class Reads:
+    """Counts the bytes that this process reads, whichever part of it does."""
+
+    def __init__(self):
+        self.num_bytes = 0
+
+    def _look(self):
+        """What the system has counted, and what looking adds to that."""
+        text = Path("/proc/self/io").read_text()
+        return int(re.search(r"^rchar: (\d+)$", text, re.MULTILINE)[1]), len(text)
+
+    @property
+    def num_bytes(self):
+        count, own = self._look()
+        found = count - self._before
+        self._before += own
+        return found
+
+    @num_bytes.setter
+    def num_bytes(self, value):
+        assert value == 0
+        self._before = sum(self._look())
+
+
 @pytest.fixture
-def reads(monkeypatch):
-    """Counts the bytes that are read from bundle files."""
-
-    class Reads:
-        num_bytes = 0
-
-    def counting(fd, buffers, offset):
-        count = preadv(fd, buffers, offset)
-        Reads.num_bytes += count
-        return count
-
-    preadv = os.preadv
-    monkeypatch.setattr(os, "preadv", counting)
-    return Reads
+def reads():
+    return Reads()
 
 
 def split_file(data):
@@ -264,8 +276,7 @@ def test_arrays_that_tables_were_made_of_stay_their_owner_s(saved):
     np.testing.assert_array_equal(made.clusters.offset, bundle.clusters.offset)
 
 
-def test_threads_read_large_bundles(tmp_path, monkeypatch):
-    monkeypatch.setattr("v3dg.bundle.file._BYTES_PER_TASK", 4096)
+def test_threads_read_large_bundles(tmp_path):
     bundle = random_bundle(1, num_levels=6, sh_degree=1, max_cluster=100)
     path = tmp_path / "a.v3dg"
     bundle.write(path)
@@ -293,6 +304,7 @@ def test_copies_go_through_pickle(saved):
 def test_opening_reads_no_page(saved, reads):
     _, path = saved
     _, tensors = split_file(path.read_bytes())
+    reads.num_bytes = 0
     Bundle.open(path)
     assert reads.num_bytes == path.stat().st_size - tensors["pages"].nbytes
 
@@ -373,6 +385,7 @@ def test_a_sparse_file_of_ten_gigabytes_opens(tmp_path, reads):
         file.write(parts[data_start:])
     assert path.stat().st_size > 10e9
 
+    reads.num_bytes = 0
     bundle = Bundle.open(path)
     assert bundle.info()["bytes"] == path.stat().st_size
     assert reads.num_bytes < 100_000
@@ -435,6 +448,26 @@ def test_truncation_after_opening_is_named(saved):
     os.truncate(path, 8 + int.from_bytes(path.read_bytes()[:8], "little") + 1)
     with pytest.raises(ValueError, match=r"small\.v3dg: .*truncated"):
         assert opened.gaussians is None
+
+
+def test_damage_of_a_file_with_an_odd_name_is_told(tmp_path):
+    path = tmp_path / os.fsdecode(b"\xff.v3dg")
+    random_bundle(3).write(path)
+    content = bytearray(path.read_bytes())
+    content[8 + int.from_bytes(content[:8], "little")] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"\.v3dg: page 0 \(gaussians 0 to \d+\): the hash does not match"):
+        Bundle.open(path).read_page(0)
+
+
+def test_a_page_that_the_system_cannot_read_is_named(saved, tmp_path):
+    """A folder opens, but is not read."""
+    opened = Bundle.open(saved[1])
+    folder = os.open(tmp_path, os.O_RDONLY)
+    os.dup2(folder, opened._file._fd)
+    os.close(folder)
+    with pytest.raises(IsADirectoryError, match=r"page 0 \(gaussians 0 to \d+\): Is a directory: '.*small"):
+        opened.read_page(0)
 
 
 # Hostile files

@@ -146,6 +146,31 @@ def page_code_bytes(sh_degree: int) -> tuple[int, int, int]: ...
 def encode_page(gaussians: Rows, offset: Int64) -> Int32: ...
 def decode_page(page: Int32, offset: Int64, out: Rows) -> None: ...
 
+# pages
+def read_pages(
+    path: str,
+    descriptor: int,
+    out: Rows,
+    codec: str,
+    hashes: Uint8,
+    *,
+    first_page: int,
+    first_cluster: Int64,
+    offset: Int64,
+    places: Int64,
+) -> None: ...
+def read_codes(
+    path: str,
+    descriptor: int,
+    words: Int32,
+    hashes: Uint8,
+    *,
+    first_page: int,
+    first_cluster: Int64,
+    offset: Int64,
+    places: Int64,
+) -> None: ...
+
 class Codes:
     """All pages of a bundle as codes, on the host; borrows the arrays."""
 

@@ -49,6 +49,7 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_simplify(m);
     v3dg::bind_gather(m);
     v3dg::bind_quantize(m);
+    v3dg::bind_pages(m);
     v3dg::bind_select(m);
     v3dg::bind_rasterize(m);
     v3dg::bind_scene(m);

@@ -12,6 +12,7 @@ void bind_cluster(pybind11::module_& m);
 void bind_simplify(pybind11::module_& m);
 void bind_gather(pybind11::module_& m);
 void bind_quantize(pybind11::module_& m);
+void bind_pages(pybind11::module_& m);
 void bind_select(pybind11::module_& m);
 void bind_rasterize(pybind11::module_& m);
 void bind_scene(pybind11::module_& m);

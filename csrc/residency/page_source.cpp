@@ -43,20 +43,23 @@ FilePages::FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, 
       place_(place.begin(), place.end()),
       hash_(hash.begin(), hash.end()) {}
 
-void FilePages::read(size_t page, unsigned char* bytes) const {
-    const std::string where = name_ + ": page " + std::to_string(page);
-    const size_t size = num_bytes(page);
+void read_verified(const PosixFile& file, size_t place, size_t size, const uint8_t* hash,
+                   const std::string& where, unsigned char* bytes) {
     size_t got = 0;
     try {
-        got = file_.read_at(place_[page], reinterpret_cast<char*>(bytes), size);
+        got = file.read_at(place, reinterpret_cast<char*>(bytes), size);
     } catch (const std::system_error& error) {
-        throw PageError(where + ": " + error.code().message(), false);
+        throw PageError(where + ": " + error.code().message(), false, error.code().value());
     }
     if (got < size) throw PageError(where + " is not there; the file was truncated", true);
     const auto digest = blake2b(bytes, size);
-    if (!std::equal(digest.begin(), digest.end(), hash_.begin() + kPageHashBytes * page))
-        throw PageError(where + ": the hash does not match; the file is damaged, copy or build it again",
-                        true);
+    if (!std::equal(digest.begin(), digest.end(), hash))
+        throw PageError(where + ": the hash does not match; " + kDamaged, true);
+}
+
+void FilePages::read(size_t page, unsigned char* bytes) const {
+    const std::string where = name_ + ": page " + std::to_string(page);
+    read_verified(file_, place_[page], num_bytes(page), hash_.data() + kPageHashBytes * page, where, bytes);
     if (codec() == PageCodec::float32) return;
     const PageCodes<const uint32_t> codes{clusters(page), reinterpret_cast<const uint32_t*>(bytes),
                                           sh_degree()};
@@ -65,8 +68,7 @@ void FilePages::read(size_t page, unsigned char* bytes) const {
         if (!are_valid(*reinterpret_cast<const ClusterCode*>(words),
                        reinterpret_cast<const uint16_t*>(words + sizeof(ClusterCode) / 4), sh_degree()))
             throw PageError(
-                where + ": cluster " + std::to_string(c) +
-                    " has ranges that are not finite; the file is damaged, copy or build it again",
+                where + ": cluster " + std::to_string(c) + " has ranges that are not finite; " + kDamaged,
                 true);
     }
 }

@@ -17,9 +17,17 @@ namespace v3dg {
 // A page that cannot be had; what() names the file and the page.
 class PageError : public std::runtime_error {
   public:
-    PageError(const std::string& text, bool is_damage) : std::runtime_error(text), is_damage(is_damage) {}
+    PageError(const std::string& text, bool is_damage, int code = 0)
+        : std::runtime_error(text), is_damage(is_damage), code(code) {}
     const bool is_damage;  // of what is in the file; else the system failed to read it
+    const int code;        // the system's
 };
+
+constexpr const char* kDamaged = "the file is damaged, copy or build it again";
+
+// Reads all bytes of a page and compares their hash, [16]. Throws PageError, which begins with `where`.
+void read_verified(const PosixFile& file, size_t place, size_t size, const uint8_t* hash,
+                   const std::string& where, unsigned char* bytes);
 
 enum class PageCodec { float32, quantized };
 

@@ -42,13 +42,6 @@ class Codec:
         """Arrays whose bytes, one after another, are the page of the clusters that begin at these rows."""
         return [array[offset[0] : offset[-1]] for array in vars(gaussians).values()]
 
-    def buffers(self, out: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
-        """Arrays to read such a page to, from which `decode` takes it."""
-        return Codec.encode(self, out, offset)
-
-    def decode(self, buffers: Sequence[NDArray[Any]], out: Gaussians, offset: NDArray[np.int64]) -> None:
-        """Fill the rows with the page; ValueError where it is none."""
-
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
         """The gaussians of these clusters as they come back from pages, where they are."""
         return gaussians
@@ -56,9 +49,6 @@ class Codec:
     def empty(self, count: int) -> Gaussians:
         """Gaussians on the host to decode to, with any values."""
         return empty(count, self.sh_degree)
-
-
-_WORD = 4  # bytes; codes are arrays of int32
 
 
 class Quantized(Codec):
@@ -74,16 +64,10 @@ class Quantized(Codec):
     def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
         return [_core.encode_page(gaussians.rows, offset)]
 
-    def buffers(self, out: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
-        size = self.page_bytes(offset[-1] - offset[0], np.int64(len(offset) - 1))
-        return [np.empty(int(size) // _WORD, np.int32)]
-
-    def decode(self, buffers: Sequence[NDArray[Any]], out: Gaussians, offset: NDArray[np.int64]) -> None:
-        _core.decode_page(buffers[0], offset, out.rows)
-
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
         result = self.empty(len(gaussians))
-        self.decode(self.encode(gaussians.numpy(), offset), result, offset)
+        (page,) = self.encode(gaussians.numpy(), offset)
+        _core.decode_page(page, offset, result.rows)
         return _device.place(result, _device.of(gaussians.means))
 
 

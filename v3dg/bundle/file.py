@@ -6,28 +6,26 @@ tables mean is checked by `v3dg.bundle.tables`.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import re
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _files
+from v3dg import _core, _files
 from v3dg._json import parse_json, shown
 from v3dg._numbers import check
 from v3dg.bundle import format as file_format
 from v3dg.bundle.codec import CODECS, Codec
 from v3dg.bundle.format import DTYPES, HASH_BYTES, entries_of, page_hash, page_tables, schema_of
-from v3dg.bundle.pages import DAMAGED, PageLayout, PageRun, on_threads, runs_of_pages
+from v3dg.bundle.pages import DAMAGED, PageLayout, PageRun, on_threads
 from v3dg.bundle.tables import Clusters, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
-_BYTES_PER_TASK = 16 << 20
 _FIRST_BYTES = 4096  # of the header: what a disk writes at once
 
 
@@ -90,61 +88,8 @@ def read_pages(
 ) -> Gaussians:
     """The gaussians of a run of pages; ValueError unless they are there and have these hashes."""
     result = codec.empty(run.rows.stop - run.rows.start)
-
-    def decode(page: int, buffers: Sequence[NDArray[Any]]) -> None:
-        codec.decode(buffers, result, run.clusters_of(page))
-
-    _read_run(path, descriptor, run, hashes, lambda p: codec.buffers(result, run.clusters_of(p)), decode)
+    _core.read_pages(os.fspath(path), descriptor, result.rows, codec.name, hashes[: len(run)], **vars(run))
     return result
-
-
-def read_codes(
-    path: str | os.PathLike[str], descriptor: int, run: PageRun, hashes: NDArray[np.uint8]
-) -> NDArray[np.int32]:
-    """The words of a run of quantised pages; ValueError unless they are there and have these hashes."""
-    first = (run.places - run.places[0]) // 4
-    words = np.empty(int(first[-1]), np.int32)
-    _read_run(path, descriptor, run, hashes, lambda p: [words[first[p] : first[p + 1]]], lambda *_: None)
-    return words
-
-
-def _read_run(
-    path: str | os.PathLike[str],
-    descriptor: int,
-    run: PageRun,
-    hashes: NDArray[np.uint8],
-    buffers_of: Callable[[int], Sequence[NDArray[Any]]],
-    take: Callable[[int, Sequence[NDArray[Any]]], None],
-) -> None:
-    """Fill the buffers of each page and hand them over."""
-
-    def read_page(page: int) -> None:
-        place, end = run.places[page : page + 2].tolist()
-        buffers = buffers_of(page)
-        fill = end - place - sum(buffer.nbytes for buffer in buffers)
-        pieces = (*buffers, np.empty(fill, np.uint8))
-        first, last = run.clusters_of(page)[[0, -1]] + run.rows.start
-        name = f"page {run.first_page + page} (gaussians {first} to {last - 1})"
-        try:
-            for piece in pieces:
-                if not _files.read_at(descriptor, piece, place):
-                    raise ValueError(f"{os.fspath(path)}: {name} is not there; the file was truncated")
-                place += piece.nbytes
-        except OSError as error:
-            problem = f"{os.strerror(error.errno or errno.EIO)} in {name}"
-            raise OSError(error.errno, problem, os.fspath(path)) from error
-        if page_hash(pieces) != hashes[page].tobytes():
-            raise ValueError(f"{os.fspath(path)}: {name}: the hash does not match; {DAMAGED}")
-        try:
-            take(page, buffers)
-        except ValueError as error:
-            raise ValueError(f"{os.fspath(path)}: {name}: {error}; {DAMAGED}") from None
-
-    def read(pages: range) -> None:
-        for page in pages:
-            read_page(page)
-
-    on_threads(read, list(runs_of_pages(0, len(run), np.diff(run.places), _BYTES_PER_TASK)))
 
 
 class BundleFile:
@@ -278,4 +223,7 @@ class BundleFile:
 
     def read_codes(self, run: PageRun) -> NDArray[np.int32]:
         """The words of a run of quantised pages, verified."""
-        return read_codes(self.path, self._fd, run, self.tables["pages.hash"][run.first_page :])
+        words = np.empty((run.places[-1] - run.places[0]) // 4, np.int32)
+        hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
+        _core.read_codes(self.path, self._fd, words, hashes, **vars(run))
+        return words

@@ -1,0 +1,92 @@
+#include <cerrno>
+#include <system_error>
+
+#include "bindings/codes.h"
+#include "bindings/operations.h"
+#include "residency/page_run.h"
+
+namespace v3dg {
+
+namespace {
+
+PageRun run_of(const py::array& hashes, size_t first_page, const py::array& first_cluster,
+               const py::array& offset, const py::array& places) {
+    constexpr size_t kMost = size_t(1) << 62;
+    PageRun run{
+        first_page, {}, boundaries_of(offset, "offset", kMost), boundaries_of(places, "places", kMost), {}};
+    run.first_cluster = boundaries_of(first_cluster, "first_cluster", run.offset.size - 1);
+    if (run.first_cluster.size != run.places.size)
+        throw py::value_error("places: expected " + std::to_string(run.first_cluster.size) + ", got " +
+                              std::to_string(run.places.size));
+    run.hashes = span_of<const uint8_t>(hashes, "hashes", {static_cast<py::ssize_t>(run.size()), 16});
+    return run;
+}
+
+// Calls body(file) without the interpreter lock; what goes wrong with a page gets the file's name, which
+// need not be text that can be encoded.
+template <class Body>
+void with_file(const py::object& path, int descriptor, const Body& body) {
+    try {
+        const PosixFile file = PosixFile::duplicate(descriptor);
+        const py::gil_scoped_release unlocked;
+        body(file);
+    } catch (const PageError& error) {
+        if (error.is_damage)
+            PyErr_SetObject(PyExc_ValueError, py::str("{}: {}").format(path, error.what()).ptr());
+        else
+            PyErr_SetObject(PyExc_OSError, py::make_tuple(error.code, error.what(), path).ptr());
+        throw py::error_already_set();
+    } catch (const std::system_error& error) {
+        errno = error.code().value();
+        PyErr_SetFromErrnoWithFilenameObject(PyExc_OSError, path.ptr());
+        throw py::error_already_set();
+    }
+}
+
+void read_rows(const py::object& path, int descriptor, const Rows& out, const std::string& codec,
+               const py::array& hashes, size_t first_page, const py::array& first_cluster,
+               const py::array& offset, const py::array& places) {
+    const PageRun run = run_of(hashes, first_page, first_cluster, offset, places);
+    const GaussianRows<float> rows = out.write();
+    const auto count = static_cast<size_t>(run.offset[run.offset.size - 1] - run.offset[0]);
+    if (!out.device().is_host() || rows.size != count)
+        throw py::value_error("out: expected " + std::to_string(count) +
+                              " gaussians on the host, got others");
+    const bool is_quantized = codec == "quantized";
+    for (size_t page = 0; page < run.size(); ++page) {
+        const Span<const int64_t> clusters = run.clusters(page);
+        const auto size = static_cast<size_t>(clusters[clusters.size - 1] - clusters[0]);
+        const size_t needed = is_quantized ? page_bytes(size, clusters.size - 1, rows.sh_degree)
+                                           : sizeof(float) * (11 + rows.num_sh()) * size;
+        if (run.num_bytes(page) < needed)
+            throw py::value_error("places: expected " + std::to_string(needed) + " bytes of a page, got " +
+                                  std::to_string(run.num_bytes(page)));
+    }
+    with_file(path, descriptor, [&](const PosixFile& file) {
+        read_pages(file, run, is_quantized ? PageCodec::quantized : PageCodec::float32, rows);
+    });
+}
+
+void read_words(const py::object& path, int descriptor, const py::array& words, const py::array& hashes,
+                size_t first_page, const py::array& first_cluster, const py::array& offset,
+                const py::array& places) {
+    const PageRun run = run_of(hashes, first_page, first_cluster, offset, places);
+    const int64_t num_bytes = run.places[run.size()] - run.places[0];
+    if (num_bytes % 4 != 0)
+        throw py::value_error("places: expected whole words, got " + std::to_string(num_bytes) + " bytes");
+    const Span<int32_t> out = span_of<int32_t>(words, "words", {static_cast<py::ssize_t>(num_bytes / 4)});
+    with_file(path, descriptor, [&](const PosixFile& file) { read_codes(file, run, out); });
+}
+
+}  // namespace
+
+void bind_pages(py::module_& m) {
+    m.def("read_pages", &read_rows, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a, py::kw_only(),
+          "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,
+          "Fills rows with the gaussians of neighbouring pages of a file, which have these hashes (n, 16).");
+    m.def("read_codes", &read_words, "path"_a, "descriptor"_a, "words"_a, "hashes"_a, py::kw_only(),
+          "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,
+          "Fills words (W,) int32 with neighbouring pages of codes, which have these hashes (n, 16).");
+}
+
+}  // namespace v3dg
