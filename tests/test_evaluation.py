@@ -206,7 +206,7 @@ def test_paths_go_where_they_say():
     paths = {path.name: path for path in steadiness.paths_from(first, np.zeros(3), 5)}
     for path in paths.values():
         assert len(path.cameras) == 5
-        assert path.is_drift == path.name.startswith("drift")
+        assert path.is_drift == (path.name in ("drift in", "drift out", "moved instances"))
         np.testing.assert_allclose(path.cameras[0].viewmat, first.viewmat, atol=1e-12)
         np.testing.assert_allclose(path.cameras[0].K, first.K)
     far = {name: [np.linalg.norm(c.position) for c in path.cameras] for name, path in paths.items()}
@@ -216,6 +216,55 @@ def test_paths_go_where_they_say():
     np.testing.assert_allclose(far["orbit"], start)
     for camera in paths["turn in place"].cameras:
         np.testing.assert_allclose(camera.position, first.position, atol=1e-12)
+    ahead = np.array([camera.viewmat[2, :3] for camera in paths["walk"].cameras])
+    np.testing.assert_allclose(ahead, ahead[:1].repeat(5, 0), atol=1e-12)
+    steps = np.diff([camera.position for camera in paths["walk"].cameras], axis=0)
+    np.testing.assert_allclose(steps @ ahead[0], 0.005 * start)
+    moved = paths["moved instances"]
+    np.testing.assert_allclose(
+        [np.linalg.norm(moved.seen_from(k).position) for k in range(5)], far["drift in"]
+    )
+
+
+class Seen:
+    """What a picture of a wall has besides colours."""
+
+    def __init__(self, depth, alpha=1.0):
+        self.depth, self.alpha = np.full((32, 48), depth), np.full((32, 48), alpha)
+
+
+def test_errors_are_followed_to_where_they_are_seen_next():
+    """A wall at depth 8, seen by cameras that are three pixels of it apart, or by one as the wall moves."""
+    first = Camera(np.eye(4), np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), 48, 32)
+    aside = np.eye(4)
+    aside[0, 3] = 3 * 8 / 40
+    still = steadiness.Path("", [first, replace(first, viewmat=aside)], True, np.zeros((2, 3)))
+    moved = steadiness.Path("", [first] * 2, True, np.array([[0, 0, 0], aside[:3, 3]]))
+    error = np.random.default_rng(0).uniform(0.2, 0.8, (32, 48, 3)).astype(np.float32)
+    for path in (still, moved):
+        warp = steadiness.Warp(path.seen_from(0), path.seen_from(1), (Seen(8.0), Seen(8.0)))
+        np.testing.assert_array_equal(warp.is_valid, np.arange(48)[None] >= np.full((32, 1), 3))
+        np.testing.assert_allclose(warp(error)[:, 3:], error[:, :-3], atol=1e-5)
+        found = steadiness.Steadiness()
+        found.add(error, np.zeros_like(error))
+        found.add(np.roll(error, 3, axis=1), np.zeros_like(error), warp)
+        assert found.row()["warped_worst"] < 0.01 < 50 < found.row()["tile_worst"]
+    for before, after in ((Seen(8.0), Seen(7.0)), (Seen(8.0, 0.5), Seen(8.0)), (Seen(8.0), Seen(8.0, 0.5))):
+        assert not steadiness.Warp(first, first, (before, after)).is_valid.any()
+
+
+def test_changed_items_are_those_of_another_weight_and_those_of_one_cut(scene):
+    cut = v3dg.select(scene, eye_camera(12), fade=4.0, device="cpu")
+    fewer = replace(
+        cut,
+        instance_ids=cut.instance_ids[2:],
+        cluster_ids=cut.cluster_ids[2:],
+        given_weights=cut.weights[2:],
+    )
+    other = replace(cut, given_weights=np.where(np.arange(len(cut)) < 3, 0.125, cut.weights).astype("f4"))
+    assert steadiness.changed_items(cut, cut) == 0
+    assert steadiness.changed_items(cut, fewer) == steadiness.changed_items(fewer, cut) == 2
+    assert steadiness.changed_items(cut, other) == 3
 
 
 def test_made_assets_are_as_many_as_asked_for_and_repeat():

@@ -2,13 +2,15 @@
 
 What a frame is off, less what the frame before it was off, is what an eye sees beside the motion: flicker,
 and levels that are replaced at once. A whole picture hides that, for what pops is small; so the worst tile
-counts.
+counts. Of quicker motion the same is found along the motion: the last error is brought to where its place is
+seen now, by the depth of the picture.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,8 @@ from v3dg import _device
 from v3dg.cameras import Camera
 from v3dg.metrics import box_downsample
 from v3dg.render import render
+from v3dg.scene import Scene
+from v3dg.select import Selection, select
 
 TILE_PX = 16
 SUPERSAMPLING = 4
@@ -27,15 +31,34 @@ _TURN = 5e-4  # rad a frame
 _SHAKE = 2e-3  # of the distance, to either side
 # Frames a wave of each of the two that make up a shaking hand, so that they do not meet.
 _WAVES = (7.3, 11.9)
+_BOB, _STEP_FRAMES = 2e-3, 30.0  # of who walks: of the distance, up and down, and frames a step
+_COVERED = 0.9  # alpha from which on a pixel has a depth
+_SAME_DEPTH = 0.02  # of the depth; what differs more was hidden before
+
+# Options of `render`; or what gives them for a frame.
+Options = dict[str, Any]
+Cut = Options | Callable[[Scene, Camera], Options]
 
 
 @dataclass(frozen=True)
 class Path:
-    """Cameras of frames that follow each other; `is_drift` if so slowly that an eye finds a pop."""
+    """Cameras of frames that follow each other.
+
+    Attributes:
+        is_drift: Whether all is so slow that an eye finds a pop.
+        moves: (F, 3) where all instances are moved to from where they were at first.
+    """
 
     name: str
     cameras: list[Camera]
     is_drift: bool
+    moves: Any
+
+    def seen_from(self, k: int) -> Camera:
+        """The camera of a frame as it would look at instances that had stayed."""
+        camera, shift = self.cameras[k], np.eye(4)
+        shift[:3, 3] = self.moves[k]
+        return replace(camera, viewmat=camera.viewmat @ shift)
 
 
 def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
@@ -53,8 +76,14 @@ def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
         aside, up = (_SHAKE * distance * np.sin(2 * np.pi * k / wave) for wave in _WAVES)
         return moved(first.position + aside * right + up * down)
 
+    def walked(k: int) -> Camera:
+        up = -_BOB * distance * np.sin(2 * np.pi * k / _STEP_FRAMES) * down
+        eye = first.position - k * _ZOOM * away + up
+        return moved(eye, eye - away)
+
     steps = range(frames)
     step = _DRIFT * distance * right
+    still = np.zeros((frames, 3))
     ways = {
         "drift in": [moved(target + away * (1 - _DRIFT) ** k) for k in steps],
         "drift out": [moved(target + away * (1 + _DRIFT) ** k) for k in steps],
@@ -65,14 +94,52 @@ def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
         "hand shake": [shaken(k) for k in steps],
         "turn in place": [moved(first.position, target + k * _TURN * distance * right) for k in steps],
         "zoom": [moved(target + away * (1 - _ZOOM) ** k) for k in steps],
+        "walk": [walked(k) for k in steps],
     }
-    return [Path(name, cameras, name.startswith("drift")) for name, cameras in ways.items()]
+    paths = [Path(name, cameras, name.startswith("drift"), still) for name, cameras in ways.items()]
+    nearer = np.array([away * (1 - (1 - _DRIFT) ** k) for k in steps])
+    return [*paths, Path("moved instances", [first] * frames, True, nearer)]
 
 
 def true_picture(subject: Any, camera: Camera, device: str) -> Any:
     """(H, W, 3) of all gaussians, floats in [0, 1], of so many samples that it hardly flickers."""
     color = render(subject, camera.scaled(SUPERSAMPLING), tolerance=0.0, device=device).color
     return box_downsample(_device.to_host(color).clip(0, 1), SUPERSAMPLING)
+
+
+class Warp:
+    """Brings values of one picture to where their places are seen in another, by the depths of both."""
+
+    def __init__(self, before: Camera, after: Camera, images: tuple[Any, Any]) -> None:
+        (depth_before, alpha_before), (depth, alpha) = (
+            (_device.to_host(image.depth), _device.to_host(image.alpha)) for image in images
+        )
+        row, column = np.indices(depth.shape)
+        ray = np.stack([(column + 0.5 - after.cx) / after.fx, (row + 0.5 - after.cy) / after.fy], -1)
+        seen = depth[..., None] * np.concatenate([ray, np.ones((*depth.shape, 1))], -1)
+        rotation, shift = after.viewmat[:3, :3], after.viewmat[:3, 3]
+        place = (seen - shift) @ rotation
+        x, y, z = np.moveaxis(place @ before.viewmat[:3, :3].T + before.viewmat[:3, 3], -1, 0)
+        deep = np.maximum(z, before.near)
+        self._x = before.fx * x / deep + before.cx - 0.5
+        self._y = before.fy * y / deep + before.cy - 0.5
+        height, width = depth.shape
+        inside = (self._x >= 0) & (self._x <= width - 1) & (self._y >= 0) & (self._y <= height - 1)
+        self.is_valid = inside & (alpha > _COVERED) & (z > before.near)
+        self.is_valid &= self(alpha_before) > _COVERED
+        self.is_valid &= np.abs(self(depth_before) - z) < _SAME_DEPTH * deep
+
+    def __call__(self, values: Any) -> Any:
+        """(H, W, ...) values between those of the four nearest pixels; of no use where it is not valid."""
+        height, width = values.shape[:2]
+        x, y = np.clip(self._x, 0, width - 1), np.clip(self._y, 0, height - 1)
+        left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
+        right, below = x - left, y - top
+        if values.ndim == 3:
+            right, below = right[..., None], below[..., None]
+        upper = (1 - right) * values[top, left] + right * values[top, left + 1]
+        lower = (1 - right) * values[top + 1, left] + right * values[top + 1, left + 1]
+        return (1 - below) * upper + below * lower
 
 
 class Steadiness:
@@ -82,21 +149,25 @@ class Steadiness:
         self._last: Any = None
         self._whole: list[float] = []
         self._worst_tile: list[float] = []
+        self._warped: list[float] = []
         self._mse: list[float] = []
 
-    def add(self, picture: Any, truth: Any) -> None:
-        """Take the next frame: (H, W, 3) floats in [0, 1]."""
+    def add(self, picture: Any, truth: Any, warp: Warp | None = None) -> None:
+        """Take the next frame: (H, W, 3) floats in [0, 1], and how the last one comes to it."""
         error = _device.to_host(picture).clip(0, 1) - truth
         self._mse.append(float(np.square(error).mean()))
         if self._last is not None:
             change = np.square(255.0 * (error - self._last)).mean(-1)
             self._whole.append(float(np.sqrt(change.mean())))
             self._worst_tile.append(float(np.sqrt(tile_means(change).max())))
+        if warp is not None:
+            change = np.square(255.0 * (error - warp(self._last))).mean(-1) * warp.is_valid
+            self._warped.append(float(np.sqrt(tile_means(change).max())))
         self._last = error
 
     def row(self) -> Row:
         """Root mean squares in 255ths: of whole pictures, and of the worst tile of each; PSNR in dB."""
-        return {
+        row = {
             "rms": round(float(np.mean(self._whole)), 4),
             "tile_mean": round(float(np.mean(self._worst_tile)), 4),
             "tile_median": round(float(np.median(self._worst_tile)), 4),
@@ -104,6 +175,10 @@ class Steadiness:
             "tile_worst": round(max(self._worst_tile), 4),
             "psnr": round(float(-10 * np.log10(np.mean(self._mse))), 3),
         }
+        if self._warped:
+            row["warped_mean"] = round(float(np.mean(self._warped)), 4)
+            row["warped_worst"] = round(max(self._warped), 4)
+        return row
 
 
 def tile_means(values: Any) -> Any:
@@ -116,19 +191,75 @@ def tile_means(values: Any) -> Any:
     return sums / np.outer(height, width)
 
 
-def compare(
-    subject: Any, cameras: Iterable[Camera], cuts: dict[str, dict[str, Any]], device: str
-) -> list[Row]:
+def changed_items(before: Selection, after: Selection) -> int:
+    """How many pairs are drawn with another weight, or come or go."""
+    if len(before) == len(after):
+        same = (before.instance_ids == after.instance_ids) & (before.cluster_ids == after.cluster_ids)
+        if same.all():
+            return int((before.weights != after.weights).sum())
+    first, second = (
+        {
+            (int(i), int(c)): float(w)
+            for i, c, w in zip(cut.instance_ids, cut.cluster_ids, cut.weights, strict=True)
+        }
+        for cut in (before, after)
+    )
+    return sum(first.get(pair) != second.get(pair) for pair in first.keys() | second.keys())
+
+
+class _Follower:
+    """What is known of one way to draw a path."""
+
+    def __init__(self, cut: Cut) -> None:
+        self._cut = cut
+        self._steadiness = Steadiness()
+        self._counts: list[int] = []
+        self._tolerances: list[float] = []
+        self._changed: list[int] = []
+        self._last: Selection | None = None
+
+    def draw(self, scene: Scene, camera: Camera, truth: Any, warp: Warp | None, device: str) -> None:
+        options = self._cut if isinstance(self._cut, dict) else self._cut(scene, camera)
+        image = render(scene, camera, device=device, **options)
+        self._steadiness.add(image.color, truth, warp)
+        self._counts.append(image.stats.gaussians_selected)
+        self._tolerances.append(image.stats.tolerance)
+        tolerance, fade = image.stats.tolerance, options.get("fade")
+        items = options.get("cut") or select(
+            scene, camera, tolerance=tolerance, fade=fade, cull=False, device="cpu"
+        )
+        if self._last is not None:
+            self._changed.append(changed_items(self._last, items))
+        self._last = items
+
+    def row(self) -> Row:
+        return {
+            "gaussians": float(np.mean(self._counts)),
+            "most_gaussians": max(self._counts),
+            "changed_items": float(np.mean(self._changed)),
+            "most_changed_items": max(self._changed),
+            "tolerances": [min(self._tolerances), max(self._tolerances)],
+            **self._steadiness.row(),
+        }
+
+
+def compare(subject: Any, path: Path, cuts: dict[str, Cut], device: str) -> list[Row]:
     """Draw the frames of a path with several options of `render`: how steady they are, gaussians a frame."""
-    steadiness = {name: Steadiness() for name in cuts}
-    counts: dict[str, list[int]] = {name: [] for name in cuts}
-    for camera in cameras:
-        truth = true_picture(subject, camera, device)
-        for name, options in cuts.items():
-            image = render(subject, camera, device=device, **options)
-            steadiness[name].add(image.color, truth)
-            counts[name].append(image.stats.gaussians_selected)
+    scene = copy.copy(Scene.of(subject))
+    start = scene.positions
+    followers = {name: _Follower(cut) for name, cut in cuts.items()}
+    last: Any = None
+    for k, camera in enumerate(path.cameras):
+        scene.move(positions=start + path.moves[k])
+        truth = true_picture(scene, camera, device)
+        whole = render(scene, camera, tolerance=0.0, depth=True, device=device)
+        warp = None
+        if last is not None:
+            warp = Warp(path.seen_from(k - 1), path.seen_from(k), (last, whole))
+        for follower in followers.values():
+            follower.draw(scene, camera, truth, warp, device)
+        last = whole
     return [
-        {"cut": name, **options, "gaussians": float(np.mean(counts[name])), **steadiness[name].row()}
-        for name, options in cuts.items()
+        {"cut": name, **(cut if isinstance(cut, dict) else {}), **followers[name].row()}
+        for name, cut in cuts.items()
     ]

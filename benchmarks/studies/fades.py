@@ -16,14 +16,15 @@ import numpy as np
 
 from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.record import write
+from benchmarks.evaluation.steadiness import Cut, compare, paths_from
 from benchmarks.evaluation.steadiness import Path as CameraPath
-from benchmarks.evaluation.steadiness import compare, paths_from
-from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, select
+from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Scene, select
 from v3dg.cleaning import ball_of_most
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _HALVINGS = 24
 _FILLS = 2.0  # distance of the nearest camera, in radii of the ball of most gaussians
+_SPACING = 2.5  # of a field, in the same
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -32,6 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("bundles", nargs="+", type=Path, help=".v3dg files, each as PATH or PATH:UP (-y, z)")
     parser.add_argument("--frames", type=int, default=60, help="of each path")
+    parser.add_argument("--side", type=int, default=1, help="of a field of copies; 1: a single one")
     parser.add_argument("--size", type=int, default=160, help="sides of the pictures, px")
     parser.add_argument("--distances", type=float, nargs="+", default=[1.0, 2.0], help="where paths begin")
     parser.add_argument("--fades", type=float, nargs="+", default=[DEFAULT_FADE])
@@ -45,13 +47,14 @@ def main(arguments: list[str] | None = None) -> int:
     for name in map(str, options.bundles):
         path, _, up = name.partition(":")
         bundle = Bundle.open(path)
+        scene = field_of(bundle, options.side, up or "z")
+        of = {"asset": Path(path).stem, "side": options.side}
         for distance in options.distances:
-            for camera_path in _paths(bundle, up or "z", distance, options):
+            first, center = first_camera(bundle, up or "z", distance, options.size)
+            for camera_path in paths_from(first, center, options.frames):
                 if options.paths and camera_path.name not in options.paths:
                     continue
-                rows += measure(
-                    bundle, camera_path, options, {"asset": Path(path).stem, "distance": distance}
-                )
+                rows += measure(scene, camera_path, options, {**of, "distance": distance})
                 print(*(_line(row) for row in rows[-3 - len(options.fades) :]), sep="\n", flush=True)
     result = {"frames": options.frames, "size": options.size, "tolerance": options.tolerance, "rows": rows}
     result["verdict"] = [verdict(rows, fade) for fade in options.fades]
@@ -60,40 +63,61 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _paths(bundle: Bundle, up: str, distance: float, options: argparse.Namespace) -> list[CameraPath]:
-    """Paths that begin where the asset fills a picture, or so many times as far away."""
+def field_of(bundle: Bundle, side: int, up: str) -> Scene:
+    """So many times so many of the bundle, each turned about its upright middle at random; one stays."""
+    if side == 1:
+        return Scene.of(bundle)
     center, radius = ball_of_most(bundle.level_gaussians(0).means)
+    axis, aside = _axes(up)
+    half_turns = np.random.default_rng(0).uniform(0, math.pi, side * side)[:, None]
+    steps = np.arange(side) - side // 2
+    across, along = np.meshgrid(steps, steps)
+    places = across.reshape(-1, 1) * aside + along.reshape(-1, 1) * np.cross(axis, aside)
+    scene = Scene()
+    turns = np.concatenate([np.cos(half_turns), np.sin(half_turns) * axis], axis=1)
+    scene.add(bundle, positions=_SPACING * radius * places, quaternions=turns)
+    scene.move(positions=scene.positions + center - scene.rotations @ center)
+    return scene
+
+
+def _axes(up: str) -> tuple[Any, Any]:
+    """What is up, and an axis across."""
     axis = np.array(_AXES[up[-1]]) * (-1 if up[0] == "-" else 1)
-    aside = np.roll(axis, 1)
+    return axis, np.roll(axis, 1)
+
+
+def first_camera(bundle: Bundle, up: str, distance: float, size: int) -> tuple[Camera, Any]:
+    """From where the bundle fills a picture, or so many times as far away; and its middle."""
+    center, radius = ball_of_most(bundle.level_gaussians(0).means)
+    axis, aside = _axes(up)
     direction = math.cos(0.45) * aside + math.sin(0.45) * axis
     eye = center + distance * _FILLS * radius * direction / np.linalg.norm(direction)
-    size = {"width": options.size, "height": options.size}
-    camera = Camera.look_at(eye, center, axis, **size, near=1e-3 * radius)
-    return paths_from(camera, center, options.frames)
+    return Camera.look_at(eye, center, axis, width=size, height=size, near=1e-3 * radius), center
 
 
-def measure(bundle: Bundle, path: CameraPath, options: argparse.Namespace, of: Row) -> list[Row]:
+def measure(scene: Scene, path: CameraPath, options: argparse.Namespace, of: Row) -> list[Row]:
     """Rows of one path: all gaussians, the hard cut, fades, the hard cut with as many as the first fade."""
     tolerance = options.tolerance
-    cuts: dict[str, dict[str, Any]] = {"all": {"tolerance": 0.0}, "hard": {"tolerance": tolerance}}
+    cuts: dict[str, Cut] = {"all": {"tolerance": 0.0}, "hard": {"tolerance": tolerance}}
     cuts |= {f"fade {fade:g}": {"tolerance": tolerance, "fade": fade} for fade in options.fades}
-    count = _mean_count(bundle, path.cameras, tolerance=tolerance, fade=options.fades[0])
-    cuts["hard, equal count"] = {"tolerance": _tolerance_of_count(bundle, path.cameras, count, tolerance)}
-    rows = compare(bundle, path.cameras, cuts, options.device)
+    cameras = [path.seen_from(k) for k in range(0, len(path.cameras), max(1, len(path.cameras) // 8))]
+    count = _mean_count(scene, cameras, tolerance=tolerance, fade=options.fades[0])
+    cuts["hard, equal count"] = {"tolerance": _tolerance_of_count(scene, cameras, count, tolerance)}
+    rows = compare(scene, path, cuts, options.device)
     return [{**of, "path": path.name, "is_drift": path.is_drift, **row} for row in rows]
 
 
-def _mean_count(bundle: Bundle, cameras: list[Camera], **how: Any) -> float:
-    cuts = select(bundle, cameras[:: max(1, len(cameras) // 8)], **how, device="cpu")
+def _mean_count(scene: Scene, cameras: list[Camera], **how: Any) -> float:
+    cuts = select(scene, cameras, **how, device="cpu")
     return float(np.mean([cut.num_gaussians for cut in cuts]))
 
 
-def _tolerance_of_count(bundle: Bundle, cameras: list[Camera], count: float, most: float) -> float:
+def _tolerance_of_count(scene: Scene, cameras: list[Camera], count: float, most: float) -> float:
     """The least tolerance, up to one, at which the hard cut has at most so many gaussians a frame."""
     low, high = most / 4, most
     for _ in range(_HALVINGS):
         middle = math.sqrt(low * high)
-        if _mean_count(bundle, cameras, tolerance=middle) > count:
+        if _mean_count(scene, cameras, tolerance=middle) > count:
             low = middle
         else:
             high = middle
@@ -137,7 +161,8 @@ def _line(row: Row) -> str:
     return (
         f"{row['asset']:>10} {row['distance']:4g} {row['path']:14} {row['cut']:18} "
         f"{row['gaussians']:9,.0f}  rms {row['rms']:.3f}  tile {row['tile_mean']:.3f} {row['tile_p99']:.3f} "
-        f"{row['tile_worst']:.3f}  PSNR {row['psnr']:.2f}"
+        f"{row['tile_worst']:.3f}  warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  "
+        f"changed {row['changed_items']:.0f}  PSNR {row['psnr']:.2f}"
     )
 
 

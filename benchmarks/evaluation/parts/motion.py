@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.evaluation.evaluation import Evaluation, orbit_view
 from benchmarks.evaluation.markdown import Column, markdown
 from benchmarks.evaluation.measure import Row, crop
-from benchmarks.evaluation.steadiness import compare, paths_from
+from benchmarks.evaluation.steadiness import Cut, compare, paths_from
 from benchmarks.evaluation.summary import Summary
 from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, contact_sheet, to_8bit
@@ -69,7 +69,7 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
         ),
     )
     drift = paths_from(start.camera, np.zeros(3), evaluation.settings.motion_frames)[0]
-    cuts: dict[str, dict[str, Any]] = {
+    cuts: dict[str, Cut] = {
         "full": {"tolerance": 0.0},
         "ours": {},
         "ours, fading": {"fade": DEFAULT_FADE},
@@ -80,7 +80,7 @@ def run(evaluation: Evaluation) -> dict[str, Any]:
         "worst_pair": worst,
         "steps": steps,
         "rows": rows,
-        "drift": compare(scene, drift.cameras, cuts, evaluation.device),
+        "drift": compare(scene, drift, cuts, evaluation.device),
     }
 
 
