@@ -124,18 +124,88 @@ def test_budget_is_kept(seed, fade, share, cull):
     assert least <= cut.num_gaussians <= budget
 
 
+def slow_orbit(num_frames):
+    """Cameras that come to where CAMERA is, while clusters come into view and go."""
+    angles = 2e-3 * np.arange(num_frames)[::-1]
+    eyes = [(6 * np.sin(a), -6 * np.cos(a), 1) for a in angles]
+    return [Camera.look_at(eye, (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117) for eye in eyes]
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_at_rest_a_budget_draws_the_same_bits_every_frame(device):
-    rng = np.random.default_rng(5)
-    scene = composed_scene(rng)
+    """At once where it looks first; where it came to slowly, once the tolerance has arrived."""
+    scene = composed_scene(np.random.default_rng(5))
+    options = {"budget": 9000, "fade": DEFAULT_FADE}
+    tolerances = []
+    for cameras in ([], slow_orbit(30)):
+        renderer = Renderer(scene, device=device)
+        for camera in cameras:
+            renderer.render(camera, **options).stats  # noqa: B018
+        for _ in range(65 if cameras else 0):
+            renderer.render(CAMERA, **options).stats  # noqa: B018
+        first, *others = (renderer.render(CAMERA, **options) for _ in range(10))
+        for image in others:
+            assert_same_bytes(image, first)
+            assert image.stats.tolerance == first.stats.tolerance
+        tolerances.append(first.stats.tolerance)
+    roomy = select(scene, CAMERA, budget=9000 - 9000 // 32, fade=DEFAULT_FADE, device=device)
+    assert tolerances == [roomy.tolerance] * 2
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_in_slow_motion_the_tolerance_of_a_budget_goes_in_steps(device):
+    scene = composed_scene(np.random.default_rng(5))
     renderer = Renderer(scene, device=device)
-    options = {"budget": 4000, "fade": DEFAULT_FADE}
-    for _ in range(5):  # what was seen before
-        renderer.render(random_camera(rng, width=203, height=117), **options).stats  # noqa: B018
-    first, *others = (renderer.render(CAMERA, **options) for _ in range(10))
-    for image in others:
-        assert_same_bytes(image, first)
-        assert image.stats.tolerance == first.stats.tolerance
+    options = {"budget": 9000, "fade": DEFAULT_FADE}
+    last, leaps, least_leaps = None, 0, 0
+    for camera in slow_orbit(150):
+        stats = renderer.render(camera, **options).stats
+        least = select(scene, camera, **options, device="cpu").tolerance
+        assert stats.tolerance >= least
+        assert stats.gaussians_selected <= 9000
+        if last is not None:
+            tolerance, before = stats.tolerance, last[0]
+            assert tolerance == least or abs(np.log2(tolerance / before)) <= 17 / 1024
+            leaps += abs(np.log2(tolerance / before)) > 0.02
+            least_leaps += abs(np.log2(least / last[1])) > 0.02
+        last = stats.tolerance, least
+    assert least_leaps > 3 * leaps
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_leaps_of_a_budget_are_made_at_once(device):
+    """After another view, another budget or another tolerance, and where the budget binds no more."""
+    scene = composed_scene(np.random.default_rng(5))
+    renderer = Renderer(scene, device=device)
+    not_binding = {"budget": 9000, "tolerance": 5000.7}
+    for options in ({"budget": 9000}, {"budget": 12000}, {"budget": 9000}, not_binding):
+        stats = renderer.render(CAMERA, **options, fade=1.05).stats
+        roomy = options | {"budget": options["budget"] - options["budget"] // 32}
+        assert stats.tolerance == select(scene, CAMERA, **roomy, fade=1.05, device="cpu").tolerance
+    assert stats.tolerance == np.float32(5000.7)
+
+
+def test_without_a_fade_a_budget_depends_on_the_view_alone():
+    scene = composed_scene(np.random.default_rng(5))
+    renderer = Renderer(scene, device="cpu")
+    for camera in slow_orbit(10):
+        image = renderer.render(camera, budget=9000)
+        assert_same_bytes(image, render(scene, camera, budget=9000, device="cpu"))
+    for camera in slow_orbit(10):
+        image = render(scene, camera, budget=9000, fade=1.05, device="cpu")
+        cut = select(scene, camera, budget=9000, fade=1.05, device="cpu")
+        assert image.stats.tolerance == cut.tolerance
+
+
+@pytest.mark.gpu
+def test_both_devices_go_the_same_steps():
+    scene = composed_scene(np.random.default_rng(5))
+    renderers = [Renderer(scene, device=device) for device in ("cpu", "cuda")]
+    for budget in (9000, 9100, 15000):
+        for camera in slow_orbit(60):
+            cpu, cuda = (r.render(camera, budget=budget, fade=DEFAULT_FADE).stats for r in renderers)
+            assert cuda.tolerance == cpu.tolerance
+            assert cuda.gaussians_selected == cpu.gaussians_selected
 
 
 @pytest.mark.parametrize("device", DEVICES)

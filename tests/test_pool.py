@@ -67,12 +67,12 @@ def assert_same(image, expected):
     ],
 )
 def test_settled_picture_is_that_of_all_pages(scene, device, options):
-    renderer = Renderer(scene, device=device, memory="64MB")
+    renderer, whole = Renderer(scene, device=device, memory="64MB"), Renderer(scene, device=device)
     for camera in (CAMERA, NEAR, AWAY, CAMERA):
         renderer.settle(camera, **options)
         image = renderer.render(camera, **options)
         assert image.stats.missing == image.stats.failed == 0
-        assert_same(image, render(scene, camera, device=device, **options))
+        assert_same(image, whole.render(camera, **options))
 
 
 @pytest.mark.parametrize("memory", ["64MB", 500_000])

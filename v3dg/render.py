@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 _Subject: TypeAlias = Scene | Bundle | Gaussians
+_Memory: TypeAlias = int | str | None
 
 # Of pictures with levels, whose own error is far larger; docs/cuda.md has what it saves.
 DEFAULT_MIN_TRANSMITTANCE = 1e-3
@@ -126,6 +127,10 @@ class Renderer:
     the graph, and capture again when the scene has changed. A picture that is under way when its scene is
     changed is finished first.
 
+    With a budget and a fade, pictures are taken to follow each other: the tolerance goes in steps to the one
+    at which a part of the budget is free, never below that of `render`, so that slow motion is steady
+    (docs/fades.md). Without a fade, pictures are those of `render`.
+
     With `memory`, only a part of the bundles is resident, so that they may be far larger than memory: pages
     come in from the files as views need them, read by other threads. A picture waits for none of them: where
     one is missing, the coarser clusters above it are drawn. Use `settle` for a picture that misses nothing.
@@ -150,7 +155,7 @@ class Renderer:
         memory: int | str | None = None,
     ) -> None:
         self._subject = subject
-        self._frame = _Frame(subject, color_by, _device.resolve(device), memory)
+        self._frame = _Frame(subject, color_by, _device.resolve(device), memory, moves=True)
 
     @overload
     def render(self, camera: Camera, **options: Unpack[_FrameOptions]) -> RenderedImage: ...
@@ -210,7 +215,7 @@ class _Frame:
     """Buffers that pictures of one subject are drawn with; it does not keep the subject alive."""
 
     def __init__(
-        self, subject: _Subject, color_by: ColorBy, device: Device, memory: int | str | None
+        self, subject: _Subject, color_by: ColorBy, device: Device, memory: _Memory, moves: bool = False
     ) -> None:
         self._device, self._color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
@@ -224,7 +229,7 @@ class _Frame:
         else:
             expected = f"'appearance' for a pool, got {color_by!r}"
             check("color_by", memory is None or color_by == "appearance", expected)
-            self._frame = _core.SceneFrame(device.number)
+            self._frame = _core.SceneFrame(device.number, moves)
             with residency.reading(subject, device) as resident:
                 self._take_models(resident)
 

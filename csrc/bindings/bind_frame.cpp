@@ -124,7 +124,7 @@ struct HostPictures {
 // Draws scenes of the same bundles, or of the first of them, on one device.
 class BoundSceneFrame {
   public:
-    explicit BoundSceneFrame(int device) : device_{device} {
+    BoundSceneFrame(int device, bool moves) : device_{device}, moves_(moves) {
         const Work work(device_);
 #if V3DG_WITH_CUDA
         if (!device_.is_host()) frame_ = std::make_unique<cuda::SceneFrame>();
@@ -161,15 +161,21 @@ class BoundSceneFrame {
                                        const SelectRule& rule, const Shade& shade, const Stop* stop) {
         auto& scene = checked(scene_object);
         const Eyes& eyes = camera.eyes;
-        if (device_.is_host())
-            return on_host(scene, eyes, shade, [&](const HostScene& host, Span<const Picture<float>> out) {
-                return cpu::draw_scene(host, eyes, rule, out, flag_of(stop));
+        const SelectRule paced = in_pace(rule);
+        if (device_.is_host()) {
+            uint32_t last_bin = last_bin_;
+            auto drawing = on_host(scene, eyes, shade, [&](HostScene host, Span<const Picture<float>> out) {
+                host.last_bin = &last_bin;
+                return cpu::draw_scene(host, eyes, paced, out, flag_of(stop));
             });
+            last_bin_ = last_bin;
+            return drawing;
+        }
 #if V3DG_WITH_CUDA
         const Work work(device_);
         NewPictures pictures;
         const cuda::EyeImages images = new_images(eyes, shade, pictures);
-        auto drawing = frame_->draw(scene.on_device(), eyes, rule, images, work.stream());
+        auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream());
         return std::make_unique<BoundDrawing>(std::move(pictures),
                                               py::make_tuple(py::cast(this), scene_object), device_,
                                               std::move(drawing), rule);
@@ -194,7 +200,7 @@ class BoundSceneFrame {
             const Work work(device_);
             NewPictures pictures;
             const cuda::EyeImages images = new_images(eyes, shade, pictures);
-            SelectRule used = rule;
+            SelectRule used = in_pace(rule);
             auto drawing =
                 frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images, work.stream());
             return std::make_unique<BoundDrawing>(std::move(pictures),
@@ -207,14 +213,18 @@ class BoundSceneFrame {
         for (size_t b = 0; b < state->tables.size(); ++b)
             models.push_back({&pool.planes(b), state->bundle(b).appearance(), {}});
         SceneFrameCounts counts{};
+        uint32_t last_bin = last_bin_;
         {
             const py::gil_scoped_release unlocked;
-            pool.frame_on_host(*state, rule, true, [&](auto tables, const SelectRule& raised, auto needs) {
-                const HostScene host{tables, {models.data(), models.size()}, state->instances, needs};
+            const auto cut = [&](auto tables, const SelectRule& raised, auto needs) {
+                const HostScene host{
+                    tables, {models.data(), models.size()}, state->instances, needs, &last_bin};
                 counts = cpu::draw_scene(host, eyes, raised, out.span(), flag_of(stop));
                 return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
-            });
+            };
+            pool.frame_on_host(*state, in_pace(rule), true, cut);
         }
+        last_bin_ = last_bin;
         return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
     }
 
@@ -295,6 +305,12 @@ class BoundSceneFrame {
         return scene;
     }
 
+    // Pictures that follow each other have a fade.
+    SelectRule in_pace(SelectRule rule) const {
+        if (moves_ && rule.fade.is_on()) rule.pace = BudgetPace::in_steps;
+        return rule;
+    }
+
     void check_device(Device device, const char* name) const {
         if (device != device_)
             throw py::value_error(std::string(name) + ": expected what is on the frame's device, got others");
@@ -358,6 +374,8 @@ class BoundSceneFrame {
     }
 
     Device device_;
+    bool moves_;                  // pictures follow each other
+    uint32_t last_bin_ = kNoBin;  // on the host, of a budget
     py::list models_, palettes_;
     std::vector<size_t> num_gaussians_;  // of each bundle
     std::vector<SceneModel> host_;       // without what the scene knows of the clusters
@@ -449,7 +467,7 @@ void bind_frame(py::module_& m) {
         .def_property_readonly("right", &BoundDrawing::right, "Of two eyes: what the right one sees.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy, "Waits for the picture.");
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
-        .def(py::init<int>(), "device"_a)
+        .def(py::init<int, bool>(), "device"_a, "moves"_a = false)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a, "stop"_a = nullptr)
         .def("draw_resident", &BoundSceneFrame::draw_resident, "scene"_a, "pool"_a, "camera"_a, "rule"_a,

@@ -21,7 +21,9 @@ struct HostScene {
     Span<const ClusterTable> tables;
     Span<const SceneModel> models;  // of the same bundles
     InstanceTable instances;
-    Span<const Span<uint32_t>> needs = {};  // as SelectInput has them
+    // As SelectInput has them.
+    Span<const Span<uint32_t>> needs = {};
+    uint32_t* last_bin = nullptr;
 };
 
 // What one frame came to.

@@ -112,7 +112,7 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const
                                  Span<const Picture<float>> pictures, const std::atomic<bool>* stop) {
     const double start = now();
     SelectOutput cut;
-    select({scene.tables, scene.instances, eyes, rule, scene.needs}, cut);
+    select({scene.tables, scene.instances, eyes, rule, scene.needs, scene.last_bin}, cut);
     const double select_seconds = now() - start;
     SceneFrameCounts counts{};
     for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k)

@@ -126,12 +126,19 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             fades};
 }
 
+// What a frame that was drawn once is drawn again with.
+static SelectRule drawn_again(SelectRule rule) {
+    if (rule.pace == BudgetPace::in_steps) rule.pace = BudgetPace::again;
+    return rule;
+}
+
 std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                                           const EyeImages& pictures, cudaStream_t stream) {
     return frame_.draw(
         batch(scene, pictures, rule.fade.is_on(), stream),
-        [=, &scene](const ItemList& items, cudaStream_t on) {
-            cut_.cut_items(scene, eyes, rule, pictures, images_.data(), placements_.data(), items, on);
+        [=, &scene, next = rule](const ItemList& items, cudaStream_t on) mutable {
+            cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items, on);
+            next = drawn_again(next);
         },
         stream);
 }
@@ -141,7 +148,7 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
                                                    const EyeImages& pictures, cudaStream_t stream) {
     const StreamLock lock(pages.mutex(), stream);
     PartlyResident resident = pages.begin_frame(true, stream);
-    const SelectRule raised = rule = pages.raised(rule);
+    SelectRule next = rule = pages.raised(rule);
     FrameBatch of_pages = batch(scene, pictures, rule.fade.is_on(), stream);
     of_pages.packed = pages.planes();
     of_pages.coded = nullptr;
@@ -149,8 +156,9 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
     return frame_.draw(
         of_pages,
         [=, &scene, &pages](const ItemList& items, cudaStream_t on) mutable {
-            cut_.cut_items(scene, eyes, raised, pictures, images_.data(), placements_.data(), items, on,
+            cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items, on,
                            &resident);
+            next = drawn_again(next);
             // A frame that is drawn again tells nothing: another one may be telling.
             if (resident.needs.report != nullptr) pages.end_frame(on);
             resident.needs = {};

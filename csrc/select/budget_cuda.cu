@@ -54,13 +54,13 @@ __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound ro
     if (threadIdx.x == 0 && at_first > 0) atomicAdd(&change[0], at_first);
 }
 
-// One block. Chooses the tolerance after the last one whose cut exceeds the budget. Where there is none, no
-// parts are left to cut.
+// One block. Chooses the tolerance after the last one whose cut exceeds the budget, or in steps one that is
+// not below. Where there is none, no parts are left to cut.
 __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change, CutChoice* choice,
                               BudgetState* state, unsigned* num_parts) {
     if (round.is_over()) return;
     const float least_tolerance = round.least_tolerance(rule);
-    __shared__ uint32_t chosen;
+    __shared__ uint32_t chosen, goal;
     __shared__ Count before_warp[kChooseThreads / 32 + 1];
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     const uint32_t first = kWarpBins * warp, last = min(first + kWarpBins, kNumBudgetBins);
@@ -70,7 +70,7 @@ __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change,
     if (lane == 0) before_warp[warp + 1] = sum;
     if (threadIdx.x == 0) {
         before_warp[0] = 0;
-        chosen = 0;
+        chosen = goal = 0;
     }
     __syncthreads();
     if (threadIdx.x == 0)
@@ -80,8 +80,11 @@ __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change,
     for (uint32_t from = first; from < last; from += 32) {
         const uint32_t bin = from + lane;
         const Count here = warp_prefix(bin < last ? change[bin] : 0);
-        const unsigned beyond = __ballot_sync(kAllLanes, bin < last && count + here > rule.budget);
+        const Count upto = bin < last ? count + here : 0;
+        const unsigned beyond = __ballot_sync(kAllLanes, upto > rule.budget),
+                       beyond_goal = __ballot_sync(kAllLanes, upto > goal_of_budget(rule.budget));
         if (lane == 0 && beyond != 0) atomicMax(&chosen, from + 32 - __clz(static_cast<int>(beyond)));
+        if (lane == 0 && beyond_goal != 0) atomicMax(&goal, from + 32 - __clz(static_cast<int>(beyond_goal)));
         count += __shfl_sync(kAllLanes, here, 31);
     }
     __syncthreads();
@@ -90,9 +93,12 @@ __global__ void choose_kernel(SelectRule rule, BudgetRound round, Count* change,
         for (uint32_t bin = threadIdx.x; bin < kNumBudgetBins; bin += kChooseThreads) change[bin] = 0;
     if (threadIdx.x != 0) return;
     const bool fits_budget = chosen < kNumBudgetBins;
-    const float tolerance = fits_budget ? tolerance_of_bin(chosen, least_tolerance) : INFINITY;
+    const float least = fits_budget ? tolerance_of_bin(chosen, least_tolerance) : INFINITY;
+    state->guess = fminf(0.5f * least, kMostGuess);
+    state->again = is_first_in_vain || round.is_second;
+    const bool is_chosen = fits_budget && !is_first_in_vain;
+    const float tolerance = is_chosen ? tolerance_of_budget(rule, chosen, goal, state->last_bin) : least;
     *choice = {tolerance, !fits_budget, before_warp[kChooseThreads / 32]};
-    *state = {fminf(0.5f * tolerance, kMostGuess), is_first_in_vain || round.is_second};
     if (!fits_budget) *num_parts = 0;
 }
 

@@ -32,8 +32,9 @@ struct PlacedScene {
 
 // What the search for the tolerance of a budget hands to the next one.
 struct BudgetState {
-    float guess;     // a tolerance that is probably below the one that will be chosen
-    unsigned again;  // whether it was above, so that the second round counts
+    float guess = 0.0f;          // a tolerance that is probably below the one that will be chosen
+    unsigned again = 0;          // whether it was above, so that the second round counts
+    uint32_t last_bin = kNoBin;  // as tolerance_of_budget() keeps it
 };
 
 // One search for the tolerance of a budget: the first round looks at no tolerance below the guess, the second

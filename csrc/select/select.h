@@ -21,7 +21,8 @@ namespace v3dg {
 // no cut has more gaussians: a coarser cut can have more than a finer one where the frustum cuts through it.
 // There may be none: then `fits_budget` is false, nothing is selected and `num_gaussians` is what the
 // coarsest cut has. All pages count as resident: while some are not, the cut may have more or less. With a
-// fade, what counts at a tolerance is every cluster that may be drawn.
+// fade, what counts at a tolerance is every cluster that may be drawn. In steps, a tolerance above that least
+// one is used, which comes from that of the frame before (select_math.h).
 //
 // With a fade there may be several clusters on a path, whose weights add up to 1, whichever pages are
 // resident. They depend on that and on the metrics of the groups above and below alone.
@@ -37,6 +38,7 @@ struct SelectInput {
     // each, bits of the highest priority of each page (select_math.h), 0 where it is not needed and before.
     // Empty: nobody asks.
     Span<const Span<uint32_t>> needs = {};
+    uint32_t* last_bin = nullptr;  // of a budget in steps: what tolerance_of_budget() keeps
 };
 
 struct SelectOutput {

@@ -203,9 +203,9 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins, st
     }
 }
 
-// Sets the tolerance of `rule`. Returns how many gaussians its cut has; more than the budget where no cut
-// fits.
-int64_t meet_budget(const View& view, SelectRule& rule) {
+// Sets the tolerance of `rule`. Returns whether a cut fits; if none does, `least_count` is what the coarsest
+// one has.
+bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
     const size_t num_instances = view.in.instances.bundle.size;
     // Each part takes every kBudgetParts-th instance, because neighbours cost about the same.
     std::vector<std::vector<int64_t>> changes(std::min(kBudgetParts, num_instances));
@@ -215,18 +215,17 @@ int64_t meet_budget(const View& view, SelectRule& rule) {
         for (size_t i = part; i < num_instances; i += changes.size())
             count_instance(view, i, bins, changes[part]);
     });
-    int64_t count = 0, chosen_count = 0;
-    uint32_t chosen = 0;
+    const uint64_t goal_count = goal_of_budget(rule.budget);
+    uint32_t least = 0, goal = 0, none = kNoBin;
     for (uint32_t bin = 0; bin < kNumBudgetBins; ++bin) {
-        for (const std::vector<int64_t>& change : changes) count += change[bin];
-        if (static_cast<uint64_t>(count) > rule.budget)
-            chosen = bin + 1;
-        else if (bin == chosen)
-            chosen_count = count;
+        for (const std::vector<int64_t>& change : changes) least_count += change[bin];
+        if (static_cast<uint64_t>(least_count) > rule.budget) least = bin + 1;
+        if (static_cast<uint64_t>(least_count) > goal_count) goal = bin + 1;
     }
-    if (chosen == kNumBudgetBins) return count;
-    rule.tolerance_px2 = tolerance_of_bin(chosen, rule.tolerance_px2);
-    return chosen_count;
+    if (least == kNumBudgetBins) return false;
+    uint32_t* last = view.in.last_bin == nullptr ? &none : view.in.last_bin;
+    rule.tolerance_px2 = tolerance_of_budget(rule, least, goal, *last);
+    return true;
 }
 
 }  // namespace
@@ -235,8 +234,8 @@ void cpu::select(const SelectInput& in, SelectOutput& out) {
     const View view(in);
     SelectRule rule = in.rule;
     if (rule.budget != kNoBudget) {
-        out.num_gaussians = meet_budget(view, rule);
-        out.fits_budget = static_cast<uint64_t>(out.num_gaussians) <= rule.budget;
+        out.num_gaussians = 0;
+        out.fits_budget = meet_budget(view, rule, out.num_gaussians);
         if (!out.fits_budget) return;
     }
     out.tolerance_px2 = rule.tolerance_px2;

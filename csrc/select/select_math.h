@@ -52,13 +52,21 @@ struct Fade {
     V3DG_HD bool is_on() const { return factor > 1.0f; }
 };
 
+// How the tolerance of a budget comes about.
+enum class BudgetPace {
+    at_once,   // from one view alone
+    in_steps,  // from that of the frame before, too, so that slow motion sees no leap of it
+    again,     // of a frame that is drawn once more: no step, unless the budget wants it
+};
+
 struct SelectRule {
     float tolerance_px2;
     Footprint footprint = Footprint::solid_angle;
     bool culls = true;            // drop what lies outside the frustum
     int32_t min_level = 0;        // nothing finer is drawn
     uint64_t budget = kNoBudget;  // most gaussians; the tolerance is raised until they fit
-    Fade fade = {};               // not with the paper's footprint, which may decrease towards the root
+    BudgetPace pace = BudgetPace::at_once;
+    Fade fade = {};  // not with the paper's footprint, which may decrease towards the root
 };
 
 V3DG_HD inline float distance2_from(const float eye[3], const Ball& ball) {
@@ -184,6 +192,31 @@ V3DG_HD inline float tolerance_of_bin(uint32_t bin, float tolerance) {
     float value;
     std::memcpy(&value, &bits, sizeof value);
     return value;
+}
+
+// In steps, a budget's tolerance goes towards the one at which this part of the budget stays free, so that
+// what comes into view seldom makes it leap: a share of the way, and a least number of bins. A band of the
+// usual fade is 117 bins wide. From some distance on the motion is not slow, and it goes all the way.
+constexpr uint64_t kHeadroomParts = 32;
+constexpr uint32_t kStepParts = 32, kLeastStepBins = 6, kLeapBins = 512;
+constexpr uint32_t kNoBin = ~uint32_t(0);  // of the frame before, where there was none
+
+V3DG_HD inline uint64_t goal_of_budget(uint64_t budget) { return budget - budget / kHeadroomParts; }
+
+// The tolerance that is drawn with. `least` and `goal` are the first bins from which on no cut exceeds the
+// budget and its goal, kNumBudgetBins where there is none; `least` is one. Never below the least bin, which
+// would exceed the budget. `last` becomes the bin of this frame.
+V3DG_HD inline float tolerance_of_budget(const SelectRule& rule, uint32_t least, uint32_t goal,
+                                         uint32_t& last) {
+    if (rule.pace == BudgetPace::at_once) return tolerance_of_bin(least, rule.tolerance_px2);
+    const uint32_t floor = bin_of_metric(rule.tolerance_px2, 0.0f);  // no bin below is drawn with
+    goal = max_of(floor, min_of(goal, kNumBudgetBins - 1));
+    const uint32_t from = last == kNoBin ? goal : last, way = goal > from ? goal - from : from - goal;
+    uint32_t step = way > kLeapBins ? way : min_of(way, max_of(way / kStepParts, kLeastStepBins));
+    if (rule.pace == BudgetPace::again) step = 0;
+    last = max_of(max_of(least, floor), goal > from ? from + step : from - step);
+    // The floor is rounded up, so that its own cut may fit where that of the rule's tolerance does not.
+    return last == floor && least == 0 ? rule.tolerance_px2 : tolerance_of_bin(last, rule.tolerance_px2);
 }
 
 // Whether the clusters that nothing replaces are the cut, at full weight, and no page is wanted. The paper's
