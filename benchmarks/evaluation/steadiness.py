@@ -19,7 +19,7 @@ from benchmarks.evaluation.measure import Row
 from v3dg import _device
 from v3dg.cameras import Camera
 from v3dg.metrics import box_downsample
-from v3dg.render import render
+from v3dg.render import Renderer, render
 from v3dg.scene import Scene
 from v3dg.select import Selection, select
 
@@ -35,7 +35,7 @@ _BOB, _STEP_FRAMES = 2e-3, 30.0  # of who walks: of the distance, up and down, a
 _COVERED = 0.9  # alpha from which on a pixel has a depth
 _SAME_DEPTH = 0.02  # of the depth; what differs more was hidden before
 
-# Options of `render`; or what gives them for a frame.
+# Options of `Renderer.render`; or what gives them for a frame.
 Options = dict[str, Any]
 Cut = Options | Callable[[Scene, Camera], Options]
 
@@ -210,23 +210,24 @@ def changed_items(before: Selection, after: Selection) -> int:
 class _Follower:
     """What is known of one way to draw a path."""
 
-    def __init__(self, cut: Cut) -> None:
-        self._cut = cut
+    def __init__(self, cut: Cut, scene: Scene, device: str) -> None:
+        self._cut, self._scene = cut, scene
+        self._renderer = Renderer(scene, device=device)
         self._steadiness = Steadiness()
         self._counts: list[int] = []
         self._tolerances: list[float] = []
         self._changed: list[int] = []
         self._last: Selection | None = None
 
-    def draw(self, scene: Scene, camera: Camera, truth: Any, warp: Warp | None, device: str) -> None:
-        options = self._cut if isinstance(self._cut, dict) else self._cut(scene, camera)
-        image = render(scene, camera, device=device, **options)
+    def draw(self, camera: Camera, truth: Any, warp: Warp | None) -> None:
+        options = self._cut if isinstance(self._cut, dict) else self._cut(self._scene, camera)
+        image = self._renderer.render(camera, **options)
         self._steadiness.add(image.color, truth, warp)
         self._counts.append(image.stats.gaussians_selected)
         self._tolerances.append(image.stats.tolerance)
         tolerance, fade = image.stats.tolerance, options.get("fade")
         items = options.get("cut") or select(
-            scene, camera, tolerance=tolerance, fade=fade, cull=False, device="cpu"
+            self._scene, camera, tolerance=tolerance, fade=fade, cull=False, device="cpu"
         )
         if self._last is not None:
             self._changed.append(changed_items(self._last, items))
@@ -247,7 +248,7 @@ def compare(subject: Any, path: Path, cuts: dict[str, Cut], device: str) -> list
     """Draw the frames of a path with several options of `render`: how steady they are, gaussians a frame."""
     scene = copy.copy(Scene.of(subject))
     start = scene.positions
-    followers = {name: _Follower(cut) for name, cut in cuts.items()}
+    followers = {name: _Follower(cut, scene, device) for name, cut in cuts.items()}
     last: Any = None
     for k, camera in enumerate(path.cameras):
         scene.move(positions=start + path.moves[k])
@@ -257,7 +258,7 @@ def compare(subject: Any, path: Path, cuts: dict[str, Cut], device: str) -> list
         if last is not None:
             warp = Warp(path.seen_from(k - 1), path.seen_from(k), (last, whole))
         for follower in followers.values():
-            follower.draw(scene, camera, truth, warp, device)
+            follower.draw(camera, truth, warp)
         last = whole
     return [
         {"cut": name, **(cut if isinstance(cut, dict) else {}), **followers[name].row()}

@@ -1,7 +1,9 @@
 """What an eye makes of a slow drift: ColorVideoVDP of the hard cut and of a fade, beside all gaussians.
 
-Frames of 1920 x 1080 px at 30 a second, as on a screen of that size, against frames of 4 x 4 samples of all
-gaussians. Needs a GPU and the package `cvvdp`; docs/fades.md is about the result.
+Frames at 30 a second, as on a screen of 1920 x 1080 px, against two references: frames of 4 x 4 samples of
+all gaussians, from which a cut differs everywhere and always, and the same path drawn from the cut of its
+middle frame, from which it differs by what levels do while the camera moves. Needs the package `cvvdp`, and a
+GPU for large pictures; docs/fades.md is about the result.
 """
 
 from __future__ import annotations
@@ -18,10 +20,9 @@ import torch
 from benchmarks.evaluation.evaluation import resized
 from benchmarks.evaluation.record import write
 from benchmarks.evaluation.steadiness import SUPERSAMPLING, paths_from
-from v3dg import DEFAULT_FADE, Bundle, Renderer, read_scene
+from v3dg import DEFAULT_FADE, Bundle, Renderer, Scene, read_scene, select
 from v3dg.cameras import Camera
 
-_SIZE = (1920, 1080)
 _FRAMES_A_SECOND = 30
 _DISPLAY = "standard_fhd"
 
@@ -34,6 +35,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--layout", type=Path, required=True, help="scene file of instances and cameras")
     parser.add_argument("--cameras", nargs="+", help="names of those from which paths begin")
     parser.add_argument("--frames", type=int, default=60, help="of each path")
+    parser.add_argument("--size", type=int, nargs=2, default=[1920, 1080], help="of the pictures, px")
+    parser.add_argument("--references", nargs="+", default=["truth", "frozen"], choices=["truth", "frozen"])
+    parser.add_argument("--device", default="cuda", choices=["cpu", "cuda"])
     parser.add_argument("--tolerances", type=float, nargs="+", default=[3.0, 9.4])
     parser.add_argument("--paths", nargs="+", default=["drift in", "drift out"])
     parser.add_argument("--json", type=Path, help="write the result there")
@@ -41,38 +45,43 @@ def main(arguments: list[str] | None = None) -> int:
 
     asset = json.loads(options.layout.read_text(encoding="utf-8"))["asset"]
     scene, cameras = read_scene(options.layout, bundles={asset: Bundle.open(options.bundle)})
-    renderer = Renderer(scene, device="cuda")
     rows = []
     for name in options.cameras:
-        first = resized(cameras[name], _SIZE)
+        first = resized(cameras[name], tuple(options.size))
         for path in paths_from(first, np.mean(scene.positions, axis=0), options.frames):
             if path.name in options.paths:
-                rows += measure(
-                    renderer, path.cameras, options.tolerances, {"camera": name, "path": path.name}
-                )
-    result = {"frames": options.frames, "size": _SIZE, "display": _DISPLAY, "rows": rows}
-    write(options.json, result, "cuda")
+                of = {"camera": name, "path": path.name}
+                rows += [{**of, **row} for row in measure(scene, path.cameras, options)]
+    result = {"frames": options.frames, "size": options.size, "display": _DISPLAY, "rows": rows}
+    write(options.json, result, options.device)
     return 0
 
 
-def measure(
-    renderer: Renderer, cameras: list[Camera], tolerances: list[float], of: dict[str, Any]
-) -> list[dict[str, Any]]:
+def measure(scene: Scene, cameras: list[Camera], options: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of one path: just objectionable differences, 10 where there is none, and gaussians a frame."""
     import pycvvdp
 
-    metric = pycvvdp.cvvdp(display_name=_DISPLAY, device=torch.device("cuda"), quiet=True)
-    truth = video(renderer, cameras, SUPERSAMPLING, tolerance=0.0)[0]
-    cuts: list[dict[str, Any]] = [{"tolerance": 0.0}]
-    for tolerance in tolerances:
-        cuts += [{"tolerance": tolerance}, {"tolerance": tolerance, "fade": DEFAULT_FADE}]
-    rows = []
-    for cut in cuts:
-        frames, gaussians = video(renderer, cameras, 1, **cut)
-        order = {"dim_order": "FHWC", "frames_per_second": _FRAMES_A_SECOND}
-        jod = float(metric.predict(frames, truth, **order)[0])
-        rows.append({**of, **cut, "jod": round(jod, 4), "gaussians": gaussians})
-        print(rows[-1], flush=True)
+    metric = pycvvdp.cvvdp(display_name=_DISPLAY, device=torch.device(options.device), quiet=True)
+    renderer = Renderer(scene, device=options.device)
+    truth = None
+    if "truth" in options.references:
+        truth = video(renderer, cameras, SUPERSAMPLING, tolerance=0.0)[0]
+    rows: list[dict[str, Any]] = []
+    for tolerance in [0.0, *options.tolerances]:
+        references = {"truth": truth}
+        if tolerance > 0 and "frozen" in options.references:
+            middle = cameras[len(cameras) // 2]
+            cut = select(scene, middle, tolerance=tolerance, cull=False, device=options.device)
+            references["frozen"] = video(renderer, cameras, 1, cut=cut)[0]
+        for fade in [None, DEFAULT_FADE] if tolerance > 0 else [None]:
+            frames, gaussians = video(renderer, cameras, 1, tolerance=tolerance, fade=fade)
+            row = {"tolerance": tolerance, "fade": fade, "gaussians": gaussians}
+            for name, reference in references.items():
+                if reference is not None:
+                    order = {"dim_order": "FHWC", "frames_per_second": _FRAMES_A_SECOND}
+                    row[f"jod_{name}"] = round(float(metric.predict(frames, reference, **order)[0]), 4)
+            rows.append(row)
+            print(row, flush=True)
     return rows
 
 

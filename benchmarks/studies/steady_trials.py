@@ -1,0 +1,211 @@
+"""What makes motion steadier beside a fade? A budget in steps, hysteresis, pages that fade in.
+
+The first is beside the tolerance that each view would have alone. The others are trials: cuts with a state,
+made of the metrics that selection has. docs/notes/steadiness.md is about the results.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from benchmarks.evaluation.measure import Row
+from benchmarks.evaluation.record import write
+from benchmarks.evaluation.steadiness import Cut, Options, compare, paths_from
+from benchmarks.evaluation.steadiness import Path as CameraPath
+from benchmarks.studies.fades import field_of, first_camera
+from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Scene, Selection, _core, select
+from v3dg.residency import residency
+from v3dg.select import rule_of
+
+_FAR = 1.15  # how much farther away hysteresis begins to look, so that it is in its stride at the first frame
+_FAR_FRAMES = 30
+_HEADROOM_PARTS = 32  # as csrc/select/select_math.h has them
+
+
+@dataclass
+class Config:
+    bundles: tuple[str, ...]
+    """.v3dg files, each as PATH or PATH:UP (-y, z)."""
+    frames: int = 48
+    size: int = 160
+    side: int = 1
+    """Of a field of copies; 1: a single one."""
+    distances: tuple[float, ...] = (3.0,)
+    tolerance: float = DEFAULT_TOLERANCE
+    """The budget is what this one comes to in the middle of the path."""
+    fade: float = DEFAULT_FADE
+    hysteresis: tuple[float, ...] = (1.05, 1.1)
+    arrivals: tuple[int, ...] = (1, 4, 8)
+    """Over how many frames pages fade in."""
+    trials: tuple[str, ...] = ("budget", "hysteresis", "pages")
+    paths: tuple[str, ...] = ()
+    """Only these."""
+    device: str = "cpu"
+    json: Path | None = None
+
+
+class AtOnce:
+    """The least tolerance of a budget, whatever the frame before had."""
+
+    def __init__(self, budget: int, fade: float) -> None:
+        self.budget, self.fade = budget, fade
+
+    def __call__(self, scene: Scene, camera: Camera) -> Options:
+        cut = select(scene, camera, budget=self.budget, fade=self.fade, device="cpu")
+        return {"tolerance": cut.tolerance, "fade": self.fade}
+
+
+def metrics_of(scene: Scene, camera: Camera) -> tuple[Any, Any]:
+    """Metrics of the groups of all instances, px², and where each instance's begin."""
+    instances = _core.Instances(
+        bundle=scene.instance_bundle,
+        positions=scene.positions,
+        quaternions=scene.quaternions,
+        scales=scene.scales,
+        importance=scene.importance,
+    )
+    tables = [residency.table(bundle) for bundle in scene.bundles]
+    rule = rule_of(0.0, None, 0)
+    return _core.group_metrics(tables=tables, instances=instances, camera=camera.core, rule=rule)
+
+
+def cut_of(scene: Scene, refinement: Any, offset: Any) -> Selection:
+    """The cut of groups that are refined by 0 to 1, none further than the group above it."""
+    instance_ids, cluster_ids, weights, count = [], [], [], 0
+    for i, b in enumerate(scene.instance_bundle):
+        clusters = scene.bundles[b].clusters
+        mine = refinement[offset[i] : offset[i + 1]]
+        # -1 is no group, and the last value is what stands for it.
+        weight = np.append(mine, 1.0)[clusters.parent_group] - np.append(mine, 0.0)[clusters.own_group]
+        assert weight.min() >= 0, "a path would have no cluster, or two"
+        chosen = np.flatnonzero(weight > 0).astype(np.int32)
+        instance_ids.append(np.full(len(chosen), i, np.int32))
+        cluster_ids.append(chosen)
+        weights.append(weight[chosen].astype(np.float32))
+        count += int(np.diff(clusters.offset)[chosen].sum())
+    ids = np.concatenate(instance_ids), np.concatenate(cluster_ids)
+    return Selection(scene, *ids, count, 0.0, 0.0, given_weights=np.concatenate(weights))
+
+
+class Sticks:
+    """A cut that refines a group above the tolerance times a factor and coarsens it below the quotient."""
+
+    def __init__(self, tolerance: float, factor: float) -> None:
+        self.tolerance, self.factor = tolerance, factor
+        self.refined: Any = None
+
+    def __call__(self, scene: Scene, camera: Camera) -> Options:
+        metric, offset = metrics_of(scene, camera)
+        at = 1.0 if self.refined is None else np.where(self.refined, 1 / self.factor, self.factor)
+        self.refined = metric > at * self.tolerance
+        return {"cut": cut_of(scene, self.refined.astype(float), offset)}
+
+
+class Arrives:
+    """A cut with a fade whose pages all come in after the first frame, and fade in over so many frames.
+
+    All of them together, or those of a level once those above it are there.
+    """
+
+    def __init__(self, tolerance: float, fade: float, frames: int, *, by_level: bool) -> None:
+        self.low, self.high, self.frames = tolerance / fade, tolerance * fade, frames
+        self.by_level = by_level
+        self.frame = 0
+
+    def __call__(self, scene: Scene, camera: Camera) -> Options:
+        metric, offset = metrics_of(scene, camera)
+        ramp = np.clip((np.minimum(metric, 2 * self.high) - self.low) / (self.high - self.low), 0, 1)
+        levels = [scene.bundles[b].groups.level for b in scene.instance_bundle]
+        waits = np.concatenate([level.max() - level for level in levels]) if self.by_level else 0
+        arrived = np.clip(self.frame / self.frames - waits, 0.0, 1.0)
+        self.frame += 1
+        return {"cut": cut_of(scene, np.minimum(ramp, arrived), offset)}
+
+
+def main(config: Config) -> None:
+    rows = []
+    for name in config.bundles:
+        path, _, up = name.partition(":")
+        bundle = Bundle.open(path)
+        subject = field_of(bundle, config.side, up or "z")
+        for distance in config.distances:
+            first, center = first_camera(bundle, up or "z", distance, config.size)
+            for camera_path in paths_from(first, center, config.frames):
+                if config.paths and camera_path.name not in config.paths:
+                    continue
+                for trial in config.trials:
+                    cuts = TRIALS[trial](subject, camera_path, config)
+                    of = {"asset": Path(path).stem, "side": config.side, "distance": distance}
+                    of |= {"trial": trial, "path": camera_path.name}
+                    found = compare(subject, camera_path, cuts, config.device)
+                    rows += [{**of, **row} for row in found]
+                    print(*(line(row) for row in rows[-len(found) :]), sep="\n", flush=True)
+    settings = {k: v for k, v in vars(config).items() if k not in ("bundles", "json", "device")}
+    write(config.json, {**settings, "rows": rows}, config.device)
+
+
+def budget_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
+    middle = path.seen_from(len(path.cameras) // 2)
+    chosen: Any = {"tolerance": config.tolerance, "fade": config.fade}
+    budget = select(scene, middle, **chosen, device="cpu").num_gaussians
+    return {
+        "no budget": chosen,
+        "at once": AtOnce(budget, config.fade),
+        "at once, less": AtOnce(budget - budget // _HEADROOM_PARTS, config.fade),
+        "in steps": {"budget": budget, "fade": config.fade},
+    }
+
+
+def hysteresis_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
+    tolerance = config.tolerance
+    cuts: dict[str, Cut] = {
+        "hard": {"tolerance": tolerance},
+        f"fade {config.fade:g}": {"tolerance": tolerance, "fade": config.fade},
+    }
+    start = path.seen_from(0)
+    for factor in config.hysteresis:
+        sticks = Sticks(tolerance, factor)
+        grows = path.name in ("drift in", "zoom", "walk", "moved instances")
+        for far in np.geomspace(_FAR if grows else 1 / _FAR, 1.0, _FAR_FRAMES):
+            away = np.array([0, 0, (far - 1) * _depth_of(scene, start)])
+            viewmat = start.viewmat.copy()
+            viewmat[:3, 3] += away
+            sticks(scene, replace(start, viewmat=viewmat))
+        cuts[f"hysteresis {factor:g}"] = sticks
+    return cuts
+
+
+def page_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
+    tolerance, fade = config.tolerance, config.fade
+    cuts: dict[str, Cut] = {"all there": {"tolerance": tolerance, "fade": fade}}
+    for frames in config.arrivals:
+        cuts[f"together, {frames}"] = Arrives(tolerance, fade, frames, by_level=False)
+        cuts[f"by level, {frames}"] = Arrives(tolerance, fade, frames, by_level=True)
+    return cuts
+
+
+def _depth_of(scene: Scene, camera: Camera) -> float:
+    """How deep the middle of the scene is."""
+    return float((camera.viewmat[:3, :3] @ scene.positions.mean(axis=0) + camera.viewmat[:3, 3])[2])
+
+
+TRIALS = {"budget": budget_cuts, "hysteresis": hysteresis_cuts, "pages": page_cuts}
+
+
+def line(row: Row) -> str:
+    low, high = row["tolerances"]
+    return (
+        f"{row['asset']:>8} {row['distance']:4g} {row['path']:15} {row['cut']:16} {row['gaussians']:9,.0f} "
+        f"rms {row['rms']:.3f}  tile {row['tile_mean']:.3f} {row['tile_p99']:.3f} {row['tile_worst']:.3f}  "
+        f"warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  changed {row['changed_items']:.0f}  "
+        f"PSNR {row['psnr']:.2f}  tolerance {low:.3f} to {high:.3f}"
+    )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))
