@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import exact_cut
@@ -122,6 +122,24 @@ def test_budget_is_kept(seed, fade, share, cull):
     budget = round(least + share * (most - least))
     cut = select(scene, camera, budget=budget, fade=fade, cull=cull, device="cpu")
     assert least <= cut.num_gaussians <= budget
+
+
+@settings(max_examples=20)
+@given(seed=seeds, fade=fades, share=st.floats(0, 1))
+def test_budget_is_kept_in_steps(seed, fade, share):
+    rng = np.random.default_rng(seed)
+    scene = random_scene(rng, lod_bundle(rng, blob(rng, 200), 8), 5)
+    renderer, camera = Renderer(scene, device="cpu"), random_camera(rng, width=16, height=12)
+    eye, ahead = camera.position, camera.viewmat[2, :3]
+    for step in (1e-3, 1e-3, 0.3, 3e-3, 0):
+        eye = eye + step * np.linalg.norm(eye) * rng.normal(size=3)
+        camera = Camera.look_at(eye, eye + ahead, camera.viewmat[1, :3], width=16, height=12)
+        least, most = (select(scene, camera, tolerance=t, device="cpu").num_gaussians for t in (np.inf, 0.0))
+        options = {"budget": round(least + share * (most - least)), "fade": fade}
+        cut = select(scene, camera, **options, device="cpu")
+        stats = renderer.render(camera, **options).stats
+        assert stats.gaussians_selected <= options["budget"]
+        assert stats.tolerance >= cut.tolerance
 
 
 def slow_orbit(num_frames):

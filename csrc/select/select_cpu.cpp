@@ -180,7 +180,7 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
 }
 
 // Adds to `change`, for each tolerance that a budget chooses from, by how many gaussians the cut of instance
-// i differs from that of the tolerance before. bins: as above.
+// i differs from that of the tolerance before. `bins` has room for those of its groups.
 void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins, std::vector<int64_t>& change) {
     const SelectRule& rule = view.in.rule;
     const SeenInstance seen(view, i);
