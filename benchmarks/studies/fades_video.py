@@ -67,7 +67,7 @@ def measure(scene: Scene, cameras: list[Camera], options: argparse.Namespace) ->
     if "truth" in options.references:
         truth = video(renderer, cameras, SUPERSAMPLING, tolerance=0.0)[0]
     rows: list[dict[str, Any]] = []
-    for tolerance in [0.0, *options.tolerances]:
+    for tolerance in [*([] if truth is None else [0.0]), *options.tolerances]:
         references = {"truth": truth}
         if tolerance > 0 and "frozen" in options.references:
             middle = cameras[len(cameras) // 2]

@@ -24,6 +24,7 @@ from v3dg.select import rule_of
 
 _FAR = 1.15  # how much farther away hysteresis begins to look, so that it is in its stride at the first frame
 _FAR_FRAMES = 30
+_SWAY = 12  # frames to one side
 _HEADROOM_PARTS = 32  # as csrc/select/select_math.h has them
 
 
@@ -135,7 +136,8 @@ def main(config: Config) -> None:
         subject = field_of(bundle, config.side, up or "z")
         for distance in config.distances:
             first, center = first_camera(bundle, up or "z", distance, config.size)
-            for camera_path in paths_from(first, center, config.frames):
+            paths = paths_from(first, center, config.frames)
+            for camera_path in [*paths, to_and_fro(paths[0])]:
                 if config.paths and camera_path.name not in config.paths:
                     continue
                 for trial in config.trials:
@@ -147,6 +149,12 @@ def main(config: Config) -> None:
                     print(*(line(row) for row in rows[-len(found) :]), sep="\n", flush=True)
     settings = {k: v for k, v in vars(config).items() if k not in ("bundles", "json", "device")}
     write(config.json, {**settings, "rows": rows}, config.device)
+
+
+def to_and_fro(path: CameraPath) -> CameraPath:
+    """A path of which a few frames are gone again and again, so that the same groups come and go."""
+    frames = [abs((k + _SWAY) % (2 * _SWAY) - _SWAY) for k in range(len(path.cameras))]
+    return replace(path, name="to and fro", cameras=[path.cameras[min(k, len(frames) - 1)] for k in frames])
 
 
 def budget_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
