@@ -271,13 +271,12 @@ class _Frame:
                 bytes_in = now.bytes_in - before
                 came_in = {"missing": now.missing, "failed": now.failed, "bytes_in": bytes_in}
             resident.add_drawing(drawing)
-        budget = options["budget"]
 
         def finish() -> Stats:
             stats = drawing.finish()
-            if budget is not None and stats.exceeds_budget:
-                raise over_budget(budget, stats.gaussians)
-            chosen = stats.tolerance_px2 if budget is not None else rule.tolerance_px2
+            if stats.exceeds_budget:
+                raise over_budget(options["budget"], stats.gaussians)
+            chosen = stats.tolerance_px2 if options["budget"] is not None else rule.tolerance_px2
             if pool is not None:
                 return replace(_stats(stats, stats.tolerance_px2), **came_in)
             return _stats(stats, chosen if cut is None else cut.tolerance)
