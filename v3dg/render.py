@@ -92,8 +92,9 @@ def render(
         color_by: "level" or "cluster" colours gaussians by the one that they belong to.
         background: Three numbers.
         min_transmittance: A pixel stops behind the gaussian that lets no more than this share of light
-            through, 0 to 0.99, so that no channel misses more than this times what lies behind. None is 0.001
-            for scenes and bundles, and draws assets as `v3dg.rasterize` does.
+            through, 0 to 0.99, and gives that light to what it has blended: no channel is off by more than
+            this times the difference to what lies behind. None is 0.001 for scenes and bundles, and draws
+            assets as `v3dg.rasterize` does.
         depth: Draw the expected depth, too.
         device: "cpu" draws NumPy arrays; "cuda", or a certain one as "cuda:1", draws torch tensors there, on
             the stream that is torch's current one, and keeps on the device what the next picture of the same
