@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import v3dg
 from benchmarks.worlds.procedural import make_donut
 from v3dg.metrics import psnr
+from v3dg.pictures import to_8bit, write_picture
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -55,8 +57,56 @@ def test_what_is_trained_looks_like_the_donut(tmp_path, device):
     path = tmp_path / "trained.ply"
     few = {"gaussians": 300, "pictures": 8, "size": (64, 48), "device": device}
     before = example.main(example.Config(path, steps=0, **few))
-    assert example.main(example.Config(path, steps=60, **few)) > before + 6
+    assert example.main(example.Config(path, steps=40, **few)) > before + 6
     assert len(v3dg.read_asset(path)) == 300
+
+
+@pytest.fixture(params=["model of COLMAP", "transforms.json"])
+def capture(tmp_path, request):
+    """Pictures of a donut from around, as photographs with their cameras."""
+    cameras = v3dg.turntable((0, 0, 0), 3.5, 10, elevation=0.6, width=64, height=48)
+    named = {f"{number}.png": camera for number, camera in enumerate(cameras)}
+    (tmp_path / "images").mkdir()
+    donut = make_donut(5000)
+    for name, camera in named.items():
+        picture = v3dg.rasterize(donut, camera, filter_px2=0.3).color
+        write_picture(tmp_path / "images" / name, to_8bit(picture))
+    if request.param == "transforms.json":
+        listed = {f"images/{name}": camera for name, camera in named.items()}
+        v3dg.write_cameras(tmp_path / request.param, listed)
+    else:
+        pycolmap = pytest.importorskip("pycolmap")
+        from test_camera_folders import write_model
+
+        write_model(tmp_path / "sparse" / "0", named)
+        model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+        for mean in donut.means[::25]:
+            model.add_point3D(mean, pycolmap.Track(), np.array([180, 130, 90], np.uint8))
+        model.write(str(tmp_path / "sparse" / "0"))
+    return tmp_path
+
+
+def test_what_is_trained_looks_like_photographs_that_were_held_out(capture, device):
+    pytest.importorskip("gsplat")
+    example = load_example("train_photographs")
+    path = capture / "trained.ply"
+    few = {"start": 500, "sh_degree": 1, "device": device}
+    before = example.main(example.Config(capture, path, steps=0, **few))
+    # As large as they are, and smaller.
+    assert example.main(example.Config(capture, path, steps=40, **few)) > before + 3
+    assert example.main(example.Config(capture, path, steps=40, longest=32, **few)) > before + 3
+    num_points = 200 if (capture / "sparse").is_dir() else 500
+    assert len(v3dg.read_asset(path)) == num_points
+    with Image.open(path.with_suffix(".png")) as sheet:
+        assert sheet.width > 2 * 32
+
+
+def test_photographs_of_another_size_than_their_cameras_are_refused(capture):
+    pytest.importorskip("gsplat")
+    example = load_example("train_photographs")
+    write_picture(capture / "images" / "3.png", np.zeros((48, 32, 3), np.uint8))
+    with pytest.raises(SystemExit, match=r"3\.png: expected 64 x 48 px, as its camera, got 32 x 48"):
+        example.main(example.Config(capture, capture / "trained.ply", device="cpu"))
 
 
 @pytest.fixture
