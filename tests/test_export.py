@@ -14,6 +14,7 @@ import v3dg
 from command_line import run
 from random_bundle import random_bundle
 from v3dg.export import write_streamed_sog
+from v3dg.export.chunk_errors import ChunkErrors
 from v3dg.io import asset_bytes
 from v3dg.metrics import psnr
 
@@ -72,6 +73,33 @@ def bundle():
 
     config = v3dg.BuildConfig(cluster_size=32, steps=0)
     return v3dg.build_bundle(make_asset(1500), config=config, progress=False)
+
+
+def test_every_leaf_says_how_far_its_levels_are_from_the_finest(tmp_path, bundle):
+    write_streamed_sog(bundle, tmp_path / "web", chunk=250)
+    index = json.loads((tmp_path / "web" / "lod-meta.json").read_text())
+    assert index["lodErrors"] is True
+    for leaf in leaves_of(index["tree"]):
+        errors = np.array(leaf["errors"])
+        assert errors.shape == (index["lodLevels"],)
+        assert errors[0] == 0
+        assert (np.diff(errors) >= 0).all()
+        assert 0 < errors[1] < errors[-1] < 10
+
+
+def test_errors_of_a_chunk_are_those_of_its_pictures(bundle):
+    """Whatever its size; a level that is the finest has none, and one that is missing that of the last."""
+    finest, nothing = bundle.level_gaussians(0), bundle.level_gaussians(0).subset(slice(0, 0))
+    half = finest.subset(slice(0, None, 2))
+    errors = ChunkErrors()
+    for chunk, scale in ((0, 1.0), (1, 1000.0)):
+        for level in (finest, finest, bundle.level_gaussians(1), half, nothing):
+            errors.add(chunk, level.transform(scale=scale))
+    first, second = errors.of_chunk[0], errors.of_chunk[1]
+    assert first[0] == 0
+    assert first[1] < 1e-6  # pictures are kept rounded
+    assert 0 < 2 * first[2] < first[3] == first[4]  # every other gaussian is worse than a level of as many
+    np.testing.assert_allclose(first, second, rtol=1e-3)
 
 
 @pytest.mark.parametrize("chunk", [70, 250, 500, 10**9])

@@ -28,6 +28,7 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
 from v3dg.cleaning import ball_of_most
 from v3dg.export import _common
+from v3dg.export.chunk_errors import ChunkErrors
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
@@ -69,7 +70,8 @@ def write_streamed_sog(
 ) -> Export:
     """Write a bundle as streamed SOG, replacing an earlier export in one step once all is written.
 
-    Besides, `settings.json` tells SuperSplat's viewer where to start. Memory is needed for one folder of SOG.
+    Besides, `settings.json` tells SuperSplat's viewer where to start. Memory is needed for one folder of SOG,
+    and for 128 KiB of pictures a chunk.
 
     Args:
         folder: Where to; new, empty, or with an earlier export. Folders above it are made.
@@ -94,15 +96,16 @@ def write_streamed_sog(
 
 def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int], Any]) -> Export:
     """Fill a folder with the levels of a bundle, turned by a quaternion (4,)."""
-    names, lods, counts = _write_folders(place, plan, turn, advance)
+    names, leaves, counts = _write_folders(place, plan, turn, advance)
     index = {
         "version": 1,
         "asset": {"generator": f"v3dg {__version__}"},
         "count": sum(counts),
         "counts": counts,
         "lodLevels": len(counts),
+        "lodErrors": True,
         "filenames": [f"{name}/meta.json" for name in names],
-        "tree": plan.tree(lods, turn),
+        "tree": plan.tree(leaves, turn),
     }
     _common.write_document(place / INDEX, index)
     shown = plan.bundle.level_gaussians(plan.top).transform(turn)
@@ -112,17 +115,20 @@ def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int],
 
 def _write_folders(
     place: Path, plan: Plan, turn: Floats, advance: Callable[[int], Any]
-) -> tuple[list[str], list[dict[str, dict[str, int]]], list[int]]:
-    """Write a folder of SOG after another: their names, where each chunk's levels are, gaussians by level."""
-    names: list[str] = []
-    lods: list[dict[str, dict[str, int]]] = [{} for _ in range(plan.num_chunks)]
+) -> tuple[list[str], list[dict[str, Any]], list[int]]:
+    """Write a folder of SOG after another: their names, chunks as leaves of the tree, gaussians by level."""
+    names, errors = list[str](), ChunkErrors()
+    leaves: list[dict[str, Any]] = [
+        {"lods": {}, "errors": errors.of_chunk[c]} for c in range(plan.num_chunks)
+    ]
     counts = [0] * plan.bundle.num_levels
     for level in range(plan.bundle.num_levels):
         parts: list[Gaussians] = []
         first, size = len(names), 0
         for number, part in enumerate(plan.parts(level)):
             chunk = check_writable(part).transform(turn)
-            lods[number][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
+            errors.add(number, chunk)
+            leaves[number]["lods"][str(level)] = {"file": len(names), "offset": size, "count": len(chunk)}
             parts.append(chunk.subset(_core.morton_order(chunk.means)))
             size += len(chunk)
             if size >= _FOLDER_GAUSSIANS or number == plan.num_chunks - 1:
@@ -133,7 +139,7 @@ def _write_folders(
                 counts[level] += size
                 advance(size)
                 parts, size = [], 0
-    return names, lods, counts
+    return names, leaves, counts
 
 
 def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
@@ -218,13 +224,13 @@ class Plan:
         ends = np.cumsum(np.bincount(chunks, minlength=self.num_chunks))[:-1]
         return np.split(clusters[np.argsort(chunks, kind="stable")], ends)
 
-    def tree(self, lods: list[dict[str, dict[str, int]]], turn: Floats) -> dict[str, Any]:
+    def tree(self, leaves: list[dict[str, Any]], turn: Floats) -> dict[str, Any]:
         """The spatial index: the groups above the chunks, with bounds, in boxes that stay along the axes."""
         clusters, parent = self.bundle.clusters, self.bundle.groups.parent
         used = np.flatnonzero((self.chunk_of_cluster >= 0) & (np.diff(clusters.offset) > 0))
         corners = clusters.box.astype(np.float64) @ rotation_from_quaternion(turn).T
         chunks = enumerate(self.by_chunk(used))
-        nodes = {c: _node(corners[ids].reshape(-1, 3), lods=lods[c]) for c, ids in chunks if len(ids)}
+        nodes = {c: _node(corners[ids].reshape(-1, 3), **leaves[c]) for c, ids in chunks if len(ids)}
         of_group = {g: nodes[c] for g, c in enumerate(self.chunk_of_group.tolist()) if c in nodes}
         of_group = of_group or {-1: nodes[0]}
         while of_group.keys() != {-1}:
