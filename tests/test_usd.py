@@ -1,5 +1,6 @@
 """OpenUSD, in and out, checked with its own validators and its own choice of levels."""
 
+import json
 import math
 import os
 import sys
@@ -152,3 +153,90 @@ def test_without_usd_core_the_error_says_how_to_get_it(tmp_path, monkeypatch):
     with pytest.raises(ImportError, match=r"OpenUSD: expected .*pip install 'usd-core>=26.11'"):
         v3dg.write_asset(tmp_path / "a.usdc", random_gaussians(np.random.default_rng(0), 3))
     assert os.listdir(tmp_path) == []
+
+
+def world_means(scene):
+    """Means of all gaussians of the finest levels, in the world."""
+    found = [scene.bundles[b].level_gaussians(0).means for b in scene.instance_bundle]
+    poses = zip(found, scene.rotations, scene.scales, scene.positions, strict=True)
+    means = np.concatenate([scale * means @ turn.T + position for means, turn, scale, position in poses])
+    return means[np.lexsort(np.round(means.T, 3))]
+
+
+def test_a_scene_reads_back_as_a_scene(tmp_path):
+    scene = v3dg.Scene()
+    bundles = [random_bundle(seed, num_levels=3, sh_degree=1) for seed in (1, 2)]
+    turns = [[1, 0, 0, 0], [0.5, 0.5, -0.5, 0.5], [1, 0, 0, 1]]
+    scene.add([bundles[0], bundles[1], bundles[0]], np.eye(3) * 9, turns, [1, 2, 0.5])
+    write_usd(scene, tmp_path / "a.usdc", up="z")
+    found = v3dg.open(tmp_path / "a.usdc")
+    assert isinstance(found, v3dg.Scene)
+    assert found.up == "z"
+    assert found.instance_bundle.tolist() == [0, 1, 0]
+    np.testing.assert_allclose(found.positions, scene.positions, atol=1e-5)
+    np.testing.assert_allclose(found.rotations, scene.rotations, atol=1e-5)
+    np.testing.assert_allclose(found.scales, scene.scales, rtol=1e-6)
+    np.testing.assert_allclose(world_means(found), world_means(scene), atol=1e-4)
+    assert found.bundles[0].num_levels >= 1
+
+
+@pytest.mark.parametrize("is_instanceable", [True, False])
+def test_references_to_an_asset_are_instances_of_it(tmp_path, is_instanceable):
+    """Of files beside, in Xforms in Xforms; what is alone has one, and changed values are another asset."""
+    asset = Usd.Stage.CreateNew(os.fspath(tmp_path / "asset.usdc"))
+    asset.SetDefaultPrim(UsdGeom.Xform.Define(asset, "/house").GetPrim())
+    v3dg.formats.usd.define(asset, "/house/walls", random_gaussians(np.random.default_rng(0), 50, 1))
+    asset.GetRootLayer().Save()
+    stage = Usd.Stage.CreateNew(os.fspath(tmp_path / "world.usda"))
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    street = UsdGeom.Xform.Define(stage, "/world/street")
+    street.AddTranslateOp().Set(Gf.Vec3d(0, 100, 0))
+    for number in range(3):
+        house = UsdGeom.Xform.Define(stage, f"/world/street/house_{number}")
+        house.AddTranslateOp().Set(Gf.Vec3d(10 * number, 0, 0))
+        house.AddScaleOp().Set(Gf.Vec3f(number + 1))
+        house.GetPrim().GetReferences().AddReference("asset.usdc")
+        house.GetPrim().SetInstanceable(is_instanceable)
+    stage.DefinePrim("/world/faint").GetReferences().AddReference("asset.usdc")
+    stage.GetPrimAtPath("/world/faint/walls").GetAttribute("opacities").Set([0.5] * 50)
+    stage.GetRootLayer().Save()
+    scene = v3dg.read_usd_scene(tmp_path / "world.usda")
+    assert scene.up == "y"
+    assert scene.instance_bundle.tolist() == [0, 0, 0, 1]
+    np.testing.assert_allclose(
+        scene.positions, [[0, 100, 0], [10, 100, 0], [20, 100, 0], [0, 0, 0]], atol=1e-5
+    )
+    np.testing.assert_allclose(scene.scales, [1, 2, 3, 1], rtol=1e-6)
+    assert (scene.bundles[1].level_gaussians(0).opacities == 0.5).all()
+    opened = v3dg.open(tmp_path / "world.usda")
+    assert isinstance(opened, v3dg.Scene if is_instanceable else v3dg.Gaussians)
+    assert is_instanceable or len(opened) == 200
+
+
+def test_instancers_may_hold_instancers_and_hide_instances(tmp_path):
+    stage = Usd.Stage.CreateNew(os.fspath(tmp_path / "world.usda"))
+    v3dg.formats.usd.define(stage, "/rows/row/tree", random_gaussians(np.random.default_rng(0), 20, 0))
+    for path, step in (("/rows", (0, 10, 0)), ("/rows/row", (1, 0, 0))):
+        instancer = UsdGeom.PointInstancer.Define(stage, path)
+        instancer.CreatePrototypesRel().SetTargets([f"{path}/{'row' if path == '/rows' else 'tree'}"])
+        instancer.CreateProtoIndicesAttr([0, 0, 0])
+        instancer.CreatePositionsAttr([Gf.Vec3f(*step) * k for k in range(3)])
+        # In half precision, as most programs write them.
+        instancer.CreateOrientationsAttr([Gf.Quath(0.5, 0.5, -0.5, 0.5)] * 3)
+    UsdGeom.PointInstancer(stage.GetPrimAtPath("/rows")).InvisId(1, 0)
+    stage.GetRootLayer().Save()
+    scene = v3dg.open(tmp_path / "world.usda")
+    assert len(scene.bundles) == 1
+    turn = v3dg.rotations.rotation_from_quaternion(np.array([0.5, 0.5, -0.5, 0.5]))
+    wanted = [np.array([0, 10, 0]) * row + turn @ [tree, 0, 0] for row in (0, 2) for tree in range(3)]
+    np.testing.assert_allclose(scene.positions, wanted, atol=1e-5)
+    np.testing.assert_allclose(scene.rotations, np.broadcast_to(turn @ turn, (6, 3, 3)), atol=1e-5)
+
+
+def test_a_world_is_known_to_the_command_line(tmp_path):
+    scene = v3dg.Scene()
+    scene.add(random_bundle(3), [[0, 0, 0], [4, 0, 0]])
+    write_usd(scene, tmp_path / "a.usdc", up="z")
+    done = run("info", "a.usdc", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["instances"] == 2

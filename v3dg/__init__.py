@@ -21,6 +21,7 @@ from v3dg.gaussians import Gaussians
 from v3dg.image import Image, RenderedImage, Stats
 from v3dg.io import read_asset, write_asset
 from v3dg.opening import open as open  # not in __all__: with `*` it would hide the one of Python
+from v3dg.opening import read_usd_scene
 from v3dg.pick import Pick, pick
 from v3dg.rasterize import rasterize
 from v3dg.render import Renderer, render
@@ -34,4 +35,4 @@ __all__ += ["__version__", "build_bundle", "read_asset", "write_asset"]
 __all__ += ["Camera", "Scene", "read_cameras", "read_scene", "turntable", "write_cameras", "write_scene"]
 __all__ += ["DEFAULT_FADE", "DEFAULT_TOLERANCE", "Image", "Pick", "RenderedImage", "Renderer", "Stats"]
 __all__ += ["Selection", "StereoCamera", "pick", "rasterize", "render", "select", "view"]
-__all__ += ["write_site", "write_streamed_sog", "write_tiles", "write_usd"]
+__all__ += ["read_usd_scene", "write_site", "write_streamed_sog", "write_tiles", "write_usd"]

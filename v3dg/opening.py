@@ -6,8 +6,10 @@ import os
 from pathlib import Path
 from typing import TypeAlias
 
+from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
+from v3dg.formats import usd
 from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, read_asset
 from v3dg.scene import Scene
@@ -19,7 +21,8 @@ Subject: TypeAlias = Scene | Bundle | Gaussians
 def open(path: str | os.PathLike[str]) -> Subject:
     """Open a file by its name: a scene (.json), a bundle (.v3dg) or an asset, as `read_asset` does.
 
-    `read_scene` gives the cameras of a scene, too.
+    `read_scene` gives the cameras of a scene, too. A file of OpenUSD with instances is a scene, as
+    `read_usd_scene` reads it.
 
     Raises:
         ValueError: The file is not what its name says, or has another name.
@@ -32,9 +35,39 @@ def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
     """A scene with its cameras, or a bundle or an asset, which have none."""
     if is_scene(path):
         return read_scene(path)
+    if path.suffix.lower() in usd.SUFFIXES and usd.has_instances(path):
+        return read_usd_scene(path), None
     return Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path), None
 
 
 def is_scene(path: Path) -> bool:
     """Whether a file is a scene by its name: JSON, but not the `meta.json` of an asset in SOG."""
     return path.suffix == ".json" and not path.name.endswith(SUFFIXES)
+
+
+def read_usd_scene(
+    path: str | os.PathLike[str], *, config: BuildConfig | None = None, device: str = "auto"
+) -> Scene:
+    """Read a world of OpenUSD: a bundle is built of each thing in it, and stands where its instances do.
+
+    Instances are those of PointInstancers, also of each other, and prims that refer to the same gaussians;
+    a prim alone has one. The finest of their levels is read. Needs the extra `usd`.
+
+    Args:
+        config: How bundles are built; if None, without fitting the levels, which takes seconds.
+        device: Where, as in `build_bundle`.
+
+    Raises:
+        ImportError: usd-core is not installed.
+        ValueError: The file is not OpenUSD with gaussians, or something is placed otherwise than by rotation,
+            translation and one scale.
+        OSError: It cannot be read.
+    """
+    assets, which, poses, up = usd.read_world(path)
+    config = config or BuildConfig(steps=0)
+    bundles = [build_bundle(asset, config=config, device=device, progress=False) for asset in assets]
+    scene = Scene()
+    quaternions, positions, scales = zip(*poses, strict=True)
+    scene.add([bundles[number] for number in which], positions, quaternions, scales)
+    scene.up = up
+    return scene

@@ -1,22 +1,25 @@
 """OpenUSD: gaussians as prims `ParticleField3DGaussianSplat`, with Pixar's usd-core.
 
-Written is one prim; read are all prims that are there, where their transforms put them. Of levels of detail,
-the first is read. Coordinates are passed on as they are stored.
+Written is one prim; read are all prims that are there, where their transforms put them: as one asset, or
+each of them once and where it stands. Of levels of detail, the first is read. Coordinates are passed on as
+they are stored.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from v3dg import _extras, _files
-from v3dg.cameras import is_rotation
+from v3dg.cameras import Axis, Floats, is_rotation
 from v3dg.formats._packing import check_writable, normalised
 from v3dg.formats._reading import AssetFile, telling
 from v3dg.formats._reading import Path as AnyPath
@@ -24,7 +27,10 @@ from v3dg.gaussians import Gaussians
 from v3dg.rotations import quaternion_from_rotation
 
 SUFFIXES = (".usd", ".usda", ".usdc")
+_Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
 _SH = "radiance:sphericalHarmonics"
+_HALVES = ("positions", "orientations", "scales", "opacities", f"{_SH}Coefficients")  # or in half precision
+_COLUMNS = (f"{_SH}Degree", *_HALVES, *(f"{name}h" for name in _HALVES))
 
 
 @cache
@@ -42,26 +48,107 @@ def open_file(path: AnyPath) -> AssetFile:
 
 
 def read(path: AnyPath) -> Gaussians:
-    """Read the gaussians of a USD file."""
-    usd = pxr()
-    os.close(_files.open_regular(path))
-    with telling(path, "OpenUSD with gaussians of one SH degree, without instances"):
-        stage, parts = usd.Usd.Stage.Open(os.fspath(path)), []
-        walk = iter(usd.Usd.PrimRange.Stage(stage))
-        for prim in walk:
-            root = prim.GetParent()
+    """Read the gaussians of a USD file as one asset."""
+    with _opened(path, "OpenUSD with gaussians of one SH degree, without instances") as (usd, root):
+        for prim in _prims(usd, root):
             if prim.IsA(usd.UsdGeom.PointInstancer):
-                raise ValueError(f"instances in {prim.GetPath()}")
-            if root.HasAPI(usd.UsdLod.RootAPI) and prim != root.GetChildren()[0]:
-                walk.PruneChildren()
-            elif prim.IsA(usd.UsdVol.ParticleField3DGaussianSplat):
-                parts.append(_gaussians_of(usd, prim))
-        if not parts:
-            raise ValueError("no ParticleField3DGaussianSplat")
+                raise ValueError(f"instances in {prim.GetPath()}; open it as a scene")
+        parts = []
+        for prim, matrix in _placed(usd, root):
+            gaussians = _gaussians_of(prim)
+            is_moved = not np.array_equal(matrix, np.eye(4))
+            parts.append(gaussians.transform(*_similarity(prim, matrix)) if is_moved else gaussians)
         return Gaussians.concatenate(parts)
 
 
-def _gaussians_of(usd: Any, prim: Any) -> Gaussians:
+def has_instances(path: AnyPath) -> bool:
+    """Whether instances make a USD file a scene."""
+    with _opened(path, "OpenUSD with gaussians") as (usd, root):
+        return any(
+            prim.IsInstanceProxy() or prim.IsA(usd.UsdGeom.PointInstancer) for prim in _prims(usd, root)
+        )
+
+
+def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], Axis]:
+    """Read what is in a USD file once each; which of it has an instance where; and what is up.
+
+    Prims whose values come from the same place are one asset, as references to it are.
+    """
+    numbers: dict[Any, int] = {}  # by path, and by where values come from
+    assets, which, poses = list[Gaussians](), list[int](), list[_Pose]()
+    with _opened(path, "OpenUSD with gaussians and instances of them") as (usd, root):
+        for prim, matrix in _placed(usd, root):
+            if prim.GetPath() not in numbers:
+                stacks = [prim.GetAttribute(name).GetPropertyStack() for name in _COLUMNS]
+                source = tuple((stack[0].layer.identifier, stack[0].path) for stack in stacks if stack)
+                if source not in numbers:
+                    numbers[source] = len(assets)
+                    assets.append(_gaussians_of(prim))
+                numbers[prim.GetPath()] = numbers[source]
+            which.append(numbers[prim.GetPath()])
+            poses.append(_similarity(prim, matrix))
+        if not assets:
+            raise ValueError("no instances")
+        return assets, which, poses, usd.UsdGeom.GetStageUpAxis(root.GetStage()).lower()
+
+
+@contextlib.contextmanager
+def _opened(path: AnyPath, expected: str) -> Iterator[tuple[Any, Any]]:
+    """The package, and the root of a file's prims, of which some must be gaussians."""
+    usd = pxr()
+    os.close(_files.open_regular(path))
+    with telling(path, expected):
+        stage = usd.Usd.Stage.Open(os.fspath(path))
+        if not any(_prims(usd, stage.GetPseudoRoot())):
+            raise ValueError("no ParticleField3DGaussianSplat")
+        yield usd, stage.GetPseudoRoot()
+
+
+def _prims(usd: Any, root: Any) -> Iterator[Any]:
+    """Gaussians and instancers of the prims from a root on."""
+    walk = iter(usd.Usd.PrimRange(root, usd.Usd.TraverseInstanceProxies()))
+    for prim in walk:
+        parent, is_instancer = prim.GetParent(), prim.IsA(usd.UsdGeom.PointInstancer)
+        is_coarse = parent and parent.HasAPI(usd.UsdLod.RootAPI) and prim != parent.GetChildren()[0]
+        if is_instancer or is_coarse:  # what is below an instancer is drawn where its instances are
+            walk.PruneChildren()
+        if not is_coarse and (is_instancer or prim.IsA(usd.UsdVol.ParticleField3DGaussianSplat)):
+            yield prim
+
+
+def _placed(usd: Any, root: Any) -> Iterator[tuple[Any, Floats]]:
+    """Prims of gaussians, and what takes each, or an instance of it, to the frame of the root."""
+    from_root, time = np.linalg.inv(_to_world(usd, root)), usd.Usd.TimeCode.EarliestTime()
+    for prim in _prims(usd, root):
+        matrix = from_root @ _to_world(usd, prim)
+        if not prim.IsA(usd.UsdGeom.PointInstancer):
+            yield prim, matrix
+            continue
+        instancer = usd.UsdGeom.PointInstancer(prim)
+        targets = map(prim.GetStage().GetPrimAtPath, instancer.GetPrototypesRel().GetForwardedTargets())
+        prototypes = [list(_placed(usd, target)) for target in targets]
+        kinds = np.array(instancer.GetProtoIndicesAttr().Get(time))
+        kinds = kinds[np.array(instancer.ComputeMaskAtTime(time) or np.ones(len(kinds)), bool)]
+        poses = np.array(instancer.ComputeInstanceTransformsAtTime(time, time)).reshape(-1, 4, 4)
+        for kind, pose in zip(kinds.tolist(), poses.transpose(0, 2, 1), strict=True):
+            yield from ((inside, matrix @ pose @ of) for inside, of in prototypes[kind])
+
+
+def _to_world(usd: Any, prim: Any) -> Floats:
+    # USD has vectors as rows.
+    matrix: Floats = np.array(usd.UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T
+    return matrix
+
+
+def _similarity(prim: Any, matrix: Floats) -> _Pose:
+    """Quaternion, translation and scale of a (4, 4) matrix that places a prim."""
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    if not (scale > 0 and is_rotation(matrix[:3, :3] / scale)):
+        raise ValueError(f"a transform of {prim.GetPath()} that is no rotation, translation and one scale")
+    return quaternion_from_rotation(matrix[:3, :3] / scale), matrix[:3, 3], scale
+
+
+def _gaussians_of(prim: Any) -> Gaussians:
     def column(name: str) -> Any:
         values = prim.GetAttribute(name).Get()
         if values is None:  # in half precision
@@ -69,21 +156,13 @@ def _gaussians_of(usd: Any, prim: Any) -> Gaussians:
         return np.array(values, np.float32)
 
     means, degree = column("positions"), prim.GetAttribute(f"{_SH}Degree").Get()
-    gaussians = Gaussians(
+    return Gaussians(
         means=means,
         quats=normalised(np.roll(column("orientations"), 1, axis=1)).astype(np.float32),
         scales=column("scales"),
         opacities=column("opacities"),
         sh=column(f"{_SH}Coefficients").reshape(len(means), (degree + 1) ** 2, 3),
     )
-    # USD has vectors as rows.
-    matrix = np.array(usd.UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T
-    if np.array_equal(matrix, np.eye(4)):
-        return gaussians
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    if not (scale > 0 and is_rotation(matrix[:3, :3] / scale)):
-        raise ValueError(f"a transform of {prim.GetPath()} that is no rotation, translation and one scale")
-    return gaussians.transform(quaternion_from_rotation(matrix[:3, :3] / scale), matrix[:3, 3], scale)
 
 
 def write(path: AnyPath, gaussians: Gaussians) -> None:
