@@ -149,7 +149,7 @@ def test_alpha_and_depth_are_shown(scene_view, view, device):
 
 def test_an_empty_picture_is_black_in_every_mode(scene_view):
     away = look_at((0, -60, 0), (0, -70, 0), (0, 0, 1), 0.5, 1.5)
-    for shows in ("appearance", "level", "depth", "alpha", "count", "difference"):
+    for shows in ("appearance", "level", "depth", "alpha", "count", "error", "difference"):
         frame = scene_view.frame(away, SIZE, Settings(shows=shows, split=0.0))
         assert not frame.pixels.any()
         assert frame.figures.gaussians_in_view == 0
@@ -165,7 +165,7 @@ def test_count_is_of_the_gaussians_that_a_pixel_is_blended_of(opacities, count):
     camera = AXIS.camera(33, 33, 0.01)
     cut = v3dg.select(scene_view.scene, camera, device="cpu")
     window = (0, 0, 33, 33)
-    counts, in_view = scene_view._count(cut, camera, window, None)
+    _, _, counts, in_view = scene_view._values("count_cut", cut, camera, window, (), None)
     assert counts[16, 16] == count
     assert in_view == len(opacities)
     alpha = v3dg.render(scene_view.scene, camera, device="cpu").alpha
@@ -182,6 +182,30 @@ def test_count_is_shown_on_a_scale_of_octaves(device):
         assert frame.value_range == (1.0, MOST_COUNTED)
     for number, pixel in pixels.items():
         np.testing.assert_array_equal(pixel, to_8bit(ramp(np.array(math.log2(number) / 8))))
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
+def test_error_is_the_share_of_the_tolerance_that_is_used(share, device):
+    """Of each instance by itself, and none where the finest level is drawn."""
+    rng = np.random.default_rng(0)
+    bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 600, size=0.3), 64)
+    scene = Scene()
+    scene.add(bundle, positions=[[-2, 0, 0], [3, 8, 0]])
+    scene_view, size = SceneView(scene, device=device), (120, 60)
+    view = look_at((0, -12, 0), (0, 0, 0), (0, 0, 1), 0.6, 2.0)
+    near, far = (metrics.max() for metrics in scenes_lod.group_metrics(scene, view.camera(*size, 0.01)))
+    assert far < 0.5 * near
+    frame = scene_view.frame(view, size, Settings(shows="error", tolerance=float(near) / share, fade=None))
+    assert frame.value_range == (0.0, pytest.approx(near / share))
+    camera = view.camera(*size, 0.01)
+    alpha = v3dg.render(scene, camera, tolerance=float(near) / share, device="cpu").alpha[..., None]
+    for half, metric in ((slice(0, 60), near), (slice(60, 120), far)):
+        wanted = to_8bit(ramp(np.array(share * metric / near)) * alpha[:, half])
+        assert wanted.max() > 20
+        np.testing.assert_allclose(frame.pixels[:, half].astype(int), wanted, atol=2)
+    finest = scene_view.frame(view, size, Settings(shows="error", tolerance=0.0)).pixels
+    alpha = v3dg.render(scene, camera, tolerance=0.0, device="cpu").alpha[..., None]
+    np.testing.assert_allclose(finest.astype(int), to_8bit(ramp(np.array(0.0)) * alpha), atol=2)
 
 
 def test_difference_is_to_all_gaussians_and_amplified(scene_view, view):
@@ -241,7 +265,7 @@ def test_scene_of_nothing_is_drawn():
 def test_a_picture_that_is_stopped_is_given_up(crowd, view):
     scene_view, stop = SceneView(crowd, device="cpu"), _core.Stop()
     stop.request()
-    for shows in ("appearance", "count", "difference"):
+    for shows in ("appearance", "count", "error", "difference"):
         with pytest.raises(Stopped):
             scene_view.frame(view, SIZE, Settings(shows=shows), stop)
 

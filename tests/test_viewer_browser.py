@@ -29,6 +29,7 @@ SHOWS = (
     "Colour",
     "Level",
     "Cluster",
+    "Error",
     "Depth",
     "Alpha",
     "Gaussians per pixel",

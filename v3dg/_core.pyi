@@ -440,6 +440,17 @@ class SceneFrame:
         stop: Stop | None = None,
         weights: Float32 | None = None,
     ) -> Drawing: ...
+    def draw_metrics(
+        self,
+        scene: ResidentScene,
+        camera: Camera,
+        rule: Rule,
+        instance_ids: Int32,
+        cluster_ids: Int32,
+        shade: Shade,
+        stop: Stop | None = None,
+        weights: Float32 | None = None,
+    ) -> Drawing: ...
     def pick_cut(
         self, scene: ResidentScene, camera: Camera, instance_ids: Int32, cluster_ids: Int32
     ) -> tuple[int, float, float] | None: ...

@@ -267,6 +267,19 @@ class BoundSceneFrame {
                        });
     }
 
+    // As draw_cut(), with the share of the rule's tolerance that each pair's metric takes as its colour.
+    std::unique_ptr<BoundDrawing> draw_metrics(const py::object& scene_object, const BoundCamera& camera,
+                                               const SelectRule& rule, const py::array& instance_ids,
+                                               const py::array& cluster_ids, const Shade& shade,
+                                               const Stop* stop, const py::object& weights) {
+        require_host("draw_metrics");
+        const GivenCut given = given_cut(instance_ids, cluster_ids, weights);
+        return on_host(checked(scene_object), camera.camera, shade,
+                       [&](const HostScene& host, Span<const Picture<float>> out) {
+                           return cpu::draw_metrics(host, camera.camera, rule, given, out[0], flag_of(stop));
+                       });
+    }
+
     // (place in the cut, weight, depth), or None.
     py::object pick_cut(const py::object& scene_object, const BoundCamera& camera,
                         const py::array& instance_ids, const py::array& cluster_ids) {
@@ -476,6 +489,8 @@ void bind_frame(py::module_& m) {
              "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
         .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,
              "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
+        .def("draw_metrics", &BoundSceneFrame::draw_metrics, "scene"_a, "camera"_a, "rule"_a,
+             "instance_ids"_a, "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
         .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
              "cluster_ids"_a);
     py::class_<BoundAssetFrame>(m, "AssetFrame",

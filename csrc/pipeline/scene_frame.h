@@ -60,6 +60,13 @@ SceneFrameCounts draw_scene(const HostScene& scene, const Eyes& eyes, const Sele
 SceneFrameCounts draw_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,
                           const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);
 
+// The same in shades of grey: the metric of each pair (see pair_metrics) over the rule's tolerance, at most
+// kMostShare.
+constexpr float kMostShare = 2.0f;
+SceneFrameCounts draw_metrics(const HostScene& scene, const Camera& camera, const SelectRule& rule,
+                              const GivenCut& given, const Picture<float>& picture,
+                              const std::atomic<bool>* stop = nullptr);
+
 // Draws all gaussians of one model, in the world, without a filter.
 SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,
                             const Picture<float>& picture, const std::atomic<bool>* stop = nullptr);

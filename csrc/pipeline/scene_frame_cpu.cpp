@@ -6,6 +6,8 @@
 #include <stdexcept>
 #include <string>
 
+#include "math/sh.h"
+
 namespace v3dg {
 
 namespace {
@@ -48,13 +50,14 @@ SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& c
 }
 
 // The clusters of a cut as draws. Clusters of one instance whose rows follow on each other make one draw if
-// they are drawn alike, also with the same weight.
+// they are drawn alike, also with the same weight. `tint` has three SH coefficients of the constant basis for
+// each pair, in place of its gaussians' colours; null: none.
 class CutDraws {
   public:
-    CutDraws(const HostScene& scene, const Camera& camera, const GivenCut& given)
+    CutDraws(const HostScene& scene, const Camera& camera, const GivenCut& given, const float* tint = nullptr)
         : scene_(scene), camera_(camera) {
         for (size_t s = 0; s < given.instance.size; ++s)
-            add(given.instance[s], given.cluster[s], given.weight_of(s));
+            add(given.instance[s], given.cluster[s], given.weight_of(s), tint ? tint + 3 * s : nullptr);
     }
 
     const std::vector<Draw<float>>& draws() const { return draws_; }
@@ -65,7 +68,7 @@ class CutDraws {
     }
 
   private:
-    void add(int32_t i, int32_t c, float weight) {
+    void add(int32_t i, int32_t c, float weight, const float* tint) {
         if (i < 0 || static_cast<size_t>(i) >= scene_.instances.bundle.size)
             throw std::out_of_range("instance_ids: expected ids of the scene's instances, got " +
                                     std::to_string(i));
@@ -83,8 +86,9 @@ class CutDraws {
             view_ = model_view_from_instance(axes_of_instance(camera_, pose), pose);
         }
         end_of_pair_.back() = num_gaussians_ += count;
-        const Draw<float> next{model.planes,        first,         count,       view_,
-                               model.appearance[c], model.palette, model.codes, weight};
+        const Palette palette = tint == nullptr ? model.palette : Palette{tint, nullptr, 1};
+        const Draw<float> next{model.planes,        first,   count,       view_,
+                               model.appearance[c], palette, model.codes, weight};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else
@@ -94,7 +98,8 @@ class CutDraws {
 
     // Whether the second, of the same instance, begins where the first ends and is drawn alike.
     static bool joins(const Draw<float>& a, const Draw<float>& b) {
-        return a.first + a.count == b.first && a.appearance == b.appearance && a.weight == b.weight;
+        return a.first + a.count == b.first && a.appearance == b.appearance && a.weight == b.weight &&
+               a.palette.sh == b.palette.sh;
     }
 
     const HostScene& scene_;
@@ -132,6 +137,23 @@ SceneFrameCounts cpu::draw_cut(const HostScene& scene, const Camera& camera, con
                                const Picture<float>& picture, const std::atomic<bool>* stop) {
     const double start = now();
     const CutDraws cut(scene, camera, given);
+    SceneFrameCounts counts = draw_all(cut.draws(), camera, picture, stop);
+    counts.gaussians = cut.num_gaussians();
+    counts.draw_seconds = now() - start;
+    return counts;
+}
+
+SceneFrameCounts cpu::draw_metrics(const HostScene& scene, const Camera& camera, const SelectRule& rule,
+                                   const GivenCut& given, const Picture<float>& picture,
+                                   const std::atomic<bool>* stop) {
+    const double start = now();
+    std::vector<float> metric(given.instance.size), tint(3 * metric.size());
+    const CutDraws cut(scene, camera, given, tint.data());  // which checks the pairs
+    pair_metrics({scene.tables, scene.instances, camera, rule}, given, {metric.data(), metric.size()});
+    for (size_t s = 0; s < metric.size(); ++s) {
+        const float share = metric[s] > 0.0f ? std::min(metric[s] / rule.tolerance_px2, kMostShare) : 0.0f;
+        std::fill_n(tint.data() + 3 * s, 3, (share - 0.5f) / static_cast<float>(kShBase0));
+    }
     SceneFrameCounts counts = draw_all(cut.draws(), camera, picture, stop);
     counts.gaussians = cut.num_gaussians();
     counts.draw_seconds = now() - start;

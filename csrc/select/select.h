@@ -63,6 +63,10 @@ void select(const SelectInput& in, SelectOutput& out);
 // Metric of every group of every instance, px2. The bundle of instance i has its metrics at metric_offset[i].
 void group_metrics(const SelectInput& in, Span<const int64_t> metric_offset, Span<float> metric);
 
+// Metric of the group that made the cluster of each pair, px2; 0 where it is of level 0. Pairs are the
+// scene's.
+void pair_metrics(const SelectInput& in, const GivenCut& given, Span<float> metric);
+
 // What bounds tell without asking a cluster: for each kClustersOfBounds neighbours of the table of every
 // instance, 0 if none of them is drawn at these tolerances, else 1. Those of instance i begin at first[i].
 void bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<const int64_t> first,

@@ -273,6 +273,16 @@ void cpu::group_metrics(const SelectInput& in, Span<const int64_t> metric_offset
     });
 }
 
+void cpu::pair_metrics(const SelectInput& in, const GivenCut& given, Span<float> metric) {
+    const View view(in);
+    parallel_for(metric.size, kChunk, [&](size_t s) {
+        const SeenInstance seen(view, given.instance[s]);
+        const int32_t group = seen.table.own_group[given.cluster[s]];
+        const bool is_coarse = seen.is_placed && group >= 0;
+        metric[s] = is_coarse ? wanted_metric_px2(seen.table, group, seen.view, in.rule) : 0.0f;
+    });
+}
+
 void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<const int64_t> first,
                           Span<uint8_t> may_draw) {
     std::vector<std::vector<ClusterBounds>> bounds;

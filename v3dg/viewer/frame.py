@@ -22,12 +22,12 @@ from v3dg.pictures import to_8bit
 from v3dg.render import render, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Scene
-from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select
+from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, rule_of, select
 from v3dg.viewer.view import View
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
 Window: TypeAlias = tuple[int, int, int, int]
-Shows: TypeAlias = Literal["appearance", "level", "cluster", "depth", "alpha", "count", "difference"]
+Shows: TypeAlias = Literal["appearance", "level", "cluster", "error", "depth", "alpha", "count", "difference"]
 
 # Gaussians in a pixel that get the brightest colour.
 MOST_COUNTED = 256
@@ -54,8 +54,9 @@ class Settings:
     """What a picture shows, and how finely.
 
     Attributes:
-        shows: The colours, those of a level or a cluster, expected depth, alpha, how many gaussians a pixel
-            is blended of, or the difference to the picture of all gaussians.
+        shows: The colours, those of a level or a cluster, the error, which is the screen area that a gaussian
+            of a coarser cluster stands for, expected depth, alpha, how many gaussians a pixel is blended of,
+            or the difference to the picture of all gaussians.
         tolerance, budget, min_level, fade: As in `v3dg.render`, but that a tolerance is always given.
         gain: What a difference is multiplied by.
         split: Share of the width, from the left, that shows all gaussians; 0 for none.
@@ -214,9 +215,15 @@ class SceneView:
         """Colours of the window, values of darkest and brightest, gaussians in the frustum, the distance."""
         shows = settings.shows
         if shows == "count":
-            count, in_view = self._count(cut, camera, window, stop)
+            _, _, count, in_view = self._values("count_cut", cut, camera, window, (), stop)
             values = np.log2(np.maximum(count, 1)) / np.log2(MOST_COUNTED)
             return ramp(values) * (count > 0)[..., None], (1.0, MOST_COUNTED), in_view, None
+        if shows == "error":
+            rule = (rule_of(cut.tolerance, None, 0),)
+            share, alpha, depth, in_view = self._values("draw_metrics", cut, camera, window, rule, stop)
+            mean = np.clip(share[..., 0] / np.maximum(alpha, 1e-6), 0, 1)
+            picture = ramp(mean) * alpha[..., None]
+            return picture, (0.0, cut.tolerance), in_view, _distance(alpha, depth)
         color_by: ColorBy = shows if shows in ("level", "cluster") else "appearance"
         color, alpha, depth, in_view = self._draw(cut, camera, window, color_by, stop)
         distance = _distance(alpha, depth)
@@ -247,22 +254,24 @@ class SceneView:
             planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
             color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
             return color, alpha, depth, image.stats.gaussians_in_frustum
+        return self._values("draw_cut", cut, camera, window, (), stop, color_by)
+
+    def _values(
+        self,
+        how: str,
+        cut: Selection,
+        camera: Camera,
+        window: Window,
+        rule: Any,
+        stop: _core.Stop | None,
+        color_by: ColorBy = "appearance",
+    ) -> tuple[Any, Any, Any, int]:
+        """As `_draw`, by a method of frames that are drawn on the CPU on any device."""
         frame, scene = self._frame(color_by, cut)
         pairs, part = (cut.instance_ids, cut.cluster_ids), camera.core.window(*window)
-        drawing = frame.draw_cut(scene, part, *pairs, _SHADE, stop, cut.given_weights)
+        drawing = getattr(frame, how)(scene, part, *rule, *pairs, _SHADE, stop, cut.given_weights)
         _check(stop)
         return drawing.color, drawing.alpha, drawing.depth, drawing.finish().in_frustum
-
-    def _count(
-        self, cut: Selection, camera: Camera, window: Window, stop: _core.Stop | None
-    ) -> tuple[npt.NDArray[np.float32], int]:
-        """(H, W) gaussians that each pixel is blended of; drawn on the CPU on any device."""
-        frame, scene = self._frame("appearance", cut)
-        pairs, part = (cut.instance_ids, cut.cluster_ids), camera.core.window(*window)
-        drawing = frame.count_cut(scene, part, *pairs, _SHADE, stop, cut.given_weights)
-        _check(stop)
-        assert drawing.depth is not None
-        return drawing.depth, drawing.finish().in_frustum
 
     def _frame(self, color_by: ColorBy, cut: Selection) -> tuple[_core.SceneFrame, _core.ResidentScene]:
         """A frame, and the scene as it is, which still has the instances of the cut."""

@@ -4,12 +4,13 @@ export const SHOWS = {
   appearance: "Colour",
   level: "Level",
   cluster: "Cluster",
+  error: "Error",
   depth: "Depth",
   alpha: "Alpha",
   count: "Gaussians per pixel",
   difference: "Difference to all gaussians",
 };
-const NEED_LEVELS = ["level", "difference"];
+const NEED_LEVELS = ["level", "error", "difference"];
 const KEYS = [
   ["drag", "turn"], ["right or Shift drag, two fingers", "move sideways"], ["wheel, pinch", "near and far"],
   ["click", "turn around this, select its instance"], ["double click", "fly there"], ["W A S D Q E", "fly"],
@@ -286,6 +287,7 @@ export class Panel {
     const short = (x) => `${+x.toPrecision(3)}`;
     let marks = range.map(short);
     if (shows === "count") marks = ["1", "4", "16", "64", `${this.app.scene.most_counted}+`];
+    if (shows === "error") marks = ["finest", `tolerance, ${marks[1]} px²`];
     if (shows === "depth") marks = [`far ${marks[0]}`, `near ${marks[1]}`];
     const colors = shows === "alpha" ? ["#000", "#fff"] : this.app.scene.ramp.map((color) => `rgb(${color})`);
     const ramp = make("div", { className: "ramp" });
