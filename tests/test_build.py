@@ -193,6 +193,17 @@ def test_level_zero_is_the_asset(asset, bundle):
     np.testing.assert_array_equal(*(r[np.lexsort(r.T)] for r in rows))
 
 
+def test_the_filter_of_an_asset_is_its_own(asset, bundle, device):
+    """Level 0 is drawn with it; what is coarser is fitted to the asset without, or would be thicker."""
+    filtered = build(asset, replace(SMALL, asset_filter_px2=0.3), device=device)
+    is_fine = bundle.clusters.level == 0
+    assert (filtered.clusters.filter_px2[is_fine] == np.float32(0.3)).all()
+    for level in range(bundle.num_levels):
+        found, wanted = filtered.level_gaussians(level), bundle.level_gaussians(level)
+        np.testing.assert_array_equal(found.means, wanted.means)
+        np.testing.assert_array_equal(found.opacities, wanted.opacities)
+
+
 def test_gaussians_stay_within_their_ranges(asset, bundle):
     g = bundle.gaussians
     assert (g.scales >= 0).all()

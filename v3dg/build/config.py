@@ -47,7 +47,9 @@ class BuildConfig:
         px2_per_gaussian: That size: px² of the group's footprint for each gaussian that it is simplified to.
         distance: From the camera to the centre of the group, in radii.
         filter_px2: Variance of the low-pass that the coarser levels are drawn with, px².
-        asset_filter_px2: The same for level 0: what the asset was trained with (0.3 for the original 3DGS).
+        asset_filter_px2: The same for level 0: what the asset was trained with (0.3 for the original 3DGS) at
+            the size of its photographs; without, it is better seen from farther away. Coarser levels are
+            fitted to the asset without a filter.
         asset_antialiased: Whether the asset was trained with opacities compensated for its filter.
         loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
         step_position: Step size of positions, in radii of the group, or in world units if

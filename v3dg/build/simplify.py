@@ -178,11 +178,15 @@ def _spheres(gaussians: Gaussians) -> Array:
 
 
 def _target(below: Mapping[int, Level], numbers: range, config: BuildConfig) -> _core.FitTarget:
-    """What groups are to look like, drawn as it is drawn when it is selected."""
+    """What groups are to look like, drawn as it is drawn when it is selected.
+
+    But for the filter of the asset: that spreads gaussians without taking from their opacity, the more the
+    smaller they are shown, and coarser levels would learn to be too thick.
+    """
     parts = [below[number].gaussians for number in numbers]
     rows = (parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)).rows
     if numbers[0] == 0:
-        return _core.FitTarget(rows, config.asset_filter_px2, config.asset_antialiased)
+        return _core.FitTarget(rows, 0.0, False)
     return _core.FitTarget(rows, config.filter_px2, True)
 
 
