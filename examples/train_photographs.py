@@ -40,7 +40,7 @@ class Config:
     capture: Annotated[Path, tyro.conf.Positional]
     """Folder with photographs and cameras."""
     output: Path = Path("trained.ply")
-    """Asset to write; beside it a .png of the photographs that were held out and what it shows there."""
+    """Asset to write; beside it a .jpg of the photographs that were held out and what it shows there."""
     steps: int = 7000
     """Steps, of one photograph each."""
     longest: int = 1200
@@ -88,7 +88,7 @@ def main(config: Config) -> float:
             text = f"{photograph.name}: {decibels[-1]:.2f} dB"
             rows.append([(text, photograph.pixels.numpy()), ("trained", to_8bit(drawn))])
             print(text)
-    write_picture(config.output.with_suffix(".png"), contact_sheet(rows[:4]))
+    write_picture(config.output.with_suffix(".jpg"), contact_sheet(rows[:4]))
     mean = float(np.mean(decibels))
     num = len(parameters["means"])
     print(f"{config.output}: {num:,} gaussians, {seconds:.0f} s, {mean:.2f} dB on photographs held out")

@@ -74,6 +74,7 @@ def files(tmp_path_factory):
     around = v3dg.turntable((0, 0, 0), 3, 6, width=64, height=48)
     cameras = {f"side {i}": camera for i, camera in enumerate(around)}
     v3dg.write_scene(folder / "scene.json", scene, ["donut.v3dg"], cameras)
+    write_capture(folder, asset)
     # The folders of the V3DG paper's code.
     theirs = folder / "_3dgs-assets" / "donut" / "donut" / "point_cloud" / "iteration_30000"
     theirs.mkdir(parents=True)
@@ -91,6 +92,16 @@ def files(tmp_path_factory):
         (commands / name).write_text(f"#!/bin/sh\n{line}\n")
         (commands / name).chmod(0o755)
     return folder
+
+
+def write_capture(folder, asset):
+    """What was trained, and where its photographs were taken from, as COLMAP has it."""
+    v3dg.write_asset(folder / "fox.ply", asset)
+    if find_spec("pycolmap") is not None:
+        from test_camera_folders import write_model
+
+        around = v3dg.turntable((0, 0, 0), 3, 6, width=64, height=48)
+        write_model(folder / "fox" / "sparse", {f"{i}.jpg": camera for i, camera in enumerate(around)})
 
 
 def published_layout():

@@ -97,7 +97,7 @@ def test_what_is_trained_looks_like_photographs_that_were_held_out(capture, devi
     assert example.main(example.Config(capture, path, steps=40, longest=32, **few)) > before + 3
     num_points = 200 if (capture / "sparse").is_dir() else 500
     assert len(v3dg.read_asset(path)) == num_points
-    with Image.open(path.with_suffix(".png")) as sheet:
+    with Image.open(path.with_suffix(".jpg")) as sheet:
         assert sheet.width > 2 * 32
 
 
