@@ -215,15 +215,16 @@ class SceneView:
         """Colours of the window, values of darkest and brightest, gaussians in the frustum, the distance."""
         shows = settings.shows
         if shows == "count":
-            _, _, count, in_view = self._values("count_cut", cut, camera, window, (), stop)
+            _, _, count, in_view = self._values("count_cut", cut, camera, window, stop, "appearance")
             values = np.log2(np.maximum(count, 1)) / np.log2(MOST_COUNTED)
             return ramp(values) * (count > 0)[..., None], (1.0, MOST_COUNTED), in_view, None
         if shows == "error":
-            rule = (rule_of(cut.tolerance, None, 0),)
-            share, alpha, depth, in_view = self._values("draw_metrics", cut, camera, window, rule, stop)
+            rule = rule_of(cut.tolerance, None, 0)
+            share, alpha, depth, seen = self._values(
+                "draw_metrics", cut, camera, window, stop, "appearance", rule
+            )
             mean = np.clip(share[..., 0] / np.maximum(alpha, 1e-6), 0, 1)
-            picture = ramp(mean) * alpha[..., None]
-            return picture, (0.0, cut.tolerance), in_view, _distance(alpha, depth)
+            return ramp(mean) * alpha[..., None], (0.0, cut.tolerance), seen, _distance(alpha, depth)
         color_by: ColorBy = shows if shows in ("level", "cluster") else "appearance"
         color, alpha, depth, in_view = self._draw(cut, camera, window, color_by, stop)
         distance = _distance(alpha, depth)
@@ -254,20 +255,13 @@ class SceneView:
             planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
             color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
             return color, alpha, depth, image.stats.gaussians_in_frustum
-        return self._values("draw_cut", cut, camera, window, (), stop, color_by)
+        return self._values("draw_cut", cut, camera, window, stop, color_by)
 
     def _values(
-        self,
-        how: str,
-        cut: Selection,
-        camera: Camera,
-        window: Window,
-        rule: Any,
-        stop: _core.Stop | None,
-        color_by: ColorBy = "appearance",
+        self, how: str, cut: Selection, camera: Camera, window: Window, stop: Any, by: ColorBy, *rule: Any
     ) -> tuple[Any, Any, Any, int]:
         """As `_draw`, by a method of frames that are drawn on the CPU on any device."""
-        frame, scene = self._frame(color_by, cut)
+        frame, scene = self._frame(by, cut)
         pairs, part = (cut.instance_ids, cut.cluster_ids), camera.core.window(*window)
         drawing = getattr(frame, how)(scene, part, *rule, *pairs, _SHADE, stop, cut.given_weights)
         _check(stop)
