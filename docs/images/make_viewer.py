@@ -17,7 +17,10 @@ from v3dg.viewer.server import Site
 
 FOLDER = Path(__file__).parent
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
-MODES = ("Colour", "Level", "Cluster", "Depth", "Alpha", "Gaussians per pixel", "Difference to all gaussians")
+MODES = (
+    *("Colour", "Level", "Cluster", "Error", "Depth", "Alpha"),
+    *("Gaussians per pixel", "Difference to all gaussians"),
+)
 
 
 def main(scene_path: str, camera: str) -> None:
@@ -46,7 +49,7 @@ def main(scene_path: str, camera: str) -> None:
             )
         settle(page)
         pictures.append(shown(page))
-        save("modes", sheet(pictures, [*MODES, "Split, tolerance 32"], columns=2))
+        save("modes", sheet(pictures, [*MODES, "Split, tolerance 32"], columns=3))
         page.get_by_role("slider", name="Split").evaluate(
             "e => { e.value = 0; e.dispatchEvent(new Event('input')); }"
         )
