@@ -20,9 +20,8 @@ _FILTER_PX2 = 0.3  # with which viewers of the format draw
 class ChunkErrors:
     """Errors of chunks whose levels are added from the finest on.
 
-    An error is the sum of the squared differences of colour and alpha from the pictures of the finest level,
-    from four sides, over the sum of the squares of those. It never falls from a level to the next. Of each
-    chunk 128 KiB of pictures are kept.
+    An error is the mean of the squared differences of colour and alpha from the pictures of the finest level,
+    from four sides. It never falls from a level to the next. Of each chunk 128 KiB of pictures are kept.
 
     Attributes:
         of_chunk: The errors by chunk, a number for each level.
@@ -40,8 +39,7 @@ class ChunkErrors:
             self._finest[chunk] = cameras, _pictures(gaussians, cameras).astype(np.float16)
         elif len(gaussians):
             cameras, finest = self._finest[chunk]
-            apart = np.square(_pictures(gaussians, cameras) - finest).sum()
-            error = float(apart / max(np.square(finest, dtype=np.float32).sum(), 1e-6))
+            error = float(np.square(_pictures(gaussians, cameras) - finest).mean())
         errors.append(max(error, *errors[-1:]) if errors else error)
 
 
