@@ -11,6 +11,7 @@ from PIL import Image
 
 import v3dg
 from benchmarks.worlds.procedural import make_donut
+from v3dg.camera_file import write_cameras
 from v3dg.metrics import psnr
 from v3dg.pictures import to_8bit, write_picture
 
@@ -107,6 +108,46 @@ def test_photographs_of_another_size_than_their_cameras_are_refused(capture):
     write_picture(capture / "images" / "3.png", np.zeros((48, 32, 3), np.uint8))
     with pytest.raises(SystemExit, match=r"3\.png: expected 64 x 48 px, as its camera, got 32 x 48"):
         example.main(example.Config(capture, capture / "trained.ply", device="cpu"))
+def sheet(z, size):
+    """Gaussians side by side across the z axis, opaque together."""
+    x, y = np.meshgrid(np.linspace(-size, size, 12), np.linspace(-size, size, 12))
+    count = x.size
+    return v3dg.Gaussians(
+        means=np.stack([x.ravel(), y.ravel(), np.full(count, z)], axis=1).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        scales=np.full((count, 3), size / 5, np.float32) * np.float32([1, 1, 0.01]),
+        opacities=np.full(count, 0.99, np.float32),
+        sh=np.ones((count, 1, 3), np.float32),
+    )
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+def test_what_no_camera_sees_is_dropped(tmp_path, turns):
+    """A wall ahead hides what is behind it; another wall is behind the camera, and seen when it turns."""
+    wall, hidden, behind = sheet(3, 6), sheet(9, 1), sheet(-3, 6)
+    v3dg.write_asset(tmp_path / "scene.ply", v3dg.Gaussians.concatenate([hidden, wall, behind]))
+    camera = v3dg.Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), fov_x=1.2, width=64, height=48)
+    write_cameras(tmp_path / "cameras.json", {"eye": camera})
+    example = load_example("drop_unseen")
+    files = tmp_path / "scene.ply", tmp_path / "cameras.json", tmp_path / "seen.ply"
+    share = example.main(example.Config(*files, turns=turns, width=128))
+    seen = v3dg.read_asset(tmp_path / "seen.ply")
+    assert len(seen) == round(share * 3 * len(wall))
+    places = set(np.round(seen.means[:, 2]))
+    assert places == ({3, -3} if turns == 2 else {3})
+    whole = v3dg.read_asset(tmp_path / "scene.ply")
+    np.testing.assert_array_equal(v3dg.rasterize(seen, camera).color, v3dg.rasterize(whole, camera).color)
+    half = example.main(example.Config(*files, keep=0.5, turns=turns, width=128))
+    assert half == pytest.approx(share / 2, abs=0.01)
+
+
+def test_weights_are_those_of_the_picture(tmp_path):
+    """All weights together are the picture's alpha."""
+    example = load_example("drop_unseen")
+    camera = v3dg.Camera.look_at((0, 0, 0), (0, 0, 1), up=(0, -1, 0), fov_x=1.2, width=64, height=48)
+    asset = sheet(3, 1)
+    weights = example.weights_in(asset, camera, "cpu")
+    assert weights.sum() == pytest.approx(v3dg.rasterize(asset, camera).alpha.sum(), rel=1e-5)
 
 
 @pytest.fixture
