@@ -3,6 +3,9 @@
 // Blending one tile, front to back: a batch of records is sorted into the blocks that they may change, then
 // each block takes its own, with its pixels in registers.
 
+#include <cstddef>
+#include <cstring>
+
 #include "rasterize/simd_tile.h"
 
 namespace v3dg {
@@ -14,12 +17,20 @@ constexpr int kBatchSize = 256;
 // hidden.
 constexpr int kBatchBlocks = 1024;
 
-// What blending reads of a record; its centre is in px from the tile's corner.
+// What blending reads of a record, as it begins; its centre is in px from the tile's corner.
 template <class T>
 struct BatchRecord {
     T u, v, l11, l12, l22, log2_opacity;
     T color[3];
     T depth;
+
+    V3DG_INLINE void take(const Record<T>& g, int left, int top) {
+        static_assert(sizeof *this <= sizeof g && offsetof(Record<T>, depth) == offsetof(BatchRecord, depth),
+                      "the first part of a record");
+        std::memcpy(static_cast<void*>(this), &g, sizeof *this);
+        u = g.u - T(left);
+        v = g.v - T(top);
+    }
 };
 
 // Records of a tile, front to back, and places among them by block.
@@ -67,15 +78,7 @@ V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     }
     for (uint16_t& n : batch.count) n = 0;
     for (int i = 0; i < batch.size; ++i) {
-        const Record<T>& g = *batch.source[i];
-        batch.record[i] = {g.u - T(left),
-                           g.v - T(top),
-                           g.l11,
-                           g.l12,
-                           g.l22,
-                           g.log2_opacity,
-                           {g.color[0], g.color[1], g.color[2]},
-                           g.depth};
+        batch.record[i].take(*batch.source[i], left, top);
         for (uint64_t blocks = batch.blocks[i]; blocks != 0; blocks &= blocks - 1) {
             const int block = __builtin_ctzll(blocks);
             batch.place[block][batch.count[block]++] = static_cast<uint8_t>(i);
