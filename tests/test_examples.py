@@ -108,6 +108,8 @@ def test_photographs_of_another_size_than_their_cameras_are_refused(capture):
     write_picture(capture / "images" / "3.png", np.zeros((48, 32, 3), np.uint8))
     with pytest.raises(SystemExit, match=r"3\.png: expected 64 x 48 px, as its camera, got 32 x 48"):
         example.main(example.Config(capture, capture / "trained.ply", device="cpu"))
+
+
 def sheet(z, size):
     """Gaussians side by side across the z axis, opaque together."""
     x, y = np.meshgrid(np.linspace(-size, size, 12), np.linspace(-size, size, 12))
