@@ -119,6 +119,8 @@ class LevelFit {
             if (progress_.cancel) signals.host().cancel = 1;
             std::this_thread::sleep_for(kBetweenLooks);
         }
+        // Of two blocks that are done at once, the one that counted first may tell last.
+        if (!progress_.cancel) signals.host().groups_done = jobs.size;
         report();
     }
 
