@@ -10,9 +10,9 @@ import pytest
 
 import scenes_lod
 from devices import host
-from frames import arrays
+from frames import Renderer, arrays, render
 from random_bundle import random_bundle
-from v3dg import Bundle, Gaussians, Renderer, Scene, _core, _device, render, select
+from v3dg import Bundle, Gaussians, Scene, _core, _device, select
 from v3dg.residency import residency
 
 DEGREES = (0, 1, 2, 3)

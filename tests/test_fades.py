@@ -9,11 +9,20 @@ from hypothesis import strategies as st
 
 import exact_cut
 from devices import host
-from frames import CAMERA, arrays, assert_close, assert_like_cpu, assert_same_bytes, composed_scene
+from frames import (
+    CAMERA,
+    Renderer,
+    arrays,
+    assert_close,
+    assert_like_cpu,
+    assert_same_bytes,
+    composed_scene,
+    render,
+)
 from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, group_metrics, lod_bundle, random_camera, random_scene, turned
-from v3dg import DEFAULT_FADE, Camera, Gaussians, Renderer, Scene, Selection, render, select
+from v3dg import DEFAULT_FADE, Camera, Gaussians, Scene, Selection, select
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 WHOLE = exact_cut.WHOLE

@@ -8,10 +8,10 @@ import pytest
 
 import v3dg.pool
 from devices import host
-from frames import arrays
+from frames import Renderer, arrays, render
 from random_bundle import random_bundle
 from scenes_lod import blob, lod_bundle
-from v3dg import Bundle, Camera, Renderer, Scene, render
+from v3dg import Bundle, Camera, Scene
 
 CAMERA = Camera.look_at((0, -9, 1), (0, 0, 0), (0, 0, 1), 0.9, width=93, height=61)
 NEAR = Camera.look_at((2, -2, 1), (0, 0, 0), (0, 0, 1), 0.7, width=93, height=61)

@@ -6,9 +6,9 @@ import pickle
 import numpy as np
 import pytest
 
-from frames import arrays
+from frames import Renderer, arrays, render
 from scenes_lod import blob, lod_bundle
-from v3dg import Camera, Renderer, Scene, StereoCamera, render, select
+from v3dg import Camera, Scene, StereoCamera, select
 from v3dg.residency import residency
 
 

@@ -1,8 +1,11 @@
 """What tests of whole frames share: a camera, a scene, and how pictures are compared."""
 
+import functools
+
 import numpy as np
 
 import scenes_lod
+import v3dg
 from compare import PICTURE_FLOAT
 from devices import host
 from v3dg import Camera
@@ -10,9 +13,18 @@ from v3dg import Camera
 CAMERA = Camera.look_at((0, -6, 1), (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117)
 
 
+render = functools.partial(v3dg.render, depth=True)
+
+
+class Renderer(v3dg.Renderer):
+    """Draws depth, too, so that it is compared."""
+
+    def render(self, camera, **options):
+        return super().render(camera, **{"depth": True} | options)
+
+
 def arrays(image):
-    """Colour and alpha, and depth where it was drawn."""
-    return host([getattr(image, name) for name in ("color", "alpha", "depth") if hasattr(image, name)])
+    return host((image.color, image.alpha, image.depth))
 
 
 def assert_same_bytes(image, other):
