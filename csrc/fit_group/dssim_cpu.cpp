@@ -10,7 +10,7 @@ static void blur(const float* in, int width, int height, float* rows, float* out
         for (int x = 0; x < width; ++x) {
             float sum = 0;
             for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
-                if (x + k >= 0 && x + k < width) sum += ssim_weight(k) * in[y * width + x + k];
+                if (x + k >= 0 && x + k < width) sum += ssim_weight<float>(k) * in[y * width + x + k];
             rows[y * width + x] = sum;
         }
     for (int y = 0; y < height; ++y) {
@@ -18,7 +18,7 @@ static void blur(const float* in, int width, int height, float* rows, float* out
         for (int x = 0; x < width; ++x) line[x] = 0;
         for (int k = -kSsimRadius; k <= kSsimRadius; ++k) {
             if (y + k < 0 || y + k >= height) continue;
-            const float w = ssim_weight(k);
+            const float w = ssim_weight<float>(k);
             for (int x = 0; x < width; ++x) line[x] += w * rows[(y + k) * width + x];
         }
     }

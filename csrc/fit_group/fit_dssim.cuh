@@ -21,7 +21,7 @@ __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int nu
         for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
             if (place + k >= 0 && place + k < size)
                 for (int m = 0; m < static_cast<int>(sizeof(sums) / sizeof(float)); ++m)
-                    sums[m] += ssim_weight(k) * maps[m * num_pixels + i + k * step];
+                    sums[m] += ssim_weight<float>(k) * maps[m * num_pixels + i + k * step];
     };
     const auto for_each_pixel = [&](const auto& body) {
         for (uint32_t t = fit.first(); t < count; t += fit.stride()) {
@@ -40,7 +40,7 @@ __device__ void dssim_backward(const Fit& fit, const FitCameras& cameras, int nu
 #pragma unroll
         for (int k = -kSsimRadius; k <= kSsimRadius; ++k) {
             if (column + k < 0 || column + k >= size) continue;
-            const float w = ssim_weight(k), x = picture[i + k], y = target_of(plane, i + k);
+            const float w = ssim_weight<float>(k), x = picture[i + k], y = target_of(plane, i + k);
             sums.x += w * x;
             sums.y += w * y;
             sums.xx += w * x * x;

@@ -1,4 +1,3 @@
-#include <cmath>
 #include <numeric>
 #include <vector>
 
@@ -10,18 +9,6 @@ namespace v3dg {
 namespace {
 
 constexpr size_t kRowsAtOnce = 4;
-constexpr double kSigma = 1.5;
-
-struct Window {
-    double weight[2 * kSsimRadius + 1];
-
-    Window() {
-        double sum = 0;
-        for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
-            sum += weight[k + kSsimRadius] = std::exp(-0.5 * (k / kSigma) * (k / kSigma));
-        for (double& w : weight) w /= sum;
-    }
-};
 
 size_t mirrored(size_t place, int offset, size_t size) {
     const auto at = static_cast<ptrdiff_t>(place) + offset, end = static_cast<ptrdiff_t>(size) - 1;
@@ -37,14 +24,14 @@ void add(SsimSums<double>& to, double weight, const SsimSums<double>& s) {
 }
 
 template <class T>
-double sum_of_row(const SsimInput<T>& in, const Window& window, size_t row) {
+double sum_of_row(const SsimInput<T>& in, size_t row) {
     const size_t row_size = in.width * in.channels;
     std::vector<SsimSums<double>> columns(row_size);  // down the window
     for (int k = -kSsimRadius; k <= kSsimRadius; ++k) {
         const size_t first = mirrored(row, k, in.height) * row_size;
         for (size_t i = 0; i < row_size; ++i) {
             const double x = in.picture[first + i], y = in.target[first + i];
-            add(columns[i], window.weight[k + kSsimRadius], {x, y, x * x, y * y, x * y});
+            add(columns[i], ssim_weight<double>(k), {x, y, x * x, y * y, x * y});
         }
     }
     double sum = 0;
@@ -52,8 +39,7 @@ double sum_of_row(const SsimInput<T>& in, const Window& window, size_t row) {
         const size_t column = i / in.channels, channel = i % in.channels;
         SsimSums<double> sums{};
         for (int k = -kSsimRadius; k <= kSsimRadius; ++k)
-            add(sums, window.weight[k + kSsimRadius],
-                columns[mirrored(column, k, in.width) * in.channels + channel]);
+            add(sums, ssim_weight<double>(k), columns[mirrored(column, k, in.width) * in.channels + channel]);
         sum += ssim_of(sums).value;
     }
     return sum;
@@ -63,9 +49,8 @@ double sum_of_row(const SsimInput<T>& in, const Window& window, size_t row) {
 
 template <class T>
 double mean_ssim(const SsimInput<T>& in) {
-    const Window window;
     std::vector<double> sums(in.height);
-    parallel_for(in.height, kRowsAtOnce, [&](size_t row) { sums[row] = sum_of_row(in, window, row); });
+    parallel_for(in.height, kRowsAtOnce, [&](size_t row) { sums[row] = sum_of_row(in, row); });
     return std::accumulate(sums.begin(), sums.end(), 0.0) /
            static_cast<double>(in.height * in.width * in.channels);
 }

@@ -9,9 +9,11 @@ namespace v3dg {
 constexpr int kSsimRadius = 5;
 
 // Weight of the pixel `offset` away in the normalised Gaussian window of 11, sigma 1.5.
-V3DG_HD V3DG_INLINE float ssim_weight(int offset) {
-    const float weight[kSsimRadius + 1] = {0.26601171f,  0.21300554f,  0.10936069f,
-                                           0.036000773f, 0.007598758f, 0.0010283801f};
+template <class T>
+V3DG_HD V3DG_INLINE T ssim_weight(int offset) {
+    const T weight[kSsimRadius + 1] = {T(0.2660117248617943),   T(0.21300553771125366),
+                                       T(0.1093606895097),      T(0.03600077212843082),
+                                       T(0.007598758135239184), T(0.001028380084479109)};
     return weight[offset < 0 ? -offset : offset];
 }
 

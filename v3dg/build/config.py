@@ -6,8 +6,9 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 # A target is drawn in one go that cannot be interrupted: in about a second.
 _MOST_SIDE = 8192
-# Of a pixel's side in targets of deep levels; beyond, nothing is gained.
-_MOST_SAMPLES, _DEEP = 8, 64
+# Samples along a pixel's side, in targets of deep levels; beyond, nothing is gained.
+_MOST_SAMPLES = 8
+_DEEP = 64  # a level that has them
 # Of all views of a group: they are kept, by each thread that fits one, in 16 bytes each.
 _MOST_PIXELS_KEPT = 1 << 26
 
