@@ -156,15 +156,27 @@ __device__ void tell_need(const InstanceCut<AskedGroups>& cut, int32_t c, uint32
     if (place < needs.capacity) needs.list[place] = {bundle, static_cast<uint32_t>(need.page), 0.0f};
 }
 
-// A thread a page that is needed.
+// A thread a page that is needed. A warp writes words that lie side by side, for what goes to the host piece
+// by piece is slow.
 __global__ void report_kernel(NeedList needs, SelectRule rule, const CutChoice* choice) {
+    constexpr unsigned kWords = sizeof(PageRequest) / sizeof(uint32_t);
+    __shared__ uint32_t words[kWords * kCutThreads];
     const unsigned num_pages = *needs.words, count = min(num_pages, needs.capacity);
-    const unsigned first = blockIdx.x * blockDim.x + threadIdx.x;
-    if (first == 0)
+    if (blockIdx.x == 0 && threadIdx.x == 0)
         *needs.report = {num_pages, rule.budget == kNoBudget ? rule.tolerance_px2 : choice->tolerance_px2};
-    for (unsigned i = first; i < count; i += gridDim.x * blockDim.x) {
-        const PageRequest need = needs.list[i];
-        needs.reported[i] = {need.bundle, need.page, __uint_as_float(needs.need[need.bundle][need.page])};
+    for (unsigned first = blockIdx.x * kCutThreads; first < count; first += gridDim.x * kCutThreads) {
+        const unsigned here = min(count - first, kCutThreads);
+        if (threadIdx.x < here) {
+            const PageRequest need = needs.list[first + threadIdx.x];
+            uint32_t* own = words + kWords * threadIdx.x;
+            own[0] = need.bundle;
+            own[1] = need.page;
+            own[2] = needs.need[need.bundle][need.page];
+        }
+        __syncthreads();
+        auto* reported = reinterpret_cast<uint32_t*>(needs.reported + first);
+        for (unsigned i = threadIdx.x; i < kWords * here; i += kCutThreads) reported[i] = words[i];
+        __syncthreads();
     }
 }
 
