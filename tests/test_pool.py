@@ -32,17 +32,30 @@ def path(asset, tmp_path):
     return tmp_path / "asset.v3dg"
 
 
-@pytest.fixture
-def scene(path):
-    """Instances of a file, of one of codes and of a bundle in memory, each of another SH degree."""
+@pytest.fixture(params=["mixed", "coded"])
+def scene(request, asset, path):
+    """Instances of files, each of another SH degree: of codes, or also of rows and of a bundle in memory."""
     rng, scene = np.random.default_rng(1), Scene()
-    scene.add(Bundle.open(path), positions=2 * rng.normal(size=(3, 3)), quaternions=rng.normal(size=(3, 4)))
-    scene.add(lod_bundle(rng, blob(rng, 2000), 32), positions=(1.0, 0, 0), importance=2)
-    rough = lod_bundle(rng, blob(rng, 1500, sh_degree=2), 32)
-    coded = path.with_name("coded.v3dg")
-    Bundle(rough.clusters, rough.groups, rough.gaussians, codec="quantized").write(coded)
-    scene.add(Bundle.open(coded), positions=(-1.0, 0, 0.5))
+    is_coded = request.param == "coded"
+    many = coded(asset, path.with_name("many.v3dg")) if is_coded else Bundle.open(path)
+    scene.add(many, positions=2 * rng.normal(size=(3, 3)), quaternions=rng.normal(size=(3, 4)))
+    few = lod_bundle(rng, blob(rng, 2000), 32)
+    few = coded(few, path.with_name("few.v3dg")) if is_coded else few
+    scene.add(few, positions=(1.0, 0, 0), importance=2)
+    rough = lod_bundle(rng, blob(rng, 1500, sh_degree=3 if is_coded else 2), 32)
+    scene.add(coded(rough, path.with_name("rough.v3dg")), positions=(-1.0, 0, 0.5))
     return scene
+
+
+def coded(bundle, path):
+    """The bundle as a file of codes."""
+    Bundle(bundle.clusters, bundle.groups, bundle.gaussians, codec="quantized").write(path)
+    return Bundle.open(path)
+
+
+def scaled(scene, memory):
+    """As many bytes for a scene of codes as are for one of rows: about as many gaussians."""
+    return memory if any(bundle.codec == "float32" for bundle in scene.bundles) else int(0.3 * memory)
 
 
 def status(renderer):
@@ -79,6 +92,8 @@ def test_settled_picture_is_that_of_all_pages(scene, device, options):
 def test_stills_are_settled(scene, device, memory):
     """Also those that are looked at when the pages of other views are there."""
     cameras = [CAMERA, NEAR, AWAY]
+    if memory != "64MB":
+        memory = scaled(scene, memory)
     pictures = render(scene, cameras, device=device, memory=memory, **FINE)
     for camera, picture in zip(cameras, pictures, strict=True):
         tolerance = picture.stats.tolerance
@@ -137,7 +152,7 @@ def status_of_new(scene, device, memory):
 def test_shortage_raises_the_tolerance_alike_whatever_was_there_before(scene, device):
     pictures = []
     for before in ([], [NEAR], [AWAY, CAMERA, NEAR]):
-        renderer = Renderer(scene, device=device, memory=150_000)
+        renderer = Renderer(scene, device=device, memory=scaled(scene, 150_000))
         for camera in before:
             renderer.settle(camera, tolerance=3.0)
             renderer.render(camera, tolerance=3.0).stats  # noqa: B018
@@ -148,6 +163,18 @@ def test_shortage_raises_the_tolerance_alike_whatever_was_there_before(scene, de
         assert_same(pictures[-1], pictures[0])
     tolerance = pictures[0].stats.tolerance
     assert_same(pictures[0], render(scene, CAMERA, device=device, tolerance=tolerance))
+
+
+@pytest.mark.parametrize(("sh_degree", "most"), [(0, 18), (3, 48)])
+def test_resident_gaussian_of_a_quantised_bundle_takes_its_code(tmp_path, device, sh_degree, most):
+    rng = np.random.default_rng(0)
+    made = lod_bundle(rng, blob(rng, 40_000, sh_degree=sh_degree), 170)
+    bundle = coded(made, tmp_path / "coded.v3dg")
+    ends = [bundle.page_range(page) for page in range(bundle.num_pages - 1)]
+    slot = max(int(bundle.clusters.offset[page.stop] - bundle.clusters.offset[page.start]) for page in ends)
+    few, many = (memory_for(bundle, device, count) for count in (100, 200))
+    of_gaussians = 7 / 8 * (many - few)  # the rest is for pages on their way
+    assert 16 + 8 * sh_degree < of_gaussians / (100 * slot) <= most
 
 
 def test_frames_become_finer_until_nothing_is_missing(scene, device):
@@ -188,7 +215,7 @@ def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, m
 
 
 def test_shortage_raises_the_tolerance_from_frame_to_frame(scene, device):
-    renderer = Renderer(scene, device=device, memory=150_000)
+    renderer = Renderer(scene, device=device, memory=scaled(scene, 150_000))
     tolerances = [renderer.render(CAMERA, **FINE).stats.tolerance for _ in range(300)]
     steps = np.array(tolerances[1:]) / tolerances[:-1]
     assert (steps <= 1.0201).all()
@@ -201,7 +228,7 @@ def test_pages_are_there_together_with_those_above_them(scene, device, seed, mon
     """In every order of frames and of pages that have been read, with too little room for most views."""
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     rng = np.random.default_rng(seed)
-    renderer = Renderer(scene, device=device, memory=int(rng.integers(60_000, 160_000)))
+    renderer = Renderer(scene, device=device, memory=scaled(scene, int(rng.integers(60_000, 160_000))))
     num_changes, before = 0, None
     for _ in range(80):
         eye = rng.choice([1.5, 4.0, 12.0]) * rng.normal(size=3)
@@ -397,7 +424,7 @@ def test_devices_need_the_same_pages(scene):
 @pytest.mark.gpu
 def test_pictures_that_are_drawn_ahead_are_finished_later(scene):
     """Many in flight, of views that need other pages each, without a look at any of them."""
-    renderer = Renderer(scene, device="cuda", memory=150_000)
+    renderer = Renderer(scene, device="cuda", memory=scaled(scene, 150_000))
     rng = np.random.default_rng(5)
     cameras = [
         Camera.look_at(4 * rng.normal(size=3), (0, 0, 0), (0, 0, 1), 0.8, width=93, height=61)

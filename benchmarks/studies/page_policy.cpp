@@ -135,7 +135,7 @@ void fly(unsigned num_threads) {
     for (int32_t b = 0; b < kBundles; ++b)
         bundles.push_back({tree.table(), std::make_shared<NoPages>(tree.table(), 0, PageCodec::quantized)});
     PoolLimits limits{};
-    limits.num_rows = kSlots * 2 * kRows + kBundles * kRows;
+    limits.memory = {kSlots * 2 * kRows + kBundles * kRows, 1, 0};
     limits.num_threads = num_threads;
     PagePool pool(bundles, limits, std::make_shared<HostBlocks>());
     Flight flight(pool, num_threads == 0);

@@ -211,7 +211,8 @@ class BoundSceneFrame {
         HostPictures out(eyes, shade);
         std::vector<SceneModel> models;
         for (size_t b = 0; b < state->tables.size(); ++b)
-            models.push_back({&pool.planes(b), state->bundle(b).appearance(), {}});
+            models.push_back(
+                {pool.on_host().planes(b), state->bundle(b).appearance(), {}, pool.on_host().codes(b)});
         SceneFrameCounts counts{};
         uint32_t last_bin = last_bin_;
         {

@@ -86,9 +86,13 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
                      [&](size_t b) { bundles[b].source = source_of(given[b], bundles[b].table); });
     }
     int max_degree = 0;
-    for (const PagedBundle& bundle : bundles) max_degree = std::max(max_degree, bundle.source->sh_degree());
-    needs_.resize(bundles.size());
     PoolLimits limits{};
+    limits.keeps_codes = device_.is_host() && !bundles.empty();
+    for (const PagedBundle& bundle : bundles) {
+        max_degree = std::max(max_degree, bundle.source->sh_degree());
+        limits.keeps_codes &= bundle.source->codec() == PageCodec::quantized;
+    }
+    needs_.resize(bundles.size());
     limits.num_threads = num_threads;
     if (num_threads > 0)
         limits.num_threads =
@@ -105,22 +109,27 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
         limits.most_frames = cuda::kMostFlights;
     }
 #endif
-    limits.num_rows = (num_bytes - limits.block_bytes) / row_bytes;
+    limits.memory = {num_bytes - limits.block_bytes, row_bytes, 0};
+    if (limits.keeps_codes) {
+        limits.memory.row_bytes = slot_row_bytes(max_degree);
+        limits.memory.cluster_bytes = slot_cluster_bytes(max_degree);
+        // Codes have places of 32 bits.
+        limits.memory.most_rows = UINT32_MAX / static_cast<size_t>(std::max(1, max_degree));
+    }
     try {
         const py::gil_scoped_release unlocked;
         pool_ = std::make_unique<PagePool>(bundles, limits, std::move(blocks));
     } catch (const PageError& error) {
         raise(error);
     }
-    const size_t num_rows = pool_->first_slot_row() + pool_->num_slots() * pool_->slot_rows();
-    if (device_.is_host()) host_ = std::make_unique<HostPages>(*pool_, num_rows);
+    if (device_.is_host()) host_ = std::make_unique<HostPages>(*pool_);
 #if V3DG_WITH_CUDA
-    if (!device_.is_host()) make_on_device(num_rows, work);
+    if (!device_.is_host()) make_on_device(work);
 #endif
 }
 
 #if V3DG_WITH_CUDA
-void BoundPool::make_on_device(size_t num_rows, const Work& work) {
+void BoundPool::make_on_device(const Work& work) {
     std::vector<std::shared_ptr<const cuda::BundleTables>> tables;
     std::vector<ClusterTable> host;
     std::vector<ClusterAppearance> appearance;
@@ -130,8 +139,8 @@ void BoundPool::make_on_device(size_t num_rows, const Work& work) {
         host.push_back(bound.table());
         appearance.push_back(bound.appearance());
     }
-    on_device_ = std::make_unique<cuda::DevicePages>(*pool_, std::move(tables), host, appearance, num_rows,
-                                                     work.stream());
+    on_device_ = std::make_unique<cuda::DevicePages>(*pool_, std::move(tables), host, appearance,
+                                                     pool_->plan().num_rows(), work.stream());
 }
 #endif
 

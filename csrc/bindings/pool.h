@@ -47,7 +47,7 @@ class BoundPool {
                        Span<const Span<uint32_t>>{needs.data(), needs.size()}),
                    is_bounded);
     }
-    const GaussianPlanes<float>& planes(size_t bundle) const { return host_->planes(bundle); }
+    const HostPages& on_host() const { return *host_; }
 #if V3DG_WITH_CUDA
     cuda::DevicePages& on_device() { return *on_device_; }
 #endif
@@ -57,7 +57,7 @@ class BoundPool {
 
   private:
 #if V3DG_WITH_CUDA
-    void make_on_device(size_t num_rows, const Work& work);
+    void make_on_device(const Work& work);
 #endif
     void note_needs(float tolerance_px2, bool is_bounded);
 

@@ -38,7 +38,8 @@ struct CodeSource {
 
     V3DG_INLINE Gaussian3d<V> load_gaussians(uint64_t i, uint64_t count) const {
         Bits<V> words[kRecordWords];
-        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, count, words);
+        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, kRecordWords, count,
+                   words);
         Gaussian3d<V> g;
         V color[3];
         decode(words, ranges, g, color);
@@ -47,19 +48,22 @@ struct CodeSource {
     V3DG_INLINE int load_sh(uint64_t i, uint64_t count, V* sh) const {
         Bits<V> words[2 * kMaxShDegree];
         Gaussian3d<V> g;
-        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, count, words);
-        decode(words, ranges, g, sh);
-        load_words(codes.sh_of(ranges, static_cast<uint32_t>(i)), num_sh_words(codes.sh_degree), count,
+        load_words(codes.record_of(ranges, static_cast<uint32_t>(i)), kRecordWords, kRecordWords, count,
                    words);
+        decode(words, ranges, g, sh);
+        load_words(codes.sh_of(ranges, static_cast<uint32_t>(i)), num_sh_words(codes.sh_degree),
+                   2 * codes.sh_stride, count, words);
         decode_sh(words, ranges.sh_step, codes.sh_degree, sh + 3);
         return codes.sh_degree;
     }
 
   private:
-    static V3DG_INLINE void load_words(const uint32_t* rows, int width, uint64_t count, Bits<V>* words) {
+    // `width` words each, of rows that begin `stride` words apart.
+    static V3DG_INLINE void load_words(const uint32_t* rows, int width, uint64_t stride, uint64_t count,
+                                       Bits<V>* words) {
         for (int lane = 0; lane < kLanes<float>; ++lane) {
             const uint64_t row = static_cast<uint64_t>(lane) < count ? lane : count - 1;
-            for (int k = 0; k < width; ++k) words[k][lane] = rows[width * row + k];
+            for (int k = 0; k < width; ++k) words[k][lane] = rows[stride * row + k];
         }
     }
 };

@@ -240,7 +240,8 @@ struct CodeSource {
         uint32_t words[num_sh_words(kDegree)];
 #pragma unroll
         for (int k = 0; k < kDegree; ++k) {
-            const uint2 pair = __ldg(reinterpret_cast<const uint2*>(m.codes.sh) + kDegree * size_t(g) + k);
+            const uint2 pair =
+                __ldg(reinterpret_cast<const uint2*>(m.codes.sh) + m.codes.sh_stride * size_t(g) + k);
             words[2 * k] = pair.x;
             words[2 * k + 1] = pair.y;
         }

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <cstring>
+
 #include "base/buffer.h"
 #include "base/span.h"
 #include "base/stream.h"
@@ -59,6 +61,48 @@ class CodedPages {
     Codes codes_;
 };
 
+// Memory for the codes of pages that come and go, which is drawn from as if it were one bundle. It is divided
+// into slots of a page each, which hold as many rows and as many clusters: the rows of all slots follow on
+// each other, and so do their clusters, with gaussians or without. A page's ranges move with it, its
+// gaussians and its clusters are neighbours as in its own bundle, and nothing else has to know where it is.
+struct CodeSlots {
+    uint32_t *records, *sh;
+    unsigned char* ranges;
+    int64_t* offset;  // as Codes has it; what is written into a slot keeps it ascending
+    uint32_t range_size, sh_stride;
+    size_t num_clusters;
+
+    // Of pages of a bundle.
+    Codes codes(int sh_degree) const {
+        return {records, sh, ranges, {offset, num_clusters + 1}, sh_degree, range_size, sh_stride};
+    }
+};
+
+// What a slot takes for each row, and for each place of a cluster.
+constexpr size_t slot_row_bytes(int sh_degree) { return 4 * (kRecordWords + num_sh_words(sh_degree)); }
+constexpr size_t slot_cluster_bytes(int sh_degree) { return range_bytes(sh_degree) + sizeof(int64_t); }
+
+// A page, and the slot that it goes to.
+struct SlotPage {
+    PageCodes<const uint32_t> page;
+    size_t row, cluster;  // first of the slot
+    size_t num_clusters;  // of the slot; those that the page does not have are empty
+};
+
+// Writes what decodes the k-th cluster of a slot.
+V3DG_HD inline void write_cluster(const SlotPage& from, size_t k, const CodeSlots& to) {
+    const PageCodes<const uint32_t>& page = from.page;
+    const size_t begin = static_cast<size_t>(page.offset[k < page.num_clusters() ? k : page.num_clusters()]);
+    to.offset[from.cluster + k] = static_cast<int64_t>(from.row + begin - page.first_row());
+    if (k >= page.num_clusters()) return;
+    ClusterCode code;
+    uint16_t sh_steps[9] = {};
+    std::memcpy(&code, page.ranges(k), sizeof code);
+    std::memcpy(sh_steps, page.ranges(k) + sizeof code / 4, 6 * static_cast<size_t>(page.sh_degree));
+    const ClusterRanges ranges = ranges_of(code, sh_steps, page.sh_degree);
+    std::memcpy(to.ranges + to.range_size * (from.cluster + k), &ranges, range_bytes(page.sh_degree));
+}
+
 // Clusters, in any order, and where their gaussians are to be.
 struct DecodeInput {
     Codes codes;
@@ -79,10 +123,19 @@ void decode_page(const PageCodes<const uint32_t>& page, const GaussianRows<float
 
 // The gaussians of clusters.
 void decode(const DecodeInput& in, const GaussianRows<float>& out);
+
+// Brings a page, whose ranges are_valid(), to its slot.
+void write_slot(const SlotPage& from, const CodeSlots& to);
 }  // namespace cpu
 
 // The same bits. The codes and `out` are on the device, all else on the host. Work is queued on the stream.
 // Throws std::runtime_error when CUDA reports an error.
-namespace cuda { void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream); }
+namespace cuda {
+void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream);
+
+// As cpu::write_slot() for several pages, in memory that the device can read; what they and the slots point
+// to is on the device.
+void write_slots(const SlotPage* pages, size_t num_pages, const CodeSlots& to, Stream stream);
+}  // namespace cuda
 
 }  // namespace v3dg

@@ -310,7 +310,13 @@ CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster,
                        int sh_degree)
     : ranges_(size_t(range_bytes(sh_degree)) * (offset.size - 1)),
       first_cluster_(first_cluster),
-      codes_{words, words, ranges_.data(), offset, sh_degree, range_bytes(sh_degree)} {
+      codes_{words,
+             words,
+             ranges_.data(),
+             offset,
+             sh_degree,
+             range_bytes(sh_degree),
+             static_cast<uint32_t>(sh_degree)} {
     std::vector<uint64_t> place(first_cluster.size, 0);  // words before each page
     const auto page_at = [&](size_t p) {
         const auto first = static_cast<size_t>(first_cluster[p]),
@@ -335,6 +341,16 @@ CodedPages::CodedPages(const uint32_t* words, Span<const int64_t> first_cluster,
             std::memcpy(ranges_.data() + size_t(range_bytes(sh_degree)) * c, &own, range_bytes(sh_degree));
         }
     });
+}
+
+void cpu::write_slot(const SlotPage& from, const CodeSlots& to) {
+    const PageCodes<const uint32_t>& page = from.page;
+    const size_t first = page.first_row(), count = page.end_row() - first;
+    const auto width = static_cast<size_t>(num_sh_words(page.sh_degree));
+    std::copy_n(page.record(first), kRecordWords * count, to.records + kRecordWords * from.row);
+    for (size_t i = 0; i < count && width > 0; ++i)
+        std::copy_n(page.sh(first + i), width, to.sh + 2 * to.sh_stride * (from.row + i));
+    for (size_t k = 0; k < from.num_clusters; ++k) write_cluster(from, k, to);
 }
 
 void cpu::decode(const DecodeInput& in, const GaussianRows<float>& out) {

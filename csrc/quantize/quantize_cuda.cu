@@ -28,6 +28,21 @@ __global__ void decode_kernel(DecodeInput in, GaussianRows<float> out) {
     decode_row(in.codes.record_of(ranges, from), in.codes.sh_of(ranges, from), ranges, out, row);
 }
 
+// A block a page.
+__global__ void write_slots_kernel(const SlotPage* pages, CodeSlots to) {
+    const SlotPage from = pages[blockIdx.x];
+    const size_t first = from.page.first_row(), count = from.page.end_row() - first;
+    const auto* records = reinterpret_cast<const uint4*>(from.page.record(first));
+    auto* own_records = reinterpret_cast<uint4*>(to.records) + from.row;
+    for (size_t i = threadIdx.x; i < count; i += blockDim.x) own_records[i] = records[i];
+    const auto* sh = reinterpret_cast<const uint2*>(from.page.sh(first));
+    auto* own_sh = reinterpret_cast<uint2*>(to.sh) + to.sh_stride * from.row;
+    const size_t width = from.page.sh_degree;
+    for (size_t i = threadIdx.x; i < width * count; i += blockDim.x)
+        own_sh[i / width * to.sh_stride + i % width] = sh[i];
+    for (size_t k = threadIdx.x; k < from.num_clusters; k += blockDim.x) write_cluster(from, k, to);
+}
+
 }  // namespace
 
 void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream) {
@@ -37,6 +52,12 @@ void decode(const DecodeInput& in, const GaussianRows<float>& out, Stream stream
     on_device.cluster.data = cluster.data();
     on_device.offset.data = offset.data();
     launch("decode", decode_kernel, blocks_for(out.size, kBlockSize), kBlockSize, 0, stream, on_device, out);
+}
+
+void write_slots(const SlotPage* pages, size_t num_pages, const CodeSlots& to, Stream stream) {
+    static_assert(kRecordWords == 4, "a record is a vector");
+    launch("write_slots", write_slots_kernel, static_cast<unsigned>(num_pages), kBlockSize, 0, stream, pages,
+           to);
 }
 
 }  // namespace cuda

@@ -81,14 +81,15 @@ V3DG_HD constexpr uint32_t range_bytes(int sh_degree) { return 64 + (3 * sh_degr
 static_assert(range_bytes(3) == sizeof(ClusterRanges), "all of it");
 
 // The gaussians of a bundle as codes, on the host or on a device. Row r, of cluster c, has four words from
-// 4 (record_base + r) of `records` on, and two words a degree from 2 (sh_base + degree r) of `sh` on; what is
-// in brackets is modulo 2^32.
+// 4 (record_base + r) of `records` on, and two words a degree from 2 (sh_base + sh_stride r) of `sh` on; what
+// is in brackets is modulo 2^32.
 struct Codes {
     const uint32_t *records, *sh;
     const unsigned char* ranges;  // [C]
     Span<const int64_t> offset;   // [C + 1] gaussians before each cluster
     int sh_degree;
-    uint32_t range_size;  // range_bytes()
+    uint32_t range_size;  // range_bytes(), or more
+    uint32_t sh_stride;   // sh_degree, or more
 
     V3DG_HD size_t num_clusters() const { return offset.size - 1; }
     V3DG_HD V3DG_INLINE const ClusterRanges& ranges_of(uint32_t cluster) const {
@@ -98,7 +99,7 @@ struct Codes {
         return records + size_t(kRecordWords) * (own.record_base + row);
     }
     V3DG_HD V3DG_INLINE const uint32_t* sh_of(const ClusterRanges& own, uint32_t row) const {
-        return sh + 2 * size_t(own.sh_base + sh_degree * row);
+        return sh + 2 * size_t(own.sh_base + sh_stride * row);
     }
 };
 

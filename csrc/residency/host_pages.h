@@ -1,28 +1,42 @@
 #pragma once
 
-// The slots of a page pool on the host.
+// The slots of a page pool on the host: rows, as planes that the bundles of the pool share, or codes.
 
 #include <memory>
 #include <vector>
 
 #include "base/buffer.h"
+#include "quantize/quantize.h"
 #include "residency/page_pool.h"
 
 namespace v3dg {
 
-// Gaussians in slots, as planes that the bundles of the pool share.
 class HostPages {
   public:
-    HostPages(const PagePool& pool, size_t num_rows);
+    explicit HostPages(const PagePool& pool);
 
     // Brings pages to their slots.
     void apply(const PagePool& pool, const std::vector<PageChange>& changes);
-    const GaussianPlanes<float>& planes(size_t bundle) const { return planes_[bundle]; }
+    // The gaussians of a bundle: one of the two, the other is null.
+    const GaussianPlanes<float>* planes(size_t bundle) const {
+        return planes_.empty() ? nullptr : &planes_[bundle];
+    }
+    const Codes* codes(size_t bundle) const { return codes_.empty() ? nullptr : &codes_[bundle]; }
 
   private:
+    void make_planes(const PagePool& pool);
+    void make_codes(const PagePool& pool);
+    void write_rows(const PageSource& source, const PageChange& change);
+
     Buffer<float> storage_;
-    size_t stride_;                              // of a plane
+    size_t stride_ = 0;                          // of a plane
     std::vector<GaussianPlanes<float>> planes_;  // of each bundle, which differ in the degree
+
+    Buffer<uint32_t> records_, sh_;
+    Buffer<unsigned char> ranges_;
+    std::vector<int64_t> offset_;
+    CodeSlots slots_{};
+    std::vector<Codes> codes_;  // of each bundle, as planes
 };
 
 // Blocks on the host.

@@ -38,7 +38,16 @@ void PagesComing::clear() {
     bytes = num_left = 0;
 }
 
-PagePolicy::PagePolicy(const std::vector<PagedBundle>& bundles, size_t num_rows) : places_of_key_(kNumKeys) {
+std::vector<int64_t> SlotPlan::empty_offsets() const {
+    std::vector<int64_t> offset(first_slot_cluster, 0);
+    for (size_t s = 0; s < num_slots; ++s)
+        offset.insert(offset.end(), slot_clusters, static_cast<int64_t>(first_slot_row + s * slot_rows));
+    offset.push_back(static_cast<int64_t>(num_rows()));
+    return offset;
+}
+
+PagePolicy::PagePolicy(const std::vector<PagedBundle>& bundles, const PoolMemory& memory)
+    : places_of_key_(kNumKeys) {
     size_t num_pages = 0;
     for (const PagedBundle& bundle : bundles) num_pages += bundle.table.num_pages();
     if (num_pages > INT32_MAX)
@@ -53,7 +62,7 @@ PagePolicy::PagePolicy(const std::vector<PagedBundle>& bundles, size_t num_rows)
         first_page += static_cast<uint32_t>(bundle.table.num_pages());
     }
     parallel_for(bundles.size(), 1, [&](size_t b) { add_pages(bundles_[b], bundles[b].table); });
-    plan_memory(num_rows);
+    plan_memory(memory);
 }
 
 void PagePolicy::add_pages(Bundle& bundle, const ClusterTable& table) {
@@ -68,32 +77,44 @@ void PagePolicy::add_pages(Bundle& bundle, const ClusterTable& table) {
     if (table.num_clusters() > 0) states_[first + root] = PageState::resident;
     for (size_t p = 0; p < root; ++p) {
         bundle.most_rows = std::max(bundle.most_rows, bundle.source->num_rows(p));
+        bundle.most_clusters = std::max(bundle.most_clusters, bundle.source->num_clusters(p));
         bundle.most_bytes = std::max(bundle.most_bytes, bundle.source->num_bytes(p));
     }
 }
 
-void PagePolicy::plan_memory(size_t num_rows) {
-    size_t root_rows = 0, num_pages = 0;
+void PagePolicy::plan_memory(const PoolMemory& memory) {
+    size_t num_pages = 0;
     for (Bundle& bundle : bundles_) {
         const size_t root = bundle.source->num_pages() - 1;
-        bundle.root_row = static_cast<int64_t>(root_rows);
-        root_rows += bundle.source->num_rows(root);
+        bundle.root_row = plan_.first_slot_row;
+        bundle.root_cluster = plan_.first_slot_cluster;
+        plan_.first_slot_row += bundle.source->num_rows(root);
+        plan_.first_slot_cluster += bundle.source->num_clusters(root);
         num_pages += root;
-        slot_rows_ = std::max(slot_rows_, bundle.most_rows);
+        plan_.slot_rows = std::max(plan_.slot_rows, bundle.most_rows);
+        plan_.slot_clusters = std::max(plan_.slot_clusters, bundle.most_clusters);
         most_page_bytes_ = std::max(most_page_bytes_, bundle.most_bytes);
     }
-    first_slot_row_ = root_rows;
-    const size_t least = root_rows + (num_pages > 0 ? bundles_.size() * slot_rows_ : 0);
-    if (num_rows < least)
+    const size_t roots = memory.bytes_of(plan_.num_rows(), plan_.num_clusters());
+    const size_t slot = memory.bytes_of(plan_.slot_rows, plan_.slot_clusters);
+    const size_t least = roots + (num_pages > 0 ? bundles_.size() * slot : 0);
+    if (memory.num_bytes < least || memory.most_rows < plan_.num_rows())
         throw std::invalid_argument("memory: expected room for at least " + std::to_string(least) +
-                                    " gaussians, the coarsest of all bundles and a page more of each, got "
-                                    "room for " +
-                                    std::to_string(num_rows));
-    const size_t num_slots = std::min((num_rows - root_rows) / slot_rows_, num_pages);
-    slots_.resize(num_slots);
-    uses_.resize(num_slots);
-    leaving_.reserve(num_slots);
-    for (size_t s = num_slots; s > 0; --s) free_slots_.push_back(static_cast<uint32_t>(s - 1));
+                                    " bytes of gaussians, the coarsest of all bundles and a page more of "
+                                    "each, got room for " +
+                                    std::to_string(memory.num_bytes));
+    plan_.num_slots = std::min({(memory.num_bytes - roots) / slot,
+                                (memory.most_rows - plan_.first_slot_row) / plan_.slot_rows, num_pages});
+    slots_.resize(plan_.num_slots);
+    uses_.resize(plan_.num_slots);
+    leaving_.reserve(plan_.num_slots);
+    for (size_t s = plan_.num_slots; s > 0; --s) free_slots_.push_back(static_cast<uint32_t>(s - 1));
+}
+
+PageChange PagePolicy::root(size_t bundle) const {
+    const Bundle& of = bundles_[bundle];
+    return {static_cast<uint32_t>(bundle), static_cast<uint32_t>(of.source->num_pages() - 1),
+            static_cast<int64_t>(of.root_row), of.root_cluster, nullptr};
 }
 
 void PagePolicy::forget_failures() {
@@ -208,7 +229,7 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
 void PagePolicy::evict(uint32_t s, PagesComing& out) {
     const Slot slot = std::exchange(slots_[s], {});
     const uint32_t id = id_of(slot.bundle, slot.page);
-    out.changes.push_back({static_cast<uint32_t>(slot.bundle), slot.page, kAbsentPage, nullptr});
+    out.changes.push_back({static_cast<uint32_t>(slot.bundle), slot.page, kAbsentPage, 0, nullptr});
     slot_of_page_[id] = kNoSlot;
     states_[id].store(PageState::absent, std::memory_order_release);
     Use& of = uses_[s];
@@ -261,7 +282,8 @@ bool PagePolicy::make_room(bool is_missed, PagesComing& out) {
 void PagePolicy::occupy(const LoadedPage& loaded, PagesComing& out) {
     const uint32_t s = free_slots_.back(), id = id_of(loaded.bundle, loaded.page);
     free_slots_.pop_back();
-    const auto row = static_cast<int64_t>(first_slot_row_ + s * slot_rows_);
+    const auto row = static_cast<int64_t>(plan_.first_slot_row + s * plan_.slot_rows);
+    const size_t cluster = plan_.first_slot_cluster + s * plan_.slot_clusters;
     slots_[s] = {static_cast<int32_t>(loaded.bundle), loaded.page};
     Use& of = uses_[s];
     touch(of.last_needed, noted_ + 1, needed_);
@@ -271,7 +293,7 @@ void PagePolicy::occupy(const LoadedPage& loaded, PagesComing& out) {
     if (of.above >= 0) ++uses_[of.above].num_children;
     slot_of_page_[id] = static_cast<int32_t>(s);
     states_[id].store(PageState::resident, std::memory_order_release);
-    out.changes.push_back({loaded.bundle, loaded.page, row, loaded.block});
+    out.changes.push_back({loaded.bundle, loaded.page, row, cluster, loaded.block});
     out.bytes += bundles_[loaded.bundle].source->num_bytes(loaded.page);
 }
 

@@ -3,9 +3,9 @@
 // What a pool of pages decides: which pages are read, which become resident, which make room, and in what
 // order. It knows no threads and no bytes: whoever asks is one thread at a time, and tells what was read.
 //
-// Memory is rows of gaussians: the coarsest pages of all bundles first, which stay, then slots that hold any
-// other page. What is resident is closed towards the root at every moment: a page comes after the page above
-// it, and goes when none below it is there.
+// Memory is rows of gaussians, and places of clusters: those of the coarsest pages of all bundles first,
+// which stay, then slots that hold any other page. What is resident is closed towards the root at every
+// moment: a page comes after the page above it, and goes when none below it is there.
 
 #include <atomic>
 #include <cstdint>
@@ -25,10 +25,37 @@ struct PagedBundle {
     std::shared_ptr<const PageSource> source;
 };
 
+// Memory for gaussians.
+struct PoolMemory {
+    size_t num_bytes;
+    size_t row_bytes, cluster_bytes;  // that a gaussian takes, and a cluster besides
+    size_t most_rows = UINT32_MAX;    // that whoever draws can tell apart
+
+    size_t bytes_of(size_t num_rows, size_t num_clusters) const {
+        return num_rows * row_bytes + num_clusters * cluster_bytes;
+    }
+};
+
+// What that is divided into: what the coarsest pages take, then slots of one size.
+struct SlotPlan {
+    size_t first_slot_row = 0, first_slot_cluster = 0;
+    size_t num_slots = 0, slot_rows = 1, slot_clusters = 1;
+
+    size_t num_rows() const { return first_slot_row + num_slots * slot_rows; }
+    size_t num_clusters() const { return first_slot_cluster + num_slots * slot_clusters; }
+    // What a page of so many clusters that begin there has of them: all in a slot, else its own.
+    size_t num_clusters_at(size_t cluster, size_t num_clusters) const {
+        return cluster < first_slot_cluster ? num_clusters : slot_clusters;
+    }
+    // [num_clusters() + 1] rows where clusters begin while there is nothing in any slot, ascending.
+    std::vector<int64_t> empty_offsets() const;
+};
+
 // A page that comes to its slot, or leaves it.
 struct PageChange {
     uint32_t bundle, page;
     int64_t row;                 // where its rows begin; kAbsentPage: it leaves
+    size_t cluster;              // where the places of its clusters begin
     const unsigned char* bytes;  // of what comes
 };
 
@@ -53,14 +80,14 @@ struct PagesComing {
 
 class PagePolicy {
   public:
-    // Throws std::invalid_argument where `num_rows` has no room for the coarsest pages and one page more of
-    // each bundle.
-    PagePolicy(const std::vector<PagedBundle>& bundles, size_t num_rows);
+    // Throws std::invalid_argument where there is no room for the coarsest pages and one page more of each
+    // bundle.
+    PagePolicy(const std::vector<PagedBundle>& bundles, const PoolMemory& memory);
 
     size_t num_slots() const { return slots_.size(); }
-    size_t slot_rows() const { return slot_rows_; }
-    size_t first_slot_row() const { return first_slot_row_; }
-    int64_t root_row(size_t bundle) const { return bundles_[bundle].root_row; }
+    const SlotPlan& plan() const { return plan_; }
+    // The coarsest page of a bundle, without its bytes.
+    PageChange root(size_t bundle) const;
     size_t num_pages() const { return slot_of_page_.size; }
     size_t most_page_bytes() const { return most_page_bytes_; }
     const PageSource& source(size_t bundle) const { return *bundles_[bundle].source; }
@@ -89,8 +116,8 @@ class PagePolicy {
     struct Bundle {
         std::shared_ptr<const PageSource> source;
         uint32_t first_page = 0;
-        int64_t root_row = 0;
-        size_t most_rows = 1, most_bytes = 1;  // of its pages but the coarsest
+        size_t root_row = 0, root_cluster = 0;
+        size_t most_rows = 1, most_clusters = 1, most_bytes = 1;  // of its pages but the coarsest
     };
     struct Page {
         int32_t parent = -1;  // all pages are numbered together; -1: the coarsest has none
@@ -129,7 +156,7 @@ class PagePolicy {
     };
 
     void add_pages(Bundle& bundle, const ClusterTable& table);
-    void plan_memory(size_t num_rows);
+    void plan_memory(const PoolMemory& memory);
     uint32_t id_of(size_t bundle, size_t page) const {
         return bundles_[bundle].first_page + static_cast<uint32_t>(page);
     }
@@ -151,7 +178,8 @@ class PagePolicy {
     void occupy(const LoadedPage& loaded, PagesComing& out);
 
     std::vector<Bundle> bundles_;
-    size_t slot_rows_ = 1, first_slot_row_ = 0, most_page_bytes_ = 1;
+    SlotPlan plan_;
+    size_t most_page_bytes_ = 1;
 
     // Of pages. A page that is in no slot is absent, on its way, or the coarsest of its bundle.
     Buffer<int32_t> slot_storage_;

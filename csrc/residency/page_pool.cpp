@@ -35,7 +35,7 @@ struct Reading {
 
 struct PagePool::State {
     State(const std::vector<PagedBundle>& bundles, const PoolLimits& given)
-        : limits(given), policy(bundles, given.num_rows) {
+        : limits(given), policy(bundles, given.memory) {
         decides_itself = limits.num_threads == 0 || policy.num_slots() == 0;
         missing = policy.num_slots() == 0 ? 0 : 1;  // until it is known
     }
@@ -131,7 +131,7 @@ void PagePool::State::read_roots(size_t num_bundles) {
         max_sh_degree = std::max(max_sh_degree, source.sh_degree());
         first.push_back(first.back());
         if (source.num_clusters() == 0) continue;
-        changes.push_back({b, static_cast<uint32_t>(root), policy.root_row(b), nullptr});
+        changes.push_back(policy.root(b));
         first.back() += (source.num_bytes(root) + 15) / 16 * 16;
     }
     most_bytes = first.back();
@@ -419,14 +419,20 @@ PagePool::~PagePool() {
 }
 
 size_t PagePool::num_bundles() const { return state_->shift.size(); }
-size_t PagePool::slot_rows() const { return state_->policy.slot_rows(); }
-size_t PagePool::first_slot_row() const { return state_->policy.first_slot_row(); }
-size_t PagePool::num_slots() const { return state_->policy.num_slots(); }
+const SlotPlan& PagePool::plan() const { return state_->policy.plan(); }
+bool PagePool::keeps_codes() const { return state_->limits.keeps_codes; }
 int PagePool::max_sh_degree() const { return state_->max_sh_degree; }
 Span<const int64_t> PagePool::shift(size_t b) const {
     return {state_->shift[b].data(), state_->shift[b].size()};
 }
 const PageSource& PagePool::source(uint32_t b) const { return state_->policy.source(b); }
+SlotPage PagePool::slot_page(const PageChange& change) const {
+    const PageSource& of = source(change.bundle);
+    return {{of.clusters(change.page), reinterpret_cast<const uint32_t*>(change.bytes), of.sh_degree()},
+            static_cast<size_t>(change.row),
+            change.cluster,
+            plan().num_clusters_at(change.cluster, of.num_clusters(change.page))};
+}
 size_t PagePool::most_changes() const { return 2 * state_->blocks.num_blocks() + num_bundles(); }
 size_t PagePool::most_needs() const { return state_->most_needs; }
 size_t PagePool::most_bytes_on_their_way() const { return state_->most_bytes; }

@@ -11,13 +11,15 @@
 #include <string>
 #include <vector>
 
+#include "quantize/quantize.h"
 #include "residency/page_blocks.h"
 #include "residency/page_policy.h"
 
 namespace v3dg {
 
 struct PoolLimits {
-    size_t num_rows;                               // of memory
+    PoolMemory memory;
+    bool keeps_codes = false;                      // of pages, all of which are coded; else rows
     size_t block_bytes = size_t(64) << 20;         // for what has been read and is not resident yet
     size_t most_bytes_a_frame = size_t(32) << 20;  // that become resident, at first
     size_t most_frames = 1;                        // that borrow memory for their needs at once
@@ -58,13 +60,14 @@ class PagePool {
     PagePool& operator=(const PagePool&) = delete;
 
     size_t num_bundles() const;
-    size_t slot_rows() const;
-    size_t first_slot_row() const;
-    size_t num_slots() const;
+    const SlotPlan& plan() const;
+    bool keeps_codes() const;
     int max_sh_degree() const;
     // [P] of the host's PageTable; as of the last changes that were taken.
     Span<const int64_t> shift(size_t bundle) const;
     const PageSource& source(uint32_t bundle) const;
+    // What becomes of a page that comes, where codes are kept.
+    SlotPage slot_page(const PageChange& change) const;
     // Of all that blocks and the coarsest pages hold together.
     size_t most_bytes_on_their_way() const;
     size_t most_changes() const;  // of a frame

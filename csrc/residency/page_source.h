@@ -40,6 +40,7 @@ class PageSource {
     PageCodec codec() const { return codec_; }
     size_t num_pages() const { return first_cluster_.size() - 1; }
     size_t num_clusters() const { return offset_.size() - 1; }
+    size_t num_clusters(size_t page) const { return first_cluster_[page + 1] - first_cluster_[page]; }
     size_t first_cluster(size_t page) const { return first_cluster_[page]; }
     // [K + 1] where the clusters of a page begin among the rows of the bundle, and the end.
     Span<const int64_t> clusters(size_t page) const;
