@@ -441,6 +441,25 @@ def test_pictures_that_are_drawn_ahead_are_finished_later(scene):
 
 
 @pytest.mark.gpu
+def test_pages_that_leave_before_a_frame_has_them_are_not_drawn(scene):
+    """Several pictures are looked at without one in between that takes what came and left meanwhile."""
+    renderer = Renderer(scene, device="cuda", memory=scaled(scene, 150_000))
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        cameras = [
+            Camera.look_at(3 * rng.normal(size=3), (0, 0, 0), (0, 0, 1), 0.8, width=93, height=61)
+            for _ in range(4)
+        ]
+        for image in [renderer.render(camera, tolerance=30.0) for camera in cameras]:
+            image.stats  # noqa: B018
+            time.sleep(0.005)  # for other threads to decide
+        for camera in cameras[:2]:
+            renderer.settle(camera, tolerance=30.0)
+            image = renderer.render(camera, tolerance=30.0)
+            assert_same(image, render(scene, camera, device="cuda", tolerance=image.stats.tolerance))
+
+
+@pytest.mark.gpu
 def test_graphs_of_a_pool_are_refused(scene):
     import torch
 

@@ -68,6 +68,7 @@ struct PagePool::State {
     uint64_t rounds_begun = 0, rounds_over = 0;  // of deciding
     bool wants_round = false, takes_all = false, lacks_blocks = false, is_over = false;
     bool frees_readers = false;  // who decides wakes them, for that takes a frame too long
+    bool has_noted = false;      // since a frame took what is ready
     std::string error;
     bool is_damage = false;
 
@@ -89,6 +90,7 @@ struct PagePool::State {
     void start_threads(const std::shared_ptr<State>& shared);
     void stop_threads();
 
+    bool may_note() const;
     bool has_to_decide() const;
     bool is_deciding() const { return rounds_begun != rounds_over; }
     void decide(std::unique_lock<std::mutex>& lock);
@@ -196,9 +198,13 @@ void PagePool::State::stop_threads() {
     has_changed.wait_for(lock, std::chrono::seconds(2), [&] { return num_threads == 0; });
 }
 
-// Under the lock, as all from here to who reads.
+// Under the lock, as all from here to who reads. What is ready for a frame was needed by the last view or the
+// one before, and so is not to leave before that frame has it: changes that are taken together bring at most
+// one page to a slot.
+bool PagePool::State::may_note() const { return noted != nullptr && (!has_noted || ready.empty()); }
+
 bool PagePool::State::has_to_decide() const {
-    return wants_round || noted != nullptr || frees_readers ||
+    return wants_round || may_note() || frees_readers ||
            ((num_left > 0 || !read.empty()) && ready_bytes < most_bytes_a_frame);
 }
 
@@ -207,7 +213,8 @@ void PagePool::State::decide(std::unique_lock<std::mutex>& lock) {
     ++rounds_begun;
     wants_round = false;
     if (std::exchange(frees_readers, false)) to_read.notify_all();
-    FrameNeeds* needs = std::exchange(noted, nullptr);
+    FrameNeeds* needs = may_note() ? std::exchange(noted, nullptr) : nullptr;
+    has_noted |= needs != nullptr;
     loaded.insert(loaded.end(), read.begin(), read.end());
     read.clear();
     const size_t under_way = num_loading + loaded.size();
@@ -452,6 +459,7 @@ const std::vector<PageChange>& PagePool::begin_frame(bool is_bounded) {
     }
     state.changes.swap(state.ready);
     state.ready_bytes = 0;
+    state.has_noted = false;
     if (state.has_to_decide()) state.to_decide.notify_one();
     lock.unlock();
     state.take_ready();
