@@ -108,16 +108,24 @@ class Field:
 
     def memory(self, num_slots: int) -> int:
         """Bytes of a pool with about so many slots."""
-        degree = max(bundle.sh_degree for bundle in self.scene.bundles)
+        bundles = self.scene.bundles
+        degree = max(bundle.sh_degree for bundle in bundles)
         num_sh = 3 * (degree + 1) ** 2
-        floats = 11 + num_sh if self.config.device == "cpu" else 16 + (-(-num_sh // 4) * 4 if degree else 0)
-        rows = 0
-        for bundle in self.scene.bundles:
-            counts = np.diff(bundle._layout.first_gaussian)
-            rows += int(counts[-1])
-        rows += num_slots * int(counts[:-1].max())
-        num_bytes = 4 * floats * rows
-        return num_bytes + min(64 << 20, num_bytes // 7) + 4096
+        of_row, of_cluster = 4 * (11 + num_sh), 0
+        if all(bundle.codec == "quantized" for bundle in bundles):
+            of_row, of_cluster = 16 + 8 * degree, 72 + 16 * degree
+        elif self.config.device != "cpu":
+            of_row = 4 * (16 + (-(-num_sh // 4) * 4 if degree else 0))
+
+        def size(of_each: int, firsts: list[np.ndarray]) -> int:
+            counts = [np.diff(first) for first in firsts]
+            most = max(int(count[:-1].max()) for count in counts)
+            return of_each * (sum(int(count[-1]) for count in counts) + num_slots * most)
+
+        num_bytes = size(of_row, [bundle._layout.first_gaussian for bundle in bundles])
+        num_bytes += size(of_cluster, [bundle._layout.first_cluster for bundle in bundles])
+        most_on_the_way = (64 if self.config.device == "cpu" else 128) << 20
+        return num_bytes + min(most_on_the_way, num_bytes // 7) + 4096
 
 
 def timed(

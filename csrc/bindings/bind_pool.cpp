@@ -87,7 +87,7 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
     }
     int max_degree = 0;
     PoolLimits limits{};
-    limits.keeps_codes = device_.is_host() && !bundles.empty();
+    limits.keeps_codes = !bundles.empty();
     for (const PagedBundle& bundle : bundles) {
         max_degree = std::max(max_degree, bundle.source->sh_degree());
         limits.keeps_codes &= bundle.source->codec() == PageCodec::quantized;
@@ -104,7 +104,7 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
     const Work work(device_);
 #if V3DG_WITH_CUDA
     if (!device_.is_host()) {
-        row_bytes = cuda::pooled_row_bytes(max_degree);
+        row_bytes = cuda::packed_row_bytes(max_degree);
         blocks = std::make_shared<cuda::PinnedBlocks>();
         limits.most_frames = cuda::kMostFlights;
     }
@@ -113,8 +113,8 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
     if (limits.keeps_codes) {
         limits.memory.row_bytes = slot_row_bytes(max_degree);
         limits.memory.cluster_bytes = slot_cluster_bytes(max_degree);
-        // Codes have places of 32 bits.
-        limits.memory.most_rows = UINT32_MAX / static_cast<size_t>(std::max(1, max_degree));
+        // The host has places of 32 bits for coefficients, which devices have for rows alone.
+        if (device_.is_host()) limits.memory.most_rows /= std::max(1, max_degree);
     }
     try {
         const py::gil_scoped_release unlocked;
@@ -139,8 +139,8 @@ void BoundPool::make_on_device(const Work& work) {
         host.push_back(bound.table());
         appearance.push_back(bound.appearance());
     }
-    on_device_ = std::make_unique<cuda::DevicePages>(*pool_, std::move(tables), host, appearance,
-                                                     pool_->plan().num_rows(), work.stream());
+    on_device_ =
+        std::make_unique<cuda::DevicePages>(*pool_, std::move(tables), host, appearance, work.stream());
 }
 #endif
 

@@ -50,7 +50,7 @@ struct Placement {
 // Neighbouring gaussians of a placed model, or of a model that several placements share: those at
 // `placement` + k for each bit k of `sharers`, where it is not 0. They are to have one picture, and to make
 // kItemSize records at most: there is room for those from `record` on, and they stand at its beginning, by
-// gaussian and then by placement. The first gaussian belongs to `cluster` of its bundle, or to one of the
+// gaussian and then by placement. The first gaussian belongs to `cluster` of the model, or to one of the
 // kItemClusters - 1 after that.
 struct DrawItem {
     uint32_t placement, first, count, record;

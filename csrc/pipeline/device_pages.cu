@@ -21,15 +21,17 @@ struct PageMove {
     const uint4* from;
     uint4* to;
     size_t num_vectors;
-    int64_t* shift;
-    int64_t value;
+    int64_t *shift, shift_value;
+    uint32_t *cluster_shift, cluster_value;  // may be null
 };
 
 // A block a page. Reads the host's memory, so that one launch brings all pages.
 __global__ void move_kernel(const PageMove* moves) {
     const PageMove move = moves[blockIdx.x];
     for (size_t i = threadIdx.x; i < move.num_vectors; i += blockDim.x) move.to[i] = move.from[i];
-    if (threadIdx.x == 0) *move.shift = move.value;
+    if (threadIdx.x != 0) return;
+    *move.shift = move.shift_value;
+    if (move.cluster_shift != nullptr) *move.cluster_shift = move.cluster_value;
 }
 
 template <class T>
@@ -59,14 +61,15 @@ unsigned char* PinnedBlocks::allocate(size_t bytes) {
     return blocks_.emplace_back(pinned<unsigned char>(bytes)).get();
 }
 
-size_t pooled_row_bytes(int max_sh_degree) {
+size_t packed_row_bytes(int max_sh_degree) {
     return sizeof(float) * (16 + static_cast<size_t>(stride_of(max_sh_degree)));
 }
 
 // What the host keeps of a frame until its cut is over.
 struct DevicePages::Flight {
     const Pinned<PageMove> moves;
-    const Pinned<PageRows> pages;
+    const Pinned<PageRows> rows;  // pages that come, or
+    const Pinned<SlotPage> codes;
     const Pinned<NeedsReport> report;
     FrameNeeds* needs = nullptr;
     std::vector<unsigned char*> blocks;  // that `moves` reads
@@ -76,7 +79,8 @@ struct DevicePages::Flight {
 
     explicit Flight(size_t most_changes)
         : moves(pinned<PageMove>(most_changes)),
-          pages(pinned<PageRows>(most_changes)),
+          rows(pinned<PageRows>(most_changes)),
+          codes(pinned<SlotPage>(most_changes)),
           report(pinned<NeedsReport>(1)) {
         check(cudaEventCreateWithFlags(&done, cudaEventDisableTiming), "cudaEventCreate");
         for (cudaEvent_t* event : {&begun, &brought}) check(cudaEventCreate(event), "cudaEventCreate");
@@ -90,59 +94,87 @@ struct DevicePages::Flight {
 
 DevicePages::DevicePages(PagePool& pool, std::vector<std::shared_ptr<const BundleTables>> tables,
                          const std::vector<ClusterTable>& host,
-                         const std::vector<ClusterAppearance>& appearance, size_t num_rows,
-                         cudaStream_t stream)
+                         const std::vector<ClusterAppearance>& appearance, cudaStream_t stream)
     : pool_(pool),
       tables_(std::move(tables)),
-      num_rows_(num_rows),
       sh_stride_(stride_of(pool.max_sh_degree())),
-      rows_(16 * num_rows, stream),
-      sh_(static_cast<size_t>(sh_stride_) * num_rows, stream),
       staged_(pool.most_bytes_on_their_way(), stream),
       list_(pool.most_needs(), stream) {
-    std::vector<PackedPlanes> planes;
-    std::vector<BundleOnDevice> bundles;
+    if (pool.keeps_codes())
+        make_coded(stream);
+    else
+        make_packed(stream);
+    make_tables(host, appearance, stream);
+    for (size_t k = 0; k < kMostFlights; ++k)
+        flights_.push_back(std::make_unique<Flight>(pool.most_changes()));
+    check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
+}
+
+void DevicePages::make_packed(cudaStream_t stream) {
+    const size_t num_rows = pool_.plan().num_rows();
+    const float* plane = rows_.reserve(16 * num_rows, stream);
+    const float* sh = sh_.reserve(static_cast<size_t>(sh_stride_) * num_rows, stream);
+    std::vector<PackedPlanes> packed;
+    for (uint32_t b = 0; b < tables_.size(); ++b)
+        packed.push_back({{plane, plane + 4 * num_rows, plane + 8 * num_rows, plane + 12 * num_rows},
+                          sh,
+                          pool_.source(b).sh_degree(),
+                          sh_stride_,
+                          {}});
+    packed_.copy_from({packed.data(), packed.size()}, stream);
+}
+
+void DevicePages::make_coded(cudaStream_t stream) {
+    const SlotPlan& plan = pool_.plan();
+    const int sh_degree = pool_.max_sh_degree();
+    const std::vector<int64_t> offset = plan.empty_offsets();
+    slots_ = {records_.reserve(kRecordWords * plan.num_rows(), stream),
+              sh_codes_.reserve(num_sh_words(sh_degree) * plan.num_rows(), stream),
+              ranges_.reserve(range_bytes(sh_degree) * plan.num_clusters(), stream),
+              offset_.copy_from({offset.data(), offset.size()}, stream),
+              range_bytes(sh_degree),
+              static_cast<uint32_t>(sh_degree),
+              plan.num_clusters()};
+    std::vector<CodedGaussians> coded;
+    for (uint32_t b = 0; b < tables_.size(); ++b)
+        coded.push_back({slots_.codes(pool_.source(b).sh_degree()), {}});
+    coded_.copy_from({coded.data(), coded.size()}, stream);
+}
+
+void DevicePages::make_tables(const std::vector<ClusterTable>& host,
+                              const std::vector<ClusterAppearance>& appearance, cudaStream_t stream) {
     std::vector<uint8_t> joins;
-    std::vector<int64_t> shift;
-    std::vector<size_t> first_join, first_page;
+    std::vector<size_t> first_join;
     size_t num_pages = 0;
-    for (size_t b = 0; b < tables_.size(); ++b) num_pages += pool.shift(b).size;
-    shift.assign(num_pages, kAbsentPage);
-    num_pages = 0;
     for (size_t b = 0; b < tables_.size(); ++b) {
         ClusterTable table = host[b];
-        table.pages.shift = pool.shift(b);
+        table.pages.shift = pool_.shift(b);
         const std::vector<uint8_t> own = joins_of_clusters(table, appearance[b]);
         first_join.push_back(joins.size());
         joins.insert(joins.end(), own.begin(), own.end());
-        first_page.push_back(num_pages);
+        first_page_.push_back(num_pages);
         num_pages += table.num_pages();
-        const float* plane = rows_.data();
-        planes.push_back({{plane, plane + 4 * num_rows, plane + 8 * num_rows, plane + 12 * num_rows},
-                          sh_.data(),
-                          pool.source(static_cast<uint32_t>(b)).sh_degree(),
-                          sh_stride_,
-                          {}});
     }
     joins_.copy_from({joins.data(), joins.size()}, stream);
+    const std::vector<int64_t> shift(num_pages, kAbsentPage);
     shift_.copy_from({shift.data(), shift.size()}, stream);
-    num_words_ = 1 + shift.size();
+    if (pool_.keeps_codes()) cluster_shift_.reserve(num_pages, stream);
+    num_words_ = 1 + num_pages;
     words_.reserve(num_words_, stream);
+    std::vector<BundleOnDevice> bundles;
     std::vector<uint32_t*> need;
     for (size_t b = 0; b < tables_.size(); ++b) {
         BundleOnDevice bundle = tables_[b]->on_device();
-        const size_t count = pool.shift(b).size;
-        bundle.table.pages.shift = {shift_.data() + first_page[b], count};
+        const size_t count = pool_.shift(b).size;
+        bundle.table.pages.shift = {shift_.data() + first_page_[b], count};
+        if (pool_.keeps_codes())
+            bundle.table.pages.cluster_shift = {cluster_shift_.data() + first_page_[b], count};
         bundle.joins = joins_.data() + first_join[b];
         bundles.push_back(bundle);
-        shift_of_bundle_.push_back(shift_.data() + first_page[b]);
-        need.push_back(words_.data() + 1 + first_page[b]);
+        need.push_back(words_.data() + 1 + first_page_[b]);
     }
-    planes_on_device_.copy_from({planes.data(), planes.size()}, stream);
     bundles_.copy_from({bundles.data(), bundles.size()}, stream);
     need_.copy_from({need.data(), need.size()}, stream);
-    for (size_t k = 0; k < kMostFlights; ++k)
-        flights_.push_back(std::make_unique<Flight>(pool.most_changes()));
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
@@ -195,36 +227,65 @@ DevicePages::Flight& DevicePages::free_flight() {
     return **std::find_if(flights_.begin(), flights_.end(), is_free);
 }
 
+const int64_t* DevicePages::offset_on_device(const PageChange& change) const {
+    return tables_[change.bundle]->on_device().table.offset.data +
+           pool_.source(change.bundle).first_cluster(change.page);
+}
+
+// Of a page whose bytes are on the device.
+PageRows DevicePages::page_rows(const PageChange& change, const unsigned char* bytes) const {
+    const PageSource& source = pool_.source(change.bundle);
+    PageRows page{rows_of_page(bytes, source.num_rows(change.page), source.sh_degree()),
+                  {},
+                  static_cast<size_t>(change.row)};
+    if (source.codec() == PageCodec::quantized)
+        page.codes = {{offset_on_device(change), source.num_clusters(change.page) + 1},
+                      reinterpret_cast<const uint32_t*>(bytes),
+                      source.sh_degree()};
+    return page;
+}
+
+SlotPage DevicePages::slot_page(const PageChange& change, const unsigned char* bytes) const {
+    SlotPage page = pool_.slot_page(change);
+    page.page.words = reinterpret_cast<const uint32_t*>(bytes);
+    page.page.offset.data = offset_on_device(change);
+    return page;
+}
+
 void DevicePages::bring(const std::vector<PageChange>& changes, Flight& flight, cudaStream_t stream) {
+    const bool keeps_codes = pool_.keeps_codes();
     size_t staged = 0, num_pages = 0;
     for (size_t k = 0; k < changes.size(); ++k) {
         const PageChange& change = changes[k];
+        const size_t place = first_page_[change.bundle] + change.page;
         PageMove& move = flight.moves[k];
-        move = {nullptr, nullptr, 0, shift_of_bundle_[change.bundle] + change.page, kAbsentPage};
+        move = {nullptr, nullptr, 0, shift_.data() + place, kAbsentPage, nullptr, 0};
         if (change.bytes == nullptr) continue;
         const PageSource& source = pool_.source(change.bundle);
-        move.value = change.row - source.first_row(change.page);
-        move.from = reinterpret_cast<const uint4*>(change.bytes);
         unsigned char* bytes = staged_.data() + staged;
+        move.from = reinterpret_cast<const uint4*>(change.bytes);
         move.to = reinterpret_cast<uint4*>(bytes);
         move.num_vectors = (source.num_bytes(change.page) + sizeof(uint4) - 1) / sizeof(uint4);
+        move.shift_value = change.row - source.first_row(change.page);
         staged += move.num_vectors * sizeof(uint4);
-        PageRows& page = flight.pages[num_pages++];
-        page.first_row = static_cast<size_t>(change.row);
-        page.rows = rows_of_page(bytes, source.num_rows(change.page), source.sh_degree());
-        page.codes = {};
-        if (source.codec() == PageCodec::float32) continue;
-        const int64_t* offset = tables_[change.bundle]->on_device().table.offset.data;
-        page.codes = {{offset + source.first_cluster(change.page), source.clusters(change.page).size},
-                      reinterpret_cast<const uint32_t*>(bytes),
-                      source.sh_degree()};
+        if (keeps_codes) {
+            move.cluster_shift = cluster_shift_.data() + place;
+            move.cluster_value = static_cast<uint32_t>(change.cluster - source.first_cluster(change.page));
+            flight.codes[num_pages++] = slot_page(change, bytes);
+        } else {
+            flight.rows[num_pages++] = page_rows(change, bytes);
+        }
     }
     constexpr unsigned kThreads = 256;
     flight.bytes_in = staged;
     if (staged >= kLeastMeasured) check(cudaEventRecord(flight.begun, stream), "cudaEventRecord");
     launch("move_kernel", move_kernel, static_cast<unsigned>(changes.size()), kThreads, 0, stream,
            flight.moves.get());
-    pack_pages(flight.pages.get(), num_pages, rows_.data(), num_rows_, sh_.data(), sh_stride_, stream);
+    if (keeps_codes)
+        write_slots(flight.codes.get(), num_pages, slots_, stream);
+    else
+        pack_pages(flight.rows.get(), num_pages, rows_.data(), pool_.plan().num_rows(), sh_.data(),
+                   sh_stride_, stream);
     if (staged >= kLeastMeasured) check(cudaEventRecord(flight.brought, stream), "cudaEventRecord");
 }
 

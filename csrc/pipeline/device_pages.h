@@ -31,17 +31,17 @@ class PinnedBlocks : public BlockMemory {
 // Frames whose cuts are under way at once; the next one waits for the first of them.
 constexpr size_t kMostFlights = 4;
 
-// Bytes that a row of a pool takes.
-size_t pooled_row_bytes(int max_sh_degree);
+// Bytes that a packed row of a pool takes.
+size_t packed_row_bytes(int max_sh_degree);
 
-// Gaussians in slots, packed whatever the codec of their pages is. Frames read them, and those that come and
-// go are brought, in the order of locks of mutex(), on any streams of the device.
+// Gaussians in slots: codes, or packed rows whatever the codec of their pages is. Frames read them, and those
+// that come and go are brought, in the order of locks of mutex(), on any streams of the device.
 class DevicePages {
   public:
     // `tables` are on the current device, `host` are the same on the host.
     DevicePages(PagePool& pool, std::vector<std::shared_ptr<const BundleTables>> tables,
                 const std::vector<ClusterTable>& host, const std::vector<ClusterAppearance>& appearance,
-                size_t num_rows, cudaStream_t stream);
+                cudaStream_t stream);
     ~DevicePages();
     DevicePages(const DevicePages&) = delete;
     DevicePages& operator=(const DevicePages&) = delete;
@@ -54,8 +54,9 @@ class DevicePages {
     void end_frame(cudaStream_t stream);
     // Takes note of what frames needed whose cuts are over, before the next one begins.
     void note_frames(cudaStream_t stream);
-    // Of the models of all bundles, on the device.
-    const PackedPlanes* planes() const { return planes_on_device_.data(); }
+    // The models of all bundles, on the device: one of the two, the other is null.
+    const PackedPlanes* packed() const { return packed_.data(); }
+    const CodedGaussians* coded() const { return coded_.data(); }
     // What the pool says that a frame may be drawn with.
     SelectRule raised(SelectRule rule) const;
 
@@ -64,22 +65,34 @@ class DevicePages {
 
   private:
     struct Flight;
+    void make_packed(cudaStream_t stream);
+    void make_coded(cudaStream_t stream);
+    void make_tables(const std::vector<ClusterTable>& host, const std::vector<ClusterAppearance>& appearance,
+                     cudaStream_t stream);
     void note_flights(bool waits);
     void measure(const Flight& flight);
     Flight& free_flight();
+    const int64_t* offset_on_device(const PageChange& change) const;
+    PageRows page_rows(const PageChange& change, const unsigned char* bytes) const;
+    SlotPage slot_page(const PageChange& change, const unsigned char* bytes) const;
     void bring(const std::vector<PageChange>& changes, Flight& flight, cudaStream_t stream);
 
     PagePool& pool_;
     const std::vector<std::shared_ptr<const BundleTables>> tables_;
-    const size_t num_rows_;
-    const int sh_stride_;
+    const int sh_stride_;  // of packed rows
     StreamMutex busy_;
     DeviceBuffer<float> rows_, sh_;
-    DeviceBuffer<PackedPlanes> planes_on_device_;
+    DeviceBuffer<PackedPlanes> packed_;
+    DeviceBuffer<uint32_t> records_, sh_codes_;
+    DeviceBuffer<unsigned char> ranges_;
+    DeviceBuffer<int64_t> offset_;
+    CodeSlots slots_{};
+    DeviceBuffer<CodedGaussians> coded_;
     DeviceBuffer<unsigned char> staged_;
     DeviceBuffer<uint8_t> joins_;
-    DeviceBuffer<int64_t> shift_;  // of all bundles
-    std::vector<int64_t*> shift_of_bundle_;
+    DeviceBuffer<int64_t> shift_;           // of all bundles
+    DeviceBuffer<uint32_t> cluster_shift_;  // the same, where there are codes
+    std::vector<size_t> first_page_;        // of each bundle, among those of all
     DeviceBuffer<BundleOnDevice> bundles_;
     DeviceBuffer<uint32_t> words_;
     DeviceBuffer<uint32_t*> need_;

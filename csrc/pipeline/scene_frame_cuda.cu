@@ -150,8 +150,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
     PartlyResident resident = pages.begin_frame(true, stream);
     SelectRule next = rule = pages.raised(rule);
     FrameBatch of_pages = batch(scene, pictures, rule.fade.is_on(), stream);
-    of_pages.packed = pages.planes();
-    of_pages.coded = nullptr;
+    of_pages.packed = pages.packed();
+    of_pages.coded = pages.coded();
     of_pages.guards_models = &pages.mutex();
     return frame_.draw(
         of_pages,

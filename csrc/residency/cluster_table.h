@@ -35,6 +35,11 @@ struct ClusterTable {
     V3DG_HD int64_t first_row(size_t c) const {
         return pages.is_whole() ? offset[c] : offset[c] + pages.shift[page_of(c)];
     }
+    // Which of the clusters that are resident it is.
+    V3DG_HD uint32_t place_of(size_t c) const {
+        const auto place = static_cast<uint32_t>(c);
+        return pages.cluster_shift.empty() ? place : place + pages.cluster_shift[page_of(c)];
+    }
     // Whether they begin where those of the cluster before it end, wherever pages lie.
     V3DG_HD bool follows(size_t c) const { return pages.is_whole() || page_of(c) == page_of(c - 1); }
 };

@@ -17,6 +17,9 @@ struct PageTable {
     // [G + 1] by how many rows a page lies behind its place in the bundle, or kAbsentPage. Empty: all pages
     // are there, in the order of the bundle.
     Span<const int64_t> shift;
+    // The same of its clusters, modulo 2^32, for who reads ranges by cluster. Empty: they are where the
+    // bundle has them.
+    Span<const uint32_t> cluster_shift;
 
     V3DG_HD bool is_whole() const { return shift.empty(); }
     V3DG_HD bool is_resident(size_t page) const { return is_whole() || shift[page] != kAbsentPage; }

@@ -116,6 +116,7 @@ struct ItemOutput {
             const unsigned size = mine.size(run.k, run.num_clusters), step = run.gaussians_an_item();
             const uint32_t placement = run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
             const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.first_row(cluster));
+            const uint32_t place = mine.bundle->table.place_of(cluster);
             const Appearance<float> appearance = mine.bundle->appearance[cluster];
             const float weight = kFades ? share_of(mine.weights[run.k]) : 1.0f;
             for (uint32_t picture = 0; picture < num_pictures; ++picture)
@@ -123,10 +124,14 @@ struct ItemOutput {
                     const unsigned count = min(step, size - skip);
                     if (first < items.item_capacity &&
                         record + run.num_instances * count <= items.record_capacity)
-                        items.items[first] = {
-                            placement + picture * num_placements, gaussian + skip, count,
-                            static_cast<uint32_t>(record),        appearance,      run.sharers,
-                            static_cast<uint32_t>(cluster),       weight};
+                        items.items[first] = {placement + picture * num_placements,
+                                              gaussian + skip,
+                                              count,
+                                              static_cast<uint32_t>(record),
+                                              appearance,
+                                              run.sharers,
+                                              place,
+                                              weight};
                     record += run.num_instances * count;
                 }
         });

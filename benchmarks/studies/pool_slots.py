@@ -1,0 +1,63 @@
+"""Pools that keep rows and pools that keep codes, of the same quantised bundles: frames of a flight by turns.
+
+A pool keeps rows where a bundle of the scene is float32. So one of the two scenes has a tiny one more, behind
+the camera.
+
+    python -m benchmarks.studies.pool_slots --bundle quantized.v3dg --side 13 --size 1920 1080 --device cuda
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import tyro
+
+import v3dg
+from benchmarks.evaluation import record
+from benchmarks.studies.residency import Config, Field, pixels, summary, timed, write_copies
+from v3dg.donut import make_donut
+
+ROUNDS = 3
+
+
+def with_rows(field: Field) -> v3dg.Scene:
+    """The scene of the field and a bundle in memory that no camera sees."""
+    scene = Field(field.config, field.paths).scene
+    tiny = v3dg.build_bundle(make_donut(1000), config=v3dg.BuildConfig(steps=1), device="cpu")
+    scene.add(tiny, positions=(0.0, -1e4, 0.0))
+    return scene
+
+
+def main(config: Config) -> None:
+    with TemporaryDirectory() as temporary:
+        folder = config.folder or Path(temporary)
+        folder.mkdir(exist_ok=True)
+        field = Field(config, write_copies(config, folder))
+        cameras = field.flight()
+        scenes = {"rows": with_rows(field), "codes": field.scene}
+        result: list[dict[str, Any]] = []
+        for memory in config.pools or ("2GB",):
+            pools = {
+                kind: v3dg.Renderer(scene, device=config.device, memory=memory)
+                for kind, scene in scenes.items()
+            }
+            for number in range(ROUNDS):
+                pictures = []
+                for kind, renderer in pools.items():
+                    renderer.settle(cameras[0], tolerance=config.tolerance)
+                    frames = timed(config, renderer, cameras)
+                    renderer.settle(cameras[-1], tolerance=config.tolerance)
+                    pictures.append(pixels(renderer.render(cameras[-1], tolerance=config.tolerance)))
+                    slots = renderer._frame._pool.core.status().num_slots
+                    row = {"kind": kind, "memory": memory, "round": number, "slots": slots}
+                    result.append(row | summary(frames))
+                    print(result[-1], flush=True)
+                print("same bits:", np.array_equal(*pictures), flush=True)
+        record.write(config.output, {"device": config.device, "rows": result}, config.device)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
