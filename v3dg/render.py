@@ -220,6 +220,7 @@ class _Frame:
     ) -> None:
         self._device, self._color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
+        self._references: tuple[Any, ...] | None = None  # to those that were taken
         self._pool: Pool | None = None
         self._has_settled = False  # and drawn nothing since
         self._memory = None if memory is None else in_bytes(memory)
@@ -309,6 +310,8 @@ class _Frame:
 
     def _take_models(self, resident: ResidentScene) -> Pool | None:
         """Have the gaussians of the scene's bundles at hand: in a pool, or all of them."""
+        if self._references is resident.references:  # as in most frames
+            return self._pool
         with residency.lock:
             bundles = resident.bundles
             if self._memory is not None:
@@ -316,11 +319,11 @@ class _Frame:
                 if self._pool is None or self._pool.tables != tables:
                     self._pool = None  # its memory is needed
                     self._pool = Pool(bundles, tables, self._device, self._memory)
-                return self._pool
-            if self._num_models < len(bundles):
+            elif self._num_models < len(bundles):
                 residency.set_models(self._frame, bundles, self._device, self._color_by)
                 self._num_models = len(bundles)
-            return None
+            self._references = resident.references
+            return self._pool
 
     def _here(self, ids: Any) -> Any:
         if not self._device.is_cuda:

@@ -36,6 +36,7 @@ class ResidentScene:
 
     Attributes:
         core: The compiled module's part.
+        references: To the bundles, another tuple where they have changed.
         revision: The scene's that is there.
     """
 
@@ -43,7 +44,7 @@ class ResidentScene:
         self.device = device
         self.core = _core.ResidentScene(device.number)
         # Weak, for a bundle that is drawn by itself would else keep itself alive.
-        self._bundles: tuple[weakref.ref[Bundle], ...] = ()
+        self.references: tuple[weakref.ref[Bundle], ...] = ()
         self._drawings: weakref.WeakSet[_core.Drawing] = weakref.WeakSet()  # that may be under way
         self._lock = threading.Lock()  # of that set
         self.revision = (-1, -1, -1)
@@ -51,7 +52,7 @@ class ResidentScene:
     @property
     def bundles(self) -> tuple[Bundle, ...]:
         """The bundles whose tables are there."""
-        return tuple(bundle for reference in self._bundles if (bundle := reference()) is not None)
+        return tuple(bundle for reference in self.references if (bundle := reference()) is not None)
 
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
         """Take over what has changed since the last time: the poses, or all instances.
@@ -72,7 +73,7 @@ class ResidentScene:
             drawing.finish()
         if self.bundles != scene.bundles:
             self.core.set_bundles(tables)
-            self._bundles = tuple(map(weakref.ref, scene.bundles))
+            self.references = tuple(map(weakref.ref, scene.bundles))
         if self.device.is_cuda:
             poses = tuple(self._here(rows) for rows in scene.poses)
         else:
