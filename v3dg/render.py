@@ -129,8 +129,8 @@ class Renderer:
     changed is finished first.
 
     With a budget and a fade, pictures are taken to follow each other: the tolerance goes in steps to the one
-    at which a part of the budget is free, never below that of `render`, so that slow motion is steady
-    (docs/fades.md). Without a fade, pictures are those of `render`.
+    at which a part of the budget is free, never below that of `render`, so that slow motion is steady; at
+    rest it is there after eight pictures (docs/fades.md). Without a fade, pictures are those of `render`.
 
     With `memory`, only a part of the bundles is resident, so that they may be far larger than memory: pages
     come in from the files as views need them, read by other threads. A picture waits for none of them: where

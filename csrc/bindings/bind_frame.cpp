@@ -161,14 +161,14 @@ class BoundSceneFrame {
                                        const SelectRule& rule, const Shade& shade, const Stop* stop) {
         auto& scene = checked(scene_object);
         const Eyes& eyes = camera.eyes;
-        const SelectRule paced = in_pace(rule);
+        BudgetSteps steps = steps_;
+        const SelectRule paced = moves_ ? steps.next(rule, eyes, scene.state()) : rule;
         if (device_.is_host()) {
-            uint32_t last_bin = last_bin_;
             auto drawing = on_host(scene, eyes, shade, [&](HostScene host, Span<const Picture<float>> out) {
-                host.last_bin = &last_bin;
+                host.last_bin = &steps.last_bin;
                 return cpu::draw_scene(host, eyes, paced, out, flag_of(stop));
             });
-            last_bin_ = last_bin;
+            steps_ = steps;
             return drawing;
         }
 #if V3DG_WITH_CUDA
@@ -176,6 +176,7 @@ class BoundSceneFrame {
         NewPictures pictures;
         const cuda::EyeImages images = new_images(eyes, shade, pictures);
         auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream());
+        steps_ = steps;
         return std::make_unique<BoundDrawing>(std::move(pictures),
                                               py::make_tuple(py::cast(this), scene_object), device_,
                                               std::move(drawing), rule);
@@ -195,14 +196,17 @@ class BoundSceneFrame {
         const std::shared_ptr<const SceneState> state = scene.state();
         pool.check_scene(*state);
         const Eyes& eyes = camera.eyes;
+        BudgetSteps steps = steps_;
+        const SelectRule paced = moves_ ? steps.next(rule, eyes, state) : rule;
 #if V3DG_WITH_CUDA
         if (!device_.is_host()) {
             const Work work(device_);
             NewPictures pictures;
             const cuda::EyeImages images = new_images(eyes, shade, pictures);
-            SelectRule used = in_pace(rule);
+            SelectRule used = paced;
             auto drawing =
                 frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images, work.stream());
+            steps_ = steps;
             return std::make_unique<BoundDrawing>(std::move(pictures),
                                                   py::make_tuple(py::cast(this), scene_object, pool_object),
                                                   device_, std::move(drawing), used, &pool.on_device());
@@ -214,18 +218,17 @@ class BoundSceneFrame {
             models.push_back(
                 {pool.on_host().planes(b), state->bundle(b).appearance(), {}, pool.on_host().codes(b)});
         SceneFrameCounts counts{};
-        uint32_t last_bin = last_bin_;
         {
             const py::gil_scoped_release unlocked;
             const auto cut = [&](auto tables, const SelectRule& raised, auto needs) {
                 const HostScene host{
-                    tables, {models.data(), models.size()}, state->instances, needs, &last_bin};
+                    tables, {models.data(), models.size()}, state->instances, needs, &steps.last_bin};
                 counts = cpu::draw_scene(host, eyes, raised, out.span(), flag_of(stop));
                 return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
             };
-            pool.frame_on_host(*state, in_pace(rule), true, cut);
+            pool.frame_on_host(*state, paced, true, cut);
         }
-        last_bin_ = last_bin;
+        steps_ = steps;
         return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
     }
 
@@ -319,12 +322,6 @@ class BoundSceneFrame {
         return scene;
     }
 
-    // Pictures that follow each other have a fade.
-    SelectRule in_pace(SelectRule rule) const {
-        if (moves_ && rule.fade.is_on()) rule.pace = BudgetPace::in_steps;
-        return rule;
-    }
-
     void check_device(Device device, const char* name) const {
         if (device != device_)
             throw py::value_error(std::string(name) + ": expected what is on the frame's device, got others");
@@ -388,8 +385,8 @@ class BoundSceneFrame {
     }
 
     Device device_;
-    bool moves_;                  // pictures follow each other
-    uint32_t last_bin_ = kNoBin;  // on the host, of a budget
+    bool moves_;         // pictures follow each other
+    BudgetSteps steps_;  // then
     py::list models_, palettes_;
     std::vector<size_t> num_gaussians_;  // of each bundle
     std::vector<SceneModel> host_;       // without what the scene knows of the clusters
