@@ -22,7 +22,7 @@ from v3dg.pictures import to_8bit
 from v3dg.render import render, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Scene
-from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, rule_of, select
+from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, rule_of, select, select_by
 from v3dg.viewer.view import View
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
@@ -166,9 +166,14 @@ class SceneView:
         return text
 
     def frame(
-        self, view: View, size: tuple[int, int], settings: Settings, stop: _core.Stop | None = None
+        self,
+        view: View,
+        size: tuple[int, int],
+        settings: Settings,
+        stop: _core.Stop | None = None,
+        steps: _core.BudgetSteps | None = None,
     ) -> Frame:
-        """Draw a picture of ``size`` (width, height) px.
+        """Draw a picture of ``size`` (width, height) px; with ``steps``, one that follows others.
 
         Raises:
             Stopped: ``stop`` was requested; it is raised soon after.
@@ -178,15 +183,9 @@ class SceneView:
         camera = view.camera(*size, self.near)
         chooser = camera if settings.frozen is None else settings.frozen.camera(*size, self.near)
         start = time.perf_counter()
-        cut = select(
-            self.scene,
-            chooser,
-            tolerance=settings.tolerance,
-            budget=settings.budget,
-            min_level=settings.min_level,
-            fade=settings.fade,
-            device=self.device,
-        )
+        budget, fade = settings.budget, settings.fade
+        rule = rule_of(settings.tolerance, budget, settings.min_level, fade=fade)
+        cut = select_by(rule, self.scene, chooser, budget, self.device, steps)
         selected = time.perf_counter()
         width, height = size
         edge = round(settings.split * width)

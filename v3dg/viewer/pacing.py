@@ -111,7 +111,7 @@ class RenderLoop:
         pacer: Pacer | None = None,
     ) -> None:
         self._scene_view, self._send, self._fail = scene_view, send, fail
-        self._pacer = pacer or Pacer()
+        self._pacer, self._steps = pacer or Pacer(), _core.BudgetSteps()
         self._changed = threading.Condition()
         self._request: Request | None = None
         self._is_closed = False
@@ -157,7 +157,7 @@ class RenderLoop:
         stop = self._begin(PATIENCE_SECONDS if draft.coarser < _COARSEST else math.inf)
         start = time.perf_counter()
         try:
-            frame = self._scene_view.frame(request.view, draft.size, settings, stop)
+            frame = self._scene_view.frame(request.view, draft.size, settings, stop, self._steps)
         except Stopped:  # it would have taken so long at least
             self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
             raise
@@ -169,9 +169,17 @@ class RenderLoop:
         with self._changed:
             if self._changed.wait_for(self._has_news, REST_SECONDS):
                 return
+        is_larger, has_budget = draft.size != request.size, request.settings.budget is not None
+        steps = None if is_larger else self._steps
         for size in sizes:
-            frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0))
+            frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0), steps)
             self._send(frame, size == sizes[-1], request.number)
+        is_on_way = has_budget and not is_larger
+        while is_on_way:  # for a budget's tolerance goes in steps
+            before, stop = frame.figures.tolerance, self._begin(0.0)
+            frame = self._scene_view.frame(request.view, draft.size, request.settings, stop, steps)
+            self._send(frame, True, request.number)
+            is_on_way = frame.figures.tolerance != before
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
         """What of the settings there is time for."""

@@ -196,6 +196,7 @@ class Tab:
         request, views = message.look.request(), message.camera_path().film(_FPS)
         width, height = request.size
         size = max(width // 2 * 2, 2), max(height // 2 * 2, 2)  # as H.264 wants it
+        steps = _core.BudgetSteps()
 
         def pictures() -> Iterator[Pixels]:
             told = 0.0
@@ -204,7 +205,7 @@ class Tab:
                     self._tell({"type": "progress", "share": place / len(views)})
                     told = time.monotonic()
                 view = replace(view, aspect=size[0] / size[1])
-                yield self.scene_view.frame(view, size, request.settings, stop).pixels
+                yield self.scene_view.frame(view, size, request.settings, stop, steps).pixels
 
         self._exporter.save(f"{self._name}.mp4", lambda file: write_video(file, pictures(), fps=_FPS))
 
