@@ -147,7 +147,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
                                                    const Eyes& eyes, SelectRule& rule,
                                                    const EyeImages& pictures, cudaStream_t stream) {
     const StreamLock lock(pages.mutex(), stream);
-    PartlyResident resident = pages.begin_frame(true, stream);
+    const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
+    PartlyResident resident = pages.begin_frame(true, arrive, stream);
     SelectRule next = rule = pages.raised(rule);
     FrameBatch of_pages = batch(scene, pictures, rule.fade.is_on(), stream);
     of_pages.packed = pages.packed();

@@ -69,11 +69,12 @@ struct SelectRule {
     BudgetPace pace = BudgetPace::at_once;
     int32_t frames_at_rest = 0;  // in steps: in so many frames up to this one nothing has moved
     Fade fade = {};              // not with the paper's footprint, which may decrease towards the root
+    int32_t frame = 0;           // with a fade: up to which pages of a pool have faded in
 
     bool operator==(const SelectRule& o) const {
         return tolerance_px2 == o.tolerance_px2 && footprint == o.footprint && culls == o.culls &&
                min_level == o.min_level && budget == o.budget && pace == o.pace &&
-               frames_at_rest == o.frames_at_rest && fade == o.fade;
+               frames_at_rest == o.frames_at_rest && fade == o.fade && frame == o.frame;
     }
 };
 
@@ -137,6 +138,13 @@ V3DG_HD inline int32_t refinement(float metric_px2, const SelectRule& rule) {
     const float between = ramp > 0.0f ? (ramp < 1.0f ? ramp : 1.0f) : 0.0f;  // 0 where there is no number
     const int32_t rounded = static_cast<int32_t>(between * kWhole + 0.5f);
     return fits(metric_px2, rule) ? 0 : is_refined(metric_px2, rule) ? kWhole : rounded;
+}
+
+// How far a page has faded in, of kWhole. Groups are refined as far as their pages have, at most: as both
+// never decrease towards the root, the lesser of the two does not, and the cut stays exact.
+V3DG_HD inline int32_t arrival(const PageTable& pages, int32_t g, const SelectRule& rule) {
+    static_assert(kWhole % kArrivalFrames == 0, "frames are whole parts");
+    return rule.fade.is_on() ? pages.arrived(g, rule.frame) * (kWhole / kArrivalFrames) : kWhole;
 }
 
 // Where a box lies as seen from one plane, in units of the plane's normal.
@@ -275,7 +283,8 @@ struct AskedGroups {
     const SelectRule& rule;
 
     V3DG_HD int32_t refinement(int32_t g) const {
-        return v3dg::refinement(metric_px2(table, g, view, rule), rule);
+        return min_of(v3dg::refinement(metric_px2(table, g, view, rule), rule),
+                      arrival(table.pages, g, rule));
     }
     // The first of the tolerances that a budget chooses from at which it fits, and is not refined any more.
     V3DG_HD uint32_t first_fitting(int32_t g) const {
