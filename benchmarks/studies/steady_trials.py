@@ -1,8 +1,8 @@
 """What makes motion steadier beside a fade? A budget in steps, hysteresis, pages that fade in.
 
 The first is beside the tolerance that each view would have alone, also in the frames after the camera has
-stopped where steps are farthest behind. The others are trials: cuts with a state, made of the metrics that
-selection has. docs/notes/steadiness.md is about the results.
+stopped where steps are farthest behind. Hysteresis is a trial, and so are pages beside what a pool does: cuts
+with a state, made of the metrics that selection has. docs/notes/steadiness.md is about the results.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from v3dg.select import rule_of
 _FAR = 1.15  # how much farther away hysteresis begins to look, so that it is in its stride at the first frame
 _FAR_FRAMES = 30
 _SWAY = 12  # frames to one side
+_ARRIVAL_FRAMES = 8  # as csrc/residency/page_table.h has them
 _HEADROOM_PARTS = 32  # as csrc/select/select_math.h has them
 
 
@@ -158,11 +159,30 @@ class Arrives:
     def __call__(self, scene: Scene, camera: Camera) -> Options:
         metric, offset = metrics_of(scene, camera)
         ramp = np.clip((np.minimum(metric, 2 * self.high) - self.low) / (self.high - self.low), 0, 1)
-        levels = [scene.bundles[b].groups.level for b in scene.instance_bundle]
-        waits = np.concatenate([level.max() - level for level in levels]) if self.by_level else 0
-        arrived = np.clip(self.frame / self.frames - waits, 0.0, 1.0)
+        arrived = self.arrived(scene, camera)
         self.frame += 1
         return {"cut": cut_of(scene, np.minimum(ramp, arrived), offset)}
+
+    def arrived(self, scene: Scene, camera: Camera) -> Any:
+        """Shares to which the pages of the groups of all instances have faded in."""
+        levels = [scene.bundles[b].groups.level for b in scene.instance_bundle]
+        waits = np.concatenate([level.max() - level for level in levels]) if self.by_level else 0
+        return np.clip(self.frame / self.frames - waits, 0.0, 1.0)
+
+
+class ArrivesInPool(Arrives):
+    """The same as a renderer with a pool has it, which reads pages while true pictures are drawn."""
+
+    def __init__(self, scene: Scene, tolerance: float, fade: float) -> None:
+        super().__init__(tolerance, fade, 0, by_level=True)
+        self.options: Any = {"tolerance": tolerance, "fade": fade}
+        self.renderer = Renderer(scene, device="cpu", memory="1GB")
+
+    def arrived(self, scene: Scene, camera: Camera) -> Any:
+        self.renderer.render(camera, **self.options)
+        pool: Any = self.renderer._frame._pool
+        shares = [pool.core.arrived(b)[:-1] / _ARRIVAL_FRAMES for b in range(len(scene.bundles))]
+        return np.concatenate([shares[b] for b in scene.instance_bundle])
 
 
 def main(config: Config) -> None:
@@ -255,6 +275,7 @@ def hysteresis_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str,
 def page_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
     tolerance, fade = config.tolerance, config.fade
     cuts: dict[str, Cut] = {"all there": {"tolerance": tolerance, "fade": fade}}
+    cuts["as it is"] = ArrivesInPool(scene, tolerance, fade)
     for frames in config.arrivals:
         cuts[f"together, {frames}"] = Arrives(tolerance, fade, frames, by_level=False)
         cuts[f"by level, {frames}"] = Arrives(tolerance, fade, frames, by_level=True)
