@@ -134,8 +134,9 @@ class Renderer:
 
     With `memory`, only a part of the bundles is resident, so that they may be far larger than memory: pages
     come in from the files as views need them, read by other threads. A picture waits for none of them: where
-    one is missing, the coarser clusters above it are drawn. Use `settle` for a picture that misses nothing.
-    If a view needs more than there is room for, the tolerance is raised until it fits.
+    one is missing, the coarser clusters above it are drawn; with a fade, pages fade in. Use `settle` for a
+    picture that misses nothing. If a view needs more than there is room for, the tolerance is raised until it
+    fits.
 
     Args:
         color_by: As in `v3dg.render`; with `memory`, "appearance".
