@@ -246,7 +246,8 @@ class BoundSceneFrame {
         const Work work(device_);
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, shade.with_depth);
         const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
-        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, image, work.stream());
+        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, image,
+                                        shade.min_transmittance, work.stream());
         return std::make_unique<BoundDrawing>(
             NewPictures{std::move(picture)},
             py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights), device_,
@@ -337,7 +338,9 @@ class BoundSceneFrame {
             pictures.push_back(picture_of(whole, shade.with_depth));
             image[k] = pictures.back().on_device(device_, eye, shade);
         }
-        return eyes.are_two ? cuda::images_of_eyes(image[0], image[1]) : cuda::EyeImages{{image[0], {}}, 1};
+        const float stop = shade.min_transmittance;
+        return eyes.are_two ? cuda::images_of_eyes(image[0], image[1], stop)
+                            : cuda::EyeImages{{image[0], {}}, 1, stop};
     }
 
     void set_models_on_device(const py::list& models, const py::list& palettes) {
@@ -417,7 +420,7 @@ class BoundAssetFrame {
         const cuda::FrameImage image = picture.on_device(device, camera.camera, shade);
         const cuda::PackedModel& packed = *model.on_device().packed;
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
-                                    work.stream(), &packed.packed());
+                                    work.stream(), &packed.packed(), shade.min_transmittance);
         return std::make_unique<BoundDrawing>(NewPictures{std::move(picture)}, py::cast(this), device,
                                               std::move(drawing), SelectRule{});
 #else
