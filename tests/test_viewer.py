@@ -454,6 +454,23 @@ def test_a_new_request_ends_a_large_picture(rendering):
     assert rendering.sent[-1] == (2, (160, 80), True)
 
 
+def test_a_larger_picture_that_is_late_is_not_sent(rendering):
+    draw = rendering.scene_view.frame
+
+    def frame(view, size, settings, stop):
+        picture = draw(view, size, settings, stop)
+        if (view, size) == (1, (80, 40)):  # something new is asked for when it is nearly done
+            rendering.loop.ask(Request(2, (160, 80), Settings()))
+        return picture
+
+    rendering.scene_view.frame = frame
+    rendering.loop.ask(Request(1, (160, 80), Settings()))
+    wait(rendering.is_final)
+    assert rendering.sent[0] == (1, (40, 20), False)
+    assert (1, (80, 40), False) not in rendering.sent
+    assert rendering.sent[-1] == (2, (160, 80), True)
+
+
 def test_of_many_requests_the_last_is_drawn(rendering):
     for view in range(200):
         rendering.loop.ask(Request(view, (160, 80), Settings()))

@@ -11,6 +11,7 @@
 #include <string>
 
 #include "base/parallel_for.h"
+#include "base/stop.h"
 #include "project/project.h"
 #include "rasterize/rasterize.h"
 #include "rasterize/rasterize_math.h"
@@ -130,11 +131,13 @@ constexpr uint64_t kFewGaussians = 65536;
 // gaussians of a piece tell where it is drawn and how much it covers.
 template <class T>
 static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std::vector<Piece>& pieces,
-                                    const Pinhole<T>& camera, const Window& window, double band_bytes) {
+                                    const Pinhole<T>& camera, const Window& window,
+                                    const std::atomic<bool>* stop) {
     if (pieces.empty() || pieces.back().first + pieces.back().count <= kFewGaussians) return {window};
     constexpr uint64_t kFew = 16;
     std::vector<Reach> reach(pieces.size());
     parallel_for(pieces.size(), 64, [&](size_t p) {
+        if (is_stopped(stop)) return;
         V3DG_DISPATCH_ISA(project<T>, draws[pieces[p].draw], pieces[p].skip, std::min(kFew, pieces[p].count),
                           camera, Window{}, nullptr, nullptr, 0, reach[p]);
     });
@@ -155,7 +158,7 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std
             bytes += share;
         }
     }
-    const double num_bands = std::ceil(bytes / band_bytes);
+    const double num_bands = std::ceil(bytes / band_bytes_of(stop));
     std::vector<Window> bands{window};
     double above = 0;
     for (int r = 0; r + 1 < grid.rows; ++r) {
@@ -167,10 +170,6 @@ static std::vector<Window> bands_of(const std::vector<Draw<T>>& draws, const std
         bands.push_back({window.x0, edge, window.x1, window.y1});
     }
     return bands;
-}
-
-static bool is_stopped(const std::atomic<bool>* stop) {
-    return stop != nullptr && stop->load(std::memory_order_relaxed);
 }
 
 // Draws one band; `is_first` of a picture's bands finds out what each piece reaches.
@@ -202,6 +201,7 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
                                   static_cast<uint32_t>(piece.first), reach);
             piece.reach = reach;
         }
+        if (is_stopped(stop)) return;
         chunk_first[c] = first;
         chunk_count[c] = static_cast<uint32_t>(count);
         room.keep(count);
@@ -210,7 +210,9 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
     ws.room = room.used();
     ws.most_room = std::max(ws.most_room, ws.room);
     const double projected = now();
-    join_chunks(chunks.size(), grid, ws.lists);
+    if (is_stopped(stop)) return;
+    join_chunks(chunks.size(), grid, ws.lists, stop);
+    if (is_stopped(stop)) return;
     const double binned = now();
 
     const uint64_t* offset = ws.lists.offset.data();
@@ -250,9 +252,8 @@ RenderCounts render(const std::vector<Draw<T>>& draws, const Pinhole<T>& camera,
                     bool keep_source, Workspace<T>& ws, const std::atomic<bool>* stop) {
     RenderCounts counts{};
     std::vector<Piece> pieces = pieces_of(draws);
-    const std::vector<Window> bands =
-        keep_source ? std::vector<Window>{picture.window}
-                    : bands_of(draws, pieces, camera, picture.window, band_bytes_of(stop));
+    const std::vector<Window> bands = keep_source ? std::vector<Window>{picture.window}
+                                                  : bands_of(draws, pieces, camera, picture.window, stop);
     for (size_t b = 0; b < bands.size() && !is_stopped(stop); ++b)
         render_band(draws, pieces, b == 0, camera, band_of(picture, bands[b]), keep_source, ws, stop, counts);
     for (const Piece& piece : pieces) {

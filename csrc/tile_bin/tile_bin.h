@@ -1,5 +1,6 @@
 #pragma once
 
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
@@ -46,8 +47,9 @@ template <class T>
 void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const TileGrid& grid, size_t chunk,
                TileLists& out);
 
-// Makes one list a tile of those of the chunks.
-void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out);
+// Makes one list a tile of those of the chunks. Once `stop` is true, returns soon and leaves them unfinished.
+void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
+                 const std::atomic<bool>* stop = nullptr);
 
 // Sorts one tile's entries by depth; equal depths stay in their order. `scratch` has room for as many.
 // Double-precision records are ordered by their own depth, which float32 bits do not hold.

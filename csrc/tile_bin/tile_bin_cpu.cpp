@@ -4,6 +4,7 @@
 #include <cstring>
 
 #include "base/parallel_for.h"
+#include "base/stop.h"
 
 // Each chunk is counted, scanned and scattered alone, and most reach few tiles; then each tile takes what is
 // its own, chunk by chunk, so the order of the entries does not depend on which thread took which chunk.
@@ -44,7 +45,7 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
     }
 }
 
-void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out) {
+void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out, const std::atomic<bool>* stop) {
     const size_t num_tiles = grid.size(), stride = num_tiles + 1;
     const uint32_t* from = out.chunk_offset.data();
     uint64_t* offset = out.offset.reserve(stride);
@@ -63,6 +64,7 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out) {
         for (size_t c = 0; c < num_chunks; ++c) {
             const uint32_t* here = from + c * stride;
             if (here[first] == here[last]) continue;
+            if (is_stopped(stop)) return;
             const uint64_t* source = out.chunk_entry[c].data();
             for (size_t t = first; t < last; ++t) {
                 std::copy(source + here[t], source + here[t + 1], entry + next[t - first]);

@@ -173,6 +173,8 @@ class RenderLoop:
         steps = None if is_larger else self._steps
         for size in sizes:
             frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0), steps)
+            if self._has_news():
+                return
             self._send(frame, size == sizes[-1], request.number)
         is_on_way = has_budget and not is_larger
         while is_on_way:  # for a budget's tolerance goes in steps

@@ -9,6 +9,10 @@ import { Panel, SHOWS, make } from "./panel.js";
 
 const MOST_RATIO = 2; // px of the picture for one of the page
 const MOST_FRAME_SECONDS = 0.1; // a tab that was hidden does not leap
+// Where the browser itself takes longer for a frame, as without a GPU, the last picture follows the hand so often only: the
+// server may be on the same cores.
+const SLOW_FRAME_MS = 25;
+const SELDOM_MS = 100;
 const MOST_PATH_SECONDS = 600; // which the server takes
 const TOOLS = ["move", "turn", "size"];
 const MODES = ["orbit", "fly", "walk"];
@@ -26,9 +30,10 @@ class App {
     [this.path, this.secondsOfAView, this.filmSize, this.isRecording] = [[], 2, "1280 x 720", false];
     [this.greeting, this.scene, this.picture, this.asked, this.bookmarks] = [null, null, null, null, []];
     [this.film, this.through, this.needsFrame, this.last, this.number] = [null, null, false, 0, 0];
+    [this.frameMs, this.wantedAt, this.placedAt, this.isNew] = [0, 0, 0, false];
     this.stage = element("stage");
     this.context = element("picture").getContext("bitmaprenderer");
-    this.overlay = new Overlay(element("overlay"), this);
+    this.overlay = new Overlay(element("overlay"), element("compass"), this);
     this.input = new Input(element("overlay"), element("pad"), this);
     this.panel = new Panel(element("panel"), this);
     new ResizeObserver(() => this.resize()).observe(this.stage);
@@ -108,11 +113,13 @@ class App {
   }
 
   async show(message, bytes) {
+    // The second picture for what is no longer looked at: it was on its way when the camera moved.
+    if (message.number !== this.number && message.number === this.picture?.number) return;
     const bitmap = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
     const canvas = element("picture");
     [canvas.width, canvas.height] = message.size;
     this.context.transferFromImageBitmap(bitmap);
-    this.picture = message;
+    [this.picture, this.isNew] = [message, true];
     this.camera.ahead = message.distance ?? this.camera.ahead;
     const now = performance.now();
     if (message.final || !(now - this.figuresAt < 200)) {
@@ -166,7 +173,7 @@ class App {
   // Draw the overlay in the next frame, and ask for a picture if another one is wanted.
   redraw() {
     if (this.needsFrame) return;
-    this.needsFrame = true;
+    [this.needsFrame, this.wantedAt] = [true, performance.now()];
     requestAnimationFrame((now) => this.frame(now));
   }
 
@@ -174,6 +181,7 @@ class App {
     this.needsFrame = false;
     if (!this.scene) return;
     const seconds = M.clamp((now - this.last) / 1000, 1e-3, MOST_FRAME_SECONDS);
+    if (this.last === this.placedAt) this.frameMs = Math.max(performance.now() - this.wantedAt, 0.9 * this.frameMs);
     this.last = now;
     const isPushed = this.input.advance(seconds);
     this.camera.advance(seconds);
@@ -181,8 +189,11 @@ class App {
     if (isPushed || this.camera.flight || this.film) this.redraw();
     if (this.isRecording && !(now - this.recordedAt < 1000 / 30)) this.keep(now);
     this.ask();
+    if (this.frameMs > SLOW_FRAME_MS && !this.isNew && now - this.placedAt < SELDOM_MS) return this.redraw();
+    [this.isNew, this.placedAt] = [false, now];
     this.place();
     this.overlay.draw();
+    return undefined;
   }
 
   ask() {

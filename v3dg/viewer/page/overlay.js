@@ -9,10 +9,11 @@ const MOST_THUMBNAILS = 40;
 const RING = [...Array(49).keys()].map((i) => (2 * Math.PI * i) / 48);
 
 export class Overlay {
-  constructor(canvas, app) {
+  constructor(canvas, compass, app) {
     this.canvas = canvas;
     this.app = app;
     this.context = canvas.getContext("2d");
+    this.arms = compass.getContext("2d");
     this.thumbnails = new Map();
   }
 
@@ -20,6 +21,8 @@ export class Overlay {
     const ratio = window.devicePixelRatio || 1;
     [this.canvas.width, this.canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
     this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    this.arms.canvas.width = this.arms.canvas.height = Math.round(80 * ratio);
+    this.arms.setTransform(ratio, 0, 0, ratio, 0, 0);
     [this.width, this.height] = [width, height];
   }
 
@@ -59,15 +62,19 @@ export class Overlay {
   }
 
   draw() {
+    const { app } = this;
+    if (this.width > 700) this.compass();
+    // A layer that shows nothing is not blended over the picture, which takes long where there is no GPU.
+    const isEmpty = !app.settings.frozen && !app.showsFrusta && !app.selected;
+    this.canvas.style.opacity = isEmpty ? 0 : 1;
+    if (isEmpty) return;
     this.context.clearRect(0, 0, this.width, this.height);
     // Browsers may not show a frame that is only cleared.
     this.context.fillStyle = "#00000003";
     this.context.fillRect(0, 0, 1, 1);
-    const { app } = this;
     if (app.settings.frozen) this.frustum(app.settings.frozen, 0.08 * app.camera.radius, "#ffbe3c", 2);
     if (app.showsFrusta) this.frusta();
     if (app.selected) this.selection();
-    if (this.width > 700) this.compass();
   }
 
   corners(view, depth) {
@@ -142,20 +149,21 @@ export class Overlay {
   }
 
   compass() {
-    const { context } = this;
+    const { arms: context } = this;
+    context.clearRect(0, 0, 80, 80);
     const turned = M.inverse(this.app.camera.wxyz);
-    const arms = ["x", "y", "z"].map((name, i) => [name, M.rotate(turned, AXES[name]), COLORS[i]]);
+    const axes = ["x", "y", "z"].map((name, i) => [name, M.rotate(turned, AXES[name]), COLORS[i]]);
     context.font = "11px system-ui";
     context.textAlign = "center";
     context.textBaseline = "middle";
-    for (const [name, [x, y], color] of arms.sort((a, b) => b[1][2] - a[1][2])) {
+    for (const [name, [x, y], color] of axes.sort((a, b) => b[1][2] - a[1][2])) {
       context.strokeStyle = context.fillStyle = color;
       context.lineWidth = 2;
       context.beginPath();
-      context.moveTo(38, 42);
-      context.lineTo(38 + 20 * x, 42 + 20 * y);
+      context.moveTo(40, 40);
+      context.lineTo(40 + 20 * x, 40 + 20 * y);
       context.stroke();
-      context.fillText(name, 38 + 28 * x, 42 + 28 * y);
+      context.fillText(name, 40 + 28 * x, 40 + 28 * y);
     }
   }
 
