@@ -1,6 +1,6 @@
 """Let donuts fall into a pile, and film it: the scene moves and the cut is chosen anew in every frame.
 
-Wants the extra `video`: pip install '.[video]' && python examples/falling_donuts.py
+Needs the extra `video`: pip install '.[video]' && python examples/falling_donuts.py
 """
 
 from __future__ import annotations

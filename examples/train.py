@@ -3,7 +3,7 @@
 The pictures here are of a donut that is made for it; yours come from a camera. What is trained is written as
 an asset, to which `v3dg build` gives levels.
 
-Wants torch: pip install '.[torch]' && python examples/train.py
+Needs torch: pip install '.[torch]' && python examples/train.py
 """
 
 from __future__ import annotations

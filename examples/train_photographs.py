@@ -5,7 +5,7 @@ Takes a folder as COLMAP's `image_undistorter` writes it, with `images/` and a m
 held out, and what is trained is measured on those. Rates and schedule are those of gsplat's
 `simple_trainer.py`, but for how long it grows. docs/photographs.md goes on from there.
 
-Wants torch and gsplat, pycolmap for models of COLMAP, and a GPU for more than a few hundred steps:
+Needs torch and gsplat, pycolmap for models of COLMAP, and a GPU for more than a few hundred steps:
 pip install '.[torch,colmap]' gsplat==1.5.3 && python examples/train_photographs.py capture/
 """
 

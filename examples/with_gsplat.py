@@ -1,6 +1,6 @@
 """Choose what one view needs with v3dg, and draw it with gsplat: a selection is gaussians for any rasterizer.
 
-Wants a GPU: pip install '.[torch]' gsplat==1.5.3 && python examples/with_gsplat.py
+Needs a GPU: pip install '.[torch]' gsplat==1.5.3 && python examples/with_gsplat.py
 """
 
 from __future__ import annotations

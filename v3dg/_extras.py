@@ -7,6 +7,7 @@ from typing import Any
 
 EXTRAS = {
     "torch": ("torch>=2.2", "CUDA and gradients"),
+    "msgspec": ("msgspec>=0.18.6", "the viewer"),
     "websockets": ("websockets>=14.1", "the viewer"),
     "flip_evaluator": ("flip-evaluator>=1.6", "errors by FLIP"),
     "av": ("av>=12", "videos"),

@@ -1,4 +1,4 @@
-"""Videos: pictures in a row in one file, written whole or not at all. Wants the extra `video`."""
+"""Videos: pictures in a row in one file, written whole or not at all. Needs the extra `video`."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ std::string printable(std::string name) {
     return name;
 }
 
-// The name of a file as the system wants it, and as messages show it.
+// The name of a file as the system takes it, and as messages show it.
 struct Path {
     explicit Path(py::object path) : shown(path) {
         PyObject* bytes = nullptr;

@@ -2,7 +2,7 @@
 
     python tests/fuzz/run.py SECONDS
 
-It is guided by coverage and wants clang++ (CLANG names another one). It works in build/fuzz; what stops it is
+It is guided by coverage and needs clang++ (CLANG names another one). It works in build/fuzz; what stops it is
 there as crash-*. Inputs go to tests/fuzz/corpus, which test_fuzz.py replays. What is not C++ is attack.py's.
 """
 

@@ -34,7 +34,7 @@ def golden_scenes():
 
 
 def load_gsplat():
-    """gsplat's torch functions as a module; None where gsplat is not installed. Its package wants CUDA."""
+    """gsplat's torch functions as a module; None where gsplat is not installed. Its package needs CUDA."""
     spec = importlib.util.find_spec("gsplat")
     if spec is None or spec.origin is None:
         return None

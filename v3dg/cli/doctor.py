@@ -58,7 +58,11 @@ def _findings() -> Iterator[tuple[str, str | None, str]]:
     browser = None
     with contextlib.suppress(webbrowser.Error):
         browser = getattr(webbrowser.get(), "name", "there")
-    yield "web browser", browser, "for `v3dg view`, whose address any machine's browser can open"
+    yield (
+        "web browser",
+        browser,
+        "or no screen: open the address that `v3dg view` prints in any browser",
+    )
 
 
 def _answer(*command: str, line: int = 0) -> str | None:

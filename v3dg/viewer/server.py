@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from v3dg import _extras
 from v3dg._version import __version__
 from v3dg.cameras import Camera, VectorLike
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE
@@ -79,12 +80,11 @@ class Site:
         budget: int | None = None,
         up: VectorLike = (0.0, 0.0, 1.0),
     ) -> None:
-        try:
-            from v3dg.viewer.gate import Gate
-            from v3dg.viewer.tab import Tab
-        except ImportError as error:
-            advice = "which is not installed; pip install 'v3dg[viewer]'"
-            raise ImportError(f"the viewer needs {error.name}, {advice}") from error
+        for module in ("msgspec", "websockets.asyncio.server"):
+            _extras.load(module)
+        from v3dg.viewer.gate import Gate
+        from v3dg.viewer.tab import Tab
+
         self._make_tab = Tab
         self._scene_view, self._name = scene_view, name
         self._photographs = [dict(photographs or {}).get(camera) for camera in cameras or {}]

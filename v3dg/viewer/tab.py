@@ -195,7 +195,7 @@ class Tab:
     def _save_film(self, message: messages.Save, stop: _core.Stop) -> None:
         request, views = message.look.request(), message.camera_path().film(_FPS)
         width, height = request.size
-        size = max(width // 2 * 2, 2), max(height // 2 * 2, 2)  # as H.264 wants it
+        size = max(width // 2 * 2, 2), max(height // 2 * 2, 2)  # as H.264 needs it
         steps = _core.BudgetSteps()
 
         def pictures() -> Iterator[Pixels]:
