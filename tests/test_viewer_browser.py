@@ -266,6 +266,21 @@ def test_keys_fly_at_a_pace_that_suits_the_scene(browser, site):
     assert max(shares) < 3 * min(shares)
 
 
+def test_who_goes_on_pushing_against_what_is_near_comes_through(tab):
+    tab.settled()
+    tab.page.evaluate("viewer.camera.ahead = 0.01 * viewer.scene.radius")
+    paces = tab.page.evaluate(
+        """[0, 1, 10].map((seconds) => {
+            for (let t = 0; t < seconds; t += 0.02) viewer.camera.move([0, 0, 1], 0.02);
+            return viewer.camera.pace / viewer.scene.radius;
+        })"""
+    )
+    assert paces[0] == pytest.approx(0.02)
+    assert paces[0] < paces[1] < paces[2] == pytest.approx(0.2)
+    tab.page.evaluate("viewer.camera.move([0, 0, 0], 0.02)")
+    assert tab.page.evaluate("viewer.camera.pace / viewer.scene.radius") == pytest.approx(0.02)
+
+
 def test_speed_slider_and_keys_change_the_pace(tab):
     pace = tab.page.evaluate("viewer.camera.pace")
     tab.set("Speed", np.log(4))
@@ -475,6 +490,8 @@ def test_phone_has_the_picture_to_itself(browser, site):
         assert tab.page.locator("#stage").bounding_box()["width"] == 390
         assert not tab.page.locator("#panel").is_visible()
         assert (picture.max(axis=2) > 30).mean() > 0.03
+        half_width = "Math.atan(Math.tan(viewer.camera.fov_y / 2) * viewer.aspect)"
+        assert tab.page.evaluate(f"Math.asin(0.9 * viewer.scene.radius / viewer.camera.distance) < {half_width}")
         tab.page.touchscreen.tap(195, 300)
         tab.page.get_by_role("button", name="Panel").tap()
         assert tab.page.locator("#panel").bounding_box()["y"] > 380

@@ -20,6 +20,7 @@ export class Camera {
     this.radius = 1; // of the scene
     this.ahead = null; // distance to what is in the middle of the picture
     this.velocity = [0, 0, 0];
+    this.held = 0; // seconds for which one has pushed against what is near
     this.flight = null;
   }
 
@@ -31,7 +32,12 @@ export class Camera {
   // Units a second at the slider's 1: the scene's size tells how quick, what is near how careful.
   get pace() {
     const near = this.ahead ?? this.radius;
-    return this.speed * M.clamp(0.6 * near, 0.02 * this.radius, 0.6 * this.radius);
+    return this.speed * M.clamp(0.6 * near, this.least, 0.6 * this.radius);
+  }
+
+  // However near things are: careful at first, but who goes on pushing comes through.
+  get least() {
+    return 0.02 * this.radius * M.clamp(2 ** (2 * (this.held - 0.5)), 1, 10);
   }
 
   view(aspect) {
@@ -80,6 +86,8 @@ export class Camera {
     const ways = this.mode === "walk"
       ? [this.right, this.up, M.unit(M.cross(this.up, this.right))]
       : [this.right, this.mode === "fly" ? M.mul(this.down, -1) : this.up, this.forward];
+    const isNear = push.some(Boolean) && 0.6 * (this.ahead ?? this.radius) < 0.05 * this.radius;
+    this.held = isNear ? this.held + seconds : 0;
     const wanted = push.reduce((sum, part, i) => M.add(sum, M.mul(ways[i], part * this.pace)), [0, 0, 0]);
     this.velocity = M.mix(this.velocity, wanted, 1 - Math.exp(-seconds / 0.07));
     if (M.length(this.velocity) < 1e-3 * this.pace) {

@@ -100,7 +100,7 @@ class App {
     [this.selected, this.undone, this.path, this.asked] = [null, [], [], null];
     this.bookmarks = this.load();
     if (isFirst) {
-      this.camera.put(this.greeting.home);
+      this.camera.put(this.home);
       this.camera.focus = scene.center;
     } else {
       this.cameras = [];
@@ -333,7 +333,7 @@ class App {
   }
 
   // All of the scene, from a little above, whichever axis is up.
-  showAll() {
+  get home() {
     const { scene, camera } = this;
     const home = this.greeting.home;
     const isHome = M.dot(M.unit(this.greeting.up), M.unit(camera.up)) > 0.9999;
@@ -347,7 +347,11 @@ class App {
     const half = Math.atan(Math.tan(fov_y / 2) * Math.min(1, this.aspect));
     const distance = (0.95 * scene.radius) / Math.sin(half);
     const position = M.sub(scene.center, M.mul(forward, distance));
-    camera.flyTo({ wxyz: M.looking(forward, camera.up), position, fov_y }, scene.center);
+    return { wxyz: M.looking(forward, camera.up), position, fov_y };
+  }
+
+  showAll() {
+    this.camera.flyTo(this.home, this.scene.center);
     this.redraw();
   }
 
