@@ -346,6 +346,15 @@ def test_pacer_gives_way_at_once_and_takes_back_slowly():
     assert 800 < pacer.draft(full).size[0] < 1600
 
 
+def test_the_first_picture_after_a_rest_has_half_the_work():
+    pacer, full = Pacer(60.0), (1920, 1080)
+    for _ in range(60):
+        draft = pacer.draft(full)
+        pacer.drew(draft, 40 * math.prod(draft.size) / (960 * 540))
+    pacer.rested()
+    assert math.prod(pacer.draft(full).size) == pytest.approx(math.prod(draft.size) / 2, rel=0.02)
+
+
 def test_sizes_double_up_to_the_full_one():
     assert finer_sizes((100, 50), (800, 400)) == [(200, 100), (400, 200), (800, 400)]
     assert finer_sizes((300, 150), (800, 400)) == [(800, 400)]
@@ -387,6 +396,9 @@ class NoPacer:
         return Draft(full)
 
     def drew(self, draft, milliseconds):
+        pass
+
+    def rested(self):
         pass
 
 

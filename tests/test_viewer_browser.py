@@ -491,7 +491,8 @@ def test_phone_has_the_picture_to_itself(browser, site):
         assert not tab.page.locator("#panel").is_visible()
         assert (picture.max(axis=2) > 30).mean() > 0.03
         half_width = "Math.atan(Math.tan(viewer.camera.fov_y / 2) * viewer.aspect)"
-        assert tab.page.evaluate(f"Math.asin(0.9 * viewer.scene.radius / viewer.camera.distance) < {half_width}")
+        fits = f"Math.asin(0.9 * viewer.scene.radius / viewer.camera.distance) < {half_width}"
+        assert tab.page.evaluate(fits)
         tab.page.touchscreen.tap(195, 300)
         tab.page.get_by_role("button", name="Panel").tap()
         assert tab.page.locator("#panel").bounding_box()["y"] > 380

@@ -65,6 +65,10 @@ class Pacer:
         share = 0.3 if speed > self._work_per_ms > 0 else 1.0
         self._work_per_ms += share * (speed - self._work_per_ms)
 
+    def rested(self) -> None:
+        """Take half the work for the next: a browser on these cores has a large picture to move then."""
+        self._work_per_ms /= 2
+
 
 def scaled(full: Size, scale: float) -> Size:
     return max(1, round(scale * full[0])), max(1, round(scale * full[1]))
@@ -169,6 +173,7 @@ class RenderLoop:
         with self._changed:
             if self._changed.wait_for(self._has_news, REST_SECONDS):
                 return
+        self._pacer.rested()
         is_larger, has_budget = draft.size != request.size, request.settings.budget is not None
         steps = None if is_larger else self._steps
         for size in sizes:

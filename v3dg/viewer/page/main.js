@@ -30,7 +30,7 @@ class App {
     [this.path, this.secondsOfAView, this.filmSize, this.isRecording] = [[], 2, "1280 x 720", false];
     [this.greeting, this.scene, this.picture, this.asked, this.bookmarks] = [null, null, null, null, []];
     [this.film, this.through, this.needsFrame, this.last, this.number] = [null, null, false, 0, 0];
-    [this.frameMs, this.wantedAt, this.placedAt, this.isNew] = [0, 0, 0, false];
+    [this.frameMs, this.wantedAt, this.placedAt, this.movedAt, this.isNew] = [0, 0, 0, 0, false];
     this.stage = element("stage");
     this.context = element("picture").getContext("bitmaprenderer");
     this.overlay = new Overlay(element("overlay"), element("compass"), this);
@@ -189,7 +189,8 @@ class App {
     if (isPushed || this.camera.flight || this.film) this.redraw();
     if (this.isRecording && !(now - this.recordedAt < 1000 / 30)) this.keep(now);
     this.ask();
-    if (this.frameMs > SLOW_FRAME_MS && !this.isNew && now - this.placedAt < SELDOM_MS) return this.redraw();
+    const waited = now - Math.max(this.placedAt, this.movedAt);
+    if (this.frameMs > SLOW_FRAME_MS && !this.isNew && waited < SELDOM_MS) return this.redraw();
     [this.isNew, this.placedAt] = [false, now];
     this.place();
     this.overlay.draw();
@@ -205,6 +206,7 @@ class App {
       this.number += 1;
       this.link.send({ ...look, number: this.number });
       this.asked = text;
+      if (!this.isMoving) this.movedAt = this.last;
       this.isMoving = true;
       clearTimeout(this.resting);
       this.resting = setTimeout(() => this.rest(), 250);
