@@ -469,8 +469,8 @@ def test_a_new_request_ends_a_large_picture(rendering):
 def test_a_larger_picture_that_is_late_is_not_sent(rendering):
     draw = rendering.scene_view.frame
 
-    def frame(view, size, settings, stop):
-        picture = draw(view, size, settings, stop)
+    def frame(view, size, *rest):
+        picture = draw(view, size, *rest)
         if (view, size) == (1, (80, 40)):  # something new is asked for when it is nearly done
             rendering.loop.ask(Request(2, (160, 80), Settings()))
         return picture
