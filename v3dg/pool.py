@@ -3,15 +3,37 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import nullcontext
 
-from v3dg import _core
+from v3dg import _core, _device
 from v3dg._device import Device
+from v3dg.build.memory import free_bytes
 from v3dg.bundle import Bundle
 from v3dg.residency import ResidentScene, residency
 
+_RESERVE_BYTES = 1 << 30  # at most, for frames, tables and whatever else
 NUM_THREADS = 8  # that read pages; a disk answers several at once
 _WAIT_SECONDS = 0.05  # until Ctrl-C is heard
+
+
+def free_on(device: Device) -> int:
+    """Bytes of memory that a device can give."""
+    if not device.is_cuda:
+        return free_bytes()
+    import torch
+
+    _device.spare_memory(device)
+    return int(torch.cuda.mem_get_info(device.number)[0])
+
+
+def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
+    """Of a pool of half of what is free on the device, where not all fits there; None where it does."""
+    for where, num_bytes in residency.bytes_to_add(bundles, device).items():
+        free = free_on(where)
+        if num_bytes > free - min(free // 4, _RESERVE_BYTES):
+            return free_on(device) // 2
+    return None
 
 
 class Pool:

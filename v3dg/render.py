@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import check, color, real
-from v3dg.build.memory import in_bytes
+from v3dg.build.memory import in_bytes, in_mib
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, StereoCamera, check_camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage, Stats
-from v3dg.pool import Pool
+from v3dg.pool import Pool, chosen_bytes
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
 from v3dg.select import CutOptions, Selection, over_budget, rule_of
@@ -71,7 +71,7 @@ def render(
     min_transmittance: float | None = None,
     depth: bool = False,
     device: str | Device = "auto",
-    memory: int | str | None = None,
+    memory: int | str | None = "auto",
 ) -> RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
@@ -113,7 +113,7 @@ def render(
     shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
     pictures: list[Any] = []
     for view in [camera] if isinstance(camera, Camera | StereoCamera) else camera:
-        if memory is not None and cut is None:
+        if cut is None:
             frame.settle(subject, view, **options)
         pictures.append(frame.draw(subject, view, shade, cut, **options))
     return pictures[0] if isinstance(camera, Camera | StereoCamera) else pictures
@@ -132,15 +132,16 @@ class Renderer:
     at which a part of the budget is free, never below that of `render`, so that slow motion is steady
     (docs/fades.md). Without a fade, pictures are those of `render`.
 
-    With `memory`, only a part of the bundles is resident, so that they may be far larger than memory: pages
+    With a pool, only a part of the bundles is resident, so that they may be far larger than memory: pages
     come in from the files as views need them, read by other threads. A picture waits for none of them: where
     one is missing, the coarser clusters above it are drawn. Use `settle` for a picture that misses nothing.
     If a view needs more than there is room for, the tolerance is raised until it fits.
 
     Args:
-        color_by: As in `v3dg.render`; with `memory`, "appearance".
+        color_by: As in `v3dg.render`; with a pool, "appearance".
         device: As in `v3dg.render`. The renderer stays on it, whichever device is torch's current one later.
-        memory: For gaussians on the device: bytes, or text like "2GB". All are resident if None.
+        memory: Of a pool for gaussians on the device: bytes, or text like "2GB". All are resident if None.
+            "auto" is None where all fit into what is free, less a quarter of that or 1 GiB; else half of it.
 
     Raises:
         RuntimeError: Something is missing for the device.
@@ -153,10 +154,19 @@ class Renderer:
         *,
         color_by: ColorBy = "appearance",
         device: str | Device = "auto",
-        memory: int | str | None = None,
+        memory: int | str | None = "auto",
     ) -> None:
         self._subject = subject
         self._frame = _Frame(subject, color_by, _device.resolve(device), memory, moves=True)
+
+    @property
+    def memory(self) -> int | None:
+        """Bytes of the pool that it draws from; None where all is resident."""
+        return self._frame.memory
+
+    def __repr__(self) -> str:
+        of = "all is resident" if self.memory is None else f"a pool of {in_mib(self.memory)}"
+        return f"Renderer({self._subject!r}, {self._frame.device}, {of})"
 
     @overload
     def render(self, camera: Camera, **options: Unpack[_FrameOptions]) -> RenderedImage: ...
@@ -218,19 +228,23 @@ class _Frame:
     def __init__(
         self, subject: _Subject, color_by: ColorBy, device: Device, memory: _Memory, moves: bool = False
     ) -> None:
-        self._device, self._color_by = device, color_by
+        self.device, self._color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
         self._references: tuple[Any, ...] | None = None  # to those that were taken
         self._pool: Pool | None = None
         self._has_settled = False  # and drawn nothing since
-        self._memory = None if memory is None else in_bytes(memory)
+        # Without levels or in other colours, all has to be there.
+        has_pool = not isinstance(subject, Gaussians) and color_by == "appearance"
+        self._is_auto = memory == "auto" and has_pool
+        memory = None if memory == "auto" else memory
+        self.memory = None if memory is None else in_bytes(memory)  # of the pool
         if isinstance(subject, Gaussians):
             check("memory", memory is None, f"None for an asset, which has no pages, got {memory}")
             _check_asset(color_by)
             self._asset = _core.AssetFrame(_core.Model(_device.place(subject, device).rows))
         else:
             expected = f"'appearance' for a pool, got {color_by!r}"
-            check("color_by", memory is None or color_by == "appearance", expected)
+            check("color_by", memory is None or has_pool, expected)
             self._frame = _core.SceneFrame(device.number, moves)
             with residency.reading(subject, device) as resident:
                 self._take_models(resident)
@@ -254,10 +268,10 @@ class _Frame:
             drawing = self._asset.draw(camera.core, shade)
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
         rule = rule_of(**options)
-        with residency.reading(subject, self._device) as resident:
+        with residency.reading(subject, self.device) as resident:
             pool = self._take_models(resident)
             if pool is not None:
-                check("cut", cut is None, "none for a pool, which has its own, got one")
+                check("cut", cut is None, "none for a pool, which has its own, got one; give memory=None")
                 before = pool.core.status().bytes_in
                 drawing = self._frame.draw_resident(resident.core, pool.core, camera.core, rule, shade)
             elif cut is None:
@@ -280,10 +294,10 @@ class _Frame:
                 raise over_budget(options["budget"], stats.gaussians)
             chosen = stats.tolerance_px2 if options["budget"] is not None else rule.tolerance_px2
             if pool is not None:
-                return replace(_stats(stats, stats.tolerance_px2), **came_in)
+                return replace(_stats(stats, stats.tolerance_px2), memory=self.memory, **came_in)
             return _stats(stats, chosen if cut is None else cut.tolerance)
 
-        if not self._device.is_cuda:
+        if not self.device.is_cuda:
             finish()
         elif self._has_settled:
             drawing.finish()  # which may draw again, with pages that other views put in place of its own
@@ -299,14 +313,13 @@ class _Frame:
         """Bring in what a view needs."""
         real(timeout, "timeout", "seconds, at least 0", 0)
         rule = rule_of(**options)
-        if self._memory is None:
+        if isinstance(subject, Gaussians) or (self.memory is None and not self._is_auto):
             return
-        assert not isinstance(subject, Gaussians)
-        with residency.reading(subject, self._device) as resident:
+        with residency.reading(subject, self.device) as resident:
             pool = self._take_models(resident)
-        assert pool is not None
-        pool.settle(resident, camera.core, rule, timeout)
-        self._has_settled = True
+        if pool is not None:
+            pool.settle(resident, camera.core, rule, timeout)
+            self._has_settled = True
 
     def _take_models(self, resident: ResidentScene) -> Pool | None:
         """Have the gaussians of the scene's bundles at hand: in a pool, or all of them."""
@@ -314,23 +327,25 @@ class _Frame:
             return self._pool
         with residency.lock:
             bundles = resident.bundles
-            if self._memory is not None:
+            if self._is_auto and self.memory is None and self._num_models < len(bundles):
+                self.memory = chosen_bytes(bundles, self.device)
+            if self.memory is not None:
                 tables = [residency.table(bundle) for bundle in bundles]
                 if self._pool is None or self._pool.tables != tables:
                     self._pool = None  # its memory is needed
-                    self._pool = Pool(bundles, tables, self._device, self._memory)
+                    self._pool = Pool(bundles, tables, self.device, self.memory)
             elif self._num_models < len(bundles):
-                residency.set_models(self._frame, bundles, self._device, self._color_by)
+                residency.set_models(self._frame, bundles, self.device, self._color_by)
                 self._num_models = len(bundles)
             self._references = resident.references
             return self._pool
 
     def _here(self, ids: Any) -> Any:
-        if not self._device.is_cuda:
+        if not self.device.is_cuda:
             return ids
         import torch
 
-        return torch.tensor(ids, device=str(self._device))
+        return torch.tensor(ids, device=str(self.device))
 
 
 def shade_of(

@@ -218,6 +218,16 @@ class Bundle:
         return self._pages
 
     @property
+    def page_bytes(self) -> int:
+        """What all pages take together, in memory as in the file."""
+        return int(self._layout.page_bytes(self._codec).sum())
+
+    @property
+    def is_in_memory(self) -> bool:
+        """Whether all gaussians are, and not only those that are read page by page."""
+        return not isinstance(self._pages, FilePages)
+
+    @property
     def page_source(self) -> Any:
         """What the core reads single pages from: the file, or all gaussians where they are in memory."""
         if self._file is None or isinstance(self._pages, MemoryPages):

@@ -35,8 +35,9 @@ class Render(Cut, OnDevice):
     """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Red, green and blue of the background, each 0 to 1."""
-    memory: Annotated[str | None, option("SIZE")] = None
-    """Draw from so much memory of the device, as 2GB, with pages read from the files as cameras need them."""
+    memory: Annotated[str, option("SIZE")] = "auto"
+    """Draw from so much memory of the device, as 2GB, with pages read from the files as cameras need them.
+    all: from as much as it takes. auto: so if that fits into what is free, else from half of what is free."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -65,7 +66,7 @@ def run(options: Render) -> None:
             color_by=options.color_by,
             background=options.background,
             device=device,
-            memory=options.memory,
+            memory=None if options.memory == "all" else options.memory,
         )
         write_picture(path, _device.to_host(image.color))
         view = {"camera": name, "width": camera.width, "height": camera.height}

@@ -250,7 +250,8 @@ class SceneView:
     ) -> tuple[Any, Any, Any, int]:
         """Colour, alpha and depth of the window, and the gaussians in the frustum of the whole picture."""
         if self.device.is_cuda:
-            image = render(self.scene, camera, cut=cut, color_by=color_by, depth=True, device=self.device)
+            how: Any = {"color_by": color_by, "depth": True, "device": self.device, "memory": None}
+            image = render(self.scene, camera, cut=cut, **how)
             x0, y0, x1, y1 = window
             planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
             color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
