@@ -7,7 +7,7 @@ import v3dg
 import v3dg.pool
 from frames import Renderer, arrays, render
 from scenes_lod import blob, lod_bundle
-from v3dg import Bundle, Camera, Scene, _device
+from v3dg import Bundle, Camera, Scene, _core, _device
 from v3dg._device import CPU
 from v3dg.residency import residency
 
@@ -128,7 +128,8 @@ def test_a_scene_that_outgrows_what_is_free_goes_on_in_a_pool(path, device, free
 def test_what_needs_all_is_drawn_of_all(path, device, free):
     free(1)
     bundle = Bundle.open(path)
-    assert render(bundle, CAMERA, device=device, color_by="level").stats.memory is None
+    if device == "cuda":
+        assert render(bundle, CAMERA, device=device, color_by="level").stats.memory is None
     asset = bundle.gaussians
     assert render(asset, CAMERA, device=device).stats.memory is None
     free(max(size_of(path, device).values()))
@@ -151,3 +152,59 @@ def test_what_is_free_on_the_host_follows_the_container(monkeypatch):
     assert v3dg.pool.free_on(CPU) == 2_000_000
     texts["/sys/fs/cgroup/memory.max"] = "max\n"
     assert v3dg.pool.free_on(CPU) == 4096 << 10
+
+
+# Colours
+
+
+@pytest.fixture
+def scene(path):
+    """Two instances of one bundle, and one of another."""
+    scene = Scene()
+    scene.add(Bundle.open(path), positions=[(0.0, 0, 0), (2.5, 0, 0)])
+    scene.add(Bundle.open(path), positions=(-2.5, 1, 0))
+    return scene
+
+
+@pytest.mark.parametrize("by", ["level", "cluster", "residency"])
+@pytest.mark.parametrize(
+    "options", [{"tolerance": 2.0}, {"budget": 4000}, {"tolerance": 0.5, "min_level": 2}]
+)
+def test_false_colors_of_a_settled_pool_are_those_of_all(scene, by, options):
+    whole = render(scene, CAMERA, device="cpu", memory=None, color_by=by, **options)
+    pooled = render(scene, CAMERA, device="cpu", memory="64MB", color_by=by, **options)
+    assert pooled.stats.memory is not None
+    assert_same(pooled, whole)
+
+
+@pytest.mark.parametrize("fade", [None, 1.3])
+def test_residency_tells_what_waits_for_pages_from_what_is_wanted(scene, monkeypatch, fade):
+    there, alpha_there = np.float32(_core.shade_missing(0.0)), 0.9
+    options = {"tolerance": 0.5, "fade": fade}
+
+    def share_missing(image):
+        covered = image.alpha > alpha_there
+        return np.abs(image.color[covered] / image.alpha[covered][:, None] - there).max(axis=1) > 0.1
+
+    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)  # so that nothing is read until it is asked for
+    renderer = Renderer(scene, device="cpu", memory="64MB", color_by="residency")
+    first = renderer.render(CAMERA, **options)
+    assert share_missing(first).mean() > 0.99  # the coarsest, everywhere
+    coarse = renderer.render(CAMERA, tolerance=1e9)
+    assert share_missing(coarse).mean() == 0  # which is what is wanted here
+    shares = [share_missing(first).mean()]
+    pool = renderer._frame._pool.core
+    while renderer.render(CAMERA, **options).stats.missing:
+        for _ in range(20):
+            pool.read_one()
+        shares.append(share_missing(renderer.render(CAMERA, **options)).mean())
+    assert any(0.05 < share < 0.95 for share in shares)
+    assert shares[-1] == 0
+
+
+def test_what_misses_more_is_redder():
+    shades = np.array([_core.shade_missing(share) for share in (0.5, 1.0, 1.1, 4.0, 64.0, 1e6, np.inf)])
+    np.testing.assert_array_equal(shades[0], shades[1])
+    assert (shades[2:, 0] > 2 * shades[1, 0]).all()
+    assert (np.diff(shades[2:5, 1]) < -0.05).all()
+    np.testing.assert_array_equal(shades[5], shades[6])

@@ -403,6 +403,8 @@ class Shade:
         self, *, background: Sequence[float], min_transmittance: float, with_depth: bool
     ) -> None: ...
 
+def shade_missing(share: float) -> list[float]: ...
+
 class SceneFrame:
     """Draws scenes of the same bundles on one device."""
 
@@ -424,6 +426,8 @@ class SceneFrame:
         rule: Rule,
         shade: Shade,
         stop: Stop | None = None,
+        colors: list[Float32] = ...,
+        shows_missing: bool = False,
     ) -> Drawing: ...
     def draw_cut(
         self,

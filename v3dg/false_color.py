@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from v3dg import _core
-from v3dg._numbers import one_of
 from v3dg.bundle import Bundle
 
-ColorBy: TypeAlias = Literal["appearance", "level", "cluster"]
+ColorBy: TypeAlias = Literal["appearance", "level", "cluster", "residency"]
 
 # Hues from fine to coarse, of which neighbours differ in lightness, too.
 _LEVEL_COLORS = np.array(
@@ -44,11 +43,13 @@ def level_colors(count: int) -> npt.NDArray[np.float32]:
 
 def palette_of(bundle: Bundle, by: ColorBy) -> npt.NDArray[np.float32] | None:
     """Constant SH coefficients (C, 3) that clusters are drawn with; None for what they appear as."""
-    one_of(by, "color_by", get_args(ColorBy))
     if by == "appearance":
         return None
     level = bundle.clusters.level
-    colors = level_colors(bundle.num_levels)[level] if by == "level" else _scattered_colors(len(level))
+    if by == "residency":  # of all of it
+        colors = np.tile(np.array(_core.shade_missing(0.0), np.float32), (len(level), 1))
+    else:
+        colors = level_colors(bundle.num_levels)[level] if by == "level" else _scattered_colors(len(level))
     return np.ascontiguousarray((colors - 0.5) / _core.sh_base0, np.float32)
 
 

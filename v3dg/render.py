@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check, color, real
+from v3dg._numbers import check, color, one_of, real
 from v3dg.build.memory import in_bytes, in_mib
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, StereoCamera, check_camera
@@ -89,7 +89,8 @@ def render(
             follow each other, as in a film.
         cut: Draw what was selected before from this scene, whatever the camera: a cut to walk around. Takes
             the place of `tolerance`, `budget`, `min_level` and `fade`.
-        color_by: "level" or "cluster" colours gaussians by the one that they belong to.
+        color_by: "level" or "cluster" colours gaussians by the one that they belong to, "residency" by
+            whether that is what the tolerance asks for, or stands for finer ones whose pages are missing.
         background: Three numbers.
         min_transmittance: A pixel stops behind the gaussian that lets no more than this share of light
             through, 0 to 0.99, and gives that light to what it has blended: no channel is off by more than
@@ -138,7 +139,7 @@ class Renderer:
     If a view needs more than there is room for, the tolerance is raised until it fits.
 
     Args:
-        color_by: As in `v3dg.render`; with a pool, "appearance".
+        color_by: As in `v3dg.render`; with a pool on a CUDA device, "appearance".
         device: As in `v3dg.render`. The renderer stays on it, whichever device is torch's current one later.
         memory: Of a pool for gaussians on the device: bytes, or text like "2GB". All are resident if None.
             "auto" is None where all fit into what is free, less a quarter of that or 1 GiB; else half of it.
@@ -228,14 +229,15 @@ class _Frame:
     def __init__(
         self, subject: _Subject, color_by: ColorBy, device: Device, memory: _Memory, moves: bool = False
     ) -> None:
-        self.device, self._color_by = device, color_by
+        one_of(color_by, "color_by", get_args(ColorBy))
+        self.device, self.color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
         self._references: tuple[Any, ...] | None = None  # to those that were taken
         self._pool: Pool | None = None
         self._has_settled = False  # and drawn nothing since
-        # Without levels or in other colours, all has to be there.
-        has_pool = not isinstance(subject, Gaussians) and color_by == "appearance"
-        self._is_auto = memory == "auto" and has_pool
+        # Without levels, or on a GPU in other colours, all has to be there.
+        is_whole = isinstance(subject, Gaussians) or (device.is_cuda and color_by != "appearance")
+        self._is_auto = memory == "auto" and not is_whole
         memory = None if memory == "auto" else memory
         self.memory = None if memory is None else in_bytes(memory)  # of the pool
         if isinstance(subject, Gaussians):
@@ -243,8 +245,8 @@ class _Frame:
             _check_asset(color_by)
             self._asset = _core.AssetFrame(_core.Model(_device.place(subject, device).rows))
         else:
-            expected = f"'appearance' for a pool, got {color_by!r}"
-            check("color_by", memory is None or has_pool, expected)
+            expected = f"'appearance' for a pool on a CUDA device, got {color_by!r}"
+            check("color_by", memory is None or not is_whole, expected)
             self._frame = _core.SceneFrame(device.number, moves)
             with residency.reading(subject, device) as resident:
                 self._take_models(resident)
@@ -255,15 +257,16 @@ class _Frame:
         camera: Camera | StereoCamera,
         shade: _core.Shade,
         cut: Selection | None,
+        stop: _core.Stop | None = None,
         **options: Any,
     ) -> Any:
-        """A picture; of a stereo camera, one for each eye."""
+        """A picture; of a stereo camera, one for each eye. Only with a pool, `stop` ends it."""
         check_camera(camera)
         if isinstance(camera, StereoCamera) and (cut is not None or isinstance(subject, Gaussians)):
             how = {"cut": cut, **options}
             return tuple(self.draw(subject, eye, shade, **how) for eye in camera.eyes)
         if isinstance(subject, Gaussians):
-            _check_asset(self._color_by, cut=cut, **options)
+            _check_asset(self.color_by, cut=cut, **options)
             assert isinstance(camera, Camera)
             drawing = self._asset.draw(camera.core, shade)
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
@@ -273,7 +276,9 @@ class _Frame:
             if pool is not None:
                 check("cut", cut is None, "none for a pool, which has its own, got one; give memory=None")
                 before = pool.core.status().bytes_in
-                drawing = self._frame.draw_resident(resident.core, pool.core, camera.core, rule, shade)
+                drawing = self._frame.draw_resident(
+                    resident.core, pool.core, camera.core, rule, shade, stop, *self._pool_colors(resident)
+                )
             elif cut is None:
                 drawing = self._frame.draw(resident.core, camera.core, rule, shade)
             else:
@@ -335,10 +340,16 @@ class _Frame:
                     self._pool = None  # its memory is needed
                     self._pool = Pool(bundles, tables, self.device, self.memory)
             elif self._num_models < len(bundles):
-                residency.set_models(self._frame, bundles, self.device, self._color_by)
+                residency.set_models(self._frame, bundles, self.device, self.color_by)
                 self._num_models = len(bundles)
             self._references = resident.references
             return self._pool
+
+    def _pool_colors(self, resident: ResidentScene) -> tuple[list[Any], bool]:
+        """Of clusters, unless they appear as they are; and whether they show what is missing."""
+        if self.color_by in ("appearance", "residency"):
+            return [], self.color_by == "residency"
+        return [residency.palette(bundle, self.color_by) for bundle in resident.bundles], False
 
     def _here(self, ids: Any) -> Any:
         if not self.device.is_cuda:

@@ -169,13 +169,17 @@ class Residency:
         self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy
     ) -> None:
         """Have a frame of a device draw these bundles, their gaussians or clusters in these colours."""
-        colors = [palette_of(bundle, color_by) for bundle in bundles]
+        colors = [self.palette(bundle, color_by) for bundle in bundles]
         palettes = [
             _core.Palette(self.table(bundle), sh, device.number)
             for bundle, sh in zip(bundles, colors, strict=True)
             if sh is not None
         ]
         frame.set_models([self.model(bundle, device) for bundle in bundles], palettes)
+
+    def palette(self, bundle: Bundle, color_by: ColorBy) -> NDArray[np.float32] | None:
+        """As `palette_of`."""
+        return self._once(bundle, ("palette", color_by), lambda: palette_of(bundle, color_by))
 
     def bytes_to_add(self, bundles: Sequence[Bundle], device: Device) -> dict[Device, int]:
         """What it takes, on the device and on the host, to have all gaussians there that are not yet."""

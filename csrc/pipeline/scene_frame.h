@@ -14,6 +14,8 @@ struct SceneModel {
     ClusterAppearance appearance;
     Palette palette;
     const Codes* codes = nullptr;
+    // [C][3] coefficients of the constant basis, in place of the palette where clusters lie here and there.
+    const float* cluster_sh = nullptr;
 };
 
 // A scene on the host: what selection reads of its bundles, their gaussians, and its instances.
@@ -24,6 +26,8 @@ struct HostScene {
     // As SelectInput has them.
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
+    // Colours say what is missing, where it is not of this tolerance, px2: see shade_missing().
+    const float* wanted_px2 = nullptr;
 };
 
 // What one frame came to.
@@ -66,6 +70,10 @@ constexpr float kMostShare = 2.0f;
 SceneFrameCounts draw_metrics(const HostScene& scene, const Camera& camera, const SelectRule& rule,
                               const GivenCut& given, const Picture<float>& picture,
                               const std::atomic<bool>* stop = nullptr);
+
+// The colour of a cluster whose metric is so many times the tolerance that is wanted: of the right level up
+// to `most`, else as much coarser as pages below it are missing.
+void shade_missing(float share, float most, float rgb[3]);
 
 // Draws all gaussians of one model, in the world, without a filter.
 SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -12,6 +12,7 @@ from v3dg import _device
 from v3dg._progress import counted
 from v3dg.cli._common import Cut, OnDevice, check_usage, finite, option, print_result, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths, up_lines
+from v3dg.false_color import ColorBy
 from v3dg.opening import open_with_cameras
 from v3dg.pictures import check_picture_path, write_picture
 from v3dg.render import render
@@ -31,7 +32,7 @@ class Render(Cut, OnDevice):
     fade: Annotated[float | None, option("FACTOR")] = None
     """Draw what is within this factor of the tolerance on two levels, one coming as the other goes, so that a
     film does not pop. Default: 1.02 for several views of a turntable, otherwise 1, which is none."""
-    color_by: Literal["appearance", "level", "cluster"] = "appearance"
+    color_by: ColorBy = "appearance"
     """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Red, green and blue of the background, each 0 to 1."""
