@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias, get_args, overload
@@ -313,7 +314,12 @@ class _Frame:
         return picture, RenderedImage(drawing, finish, is_right=True)
 
     def settle(
-        self, subject: _Subject, camera: Camera | StereoCamera, timeout: float = 30.0, **options: Any
+        self,
+        subject: _Subject,
+        camera: Camera | StereoCamera,
+        timeout: float = 30.0,
+        seconds: float = math.inf,
+        **options: Any,
     ) -> None:
         """Bring in what a view needs."""
         real(timeout, "timeout", "seconds, at least 0", 0)
@@ -323,7 +329,7 @@ class _Frame:
         with residency.reading(subject, self.device) as resident:
             pool = self._take_models(resident)
         if pool is not None:
-            pool.settle(resident, camera.core, rule, timeout)
+            pool.settle(resident, (camera.core, rule), timeout, seconds)
             self._has_settled = True
 
     def _take_models(self, resident: ResidentScene) -> Pool | None:

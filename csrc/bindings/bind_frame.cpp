@@ -489,14 +489,6 @@ void bind_frame(py::module_& m) {
         .def_property_readonly("depth", [](const BoundDrawing& d) { return d.picture().depth; })
         .def_property_readonly("right", &BoundDrawing::right, "Of two eyes: what the right one sees.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy, "Waits for the picture.");
-    m.def(
-        "shade_missing",
-        [](float share) {
-            std::array<float, 3> rgb{};
-            cpu::shade_missing(share, 1.0f, rgb.data());
-            return rgb;
-        },
-        "share"_a, "The colour of a cluster whose metric is this share of the tolerance that is wanted.");
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
         .def(py::init<int, bool>(), "device"_a, "moves"_a = false)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)

@@ -26,7 +26,7 @@ struct HostScene {
     // As SelectInput has them.
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
-    // Colours say what is missing, where it is not of this tolerance, px2: see shade_missing().
+    // Colours say what is missing, where it is not of this tolerance, px2: see missing_color().
     const float* wanted_px2 = nullptr;
 };
 
@@ -70,10 +70,6 @@ constexpr float kMostShare = 2.0f;
 SceneFrameCounts draw_metrics(const HostScene& scene, const Camera& camera, const SelectRule& rule,
                               const GivenCut& given, const Picture<float>& picture,
                               const std::atomic<bool>* stop = nullptr);
-
-// The colour of a cluster whose metric is so many times the tolerance that is wanted: of the right level up
-// to `most`, else as much coarser as pages below it are missing.
-void shade_missing(float share, float most, float rgb[3]);
 
 // Draws all gaussians of one model, in the world, without a filter.
 SceneFrameCounts draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,

@@ -2,12 +2,12 @@
 
 #include <algorithm>
 #include <chrono>
-#include <cmath>
 #include <memory>
 #include <stdexcept>
 #include <string>
 
 #include "math/sh.h"
+#include "pipeline/false_color.h"
 
 namespace v3dg {
 
@@ -122,7 +122,7 @@ std::vector<float> shares_of(const HostScene& scene, const Camera& camera, const
     return share;
 }
 
-void set_tint(const float rgb[3], float* tint) {
+void set_tint(const Rgb& rgb, float* tint) {
     for (int a = 0; a < 3; ++a) tint[a] = (rgb[a] - 0.5f) / static_cast<float>(kShBase0);
 }
 
@@ -137,15 +137,6 @@ SceneFrameCounts draw_pairs(const HostScene& scene, const Camera& camera, const 
 }
 
 }  // namespace
-
-void cpu::shade_missing(float share, float most, float rgb[3]) {
-    constexpr float kThere[3] = {0.13f, 0.45f, 0.5f}, kNear[3] = {1.0f, 0.85f, 0.3f},
-                    kFar[3] = {0.75f, 0.1f, 0.1f};
-    constexpr float kMostOctaves = 6;  // three levels, each of which has a quarter of the screen's area
-    const float octaves = share > most ? std::min(std::log2(share / most), kMostOctaves) : 0;
-    for (int a = 0; a < 3; ++a)
-        rgb[a] = share > most ? kNear[a] + octaves / kMostOctaves * (kFar[a] - kNear[a]) : kThere[a];
-}
 
 SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const SelectRule& rule,
                                  Span<const Picture<float>> pictures, const std::atomic<bool>* stop) {
@@ -167,8 +158,7 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const
             const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
             const int32_t own = table.own_group[given.cluster[s]];
             const bool is_finest = own >= 0 && table.level[own] <= rule.min_level;
-            float rgb[3];
-            shade_missing(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor, rgb);
+            const Rgb rgb = missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
             set_tint(rgb, tint.data() + 3 * s);
         }
     }
@@ -195,8 +185,8 @@ SceneFrameCounts cpu::draw_metrics(const HostScene& scene, const Camera& camera,
     std::vector<float> tint(3 * given.instance.size);
     const std::vector<float> share = shares_of(scene, camera, rule, given, rule.tolerance_px2);
     for (size_t s = 0; s < share.size(); ++s) {
-        const float grey = std::min(share[s], kMostShare), rgb[3] = {grey, grey, grey};
-        set_tint(rgb, tint.data() + 3 * s);
+        const float grey = std::min(share[s], kMostShare);
+        set_tint({grey, grey, grey}, tint.data() + 3 * s);
     }
     return draw_pairs(scene, camera, given, tint.data(), picture, stop);
 }

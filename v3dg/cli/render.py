@@ -10,7 +10,7 @@ import tyro
 
 from v3dg import _device
 from v3dg._progress import counted
-from v3dg.cli._common import Cut, OnDevice, check_usage, finite, option, print_result, table_lines
+from v3dg.cli._common import Cut, OnPool, check_usage, finite, option, print_result, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths, up_lines
 from v3dg.false_color import ColorBy
 from v3dg.opening import open_with_cameras
@@ -20,7 +20,7 @@ from v3dg.select import DEFAULT_FADE
 
 
 @dataclass
-class Render(Cut, OnDevice):
+class Render(Cut, OnPool):
     """Draw a scene from its cameras, a bundle or an asset from a turntable, or any from a camera file."""
 
     subject: tyro.conf.Positional[Path]
@@ -36,9 +36,6 @@ class Render(Cut, OnDevice):
     """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Red, green and blue of the background, each 0 to 1."""
-    memory: Annotated[str, option("SIZE")] = "auto"
-    """Draw from so much memory of the device, as 2GB, with pages read from the files as cameras need them.
-    all: from as much as it takes. auto: so if that fits into what is free, else from half of what is free."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -67,7 +64,7 @@ def run(options: Render) -> None:
             color_by=options.color_by,
             background=options.background,
             device=device,
-            memory=None if options.memory == "all" else options.memory,
+            memory=options.pool(),
         )
         write_picture(path, _device.to_host(image.color))
         view = {"camera": name, "width": camera.width, "height": camera.height}

@@ -21,6 +21,8 @@ Size = tuple[int, int]
 TARGET_MS = 60.0
 # Without a change for so long, a larger picture is begun.
 REST_SECONDS = 0.15
+# What a picture at rest waits for pages; another one follows as long as some are missing.
+PAGES_SECONDS = 0.1
 # A draft that has taken so long is given up for what is asked for now.
 PATIENCE_SECONDS = 4e-3 * TARGET_MS
 # Smaller ones show nothing; from there on the cut gets coarser, which shows less.
@@ -165,13 +167,19 @@ class RenderLoop:
         sizes = finer_sizes(draft.size, request.size)
         if settings != request.settings and not sizes:
             sizes = [draft.size]
-        self._send(frame, not sizes, request.number)
+        is_whole = self._scene_view.pool is None
+        self._send(frame, not sizes and is_whole, request.number)
         with self._changed:
             if self._changed.wait_for(self._has_news, REST_SECONDS):
                 return
         for size in sizes:
             frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0))
-            self._send(frame, size == sizes[-1], request.number)
+            self._send(frame, size == sizes[-1] and is_whole, request.number)
+        while not is_whole:
+            how = request.settings, self._begin(0.0), PAGES_SECONDS
+            frame = self._scene_view.frame(request.view, request.size, *how)
+            is_whole = not frame.figures.missing
+            self._send(frame, is_whole, request.number)
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
         """What of the settings there is time for."""
