@@ -90,8 +90,7 @@ def render(
             follow each other, as in a film.
         cut: Draw what was selected before from this scene, whatever the camera: a cut to walk around. Takes
             the place of `tolerance`, `budget`, `min_level` and `fade`.
-        color_by: "level" or "cluster" colours gaussians by the one that they belong to, "residency" by
-            whether that is what the tolerance asks for, or stands for finer ones whose pages are missing.
+        color_by: "level" or "cluster" colours gaussians by their own, "residency" where pages are missing.
         background: Three numbers.
         min_transmittance: A pixel stops behind the gaussian that lets no more than this share of light
             through, 0 to 0.99, and gives that light to what it has blended: no channel is off by more than
@@ -277,9 +276,8 @@ class _Frame:
             if pool is not None:
                 check("cut", cut is None, "none for a pool, which has its own, got one; give memory=None")
                 before = pool.core.status().bytes_in
-                drawing = self._frame.draw_resident(
-                    resident.core, pool.core, camera.core, rule, shade, stop, *self._pool_colors(resident)
-                )
+                drawn = rule, shade, stop, *self._pool_colors(resident)
+                drawing = self._frame.draw_resident(resident.core, pool.core, camera.core, *drawn)
             elif cut is None:
                 drawing = self._frame.draw(resident.core, camera.core, rule, shade)
             else:
@@ -290,8 +288,7 @@ class _Frame:
                 drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade, weights=weights)
             if pool is not None:
                 now = pool.core.status()
-                bytes_in = now.bytes_in - before
-                came_in = {"missing": now.missing, "failed": now.failed, "bytes_in": bytes_in}
+                came_in = {"missing": now.missing, "failed": now.failed, "bytes_in": now.bytes_in - before}
             resident.add_drawing(drawing)
 
         def finish() -> Stats:
@@ -308,20 +305,14 @@ class _Frame:
         elif self._has_settled:
             drawing.finish()  # which may draw again, with pages that other views put in place of its own
         self._has_settled = False
-        picture = RenderedImage(drawing, finish)
-        if isinstance(camera, Camera):
-            return picture
-        return picture, RenderedImage(drawing, finish, is_right=True)
+        eyes = tuple(RenderedImage(drawing, finish, is_right=is_right) for is_right in (False, True))
+        return eyes[0] if isinstance(camera, Camera) else eyes
 
     def settle(
-        self,
-        subject: _Subject,
-        camera: Camera | StereoCamera,
-        timeout: float = 30.0,
-        seconds: float = math.inf,
-        **options: Any,
+        self, subject: _Subject, camera: Camera | StereoCamera, timeout: float = 30.0, **options: Any
     ) -> None:
-        """Bring in what a view needs."""
+        """Bring in what a view needs, or what of it comes in so many `seconds`."""
+        seconds = options.pop("seconds", math.inf)
         real(timeout, "timeout", "seconds, at least 0", 0)
         rule = rule_of(**options)
         if isinstance(subject, Gaussians) or (self.memory is None and not self._is_auto):
