@@ -281,6 +281,18 @@ def test_render_from_a_pool(folder, tmp_path):
     assert pictures[0] == pictures[1]
 
 
+def test_render_of_a_film_takes_a_budget_in_steps(folder, tmp_path):
+    """To where a part of it is free; a still takes all of it."""
+    scene, cameras = v3dg.read_scene(folder / "scene.json")
+    camera = cameras["near"]
+    for fade, budget in ((1.0, 640), (1.02, 640 - 20)):
+        options = ("--camera", "near", "--budget", 640, "--fade", fade, "--json")
+        done = run("render", folder / "scene.json", "-o", tmp_path / "out.png", *options)
+        assert done.returncode == 0, done.stderr
+        (picture,) = json.loads(done.stdout)["pictures"]
+        assert picture["tolerance"] == v3dg.select(scene, camera, budget=budget, fade=fade).tolerance
+
+
 def test_render_within_a_budget(folder, tmp_path):
     out = tmp_path / "small.png"
     options = ("--camera", "near", "--budget", 400, "--color-by", "level", "--json")

@@ -22,7 +22,8 @@ from frames import (
 from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, group_metrics, lod_bundle, random_camera, random_scene, turned
-from v3dg import DEFAULT_FADE, Camera, Gaussians, Scene, Selection, select
+from v3dg import DEFAULT_FADE, Camera, Gaussians, Scene, Selection, _core, _device, select
+from v3dg.select import rule_of, select_by
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 WHOLE = exact_cut.WHOLE
@@ -158,25 +159,55 @@ def slow_orbit(num_frames):
     return [Camera.look_at(eye, (0, 0, 0), (0, 0, 1), 0.9, width=203, height=117) for eye in eyes]
 
 
+def settled_at(renderer, camera, options):
+    """The tolerance at which ten pictures of a camera at rest are the same, bit by bit."""
+    first, *others = (renderer.render(camera, **options) for _ in range(10))
+    for image in others:
+        assert_same_bytes(image, first)
+        assert image.stats.tolerance == first.stats.tolerance
+    return first.stats.tolerance
+
+
 @pytest.mark.parametrize("device", DEVICES)
-def test_at_rest_a_budget_draws_the_same_bits_every_frame(device):
-    """At once where it looks first; where it came to slowly, once the tolerance has arrived."""
+@pytest.mark.parametrize("memory", [None, "64MB"])
+def test_a_budget_draws_the_same_bits_from_the_tenth_frame_at_rest_on(device, memory):
+    """From the first one on where it looks first; where slow motion ended, it goes to the same in steps."""
     scene = composed_scene(np.random.default_rng(5))
-    options = {"budget": 9000, "fade": DEFAULT_FADE}
-    tolerances = []
-    for cameras in ([], slow_orbit(30)):
+    options, cameras = {"budget": 9000, "fade": DEFAULT_FADE}, slow_orbit(150)[:88]
+    last = cameras[-1]
+    roomy = select(scene, last, budget=9000 - 9000 // 32, fade=DEFAULT_FADE, device=device).tolerance
+    renderer = Renderer(scene, device=device, memory=memory)
+    renderer.settle(last, **options)
+    assert settled_at(renderer, last, options) == roomy
+    renderer = Renderer(scene, device=device, memory=memory)
+    *_, stop = (renderer.render(camera, **options).stats.tolerance for camera in cameras)
+    renderer.settle(last, **options)
+    ways = [np.log2(roomy / stop)]
+    for _ in range(8):
+        ways.append(np.log2(roomy / renderer.render(last, **options).stats.tolerance))
+    steps = -np.diff(ways)
+    assert ways[0] > 0.04
+    assert 0 <= steps.min() <= steps.max() < 2.1 * ways[0] / 8  # values of an octave are evenly apart
+    assert settled_at(renderer, last, options) == roomy
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_what_moves_is_not_at_rest(device):
+    """Also where it is an instance, or one of two cameras."""
+    scene = composed_scene(np.random.default_rng(5))
+    options, cameras = {"budget": 9000, "fade": DEFAULT_FADE}, slow_orbit(150)[:88]
+    for what in ("an instance", "a camera", "nothing"):
         renderer = Renderer(scene, device=device)
-        for camera in cameras:
-            renderer.render(camera, **options).stats  # noqa: B018
-        for _ in range(65 if cameras else 0):
-            renderer.render(CAMERA, **options).stats  # noqa: B018
-        first, *others = (renderer.render(CAMERA, **options) for _ in range(10))
-        for image in others:
-            assert_same_bytes(image, first)
-            assert image.stats.tolerance == first.stats.tolerance
-        tolerances.append(first.stats.tolerance)
-    roomy = select(scene, CAMERA, budget=9000 - 9000 // 32, fade=DEFAULT_FADE, device=device)
-    assert tolerances == [roomy.tolerance] * 2
+        *_, last = (renderer.render(camera, **options).stats.tolerance for camera in cameras)
+        steps = []
+        for k in range(8):
+            if what == "an instance":
+                scene.move([0], positions=scene.positions[:1])
+            camera = cameras[-1 - k % 2 if what == "a camera" else -1]
+            tolerance = renderer.render(camera, **options).stats.tolerance
+            steps.append(abs(np.log2(tolerance / last)))
+            last = tolerance
+        assert (max(steps) > 13 / 2048) == (what == "nothing")
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -224,12 +255,27 @@ def test_without_a_fade_a_budget_depends_on_the_view_alone():
         assert image.stats.tolerance == cut.tolerance
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_cuts_that_follow_each_other_are_those_of_a_renderer(device):
+    """Also those of two viewers by turns."""
+    scene, where = composed_scene(np.random.default_rng(5)), _device.resolve(device)
+    options, cameras = {"budget": 9000, "fade": DEFAULT_FADE}, slow_orbit(150)[:88]
+    viewers = [(Renderer(scene, device=device), _core.BudgetSteps()) for _ in range(2)]
+    for pair in zip([*cameras, *10 * cameras[-1:]], cameras[::-1] + 10 * cameras[:1], strict=True):
+        for camera, (renderer, steps) in zip(pair, viewers, strict=True):
+            cut = select_by(rule_of(None, **options, min_level=0), scene, camera, 9000, where, steps)
+            stats = renderer.render(camera, **options).stats
+            assert (cut.tolerance, cut.num_gaussians) == (stats.tolerance, stats.gaussians_selected)
+        last = cut
+    assert last.tolerance == select(scene, camera, budget=9000 - 281, fade=DEFAULT_FADE).tolerance
+
+
 @pytest.mark.gpu
 def test_both_devices_go_the_same_steps():
     scene = composed_scene(np.random.default_rng(5))
     renderers = [Renderer(scene, device=device) for device in ("cpu", "cuda")]
     for budget in (9000, 9100, 15000):
-        for camera in slow_orbit(60):
+        for camera in [*slow_orbit(60), *slow_orbit(150)[:88], *10 * slow_orbit(150)[87:88]]:
             cpu, cuda = (r.render(camera, budget=budget, fade=DEFAULT_FADE).stats for r in renderers)
             assert cuda.tolerance == cpu.tolerance
             assert cuda.gaussians_selected == cpu.gaussians_selected

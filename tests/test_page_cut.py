@@ -6,8 +6,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from devices import host, on
-from exact_cut import count_wrong, numbers_of_clusters, parts_of, random_batch, random_trees, run_trials
-from partial import ABSENT, closed_residency, page_rows, random_shift, resident_scene, rule
+from exact_cut import (
+    WHOLE,
+    count_wrong,
+    numbers_of_clusters,
+    parts_of,
+    random_batch,
+    random_trees,
+    run_trials,
+)
+from partial import (
+    ABSENT,
+    arrived,
+    closed_residency,
+    page_rows,
+    random_begins,
+    random_shift,
+    resident_scene,
+    rule,
+)
 from random_bundle import random_bundle
 from scenes_lod import blob, group_metrics, lod_bundle, random_camera, random_scene
 from v3dg import Gaussians, Scene, _core, select
@@ -39,7 +56,56 @@ def test_every_path_has_exactly_one_cluster(device, fades):
     """With fades, weights that add up to exactly one."""
     result = run_trials(200_000, device=device, partial=True, fades=fades)
     assert result["violations"] == 0
+    assert result.get("pages_that_fade_in", 100) >= 100
     assert result.get("selected_with_weights_below_1", 1) > 0.1
+
+
+def test_pages_that_fade_in_before_those_above_them_would_be_counted():
+    rng = np.random.default_rng(0)
+    bundle = random_trees(rng)[0]
+    number, whole = numbers_of_clusters(bundle, rng)
+    shift, _ = random_shift(rng, bundle, np.ones(bundle.num_pages, bool))
+    begins = rng.integers(0, 8, bundle.num_pages).astype(np.int32)
+    wrong = 0
+    for _ in range(10):
+        scene, camera, tolerance, _ = random_batch(bundle, rng, 200)
+        core = resident_scene(scene, [shift], begins=[begins])
+        cut = core.select(camera.core, rule(tolerance, fade=1.3, cull=False, frame=8))
+        wrong += count_wrong(cut.instance_ids, cut.cluster_ids, 200, number, whole, parts_of(cut.weights))
+    assert wrong > 100
+
+
+@settings(max_examples=60)
+@given(seed=seeds, fade=fades)
+def test_groups_are_refined_as_far_as_their_pages_have_faded_in(seed, fade):
+    rng = np.random.default_rng(seed)
+    scene = scene_of(rng)
+    camera = random_camera(rng)
+    tolerance = a_tolerance(rng, scene, camera)
+    there = [closed_residency(rng, bundle) for bundle in scene.bundles]
+    shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
+    begins, frames = zip(*(random_begins(rng, bundle) for bundle in scene.bundles), strict=True)
+    frame = int(rng.choice(frames))
+    one = rule(tolerance, fade=fade, cull=False, frame=frame)
+    core = resident_scene(scene, shifts, begins=begins)
+    cut = core.select(camera.core, one)
+    if fade is None:  # nothing fades in
+        np.testing.assert_array_equal(
+            cut.cluster_ids, resident_scene(scene, shifts).select(camera.core, one).cluster_ids
+        )
+        return
+    for i, metric in enumerate(group_metrics(scene, camera)):
+        b = scene.instance_bundle[i]
+        low, high = tolerance / fade, tolerance * fade
+        ramp = (np.clip(metric.astype(np.float64), low, high) - low) / (high - low)
+        refined = np.minimum(ramp, (arrived(begins[b], frame) * there[b])[:-1])
+        clusters, mine = scene.bundles[b].clusters, cut.instance_ids == i
+        expected = (
+            np.append(refined, 1.0)[clusters.parent_group] - np.append(refined, 0.0)[clusters.own_group]
+        )
+        weights = np.zeros(len(clusters))
+        weights[cut.cluster_ids[mine]] = cut.weights[mine]
+        np.testing.assert_allclose(weights, expected, atol=2 / WHOLE)
 
 
 @pytest.mark.parametrize("fade", [None, 1.3])
@@ -179,9 +245,12 @@ def test_both_devices_choose_the_same_of_what_is_there():
         scene, camera = scene_of(rng), random_camera(rng)
         there = [closed_residency(rng, bundle) for bundle in scene.bundles]
         shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
-        one = rule(a_tolerance(rng, scene, camera), fade=[None, 1.05, 1.3, 4.0][k % 4])
+        begins, frames = zip(*(random_begins(rng, bundle) for bundle in scene.bundles), strict=True)
+        fade, frame = [None, 1.05, 1.3, 4.0][k % 4], int(rng.choice(frames))
+        one = rule(a_tolerance(rng, scene, camera), fade=fade, frame=frame)
         cpu, cuda = (
-            resident_scene(scene, shifts, device).select(camera.core, one) for device in ("cpu", "cuda")
+            resident_scene(scene, shifts, device, begins=begins).select(camera.core, one)
+            for device in ("cpu", "cuda")
         )
         np.testing.assert_array_equal(cpu.instance_ids, cuda.instance_ids)
         np.testing.assert_array_equal(cpu.cluster_ids, cuda.cluster_ids)

@@ -1,5 +1,6 @@
 """Pools: pictures of scenes of which only a part is in memory, settled and not, and with faults."""
 
+import itertools
 import os
 import time
 
@@ -7,11 +8,15 @@ import numpy as np
 import pytest
 
 import v3dg.pool
+from benchmarks.evaluation.steadiness import tile_means
 from devices import host
 from frames import Renderer, arrays, render
+from partial import rule
 from random_bundle import random_bundle
 from scenes_lod import blob, lod_bundle
 from v3dg import Bundle, Camera, Scene
+from v3dg._device import CPU
+from v3dg.residency import residency
 
 CAMERA = Camera.look_at((0, -9, 1), (0, 0, 0), (0, 0, 1), 0.9, width=93, height=61)
 NEAR = Camera.look_at((2, -2, 1), (0, 0, 0), (0, 0, 1), 0.7, width=93, height=61)
@@ -247,6 +252,97 @@ def test_pages_are_there_together_with_those_above_them(scene, device, seed, mon
         num_changes += before is not None and any((a & ~b).any() for a, b in zip(before, there, strict=True))
         before = there
     assert num_changes > 0  # pages left, too
+
+
+def film_of_arriving_pages(scene, device, options, num_frames=150):
+    """Pictures of a camera at rest from the coarsest level on, and in how many frames pages have faded in."""
+    renderer, pictures, arrived = Renderer(scene, device=device, memory="64MB"), [], []
+    for _ in range(num_frames):
+        image = renderer.render(CAMERA, **options)
+        pictures.append(arrays(image)[0])
+        core = renderer._frame._pool.core
+        arrived.append([core.arrived(b) for b in range(len(scene.bundles))])
+        while core.read_one():
+            pass
+        num_there = [core.resident(b).sum() for b in range(len(scene.bundles))]
+        have_arrived = num_there == [(pages == 8).sum() for pages in arrived[-1]]
+        if have_arrived and image.stats.missing == 0 and len(pictures) > 8:
+            break
+    return pictures, arrived
+
+
+def worst_tile(pictures):
+    """Root mean square, in 255ths, of the tile that changes most from one picture to the next."""
+    changes = (np.square(255.0 * (b - a)).mean(-1) for a, b in itertools.pairwise(pictures))
+    return max(np.sqrt(tile_means(change).max()) for change in changes)
+
+
+def test_pages_fade_in_level_by_level(scene, device, monkeypatch):
+    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
+    options = {"tolerance": 20.0, "fade": 1.02}
+    pictures, arrived = film_of_arriving_pages(scene, device, options)
+    assert 3 * 8 < len(pictures) < 150
+    for before, now in itertools.pairwise(arrived):
+        for bundle, a, b in zip(scene.bundles, before, now, strict=True):
+            assert ((b - a >= 0) & (b - a <= 1)).all()
+            assert (b[bundle.groups.parent][b[:-1] > 0] == 8).all()
+    whole = Renderer(scene, device=device).render(CAMERA, **options)
+    np.testing.assert_array_equal(pictures[-1], arrays(whole)[0])
+    at_once, _ = film_of_arriving_pages(scene, device, {"tolerance": 20.0})
+    assert worst_tile(pictures) < worst_tile(at_once) / 2
+
+
+def test_settling_ends_what_fades_in(scene, device):
+    options, whole = {"tolerance": 5.0, "fade": 1.05}, Renderer(scene, device=device)
+    renderer = Renderer(scene, device=device, memory="64MB")
+    for camera in (CAMERA, NEAR):
+        for _ in range(5):
+            renderer.render(camera, **options).stats  # noqa: B018
+        renderer.settle(camera, **options)
+        for _ in range(3):
+            assert_same(renderer.render(camera, **options), whole.render(camera, **options))
+
+
+def test_without_a_fade_pages_are_there_at_once(scene, device, monkeypatch):
+    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
+    _, arrived = film_of_arriving_pages(scene, device, FINE)
+    assert set(np.unique(np.concatenate([np.concatenate(pages) for pages in arrived]))) == {0, 8}
+
+
+def test_pages_that_come_again_fade_in_again(device, monkeypatch):
+    """With room for what one view needs, not for two, and with frames without a fade in between.
+
+    None leaves that the picture before showed.
+    """
+    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
+    rng, scene = np.random.default_rng(0), Scene()
+    for place in range(3):
+        scene.add(lod_bundle(rng, blob(rng, 1500), 32), positions=(40.0 * place, 0, 0))
+    renderer = Renderer(scene, device=device, memory=250_000)
+    before = needs = [np.zeros(bundle.num_pages) > 0 for bundle in scene.bundles]
+    num_left = num_fading = 0
+    for k in range(300):
+        x = 40.0 * (k // 12 % 3)
+        camera = Camera.look_at((x, -4, 1), (x, 0, 0), (0, 0, 1), 0.9, width=61, height=43)
+        fade = 1.05 if rng.random() < 0.95 else None
+        tolerance = renderer.render(camera, tolerance=5.0, fade=fade).stats.tolerance
+        core, now = renderer._frame._pool.core, []
+        for b, bundle in enumerate(scene.bundles):
+            there, arrived = core.resident(b), core.arrived(b)
+            assert (arrived[bundle.groups.parent][arrived[:-1] > 0] == 8).all()
+            assert (arrived[~there] == 0).all()
+            assert fade is not None or (arrived[there] == 8).all()
+            has_left = before[b] & ~there
+            assert not (has_left & (needs[b] > 1)).any()
+            num_left += int(has_left.sum())
+            num_fading += int(((arrived > 0) & (arrived < 8)).sum())
+            now.append(there)
+        before = now
+        needs = residency.scene(scene, CPU).core.page_needs(camera.core, rule(tolerance, fade=fade))
+        for _ in range(int(rng.integers(0, 60))):
+            core.read_one()
+    assert num_left > 100
+    assert num_fading > 300
 
 
 def test_gaussians_of_a_file_stay_on_the_disk(path, device):

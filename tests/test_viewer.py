@@ -362,10 +362,12 @@ class FakeSceneView:
 
     def __init__(self):
         self.drawn, self.hold, self.held_until = [], (), math.inf
+        self.tolerances, self.steps = iter(()), []  # that a budget comes to
         self.is_held = threading.Event()
 
-    def frame(self, view, size, settings, stop):
+    def frame(self, view, size, settings, stop, steps):
         self.drawn.append((view, size, settings))
+        self.steps.append(steps)
         if isinstance(view, Exception):
             raise view
         is_held = size[0] in self.hold and settings.tolerance <= self.held_until
@@ -374,7 +376,8 @@ class FakeSceneView:
             if stop.is_requested:
                 raise Stopped
             time.sleep(1e-3)
-        return Frame(np.full((size[1], size[0], 3), view, np.uint8), None, settings.shows, None, None)
+        figures = SimpleNamespace(tolerance=next(self.tolerances, 1.0))
+        return Frame(np.full((size[1], size[0], 3), view, np.uint8), figures, settings.shows, None, None)
 
 
 class NoPacer:
@@ -415,6 +418,29 @@ def test_a_request_is_answered_small_and_then_in_full(rendering):
     rendering.loop.ask(Request(7, (160, 80), Settings()))
     wait(rendering.is_final)
     assert rendering.sent == [(7, (40, 20), False), (7, (80, 40), False), (7, (160, 80), True)]
+
+
+@pytest.mark.parametrize("rendering", [NoPacer()], indirect=True)
+@pytest.mark.parametrize(("budget", "sent"), [(None, 1), (100, 4)])
+def test_at_rest_pictures_follow_until_the_tolerance_of_a_budget_has_arrived(rendering, budget, sent):
+    rendering.scene_view.draws_all_while_moving = True
+    rendering.scene_view.tolerances = iter((4.0, 3.0, 2.0, 2.0))
+    rendering.loop.ask(Request(7, (160, 80), Settings(budget=budget)))
+    end = time.monotonic() + SECONDS
+    while len(rendering.sent) < sent and time.monotonic() < end:
+        time.sleep(0.01)
+    time.sleep(0.3)
+    assert rendering.sent == sent * [(7, (160, 80), True)]
+    assert len(set(map(id, rendering.scene_view.steps))) == 1
+    assert rendering.scene_view.steps[0] is not None
+
+
+def test_larger_pictures_do_not_follow_smaller_ones(rendering):
+    rendering.loop.ask(Request(7, (160, 80), Settings(budget=100)))
+    wait(rendering.is_final)
+    first, *others = rendering.scene_view.steps
+    assert first is not None
+    assert others == [None, None]
 
 
 def test_a_new_request_ends_a_large_picture(rendering):

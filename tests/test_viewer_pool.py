@@ -37,7 +37,7 @@ def test_a_picture_that_waits_is_that_of_all(scene, shows, given):
     settings = Settings(shows=shows, **given)
     for view in (VIEW, ASIDE):
         expected = whole.frame(view, SIZE, settings)
-        frame = pooled.frame(view, SIZE, settings, None, math.inf)
+        frame = pooled.frame(view, SIZE, settings, None, None, math.inf)
         np.testing.assert_array_equal(frame.pixels, expected.pixels)
         assert frame.figures.missing == expected.figures.missing == 0
         assert frame.figures.gaussians_selected == expected.figures.gaussians_selected
@@ -59,7 +59,7 @@ def test_residency_shows_what_is_missing_until_it_is_there(scene):
     settings = Settings(shows="residency", tolerance=0.5, fade=None)
     first = pooled.frame(VIEW, SIZE, settings)
     assert first.figures.missing > 0
-    settled = pooled.frame(VIEW, SIZE, settings, None, math.inf)
+    settled = pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
     alpha = pooled.frame(VIEW, SIZE, Settings(shows="alpha", tolerance=0.5, fade=None)).pixels[..., :1] / 255
     there = to_8bit(_core.missing_colors(np.zeros(())) * alpha)
     np.testing.assert_allclose(settled.pixels.astype(int), there, atol=2)
@@ -71,9 +71,9 @@ def test_what_a_pool_cannot_show_is_not_offered(scene):
     assert "residency" not in whole.modes
     assert "error" in whole.modes
     assert set(pooled.modes) == {"appearance", "level", "cluster", "residency", "depth", "alpha"}
-    expected = pooled.frame(VIEW, SIZE, Settings(), None, math.inf)
+    expected = pooled.frame(VIEW, SIZE, Settings(), None, None, math.inf)
     for settings in (Settings(shows="difference"), Settings(split=0.5), Settings(frozen=ASIDE)):
-        frame = pooled.frame(VIEW, SIZE, settings, None, math.inf)
+        frame = pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
         np.testing.assert_array_equal(frame.pixels, expected.pixels)
 
 

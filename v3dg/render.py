@@ -130,13 +130,14 @@ class Renderer:
     changed is finished first.
 
     With a budget and a fade, pictures are taken to follow each other: the tolerance goes in steps to the one
-    at which a part of the budget is free, never below that of `render`, so that slow motion is steady
-    (docs/fades.md). Without a fade, pictures are those of `render`.
+    at which a part of the budget is free, never below that of `render`, so that slow motion is steady; at
+    rest it is there after eight pictures (docs/fades.md). Without a fade, pictures are those of `render`.
 
     With a pool, only a part of the bundles is resident, so that they may be far larger than memory: pages
     come in from the files as views need them, read by other threads. A picture waits for none of them: where
-    one is missing, the coarser clusters above it are drawn. Use `settle` for a picture that misses nothing.
-    If a view needs more than there is room for, the tolerance is raised until it fits.
+    one is missing, the coarser clusters above it are drawn; with a fade, pages fade in. Use `settle` for a
+    picture that misses nothing. If a view needs more than there is room for, the tolerance is raised until it
+    fits.
 
     Args:
         color_by: As in `v3dg.render`; with a pool on a CUDA device, "appearance".

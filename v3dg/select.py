@@ -228,21 +228,23 @@ def select(
     rule = rule_of(tolerance, budget, min_level, footprint, cull, fade)
     where = _device.resolve(device)
     if not isinstance(camera, Camera | StereoCamera):
-        return [_select(subject, view, rule, budget, where) for view in camera]
-    return _select(subject, camera, rule, budget, where)
+        return [select_by(rule, subject, view, budget, where) for view in camera]
+    return select_by(rule, subject, camera, budget, where)
 
 
-def _select(
+def select_by(
+    rule: _core.Rule,
     subject: Scene | Bundle,
     camera: Camera | StereoCamera,
-    rule: _core.Rule,
     budget: int | None,
     device: Device,
+    steps: _core.BudgetSteps | None = None,
 ) -> Selection:
+    """Select for one view; with `steps`, for the next of views that follow each other."""
     check_camera(camera)
     start = time.perf_counter()
     with residency.reading(subject, device) as resident:
-        cut = resident.core.select(camera.core, rule)
+        cut = resident.core.select(camera.core, rule, steps)
     if not cut.fits_budget:
         assert budget is not None
         raise over_budget(budget, cut.num_gaussians)

@@ -80,7 +80,7 @@ class Flight {
     // A frame of the view that begins at a page; what it takes of this thread.
     void frame(size_t first) {
         const double begin = processor_us();
-        pool_.begin_frame(true);
+        pool_.begin_frame(true, Arrive::fading);
         pool_.release();
         static_cast<void>(pool_.status());
         FrameNeeds* needs = pool_.lend_needs();

@@ -1,7 +1,8 @@
 """What makes motion steadier beside a fade? A budget in steps, hysteresis, pages that fade in.
 
-The first is beside the tolerance that each view would have alone. The others are trials: cuts with a state,
-made of the metrics that selection has. docs/notes/steadiness.md is about the results.
+The first is beside the tolerance that each view would have alone, also in the frames after the camera has
+stopped where steps are farthest behind. Hysteresis is a trial, and so are pages beside what a pool does: cuts
+with a state, made of the metrics that selection has. docs/notes/steadiness.md is about the results.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ from benchmarks.evaluation.record import write
 from benchmarks.evaluation.steadiness import Cut, Options, compare, paths_from
 from benchmarks.evaluation.steadiness import Path as CameraPath
 from benchmarks.studies.fades import field_of, first_camera
-from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Scene, Selection, _core, select
+from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Renderer, Scene, Selection, _core, select
 from v3dg.residency import residency
 from v3dg.select import rule_of
 
 _FAR = 1.15  # how much farther away hysteresis begins to look, so that it is in its stride at the first frame
 _FAR_FRAMES = 30
 _SWAY = 12  # frames to one side
+_ARRIVAL_FRAMES = 8  # as csrc/residency/page_table.h has them
 _HEADROOM_PARTS = 32  # as csrc/select/select_math.h has them
 
 
@@ -43,7 +45,9 @@ class Config:
     hysteresis: tuple[float, ...] = (1.05, 1.1)
     arrivals: tuple[int, ...] = (1, 4, 8)
     """Over how many frames pages fade in."""
-    trials: tuple[str, ...] = ("budget", "hysteresis", "pages")
+    rests: tuple[int, ...] = (1, 4, 16, 64)
+    """Over how many frames the tolerance of a budget arrives at rest."""
+    trials: tuple[str, ...] = ("budget", "rest", "hysteresis", "pages")
     paths: tuple[str, ...] = ()
     """Only these."""
     device: str = "cpu"
@@ -59,6 +63,40 @@ class AtOnce:
     def __call__(self, scene: Scene, camera: Camera) -> Options:
         cut = select(scene, camera, budget=self.budget, fade=self.fade, device="cpu")
         return {"tolerance": cut.tolerance, "fade": self.fade}
+
+
+class Rests:
+    """A budget in steps along a path, and after its end, over so many frames, to where it would be at once.
+
+    As a `Renderer` does if no number of frames is given.
+    """
+
+    def __init__(
+        self, scene: Scene, path: CameraPath, budget: int, config: Config, frames: int | None
+    ) -> None:
+        self.budget, self.fade, self.frames = budget, config.fade, frames
+        self.goal = _goal(scene, path.cameras[-1], budget, config.fade)
+        self.renderer, self.frame = Renderer(scene, device="cpu"), 0
+        for camera in path.cameras[:-1]:
+            self._draw(camera)
+
+    def _draw(self, camera: Camera) -> float:
+        return self.renderer.render(camera, budget=self.budget, fade=self.fade).stats.tolerance
+
+    def __call__(self, scene: Scene, camera: Camera) -> Options:
+        if self.frame == 0 or self.frames is None:
+            self.tolerance = self._draw(camera)
+        else:
+            left = max(self.frames - self.frame + 1, 1)
+            self.tolerance *= (self.goal / self.tolerance) ** (1 / left)
+        self.frame += 1
+        return {"tolerance": self.tolerance, "fade": self.fade}
+
+
+def _goal(scene: Scene, camera: Camera, budget: int, fade: float) -> float:
+    """The tolerance that steps go to."""
+    roomy = budget - budget // _HEADROOM_PARTS
+    return select(scene, camera, budget=roomy, fade=fade, device="cpu").tolerance
 
 
 def metrics_of(scene: Scene, camera: Camera) -> tuple[Any, Any]:
@@ -121,11 +159,30 @@ class Arrives:
     def __call__(self, scene: Scene, camera: Camera) -> Options:
         metric, offset = metrics_of(scene, camera)
         ramp = np.clip((np.minimum(metric, 2 * self.high) - self.low) / (self.high - self.low), 0, 1)
-        levels = [scene.bundles[b].groups.level for b in scene.instance_bundle]
-        waits = np.concatenate([level.max() - level for level in levels]) if self.by_level else 0
-        arrived = np.clip(self.frame / self.frames - waits, 0.0, 1.0)
+        arrived = self.arrived(scene, camera)
         self.frame += 1
         return {"cut": cut_of(scene, np.minimum(ramp, arrived), offset)}
+
+    def arrived(self, scene: Scene, camera: Camera) -> Any:
+        """Shares to which the pages of the groups of all instances have faded in."""
+        levels = [scene.bundles[b].groups.level for b in scene.instance_bundle]
+        waits = np.concatenate([level.max() - level for level in levels]) if self.by_level else 0
+        return np.clip(self.frame / self.frames - waits, 0.0, 1.0)
+
+
+class ArrivesInPool(Arrives):
+    """The same as a renderer with a pool has it, which reads pages while true pictures are drawn."""
+
+    def __init__(self, scene: Scene, tolerance: float, fade: float) -> None:
+        super().__init__(tolerance, fade, 0, by_level=True)
+        self.options: Any = {"tolerance": tolerance, "fade": fade}
+        self.renderer = Renderer(scene, device="cpu", memory="1GB")
+
+    def arrived(self, scene: Scene, camera: Camera) -> Any:
+        self.renderer.render(camera, **self.options)
+        pool: Any = self.renderer._frame._pool
+        shares = [pool.core.arrived(b)[:-1] / _ARRIVAL_FRAMES for b in range(len(scene.bundles))]
+        return np.concatenate([shares[b] for b in scene.instance_bundle])
 
 
 def main(config: Config) -> None:
@@ -141,10 +198,14 @@ def main(config: Config) -> None:
                 if config.paths and camera_path.name not in config.paths:
                     continue
                 for trial in config.trials:
-                    cuts = TRIALS[trial](subject, camera_path, config)
+                    shown = up_to_the_rest(subject, camera_path, config) if trial == "rest" else camera_path
+                    cuts = TRIALS[trial](subject, shown, config)
                     of = {"asset": Path(path).stem, "side": config.side, "distance": distance}
                     of |= {"trial": trial, "path": camera_path.name}
-                    found = compare(subject, camera_path, cuts, config.device)
+                    if trial == "rest":
+                        of |= {"stops_after": len(shown.cameras)}
+                        shown = replace(shown, cameras=shown.cameras[-1:] * config.frames)
+                    found = compare(subject, shown, cuts, config.device)
                     rows += [{**of, **row} for row in found]
                     print(*(line(row) for row in rows[-len(found) :]), sep="\n", flush=True)
     settings = {k: v for k, v in vars(config).items() if k not in ("bundles", "json", "device")}
@@ -157,10 +218,33 @@ def to_and_fro(path: CameraPath) -> CameraPath:
     return replace(path, name="to and fro", cameras=[path.cameras[min(k, len(frames) - 1)] for k in frames])
 
 
+def up_to_the_rest(scene: Scene, path: CameraPath, config: Config) -> CameraPath:
+    """The path up to where steps are farthest from where they go."""
+    renderer, budget = Renderer(scene, device="cpu"), budget_of(scene, path.cameras[0], config)
+    ways = []
+    for camera in path.cameras:
+        now = renderer.render(camera, budget=budget, fade=config.fade).stats.tolerance
+        ways.append(abs(np.log2(now / _goal(scene, camera, budget, config.fade))))
+    print(f"{path.name}: {max(ways):.4f} octaves behind at most")
+    return replace(path, cameras=path.cameras[: int(np.argmax(ways)) + 1])
+
+
+def budget_of(scene: Scene, camera: Camera, config: Config) -> int:
+    options: Any = {"tolerance": config.tolerance, "fade": config.fade}
+    return select(scene, camera, **options, device="cpu").num_gaussians
+
+
+def rest_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
+    budget = budget_of(scene, path.cameras[0], config)
+    cuts: dict[str, Cut] = {"as it is": Rests(scene, path, budget, config, None)}
+    for frames in config.rests:
+        cuts[f"over {frames}"] = Rests(scene, path, budget, config, frames)
+    return cuts
+
+
 def budget_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
-    middle = path.seen_from(len(path.cameras) // 2)
     chosen: Any = {"tolerance": config.tolerance, "fade": config.fade}
-    budget = select(scene, middle, **chosen, device="cpu").num_gaussians
+    budget = budget_of(scene, path.seen_from(len(path.cameras) // 2), config)
     return {
         "no budget": chosen,
         "at once": AtOnce(budget, config.fade),
@@ -191,6 +275,7 @@ def hysteresis_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str,
 def page_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
     tolerance, fade = config.tolerance, config.fade
     cuts: dict[str, Cut] = {"all there": {"tolerance": tolerance, "fade": fade}}
+    cuts["as it is"] = ArrivesInPool(scene, tolerance, fade)
     for frames in config.arrivals:
         cuts[f"together, {frames}"] = Arrives(tolerance, fade, frames, by_level=False)
         cuts[f"by level, {frames}"] = Arrives(tolerance, fade, frames, by_level=True)
@@ -202,7 +287,7 @@ def _depth_of(scene: Scene, camera: Camera) -> float:
     return float((camera.viewmat[:3, :3] @ scene.positions.mean(axis=0) + camera.viewmat[:3, 3])[2])
 
 
-TRIALS = {"budget": budget_cuts, "hysteresis": hysteresis_cuts, "pages": page_cuts}
+TRIALS = {"budget": budget_cuts, "rest": rest_cuts, "hysteresis": hysteresis_cuts, "pages": page_cuts}
 
 
 def line(row: Row) -> str:

@@ -161,14 +161,14 @@ class BoundSceneFrame {
                                        const SelectRule& rule, const Shade& shade, const Stop* stop) {
         auto& scene = checked(scene_object);
         const Eyes& eyes = camera.eyes;
-        const SelectRule paced = in_pace(rule);
+        BudgetSteps steps = steps_;
+        const SelectRule paced = moves_ ? steps.next(rule, eyes, scene.state()) : rule;
         if (device_.is_host()) {
-            uint32_t last_bin = last_bin_;
             auto drawing = on_host(scene, eyes, shade, [&](HostScene host, Span<const Picture<float>> out) {
-                host.last_bin = &last_bin;
+                host.last_bin = &steps.last_bin;
                 return cpu::draw_scene(host, eyes, paced, out, flag_of(stop));
             });
-            last_bin_ = last_bin;
+            steps_ = steps;
             return drawing;
         }
 #if V3DG_WITH_CUDA
@@ -176,6 +176,7 @@ class BoundSceneFrame {
         NewPictures pictures;
         const cuda::EyeImages images = new_images(eyes, shade, pictures);
         auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream());
+        steps_ = steps;
         return std::make_unique<BoundDrawing>(std::move(pictures),
                                               py::make_tuple(py::cast(this), scene_object), device_,
                                               std::move(drawing), rule);
@@ -198,14 +199,17 @@ class BoundSceneFrame {
         if (!device_.is_host() && (!colors.empty() || shows_missing))
             throw py::value_error("colors, shows_missing: expected none on a CUDA device");
         const Eyes& eyes = camera.eyes;
+        BudgetSteps steps = steps_;
+        const SelectRule paced = moves_ ? steps.next(rule, eyes, state) : rule;
 #if V3DG_WITH_CUDA
         if (!device_.is_host()) {
             const Work work(device_);
             NewPictures pictures;
             const cuda::EyeImages images = new_images(eyes, shade, pictures);
-            SelectRule used = in_pace(rule);
+            SelectRule used = paced;
             auto drawing =
                 frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images, work.stream());
+            steps_ = steps;
             return std::make_unique<BoundDrawing>(std::move(pictures),
                                                   py::make_tuple(py::cast(this), scene_object, pool_object),
                                                   device_, std::move(drawing), used, &pool.on_device());
@@ -223,18 +227,18 @@ class BoundSceneFrame {
                 span_of<const float>(colors[b].cast<py::array>(), "colors", {clusters, 3}).data;
         }
         SceneFrameCounts counts{};
-        uint32_t last_bin = last_bin_;
         {
             const py::gil_scoped_release unlocked;
             const auto cut = [&](auto tables, const SelectRule& raised, auto needs) {
-                HostScene host{tables, {models.data(), models.size()}, state->instances, needs, &last_bin};
+                HostScene host{
+                    tables, {models.data(), models.size()}, state->instances, needs, &steps.last_bin};
                 if (shows_missing) host.wanted_px2 = &rule.tolerance_px2;
                 counts = cpu::draw_scene(host, eyes, raised, out.span(), flag_of(stop));
                 return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
             };
-            pool.frame_on_host(*state, in_pace(rule), true, cut);
+            pool.frame_on_host(*state, paced, true, cut);
         }
-        last_bin_ = last_bin;
+        steps_ = steps;
         return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
     }
 
@@ -252,7 +256,8 @@ class BoundSceneFrame {
         const Work work(device_);
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, shade.with_depth);
         const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
-        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, image, work.stream());
+        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, image,
+                                        shade.min_transmittance, work.stream());
         return std::make_unique<BoundDrawing>(
             NewPictures{std::move(picture)},
             py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights), device_,
@@ -328,12 +333,6 @@ class BoundSceneFrame {
         return scene;
     }
 
-    // Pictures that follow each other have a fade.
-    SelectRule in_pace(SelectRule rule) const {
-        if (moves_ && rule.fade.is_on()) rule.pace = BudgetPace::in_steps;
-        return rule;
-    }
-
     void check_device(Device device, const char* name) const {
         if (device != device_)
             throw py::value_error(std::string(name) + ": expected what is on the frame's device, got others");
@@ -349,7 +348,9 @@ class BoundSceneFrame {
             pictures.push_back(picture_of(whole, shade.with_depth));
             image[k] = pictures.back().on_device(device_, eye, shade);
         }
-        return eyes.are_two ? cuda::images_of_eyes(image[0], image[1]) : cuda::EyeImages{{image[0], {}}, 1};
+        const float stop = shade.min_transmittance;
+        return eyes.are_two ? cuda::images_of_eyes(image[0], image[1], stop)
+                            : cuda::EyeImages{{image[0], {}}, 1, stop};
     }
 
     void set_models_on_device(const py::list& models, const py::list& palettes) {
@@ -397,8 +398,8 @@ class BoundSceneFrame {
     }
 
     Device device_;
-    bool moves_;                  // pictures follow each other
-    uint32_t last_bin_ = kNoBin;  // on the host, of a budget
+    bool moves_;         // pictures follow each other
+    BudgetSteps steps_;  // then
     py::list models_, palettes_;
     std::vector<size_t> num_gaussians_;  // of each bundle
     std::vector<SceneModel> host_;       // without what the scene knows of the clusters
@@ -429,7 +430,7 @@ class BoundAssetFrame {
         const cuda::FrameImage image = picture.on_device(device, camera.camera, shade);
         const cuda::PackedModel& packed = *model.on_device().packed;
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
-                                    work.stream(), &packed.packed());
+                                    work.stream(), &packed.packed(), shade.min_transmittance);
         return std::make_unique<BoundDrawing>(NewPictures{std::move(picture)}, py::cast(this), device,
                                               std::move(drawing), SelectRule{});
 #else

@@ -69,6 +69,16 @@ py::array_t<bool> resident_pages(BoundPool& pool, size_t bundle) {
     return there;
 }
 
+py::array_t<int32_t> arrived_pages(BoundPool& pool, size_t bundle) {
+    const py::ssize_t num_pages = resident_pages(pool, bundle).size();
+    const PageTable pages{pool.pool().shift(bundle), {}, pool.pool().begins(bundle)};
+    py::array_t<int32_t> arrived(num_pages);
+    for (py::ssize_t p = 0; p < num_pages; ++p)
+        arrived.mutable_data()[p] =
+            pages.is_resident(p) ? pages.arrived(p, pool.pool().arrivals().frame()) : 0;
+    return arrived;
+}
+
 }  // namespace
 
 BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device, size_t num_bytes,
@@ -207,6 +217,8 @@ void bind_pool(py::module_& m) {
              "Brings pages and finds out what a view needs; the tolerance that was used.")
         .def("status", &BoundPool::status)
         .def("resident", &resident_pages, "bundle"_a, "(P,) which pages of a bundle are there.")
+        .def("arrived", &arrived_pages, "bundle"_a,
+             "(P,) in how many frames of eight pages have faded in, up to the last one.")
         .def(
             "raise_tolerance",
             [](BoundPool& p, float from) { return p.pool().raise_tolerance_at_once(from); }, "from_px2"_a,

@@ -55,13 +55,15 @@ void bind_scene(py::module_& m) {
         .def_property_readonly("bytes", &BoundModel::bytes);
     py::class_<BoundPalette>(m, "Palette", "Colours of a bundle's clusters, in which gaussians can be drawn.")
         .def(py::init<py::object, py::array, int>(), "table"_a, "sh"_a, "device"_a);
+    py::class_<BudgetSteps>(m, "BudgetSteps", "What pictures with a budget know of the ones before.")
+        .def(py::init<>());
     py::class_<BoundScene>(m, "ResidentScene", "What selection reads of a scene, on one device.")
         .def(py::init<int>(), "device"_a)
         .def("set_bundles", &BoundScene::set_bundles, "tables"_a)
         .def("set_instances", &BoundScene::set_instances, "bundle"_a, "importance"_a, "positions"_a,
              "quaternions"_a, "scales"_a)
         .def("set_poses", &BoundScene::set_poses, "positions"_a, "quaternions"_a, "scales"_a)
-        .def("select", &BoundScene::select, "camera"_a, "rule"_a)
+        .def("select", &BoundScene::select, "camera"_a, "rule"_a, "steps"_a = nullptr)
         .def("page_needs", &BoundScene::page_needs, "camera"_a, "rule"_a,
              "For each bundle how urgently its pages are needed: (G+1,), above 1 where the cut misses them.");
 }

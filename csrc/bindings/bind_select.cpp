@@ -77,7 +77,7 @@ py::tuple bounds_may_draw(const Tables& tables, const Instances& instances, cons
 
 BoundTable::BoundTable(py::array ball, py::array weight, py::array level, py::array own_group,
                        py::array parent_group, py::array box, py::array filter_px2, py::array antialiased,
-                       py::array offset, py::object page_shift)
+                       py::array offset, py::object page_shift, py::object page_begins)
     : arrays_{ball, weight, level, own_group, parent_group, box, filter_px2, antialiased, offset} {
     const Span<const float> balls = span_of<const float>(ball, "ball", {-1, 4});
     const size_t num_groups = balls.size / 4;
@@ -100,6 +100,10 @@ BoundTable::BoundTable(py::array ball, py::array weight, py::array level, py::ar
     if (!page_shift.is_none()) {
         given.pages.shift = span_of<const int64_t>(page_shift, "page_shift", {groups + 1});
         arrays_.push_back(py::reinterpret_borrow<py::array>(page_shift));
+    }
+    if (!page_begins.is_none()) {
+        given.pages.begins = span_of<const int32_t>(page_begins, "page_begins", {groups + 1});
+        arrays_.push_back(py::reinterpret_borrow<py::array>(page_begins));
     }
     host_ = std::make_unique<HostTable>(given, appearance);
 }
@@ -137,9 +141,10 @@ BoundCut::BoundCut(const SelectOutput& out)
 void bind_select(py::module_& m) {
     py::class_<BoundTable>(m, "ClusterTable", "What selection and drawing read of a bundle's clusters.")
         .def(py::init<py::array, py::array, py::array, py::array, py::array, py::array, py::array, py::array,
-                      py::array, py::object>(),
+                      py::array, py::object, py::object>(),
              py::kw_only(), "ball"_a, "weight"_a, "level"_a, "own_group"_a, "parent_group"_a, "box"_a,
-             "filter_px2"_a, "antialiased"_a, "offset"_a, "page_shift"_a = py::none())
+             "filter_px2"_a, "antialiased"_a, "offset"_a, "page_shift"_a = py::none(),
+             "page_begins"_a = py::none())
         .def("bytes_on", &BoundTable::bytes_on, "device"_a, "Memory that the tables take on a device.");
     py::class_<BoundCut>(m, "Cut", "The clusters that one view needs, and what their selection came to.")
         .def_readonly("instance_ids", &BoundCut::instance_ids)

@@ -70,7 +70,7 @@ Footprint footprint_of(const std::string& name) {
 }
 
 SelectRule make_rule(double tolerance_px2, std::optional<uint64_t> budget, int32_t min_level,
-                     const std::string& footprint, bool culls, double fade) {
+                     const std::string& footprint, bool culls, double fade, int32_t frame) {
     SelectRule rule;
     rule.tolerance_px2 = static_cast<float>(tolerance_px2);
     rule.budget = budget.value_or(kNoBudget);
@@ -80,6 +80,7 @@ SelectRule make_rule(double tolerance_px2, std::optional<uint64_t> budget, int32
     if (!(fade >= 1) || (fade > 1 && rule.footprint == Footprint::paper))
         throw py::value_error("fade: expected a factor of 1 or more, and 1 with the paper's footprint");
     rule.fade = {static_cast<float>(fade), 1.0f / static_cast<float>(fade)};
+    rule.frame = frame;
     return rule;
 }
 
@@ -179,7 +180,7 @@ void bind_types(py::module_& m) {
     py::implicitly_convertible<BoundCamera, BoundEyes>();
     py::class_<SelectRule>(m, "Rule", "What a selection chooses.")
         .def(py::init(&make_rule), py::kw_only(), "tolerance_px2"_a, "budget"_a, "min_level"_a, "footprint"_a,
-             "culls"_a, "fade"_a = 1.0)
+             "culls"_a, "fade"_a = 1.0, "frame"_a = 0)
         .def_readonly("tolerance_px2", &SelectRule::tolerance_px2);
     py::class_<Instances>(m, "Instances", "Instances of bundles; borrows the arrays, which are on the host.")
         .def(py::init<py::array, py::array, py::array, py::array, py::array>(), py::kw_only(), "bundle"_a,

@@ -57,11 +57,8 @@ struct NewPicture {
         }
         const auto& of = shade.background;
         const float b[3] = {float(of[0]), float(of[1]), float(of[2])};
-        cuda::FrameImage image =
-            cuda::frame_image(pinhole_of<float>(camera), static_cast<int>(width), static_cast<int>(height), b,
-                              color_plane.span.data, alpha_plane.span.data, depth_data);
-        image.min_transmittance = shade.min_transmittance;
-        return image;
+        return cuda::frame_image(pinhole_of<float>(camera), static_cast<int>(width), static_cast<int>(height),
+                                 b, color_plane.span.data, alpha_plane.span.data, depth_data);
     }
 #endif
 };

@@ -33,16 +33,19 @@ class BoundPool {
     template <class Cut>
     void frame_on_host(const SceneState& scene, SelectRule rule, bool is_bounded, const Cut& cut) {
         const std::lock_guard<std::mutex> lock(busy_);
-        host_->apply(*pool_, pool_->begin_frame(is_bounded));
+        const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
+        host_->apply(*pool_, pool_->begin_frame(is_bounded, arrive));
         pool_->release();
         std::vector<ClusterTable> tables = scene.tables;
         std::vector<Span<uint32_t>> needs;
         for (size_t b = 0; b < tables.size(); ++b) {
             tables[b].pages.shift = pool_->shift(b);
+            tables[b].pages.begins = pool_->begins(b);
             needs_[b].assign(tables[b].num_pages(), 0);
             needs.push_back({needs_[b].data(), needs_[b].size()});
         }
         rule.tolerance_px2 = std::max(rule.tolerance_px2, pool_->least_tolerance_px2());
+        rule.frame = pool_->arrivals().frame();
         note_needs(cut(Span<const ClusterTable>{tables.data(), tables.size()}, rule,
                        Span<const Span<uint32_t>>{needs.data(), needs.size()}),
                    is_bounded);

@@ -9,6 +9,7 @@
 #include "bindings/tables.h"
 #include "pipeline/model.h"
 #include "pipeline/scene_frame.h"
+#include "select/budget_steps.h"
 #include "select/select.h"
 
 #if V3DG_WITH_CUDA
@@ -234,23 +235,31 @@ class BoundScene {
 #endif
     }
 
-    BoundCut select(const BoundEyes& camera, const SelectRule& rule) {
+    // With `steps`, for pictures that follow each other, which it is of.
+    BoundCut select(const BoundEyes& camera, const SelectRule& rule, BudgetSteps* steps) {
         if (camera.eyes.are_two && rule.footprint == Footprint::paper)
             throw py::value_error("footprint: expected 'solid_angle' for two eyes, got 'paper'");
         const std::shared_ptr<const SceneState> state = state_;
         SelectOutput out;
+        BudgetSteps now = steps == nullptr ? BudgetSteps{} : *steps;
+        const SelectRule paced = steps == nullptr ? rule : now.next(rule, camera.eyes, state);
         const Work work(device_);
         {
             const py::gil_scoped_release unlocked;
             if (device_.is_host())
-                cpu::select(
-                    {{state->tables.data(), state->tables.size()}, state->instances, camera.eyes, rule, {}},
-                    out);
+                cpu::select({{state->tables.data(), state->tables.size()},
+                             state->instances,
+                             camera.eyes,
+                             paced,
+                             {},
+                             &now.last_bin},
+                            out);
 #if V3DG_WITH_CUDA
             else
-                cut_->select(*on_device_, camera.eyes, rule, out, work.stream());
+                cut_->select(*on_device_, camera.eyes, paced, out, work.stream(), nullptr, &now.last_bin);
 #endif
         }
+        if (steps != nullptr) *steps = now;
         return BoundCut(out);
     }
 

@@ -18,7 +18,7 @@ class BoundTable {
   public:
     BoundTable(py::array ball, py::array weight, py::array level, py::array own_group, py::array parent_group,
                py::array box, py::array filter_px2, py::array antialiased, py::array offset,
-               py::object page_shift);
+               py::object page_shift, py::object page_begins);
     BoundTable(const BoundTable&) = delete;
 
     const ClusterTable& table() const { return host_->table(); }

@@ -70,13 +70,13 @@ struct FrameImage {
     uint32_t first_tile;  // in the batch, its tiles row by row
     float background[3];
     float *color, *alpha, *depth;  // as Picture<float> has them; depth may be null
-    float min_transmittance;       // the same for all pictures of a frame
 };
 
 // The pictures of a scene's frame: one for each eye. Tiles of the second follow on those of the first.
 struct EyeImages {
     FrameImage image[2];
     uint32_t count;
+    float min_transmittance;  // of both
 };
 
 }  // namespace cuda

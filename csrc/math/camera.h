@@ -87,6 +87,7 @@ struct Camera {
     double fx, fy, cx, cy, width, height, near;  // px; near in world units
     double x0, y0, x1, y1;                       // the part of the image that is wanted, px
 };
+static_assert(sizeof(Camera) == 26 * sizeof(double), "nothing but its numbers is compared");
 
 // What one cut is for: a camera, or the two eyes of a stereo camera. They look the same way: their rotations
 // are equal.
@@ -98,6 +99,10 @@ struct Eyes {
     V3DG_HD Eyes(const Camera& only) : camera{only, only}, are_two(false) {}
     V3DG_HD Eyes(const Camera& left, const Camera& right) : camera{left, right}, are_two(true) {}
     V3DG_HD int count() const { return are_two ? 2 : 1; }
+    // Bit by bit.
+    bool operator==(const Eyes& other) const {
+        return are_two == other.are_two && std::memcmp(camera, other.camera, sizeof camera) == 0;
+    }
 };
 
 // Where a camera is: what its world-to-camera matrix brings to 0. The rotation in it may be off by what

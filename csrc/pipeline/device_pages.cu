@@ -34,6 +34,12 @@ __global__ void move_kernel(const PageMove* moves) {
     if (move.cluster_shift != nullptr) *move.cluster_shift = move.cluster_value;
 }
 
+// A thread a page of which is told when it fades in.
+__global__ void arrivals_kernel(const Arrival* arrivals, unsigned count, int32_t* begins) {
+    const unsigned i = blockIdx.x * blockDim.x + threadIdx.x;
+    if (i < count) begins[arrivals[i].page] = arrivals[i].begins;
+}
+
 template <class T>
 Pinned<T> pinned(size_t count) {
     void* memory = nullptr;
@@ -70,6 +76,7 @@ struct DevicePages::Flight {
     const Pinned<PageMove> moves;
     const Pinned<PageRows> rows;  // pages that come, or
     const Pinned<SlotPage> codes;
+    const Pinned<Arrival> arrivals;
     const Pinned<NeedsReport> report;
     FrameNeeds* needs = nullptr;
     std::vector<unsigned char*> blocks;  // that `moves` reads
@@ -77,10 +84,11 @@ struct DevicePages::Flight {
     size_t bytes_in = 0;
     cudaEvent_t done = nullptr, begun = nullptr, brought = nullptr;  // bringing pages begins, and is over
 
-    explicit Flight(size_t most_changes)
+    Flight(size_t most_changes, size_t most_arrivals)
         : moves(pinned<PageMove>(most_changes)),
           rows(pinned<PageRows>(most_changes)),
           codes(pinned<SlotPage>(most_changes)),
+          arrivals(pinned<Arrival>(most_arrivals)),
           report(pinned<NeedsReport>(1)) {
         check(cudaEventCreateWithFlags(&done, cudaEventDisableTiming), "cudaEventCreate");
         for (cudaEvent_t* event : {&begun, &brought}) check(cudaEventCreate(event), "cudaEventCreate");
@@ -106,7 +114,8 @@ DevicePages::DevicePages(PagePool& pool, std::vector<std::shared_ptr<const Bundl
         make_packed(stream);
     make_tables(host, appearance, stream);
     for (size_t k = 0; k < kMostFlights; ++k)
-        flights_.push_back(std::make_unique<Flight>(pool.most_changes()));
+        flights_.push_back(
+            std::make_unique<Flight>(pool.most_changes(), pool.plan().num_slots + pool.most_changes()));
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
@@ -158,6 +167,8 @@ void DevicePages::make_tables(const std::vector<ClusterTable>& host,
     joins_.copy_from({joins.data(), joins.size()}, stream);
     const std::vector<int64_t> shift(num_pages, kAbsentPage);
     shift_.copy_from({shift.data(), shift.size()}, stream);
+    const std::vector<int32_t>& begins = pool_.arrivals().begins();
+    begins_.copy_from({begins.data(), begins.size()}, stream);
     if (pool_.keeps_codes()) cluster_shift_.reserve(num_pages, stream);
     num_words_ = 1 + num_pages;
     words_.reserve(num_words_, stream);
@@ -167,6 +178,7 @@ void DevicePages::make_tables(const std::vector<ClusterTable>& host,
         BundleOnDevice bundle = tables_[b]->on_device();
         const size_t count = pool_.shift(b).size;
         bundle.table.pages.shift = {shift_.data() + first_page_[b], count};
+        bundle.table.pages.begins = {begins_.data() + first_page_[b], count};
         if (pool_.keeps_codes())
             bundle.table.pages.cluster_shift = {cluster_shift_.data() + first_page_[b], count};
         bundle.joins = joins_.data() + first_join[b];
@@ -289,7 +301,16 @@ void DevicePages::bring(const std::vector<PageChange>& changes, Flight& flight, 
     if (staged >= kLeastMeasured) check(cudaEventRecord(flight.brought, stream), "cudaEventRecord");
 }
 
-PartlyResident DevicePages::begin_frame(bool is_bounded, cudaStream_t stream) {
+void DevicePages::note_arrivals(Flight& flight, cudaStream_t stream) {
+    constexpr unsigned kThreads = 256;
+    const std::vector<Arrival>& changed = pool_.arrivals().changed();
+    if (changed.empty()) return;
+    std::copy(changed.begin(), changed.end(), flight.arrivals.get());
+    launch("arrivals_kernel", arrivals_kernel, blocks_for(changed.size(), kThreads), kThreads, 0, stream,
+           flight.arrivals.get(), static_cast<unsigned>(changed.size()), begins_.data());
+}
+
+PartlyResident DevicePages::begin_frame(bool is_bounded, Arrive arrive, cudaStream_t stream) {
     if (is_capturing(stream))
         throw std::runtime_error(
             "memory: expected no CUDA graph of a pool, whose pages come and go; capture a renderer without "
@@ -302,12 +323,13 @@ PartlyResident DevicePages::begin_frame(bool is_bounded, cudaStream_t stream) {
         pool_.give_back(std::exchange(current_->blocks, {}));
     }
     Flight& flight = free_flight();
-    const std::vector<PageChange>& changes = pool_.begin_frame(is_bounded);
+    const std::vector<PageChange>& changes = pool_.begin_frame(is_bounded, arrive);
     flight.needs = pool_.lend_needs();
     flight.is_bounded = is_bounded;
     flight.blocks = pool_.take_blocks();
     current_ = &flight;
     bring(changes, flight, stream);
+    note_arrivals(flight, stream);
     return {bundles_.data(),
             {words_.data(), num_words_, need_.data(), list_.data(), static_cast<unsigned>(pool_.most_needs()),
              flight.report.get(), flight.needs->list}};
@@ -320,6 +342,7 @@ void DevicePages::end_frame(cudaStream_t stream) {
 
 SelectRule DevicePages::raised(SelectRule rule) const {
     rule.tolerance_px2 = std::max(rule.tolerance_px2, pool_.least_tolerance_px2());
+    rule.frame = pool_.arrivals().frame();
     return rule;
 }
 
@@ -327,7 +350,7 @@ float DevicePages::ask(const SceneTables& scene, const Eyes& eyes, const SelectR
                        cudaStream_t stream) {
     const StreamLock lock(busy_, stream);
     note_flights(true);
-    const PartlyResident resident = begin_frame(false, stream);
+    const PartlyResident resident = begin_frame(false, Arrive::at_once, stream);
     const SelectRule used = raised(rule);
     SelectOutput out;
     cut_.select(scene, eyes, used, out, stream, &resident);

@@ -49,7 +49,7 @@ class DevicePages {
     StreamMutex& mutex() { return busy_; }
     // Takes note of what frames needed whose cuts are over. Enqueues what brings pages in before a cut, and
     // returns what that reads. Under the lock. Waits only where kMostFlights cuts are not over.
-    PartlyResident begin_frame(bool is_bounded, cudaStream_t stream);
+    PartlyResident begin_frame(bool is_bounded, Arrive arrive, cudaStream_t stream);
     // The cut is enqueued. Under the lock.
     void end_frame(cudaStream_t stream);
     // Takes note of what frames needed whose cuts are over, before the next one begins.
@@ -57,7 +57,7 @@ class DevicePages {
     // The models of all bundles, on the device: one of the two, the other is null.
     const PackedPlanes* packed() const { return packed_.data(); }
     const CodedGaussians* coded() const { return coded_.data(); }
-    // What the pool says that a frame may be drawn with.
+    // What the pool says that the frame which began last is drawn with.
     SelectRule raised(SelectRule rule) const;
 
     // Cuts the scene without drawing, and waits for what that needs; the tolerance that was used.
@@ -76,6 +76,7 @@ class DevicePages {
     PageRows page_rows(const PageChange& change, const unsigned char* bytes) const;
     SlotPage slot_page(const PageChange& change, const unsigned char* bytes) const;
     void bring(const std::vector<PageChange>& changes, Flight& flight, cudaStream_t stream);
+    void note_arrivals(Flight& flight, cudaStream_t stream);
 
     PagePool& pool_;
     const std::vector<std::shared_ptr<const BundleTables>> tables_;
@@ -92,6 +93,7 @@ class DevicePages {
     DeviceBuffer<uint8_t> joins_;
     DeviceBuffer<int64_t> shift_;           // of all bundles
     DeviceBuffer<uint32_t> cluster_shift_;  // the same, where there are codes
+    DeviceBuffer<int32_t> begins_;          // likewise, as PageTable has them
     std::vector<size_t> first_page_;        // of each bundle, among those of all
     DeviceBuffer<BundleOnDevice> bundles_;
     DeviceBuffer<uint32_t> words_;

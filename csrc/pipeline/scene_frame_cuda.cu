@@ -19,8 +19,7 @@ FrameImage frame_image(const Pinhole<float>& camera, int width, int height, cons
             {background[0], background[1], background[2]},
             color,
             alpha,
-            depth,
-            kStopsBefore};
+            depth};
 }
 
 static uint32_t num_tiles(const FrameImage& image) {
@@ -106,9 +105,9 @@ void SceneFrame::set_models(std::vector<DeviceModel> models,
     palettes_ = std::move(palettes);
 }
 
-EyeImages images_of_eyes(const FrameImage& left, FrameImage right) {
+EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance) {
     right.first_tile = num_tiles(left);
-    return {{left, right}, 2};
+    return {{left, right}, 2, min_transmittance};
 }
 
 FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures, bool fades,
@@ -122,7 +121,7 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             has_packed_ ? packed_.data() : nullptr,
             has_coded_ ? coded_.data() : nullptr,
             scene.num_instances() > 1,
-            last.min_transmittance,
+            pictures.min_transmittance,
             fades};
 }
 
@@ -147,7 +146,8 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
                                                    const Eyes& eyes, SelectRule& rule,
                                                    const EyeImages& pictures, cudaStream_t stream) {
     const StreamLock lock(pages.mutex(), stream);
-    PartlyResident resident = pages.begin_frame(true, stream);
+    const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
+    PartlyResident resident = pages.begin_frame(true, arrive, stream);
     SelectRule next = rule = pages.raised(rule);
     FrameBatch of_pages = batch(scene, pictures, rule.fade.is_on(), stream);
     of_pages.packed = pages.packed();
@@ -168,9 +168,9 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
 
 std::unique_ptr<Drawing> SceneFrame::draw_cut(const SceneTables& scene, const Camera& camera,
                                               const GivenCut& given, const FrameImage& image,
-                                              cudaStream_t stream) {
+                                              float min_transmittance, cudaStream_t stream) {
     return frame_.draw(
-        batch(scene, {{image, {}}, 1}, given.weight.size > 0, stream),
+        batch(scene, {{image, {}}, 1, min_transmittance}, given.weight.size > 0, stream),
         [=, &scene](const ItemList& items, cudaStream_t on) {
             cut_.given_items(scene, camera, given, image, images_.data(), placements_.data(), items, on);
         },
@@ -198,19 +198,16 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
 
 std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
                                           float filter_px2, bool antialiased, const FrameImage& image,
-                                          cudaStream_t stream, const PackedPlanes* packed) {
+                                          cudaStream_t stream, const PackedPlanes* packed,
+                                          float min_transmittance) {
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
     const ModelTables tables{rows, packed == nullptr ? PackedPlanes{} : *packed, {view, 0, 0}, image};
-    const FrameBatch batch{&on_device->rows,
-                           &on_device->placement,
-                           &on_device->image,
-                           1,
-                           num_tiles(image),
-                           packed == nullptr ? nullptr : &on_device->packed,
-                           nullptr,
-                           false,
-                           image.min_transmittance};
+    const FrameBatch batch{&on_device->rows,  &on_device->placement,
+                           &on_device->image, 1,
+                           num_tiles(image),  packed == nullptr ? nullptr : &on_device->packed,
+                           nullptr,           false,
+                           min_transmittance};
     const unsigned blocks = std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));
     return frame_.draw(
         batch,

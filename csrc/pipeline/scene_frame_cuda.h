@@ -61,7 +61,7 @@ class DevicePalette {
 };
 
 // The pictures of two eyes in one frame.
-EyeImages images_of_eyes(const FrameImage& left, FrameImage right);
+EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_transmittance);
 
 // Draws a scene that stays on the device: selects, then draws the cut.
 class SceneFrame {
@@ -80,7 +80,7 @@ class SceneFrame {
                                            SelectRule& rule, const EyeImages& pictures, cudaStream_t stream);
     // Draws pairs that were selected before; they are on the device and stay, too.
     std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera, const GivenCut& given,
-                                      const FrameImage& image, cudaStream_t stream);
+                                      const FrameImage& image, float min_transmittance, cudaStream_t stream);
 
   private:
     // Of the models that were set.
@@ -114,7 +114,8 @@ class ModelFrame {
     // The rows, and what is packed of them, stay where they are until the drawing is finished.
     std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
                                   float filter_px2, bool antialiased, const FrameImage& image,
-                                  cudaStream_t stream, const PackedPlanes* packed = nullptr);
+                                  cudaStream_t stream, const PackedPlanes* packed = nullptr,
+                                  float min_transmittance = kStopsBefore);
     FrameTape tape() const { return frame_.tape(); }
 
   private:

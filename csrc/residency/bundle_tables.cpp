@@ -74,6 +74,7 @@ BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& a
     upload.add(t.top_group);
     upload.add(t.top_cluster);
     upload.add(t.pages.shift);
+    upload.add(t.pages.begins);
     upload.add(on_device_.appearance.filter_px2);
     upload.add(on_device_.appearance.antialiased);
     upload.add(on_device_.bounds);

@@ -91,6 +91,11 @@ class PagePolicy {
     size_t num_pages() const { return slot_of_page_.size; }
     size_t most_page_bytes() const { return most_page_bytes_; }
     const PageSource& source(size_t bundle) const { return *bundles_[bundle].source; }
+    // The place of a page among those of all bundles, and that of the page above it; below 0: none is.
+    uint32_t id_of(size_t bundle, size_t page) const {
+        return bundles_[bundle].first_page + static_cast<uint32_t>(page);
+    }
+    int32_t page_above(uint32_t id) const { return pages_[id].parent; }
 
     // Any thread may ask for the state of a page, and change it from absent to loading and from that on.
     std::atomic<PageState>& state(size_t bundle, size_t page) { return states_[id_of(bundle, page)]; }
@@ -157,9 +162,6 @@ class PagePolicy {
 
     void add_pages(Bundle& bundle, const ClusterTable& table);
     void plan_memory(const PoolMemory& memory);
-    uint32_t id_of(size_t bundle, size_t page) const {
-        return bundles_[bundle].first_page + static_cast<uint32_t>(page);
-    }
     PageState state_of(size_t id) const { return states_[id].load(std::memory_order_acquire); }
     void use(int32_t slot, bool is_needed);
     size_t ask(const PageRequest& request, bool has_failures);

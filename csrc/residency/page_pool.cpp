@@ -35,7 +35,7 @@ struct Reading {
 
 struct PagePool::State {
     State(const std::vector<PagedBundle>& bundles, const PoolLimits& given)
-        : limits(given), policy(bundles, given.memory) {
+        : limits(given), policy(bundles, given.memory), arrivals(policy) {
         decides_itself = limits.num_threads == 0 || policy.num_slots() == 0;
         missing = policy.num_slots() == 0 ? 0 : 1;  // until it is known
     }
@@ -82,6 +82,7 @@ struct PagePool::State {
     std::vector<PageChange> changes;
     std::vector<unsigned char*> taken, returned;  // blocks of those changes; blocks to be used again
     std::vector<std::vector<int64_t>> shift;      // [P] of each bundle
+    PageArrivals arrivals;
     std::vector<FrameNeeds*> idle_needs;
     FrameNeeds* to_note = nullptr;
 
@@ -104,6 +105,7 @@ struct PagePool::State {
     void read_always();
 
     void exchange();
+    void take_changes(bool is_bounded);
     void take_ready();
 
     // A thread that another process has may hold the lock for ever in this one.
@@ -407,6 +409,24 @@ void PagePool::State::take_ready() {
     }
 }
 
+void PagePool::State::take_changes(bool is_bounded) {
+    changes.clear();
+    std::unique_lock<std::mutex> lock = is_bounded ? locked_at_once() : locked();
+    if (!lock.owns_lock()) return;
+    exchange();
+    if (!is_bounded || decides_itself) {
+        takes_all = !is_bounded;
+        decide_next_round(lock);
+        takes_all = false;
+    }
+    changes.swap(ready);
+    ready_bytes = 0;
+    has_noted = false;
+    if (has_to_decide()) to_decide.notify_one();
+    lock.unlock();
+    take_ready();
+}
+
 PagePool::PagePool(const std::vector<PagedBundle>& bundles, const PoolLimits& limits,
                    std::shared_ptr<BlockMemory> memory)
     : state_(std::make_shared<State>(bundles, limits)) {
@@ -432,6 +452,11 @@ int PagePool::max_sh_degree() const { return state_->max_sh_degree; }
 Span<const int64_t> PagePool::shift(size_t b) const {
     return {state_->shift[b].data(), state_->shift[b].size()};
 }
+Span<const int32_t> PagePool::begins(size_t b) const {
+    const uint32_t first = state_->policy.id_of(b, 0);
+    return {state_->arrivals.begins().data() + first, state_->shift[b].size()};
+}
+const PageArrivals& PagePool::arrivals() const { return state_->arrivals; }
 const PageSource& PagePool::source(uint32_t b) const { return state_->policy.source(b); }
 SlotPage PagePool::slot_page(const PageChange& change) const {
     const PageSource& of = source(change.bundle);
@@ -444,25 +469,11 @@ size_t PagePool::most_changes() const { return 2 * state_->blocks.num_blocks() +
 size_t PagePool::most_needs() const { return state_->most_needs; }
 size_t PagePool::most_bytes_on_their_way() const { return state_->most_bytes; }
 
-const std::vector<PageChange>& PagePool::begin_frame(bool is_bounded) {
+const std::vector<PageChange>& PagePool::begin_frame(bool is_bounded, Arrive arrive) {
     State& state = *state_;
     state.least_of_frame = state.least_tolerance;
-    if (!std::exchange(state.has_begun, true)) return state.changes;  // the coarsest
-    state.changes.clear();
-    std::unique_lock<std::mutex> lock = is_bounded ? state.locked_at_once() : state.locked();
-    if (!lock.owns_lock()) return state.changes;
-    state.exchange();
-    if (!is_bounded || state.decides_itself) {
-        state.takes_all = !is_bounded;
-        state.decide_next_round(lock);
-        state.takes_all = false;
-    }
-    state.changes.swap(state.ready);
-    state.ready_bytes = 0;
-    state.has_noted = false;
-    if (state.has_to_decide()) state.to_decide.notify_one();
-    lock.unlock();
-    state.take_ready();
+    if (std::exchange(state.has_begun, true)) state.take_changes(is_bounded);  // else the coarsest
+    state.arrivals.advance(state.changes, is_bounded ? arrive : Arrive::at_once);
     return state.changes;
 }
 

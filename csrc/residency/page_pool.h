@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "quantize/quantize.h"
+#include "residency/page_arrivals.h"
 #include "residency/page_blocks.h"
 #include "residency/page_policy.h"
 
@@ -65,6 +66,8 @@ class PagePool {
     int max_sh_degree() const;
     // [P] of the host's PageTable; as of the last changes that were taken.
     Span<const int64_t> shift(size_t bundle) const;
+    Span<const int32_t> begins(size_t bundle) const;
+    const PageArrivals& arrivals() const;
     const PageSource& source(uint32_t bundle) const;
     // What becomes of a page that comes, where codes are kept.
     SlotPage slot_page(const PageChange& change) const;
@@ -76,8 +79,8 @@ class PagePool {
 
     // Begins a frame: what comes and goes before it, in this order. The first time the coarsest pages come.
     // Their bytes stay until release() or the next call. A bounded frame waits for nothing; one that is not
-    // takes all that was read, and waits until that is decided.
-    const std::vector<PageChange>& begin_frame(bool is_bounded);
+    // takes all that was read, and waits until that is decided, and ends all that fades in.
+    const std::vector<PageChange>& begin_frame(bool is_bounded, Arrive arrive = Arrive::at_once);
     void set_most_bytes_a_frame(size_t bytes);
     void release();
     // The same in two steps, for who copies later: takes away the blocks, which give_back() returns.

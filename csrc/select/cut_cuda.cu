@@ -279,6 +279,12 @@ void copy_to_host(T* to, const T* from, size_t count, cudaStream_t stream) {
 
 }  // namespace
 
+BudgetState* Cut::budget_state(cudaStream_t stream) {
+    const BudgetState none{};
+    if (budget_.data() == nullptr) budget_.copy_from({&none, 1}, stream);
+    return budget_.data();
+}
+
 template <class Output>
 void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, const Target& target,
               const Output& output, cudaStream_t stream, const PartlyResident* resident) {
@@ -295,12 +301,9 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
         std::clamp<size_t>(num_tickets, 1, (2048 / kCutThreads) * num_multiprocessors()));
     const bool has_budget = rule.budget != kNoBudget;
     Count* change = has_budget ? change_.reserve(kNumBudgetBins, stream) : nullptr;
-    if (has_budget) {
+    if (has_budget)
         check(cudaMemsetAsync(change, 0, kNumBudgetBins * sizeof(Count), stream), "cudaMemsetAsync");
-        const BudgetState none{};
-        if (budget_.data() == nullptr) budget_.copy_from({&none, 1}, stream);
-    }
-    BudgetState* state = has_budget ? budget_.data() : nullptr;
+    BudgetState* state = has_budget ? budget_state(stream) : nullptr;
     for (const bool is_second : {false, true}) {
         const Scratch& scratch = scratches[is_second];
         const BudgetRound round{state, is_second};
@@ -362,11 +365,14 @@ void Cut::given_items(const SceneTables& scene, const Camera& camera, const Give
 
 template <bool kFades>
 void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, SelectOutput& out,
-                       cudaStream_t stream, const PartlyResident* resident) {
+                       cudaStream_t stream, const PartlyResident* resident, uint32_t* last_bin) {
     const DeviceGuard guard(device_);
     const StreamLock lock = scene.lock(stream);
     Pairs* on_device = pairs_.reserve(1, stream);
     Pairs counts{};
+    const bool has_budget = rule.budget != kNoBudget;
+    const bool keeps_bin = has_budget && last_bin != nullptr;
+    uint32_t* bin_on_device = keeps_bin ? &budget_state(stream)->last_bin : nullptr;
     // Most cuts of most scenes fit at once.
     for (Count capacity = std::max<Count>(1u << 16, pair_instance_.capacity());; capacity = counts.pairs) {
         const PairOutput<kFades> output{pair_instance_.reserve(capacity, stream),
@@ -376,12 +382,14 @@ void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectR
                                         &on_device->pairs,
                                         &on_device->gaussians};
         check(cudaMemsetAsync(on_device, 0, sizeof *on_device, stream), "cudaMemsetAsync");
+        if (keeps_bin)
+            check(cudaMemcpyAsync(bin_on_device, last_bin, sizeof *last_bin, cudaMemcpyHostToDevice, stream),
+                  "cudaMemcpyAsync of the last bin");
         cut(scene, eyes, rule, {{}, nullptr, nullptr, &on_device->choice}, output, stream, resident);
         copy_to_host(&counts, on_device, 1, stream);
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
         if (counts.pairs <= capacity) break;
     }
-    const bool has_budget = rule.budget != kNoBudget;
     out.fits_budget = !has_budget || !counts.choice.exceeds_budget;
     out.tolerance_px2 = has_budget ? counts.choice.tolerance_px2 : rule.tolerance_px2;
     out.num_gaussians = static_cast<int64_t>(out.fits_budget ? counts.gaussians : counts.choice.least);
@@ -391,15 +399,16 @@ void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectR
     copy_to_host(out.instance.data(), pair_instance_.data(), counts.pairs, stream);
     copy_to_host(out.cluster.data(), pair_cluster_.data(), counts.pairs, stream);
     copy_to_host(out.weight.data(), pair_weight_.data(), out.weight.size(), stream);
+    copy_to_host(last_bin, bin_on_device, keeps_bin ? 1 : 0, stream);
     check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
 }
 
 void Cut::select(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, SelectOutput& out,
-                 cudaStream_t stream, const PartlyResident* resident) {
+                 cudaStream_t stream, const PartlyResident* resident, uint32_t* last_bin) {
     if (rule.fade.is_on())
-        select_pairs<true>(scene, eyes, rule, out, stream, resident);
+        select_pairs<true>(scene, eyes, rule, out, stream, resident, last_bin);
     else
-        select_pairs<false>(scene, eyes, rule, out, stream, resident);
+        select_pairs<false>(scene, eyes, rule, out, stream, resident, last_bin);
 }
 
 size_t Cut::bytes() const {

@@ -25,7 +25,8 @@ namespace v3dg {
 // one is used, which comes from that of the frame before (select_math.h).
 //
 // With a fade there may be several clusters on a path, whose weights add up to 1, whichever pages are
-// resident. They depend on that and on the metrics of the groups above and below alone.
+// resident and however far they have faded in. They depend on that and on the metrics of the groups above and
+// below alone.
 //
 // Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the footprint and the
 // nesting balls are ours.

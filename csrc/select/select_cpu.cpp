@@ -92,7 +92,7 @@ struct Scratch {
 
 // Answers for all groups of an instance. What it reads comes as copies, which nothing that it writes can
 // change, so that the compiler works on several groups at once. Those that are absent, which it could not ask
-// for at once, are not refined whatever the answer.
+// for at once, are not refined whatever the answer, and those that fade in no further than they have.
 template <Footprint footprint, bool kFades>
 void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
                 uint16_t* __restrict refinement) {
@@ -103,8 +103,10 @@ void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
     const AskedGroups groups{table, view, rule};
     const int32_t num_groups = static_cast<int32_t>(table.ball.size);
     for (int32_t g = 0; g < num_groups; ++g) refinement[g] = static_cast<uint16_t>(groups.refinement(g));
-    for (int32_t g = 0; g < num_groups && !pages.is_whole(); ++g)
-        if (!pages.is_resident(g)) refinement[g] = 0;
+    for (int32_t g = 0; g < num_groups && !pages.is_whole(); ++g) {
+        const int32_t most = pages.is_resident(g) ? arrival(pages, g, rule) : 0;
+        refinement[g] = static_cast<uint16_t>(min_of<int32_t>(refinement[g], most));
+    }
 }
 
 void ask_groups(const SeenInstance& seen, const SelectRule& rule, uint16_t* refinement) {

@@ -54,9 +54,10 @@ class Cut {
                      const FrameImage& image, FrameImage* images, Placement* placements,
                      const ItemList& items, cudaStream_t stream);
 
-    // Selected clusters as pairs on the host, for which it waits.
+    // Selected clusters as pairs on the host, for which it waits. `last_bin` as SelectInput has it; null: it
+    // stays on the device.
     void select(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, SelectOutput& out,
-                cudaStream_t stream, const PartlyResident* resident = nullptr);
+                cudaStream_t stream, const PartlyResident* resident = nullptr, uint32_t* last_bin = nullptr);
 
     size_t bytes() const;
 
@@ -71,7 +72,8 @@ class Cut {
              const Output& output, cudaStream_t stream, const PartlyResident* resident);
     template <bool kFades>
     void select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, SelectOutput& out,
-                      cudaStream_t stream, const PartlyResident* resident);
+                      cudaStream_t stream, const PartlyResident* resident, uint32_t* last_bin);
+    BudgetState* budget_state(cudaStream_t stream);
 
     const int device_ = current_device();
     DeviceBuffer<InstanceView> views_;

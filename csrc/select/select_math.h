@@ -50,12 +50,13 @@ struct Fade {
     float factor = 1.0f, inverse = 1.0f;
 
     V3DG_HD bool is_on() const { return factor > 1.0f; }
+    bool operator==(const Fade& other) const { return factor == other.factor && inverse == other.inverse; }
 };
 
 // How the tolerance of a budget comes about.
 enum class BudgetPace {
     at_once,   // from one view alone
-    in_steps,  // from that of the frame before, too, so that slow motion sees no leap of it
+    in_steps,  // from that of the frame before, too, so that slow motion sees no leap of it (budget_steps.h)
     again,     // of a frame that is drawn once more: no step, unless the budget wants it
 };
 
@@ -66,7 +67,15 @@ struct SelectRule {
     int32_t min_level = 0;        // nothing finer is drawn
     uint64_t budget = kNoBudget;  // most gaussians; the tolerance is raised until they fit
     BudgetPace pace = BudgetPace::at_once;
-    Fade fade = {};  // not with the paper's footprint, which may decrease towards the root
+    int32_t frames_at_rest = 0;  // in steps: in so many frames up to this one nothing has moved
+    Fade fade = {};              // not with the paper's footprint, which may decrease towards the root
+    int32_t frame = 0;           // with a fade: up to which pages of a pool have faded in
+
+    bool operator==(const SelectRule& o) const {
+        return tolerance_px2 == o.tolerance_px2 && footprint == o.footprint && culls == o.culls &&
+               min_level == o.min_level && budget == o.budget && pace == o.pace &&
+               frames_at_rest == o.frames_at_rest && fade == o.fade && frame == o.frame;
+    }
 };
 
 V3DG_HD inline float distance2_from(const float eye[3], const Ball& ball) {
@@ -129,6 +138,13 @@ V3DG_HD inline int32_t refinement(float metric_px2, const SelectRule& rule) {
     const float between = ramp > 0.0f ? (ramp < 1.0f ? ramp : 1.0f) : 0.0f;  // 0 where there is no number
     const int32_t rounded = static_cast<int32_t>(between * kWhole + 0.5f);
     return fits(metric_px2, rule) ? 0 : is_refined(metric_px2, rule) ? kWhole : rounded;
+}
+
+// How far a page has faded in, of kWhole. Groups are refined as far as their pages have, at most: as both
+// never decrease towards the root, the lesser of the two does not, and the cut stays exact.
+V3DG_HD inline int32_t arrival(const PageTable& pages, int32_t g, const SelectRule& rule) {
+    static_assert(kWhole % kArrivalFrames == 0, "frames are whole parts");
+    return rule.fade.is_on() ? pages.arrived(g, rule.frame) * (kWhole / kArrivalFrames) : kWhole;
 }
 
 // Where a box lies as seen from one plane, in units of the plane's normal.
@@ -196,9 +212,11 @@ V3DG_HD inline float tolerance_of_bin(uint32_t bin, float tolerance) {
 
 // In steps, a budget's tolerance goes towards the one at which this part of the budget stays free, so that
 // what comes into view seldom makes it leap: a share of the way, and a least number of bins. A band of the
-// usual fade is 117 bins wide. From some distance on the motion is not slow, and it goes all the way.
+// usual fade is 117 bins wide. From some distance on the motion is not slow, and it goes all the way. At rest
+// it arrives in so many frames, in steps of about the same size.
 constexpr uint64_t kHeadroomParts = 32;
 constexpr uint32_t kStepParts = 32, kLeastStepBins = 6, kLeapBins = 512;
+constexpr int32_t kRestFrames = 8;
 constexpr uint32_t kNoBin = ~uint32_t(0);  // of the frame before, where there was none
 
 V3DG_HD inline uint64_t goal_of_budget(uint64_t budget) { return budget - budget / kHeadroomParts; }
@@ -212,7 +230,10 @@ V3DG_HD inline float tolerance_of_budget(const SelectRule& rule, uint32_t least,
     const uint32_t floor = bin_of_metric(rule.tolerance_px2, 0.0f);  // no bin below is drawn with
     goal = max_of(floor, min_of(goal, kNumBudgetBins - 1));
     const uint32_t from = last == kNoBin ? goal : last, way = goal > from ? goal - from : from - goal;
-    uint32_t step = way > kLeapBins ? way : min_of(way, max_of(way / kStepParts, kLeastStepBins));
+    const auto frames_left = static_cast<uint32_t>(kRestFrames + 1 - rule.frames_at_rest);
+    const uint32_t in_motion = min_of(way, max_of(way / kStepParts, kLeastStepBins));
+    uint32_t step = rule.frames_at_rest > 0 ? (way + frames_left - 1) / frames_left : in_motion;
+    if (way > kLeapBins) step = way;
     if (rule.pace == BudgetPace::again) step = 0;
     last = max_of(max_of(least, floor), goal > from ? from + step : from - step);
     // The floor is rounded up, so that its own cut may fit where that of the rule's tolerance does not.
@@ -262,7 +283,8 @@ struct AskedGroups {
     const SelectRule& rule;
 
     V3DG_HD int32_t refinement(int32_t g) const {
-        return v3dg::refinement(metric_px2(table, g, view, rule), rule);
+        return min_of(v3dg::refinement(metric_px2(table, g, view, rule), rule),
+                      arrival(table.pages, g, rule));
     }
     // The first of the tolerances that a budget chooses from at which it fits, and is not refined any more.
     V3DG_HD uint32_t first_fitting(int32_t g) const {

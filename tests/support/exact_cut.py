@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from partial import closed_residency, random_shift, resident_scene, rule
+from partial import arrived, closed_residency, random_begins, random_shift, resident_scene, rule
 from random_bundle import random_bundle
 from scenes_lod import blob, group_metrics, lod_bundle
 from v3dg import Camera, Scene, select
@@ -119,13 +119,15 @@ def parts_of(weights):
     return parts.astype(np.int64)
 
 
-def cut_of(scene, camera, options, shift, device):
-    """The cut, of pages at these places where there are any, and the seconds that it took."""
-    if shift is None:
+def cut_of(scene, camera, options, pages, device):
+    """The cut, of pages at places, that fade in, in a frame; or of all. And the seconds that it took."""
+    if pages is None:
         selection = select(scene, camera, **options, cull=False, device=device)
         return selection, selection.seconds
     begin = time.perf_counter()
-    cut = resident_scene(scene, [shift], device).select(camera.core, rule(**options, cull=False))
+    shift, begins, frame = pages
+    core = resident_scene(scene, [shift], device, begins=[begins])
+    cut = core.select(camera.core, rule(**options, cull=False, frame=frame))
     return cut, time.perf_counter() - begin
 
 
@@ -133,32 +135,34 @@ def run_trials(num_trials, bundles=None, *, seed=0, device="cpu", partial=False,
     """Violations among the trials, and what was tried; random trees if no bundles are given.
 
     With ``partial``, of pages closed towards the root, other ones for each camera. With ``fades``, views also
-    have random fades, finest levels, importances and budgets.
+    have random fades, finest levels, importances and budgets, and pages fade in.
     """
     rng = np.random.default_rng(seed)
     bundles = bundles or random_trees(rng)
     numbers = [numbers_of_clusters(bundle, rng) for bundle in bundles]
     check_counting(bundles[0], *numbers[0])
-    trials = wrong = ties = drawn = at_ends = between = 0
+    trials = wrong = ties = drawn = at_ends = between = fading = 0
     seconds = 0.0
     start = time.perf_counter()
     while trials < num_trials:
         b = int(rng.integers(len(bundles)))
         count = min(BATCH, num_trials - trials)
         scene, camera, tolerance, is_tie = random_batch(bundles[b], rng, count)
-        shift, options, parts = None, {"tolerance": tolerance}, None
+        pages, options, parts = None, {"tolerance": tolerance}, None
         if partial:
             shift, _ = random_shift(rng, bundles[b], closed_residency(rng, bundles[b]))
+            pages = shift, *random_begins(rng, bundles[b])
+            fading += int(np.isin(arrived(*pages[1:]), (0, 1), invert=True).sum())
         if fades:
             options = random_options(rng, bundles[b], tolerance)
             scene.set_importance(log_uniform(rng, 0.1, 10, count))
-        selection, took = cut_of(scene, camera, options, shift, device)
+        selection, took = cut_of(scene, camera, options, pages, device)
         if fades:
             if rng.random() < 0.5:
                 least, _ = cut_of(scene, camera, options | {"tolerance": np.inf}, None, device)
                 options["budget"] = least.num_gaussians + int(rng.integers(selection.num_gaussians + 1))
-                selection, took = cut_of(scene, camera, options, shift, device)
-                wrong += shift is None and selection.num_gaussians > options["budget"]
+                selection, took = cut_of(scene, camera, options, pages, device)
+                wrong += pages is None and selection.num_gaussians > options["budget"]
             parts = parts_of(selection.weights)
             between += int((parts < WHOLE).sum())
         wrong += count_wrong(selection.instance_ids, selection.cluster_ids, count, *numbers[b], parts)
@@ -178,6 +182,7 @@ def run_trials(num_trials, bundles=None, *, seed=0, device="cpu", partial=False,
         "batches_with_the_tolerance_a_metric": ties,
         "selected_per_trial": drawn / max(trials, 1),
         "selected_between_leaf_and_root": 1 - at_ends / max(drawn, 1),
+        **({"pages_that_fade_in": fading} if fades and partial else {}),
         **({"selected_with_weights_below_1": between / max(drawn, 1)} if fades else {}),
         "select_seconds": seconds,
         "seconds": time.perf_counter() - start,

@@ -6,6 +6,8 @@ from v3dg import _core, _device
 from v3dg.select import rule_of
 
 ABSENT = np.iinfo(np.int64).min
+ARRIVAL_FRAMES = 8  # over which a page fades in
+NEVER, LONG_AGO = np.iinfo(np.int32).max, -ARRIVAL_FRAMES
 
 
 def closed_residency(rng, bundle, share=None):
@@ -39,20 +41,49 @@ def random_shift(rng, bundle, there):
     return shift, row
 
 
-def table_of(bundle, shift=None):
+def random_begins(rng, bundle):
+    """(P,) after which frames pages fade in, none before the one above it, and a frame in which some do."""
+    parent = bundle.groups.parent
+    begins = np.full(len(parent) + 1, LONG_AGO, np.int32)
+    for g in range(len(parent) - 1, -1, -1):  # parents come later
+        above = int(begins[parent[g]])
+        if above == NEVER or rng.random() < 0.05:
+            begins[g] = NEVER
+        elif above >= 0 or rng.random() < 0.3:
+            begins[g] = above + ARRIVAL_FRAMES + rng.integers(0, 4)
+    known = begins[(begins >= 0) & (begins < NEVER)]
+    return begins, int(rng.choice(known) if len(known) else 0) + int(rng.integers(1, ARRIVAL_FRAMES))
+
+
+def arrived(begins, frame):
+    """(P,) shares to which pages have faded in."""
+    return np.clip(frame - begins.astype(np.int64), 0, ARRIVAL_FRAMES) / ARRIVAL_FRAMES
+
+
+def table_of(bundle, shift=None, begins=None):
     """The core's table of a bundle with pages at their places."""
     groups = {name: getattr(bundle.groups, name) for name in ("ball", "weight", "level")}
-    return _core.ClusterTable(**(vars(bundle.clusters) | groups), page_shift=shift)
+    return _core.ClusterTable(**(vars(bundle.clusters) | groups), page_shift=shift, page_begins=begins)
 
 
-def resident_scene(scene, shifts, device="cpu"):
-    """The core's scene of bundles whose pages are at these places."""
+def resident_scene(scene, shifts, device="cpu", begins=None):
+    """The core's scene of bundles whose pages are at these places, and fade in then."""
     core = _core.ResidentScene(_device.resolve(device).number)
-    core.set_bundles([table_of(bundle, shift) for bundle, shift in zip(scene.bundles, shifts, strict=True)])
+    pages = zip(scene.bundles, shifts, begins or [None] * len(shifts), strict=True)
+    core.set_bundles([table_of(*of_bundle) for of_bundle in pages])
     poses = scene.positions, scene.quaternions, scene.scales
     core.set_instances(scene.instance_bundle, scene.importance, *poses)
     return core
 
 
-def rule(tolerance=None, budget=None, min_level=0, fade=None, *, cull=True):
-    return rule_of(tolerance, budget, min_level, cull=cull, fade=fade)
+def rule(tolerance=None, budget=None, min_level=0, fade=None, *, cull=True, frame=0):
+    checked = rule_of(tolerance, budget, min_level, cull=cull, fade=fade)
+    return _core.Rule(
+        tolerance_px2=checked.tolerance_px2,
+        budget=budget,
+        min_level=min_level,
+        footprint="solid_angle",
+        culls=cull,
+        fade=fade or 1.0,
+        frame=frame,
+    )

@@ -15,8 +15,8 @@ from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths, u
 from v3dg.false_color import ColorBy
 from v3dg.opening import open_with_cameras
 from v3dg.pictures import check_picture_path, write_picture
-from v3dg.render import render
-from v3dg.select import DEFAULT_FADE
+from v3dg.render import Renderer
+from v3dg.select import DEFAULT_FADE, CutOptions
 
 
 @dataclass
@@ -53,19 +53,13 @@ def run(options: Render) -> None:
     pictures: list[dict[str, Any]] = []
     views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
     show = len(views) > 1 and not options.quiet
+    # With a fade, pictures follow each other, and the tolerance of a budget goes in steps.
+    renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.pool())
+    cut: CutOptions = {"tolerance": options.tolerance, "budget": options.budget}
+    cut |= {"min_level": options.min_level, "fade": fade}
     for path, (name, camera) in counted(views, len(views), "render", show):
-        image = render(
-            subject,
-            camera,
-            tolerance=options.tolerance,
-            budget=options.budget,
-            min_level=options.min_level,
-            fade=fade,
-            color_by=options.color_by,
-            background=options.background,
-            device=device,
-            memory=options.pool(),
-        )
+        renderer.settle(camera, **cut)
+        image = renderer.render(camera, **cut, background=options.background)
         write_picture(path, _device.to_host(image.color))
         view = {"camera": name, "width": camera.width, "height": camera.height}
         cost = asdict(image.stats) | {"tolerance": finite(image.stats.tolerance)}

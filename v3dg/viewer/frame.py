@@ -24,7 +24,7 @@ from v3dg.pool import chosen_bytes
 from v3dg.render import Renderer, render, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Scene
-from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, rule_of, select
+from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, rule_of, select, select_by
 from v3dg.viewer.view import View
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
@@ -179,38 +179,35 @@ class SceneView:
         size: tuple[int, int],
         settings: Settings,
         stop: _core.Stop | None = None,
+        steps: _core.BudgetSteps | None = None,
         patience: float = 0.0,
     ) -> Frame:
-        """Draw a picture of ``size`` (width, height) px, after so many seconds for pages that a pool lacks.
+        """Draw a picture of ``size`` (width, height) px; with ``steps``, one that follows others.
+
+        It waits so many seconds for pages that a pool lacks.
 
         Raises:
             Stopped: ``stop`` was requested; it is raised soon after.
             ValueError: The budget is too small for any cut, or a page that a pool lacks is damaged.
         """
         if self.pool is None:
-            return self._frame_of(view, size, settings, stop)
+            return self._frame_of(view, size, settings, stop, steps)
         shows = settings.shows if settings.shows in self.modes else "appearance"
         settings = replace(settings, shows=shows, split=0.0, frozen=None)
         with self._drawing:
             self._how, self._patience = {"min_level": settings.min_level, "fade": settings.fade}, patience
-            return self._frame_of(view, size, settings, stop)
+            return self._frame_of(view, size, settings, stop, steps)
 
     def _frame_of(
-        self, view: View, size: tuple[int, int], settings: Settings, stop: _core.Stop | None
+        self, view: View, size: tuple[int, int], settings: Settings, stop: Any, steps: Any
     ) -> Frame:
         _check(stop)
         camera = view.camera(*size, self.near)
         chooser = camera if settings.frozen is None else settings.frozen.camera(*size, self.near)
         start = time.perf_counter()
-        cut = select(
-            self.scene,
-            chooser,
-            tolerance=settings.tolerance,
-            budget=settings.budget,
-            min_level=settings.min_level,
-            fade=settings.fade,
-            device=self.device,
-        )
+        budget, fade = settings.budget, settings.fade
+        rule = rule_of(settings.tolerance, budget, settings.min_level, fade=fade)
+        cut = select_by(rule, self.scene, chooser, budget, self.device, steps)
         selected = time.perf_counter()
         width, height = size
         edge = round(settings.split * width)

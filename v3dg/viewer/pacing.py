@@ -113,7 +113,7 @@ class RenderLoop:
         pacer: Pacer | None = None,
     ) -> None:
         self._scene_view, self._send, self._fail = scene_view, send, fail
-        self._pacer = pacer or Pacer()
+        self._pacer, self._steps = pacer or Pacer(), _core.BudgetSteps()
         self._changed = threading.Condition()
         self._request: Request | None = None
         self._is_closed = False
@@ -159,7 +159,7 @@ class RenderLoop:
         stop = self._begin(PATIENCE_SECONDS if draft.coarser < _COARSEST else math.inf)
         start = time.perf_counter()
         try:
-            frame = self._scene_view.frame(request.view, draft.size, settings, stop)
+            frame = self._scene_view.frame(request.view, draft.size, settings, stop, self._steps)
         except Stopped:  # it would have taken so long at least
             self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
             raise
@@ -172,14 +172,22 @@ class RenderLoop:
         with self._changed:
             if self._changed.wait_for(self._has_news, REST_SECONDS):
                 return
+        is_larger, has_budget = draft.size != request.size, request.settings.budget is not None
+        steps = None if is_larger else self._steps
         for size in sizes:
-            frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0))
+            frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0), steps)
             self._send(frame, size == sizes[-1] and is_whole, request.number)
         while not is_whole:
-            how = request.settings, self._begin(0.0), PAGES_SECONDS
+            how = request.settings, self._begin(0.0), None, PAGES_SECONDS
             frame = self._scene_view.frame(request.view, request.size, *how)
             is_whole = not frame.figures.missing
             self._send(frame, is_whole, request.number)
+        is_on_way = has_budget and not is_larger and self._scene_view.pool is None
+        while is_on_way:  # for a budget's tolerance goes in steps
+            before, stop = frame.figures.tolerance, self._begin(0.0)
+            frame = self._scene_view.frame(request.view, draft.size, request.settings, stop, steps)
+            self._send(frame, True, request.number)
+            is_on_way = frame.figures.tolerance != before
 
     def _while_moving(self, settings: Settings, draft: Draft) -> Settings:
         """What of the settings there is time for."""

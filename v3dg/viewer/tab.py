@@ -188,7 +188,7 @@ class Tab:
         }
 
     def _save_picture(self, message: messages.Save, stop: _core.Stop) -> None:
-        frame = self.scene_view.frame(*message.look.request()[:3], stop, math.inf)
+        frame = self.scene_view.frame(*message.look.request()[:3], stop, None, math.inf)
         self._exporter.save(f"{self._name}.png", Image.fromarray(frame.pixels).save)
 
     def _save_play(self, message: messages.Save, _: _core.Stop) -> None:
@@ -199,6 +199,7 @@ class Tab:
         request, views = message.look.request(), message.camera_path().film(_FPS)
         width, height = request.size
         size = max(width // 2 * 2, 2), max(height // 2 * 2, 2)  # as H.264 wants it
+        steps = _core.BudgetSteps()
 
         def pictures() -> Iterator[Pixels]:
             told = 0.0
@@ -207,7 +208,7 @@ class Tab:
                     self._tell({"type": "progress", "share": place / len(views)})
                     told = time.monotonic()
                 view = replace(view, aspect=size[0] / size[1])
-                yield self.scene_view.frame(view, size, request.settings, stop, math.inf).pixels
+                yield self.scene_view.frame(view, size, request.settings, stop, steps, math.inf).pixels
 
         self._exporter.save(f"{self._name}.mp4", lambda file: write_video(file, pictures(), fps=_FPS))
 
