@@ -199,6 +199,8 @@ def test_residency_tells_what_waits_for_pages_from_what_is_wanted(scene, monkeyp
         for _ in range(20):
             pool.read_one()
         shares.append(share_missing(renderer.render(CAMERA, **options)).mean())
+    for _ in range(40 if fade else 0):  # until what came in last is there whole
+        shares.append(share_missing(renderer.render(CAMERA, **options)).mean())
     assert any(0.05 < share < 0.95 for share in shares)
     assert shares[-1] == 0
 
