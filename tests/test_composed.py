@@ -343,7 +343,7 @@ def test_false_colors_show_what_was_chosen(device, by):
     shown = color[alpha > 0.5] / alpha[alpha > 0.5, None]
     last = rgb[-1]
     np.testing.assert_allclose(shown, np.broadcast_to(last, shown.shape), atol=2e-3)
-    with pytest.raises(ValueError, match=r"color_by: expected .* or 'cluster', got 'size'"):
+    with pytest.raises(ValueError, match=r"color_by: expected .* or 'residency', got 'size'"):
         render(bundle, camera, color_by="size", device=device)
     with pytest.raises(ValueError, match="color_by: expected 'appearance' for an asset"):
         render(bundle.level_gaussians(0), camera, color_by=by, device=device)

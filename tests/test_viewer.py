@@ -14,7 +14,7 @@ import scenes_lod
 import v3dg
 from v3dg import DEFAULT_FADE, Camera, Gaussians, Scene, _core
 from v3dg.pictures import to_8bit
-from v3dg.viewer.frame import MOST_COUNTED, Frame, SceneView, Settings, Stopped, ramp
+from v3dg.viewer.frame import MOST_COUNTED, Frame, SceneView, Settings, Stopped
 from v3dg.viewer.pacing import PATIENCE_SECONDS, Draft, Pacer, RenderLoop, Request, finer_sizes
 from v3dg.viewer.path import CameraPath
 from v3dg.viewer.view import View, look_at
@@ -181,7 +181,7 @@ def test_count_is_shown_on_a_scale_of_octaves(device):
         pixels[number] = frame.pixels[16, 16]
         assert frame.value_range == (1.0, MOST_COUNTED)
     for number, pixel in pixels.items():
-        np.testing.assert_array_equal(pixel, to_8bit(ramp(np.array(math.log2(number) / 8))))
+        np.testing.assert_array_equal(pixel, to_8bit(_core.ramp(np.array(math.log2(number) / 8))))
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
@@ -200,12 +200,12 @@ def test_error_is_the_share_of_the_tolerance_that_is_used(share, device):
     camera = view.camera(*size, 0.01)
     alpha = v3dg.render(scene, camera, tolerance=float(near) / share, device="cpu").alpha[..., None]
     for half, metric in ((slice(0, 60), near), (slice(60, 120), far)):
-        wanted = to_8bit(ramp(np.array(share * metric / near)) * alpha[:, half])
+        wanted = to_8bit(_core.ramp(np.array(share * metric / near)) * alpha[:, half])
         assert wanted.max() > 20
         np.testing.assert_allclose(frame.pixels[:, half].astype(int), wanted, atol=2)
     finest = scene_view.frame(view, size, Settings(shows="error", tolerance=0.0)).pixels
     alpha = v3dg.render(scene, camera, tolerance=0.0, device="cpu").alpha[..., None]
-    np.testing.assert_allclose(finest.astype(int), to_8bit(ramp(np.array(0.0)) * alpha), atol=2)
+    np.testing.assert_allclose(finest.astype(int), to_8bit(_core.ramp(np.array(0.0)) * alpha), atol=2)
 
 
 def test_difference_is_to_all_gaussians_and_amplified(scene_view, view):
@@ -367,7 +367,7 @@ def test_sizes_double_up_to_the_full_one():
 class FakeSceneView:
     """Notes what is drawn; pictures of the widths in `hold` wait for a stop, up to a tolerance."""
 
-    draws_all_while_moving = False
+    draws_all_while_moving, pool = False, None
 
     def __init__(self):
         self.drawn, self.hold, self.held_until = [], (), math.inf

@@ -67,6 +67,7 @@ class Stats:
             resident, or the renderer has settled. This and the next as far as is known.
         failed: Pages that cannot be read.
         bytes_in: Bytes of pages that came in with this picture.
+        memory: Bytes of the pool that it was drawn from; None where all is resident.
     """
 
     gaussians_selected: int
@@ -77,6 +78,7 @@ class Stats:
     missing: int = 0
     failed: int = 0
     bytes_in: int = 0
+    memory: int | None = None
 
 
 class RenderedImage(Image):

@@ -3,15 +3,39 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import nullcontext
+from typing import TypeAlias
 
-from v3dg import _core
+from v3dg import _core, _device
 from v3dg._device import Device
+from v3dg.build.memory import free_bytes
 from v3dg.bundle import Bundle
 from v3dg.residency import ResidentScene, residency
 
+_RESERVE_BYTES = 1 << 30  # at most, for frames, tables and whatever else
+_View: TypeAlias = tuple[_core.Camera | _core.Eyes, _core.Rule]
 NUM_THREADS = 8  # that read pages; a disk answers several at once
 _WAIT_SECONDS = 0.05  # until Ctrl-C is heard
+
+
+def free_on(device: Device) -> int:
+    """Bytes of memory that a device can give."""
+    if not device.is_cuda:
+        return free_bytes()
+    import torch
+
+    _device.spare_memory(device)
+    return int(torch.cuda.mem_get_info(device.number)[0])
+
+
+def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
+    """Of a pool of half of what is free on the device, where not all fits there; None where it does."""
+    for where, num_bytes in residency.bytes_to_add(bundles, device).items():
+        free = free_on(where)
+        if num_bytes > free - min(free // 4, _RESERVE_BYTES):
+            return free_on(device) // 2
+    return None
 
 
 class Pool:
@@ -24,29 +48,27 @@ class Pool:
         sources = [bundle.page_source for bundle in bundles]
         self.core = _core.PagePool(tables, sources, device.number, num_bytes, NUM_THREADS)
 
-    def settle(
-        self, resident: ResidentScene, camera: _core.Camera | _core.Eyes, rule: _core.Rule, timeout: float
-    ) -> float:
-        """Bring in what the view needs; the tolerance that it then has.
+    def settle(self, resident: ResidentScene, view: _View, timeout: float, seconds: float) -> None:
+        """Bring in what a view needs, or as much of it as comes in so many seconds.
 
         Raises:
             ValueError: A page is damaged.
-            OSError: A page cannot be read; TimeoutError when none came in for so many seconds.
+            OSError: A page cannot be read; TimeoutError when none came in for `timeout` seconds.
         """
         core = self.core
         core.forget_failures()
         core.reset_tolerance()
-        last, known = time.monotonic(), -1
+        last, known, end = time.monotonic(), -1, time.monotonic() + seconds
         while True:
             with residency.lock if resident.device.is_cuda else nullcontext():  # it stays as it is
-                tolerance = core.ask(resident.core, camera, rule)
+                tolerance = core.ask(resident.core, *view)
             status = core.status()
             if status.failed:
                 raise (ValueError if status.is_damage else OSError)(status.error)
             if core.raise_tolerance(tolerance):
                 continue
-            if not status.missing:
-                return tolerance
+            if not status.missing or time.monotonic() > end:
+                return
             if status.pages_in != known:
                 last, known = time.monotonic(), status.pages_in
             elif time.monotonic() - last > timeout:

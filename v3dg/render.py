@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check, color, real
-from v3dg.build.memory import in_bytes
+from v3dg._numbers import check, color, one_of, real
+from v3dg.build.memory import in_bytes, in_mib
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, StereoCamera, check_camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage, Stats
-from v3dg.pool import Pool
+from v3dg.pool import Pool, chosen_bytes
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
 from v3dg.select import CutOptions, Selection, over_budget, rule_of
@@ -71,7 +72,7 @@ def render(
     min_transmittance: float | None = None,
     depth: bool = False,
     device: str | Device = "auto",
-    memory: int | str | None = None,
+    memory: int | str | None = "auto",
 ) -> RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]:
     """Draw a scene, one bundle or one asset, for one camera or for several.
 
@@ -89,7 +90,7 @@ def render(
             follow each other, as in a film.
         cut: Draw what was selected before from this scene, whatever the camera: a cut to walk around. Takes
             the place of `tolerance`, `budget`, `min_level` and `fade`.
-        color_by: "level" or "cluster" colours gaussians by the one that they belong to.
+        color_by: "level" or "cluster" colours gaussians by their own, "residency" where pages are missing.
         background: Three numbers.
         min_transmittance: A pixel stops behind the gaussian that lets no more than this share of light
             through, 0 to 0.99, and gives that light to what it has blended: no channel is off by more than
@@ -113,7 +114,7 @@ def render(
     shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
     pictures: list[Any] = []
     for view in [camera] if isinstance(camera, Camera | StereoCamera) else camera:
-        if memory is not None and cut is None:
+        if cut is None:
             frame.settle(subject, view, **options)
         pictures.append(frame.draw(subject, view, shade, cut, **options))
     return pictures[0] if isinstance(camera, Camera | StereoCamera) else pictures
@@ -132,16 +133,17 @@ class Renderer:
     at which a part of the budget is free, never below that of `render`, so that slow motion is steady; at
     rest it is there after eight pictures (docs/fades.md). Without a fade, pictures are those of `render`.
 
-    With `memory`, only a part of the bundles is resident, so that they may be far larger than memory: pages
+    With a pool, only a part of the bundles is resident, so that they may be far larger than memory: pages
     come in from the files as views need them, read by other threads. A picture waits for none of them: where
     one is missing, the coarser clusters above it are drawn; with a fade, pages fade in. Use `settle` for a
     picture that misses nothing. If a view needs more than there is room for, the tolerance is raised until it
     fits.
 
     Args:
-        color_by: As in `v3dg.render`; with `memory`, "appearance".
+        color_by: As in `v3dg.render`; with a pool on a CUDA device, "appearance".
         device: As in `v3dg.render`. The renderer stays on it, whichever device is torch's current one later.
-        memory: For gaussians on the device: bytes, or text like "2GB". All are resident if None.
+        memory: Of a pool for gaussians on the device: bytes, or text like "2GB". All are resident if None.
+            "auto" is None where all fit into what is free, less a quarter of that or 1 GiB; else half of it.
 
     Raises:
         RuntimeError: Something is missing for the device.
@@ -154,10 +156,19 @@ class Renderer:
         *,
         color_by: ColorBy = "appearance",
         device: str | Device = "auto",
-        memory: int | str | None = None,
+        memory: int | str | None = "auto",
     ) -> None:
         self._subject = subject
         self._frame = _Frame(subject, color_by, _device.resolve(device), memory, moves=True)
+
+    @property
+    def memory(self) -> int | None:
+        """Bytes of the pool that it draws from; None where all is resident."""
+        return self._frame.memory
+
+    def __repr__(self) -> str:
+        of = "all is resident" if self.memory is None else f"a pool of {in_mib(self.memory)}"
+        return f"Renderer({self._subject!r}, {self._frame.device}, {of})"
 
     @overload
     def render(self, camera: Camera, **options: Unpack[_FrameOptions]) -> RenderedImage: ...
@@ -219,19 +230,24 @@ class _Frame:
     def __init__(
         self, subject: _Subject, color_by: ColorBy, device: Device, memory: _Memory, moves: bool = False
     ) -> None:
-        self._device, self._color_by = device, color_by
+        one_of(color_by, "color_by", get_args(ColorBy))
+        self.device, self.color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
         self._references: tuple[Any, ...] | None = None  # to those that were taken
         self._pool: Pool | None = None
         self._has_settled = False  # and drawn nothing since
-        self._memory = None if memory is None else in_bytes(memory)
+        # Without levels, or on a GPU in other colours, all has to be there.
+        is_whole = isinstance(subject, Gaussians) or (device.is_cuda and color_by != "appearance")
+        self._is_auto = memory == "auto" and not is_whole
+        memory = None if memory == "auto" else memory
+        self.memory = None if memory is None else in_bytes(memory)  # of the pool
         if isinstance(subject, Gaussians):
             check("memory", memory is None, f"None for an asset, which has no pages, got {memory}")
             _check_asset(color_by)
             self._asset = _core.AssetFrame(_core.Model(_device.place(subject, device).rows))
         else:
-            expected = f"'appearance' for a pool, got {color_by!r}"
-            check("color_by", memory is None or color_by == "appearance", expected)
+            expected = f"'appearance' for a pool on a CUDA device, got {color_by!r}"
+            check("color_by", memory is None or not is_whole, expected)
             self._frame = _core.SceneFrame(device.number, moves)
             with residency.reading(subject, device) as resident:
                 self._take_models(resident)
@@ -242,25 +258,27 @@ class _Frame:
         camera: Camera | StereoCamera,
         shade: _core.Shade,
         cut: Selection | None,
+        stop: _core.Stop | None = None,
         **options: Any,
     ) -> Any:
-        """A picture; of a stereo camera, one for each eye."""
+        """A picture; of a stereo camera, one for each eye. Only with a pool, `stop` ends it."""
         check_camera(camera)
         if isinstance(camera, StereoCamera) and (cut is not None or isinstance(subject, Gaussians)):
             how = {"cut": cut, **options}
             return tuple(self.draw(subject, eye, shade, **how) for eye in camera.eyes)
         if isinstance(subject, Gaussians):
-            _check_asset(self._color_by, cut=cut, **options)
+            _check_asset(self.color_by, cut=cut, **options)
             assert isinstance(camera, Camera)
             drawing = self._asset.draw(camera.core, shade)
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
         rule = rule_of(**options)
-        with residency.reading(subject, self._device) as resident:
+        with residency.reading(subject, self.device) as resident:
             pool = self._take_models(resident)
             if pool is not None:
-                check("cut", cut is None, "none for a pool, which has its own, got one")
+                check("cut", cut is None, "none for a pool, which has its own, got one; give memory=None")
                 before = pool.core.status().bytes_in
-                drawing = self._frame.draw_resident(resident.core, pool.core, camera.core, rule, shade)
+                drawn = rule, shade, stop, *self._pool_colors(resident)
+                drawing = self._frame.draw_resident(resident.core, pool.core, camera.core, *drawn)
             elif cut is None:
                 drawing = self._frame.draw(resident.core, camera.core, rule, shade)
             else:
@@ -271,8 +289,7 @@ class _Frame:
                 drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade, weights=weights)
             if pool is not None:
                 now = pool.core.status()
-                bytes_in = now.bytes_in - before
-                came_in = {"missing": now.missing, "failed": now.failed, "bytes_in": bytes_in}
+                came_in = {"missing": now.missing, "failed": now.failed, "bytes_in": now.bytes_in - before}
             resident.add_drawing(drawing)
 
         def finish() -> Stats:
@@ -281,33 +298,31 @@ class _Frame:
                 raise over_budget(options["budget"], stats.gaussians)
             chosen = stats.tolerance_px2 if options["budget"] is not None else rule.tolerance_px2
             if pool is not None:
-                return replace(_stats(stats, stats.tolerance_px2), **came_in)
+                return replace(_stats(stats, stats.tolerance_px2), memory=self.memory, **came_in)
             return _stats(stats, chosen if cut is None else cut.tolerance)
 
-        if not self._device.is_cuda:
+        if not self.device.is_cuda:
             finish()
         elif self._has_settled:
             drawing.finish()  # which may draw again, with pages that other views put in place of its own
         self._has_settled = False
-        picture = RenderedImage(drawing, finish)
-        if isinstance(camera, Camera):
-            return picture
-        return picture, RenderedImage(drawing, finish, is_right=True)
+        eyes = tuple(RenderedImage(drawing, finish, is_right=is_right) for is_right in (False, True))
+        return eyes[0] if isinstance(camera, Camera) else eyes
 
     def settle(
         self, subject: _Subject, camera: Camera | StereoCamera, timeout: float = 30.0, **options: Any
     ) -> None:
-        """Bring in what a view needs."""
+        """Bring in what a view needs, or what of it comes in so many `seconds`."""
+        seconds = options.pop("seconds", math.inf)
         real(timeout, "timeout", "seconds, at least 0", 0)
         rule = rule_of(**options)
-        if self._memory is None:
+        if isinstance(subject, Gaussians) or (self.memory is None and not self._is_auto):
             return
-        assert not isinstance(subject, Gaussians)
-        with residency.reading(subject, self._device) as resident:
+        with residency.reading(subject, self.device) as resident:
             pool = self._take_models(resident)
-        assert pool is not None
-        pool.settle(resident, camera.core, rule, timeout)
-        self._has_settled = True
+        if pool is not None:
+            pool.settle(resident, (camera.core, rule), timeout, seconds)
+            self._has_settled = True
 
     def _take_models(self, resident: ResidentScene) -> Pool | None:
         """Have the gaussians of the scene's bundles at hand: in a pool, or all of them."""
@@ -315,23 +330,31 @@ class _Frame:
             return self._pool
         with residency.lock:
             bundles = resident.bundles
-            if self._memory is not None:
+            if self._is_auto and self.memory is None and self._num_models < len(bundles):
+                self.memory = chosen_bytes(bundles, self.device)
+            if self.memory is not None:
                 tables = [residency.table(bundle) for bundle in bundles]
                 if self._pool is None or self._pool.tables != tables:
                     self._pool = None  # its memory is needed
-                    self._pool = Pool(bundles, tables, self._device, self._memory)
+                    self._pool = Pool(bundles, tables, self.device, self.memory)
             elif self._num_models < len(bundles):
-                residency.set_models(self._frame, bundles, self._device, self._color_by)
+                residency.set_models(self._frame, bundles, self.device, self.color_by)
                 self._num_models = len(bundles)
             self._references = resident.references
             return self._pool
 
+    def _pool_colors(self, resident: ResidentScene) -> tuple[list[Any], bool]:
+        """Of clusters, unless they appear as they are; and whether they show what is missing."""
+        if self.color_by in ("appearance", "residency"):
+            return [], self.color_by == "residency"
+        return [residency.palette(bundle, self.color_by) for bundle in resident.bundles], False
+
     def _here(self, ids: Any) -> Any:
-        if not self._device.is_cuda:
+        if not self.device.is_cuda:
             return ids
         import torch
 
-        return torch.tensor(ids, device=str(self._device))
+        return torch.tensor(ids, device=str(self.device))
 
 
 def shade_of(

@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
-from v3dg._device import Device
+from v3dg._device import CPU, Device
 from v3dg.bundle import Bundle
+from v3dg.bundle.codec import Codec
 from v3dg.false_color import ColorBy, palette_of
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Gaussians, gaussian_bytes
 from v3dg.scene import Scene
 
 _Kept = TypeVar("_Kept")
@@ -29,6 +30,7 @@ _Kept = TypeVar("_Kept")
 # A GPU decodes quantised bundles once, rather than in each frame and for each instance, up to so many bytes:
 # about what its second-level cache holds. Above, codes are as fast, and take a seventh of the memory.
 MOST_DECODED_BYTES = 48 << 20
+_PACKED_BYTES = 64  # of a gaussian, which frames of a GPU read besides its rows
 
 
 class ResidentScene:
@@ -167,13 +169,31 @@ class Residency:
         self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy
     ) -> None:
         """Have a frame of a device draw these bundles, their gaussians or clusters in these colours."""
-        colors = [palette_of(bundle, color_by) for bundle in bundles]
+        colors = [self.palette(bundle, color_by) for bundle in bundles]
         palettes = [
             _core.Palette(self.table(bundle), sh, device.number)
             for bundle, sh in zip(bundles, colors, strict=True)
             if sh is not None
         ]
         frame.set_models([self.model(bundle, device) for bundle in bundles], palettes)
+
+    def palette(self, bundle: Bundle, color_by: ColorBy) -> NDArray[np.float32] | None:
+        """As `palette_of`."""
+        return self._once(bundle, ("palette", color_by), lambda: palette_of(bundle, color_by))
+
+    def bytes_to_add(self, bundles: Sequence[Bundle], device: Device) -> dict[Device, int]:
+        """What it takes, on the device and on the host, to have all gaussians there that are not yet."""
+        add = {device: 0, CPU: 0}
+        for bundle in bundles:
+            if ("model", device) in self._kept.get(bundle, {}):
+                continue
+            is_coded = bundle.codec != Codec.name
+            add[CPU] += 0 if bundle.is_in_memory else bundle.page_bytes
+            if device.is_cuda or not is_coded:  # the CPU draws codes where they are
+                add[device] += bundle.page_bytes
+            if device.is_cuda and not is_coded:
+                add[device] += _PACKED_BYTES * bundle.num_gaussians
+        return add
 
     def frame(self, subject: Scene | Bundle, key: Hashable, make: Callable[[], _Kept]) -> _Kept:
         """The buffers that pictures of a subject are drawn with, of which each key has its own."""
@@ -198,8 +218,7 @@ class Residency:
             return bundle.codes is not None
 
         def decoded_bytes() -> int:
-            packed = 16  # words of a gaussian that frames read besides its rows
-            size = bundle.num_gaussians * 4 * (packed + 11 + 3 * (bundle.sh_degree + 1) ** 2)
+            size = bundle.num_gaussians * (_PACKED_BYTES + gaussian_bytes(bundle.sh_degree))
             taken = sum(of.get(("decoded", device), 0) for of in self._kept.values())
             return size if size + taken <= MOST_DECODED_BYTES else 0
 

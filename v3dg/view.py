@@ -13,7 +13,13 @@ if TYPE_CHECKING:
     from v3dg.viewer.server import Site
 
 
-def view(subject: Subject | str | os.PathLike[str], *, device: str | Device = "auto", **options: Any) -> Site:
+def view(
+    subject: Subject | str | os.PathLike[str],
+    *,
+    device: str | Device = "auto",
+    memory: int | str | None = "auto",
+    **options: Any,
+) -> Site:
     """Show a scene, a bundle or an asset, or the file of one, in a web browser (docs/viewer.md).
 
     The viewer's server runs on threads of this process. Its address is printed, and is the `url` of what is
@@ -21,6 +27,7 @@ def view(subject: Subject | str | os.PathLike[str], *, device: str | Device = "a
 
     Args:
         device: As in `v3dg.render`.
+        memory: As in `v3dg.Renderer`.
         options: As `v3dg.viewer.server.Site` takes them, such as `cameras`, by name, `port`, `tolerance`,
             `budget` and `up`. A scene's file brings its own cameras.
 
@@ -34,6 +41,6 @@ def view(subject: Subject | str | os.PathLike[str], *, device: str | Device = "a
         path = Path(subject)
         subject, cameras = open_with_cameras(path)
         options = {"name": path.stem, "cameras": cameras} | options
-    site = Site(SceneView(subject, device=device), **options)
+    site = Site(SceneView(subject, device=device, memory=memory), **options)
     print(f"{site.url} shows it until close() is called")
     return site

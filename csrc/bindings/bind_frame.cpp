@@ -188,13 +188,16 @@ class BoundSceneFrame {
     // What is resident of the bundles of a pool, with what comes in before.
     std::unique_ptr<BoundDrawing> draw_resident(const py::object& scene_object, const py::object& pool_object,
                                                 const BoundEyes& camera, const SelectRule& rule,
-                                                const Shade& shade, const Stop* stop) {
+                                                const Shade& shade, const Stop* stop, const py::list& colors,
+                                                bool shows_missing) {
         const auto& scene = held<BoundScene>(scene_object, "scene");
         auto& pool = held<BoundPool>(pool_object, "pool");
         if (scene.device() != device_ || pool.device() != device_)
             throw py::value_error("scene, pool: expected them on the frame's device");
         const std::shared_ptr<const SceneState> state = scene.state();
         pool.check_scene(*state);
+        if (!device_.is_host() && (!colors.empty() || shows_missing))
+            throw py::value_error("colors, shows_missing: expected none on a CUDA device");
         const Eyes& eyes = camera.eyes;
         BudgetSteps steps = steps_;
         const SelectRule paced = moves_ ? steps.next(rule, eyes, state) : rule;
@@ -214,15 +217,22 @@ class BoundSceneFrame {
 #endif
         HostPictures out(eyes, shade);
         std::vector<SceneModel> models;
-        for (size_t b = 0; b < state->tables.size(); ++b)
+        for (size_t b = 0; b < state->tables.size(); ++b) {
             models.push_back(
                 {pool.on_host().planes(b), state->bundle(b).appearance(), {}, pool.on_host().codes(b)});
+            const auto clusters = static_cast<py::ssize_t>(state->tables[b].num_clusters());
+            if (colors.empty()) continue;
+            if (b >= colors.size()) throw py::value_error("colors: expected none, or of each bundle");
+            models.back().cluster_sh =
+                span_of<const float>(colors[b].cast<py::array>(), "colors", {clusters, 3}).data;
+        }
         SceneFrameCounts counts{};
         {
             const py::gil_scoped_release unlocked;
             const auto cut = [&](auto tables, const SelectRule& raised, auto needs) {
-                const HostScene host{
+                HostScene host{
                     tables, {models.data(), models.size()}, state->instances, needs, &steps.last_bin};
+                if (shows_missing) host.wanted_px2 = &rule.tolerance_px2;
                 counts = cpu::draw_scene(host, eyes, raised, out.span(), flag_of(stop));
                 return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
             };
@@ -485,7 +495,7 @@ void bind_frame(py::module_& m) {
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
         .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a, "stop"_a = nullptr)
         .def("draw_resident", &BoundSceneFrame::draw_resident, "scene"_a, "pool"_a, "camera"_a, "rule"_a,
-             "shade"_a, "stop"_a = nullptr)
+             "shade"_a, "stop"_a = nullptr, "colors"_a = py::list(), "shows_missing"_a = false)
         .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,
              "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
         .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,

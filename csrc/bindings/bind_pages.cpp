@@ -3,6 +3,7 @@
 
 #include "bindings/codes.h"
 #include "bindings/operations.h"
+#include "io/hashed_read.h"
 #include "residency/page_run.h"
 
 namespace v3dg {
@@ -22,14 +23,13 @@ PageRun run_of(const py::array& hashes, size_t first_page, const py::array& firs
     return run;
 }
 
-// Calls body(file) without the interpreter lock; what goes wrong with a page gets the file's name, which
-// need not be text that can be encoded.
+// Calls body() without the interpreter lock; what goes wrong with a page gets the file's name, which need not
+// be text that can be encoded.
 template <class Body>
-void with_file(const py::object& path, int descriptor, const Body& body) {
+void naming_file(const py::object& path, const Body& body) {
     try {
-        const PosixFile file = PosixFile::duplicate(descriptor);
         const py::gil_scoped_release unlocked;
-        body(file);
+        body();
     } catch (const PageError& error) {
         if (error.is_damage)
             PyErr_SetObject(PyExc_ValueError, py::str("{}: {}").format(path, error.what()).ptr());
@@ -62,7 +62,8 @@ void read_rows(const py::object& path, int descriptor, const Rows& out, const st
             throw py::value_error("places: expected " + std::to_string(needed) + " bytes of a page, got " +
                                   std::to_string(run.num_bytes(page)));
     }
-    with_file(path, descriptor, [&](const PosixFile& file) {
+    naming_file(path, [&] {
+        const PosixFile file = PosixFile::duplicate(descriptor);
         read_pages(file, run, is_quantized ? PageCodec::quantized : PageCodec::float32, rows);
     });
 }
@@ -75,12 +76,50 @@ void read_words(const py::object& path, int descriptor, const py::array& words, 
     if (num_bytes % 4 != 0)
         throw py::value_error("places: expected whole words, got " + std::to_string(num_bytes) + " bytes");
     const Span<int32_t> out = span_of<int32_t>(words, "words", {static_cast<py::ssize_t>(num_bytes / 4)});
-    with_file(path, descriptor, [&](const PosixFile& file) { read_codes(file, run, out); });
+    naming_file(path, [&] { read_codes(PosixFile::duplicate(descriptor), run, out); });
 }
+
+// With the arrays that it reads to and hashes.
+class BoundHashedRead {
+  public:
+    BoundHashedRead(py::object path, int descriptor, const py::array& before, size_t offset,
+                    const py::array& out)
+        : path_(std::move(path)), arrays_(py::make_tuple(before, out)) {
+        const Span<const uint8_t> first = span_of<const uint8_t>(before, "before", {-1});
+        const Span<uint8_t> bytes = span_of<uint8_t>(out, "out", {-1});
+        naming_file(path_, [&] {
+            read_ = std::make_unique<HashedRead>(PosixFile::duplicate(descriptor), first, offset, bytes);
+        });
+    }
+    bool wait() {
+        bool is_whole = false;
+        naming_file(path_, [&] { is_whole = read_->wait(); });
+        return is_whole;
+    }
+    py::bytes digest() {
+        std::array<uint8_t, kPageHashBytes> digest{};
+        {
+            const py::gil_scoped_release unlocked;
+            digest = read_->digest();
+        }
+        return {reinterpret_cast<const char*>(digest.data()), digest.size()};
+    }
+
+  private:
+    const py::object path_;
+    const py::tuple arrays_;
+    std::unique_ptr<HashedRead> read_;
+};
 
 }  // namespace
 
 void bind_pages(py::module_& m) {
+    py::class_<BoundHashedRead>(m, "HashedRead", "A part of a file that is read and hashed at the same time.")
+        .def(py::init<py::object, int, py::array, size_t, py::array>(), "path"_a, "descriptor"_a, "before"_a,
+             "offset"_a, "out"_a)
+        .def("wait", &BoundHashedRead::wait, "Waits until out is filled; whether the file has so much.")
+        .def("digest", &BoundHashedRead::digest,
+             "BLAKE2b-128 of what is in before and out together, once they are filled.");
     m.def("read_pages", &read_rows, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a, py::kw_only(),
           "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,
           "Fills rows with the gaussians of neighbouring pages of a file, which have these hashes (n, 16).");

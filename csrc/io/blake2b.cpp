@@ -8,7 +8,6 @@ namespace v3dg {
 
 namespace {
 
-constexpr size_t kBlockBytes = 128;
 constexpr uint64_t kStart[8] = {0x6a09e667f3bcc908, 0xbb67ae8584caa73b, 0x3c6ef372fe94f82b,
                                 0xa54ff53a5f1d36f1, 0x510e527fade682d1, 0x9b05688c2b3e6c1f,
                                 0x1f83d9abfb41bd6b, 0x5be0cd19137e2179};
@@ -70,19 +69,40 @@ void add_block(uint64_t h[8], const unsigned char* block, uint64_t end, bool is_
 
 }  // namespace
 
-std::array<uint8_t, kPageHashBytes> blake2b(const unsigned char* bytes, size_t size) {
-    uint64_t h[8];
-    std::copy(kStart, kStart + 8, h);
-    h[0] ^= 0x01010000 | kPageHashBytes;
-    size_t done = 0;
-    for (; size - done > kBlockBytes; done += kBlockBytes)
-        add_block(h, bytes + done, done + kBlockBytes, false);
-    unsigned char last[kBlockBytes] = {};
-    if (size > done) std::memcpy(last, bytes + done, size - done);
-    add_block(h, last, size, true);
+Blake2b::Blake2b() {
+    std::copy(kStart, kStart + 8, state_);
+    state_[0] ^= 0x01010000 | kPageHashBytes;
+}
+
+// The last block, full or not, is hashed otherwise than the others: it waits until more comes.
+void Blake2b::add(const unsigned char* bytes, size_t size) {
+    const auto take = [&](size_t count) {
+        if (count > 0) std::memcpy(waiting_ + num_waiting_, bytes, count);
+        num_waiting_ += count;
+        bytes += count;
+        size -= count;
+    };
+    if (num_waiting_ > 0) take(std::min(size, kBlockBytes - num_waiting_));
+    if (size == 0) return;
+    if (num_waiting_ > 0) add_block(state_, waiting_, num_bytes_ += kBlockBytes, false);
+    num_waiting_ = 0;
+    for (; size > kBlockBytes; bytes += kBlockBytes, size -= kBlockBytes)
+        add_block(state_, bytes, num_bytes_ += kBlockBytes, false);
+    take(size);
+}
+
+std::array<uint8_t, kPageHashBytes> Blake2b::digest() {
+    std::fill(waiting_ + num_waiting_, waiting_ + kBlockBytes, uint8_t{0});
+    add_block(state_, waiting_, num_bytes_ + num_waiting_, true);
     std::array<uint8_t, kPageHashBytes> digest;
-    std::memcpy(digest.data(), h, digest.size());
+    std::memcpy(digest.data(), state_, digest.size());
     return digest;
+}
+
+std::array<uint8_t, kPageHashBytes> blake2b(const unsigned char* bytes, size_t size) {
+    Blake2b hash;
+    hash.add(bytes, size);
+    return hash.digest();
 }
 
 }  // namespace v3dg

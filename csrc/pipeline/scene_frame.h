@@ -14,6 +14,8 @@ struct SceneModel {
     ClusterAppearance appearance;
     Palette palette;
     const Codes* codes = nullptr;
+    // [C][3] coefficients of the constant basis, in place of the palette where clusters lie here and there.
+    const float* cluster_sh = nullptr;
 };
 
 // A scene on the host: what selection reads of its bundles, their gaussians, and its instances.
@@ -24,6 +26,8 @@ struct HostScene {
     // As SelectInput has them.
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
+    // Colours say what is missing, where it is not of this tolerance, px2: see missing_color().
+    const float* wanted_px2 = nullptr;
 };
 
 // What one frame came to.

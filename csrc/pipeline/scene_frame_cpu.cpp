@@ -7,6 +7,7 @@
 #include <string>
 
 #include "math/sh.h"
+#include "pipeline/false_color.h"
 
 namespace v3dg {
 
@@ -86,6 +87,7 @@ class CutDraws {
             view_ = model_view_from_instance(axes_of_instance(camera_, pose), pose);
         }
         end_of_pair_.back() = num_gaussians_ += count;
+        if (tint == nullptr && model.cluster_sh != nullptr) tint = model.cluster_sh + 3 * size_t(c);
         const Palette palette = tint == nullptr ? model.palette : Palette{tint, nullptr, 1};
         const Draw<float> next{model.planes,        first,   count,       view_,
                                model.appearance[c], palette, model.codes, weight};
@@ -111,6 +113,29 @@ class CutDraws {
     ModelView<float> view_{};
 };
 
+// Metrics of pairs over the tolerance: (S).
+std::vector<float> shares_of(const HostScene& scene, const Camera& camera, const SelectRule& rule,
+                             const GivenCut& given, float tolerance_px2) {
+    std::vector<float> share(given.instance.size);
+    cpu::pair_metrics({scene.tables, scene.instances, camera, rule}, given, {share.data(), share.size()});
+    for (float& value : share) value = value > 0.0f ? value / tolerance_px2 : 0.0f;
+    return share;
+}
+
+void set_tint(const Rgb& rgb, float* tint) {
+    for (int a = 0; a < 3; ++a) tint[a] = (rgb[a] - 0.5f) / static_cast<float>(kShBase0);
+}
+
+SceneFrameCounts draw_pairs(const HostScene& scene, const Camera& camera, const GivenCut& given,
+                            const float* tint, const Picture<float>& picture, const std::atomic<bool>* stop) {
+    const double start = now();
+    const CutDraws cut(scene, camera, given, tint);
+    SceneFrameCounts counts = draw_all(cut.draws(), camera, picture, stop);
+    counts.gaussians = cut.num_gaussians();
+    counts.draw_seconds = now() - start;
+    return counts;
+}
+
 }  // namespace
 
 SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const SelectRule& rule,
@@ -119,13 +144,28 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const
     SelectOutput cut;
     select({scene.tables, scene.instances, eyes, rule, scene.needs, scene.last_bin}, cut);
     const double select_seconds = now() - start;
+    const GivenCut given{{cut.instance.data(), cut.instance.size()},
+                         {cut.cluster.data(), cut.cluster.size()},
+                         {cut.weight.data(), cut.weight.size()}};
+    std::vector<float> tint;
+    if (scene.wanted_px2 != nullptr && cut.fits_budget) {
+        // Of a budget, the tolerance that it comes to is wanted; a little more, for metrics are rounded.
+        const float wanted = rule.budget == kNoBudget ? *scene.wanted_px2 : cut.tolerance_px2;
+        tint.resize(3 * given.instance.size);
+        const std::vector<float> share =
+            shares_of(scene, eyes.camera[0], rule, given, std::max(wanted, 1e-6f));
+        for (size_t s = 0; s < share.size(); ++s) {
+            const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
+            const int32_t own = table.own_group[given.cluster[s]];
+            const bool is_finest = own >= 0 && table.level[own] <= rule.min_level;
+            const Rgb rgb = missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
+            set_tint(rgb, tint.data() + 3 * s);
+        }
+    }
     SceneFrameCounts counts{};
     for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k)
-        counts.add_picture(draw_cut(scene, eyes.camera[k],
-                                    {{cut.instance.data(), cut.instance.size()},
-                                     {cut.cluster.data(), cut.cluster.size()},
-                                     {cut.weight.data(), cut.weight.size()}},
-                                    pictures[k], stop));
+        counts.add_picture(draw_pairs(scene, eyes.camera[k], given, tint.empty() ? nullptr : tint.data(),
+                                      pictures[k], stop));
     counts.gaussians = cut.num_gaussians;
     counts.tolerance_px2 = cut.tolerance_px2;
     counts.exceeds_budget = !cut.fits_budget;
@@ -135,29 +175,20 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const
 
 SceneFrameCounts cpu::draw_cut(const HostScene& scene, const Camera& camera, const GivenCut& given,
                                const Picture<float>& picture, const std::atomic<bool>* stop) {
-    const double start = now();
-    const CutDraws cut(scene, camera, given);
-    SceneFrameCounts counts = draw_all(cut.draws(), camera, picture, stop);
-    counts.gaussians = cut.num_gaussians();
-    counts.draw_seconds = now() - start;
-    return counts;
+    return draw_pairs(scene, camera, given, nullptr, picture, stop);
 }
 
 SceneFrameCounts cpu::draw_metrics(const HostScene& scene, const Camera& camera, const SelectRule& rule,
                                    const GivenCut& given, const Picture<float>& picture,
                                    const std::atomic<bool>* stop) {
-    const double start = now();
-    std::vector<float> metric(given.instance.size), tint(3 * metric.size());
-    const CutDraws cut(scene, camera, given, tint.data());  // which checks the pairs
-    pair_metrics({scene.tables, scene.instances, camera, rule}, given, {metric.data(), metric.size()});
-    for (size_t s = 0; s < metric.size(); ++s) {
-        const float share = metric[s] > 0.0f ? std::min(metric[s] / rule.tolerance_px2, kMostShare) : 0.0f;
-        std::fill_n(tint.data() + 3 * s, 3, (share - 0.5f) / static_cast<float>(kShBase0));
+    static_cast<void>(CutDraws(scene, camera, given));  // which checks the pairs
+    std::vector<float> tint(3 * given.instance.size);
+    const std::vector<float> share = shares_of(scene, camera, rule, given, rule.tolerance_px2);
+    for (size_t s = 0; s < share.size(); ++s) {
+        const float grey = std::min(share[s], kMostShare);
+        set_tint({grey, grey, grey}, tint.data() + 3 * s);
     }
-    SceneFrameCounts counts = draw_all(cut.draws(), camera, picture, stop);
-    counts.gaussians = cut.num_gaussians();
-    counts.draw_seconds = now() - start;
-    return counts;
+    return draw_pairs(scene, camera, given, tint.data(), picture, stop);
 }
 
 SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,

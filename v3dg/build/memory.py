@@ -21,7 +21,7 @@ _LEAF_BYTES, _LEAF_COPIES = 320, 2.5
 def in_bytes(memory: int | str | None) -> int:
     """An amount of memory: bytes, or text like "8GiB"; None is half of what is free."""
     if memory is None:
-        return _free_bytes() // 2
+        return free_bytes() // 2
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", str(memory), re.IGNORECASE)
     if isinstance(memory, bool) or match is None or not float(match[1]) > 0:
         raise ValueError(f"memory: expected bytes, or text like '8GiB', got {memory!r}")
@@ -45,7 +45,7 @@ def in_mib(num_bytes: int) -> str:
     return f"{-(-num_bytes >> 20):,} MiB"
 
 
-def _free_bytes() -> int:
+def free_bytes() -> int:
     """Memory that the system, and the container around the process, can give."""
     free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with suppress(OSError, ValueError, AttributeError, TypeError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import os
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from typing import Any, TypeAlias
 
@@ -16,7 +17,7 @@ from v3dg._numbers import check, check_all, check_type
 from v3dg.bundle.codec import Codec, codec_of
 from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES, config_to_json, page_tables
-from v3dg.bundle.pages import CodePages, FilePages, MemoryPages, PageLayout, runs_of_pages
+from v3dg.bundle.pages import CodePages, FilePages, MemoryPages, PageLayout, on_threads, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
@@ -62,10 +63,12 @@ class Bundle:
             clusters = replace(clusters, box=box)
         layout = PageLayout.of(clusters)
         in_memory = MemoryPages if codec == Codec.name else CodePages.of
-        self._set(clusters, groups, config or {}, in_memory(layout, gaussians, kept))
+        self._set(
+            clusters, groups, parse_json(config_to_json(config or {})), in_memory(layout, gaussians, kept)
+        )
 
     def _set(self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: _Pages) -> None:
-        self.config: dict[str, Any] = parse_json(config_to_json(config))
+        self.config = config
         self._clusters = clusters
         self._groups = groups
         self._codec, self.codec = pages.codec, pages.codec.name
@@ -101,8 +104,19 @@ class Bundle:
             bundle._set(clusters, groups, file.config, pages)
             bundle._file = file
         except ValueError as error:
+            file.verify()  # for what is wrong with the tables is mostly damage
             raise ValueError(f"{file.path}: {error}") from None
+        file.verify()
         return bundle
+
+    @classmethod
+    def open_all(cls, paths: Iterable[str | os.PathLike[str]]) -> list[Bundle]:
+        """Open several bundle files as `open` does, at the same time.
+
+        Raises:
+            FileNotFoundError, ValueError: As `open`, for the first file with which something is wrong.
+        """
+        return on_threads(cls.open, list(paths))
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the bundle to a file; the same bundle gives the same bytes.
@@ -202,6 +216,16 @@ class Bundle:
         if isinstance(self._pages, FilePages):
             self._pages = self._pages.in_memory()
         return self._pages
+
+    @property
+    def page_bytes(self) -> int:
+        """What all pages take together, in memory as in the file."""
+        return int(self._layout.page_bytes(self._codec).sum())
+
+    @property
+    def is_in_memory(self) -> bool:
+        """Whether all gaussians are, and not only those that are read page by page."""
+        return not isinstance(self._pages, FilePages)
 
     @property
     def page_source(self) -> Any:

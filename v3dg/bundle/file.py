@@ -10,7 +10,6 @@ import hashlib
 import os
 import re
 import weakref
-from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -93,7 +92,7 @@ def read_pages(
 
 
 class BundleFile:
-    """A bundle file: header and tables are read and checked against the file's own hash, pages are not.
+    """A bundle file: header and tables are read, pages are not; `verify` tells whether they are damaged.
 
     Nothing is allocated that is larger than the file, which is closed when this is dropped.
     """
@@ -115,7 +114,7 @@ class BundleFile:
         self.num_bytes = os.fstat(self._fd).st_size
         check(self.path, self.num_bytes >= 8, f"a bundle, got a file of {self.num_bytes} bytes")
         length = np.empty(8, np.uint8)
-        self._read([length], 0)
+        self._read(length, 0)
         header_bytes = int.from_bytes(length.tobytes(), "little")
         is_finished = header_bytes > 0
         check(self.path, is_finished, "a bundle, got one that is not finished, or another kind of file")
@@ -123,14 +122,15 @@ class BundleFile:
         fits = header_bytes <= min(self.num_bytes - 8, file_format.MAX_HEADER_BYTES)
         expected = f"a bundle (safetensors), got {found}; it is another kind of file or it is truncated"
         self._check("header", fits, expected)
-        text = np.empty(header_bytes, np.uint8)
-        self._read([text], 8)
-        header = self._object("header", text.tobytes())
+        text = np.empty(8 + header_bytes, np.uint8)
+        text[:8] = length
+        self._read(text[8:], 8)
+        header = self._object("header", text[8:].tobytes())
         self._read_metadata(header.pop("__metadata__", None))
         self._data_start = 8 + header_bytes
         entries = self._check_entries(header)
         self.pages_bytes = int(entries["pages"]["data_offsets"][1])
-        self._read_tables(entries, (length, text))
+        self._read_tables(entries, text)
 
     def _read_metadata(self, metadata: Any) -> None:
         metadata = metadata if isinstance(metadata, dict) else {}
@@ -172,7 +172,8 @@ class BundleFile:
         self._check("size", wanted <= given, f"more than {shown(wanted)} bytes for tensors, {found}")
         expected = entries_of(self.codec.version, *counts)
         for name, entry in expected.items():
-            self._check(name, header.get(name) == entry, f"{entry}, got {shown(header.get(name))}")
+            if header.get(name) != entry:
+                self._fail(f"{name}: expected {entry}, got {shown(header.get(name))}")
         unknown = sorted(set(header) - set(expected))
         if unknown:
             self._fail(f"{shown(unknown[0])}: expected only the tensors of version {self.codec.version}")
@@ -184,27 +185,35 @@ class BundleFile:
         self._check("size", wanted == given, f"{wanted} bytes, got {given}; the file is {problem}")
         return expected
 
-    def _read_tables(self, entries: dict[str, Any], header: tuple[NDArray[Any], NDArray[Any]]) -> None:
+    def _read_tables(self, entries: dict[str, Any], header: NDArray[np.uint8]) -> None:
         start = self.pages_bytes
         end = entries["hash"]["data_offsets"][0]
         # Of eight-byte elements, so that every table in it is aligned.
         data = np.empty(-(-(end - start) // 8), np.int64).view(np.uint8)[: end - start]
-        stored = np.empty(HASH_BYTES, np.uint8)
-        self._read([data, stored], self._data_start + start)
-        if page_hash((*header, data)) != stored.tobytes():
-            self._fail(f"hash: the header and tables do not match it; {DAMAGED}")
+        self._stored = np.empty(HASH_BYTES, np.uint8)
+        self._reading = _core.HashedRead(self.path, self._fd, header, self._data_start + start, data)
+        if not self._reading.wait():
+            self._fail_truncated(self._data_start + start)
+        self._read(self._stored, self._data_start + end)
         data.flags.writeable = False
         self.tables: dict[str, NDArray[Any]] = {}
         for name, dtype, _, _ in schema_of(self.codec.version):
             first, last = (offset - start for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 
-    def _read(self, buffers: Sequence[NDArray[Any]], offset: int) -> None:
-        """Fill all buffers from one place of the file."""
-        for buffer in buffers:
-            if not _files.read_at(self._fd, buffer, offset):
-                self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
-            offset += buffer.nbytes
+    def verify(self) -> None:
+        """Compare header and tables with the file's own hash, once, for which this waits; ValueError."""
+        if self._reading.digest() != self._stored.tobytes():
+            self._fail(f"hash: the header and tables do not match it; {DAMAGED}")
+        del self._reading
+
+    def _read(self, out: NDArray[np.uint8], offset: int) -> None:
+        """Fill an array from one place of the file."""
+        if not _files.read_at(self._fd, out, offset):
+            self._fail_truncated(offset)
+
+    def _fail_truncated(self, offset: int) -> NoReturn:
+        self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
 
     @property
     def places(self) -> NDArray[np.int64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from v3dg.bundle.file import BundleFile
 
 _Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 _THREADS = 8
 DAMAGED = "the file is damaged, copy or build it again"
 
@@ -161,13 +161,12 @@ class FilePages:
         return self._file.read_pages(self.layout.run(first_page, last_page, self._file.places))
 
 
-def on_threads(work: Callable[[_Item], None], items: Sequence[_Item]) -> None:
-    """Do work for all items, on threads if there are several."""
+def on_threads(work: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
+    """What work makes of all items, on threads if there are several."""
     if len(items) < 2:
-        deque(map(work, items), maxlen=0)
-    else:
-        with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
-            deque(pool.map(work, items), maxlen=0)
+        return list(map(work, items))
+    with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+        return list(pool.map(work, items))
 
 
 def runs_of_pages(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
-from v3dg._numbers import check, check_type
+from v3dg._numbers import check, check_type, refuse
 from v3dg.bundle.format import DTYPES, SCHEMA
 
 NESTING_MARGIN = _core.nesting_margin
@@ -86,8 +86,8 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
     count = part.level.size
     for (name, kind, rows, rest), array in zip(columns, arrays, strict=True):
         dtype, shape = np.dtype(DTYPES[kind]), (count + (rows == "C+1"), *rest)
-        fits = array.dtype == dtype and array.shape == shape
-        check(name, fits, f"{dtype} {shape}, got {array.dtype} {array.shape}")
+        if array.dtype != dtype or array.shape != shape:
+            refuse(name, f"{dtype} {shape}, got {array.dtype} {array.shape}")
         check(name, array.flags.c_contiguous, "a C-contiguous array; use np.ascontiguousarray")
         if array.flags.writeable:
             own = array.copy()

@@ -73,6 +73,16 @@ class OnDevice(Common):
 
 
 @dataclass(kw_only=True)
+class OnPool(OnDevice):
+    memory: Annotated[str, option("SIZE")] = "auto"
+    """Draw from so much memory of the device, as 2GB, with pages read from the files as cameras need them.
+    all: from as much as it takes. auto: so if that fits into what is free, else from half of what is free."""
+
+    def pool(self) -> str | None:
+        return None if self.memory == "all" else self.memory
+
+
+@dataclass(kw_only=True)
 class Cut:
     """Which cut of a bundle or a scene is drawn."""
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
 from v3dg import _device
 from v3dg._progress import counted
-from v3dg.cli._common import Cut, OnDevice, check_usage, finite, option, print_result, table_lines
+from v3dg.cli._common import Cut, OnPool, check_usage, finite, option, print_result, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths, up_lines
+from v3dg.false_color import ColorBy
 from v3dg.opening import open_with_cameras
 from v3dg.pictures import check_picture_path, write_picture
 from v3dg.render import Renderer
@@ -19,7 +20,7 @@ from v3dg.select import DEFAULT_FADE, CutOptions
 
 
 @dataclass
-class Render(Cut, OnDevice):
+class Render(Cut, OnPool):
     """Draw a scene from its cameras, a bundle or an asset from a turntable, or any from a camera file."""
 
     subject: tyro.conf.Positional[Path]
@@ -31,12 +32,10 @@ class Render(Cut, OnDevice):
     fade: Annotated[float | None, option("FACTOR")] = None
     """Draw what is within this factor of the tolerance on two levels, one coming as the other goes, so that a
     film does not pop. Default: 1.02 for several views of a turntable, otherwise 1, which is none."""
-    color_by: Literal["appearance", "level", "cluster"] = "appearance"
+    color_by: ColorBy = "appearance"
     """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Red, green and blue of the background, each 0 to 1."""
-    memory: Annotated[str | None, option("SIZE")] = None
-    """Draw from so much memory of the device, as 2GB, with pages read from the files as cameras need them."""
     view: Views = field(default_factory=ViewOptions)
 
 
@@ -55,7 +54,7 @@ def run(options: Render) -> None:
     views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
     show = len(views) > 1 and not options.quiet
     # With a fade, pictures follow each other, and the tolerance of a budget goes in steps.
-    renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.memory)
+    renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.pool())
     cut: CutOptions = {"tolerance": options.tolerance, "budget": options.budget}
     cut |= {"min_level": options.min_level, "fade": fade}
     for path, (name, camera) in counted(views, len(views), "render", show):

@@ -21,7 +21,7 @@ import tyro
 from v3dg._start import SIGNALS
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import Axis
-from v3dg.cli._common import Cut, Flag, OnDevice, check_usage, option, print_result, require_subject, tell
+from v3dg.cli._common import Cut, Flag, OnPool, check_usage, option, print_result, require_subject, tell
 from v3dg.cli._views import CameraFile, up_lines
 from v3dg.opening import open_with_cameras
 from v3dg.upright import direction_of, up_of
@@ -32,7 +32,7 @@ _SIZE = (800, 800)  # px, of cameras whose file has none; the page has its own
 
 
 @dataclass
-class View(CameraFile, Cut, OnDevice):
+class View(CameraFile, Cut, OnPool):
     """Look at a scene, a bundle or an asset in a web browser."""
 
     subject: tyro.conf.Positional[Path]
@@ -69,7 +69,7 @@ def run(options: View) -> None:
     expected = f"a bundle or a scene, got the asset {options.subject}; build a bundle of it"
     check_usage("--budget", has_levels or options.budget is None, expected)
     up = options.up or up_of(subject, cameras, options.subject)[0]
-    scene_view = SceneView(subject, device=options.device)
+    scene_view = SceneView(subject, device=options.device, memory=options.pool())
     with contextlib.suppress(ImportError):  # of which the site tells; it takes long
         importlib.import_module("v3dg.viewer.tab")
     with _interrupts() as interrupts:

@@ -117,10 +117,9 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
         raise top["format"].error(f'"{FORMAT}"')
     if top["version"].value != VERSION or isinstance(top["version"].value, bool):
         raise top["version"].error(f"{VERSION}, which is what this build reads")
-    bundles = {
-        name: _open_bundle(node, node.text(), [node.text()], folder, known)
-        for name, node in top["bundles"].some_fields(()).items()
-    }
+    nodes = top["bundles"].some_fields(())
+    _open_bundles({node.text(): (node, [node.text()]) for node in nodes.values()}, folder, known)
+    bundles = {name: known[node.text()] for name, node in nodes.items()}
     instances = []
     for node in top["instances"].items():
         fields = node.fields(("bundle", "position"), ("quaternion", "scale", "importance"))
@@ -198,20 +197,22 @@ def _read_layouts(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[S
         advice = "each layout is a scene, so make a file of each"
         raise root.field("layouts").problem(f"expected one layout, got {len(layouts)}; {advice}")
     top = layouts[0].some_fields(("assets", "cameras"))
-    instances = []
+    placed, wanted = [], dict[str, tuple[Node, list[str]]]()
     for node in top["assets"].items():
         fields = node.some_fields(("asset_kind", "asset_name", "ply_suffix", "instances"))
         kind, name, suffix = (fields[key].text() for key in ("asset_kind", "asset_name", "ply_suffix"))
-        places = [
-            f"{name}.v3dg",
-            # Where `v3dg build` puts it, in a copy of the published code's folders.
-            os.path.join("..", "_3dgs-assets", kind, name, os.path.splitext(suffix)[0] + ".v3dg"),
-        ]
-        bundle = _open_bundle(fields["asset_name"], name, places, folder, known)
-        for instance in fields["instances"].items():
+        # Where `v3dg build` puts it, in a copy of the published code's folders.
+        built = os.path.join("..", "_3dgs-assets", kind, name, os.path.splitext(suffix)[0] + ".v3dg")
+        wanted.setdefault(name, (fields["asset_name"], [f"{name}.v3dg", built]))
+        placed.append((name, fields["instances"]))
+    _open_bundles(wanted, folder, known)
+    instances = []
+    for name, nodes in placed:
+        for instance in nodes.items():
             required = "positions", "quaternions", "scale"
             pose = instance.some_fields(required)
-            instances.append(_instance(bundle, {name.removesuffix("s"): pose[name] for name in required}))
+            fields = {key.removesuffix("s"): pose[key] for key in required}
+            instances.append(_instance(known[name], fields))
     keys = ("camera_name", "camera_width", "camera_height", "camera_angle_x", "camera_angle_y")
     return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
@@ -220,9 +221,9 @@ def _read_flat_layout(root: Node, folder: Path, known: dict[str, Bundle]) -> tup
     """A published layout of one asset with its names shortened."""
     top = root.fields(("asset", "instances", "cameras"), ("name", "convention"))
     asset = top["asset"].text()
-    bundle = _open_bundle(top["asset"], asset, [os.path.splitext(asset)[0] + ".v3dg"], folder, known)
+    _open_bundles({asset: (top["asset"], [os.path.splitext(asset)[0] + ".v3dg"])}, folder, known)
     required = "position", "quaternion", "scale"
-    instances = [_instance(bundle, node.fields(required)) for node in top["instances"].items()]
+    instances = [_instance(known[asset], node.fields(required)) for node in top["instances"].items()]
     keys = ("name", "width", "height", "fov_x", "fov_y")
     return _scene_of(instances), _read_blender_cameras(top["cameras"].items(), keys)
 
@@ -243,13 +244,17 @@ def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[
     return dict(zip(names, cameras, strict=True))
 
 
-def _open_bundle(node: Node, key: str, places: list[str], folder: Path, known: dict[str, Bundle]) -> Bundle:
-    """The known bundle, or the one in the first of the places, relative to the folder, that there is."""
-    if key not in known:
-        place = next((folder / place for place in places if (folder / place).is_file()), None)
-        if place is None:
+def _open_bundles(
+    wanted: Mapping[str, tuple[Node, list[str]]], folder: Path, known: dict[str, Bundle]
+) -> None:
+    """Make bundles known: each the one in the first of its places, relative to the folder, that there is."""
+    found = {}
+    for key, (node, places) in wanted.items():
+        if key in known:
+            continue
+        found[key] = next((folder / place for place in places if (folder / place).is_file()), folder)
+        if found[key] is folder:
             tried = " or ".join(str(folder / place) for place in places)
             problem = node.problem(f"expected a bundle at {tried}, found none; build it with `v3dg build`")
             raise FileNotFoundError(str(problem))
-        known[key] = Bundle.open(place)
-    return known[key]
+    known.update(zip(found, Bundle.open_all(found.values()), strict=True))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
-from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,8 @@ from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.pictures import to_8bit
-from v3dg.render import render, shade_of
+from v3dg.pool import chosen_bytes
+from v3dg.render import Renderer, render, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, rule_of, select, select_by
@@ -27,26 +29,16 @@ from v3dg.viewer.view import View
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
 Window: TypeAlias = tuple[int, int, int, int]
-Shows: TypeAlias = Literal["appearance", "level", "cluster", "error", "depth", "alpha", "count", "difference"]
+Shows: TypeAlias = Literal[
+    "appearance", "level", "cluster", "error", "residency", "depth", "alpha", "count", "difference"
+]
 
 # Gaussians in a pixel that get the brightest colour.
 MOST_COUNTED = 256
+_OF_POOLS: tuple[Shows, ...] = ("appearance", "depth", "alpha", "level", "cluster", "residency")
 # So many gaussians are drawn whole while the camera moves, too.
 _FEW_GAUSSIANS = 500_000
 _SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
-# From dark to bright, even in lightness.
-_RAMP = np.array(
-    [
-        (0.05, 0.03, 0.15),
-        (0.27, 0.06, 0.39),
-        (0.53, 0.13, 0.42),
-        (0.77, 0.23, 0.33),
-        (0.94, 0.42, 0.20),
-        (0.99, 0.66, 0.22),
-        (0.99, 0.95, 0.65),
-    ],
-    np.float32,
-)
 
 
 @dataclass(frozen=True)
@@ -82,6 +74,7 @@ class Figures:
             times of the whole picture.
         levels: (L,) selected gaussians by level.
         memory_bytes: Of the whole process.
+        missing: Pages that a pool lacks for the picture.
     """
 
     gaussians_selected: int
@@ -91,6 +84,7 @@ class Figures:
     draw_ms: float
     levels: npt.NDArray[np.int64]
     memory_bytes: int
+    missing: int
 
 
 @dataclass(frozen=True)
@@ -118,12 +112,6 @@ class Frame:
         return self.pixels.shape[1], self.pixels.shape[0]
 
 
-def ramp(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    """(..., 3) colours of values in [0, 1], dark to bright."""
-    at = np.linspace(0.0, 1.0, len(_RAMP))
-    return np.stack([np.interp(values, at, _RAMP[:, c]) for c in range(3)], axis=-1).astype(np.float32)
-
-
 class Stopped(Exception):
     """A picture was given up because another one is wanted."""
 
@@ -134,19 +122,32 @@ class SceneView:
     Args:
         subject: A scene, a bundle, or an asset, which is split into clusters but gets no coarser levels.
         device: Where to draw: "cpu", "cuda", or "auto", which is CUDA where that works.
+        memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time, and nothing is frozen or
+            split, nor shown of what only all gaussians tell.
 
     Attributes:
         scene: The subject as a scene.
         near: As in `v3dg.Camera`, to suit the scene's size.
         center, radius: A ball that holds nearly all of it, world units.
+        pool: What draws where not all is resident, or None.
     """
 
-    def __init__(self, subject: Scene | Bundle | Gaussians, *, device: str | Device = "auto") -> None:
+    def __init__(
+        self,
+        subject: Scene | Bundle | Gaussians,
+        *,
+        device: str | Device = "auto",
+        memory: int | str | None = "auto",
+    ) -> None:
         if isinstance(subject, Gaussians):
             only_leaves = BuildConfig(min_clusters=1 << 31)
             subject = build_bundle(subject, config=only_leaves, device="cpu", progress=False)
         self.scene = Scene.of(subject)
         self.device = _device.resolve(device)
+        if memory == "auto":
+            memory = chosen_bytes(self.scene.bundles, self.device)
+        self.pool = None if memory is None else Renderer(self.scene, device=self.device, memory=memory)
+        self._missing, self._drawing = 0, threading.Lock()
         self.center, self.radius = _bounds(self.scene)
         self.near = min(0.01, 1e-3 * self.radius)
         self.num_levels = max((bundle.num_levels for bundle in self.scene.bundles), default=1)
@@ -165,6 +166,13 @@ class SceneView:
             text = text.replace(path, os.path.basename(path)) if path else text
         return text
 
+    @property
+    def modes(self) -> tuple[Shows, ...]:
+        """What can be shown."""
+        if self.pool is None:
+            return tuple(mode for mode in get_args(Shows) if mode != "residency")
+        return _OF_POOLS[: 3 if self.device.is_cuda else None]
+
     def frame(
         self,
         view: View,
@@ -172,13 +180,27 @@ class SceneView:
         settings: Settings,
         stop: _core.Stop | None = None,
         steps: _core.BudgetSteps | None = None,
+        patience: float = 0.0,
     ) -> Frame:
         """Draw a picture of ``size`` (width, height) px; with ``steps``, one that follows others.
 
+        It waits so many seconds for pages that a pool lacks.
+
         Raises:
             Stopped: ``stop`` was requested; it is raised soon after.
-            ValueError: The budget is too small for any cut.
+            ValueError: The budget is too small for any cut, or a page that a pool lacks is damaged.
         """
+        if self.pool is None:
+            return self._frame_of(view, size, settings, stop, steps)
+        shows = settings.shows if settings.shows in self.modes else "appearance"
+        settings = replace(settings, shows=shows, split=0.0, frozen=None)
+        with self._drawing:
+            self._how, self._patience = {"min_level": settings.min_level, "fade": settings.fade}, patience
+            return self._frame_of(view, size, settings, stop, steps)
+
+    def _frame_of(
+        self, view: View, size: tuple[int, int], settings: Settings, stop: Any, steps: Any
+    ) -> Frame:
         _check(stop)
         camera = view.camera(*size, self.near)
         chooser = camera if settings.frozen is None else settings.frozen.camera(*size, self.near)
@@ -205,6 +227,7 @@ class SceneView:
             draw_ms=1e3 * (time.perf_counter() - selected),
             levels=self._levels(cut),
             memory_bytes=_resident_bytes(),
+            missing=self._missing,
         )
         return Frame(to_8bit(picture), figures, settings.shows, value_range, view, distance)
 
@@ -216,15 +239,15 @@ class SceneView:
         if shows == "count":
             _, _, count, in_view = self._values("count_cut", cut, camera, window, stop, "appearance")
             values = np.log2(np.maximum(count, 1)) / np.log2(MOST_COUNTED)
-            return ramp(values) * (count > 0)[..., None], (1.0, MOST_COUNTED), in_view, None
+            return _core.ramp(values) * (count > 0)[..., None], (1.0, MOST_COUNTED), in_view, None
         if shows == "error":
             rule = rule_of(cut.tolerance, None, 0)
             share, alpha, depth, seen = self._values(
                 "draw_metrics", cut, camera, window, stop, "appearance", rule
             )
             mean = np.clip(share[..., 0] / np.maximum(alpha, 1e-6), 0, 1)
-            return ramp(mean) * alpha[..., None], (0.0, cut.tolerance), seen, _distance(alpha, depth)
-        color_by: ColorBy = shows if shows in ("level", "cluster") else "appearance"
+            return _core.ramp(mean) * alpha[..., None], (0.0, cut.tolerance), seen, _distance(alpha, depth)
+        color_by: ColorBy = shows if shows in ("level", "cluster", "residency") else "appearance"
         color, alpha, depth, in_view = self._draw(cut, camera, window, color_by, stop)
         distance = _distance(alpha, depth)
         if shows == "alpha":
@@ -234,7 +257,7 @@ class SceneView:
             # A few gaussians far from all others would take all the colours.
             near, far = np.percentile(covered, (1, 99)) if covered.size else (0.0, 1.0)
             values = np.clip((far - depth) / max(far - near, 1e-12), 0, 1)
-            return ramp(values) * alpha[..., None], (float(far), float(near)), in_view, distance
+            return _core.ramp(values) * alpha[..., None], (float(far), float(near)), in_view, distance
         if shows == "difference":
             difference = np.abs(color - self._all_gaussians(camera, window, stop))
             return np.minimum(settings.gain * difference, np.float32(1)), None, in_view, distance
@@ -248,8 +271,19 @@ class SceneView:
         self, cut: Selection, camera: Camera, window: Window, color_by: ColorBy, stop: _core.Stop | None
     ) -> tuple[Any, Any, Any, int]:
         """Colour, alpha and depth of the window, and the gaussians in the frustum of the whole picture."""
-        if self.device.is_cuda:
-            image = render(self.scene, camera, cut=cut, color_by=color_by, depth=True, device=self.device)
+        if self.pool is not None or self.device.is_cuda:
+            if self.pool is not None:
+                options: Any = {"tolerance": cut.tolerance, "budget": None, **self._how}
+                drawer = self.pool._frame
+                if self._patience:
+                    drawer.settle(self.scene, camera, seconds=self._patience, **options)
+                drawer.color_by = color_by
+                image = drawer.draw(self.scene, camera, _SHADE, None, stop, **options)
+                _check(stop)
+                self._missing = image.stats.missing
+            else:
+                how: Any = {"color_by": color_by, "depth": True, "device": self.device, "memory": None}
+                image = render(self.scene, camera, cut=cut, **how)
             x0, y0, x1, y1 = window
             planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
             color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)

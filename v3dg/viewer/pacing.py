@@ -21,6 +21,8 @@ Size = tuple[int, int]
 TARGET_MS = 60.0
 # Without a change for so long, a larger picture is begun.
 REST_SECONDS = 0.15
+# What a picture at rest waits for pages; another one follows as long as some are missing.
+PAGES_SECONDS = 0.1
 # A draft that has taken so long is given up for what is asked for now.
 PATIENCE_SECONDS = 4e-3 * TARGET_MS
 # Smaller ones show nothing; from there on the cut gets coarser, which shows less.
@@ -169,7 +171,8 @@ class RenderLoop:
         sizes = finer_sizes(draft.size, request.size)
         if settings != request.settings and not sizes:
             sizes = [draft.size]
-        self._send(frame, not sizes, request.number)
+        is_whole = self._scene_view.pool is None
+        self._send(frame, not sizes and is_whole, request.number)
         with self._changed:
             if self._changed.wait_for(self._has_news, REST_SECONDS):
                 return
@@ -180,8 +183,15 @@ class RenderLoop:
             frame = self._scene_view.frame(request.view, size, request.settings, self._begin(0.0), steps)
             if self._has_news():
                 return
-            self._send(frame, size == sizes[-1], request.number)
-        is_on_way = has_budget and not is_larger
+            self._send(frame, size == sizes[-1] and is_whole, request.number)
+        while not is_whole:
+            how = request.settings, self._begin(0.0), None, PAGES_SECONDS
+            frame = self._scene_view.frame(request.view, request.size, *how)
+            if self._has_news():
+                return
+            is_whole = not frame.figures.missing
+            self._send(frame, is_whole, request.number)
+        is_on_way = has_budget and not is_larger and self._scene_view.pool is None
         while is_on_way:  # for a budget's tolerance goes in steps
             before, stop = frame.figures.tolerance, self._begin(0.0)
             frame = self._scene_view.frame(request.view, draft.size, request.settings, stop, steps)

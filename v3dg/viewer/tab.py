@@ -6,6 +6,7 @@ import contextlib
 import copy
 import functools
 import io
+import math
 import os
 import tempfile
 import threading
@@ -22,14 +23,14 @@ from PIL import Image
 from v3dg import _core
 from v3dg.bundle import Bundle
 from v3dg.camera_file import write_cameras
-from v3dg.false_color import level_colors
 from v3dg.io import read_asset
 from v3dg.pick import pick
+from v3dg.pictures import to_8bit
 from v3dg.scene.file import write_scene
 from v3dg.video import write_video
 from v3dg.viewer import messages
 from v3dg.viewer.exports import Exporter, bundle_names
-from v3dg.viewer.frame import MOST_COUNTED, Frame, Pixels, SceneView, ramp
+from v3dg.viewer.frame import MOST_COUNTED, Frame, Pixels, SceneView
 from v3dg.viewer.pacing import RenderLoop
 
 # Pictures that pass by, and those that stay.
@@ -103,8 +104,8 @@ class Tab:
     def describe_scene(self) -> dict[str, Any]:
         """Return what the page has to know of what it shows."""
         shown = self.scene_view
-        legend = [[round(255 * float(part)) for part in color] for color in ramp(np.linspace(0, 1, 7))]
-        levels = [[round(255 * float(c)) for c in color] for color in level_colors(shown.num_levels)]
+        colors = (_core.level_colors(shown.num_levels), _core.ramp(np.linspace(0, 1, 7)))
+        levels, legend = (to_8bit(of).tolist() for of in colors)
         return {
             "type": "scene",
             "name": self._name,
@@ -117,6 +118,8 @@ class Tab:
             "level_colors": levels,
             "ramp": legend,
             "most_counted": MOST_COUNTED,
+            "modes": shown.modes,
+            "missing_colors": to_8bit(_core.missing_colors(4.0 ** np.arange(4))).tolist(),
         }
 
     def _tell(self, message: dict[str, Any], data: bytes = b"") -> None:
@@ -149,7 +152,7 @@ class Tab:
         try:
             view, (width, height), settings, _ = message.look.request()
             answer: dict[str, Any] = {"type": "picked"}
-            if message.instance is None:
+            if message.instance is None and self.scene_view.pool is None:  # which has all to look at
                 camera = view.camera(width, height, self.scene_view.near)
                 x = min(int(message.at[0] * width), width - 1)
                 y = min(int(message.at[1] * height), height - 1)
@@ -158,7 +161,7 @@ class Tab:
                 found = pick(self.scene_view.scene, camera, x, y, **cut)
                 if found is not None and found.weight >= _LEAST_WEIGHT:
                     answer |= self._instance(found.instance) | {"point": found.position.tolist()}
-            else:
+            elif message.instance is not None:
                 answer |= self._instance(message.instance)
             self._tell(answer)
         except Exception as error:
@@ -185,7 +188,7 @@ class Tab:
         }
 
     def _save_picture(self, message: messages.Save, stop: _core.Stop) -> None:
-        frame = self.scene_view.frame(*message.look.request()[:3], stop)
+        frame = self.scene_view.frame(*message.look.request()[:3], stop, None, math.inf)
         self._exporter.save(f"{self._name}.png", Image.fromarray(frame.pixels).save)
 
     def _save_play(self, message: messages.Save, _: _core.Stop) -> None:
@@ -205,7 +208,7 @@ class Tab:
                     self._tell({"type": "progress", "share": place / len(views)})
                     told = time.monotonic()
                 view = replace(view, aspect=size[0] / size[1])
-                yield self.scene_view.frame(view, size, request.settings, stop, steps).pixels
+                yield self.scene_view.frame(view, size, request.settings, stop, steps, math.inf).pixels
 
         self._exporter.save(f"{self._name}.mp4", lambda file: write_video(file, pictures(), fps=_FPS))
 

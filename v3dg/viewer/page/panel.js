@@ -5,6 +5,7 @@ export const SHOWS = {
   level: "Level",
   cluster: "Cluster",
   error: "Error",
+  residency: "Residency",
   depth: "Depth",
   alpha: "Alpha",
   count: "Gaussians per pixel",
@@ -119,7 +120,8 @@ export class Panel {
     const { app } = this;
     const { settings } = app;
     const hasLevels = app.scene.level_colors.length > 1;
-    const modes = Object.entries(SHOWS).filter(([shows]) => hasLevels || !NEED_LEVELS.includes(shows));
+    const canShow = (shows) => app.scene.modes.includes(shows) && (hasLevels || !NEED_LEVELS.includes(shows));
+    const modes = Object.entries(SHOWS).filter(([shows]) => canShow(shows));
     const change = (name) => (value) => app.change({ [name]: value });
     this.shows = this.select(parent, "Show", modes, settings.shows, change("shows"));
     this.gain = this.slider(parent, "Amplify", { low: 1, high: 50, step: 1, value: settings.gain }, change("gain"));
@@ -243,6 +245,9 @@ export class Panel {
     this.fade.set(settings.fade !== null);
     this.split.set(settings.split);
     this.freeze.set(settings.frozen !== null);
+    // A pool has not all gaussians, and chooses its cut by what it has.
+    const hasAll = app.scene.modes.includes("difference");
+    for (const control of [this.split, this.freeze]) control.hidden = !hasAll;
     this.resolution.set(100 * app.resolution);
     this.speed.set(camera.speed);
     this.fov.set((camera.fov_y * 180) / Math.PI);
@@ -276,6 +281,7 @@ export class Panel {
       ["select", `${figures.select_ms.toFixed(1)} ms`],
       ["draw", `${figures.draw_ms.toFixed(1)} ms`],
       ["picture", `${size[0]} x ${size[1]}`],
+      ...(figures.missing ? [["pages missing", number(figures.missing)]] : []),
       ["memory", `${number(Math.round(figures.memory_bytes / 2 ** 20))} MiB`],
     ];
     const table = make("table", {}, ...rows.map((row) => make("tr", {}, ...row.map((cell) => make("td", {}, cell)))));
@@ -283,6 +289,10 @@ export class Panel {
   }
 
   legend({ shows, range }) {
+    if (shows === "residency") {
+      const [there, ...missing] = this.app.scene.missing_colors.map((color) => `rgb(${color})`);
+      return this.bar(`${there} 25%, ${missing[0]} 25%, ${missing.slice(1).join(",")}`, ["as wanted", "finer pages missing"]);
+    }
     if (!range) return [];
     const short = (x) => `${+x.toPrecision(3)}`;
     let marks = range.map(short);
@@ -290,8 +300,12 @@ export class Panel {
     if (shows === "error") marks = ["finest", `tolerance, ${marks[1]} px²`];
     if (shows === "depth") marks = [`far ${marks[0]}`, `near ${marks[1]}`];
     const colors = shows === "alpha" ? ["#000", "#fff"] : this.app.scene.ramp.map((color) => `rgb(${color})`);
+    return this.bar(colors.join(","), marks);
+  }
+
+  bar(colors, marks) {
     const ramp = make("div", { className: "ramp" });
-    ramp.style.background = `linear-gradient(90deg, ${colors.join(",")})`;
+    ramp.style.background = `linear-gradient(90deg, ${colors})`;
     return [ramp, make("div", { className: "marks" }, ...marks.map((mark) => make("span", {}, mark)))];
   }
 

@@ -1,0 +1,156 @@
+"""The viewer with a pool: pictures that become those of all as pages come in, and what it leaves out."""
+
+import math
+import threading
+
+import numpy as np
+import pytest
+
+import v3dg.pool
+from scenes_lod import blob, lod_bundle
+from v3dg import Bundle, Scene, _core
+from v3dg.pictures import to_8bit
+from v3dg.viewer.frame import SceneView, Settings
+from v3dg.viewer.pacing import RenderLoop, Request
+from v3dg.viewer.view import look_at
+
+VIEW = look_at((0, -4, 1), (0, 0, 0), (0, 0, 1), 0.8, 1.5)
+ASIDE = look_at((3, -2, 1), (0, 0, 0), (0, 0, 1), 0.8, 1.5)
+SIZE = (120, 80)
+SECONDS = 60
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    rng = np.random.default_rng(3)
+    path = tmp_path_factory.mktemp("pool") / "blob.v3dg"
+    lod_bundle(rng, blob(rng, 5000, sh_degree=1), 32).write(path)
+    scene = Scene()
+    scene.add(Bundle.open(path), positions=rng.normal(size=(4, 3)), scales=np.full(4, 0.4))
+    return scene
+
+
+@pytest.mark.parametrize("shows", ["appearance", "level", "cluster", "depth", "alpha"])
+@pytest.mark.parametrize("given", [{"tolerance": 1.0}, {"tolerance": 2.0, "fade": None}, {"budget": 3000}])
+def test_a_picture_that_waits_is_that_of_all(scene, shows, given):
+    whole, pooled = SceneView(scene, device="cpu", memory=None), SceneView(scene, device="cpu", memory="64MB")
+    settings = Settings(shows=shows, **given)
+    for view in (VIEW, ASIDE):
+        expected = whole.frame(view, SIZE, settings)
+        frame = pooled.frame(view, SIZE, settings, None, None, math.inf)
+        np.testing.assert_array_equal(frame.pixels, expected.pixels)
+        assert frame.figures.missing == expected.figures.missing == 0
+        assert frame.figures.gaussians_selected == expected.figures.gaussians_selected
+        assert (frame.value_range, frame.distance) == (expected.value_range, expected.distance)
+    assert pooled.pool is not None
+    assert whole.pool is None
+
+
+def test_a_pool_is_taken_where_not_all_fits(scene, monkeypatch):
+    again = Scene()
+    again.add(Bundle.open(scene.bundles[0].path))
+    assert SceneView(again, device="cpu").pool is None
+    monkeypatch.setattr(v3dg.pool, "free_on", lambda _: 500_000)
+    assert SceneView(again, device="cpu").pool.memory == 250_000
+
+
+def test_residency_shows_what_is_missing_until_it_is_there(scene):
+    pooled = SceneView(scene, device="cpu", memory="64MB")
+    settings = Settings(shows="residency", tolerance=0.5, fade=None)
+    first = pooled.frame(VIEW, SIZE, settings)
+    assert first.figures.missing > 0
+    settled = pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
+    alpha = pooled.frame(VIEW, SIZE, Settings(shows="alpha", tolerance=0.5, fade=None)).pixels[..., :1] / 255
+    there = to_8bit(_core.missing_colors(np.zeros(())) * alpha)
+    np.testing.assert_allclose(settled.pixels.astype(int), there, atol=2)
+    assert (first.pixels[..., 0] > first.pixels[..., 2] + 20).any()  # yellow or red
+
+
+def test_what_a_pool_cannot_show_is_not_offered(scene):
+    whole, pooled = SceneView(scene, device="cpu", memory=None), SceneView(scene, device="cpu", memory="64MB")
+    assert "residency" not in whole.modes
+    assert "error" in whole.modes
+    assert set(pooled.modes) == {"appearance", "level", "cluster", "residency", "depth", "alpha"}
+    expected = pooled.frame(VIEW, SIZE, Settings(), None, None, math.inf)
+    for settings in (Settings(shows="difference"), Settings(split=0.5), Settings(frozen=ASIDE)):
+        frame = pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
+        np.testing.assert_array_equal(frame.pixels, expected.pixels)
+
+
+@pytest.fixture
+def loop(scene):
+    """A render loop over a pool, and what it sent: (frame, is it final, number)."""
+    pooled, sent, is_final, errors = SceneView(scene, device="cpu", memory="64MB"), [], threading.Event(), []
+
+    def send(*frame):
+        sent.append(frame)
+        if frame[1]:
+            is_final.set()
+
+    def fail(error):
+        errors.append(error)
+        is_final.set()
+
+    loop = RenderLoop(pooled, send, fail)
+    loop.sent, loop.is_final, loop.errors = sent, is_final, errors
+    yield loop
+    assert loop.close(SECONDS)
+
+
+def test_pictures_follow_until_nothing_is_missing(scene, loop):
+    settings = Settings(tolerance=0.5)
+    for number, view in enumerate((VIEW, ASIDE)):
+        loop.is_final.clear()
+        loop.ask(Request(view, SIZE, settings, number))
+        assert loop.is_final.wait(SECONDS)
+        frame, _, of = loop.sent[-1]
+        assert of == number
+        assert frame.size == SIZE
+        assert frame.figures.missing == 0
+        expected = SceneView(scene, device="cpu", memory=None).frame(view, SIZE, settings)
+        np.testing.assert_array_equal(frame.pixels, expected.pixels)
+    assert [final for _, final, _ in loop.sent].count(True) == 2
+    assert not loop.errors
+
+
+def test_pictures_are_sent_while_pages_come_in(loop, monkeypatch):
+    """One page at a time, on a disk that is slow."""
+    pool = loop._scene_view.pool._frame
+    real, calls = pool.settle, []
+
+    def settle(*given, seconds, **options):
+        calls.append(seconds)
+        real(*given, seconds=0.0, **options)
+
+    monkeypatch.setattr(pool, "settle", settle)
+    loop.ask(Request(VIEW, SIZE, Settings(tolerance=0.5)))
+    assert loop.is_final.wait(SECONDS)
+    assert not loop.errors
+    missing = [frame.figures.missing for frame, _, _ in loop.sent]
+    assert missing[0] > 0
+    assert missing[-1] == 0
+    assert set(calls) == {0.1}
+
+
+def test_damage_is_told_and_the_draft_stays(tmp_path):
+    rng = np.random.default_rng(3)
+    path = tmp_path / "blob.v3dg"
+    lod_bundle(rng, blob(rng, 3000), 32).write(path)
+    bundle = Bundle.open(path)
+    with open(path, "r+b") as file:
+        file.seek(int(bundle._file.places[0]) + 5)
+        file.write(b"\x00\xff\x00\xff")
+    pooled, sent, told = SceneView(bundle, device="cpu", memory="64MB"), [], threading.Event()
+    errors = []
+    loop = RenderLoop(
+        pooled, lambda *frame: sent.append(frame), lambda error: (errors.append(error), told.set())
+    )
+    try:
+        loop.ask(Request(VIEW, SIZE, Settings(tolerance=0.0)))
+        assert told.wait(SECONDS)
+    finally:
+        assert loop.close(SECONDS)
+    assert "page 0: the hash does not match" in pooled.explain(errors[0])
+    assert "/" not in pooled.explain(errors[0])
+    assert sent
+    assert not any(final for _, final, _ in sent)
