@@ -99,8 +99,9 @@ def test_the_rule_is_what_is_free_less_a_quarter_of_it_or_a_gib(path, device, fr
 
 @pytest.mark.gpu
 def test_the_host_has_to_hold_what_a_gpu_draws_whole(path, free):
-    free(1 << 20, CPU)
-    assert Renderer(Bundle.open(path), device="cuda").memory is not None
+    bundle = Bundle.open(path)
+    free(bundle.page_bytes, CPU)  # of which a quarter is kept back
+    assert Renderer(bundle, device="cuda").memory is not None
 
 
 def test_what_is_there_needs_no_room(path, device, free):
