@@ -1,15 +1,17 @@
 """What a pool of pages does to frames: flights and teleports over a field of many different copies.
 
 Copies of a bundle are written with the colours of all gaussians changed a little, so that no two share a
-page, and stand in a grid. For pools of several sizes, as shares of what a view needs: how long frames take,
-how many bytes come in and how many pages are missing, and how far the picture is from the settled one. The
-size of a pool is a choice here: whether all would fit is said by the row without a pool. On a GPU, rows say
-what the process has on it.
+page, and stand in a grid. For pools of several sizes, as shares of what a view needs, with the files in the
+system's cache and without: how long frames take, how many bytes come in and how many pages are missing, and
+how far the picture is from the settled one; after a teleport, also how far both are from all gaussians at
+4 x 4 samples. The size of a pool is a choice here: whether all would fit is said by the row without a pool.
+On a GPU, rows say what the process has on it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import multiprocessing
 import os
 import time
@@ -25,6 +27,7 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import record
+from benchmarks.evaluation.steadiness import true_picture
 from v3dg import _device
 from v3dg.metrics import psnr
 
@@ -174,7 +177,7 @@ def pixels(image: v3dg.Image) -> np.ndarray:
     return np.clip(_device.to_host(image.color), 0, 1)
 
 
-def teleport(config: Config, field: Field, memory: int, *, cold: bool) -> dict[str, Any]:
+def teleport(config: Config, field: Field, memory: int, truth: np.ndarray, *, cold: bool) -> dict[str, Any]:
     """From one end of the field to the other: pictures until nothing is missing."""
     renderer = v3dg.Renderer(field.scene, device=config.device, memory=memory)
     renderer.settle(field.camera(0), tolerance=config.tolerance)
@@ -192,9 +195,21 @@ def teleport(config: Config, field: Field, memory: int, *, cold: bool) -> dict[s
             break
     renderer.settle(field.camera(0.8), tolerance=config.tolerance)
     settled = pixels(renderer.render(field.camera(0.8), tolerance=config.tolerance))
+    best = float(psnr(truth, settled))
     for frame in curve:
-        frame["psnr"] = min(100.0, float(psnr(settled, frame.pop("picture"))))
-    return {"cold": cold, "curve": curve[:200], "frames_until_settled": len(curve)}
+        picture = frame.pop("picture")
+        frame["psnr"] = min(100.0, float(psnr(settled, picture)))
+        frame["psnr_to_truth"] = float(psnr(truth, picture))
+    far = [number for number, frame in enumerate(curve, 1) if frame["psnr_to_truth"] < best - 0.5]
+    near = far[-1] if far else 0  # the first from which on all are within 0.5 dB
+    return {
+        "cold": cold,
+        "frames_until_settled": len(curve),
+        "settled_psnr_to_truth": best,
+        "frames_until_half_a_db": near + 1,
+        "seconds_until_half_a_db": curve[near]["seconds"],
+        "curve": curve[:200],
+    }
 
 
 def main(config: Config) -> None:
@@ -234,18 +249,22 @@ def main(config: Config) -> None:
             v3dg.residency.residency.clear()
         pools: list[tuple[float | None, int | str]] = [(None, memory) for memory in config.pools]
         pools += [(share, field.memory(int(share * most_needed))) for share in config.shares]
-        for share, memory in pools:
+        for (share, memory), cold in itertools.product(pools, (False, True)):
             renderer = v3dg.Renderer(field.scene, device=config.device, memory=memory)
             renderer.settle(cameras[0], tolerance=config.tolerance)
+            if cold:
+                field.drop_cached_pages()
             frames = timed(config, renderer, cameras, truth)
-            row = {"share": share, "memory": memory, **summary(frames), **errors(frames, truth)}
+            row = {"share": share, "memory": memory, "cold": cold, **summary(frames), **errors(frames, truth)}
             if idle is not None:
                 row["bytes_of_process"] = (bytes_on_device(config) or 0) - idle
             result["flights"].append(row)
             print(row, flush=True)
             del renderer
+        far_end = true_picture(field.scene, field.camera(0.8), config.device)
+        v3dg.residency.residency.clear()
         for cold in (False, True):
-            row = teleport(config, field, field.memory(2 * most_needed), cold=cold)
+            row = teleport(config, field, field.memory(2 * most_needed), far_end, cold=cold)
             result["teleports"].append(row)
             print({k: v for k, v in row.items() if k != "curve"}, flush=True)
         record.write(config.output, {"device": config.device, **result}, config.device)
