@@ -3,7 +3,8 @@
 What a frame is off, less what the frame before it was off, is what an eye sees beside the motion: flicker,
 and levels that are replaced at once. A whole picture hides that, for what pops is small; so the worst tile
 counts. Of quicker motion the same is found along the motion: the last error is brought to where its place is
-seen now, by the depth of the picture.
+seen now, by the depth of the picture. What pops, and nothing else, is the difference of two pictures from the
+same place: with the cut of the frame, and with that of the frame before.
 """
 
 from __future__ import annotations
@@ -62,15 +63,24 @@ class Path:
 
 
 def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
-    """Ways to go from a camera that looks at the target: so many frames each."""
+    """Ways to go from a camera that sees the target: so many frames each.
+
+    It stays where it is in the picture, but where the camera turns; that need not be the middle.
+    """
     away = first.position - target
     right, down = first.viewmat[0, :3], first.viewmat[1, :3]
     distance = float(np.linalg.norm(away))
 
+    def towards(eye: Any, looked_at: Any) -> Any:
+        return Camera.look_at(eye, looked_at, -down, width=1, height=1).viewmat[:3, :3]
+
+    aside_of_target = first.viewmat[:3, :3] @ towards(first.position, target).T
+
     def moved(eye: Any, looked_at: Any = target) -> Camera:
-        fov = 2 * np.arctan(first.width / 2 / first.fx)
-        size = {"width": first.width, "height": first.height}
-        return Camera.look_at(eye, looked_at, -down, float(fov), **size, near=first.near)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = aside_of_target @ towards(eye, looked_at)
+        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+        return replace(first, viewmat=viewmat)
 
     def shaken(k: int) -> Camera:
         aside, up = (_SHAKE * distance * np.sin(2 * np.pi * k / wave) for wave in _WAVES)
@@ -159,7 +169,7 @@ class Steadiness:
         if self._last is not None:
             change = np.square(255.0 * (error - self._last)).mean(-1)
             self._whole.append(float(np.sqrt(change.mean())))
-            self._worst_tile.append(float(np.sqrt(tile_means(change).max())))
+            self._worst_tile.append(worst_tile(error - self._last))
         if warp is not None:
             change = np.square(255.0 * (error - warp(self._last))).mean(-1) * warp.is_valid
             self._warped.append(float(np.sqrt(tile_means(change).max())))
@@ -191,6 +201,11 @@ def tile_means(values: Any) -> Any:
     return sums / np.outer(height, width)
 
 
+def worst_tile(change: Any) -> float:
+    """Of (H, W, 3) differences of colours in [0, 1]: root mean square of the worst tile, in 255ths."""
+    return float(np.sqrt(tile_means(np.square(255.0 * change).mean(-1)).max()))
+
+
 def changed_items(before: Selection, after: Selection) -> int:
     """How many pairs are drawn with another weight, or come or go."""
     if len(before) == len(after):
@@ -211,12 +226,13 @@ class _Follower:
     """What is known of one way to draw a path."""
 
     def __init__(self, cut: Cut, scene: Scene, device: str) -> None:
-        self._cut, self._scene = cut, scene
+        self._cut, self._scene, self._device = cut, scene, device
         self._renderer = Renderer(scene, device=device)
         self._steadiness = Steadiness()
         self._counts: list[int] = []
         self._tolerances: list[float] = []
         self._changed: list[int] = []
+        self._pops: list[float] = []
         self._last: Selection | None = None
 
     def draw(self, camera: Camera, truth: Any, warp: Warp | None) -> None:
@@ -231,7 +247,15 @@ class _Follower:
         )
         if self._last is not None:
             self._changed.append(changed_items(self._last, items))
+            self._pops.append(self._pop(camera, self._last, items) if self._changed[-1] else 0.0)
         self._last = items
+
+    def _pop(self, camera: Camera, *cuts: Selection) -> float:
+        """Worst tile of what two cuts differ by from the same place."""
+        # Not by the renderer of the path, whose budget goes on from its last frame.
+        pictures = (render(self._scene, camera, cut=cut, device=self._device).color for cut in cuts)
+        before, after = map(_device.to_host, pictures)
+        return worst_tile(after.clip(0, 1) - before.clip(0, 1))
 
     def row(self) -> Row:
         return {
@@ -239,13 +263,21 @@ class _Follower:
             "most_gaussians": max(self._counts),
             "changed_items": float(np.mean(self._changed)),
             "most_changed_items": max(self._changed),
+            "pop_mean": round(float(np.mean(self._pops)), 4),
+            "pop_worst": round(max(self._pops), 4),
             "tolerances": [min(self._tolerances), max(self._tolerances)],
             **self._steadiness.row(),
         }
 
 
-def compare(subject: Any, path: Path, cuts: dict[str, Cut], device: str) -> list[Row]:
-    """Draw the frames of a path with several options of `render`: how steady they are, gaussians a frame."""
+def compare(
+    subject: Any, path: Path, cuts: dict[str, Cut], device: str, *, along_motion: bool = True
+) -> list[Row]:
+    """Draw the frames of a path with several options of `render`: how steady they are, gaussians a frame.
+
+    Args:
+        along_motion: Whether errors are followed, too, which draws all gaussians once more.
+    """
     scene = copy.copy(Scene.of(subject))
     start = scene.positions
     followers = {name: _Follower(cut, scene, device) for name, cut in cuts.items()}
@@ -253,8 +285,9 @@ def compare(subject: Any, path: Path, cuts: dict[str, Cut], device: str) -> list
     for k, camera in enumerate(path.cameras):
         scene.move(positions=start + path.moves[k])
         truth = true_picture(scene, camera, device)
-        whole = render(scene, camera, tolerance=0.0, depth=True, device=device)
-        warp = None
+        warp, whole = None, None
+        if along_motion:
+            whole = render(scene, camera, tolerance=0.0, depth=True, device=device)
         if last is not None:
             warp = Warp(path.seen_from(k - 1), path.seen_from(k), (last, whole))
         for follower in followers.values():

@@ -1,7 +1,8 @@
 """Does a fade between levels remove pops? Bundles on slow paths, beside the hard cut and all gaussians.
 
 The hard cut is drawn twice: at the same tolerance, and at the lower one at which it has as many gaussians as
-the fade. docs/fades.md is about the result.
+the fade. So is a cut that stays as it is in the middle of the path: what it flickers is no pop, and no fade
+can be steadier. docs/fades.md is about the result.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +18,9 @@ import numpy as np
 
 from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.record import write
-from benchmarks.evaluation.steadiness import Cut, compare, paths_from
+from benchmarks.evaluation.steadiness import Cut, Options, compare, paths_from
 from benchmarks.evaluation.steadiness import Path as CameraPath
-from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Scene, select
+from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Scene, Selection, select
 from v3dg.cleaning import ball_of_most
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -39,6 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--fades", type=float, nargs="+", default=[DEFAULT_FADE])
     parser.add_argument("--tolerance", type=float, default=DEFAULT_TOLERANCE)
     parser.add_argument("--paths", nargs="+", help="only these")
+    parser.add_argument("--level-0-filter", type=float, default=0.0, help="px2, with compensated opacities")
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--json", type=Path, help="write the result there")
     options = parser.parse_args(arguments)
@@ -46,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows = []
     for name in map(str, options.bundles):
         path, _, up = name.partition(":")
-        bundle = Bundle.open(path)
+        bundle = filtered(Bundle.open(path), options.level_0_filter)
         scene = field_of(bundle, options.side, up or "z")
         of = {"asset": Path(path).stem, "side": options.side}
         for distance in options.distances:
@@ -55,12 +58,27 @@ def main(arguments: list[str] | None = None) -> int:
                 if options.paths and camera_path.name not in options.paths:
                     continue
                 rows += measure(scene, camera_path, options, {**of, "distance": distance})
-                print(*(_line(row) for row in rows[-3 - len(options.fades) :]), sep="\n", flush=True)
+                print(*(line(row) for row in rows[-4 - len(options.fades) :]), sep="\n", flush=True)
     result = {"frames": options.frames, "size": options.size, "tolerance": options.tolerance, "rows": rows}
+    result["level_0_filter"] = options.level_0_filter
     result["verdict"] = [verdict(rows, fade) for fade in options.fades]
     print(*result["verdict"], sep="\n")
     write(options.json, result, options.device)
     return 0
+
+
+def filtered(bundle: Bundle, filter_px2: float) -> Bundle:
+    """The bundle whose level 0 is drawn with a filter and compensated opacities, as coarser levels are."""
+    if filter_px2 == 0.0:
+        return bundle
+    clusters = bundle.clusters
+    is_fine = clusters.level == 0
+    changed = replace(
+        clusters,
+        filter_px2=np.where(is_fine, np.float32(filter_px2), clusters.filter_px2),
+        antialiased=np.where(is_fine, np.uint8(1), clusters.antialiased),
+    )
+    return Bundle(changed, bundle.groups, bundle.gaussians, bundle.config)
 
 
 def field_of(bundle: Bundle, side: int, up: str) -> Scene:
@@ -68,7 +86,7 @@ def field_of(bundle: Bundle, side: int, up: str) -> Scene:
     if side == 1:
         return Scene.of(bundle)
     center, radius = ball_of_most(bundle.level_gaussians(0).means)
-    axis, aside = _axes(up)
+    axis, aside = axes(up)
     half_turns = np.random.default_rng(0).uniform(0, math.pi, side * side)[:, None]
     steps = np.arange(side) - side // 2
     across, along = np.meshgrid(steps, steps)
@@ -80,7 +98,7 @@ def field_of(bundle: Bundle, side: int, up: str) -> Scene:
     return scene
 
 
-def _axes(up: str) -> tuple[Any, Any]:
+def axes(up: str) -> tuple[Any, Any]:
     """What is up, and an axis across."""
     axis = np.array(_AXES[up[-1]]) * (-1 if up[0] == "-" else 1)
     return axis, np.roll(axis, 1)
@@ -89,21 +107,35 @@ def _axes(up: str) -> tuple[Any, Any]:
 def first_camera(bundle: Bundle, up: str, distance: float, size: int) -> tuple[Camera, Any]:
     """From where the bundle fills a picture, or so many times as far away; and its middle."""
     center, radius = ball_of_most(bundle.level_gaussians(0).means)
-    axis, aside = _axes(up)
+    axis, aside = axes(up)
     direction = math.cos(0.45) * aside + math.sin(0.45) * axis
     eye = center + distance * _FILLS * radius * direction / np.linalg.norm(direction)
     return Camera.look_at(eye, center, axis, width=size, height=size, near=1e-3 * radius), center
 
 
-def measure(scene: Scene, path: CameraPath, options: argparse.Namespace, of: Row) -> list[Row]:
-    """Rows of one path: all gaussians, the hard cut, fades, the hard cut with as many as the first fade."""
+class Stays:
+    """The hard cut of one camera, whatever the frame."""
+
+    def __init__(self, camera: Camera, tolerance: float) -> None:
+        self.camera, self.tolerance = camera, tolerance
+        self.cut: Selection | None = None
+
+    def __call__(self, scene: Scene, camera: Camera) -> Options:
+        if self.cut is None:
+            self.cut = select(scene, self.camera, tolerance=self.tolerance, cull=False, device="cpu")
+        return {"cut": self.cut}
+
+
+def measure(scene: Scene, path: CameraPath, options: Any, of: Row, *, along_motion: bool = True) -> list[Row]:
+    """Rows of one path: all gaussians, the hard cut, fades, the hard cut with as many, and one that stays."""
     tolerance = options.tolerance
     cuts: dict[str, Cut] = {"all": {"tolerance": 0.0}, "hard": {"tolerance": tolerance}}
     cuts |= {f"fade {fade:g}": {"tolerance": tolerance, "fade": fade} for fade in options.fades}
     cameras = [path.seen_from(k) for k in range(0, len(path.cameras), max(1, len(path.cameras) // 8))]
     count = _mean_count(scene, cameras, tolerance=tolerance, fade=options.fades[0])
     cuts["hard, equal count"] = {"tolerance": _tolerance_of_count(scene, cameras, count, tolerance)}
-    rows = compare(scene, path, cuts, options.device)
+    cuts["stays"] = Stays(path.seen_from(len(path.cameras) // 2), tolerance)
+    rows = compare(scene, path, cuts, options.device, along_motion=along_motion)
     return [{**of, "path": path.name, "is_drift": path.is_drift, **row} for row in rows]
 
 
@@ -124,31 +156,33 @@ def _tolerance_of_count(scene: Scene, cameras: list[Camera], count: float, most:
     return high
 
 
-def verdict(rows: list[Row], fade: float) -> Row:
-    """What a fade comes to, for the worst asset and distance: ratios to the hard cut and to all gaussians."""
-    starts = sorted({(row["asset"], row["distance"]) for row in rows})
+def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "distance")) -> Row:
+    """What a fade comes to, for the worst path of each start: ratios to the hard cut and to all gaussians.
+
+    Starts differ in the keys.
+    """
+    starts = sorted({tuple(row[key] for key in keys) for row in rows})
     found = []
     for start in starts:
-        mine = [row for row in rows if (row["asset"], row["distance"]) == start]
-        cuts = {
-            "all": [r for r in mine if r["cut"] == "all"],
-            "hard": [r for r in mine if r["cut"] == "hard"],
-            "equal": [r for r in mine if r["cut"] == "hard, equal count"],
-            "fade": [r for r in mine if r.get("fade") == fade],
-        }
-        worst = {
-            name: max((r["tile_worst"] for r in cut if r["is_drift"]), default=math.nan)
-            for name, cut in cuts.items()
-        }
+        mine = [row for row in rows if tuple(row[key] for key in keys) == start]
+        names = {"all": "all", "hard": "hard", "equal": "hard, equal count", "stays": "stays"}
+        cuts = {short: [r for r in mine if r["cut"] == name] for short, name in names.items()}
+        cuts["fade"] = [r for r in mine if r.get("fade") == fade]
+        worst, pop = (
+            {name: max((r[of] for r in cut if r["is_drift"]), default=math.nan) for name, cut in cuts.items()}
+            for of in ("tile_worst", "pop_worst")
+        )
         pairs = list(zip(cuts["fade"], cuts["hard"], cuts["equal"], strict=True))
         found.append(
             {
-                "asset": start[0],
-                "distance": start[1],
-                "drift_worst_tile": {name: worst[name] for name in worst},
+                **dict(zip(keys, start, strict=True)),
+                "drift_worst_tile": worst,
+                "drift_worst_pop": pop,
                 "of_hard_at_equal_count": round(worst["fade"] / worst["equal"], 3),
                 "of_hard": round(worst["fade"] / worst["hard"], 3),
                 "of_all": round(worst["fade"] / worst["all"], 3),
+                "of_stays": round(worst["fade"] / worst["stays"], 3),
+                "pop_of_hard_at_equal_count": round(pop["fade"] / pop["equal"], 3) if pop["equal"] else None,
                 "least_psnr_gain": round(min(f["psnr"] - h["psnr"] for f, h, _ in pairs), 3),
                 "mean_psnr_gain": round(float(np.mean([f["psnr"] - h["psnr"] for f, h, _ in pairs])), 3),
                 "gaussians": round(float(np.mean([f["gaussians"] / h["gaussians"] for f, h, _ in pairs])), 3),
@@ -157,11 +191,14 @@ def verdict(rows: list[Row], fade: float) -> Row:
     return {"fade": fade, "starts": found}
 
 
-def _line(row: Row) -> str:
+def line(row: Row) -> str:
+    """What a row says, in one line."""
+    start = f"{row['asset']:>10} {row['distance']:4g} " if "distance" in row else ""
+    warped = f"warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  " if "warped_mean" in row else ""
     return (
-        f"{row['asset']:>10} {row['distance']:4g} {row['path']:14} {row['cut']:18} "
+        f"{start}{row['path']:14} {row['cut']:18} "
         f"{row['gaussians']:9,.0f}  rms {row['rms']:.3f}  tile {row['tile_mean']:.3f} {row['tile_p99']:.3f} "
-        f"{row['tile_worst']:.3f}  warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  "
+        f"{row['tile_worst']:.3f}  pop {row['pop_mean']:.3f} {row['pop_worst']:.3f}  {warped}"
         f"changed {row['changed_items']:.0f}  PSNR {row['psnr']:.2f}"
     )
 

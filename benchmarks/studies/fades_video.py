@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +48,10 @@ def main(arguments: list[str] | None = None) -> int:
     scene, cameras = read_scene(options.layout, bundles={asset: Bundle.open(options.bundle)})
     rows = []
     for name in options.cameras:
-        first = resized(cameras[name], tuple(options.size))
-        for path in paths_from(first, np.mean(scene.positions, axis=0), options.frames):
+        first, middle = resized(cameras[name], tuple(options.size)), np.mean(scene.positions, axis=0)
+        upwards = -first.viewmat[1, :3]
+        aimed = Camera.look_at(first.position, middle, upwards, width=first.width, height=first.height)
+        for path in paths_from(replace(first, viewmat=aimed.viewmat), middle, options.frames):
             if path.name in options.paths:
                 of = {"camera": name, "path": path.name}
                 rows += [{**of, **row} for row in measure(scene, path.cameras, options)]

@@ -1,8 +1,9 @@
-"""What makes motion steadier beside a fade? A budget in steps, hysteresis, pages that fade in.
+"""What makes motion steadier beside a fade? A budget in steps, hysteresis, pages that fade in, other ramps.
 
 The first is beside the tolerance that each view would have alone, also in the frames after the camera has
 stopped where steps are farthest behind. Hysteresis is a trial, and so are pages beside what a pool does: cuts
-with a state, made of the metrics that selection has. docs/notes/steadiness.md is about the results.
+with a state, made of the metrics that selection has. So are ramps, which have none.
+docs/notes/steadiness.md is about the results.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.record import write
 from benchmarks.evaluation.steadiness import Cut, Options, compare, paths_from
 from benchmarks.evaluation.steadiness import Path as CameraPath
-from benchmarks.studies.fades import field_of, first_camera
+from benchmarks.studies.fades import Stays, field_of, first_camera
 from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Renderer, Scene, Selection, _core, select
 from v3dg.residency import residency
 from v3dg.select import rule_of
@@ -47,7 +48,9 @@ class Config:
     """Over how many frames pages fade in."""
     rests: tuple[int, ...] = (1, 4, 16, 64)
     """Over how many frames the tolerance of a budget arrives at rest."""
-    trials: tuple[str, ...] = ("budget", "rest", "hysteresis", "pages")
+    bands: tuple[float, ...] = (1.005, 1.01, 1.03, 1.05)
+    """Fades beside the one above, of linear ramps; smooth ones have that and half as much again."""
+    trials: tuple[str, ...] = ("budget", "rest", "hysteresis", "pages", "ramps")
     paths: tuple[str, ...] = ()
     """Only these."""
     device: str = "cpu"
@@ -145,6 +148,24 @@ class Sticks:
         return {"cut": cut_of(scene, self.refined.astype(float), offset)}
 
 
+def between(metric: Any, tolerance: float, fade: float) -> Any:
+    """Where metrics lie in the band of a fade: 0 below, 1 above."""
+    low, high = tolerance / fade, tolerance * fade
+    return np.clip((np.minimum(metric, 2 * high) - low) / (high - low), 0, 1)
+
+
+class Smooth:
+    """A fade whose ramp begins and ends without a corner."""
+
+    def __init__(self, tolerance: float, fade: float) -> None:
+        self.tolerance, self.fade = tolerance, fade
+
+    def __call__(self, scene: Scene, camera: Camera) -> Options:
+        metric, offset = metrics_of(scene, camera)
+        ramp = between(metric, self.tolerance, self.fade)
+        return {"cut": cut_of(scene, ramp * ramp * (3 - 2 * ramp), offset)}
+
+
 class Arrives:
     """A cut with a fade whose pages all come in after the first frame, and fade in over so many frames.
 
@@ -152,13 +173,13 @@ class Arrives:
     """
 
     def __init__(self, tolerance: float, fade: float, frames: int, *, by_level: bool) -> None:
-        self.low, self.high, self.frames = tolerance / fade, tolerance * fade, frames
+        self.tolerance, self.fade, self.frames = tolerance, fade, frames
         self.by_level = by_level
         self.frame = 0
 
     def __call__(self, scene: Scene, camera: Camera) -> Options:
         metric, offset = metrics_of(scene, camera)
-        ramp = np.clip((np.minimum(metric, 2 * self.high) - self.low) / (self.high - self.low), 0, 1)
+        ramp = between(metric, self.tolerance, self.fade)
         arrived = self.arrived(scene, camera)
         self.frame += 1
         return {"cut": cut_of(scene, np.minimum(ramp, arrived), offset)}
@@ -282,12 +303,29 @@ def page_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
     return cuts
 
 
+def ramp_cuts(scene: Scene, path: CameraPath, config: Config) -> dict[str, Cut]:
+    tolerance, fade = config.tolerance, config.fade
+    cuts: dict[str, Cut] = {"hard": {"tolerance": tolerance}}
+    for band in sorted({*config.bands, fade}):
+        cuts[f"linear {band:g}"] = {"tolerance": tolerance, "fade": band}
+    for band in (fade, 1 + 1.5 * (fade - 1)):
+        cuts[f"smooth {band:g}"] = Smooth(tolerance, band)
+    cuts["stays"] = Stays(path.seen_from(len(path.cameras) // 2), tolerance)
+    return cuts
+
+
 def _depth_of(scene: Scene, camera: Camera) -> float:
     """How deep the middle of the scene is."""
     return float((camera.viewmat[:3, :3] @ scene.positions.mean(axis=0) + camera.viewmat[:3, 3])[2])
 
 
-TRIALS = {"budget": budget_cuts, "rest": rest_cuts, "hysteresis": hysteresis_cuts, "pages": page_cuts}
+TRIALS = {
+    "budget": budget_cuts,
+    "rest": rest_cuts,
+    "hysteresis": hysteresis_cuts,
+    "pages": page_cuts,
+    "ramps": ramp_cuts,
+}
 
 
 def line(row: Row) -> str:
@@ -295,6 +333,7 @@ def line(row: Row) -> str:
     return (
         f"{row['asset']:>8} {row['distance']:4g} {row['path']:15} {row['cut']:16} {row['gaussians']:9,.0f} "
         f"rms {row['rms']:.3f}  tile {row['tile_mean']:.3f} {row['tile_p99']:.3f} {row['tile_worst']:.3f}  "
+        f"pop {row['pop_mean']:.3f} {row['pop_worst']:.3f}  "
         f"warped {row['warped_mean']:.3f} {row['warped_worst']:.3f}  changed {row['changed_items']:.0f}  "
         f"PSNR {row['psnr']:.2f}  tolerance {low:.3f} to {high:.3f}"
     )
