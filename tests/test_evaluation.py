@@ -17,6 +17,8 @@ from benchmarks.evaluation import measure, report, steadiness
 from benchmarks.evaluation.assets import hair_lines, like_trained, many_copies, sky_dome
 from benchmarks.evaluation.hierarchy import HierarchyScene, build_hierarchy
 from benchmarks.evaluation.parts import motion
+from benchmarks.studies import fades_scenes
+from benchmarks.studies.fades import Stays
 from benchmarks.worlds.procedural import make_asset
 from reference.project import project
 from v3dg.build import BuildConfig, build_bundle
@@ -224,6 +226,56 @@ def test_paths_go_where_they_say():
     np.testing.assert_allclose(
         [np.linalg.norm(moved.seen_from(k).position) for k in range(5)], far["drift in"]
     )
+
+
+def test_paths_keep_a_part_of_a_picture_in_sight():
+    whole = eye_camera(3)
+    K = whole.K.copy()
+    K[:2, 2] -= 40, -9
+    part = replace(whole, K=K, width=16, height=12)
+    ray = np.array([(8 - part.cx) / part.fx, (6 - part.cy) / part.fy, 1.0])
+    place = whole.position + 2.5 * ray @ whole.viewmat[:3, :3]
+    for path in steadiness.paths_from(part, place, 5):
+        np.testing.assert_allclose(path.cameras[0].viewmat, part.viewmat, atol=1e-12)
+        for camera in path.cameras:
+            assert (camera.width, camera.height) == (16, 12)
+            np.testing.assert_array_equal(camera.K, K)
+            if path.name in ("drift in", "drift out", "zoom"):
+                x, y, z = camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3]
+                np.testing.assert_allclose([x / z, y / z], ray[:2], atol=1e-12)
+
+
+def test_pops_are_what_cuts_differ_by_from_one_place(scene):
+    path = next(p for p in steadiness.paths_from(eye_camera(6), np.zeros(3), 12) if p.name == "zoom")
+    cuts = {
+        "all": {"tolerance": 0.0},
+        "hard": {"tolerance": 3.0},
+        "fade": {"tolerance": 3.0, "fade": 1.5},
+        "stays": Stays(path.cameras[0], 3.0),
+    }
+    found = {row["cut"]: row for row in steadiness.compare(scene, path, cuts, "cpu", along_motion=False)}
+    assert found["all"]["pop_worst"] == found["stays"]["pop_worst"] == 0
+    assert found["hard"]["most_changed_items"] > 0
+    assert 0 < found["fade"]["pop_worst"] < 0.5 * found["hard"]["pop_worst"]
+    assert "warped_worst" not in found["hard"]
+
+
+def test_crowds_stand_upright_and_windows_look_at_what_is_in_them(tmp_path, scene):
+    scene.bundles[0].write(tmp_path / "a.v3dg")
+    config = fades_scenes.Config((), picture=(96, 54), window=(32, 18), side=3)
+    crowd = fades_scenes.subject_of(f"{tmp_path}/a.v3dg:-y,{tmp_path}/a.v3dg:x@above", config)
+    assert list(crowd.cameras) == ["above"]
+    first, second = (crowd.scene.rotations[crowd.scene.instance_bundle == b] for b in (0, 1))
+    np.testing.assert_allclose(first @ [0, -1, 0], [[0, 0, 1]] * 5, atol=1e-6)
+    np.testing.assert_allclose(second @ [1, 0, 0], [[0, 0, 1]] * 4, atol=1e-6)
+    found = list(fades_scenes.windows_of(crowd.scene, crowd.cameras["above"], config))
+    assert 0 < len(found) <= 9
+    for name, camera, place in found:
+        left, top = map(int, name.split(","))
+        x, y, z = camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3]
+        seen = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+        np.testing.assert_allclose(seen, [16, 9], atol=1e-6)
+        np.testing.assert_allclose([camera.cx + left, camera.cy + top], [48, 27])
 
 
 class Seen:

@@ -208,18 +208,14 @@ def worst_tile(change: Any) -> float:
 
 def changed_items(before: Selection, after: Selection) -> int:
     """How many pairs are drawn with another weight, or come or go."""
-    if len(before) == len(after):
-        same = (before.instance_ids == after.instance_ids) & (before.cluster_ids == after.cluster_ids)
-        if same.all():
-            return int((before.weights != after.weights).sum())
-    first, second = (
-        {
-            (int(i), int(c)): float(w)
-            for i, c, w in zip(cut.instance_ids, cut.cluster_ids, cut.weights, strict=True)
-        }
-        for cut in (before, after)
-    )
-    return sum(first.get(pair) != second.get(pair) for pair in first.keys() | second.keys())
+    if np.array_equal(before.instance_ids, after.instance_ids) and np.array_equal(
+        before.cluster_ids, after.cluster_ids
+    ):
+        return int((before.weights != after.weights).sum())
+    mine, other = ((cut.instance_ids.astype(np.int64) << 32) + cut.cluster_ids for cut in (before, after))
+    common, first, second = np.intersect1d(mine, other, assume_unique=True, return_indices=True)
+    other_weights = int((before.weights[first] != after.weights[second]).sum())
+    return len(before) + len(after) - 2 * len(common) + other_weights
 
 
 class _Follower:
