@@ -157,27 +157,28 @@ def _tolerance_of_count(scene: Scene, cameras: list[Camera], count: float, most:
 
 
 def verdict(rows: list[Row], fade: float, keys: tuple[str, ...] = ("asset", "distance")) -> Row:
-    """What a fade comes to, for the worst path of each start: ratios to the hard cut and to all gaussians.
+    """What a fade comes to, for each start: ratios to the hard cut and to all gaussians, of what is worst.
 
-    Starts differ in the keys.
+    Starts differ in the keys. The worst is that of drifts, if there are any.
     """
     starts = sorted({tuple(row[key] for key in keys) for row in rows})
     found = []
     for start in starts:
         mine = [row for row in rows if tuple(row[key] for key in keys) == start]
+        has_drifts = any(row["is_drift"] for row in mine)
         names = {"all": "all", "hard": "hard", "equal": "hard, equal count", "stays": "stays"}
         cuts = {short: [r for r in mine if r["cut"] == name] for short, name in names.items()}
         cuts["fade"] = [r for r in mine if r.get("fade") == fade]
         worst, pop = (
-            {name: max((r[of] for r in cut if r["is_drift"]), default=math.nan) for name, cut in cuts.items()}
+            {name: max(r[of] for r in cut if r["is_drift"] or not has_drifts) for name, cut in cuts.items()}
             for of in ("tile_worst", "pop_worst")
         )
         pairs = list(zip(cuts["fade"], cuts["hard"], cuts["equal"], strict=True))
         found.append(
             {
                 **dict(zip(keys, start, strict=True)),
-                "drift_worst_tile": worst,
-                "drift_worst_pop": pop,
+                "worst_tile": worst,
+                "worst_pop": pop,
                 "of_hard_at_equal_count": round(worst["fade"] / worst["equal"], 3),
                 "of_hard": round(worst["fade"] / worst["hard"], 3),
                 "of_all": round(worst["fade"] / worst["all"], 3),

@@ -178,18 +178,19 @@ def main(config: Config) -> None:
                 of = {"asset": subject.name, "camera": camera_name, "window": window}
                 of["away"] = round(float(np.linalg.norm(first.position - place)), 4)
                 for path in paths_from(first, place, config.frames):
-                    if path.name not in config.paths:
-                        continue
-                    found = measure(subject.scene, path, config, of, along_motion=False)
-                    rows += found
-                    print(f"{subject.name} {camera_name} {window}, {of['away']} away")
-                    print(*map(line, found), sep="\n", flush=True)
-    keys = ("asset", "camera")
+                    if path.name in config.paths:
+                        found = measure(subject.scene, path, config, of, along_motion=False)
+                        rows += found
+                        print(f"{subject.name} {camera_name} {window}, {of['away']} away")
+                        print(*map(line, found), sep="\n", flush=True)
+                report(rows, config)  # so that a run that is cut off leaves what it has
+
+
+def report(rows: list[Row], config: Config) -> None:
+    """Write what there is."""
     settings = {k: v for k, v in vars(config).items() if k not in ("subjects", "json", "device")}
-    result = {**settings, "rows": rows, "verdict": [verdict(rows, fade, keys) for fade in config.fades]}
-    for found in result["verdict"]:
-        print(*(start for start in found["starts"]), sep="\n")
-    write(config.json, result, config.device)
+    verdicts = [verdict(rows, fade, ("asset", "camera")) for fade in config.fades]
+    write(config.json, {**settings, "rows": rows, "verdict": verdicts}, config.device)
 
 
 if __name__ == "__main__":
