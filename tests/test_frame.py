@@ -122,6 +122,15 @@ def test_buffers_that_were_too_small_leave_no_trace():
     assert_same_bytes(second, third)
 
 
+def test_memory_of_a_frame_is_told_by_part():
+    renderer = Renderer(composed_scene(np.random.default_rng(4)), device="cuda")
+    count = renderer.render(CAMERA, tolerance=0.0).stats.gaussians_selected
+    parts = renderer._frame._frame.memory()
+    reserved, used = parts.pop("pool, reserved"), parts.pop("pool, used")
+    assert parts["records"] >= 40 * count > 0
+    assert sum(parts.values()) <= used <= reserved
+
+
 def test_every_renderer_draws_the_same_bytes():
     subject = composed_scene(np.random.default_rng(4))
     assert_same_bytes(Renderer(subject).render(CAMERA), Renderer(subject).render(CAMERA))

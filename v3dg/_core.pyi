@@ -427,6 +427,7 @@ class SceneFrame:
         shade: Shade,
         stop: Stop | None = None,
     ) -> Drawing: ...
+    def memory(self) -> dict[str, int]: ...
     def draw_resident(
         self,
         scene: ResidentScene,

@@ -98,7 +98,8 @@ class RenderedImage(Image):
 
     @property
     def _planes(self) -> Any:
-        self._finish()
+        if self._drawing.finish().exceeds_budget:
+            self._finish()  # which says so
         return self._drawing.right if self._is_right else self._drawing
 
     @property

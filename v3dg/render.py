@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, TypeAlias, get_args, overload
 
 from v3dg import _core, _device
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 _Subject: TypeAlias = Scene | Bundle | Gaussians
 _Memory: TypeAlias = int | str | None
+
+_known_rule = lru_cache(64, typed=True)(rule_of)  # of pictures that follow each other
 
 # Of pictures with levels, whose own error is far larger; docs/cuda.md has what it saves.
 DEFAULT_MIN_TRANSMITTANCE = 1e-3
@@ -235,6 +237,7 @@ class _Frame:
         self._num_models = 0  # of the first bundles, to which a scene only adds
         self._references: tuple[Any, ...] | None = None  # to those that were taken
         self._pool: Pool | None = None
+        self._resident: ResidentScene | None = None  # as it was last drawn
         self._has_settled = False  # and drawn nothing since
         # Without levels, or on a GPU in other colours, all has to be there.
         is_whole = isinstance(subject, Gaussians) or (device.is_cuda and color_by != "appearance")
@@ -271,8 +274,10 @@ class _Frame:
             assert isinstance(camera, Camera)
             drawing = self._asset.draw(camera.core, shade)
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
-        rule = rule_of(**options)
-        with residency.reading(subject, self.device) as resident:
+        is_plain = {float, int, type(None)} >= {*map(type, options.values())}
+        rule = (_known_rule if is_plain else rule_of)(**options)
+        with residency.reading(subject, self.device, self._resident) as resident:
+            self._resident = resident
             pool = self._take_models(resident)
             if pool is not None:
                 check("cut", cut is None, "none for a pool, which has its own, got one; give memory=None")
@@ -361,9 +366,8 @@ def shade_of(
     background: Sequence[float], min_transmittance: float | None, is_asset: bool, depth: bool
 ) -> _core.Shade:
     """What `render` says of the two, as the core has it: below 0, pixels stop as `rasterize` has them."""
-    if min_transmittance is None:
-        stop = -1.0 if is_asset else DEFAULT_MIN_TRANSMITTANCE
-    else:
+    stop = -1.0 if is_asset else DEFAULT_MIN_TRANSMITTANCE
+    if min_transmittance is not None:
         stop = real(min_transmittance, "min_transmittance", "a share of light, 0 to 0.99", 0, 0.99)
     behind = color(background, "background")
     return _core.Shade(background=behind, min_transmittance=stop, with_depth=bool(depth))

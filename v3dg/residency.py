@@ -56,6 +56,10 @@ class ResidentScene:
         """The bundles whose tables are there."""
         return tuple(bundle for reference in self.references if (bundle := reference()) is not None)
 
+    def is_of(self, subject: Scene | Bundle) -> bool:
+        """Whether the subject is there as it is now; a bundle stays as it is."""
+        return self.revision == subject.revision if isinstance(subject, Scene) else self.revision[0] >= 0
+
     def update(self, scene: Scene, tables: list[_core.ClusterTable]) -> None:
         """Take over what has changed since the last time: the poses, or all instances.
 
@@ -122,9 +126,9 @@ class Residency:
         """The scene on a device as it is now; a bundle as a scene of one."""
         with self.lock:
             resident = self._once(subject, ("scene", device), lambda: ResidentScene(device))
+            if resident.is_of(subject):
+                return resident
             is_new = resident.revision[0] < 0
-            if not is_new and (isinstance(subject, Bundle) or resident.revision == subject.revision):
-                return resident  # a bundle stays as it is
             scene = copy.copy(Scene.of(subject))
             if not is_new and not device.is_cuda:
                 resident = ResidentScene(device)
@@ -133,10 +137,13 @@ class Residency:
             return resident
 
     @contextmanager
-    def reading(self, subject: Scene | Bundle, device: Device) -> Iterator[ResidentScene]:
-        """As `scene`; it stays so meanwhile, for which on CUDA other threads have to wait."""
+    def reading(self, subject: Scene | Bundle, device: Device, last: Any = None) -> Iterator[ResidentScene]:
+        """As `scene`; it stays so meanwhile, for which on CUDA other threads have to wait.
+
+        Mostly it is what it was the last time, which is found sooner where that is given.
+        """
         with self.lock if device.is_cuda else nullcontext():
-            yield self.scene(subject, device)
+            yield last if last is not None and last.is_of(subject) else self.scene(subject, device)
 
     def rows(
         self, bundle: Bundle, clusters: NDArray[np.int32], device: Device

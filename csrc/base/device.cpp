@@ -37,6 +37,13 @@ unsigned num_multiprocessors() {
     return static_cast<unsigned>(count);
 }
 
+size_t shared_memory_of_multiprocessor() {
+    int bytes = 0;
+    check(cudaDeviceGetAttribute(&bytes, cudaDevAttrMaxSharedMemoryPerMultiprocessor, current_device()),
+          "cudaDeviceGetAttribute");
+    return static_cast<size_t>(bytes);
+}
+
 void allow_shared_memory(const void* kernel, size_t bytes, const char* name) {
     static std::mutex mutex;
     static std::map<std::pair<int, const void*>, size_t> allowed_bytes;
@@ -106,6 +113,15 @@ void release(void* pointer, int device, cudaStream_t stream) noexcept {
     // At exit the driver may be gone before us, and then so is the memory.
     if (cudaFreeAsync(pointer, stream) != cudaSuccess) cudaGetLastError();
     if (is_elsewhere && cudaSetDevice(current) != cudaSuccess) cudaGetLastError();
+}
+
+PoolBytes pool_bytes() {
+    const cudaMemPool_t pool = pool_of_current_device();
+    uint64_t reserved = 0, used = 0;
+    check(cudaMemPoolGetAttribute(pool, cudaMemPoolAttrReservedMemCurrent, &reserved),
+          "cudaMemPoolGetAttribute");
+    check(cudaMemPoolGetAttribute(pool, cudaMemPoolAttrUsedMemCurrent, &used), "cudaMemPoolGetAttribute");
+    return {reserved, used};
 }
 
 bool is_capturing(cudaStream_t stream) {

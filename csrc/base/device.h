@@ -36,6 +36,9 @@ int current_device();
 // How many multiprocessors the current device has.
 unsigned num_multiprocessors();
 
+// Bytes of shared memory that one of them has.
+size_t shared_memory_of_multiprocessor();
+
 // Lets the kernel have `bytes` of dynamic shared memory on the current device, which has to be asked for
 // where it is more than 48 KiB with what the kernel declares. The driver's limit is one for all threads, so
 // it is only ever raised: a lower one could come between another thread's asking and its launch. `name` goes
@@ -49,6 +52,12 @@ void* allocate(size_t bytes, cudaStream_t stream);
 void release(void* pointer, int device, cudaStream_t stream) noexcept;
 // Waits for the stream, and returns to the driver what the pool keeps.
 void trim_pool(cudaStream_t stream);
+
+// What the pool of the current device has of the driver, and how much of that is in use.
+struct PoolBytes {
+    size_t reserved, used;
+};
+PoolBytes pool_bytes();
 
 bool is_capturing(cudaStream_t stream);
 // Throws std::runtime_error while it is: memory from a graph is gone with the graph.

@@ -55,6 +55,7 @@ __device__ inline unsigned take_ticket(unsigned* counter) {
 __device__ inline unsigned long long prefix_of_part(unsigned long long* state, size_t part,
                                                     unsigned long long sum) {
     constexpr unsigned long long kOwn = 1ull << 62, kAll = 2ull << 62, kValue = kOwn - 1;
+    constexpr unsigned kEach = 4;  // parts that a lane looks at together, for each look takes a while
     volatile unsigned long long* word = state;
     const unsigned lane = threadIdx.x % 32;
     if (part == 0) {
@@ -63,14 +64,27 @@ __device__ inline unsigned long long prefix_of_part(unsigned long long* state, s
     }
     if (lane == 0) word[part] = kOwn | sum;
     unsigned long long before = 0;
-    for (size_t end = part;; end -= 32) {
-        unsigned long long seen = kAll;  // before the first part is nothing
-        if (lane < end) do {
-                seen = word[end - 1 - lane];
-            } while (seen < kOwn);
+    for (size_t end = part;; end -= 32 * kEach) {
+        unsigned long long seen[kEach], of_lane = 0;
+        bool knows_all = false, is_ready;
+        do {
+            is_ready = true;
+#pragma unroll
+            for (unsigned k = 0; k < kEach; ++k) {
+                const unsigned back = kEach * lane + k;  // before the first part is nothing
+                seen[k] = back < end ? word[end - 1 - back] : kAll;
+            }
+#pragma unroll
+            for (unsigned k = 0; k < kEach; ++k) is_ready = is_ready && seen[k] >= kOwn;
+        } while (!is_ready);
         // What ends at the nearest part with a sum of all before it.
-        const unsigned is_all = __ballot_sync(kAllLanes, seen >= kAll);
-        before += warp_sum(is_all == 0 || lane < unsigned(__ffs(is_all)) ? seen & kValue : 0);
+#pragma unroll
+        for (unsigned k = 0; k < kEach; ++k) {
+            of_lane += knows_all ? 0 : seen[k] & kValue;
+            knows_all = knows_all || seen[k] >= kAll;
+        }
+        const unsigned is_all = __ballot_sync(kAllLanes, knows_all);
+        before += warp_sum(is_all == 0 || lane < unsigned(__ffs(is_all)) ? of_lane : 0);
         if (is_all != 0) break;
     }
     if (lane == 0) word[part] = kAll | (before + sum);

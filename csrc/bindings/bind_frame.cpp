@@ -1,6 +1,7 @@
 #include <algorithm>
 #include <atomic>
 #include <memory>
+#include <mutex>
 #include <vector>
 
 #include "bindings/operations.h"
@@ -25,6 +26,22 @@ class Stop {
 };
 
 const std::atomic<bool>* flag_of(const Stop* stop) { return stop == nullptr ? nullptr : stop->flag(); }
+
+// While it lives, one thread draws with a frame. Python's lock alone does not see to that, for torch gives it
+// up while it looks for memory; and so it is given up here, too, where another thread has its turn.
+class Turn {
+  public:
+    explicit Turn(std::mutex* mutex) {
+        if (mutex == nullptr) return;  // on the host, where frames have nothing that they share
+        lock_ = std::unique_lock<std::mutex>(*mutex, std::try_to_lock);
+        if (lock_.owns_lock()) return;
+        const py::gil_scoped_release unlocked;
+        lock_.lock();
+    }
+
+  private:
+    std::unique_lock<std::mutex> lock_;
+};
 
 // What a frame came to; times in milliseconds.
 struct FrameStats {
@@ -51,11 +68,13 @@ class BoundDrawing {
 
 #if V3DG_WITH_CUDA
     // `kept` are the frame, which may have to draw again, and what it reads.
-    BoundDrawing(NewPictures pictures, py::object kept, Device device, std::unique_ptr<cuda::Drawing> drawing,
-                 const SelectRule& rule, cuda::DevicePages* pages = nullptr)
+    BoundDrawing(NewPictures pictures, py::object kept, Device device, std::shared_ptr<std::mutex> turns,
+                 std::unique_ptr<cuda::Drawing> drawing, const SelectRule& rule,
+                 cuda::DevicePages* pages = nullptr)
         : pictures_(std::move(pictures)),
           kept_(std::move(kept)),
           device_(device),
+          turns_(std::move(turns)),
           drawing_(std::move(drawing)),
           pages_(pages),
           rule_(rule) {}
@@ -72,7 +91,8 @@ class BoundDrawing {
                 const py::gil_scoped_release unlocked;
                 drawing_->wait();
             }
-            const cuda::FrameCounters& c = drawing_->finish();  // may draw, and so keeps other threads out
+            const Turn turn(turns_.get());
+            const cuda::FrameCounters& c = drawing_->finish();  // may draw
             if (pages_ != nullptr) pages_->note_frames(work.stream());
             const cuda::FrameTimes times = drawing_->times();
             const bool exceeds = c.choice.exceeds_budget;
@@ -96,6 +116,7 @@ class BoundDrawing {
 #if V3DG_WITH_CUDA
     py::object kept_;
     Device device_;
+    std::shared_ptr<std::mutex> turns_;       // of the frame
     std::unique_ptr<cuda::Drawing> drawing_;  // gone before what it needs
     cuda::DevicePages* pages_ = nullptr;      // of the pool that it draws from, which `kept_` has
     SelectRule rule_{};
@@ -127,7 +148,9 @@ class BoundSceneFrame {
     BoundSceneFrame(int device, bool moves) : device_{device}, moves_(moves) {
         const Work work(device_);
 #if V3DG_WITH_CUDA
-        if (!device_.is_host()) frame_ = std::make_unique<cuda::SceneFrame>();
+        if (device_.is_host()) return;
+        frame_ = std::make_unique<cuda::SceneFrame>();
+        turns_ = std::make_shared<std::mutex>();
 #endif
     }
 
@@ -159,6 +182,7 @@ class BoundSceneFrame {
 
     std::unique_ptr<BoundDrawing> draw(const py::object& scene_object, const BoundEyes& camera,
                                        const SelectRule& rule, const Shade& shade, const Stop* stop) {
+        const Turn turn(turns_.get());
         auto& scene = checked(scene_object);
         const Eyes& eyes = camera.eyes;
         BudgetSteps steps = steps_;
@@ -175,10 +199,13 @@ class BoundSceneFrame {
         const Work work(device_);
         NewPictures pictures;
         const cuda::EyeImages images = new_images(eyes, shade, pictures);
-        auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream());
+        const auto place = [&](cuda::PicturePlanes planes[2]) {
+            for (size_t k = 0; k < pictures.size(); ++k) planes[k] = pictures[k].on_device(device_);
+        };
+        auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream(), place);
         steps_ = steps;
         return std::make_unique<BoundDrawing>(std::move(pictures),
-                                              py::make_tuple(py::cast(this), scene_object), device_,
+                                              py::make_tuple(py::cast(this), scene_object), device_, turns_,
                                               std::move(drawing), rule);
 #else
         return nullptr;
@@ -198,6 +225,7 @@ class BoundSceneFrame {
         pool.check_scene(*state);
         if (!device_.is_host() && (!colors.empty() || shows_missing))
             throw py::value_error("colors, shows_missing: expected none on a CUDA device");
+        const Turn turn(turns_.get());
         const Eyes& eyes = camera.eyes;
         BudgetSteps steps = steps_;
         const SelectRule paced = moves_ ? steps.next(rule, eyes, state) : rule;
@@ -205,14 +233,16 @@ class BoundSceneFrame {
         if (!device_.is_host()) {
             const Work work(device_);
             NewPictures pictures;
-            const cuda::EyeImages images = new_images(eyes, shade, pictures);
+            cuda::EyeImages images = new_images(eyes, shade, pictures);
+            for (size_t k = 0; k < pictures.size(); ++k)
+                images.image[k].planes = pictures[k].on_device(device_);
             SelectRule used = paced;
             auto drawing =
                 frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images, work.stream());
             steps_ = steps;
-            return std::make_unique<BoundDrawing>(std::move(pictures),
-                                                  py::make_tuple(py::cast(this), scene_object, pool_object),
-                                                  device_, std::move(drawing), used, &pool.on_device());
+            return std::make_unique<BoundDrawing>(
+                std::move(pictures), py::make_tuple(py::cast(this), scene_object, pool_object), device_,
+                turns_, std::move(drawing), used, &pool.on_device());
         }
 #endif
         HostPictures out(eyes, shade);
@@ -253,14 +283,15 @@ class BoundSceneFrame {
                                return cpu::draw_cut(host, camera.camera, given, out[0], flag_of(stop));
                            });
 #if V3DG_WITH_CUDA
+        const Turn turn(turns_.get());
         const Work work(device_);
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, shade.with_depth);
-        const cuda::FrameImage image = picture.on_device(device_, camera.camera, shade);
+        const cuda::FrameImage image = picture.frame_image(camera.camera, shade, picture.on_device(device_));
         auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, image,
                                         shade.min_transmittance, work.stream());
         return std::make_unique<BoundDrawing>(
             NewPictures{std::move(picture)},
-            py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights), device_,
+            py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights), device_, turns_,
             std::move(drawing), SelectRule{});
 #else
         return nullptr;
@@ -293,6 +324,20 @@ class BoundSceneFrame {
                        [&](const HostScene& host, Span<const Picture<float>> out) {
                            return cpu::draw_metrics(host, camera.camera, rule, given, out[0], flag_of(stop));
                        });
+    }
+
+    // Bytes of what it keeps on its device by part, and of the pool that those are of.
+    py::dict memory() const {
+        py::dict parts;
+#if V3DG_WITH_CUDA
+        if (device_.is_host()) return parts;
+        const Work work(device_);
+        for (const auto& [name, bytes] : frame_->bytes()) parts[name] = bytes;
+        const cuda::PoolBytes pool = cuda::pool_bytes();
+        parts["pool, reserved"] = pool.reserved;
+        parts["pool, used"] = pool.used;
+#endif
+        return parts;
     }
 
     // (place in the cut, weight, depth), or None.
@@ -339,14 +384,14 @@ class BoundSceneFrame {
     }
 
 #if V3DG_WITH_CUDA
-    // New pictures of the eyes, on the device.
-    cuda::EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures) const {
+    // Pictures of the eyes on the device, which have no memory yet.
+    static cuda::EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures) {
         cuda::FrameImage image[2]{};
         for (int k = 0; k < eyes.count(); ++k) {
             const Camera& eye = eyes.camera[k];
             const Window whole{0, 0, static_cast<int>(eye.width), static_cast<int>(eye.height)};
             pictures.push_back(picture_of(whole, shade.with_depth));
-            image[k] = pictures.back().on_device(device_, eye, shade);
+            image[k] = pictures.back().frame_image(eye, shade);
         }
         const float stop = shade.min_transmittance;
         return eyes.are_two ? cuda::images_of_eyes(image[0], image[1], stop)
@@ -403,6 +448,7 @@ class BoundSceneFrame {
     py::list models_, palettes_;
     std::vector<size_t> num_gaussians_;  // of each bundle
     std::vector<SceneModel> host_;       // without what the scene knows of the clusters
+    std::shared_ptr<std::mutex> turns_;  // on a device
 #if V3DG_WITH_CUDA
     std::unique_ptr<cuda::SceneFrame> frame_;  // on a device
 #endif
@@ -427,12 +473,12 @@ class BoundAssetFrame {
         const Device device = model.device();
         const Work work(device);
         NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, shade.with_depth);
-        const cuda::FrameImage image = picture.on_device(device, camera.camera, shade);
+        const cuda::FrameImage image = picture.frame_image(camera.camera, shade, picture.on_device(device));
         const cuda::PackedModel& packed = *model.on_device().packed;
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
                                     work.stream(), &packed.packed(), shade.min_transmittance);
         return std::make_unique<BoundDrawing>(NewPictures{std::move(picture)}, py::cast(this), device,
-                                              std::move(drawing), SelectRule{});
+                                              nullptr, std::move(drawing), SelectRule{});
 #else
         return nullptr;
 #endif
@@ -502,6 +548,8 @@ void bind_frame(py::module_& m) {
              "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
         .def("draw_metrics", &BoundSceneFrame::draw_metrics, "scene"_a, "camera"_a, "rule"_a,
              "instance_ids"_a, "cluster_ids"_a, "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
+        .def("memory", &BoundSceneFrame::memory,
+             "Bytes that it keeps on a CUDA device, by part; and those of the pool of all frames there.")
         .def("pick_cut", &BoundSceneFrame::pick_cut, "scene"_a, "camera"_a, "instance_ids"_a,
              "cluster_ids"_a);
     py::class_<BoundAssetFrame>(m, "AssetFrame",

@@ -212,9 +212,9 @@ py::tuple rasterize_on_device(const Rows& gaussians, const BoundCamera& camera, 
     const Device device = gaussians.device();
     const Work work(device);
     NewPicture out{camera.height(), camera.width(), {}, {}, py::none(), with_depth};
-    const cuda::ModelPicture in{look.read<float>(gaussians), view_of_world<float>(camera.camera),
-                                static_cast<float>(look.filter_px2), look.antialiased,
-                                out.on_device(device, camera.camera, Shade{look.background})};
+    const cuda::ModelPicture in{
+        look.read<float>(gaussians), view_of_world<float>(camera.camera), static_cast<float>(look.filter_px2),
+        look.antialiased, out.frame_image(camera.camera, Shade{look.background}, out.on_device(device))};
     std::unique_ptr<cuda::DifferentiableFrame> frame;
     {
         const py::gil_scoped_release unlocked;

@@ -45,20 +45,21 @@ struct NewPicture {
     }
 
 #if V3DG_WITH_CUDA
-    cuda::FrameImage on_device(Device device, const Camera& camera, const Shade& shade) {
+    cuda::PicturePlanes on_device(Device device) {
         const NewArray<float> color_plane(device, {height, width, 3}), alpha_plane(device, {height, width});
         color = color_plane.object;
         alpha = alpha_plane.object;
-        float* depth_data = nullptr;
-        if (with_depth) {
-            const NewArray<float> depth_plane(device, {height, width});
-            depth = depth_plane.object;
-            depth_data = depth_plane.span.data;
-        }
+        if (!with_depth) return {color_plane.span.data, alpha_plane.span.data, nullptr};
+        const NewArray<float> depth_plane(device, {height, width});
+        depth = depth_plane.object;
+        return {color_plane.span.data, alpha_plane.span.data, depth_plane.span.data};
+    }
+    cuda::FrameImage frame_image(const Camera& camera, const Shade& shade,
+                                 const cuda::PicturePlanes& planes = {}) const {
         const auto& of = shade.background;
         const float b[3] = {float(of[0]), float(of[1]), float(of[2])};
         return cuda::frame_image(pinhole_of<float>(camera), static_cast<int>(width), static_cast<int>(height),
-                                 b, color_plane.span.data, alpha_plane.span.data, depth_data);
+                                 b, planes);
     }
 #endif
 };

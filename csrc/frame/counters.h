@@ -19,23 +19,28 @@ struct CutChoice {
 // drawn.
 struct FrameCounters {
     unsigned long long items, gaussians, in_frustum, records, entries;
-    unsigned long long large;  // records over many tiles, in whole batches
-    unsigned long long slots;  // of gradients, in a frame that keeps a tape
-    CutChoice choice;          // where there is a budget
+    unsigned long long large;   // records over many tiles, in whole batches
+    unsigned long long spread;  // entries whose lists need scratch
+    unsigned long long slots;   // of gradients, in a frame that keeps a tape
+    CutChoice choice;           // where there is a budget
 };
 
 // How many elements a frame's buffers have room for.
 struct Capacity {
-    unsigned long long items, records, large, entries;
+    unsigned long long items, records, large, entries, spread;
 
     // Without branches in these two, so that a kernel loads all counters at once.
     V3DG_HD bool holds_items(unsigned long long num_items, unsigned long long num_gaussians) const {
         return (num_items <= items) & (num_gaussians <= records);
     }
-    // All that has been counted so far.
-    V3DG_HD bool holds(const FrameCounters& counters) const {
+    // All that is counted before lists are spread.
+    V3DG_HD bool holds_entries(const FrameCounters& counters) const {
         return holds_items(counters.items, counters.gaussians) & (counters.large <= large) &
                (counters.entries <= entries);
+    }
+    // All that has been counted so far.
+    V3DG_HD bool holds(const FrameCounters& counters) const {
+        return holds_entries(counters) & (counters.spread <= spread);
     }
 };
 

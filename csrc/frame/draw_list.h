@@ -66,9 +66,10 @@ struct ItemList {
     DrawItem* items;
     FrameCounters* counters;
     unsigned long long item_capacity, record_capacity;
+    unsigned long long* zeros;  // as many as the frame was asked for, for whoever writes the items
 
     V3DG_HD bool has_room_for(unsigned long long num_items, unsigned long long num_gaussians) const {
-        return Capacity{item_capacity, record_capacity, 0, 0}.holds_items(num_items, num_gaussians);
+        return Capacity{item_capacity, record_capacity, 0, 0, 0}.holds_items(num_items, num_gaussians);
     }
     // For all that its writer has counted.
     V3DG_HD bool is_complete() const { return has_room_for(counters->items, counters->gaussians); }

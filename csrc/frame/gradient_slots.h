@@ -2,8 +2,7 @@
 
 // Where the gradients of a CUDA frame's records are summed: one place for each tile that a record lies in.
 
-#include "frame/image.h"
-#include "frame/record.h"
+#include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
@@ -17,13 +16,13 @@ struct GradientSlots {
     uint8_t* is_touched;      // zeros at the start
 };
 
-V3DG_HD inline uint32_t tile_columns_of(const Record<float>& r) {
+V3DG_HD inline uint32_t tile_columns_of(const RecordBox& r) {
     return r.x1 / kFrameTileWidth - r.x0 / kFrameTileWidth + 1u;
 }
-V3DG_HD inline uint32_t num_slots_of(const Record<float>& r) {
+V3DG_HD inline uint32_t num_slots_of(const RecordBox& r) {
     return tile_columns_of(r) * (r.y1 / kFrameTileHeight - r.y0 / kFrameTileHeight + 1u);
 }
-V3DG_HD inline uint32_t slot_of_tile(const Record<float>& r, uint32_t column, uint32_t row) {
+V3DG_HD inline uint32_t slot_of_tile(const RecordBox& r, uint32_t column, uint32_t row) {
     return (row - r.y0 / kFrameTileHeight) * tile_columns_of(r) + (column - r.x0 / kFrameTileWidth);
 }
 

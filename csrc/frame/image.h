@@ -62,6 +62,12 @@ namespace cuda {
 
 // A block blends one tile, a warp 8 x 4 of its pixels.
 constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
+// Where a picture is, as Picture<float> has it. It may be asked for after the first stages of a frame are
+// enqueued.
+struct PicturePlanes {
+    float *color, *alpha, *depth;  // all may be null, or depth alone
+};
+
 // One picture of a batch.
 struct FrameImage {
     Pinhole<float> camera;
@@ -69,7 +75,7 @@ struct FrameImage {
     int tile_columns, tile_rows;
     uint32_t first_tile;  // in the batch, its tiles row by row
     float background[3];
-    float *color, *alpha, *depth;  // as Picture<float> has them; depth may be null
+    PicturePlanes planes;
 };
 
 // The pictures of a scene's frame: one for each eye. Tiles of the second follow on those of the first.

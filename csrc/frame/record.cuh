@@ -1,48 +1,39 @@
 #pragma once
 
-// A record as kernels load and store it: three vectors of 16 bytes.
+// A record as kernels load and store it: vectors of 16 bytes, and the last one in halves.
 
 #include <cstddef>
 
 #include "base/device.h"
-#include "frame/record.h"
+#include "frame/tile_list.h"
 
 namespace v3dg {
 namespace cuda {
 
 constexpr int kRecordVectors = 3;
+constexpr int kEllipseVectors = 2;  // of those, the ones in RecordPlanes::ellipse
 static_assert(sizeof(Record<float>) == kRecordVectors * sizeof(float4) &&
                   offsetof(Record<float>, l22) == 16 && offsetof(Record<float>, color) == 24 &&
                   offsetof(Record<float>, depth) == 36 && offsetof(Record<float>, x0) == 40,
               "a record lies in its vectors as record_of_vectors() has it");
 
-__device__ inline Record<float> record_of_vectors(const float4& a, const float4& b, const float4& c) {
-    const uint32_t columns = __float_as_uint(c.z), rows = __float_as_uint(c.w);
-    return {a.x,
-            a.y,
-            a.z,
-            a.w,
-            b.x,
-            b.y,
-            {b.z, b.w, c.x},
-            c.y,
-            static_cast<uint16_t>(columns),
-            static_cast<uint16_t>(columns >> 16),
-            static_cast<uint16_t>(rows),
-            static_cast<uint16_t>(rows >> 16)};
+__device__ inline const float4* ellipse_of(const RecordPlanes& records, uint32_t record) {
+    return reinterpret_cast<const float4*>(records.ellipse) + kEllipseVectors * size_t(record);
+}
+__device__ inline const float2* rest_of(const RecordPlanes& records, uint32_t record) {
+    return reinterpret_cast<const float2*>(records.rest) + record;
 }
 
-// Loads of the vectors what the caller uses.
-__device__ inline Record<float> load_record(const Record<float>* record) {
-    const float4* vectors = reinterpret_cast<const float4*>(record);
-    return record_of_vectors(vectors[0], vectors[1], vectors[2]);
+__device__ inline Record<float> record_of_vectors(const float4& a, const float4& b, const float2& c,
+                                                  const RecordBox& box) {
+    return {a.x, a.y, a.z, a.w, b.x, b.y, {b.z, b.w, c.x}, c.y, box.x0, box.x1, box.y0, box.y1};
 }
 
-__device__ inline void store_record(const Record<float>& r, float4* vectors) {
-    vectors[0] = {r.u, r.v, r.l11, r.l12};
-    vectors[1] = {r.l22, r.log2_opacity, r.color[0], r.color[1]};
-    vectors[2] = {r.color[2], r.depth, __uint_as_float(r.x0 | uint32_t(r.x1) << 16),
-                  __uint_as_float(r.y0 | uint32_t(r.y1) << 16)};
+// Loads of the planes what the caller uses.
+__device__ inline Record<float> load_record(const RecordPlanes& records, uint32_t record,
+                                            const RecordBox& box) {
+    const float4* ellipse = ellipse_of(records, record);
+    return record_of_vectors(ellipse[0], ellipse[1], *rest_of(records, record), box);
 }
 
 }  // namespace cuda

@@ -70,22 +70,39 @@ struct TilePlan {
     uint16_t last_bucket, shift;
     uint8_t part, log2_parts;
     bool fits_windows;  // no bucket needs to be spread again, which the parts could not do side by side
+    bool in_scratch;    // is the list that was spread, and not in its own place
+    unsigned long long first_scratch;  // where the list has room in the scratch, if it needs any
 };
 constexpr uint32_t kNoTile = ~0u;
+
+// The pixels of a Record.
+struct RecordBox {
+    uint16_t x0, x1, y0, y1;
+};
+
+// The records of a frame in three planes: a Record in the order of its fields.
+struct RecordPlanes {
+    float* ellipse;  // (N, 8) u, v, l11, l12, l22, log2_opacity, and two channels
+    float* rest;     // (N, 2) the third channel and the depth
+    RecordBox* box;  // null unless the frame keeps a tape: few records are asked for it later
+};
 
 // Input of the blend stage.
 struct FrameLists {
     const FrameImage* images;
     const uint32_t* image_of_tile;  // [num_tiles]
     uint32_t num_tiles;
-    const Record<float>* records;          // in the order of items and gaussians, with gaps between items
+    RecordPlanes records;                  // in the order of items and gaussians, with gaps between items
     const unsigned long long* tile_first;  // [num_tiles + 1] into entries
     TileEntry *entries, *scratch;          // each tile's in any order
-    const FrameCounters* counters;
+    FrameCounters* counters;
     Capacity capacity;        // at most kMostFrameRecords records
     TilePlan* plans;          // [num_plans] scratch
     uint32_t num_plans;       // num_tiles, or most_plans() where tiles may be blended in parts
     float min_transmittance;  // of the images
+    // Of images that do not say where they are: those of the first and of the second.
+    PicturePlanes planes[2] = {};
+    FrameCounters* report = nullptr;  // where the counters go, on the host; may be null
 };
 
 // A record over more tiles than this is looked at row by row of tiles.
@@ -129,8 +146,9 @@ V3DG_HD inline EntryBox box_of(FewTiles f) {
 
 // A record over more than kFewTiles tiles. They come in batches of kLargeAtOnce of one item, so of neighbours
 // in one picture; what a batch lacks is filled up at its end.
-struct LargeRecord {
+struct alignas(16) LargeRecord {
     uint32_t record, image;  // kNoRecord where there is none
+    RecordBox box;
 };
 constexpr unsigned kLargeAtOnce = 16;
 constexpr uint32_t kNoRecord = ~0u;

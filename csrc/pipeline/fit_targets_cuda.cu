@@ -60,8 +60,8 @@ __global__ void pictures_kernel(TargetTables t, unsigned long long num_items, un
         image.tile_columns = (size + kFrameTileWidth - 1) / kFrameTileWidth;
         image.tile_rows = (size + kFrameTileHeight - 1) / kFrameTileHeight;
         image.first_tile = p.first_tile;
-        image.color = t.color + 3 * p.first_pixel;
-        image.alpha = t.alpha + p.first_pixel;
+        image.planes.color = t.color + 3 * p.first_pixel;
+        image.planes.alpha = t.alpha + p.first_pixel;
         t.images[blockIdx.x] = image;
         t.placements[blockIdx.x] = {view_of_world(t.config, job.group.center, job.group.radius, view), 0,
                                     blockIdx.x};

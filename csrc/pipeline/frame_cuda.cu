@@ -10,7 +10,7 @@
 namespace v3dg {
 namespace cuda {
 
-// What a frame counts, cleared before it and copied to the host after it.
+// What a frame counts, cleared before it.
 struct Frame::State {
     FrameCounters counters;
     unsigned long long ticket;
@@ -18,12 +18,12 @@ struct Frame::State {
 
 // What the host keeps of a frame in flight.
 struct Frame::Slot {
-    State* state = nullptr;  // pinned
+    FrameCounters* counters = nullptr;  // pinned
     cudaEvent_t begun = nullptr, prepared = nullptr, counted = nullptr, done = nullptr;
 
     Slot() {
-        check(cudaMallocHost(reinterpret_cast<void**>(&state), sizeof *state), "cudaMallocHost");
-        *state = State{};
+        check(cudaMallocHost(reinterpret_cast<void**>(&counters), sizeof *counters), "cudaMallocHost");
+        *counters = FrameCounters{};
         for (cudaEvent_t* event : {&begun, &prepared, &counted, &done})
             check(cudaEventCreate(event), "cudaEventCreate");
     }
@@ -31,10 +31,12 @@ struct Frame::Slot {
         // At exit the driver may be gone before us.
         for (const cudaEvent_t event : {begun, prepared, counted, done})
             if (event != nullptr) cudaEventDestroy(event);
-        cudaFreeHost(state);
+        cudaFreeHost(counters);
         cudaGetLastError();
     }
 };
+
+constexpr size_t kEllipseFloats = 8, kRecordFloats = 10;  // in RecordPlanes::ellipse, and with ::rest
 
 // So many frames can be in flight, or be captured, without a new slot.
 constexpr size_t kSlots = 8;
@@ -70,31 +72,37 @@ Frame::Slot* Frame::take_slot(bool capturing) {
     return slot;
 }
 
-void Frame::enlarge(const State& s) {
-    if (s.counters.gaussians > kMostFrameRecords)
+void Frame::enlarge(const FrameCounters& counters) {
+    if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
-                                " in one frame, got " + std::to_string(s.counters.gaussians));
+                                " in one frame, got " + std::to_string(counters.gaussians));
     // Some more, so that a camera on its way does not need a little more every frame.
     const auto grow = [](unsigned long long& capacity, unsigned long long count) {
-        if (count > capacity) capacity = count + count / 8;
+        if (count > capacity) capacity = count + count / 16;
     };
     // What was not projected has no entries yet; most scenes have one or two a gaussian.
-    if (s.counters.gaussians > capacity_.records) grow(capacity_.entries, s.counters.gaussians);
-    grow(capacity_.items, s.counters.items);
-    grow(capacity_.records, s.counters.gaussians);
-    grow(capacity_.large, s.counters.large);
-    grow(capacity_.entries, s.counters.entries);
+    if (counters.gaussians > capacity_.records) grow(capacity_.entries, counters.gaussians);
+    grow(capacity_.items, counters.items);
+    grow(capacity_.records, counters.gaussians);
+    grow(capacity_.large, counters.large);
+    grow(capacity_.entries, counters.entries);
+    grow(capacity_.spread, counters.spread);
     capacity_.records = std::min(capacity_.records, kMostFrameRecords);
+    capacity_.spread = std::max(capacity_.spread, capacity_.records);  // which share their memory
+    // Whoever differentiates is told what was counted before lists are spread.
+    if (keeps_ == Keeps::tape) capacity_.spread = std::max(capacity_.spread, capacity_.entries);
     if (was_captured_) return;
     // The largest buffers go before larger ones come, and not into the pool: pieces of the old size are of no
     // use.
     records_ = {};
+    boxes_ = {};
     entries_ = {};
     scratch_ = {};
     trim_pool(last_stream_);
 }
 
-std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream) {
+std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream,
+                                     const Place& place) {
     std::unique_ptr<Drawing> drawing(new Drawing(*this, batch, std::move(prepare), stream));
     drawing->is_captured_ = is_capturing(stream);
     was_captured_ = was_captured_ || drawing->is_captured_;
@@ -102,15 +110,15 @@ std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, c
     // If the frame before is over and was too large, this one is likely to be, too.
     if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
         const cudaError_t over = cudaEventQuery(last_->slot_->done);
-        if (over == cudaSuccess && !last_->was_drawn()) enlarge(*last_->slot_->state);
+        if (over == cudaSuccess && !last_->was_drawn()) enlarge(*last_->slot_->counters);
         if (over != cudaSuccess && over != cudaErrorNotReady) check(over, "a frame");
     }
-    enqueue(*drawing);
+    enqueue(*drawing, place);
     last_ = drawing.get();
     return drawing;
 }
 
-void Frame::enqueue(Drawing& drawing) {
+void Frame::enqueue(Drawing& drawing, const Place& place) {
     const cudaStream_t stream = drawing.stream_;
     const FrameBatch& batch = drawing.batch_;
     const Slot& slot = *drawing.slot_;
@@ -119,24 +127,27 @@ void Frame::enqueue(Drawing& drawing) {
     const StreamLock lock(busy_, stream);
 
     const size_t parts = tile_bin_parts(batch.num_tiles);
-    const size_t cleared_bytes =
-        sizeof(State) + parts * sizeof(unsigned long long) + batch.num_tiles * sizeof(uint32_t);
+    const size_t cleared_bytes = sizeof(State) + (parts + batch.num_zeros) * sizeof(unsigned long long) +
+                                 batch.num_tiles * sizeof(uint32_t);
     unsigned char* cleared = room(cleared_, cleared_bytes, drawing);
     State* state = reinterpret_cast<State*>(cleared);
     auto* scan_state = reinterpret_cast<unsigned long long*>(cleared + sizeof(State));
-    const TileCounts tiles{reinterpret_cast<uint32_t*>(scan_state + parts),
+    unsigned long long* zeros = scan_state + parts;
+    const TileCounts tiles{reinterpret_cast<uint32_t*>(zeros + batch.num_zeros),
                            reinterpret_cast<unsigned*>(&state->ticket), scan_state};
     const ItemList items{room(items_, capacity.items, drawing), &state->counters, capacity.items,
-                         capacity.records};
-    Record<float>* records = room(records_, capacity.records, drawing);
+                         capacity.records, zeros};
+    room(records_, kRecordFloats * capacity.records, drawing);
     uint32_t* item_records = room(item_records_, capacity.items, drawing);
     ItemTiles* item_tiles = room(item_tiles_, capacity.items, drawing);
     LargeRecord* large = room(large_, capacity.large, drawing);
     TileEntry* entries = room(entries_, capacity.entries, drawing);
     // The blend stage overwrites the tiles of records over few tiles, which have all been read by then.
-    FewTiles* few = room(scratch_, std::max(capacity.records, capacity.entries), drawing);
+    FewTiles* few = room(scratch_, capacity.spread, drawing);
     const bool keeps_tape = keeps_ == Keeps::tape;
     uint32_t* source = keeps_tape ? room(source_, capacity.records, drawing) : nullptr;
+    if (keeps_tape) room(boxes_, capacity.records, drawing);
+    const RecordPlanes planes = records();
     const TileBinOutput bins{room(tile_first_, batch.num_tiles + 1, drawing),
                              room(image_of_tile_, batch.num_tiles, drawing), entries};
 
@@ -146,26 +157,29 @@ void Frame::enqueue(Drawing& drawing) {
     if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
     project({batch.models, batch.packed, batch.coded, batch.placements, batch.images, items,
              batch.has_shared_items, batch.has_faded_items},
-            {records, few, item_records, item_tiles, source, tiles, large, capacity.large}, stream);
-    tile_bin({item_tiles, few, records, batch.images, batch.num_images, batch.num_tiles, capacity, large,
+            {planes, few, item_records, item_tiles, source, tiles, large, capacity.large}, stream);
+    tile_bin({item_tiles, few, planes, batch.images, batch.num_images, batch.num_tiles, capacity, large,
               tiles, &state->counters},
              bins, stream);
     num_plans_ = keeps_tape ? batch.num_tiles : most_plans(batch.num_tiles);
     room(plans_, num_plans_, drawing);
     const RasterTape tape{keeps_tape ? room(order_, capacity.entries, drawing) : nullptr,
                           keeps_tape ? room(blended_, batch.num_tiles, drawing) : nullptr};
-    const auto report = [&] {
-        check(cudaMemcpyAsync(slot.state, state, sizeof *state, cudaMemcpyDeviceToHost, stream),
+    FrameLists of_frame = lists(batch);
+    // Whoever differentiates goes on while the pictures are blended; else the blending tells what was
+    // counted.
+    if (keeps_tape) {
+        place_slots(items, item_records, planes.box, room(first_slot_, capacity.records, drawing), stream);
+        check(cudaMemcpyAsync(slot.counters, &state->counters, sizeof *slot.counters, cudaMemcpyDeviceToHost,
+                              stream),
               "cudaMemcpyAsync to the host");
         if (!capturing) check(cudaEventRecord(slot.counted, stream), "cudaEventRecord");
-    };
-    // Whoever differentiates goes on while the pictures are blended; else nothing should delay the blending.
-    if (keeps_tape) {
-        place_slots(items, item_records, records, room(first_slot_, capacity.records, drawing), stream);
-        report();
+    } else {
+        of_frame.report = slot.counters;
     }
-    rasterize(lists(batch), keeps_tape ? &tape : nullptr, stream);
-    if (!keeps_tape) report();
+    if (place) place(drawing.planes_);
+    for (int k = 0; k < 2; ++k) of_frame.planes[k] = drawing.planes_[k];
+    rasterize(of_frame, keeps_tape ? &tape : nullptr, stream);
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
@@ -175,15 +189,31 @@ FrameLists Frame::lists(const FrameBatch& batch) const {
     return {batch.images,
             image_of_tile_.data(),
             batch.num_tiles,
-            records_.data(),
+            records(),
             tile_first_.data(),
             entries_.data(),
             reinterpret_cast<TileEntry*>(scratch_.data()),
-            &reinterpret_cast<const State*>(cleared_.data())->counters,
+            &reinterpret_cast<State*>(cleared_.data())->counters,
             capacity_,
             plans_.data(),
             num_plans_,
             batch.min_transmittance};
+}
+
+std::vector<std::pair<const char*, size_t>> Frame::bytes() const {
+    const size_t tape =
+        boxes_.bytes() + source_.bytes() + first_slot_.bytes() + order_.bytes() + blended_.bytes();
+    return {{"records", records_.bytes()},
+            {"entries", entries_.bytes()},
+            {"scratch", scratch_.bytes()},
+            {"items", items_.bytes() + item_records_.bytes() + item_tiles_.bytes()},
+            {"large", large_.bytes()},
+            {"tiles", tile_first_.bytes() + image_of_tile_.bytes() + plans_.bytes() + cleared_.bytes()},
+            {"tape", tape}};
+}
+
+RecordPlanes Frame::records() const {
+    return {records_.data(), records_.data() + kEllipseFloats * capacity_.records, boxes_.data()};
 }
 
 FrameTape Frame::tape() const {
@@ -202,7 +232,7 @@ Drawing::~Drawing() {
     if (slot_ != nullptr && !is_captured_) frame_.free_slots_.push_back(slot_);
 }
 
-bool Drawing::was_drawn() const { return capacity_.holds(slot_->state->counters); }
+bool Drawing::was_drawn() const { return capacity_.holds(*slot_->counters); }
 
 void Drawing::wait() const {
     if (!is_captured_) check(cudaEventSynchronize(slot_->done), "a frame");
@@ -214,24 +244,25 @@ const FrameCounters& Drawing::finish() {
             throw std::runtime_error(
                 "frame: a captured graph met more than it has room for; draw once outside of the capture "
                 "what it will meet, and capture it again");
-        return slot_->state->counters;
+        return *slot_->counters;
     }
     settle();
     wait();
-    return slot_->state->counters;
+    return *slot_->counters;
 }
 
 const FrameCounters& Drawing::settle() {
+    const bool keeps_tape = frame_.keeps_ == Frame::Keeps::tape;
     while (!is_settled_) {
-        check(cudaEventSynchronize(slot_->counted), "a frame");
+        check(cudaEventSynchronize(keeps_tape ? slot_->counted : slot_->done), "a frame");
         is_settled_ = was_drawn();
         if (is_settled_) break;
-        frame_.enlarge(*slot_->state);
+        frame_.enlarge(*slot_->counters);
         std::optional<StreamLock> lock;
         if (batch_.guards_models != nullptr) lock.emplace(*batch_.guards_models, stream_);
-        frame_.enqueue(*this);
+        frame_.enqueue(*this, {});
     }
-    return slot_->state->counters;
+    return *slot_->counters;
 }
 
 FrameTimes Drawing::times() const {

@@ -3,6 +3,7 @@
 #include <deque>
 #include <functional>
 #include <memory>
+#include <utility>
 #include <vector>
 
 #include "base/device.h"
@@ -28,6 +29,7 @@ struct FrameBatch {
     bool has_faded_items = false;            // the same as of shared ones; these are of scenes and not shared
     // Where the models change from frame to frame: what guards them. Whoever draws has it locked.
     StreamMutex* guards_models = nullptr;
+    size_t num_zeros = 0;  // that ItemList is to have
 };
 
 // What a frame leaves for its backward pass, valid until the next frame is drawn.
@@ -66,9 +68,17 @@ class Frame {
     // a frame is drawn again. The counters are zero before.
     using Prepare = std::function<void(const ItemList& items, cudaStream_t stream)>;
 
+    // Says where the pictures of images without a place are. Called once, when the device has something to
+    // do.
+    using Place = std::function<void(PicturePlanes planes[2])>;
+
     // Enqueues a frame. While `stream` captures a graph nothing is allocated: draw as much once before. The
     // frame's buffers then live as long as this object.
-    std::unique_ptr<Drawing> draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream);
+    std::unique_ptr<Drawing> draw(const FrameBatch& batch, Prepare prepare, cudaStream_t stream,
+                                  const Place& place = {});
+
+    // Bytes of what it keeps on the device, by part.
+    std::vector<std::pair<const char*, size_t>> bytes() const;
 
     // Of the last frame that was drawn; needs Keeps::tape.
     FrameTape tape() const;
@@ -77,27 +87,29 @@ class Frame {
     friend class Drawing;
     struct Slot;
     struct State;
-    void enqueue(Drawing& drawing);
+    void enqueue(Drawing& drawing, const Place& place);
     // Of the buffers as they are now.
     FrameLists lists(const FrameBatch& batch) const;
-    void enlarge(const State& state);
+    RecordPlanes records() const;
+    void enlarge(const FrameCounters& counters);
     Slot* take_slot(bool capturing);
     template <class T>
     T* room(DeviceBuffer<T>& buffer, size_t size, const Drawing& drawing);
 
     const Keeps keeps_;
-    Capacity capacity_{64, 4096, 4096, 4096};
+    Capacity capacity_{64, 4096, 4096, 4096, 4096};
     DeviceBuffer<DrawItem> items_;
     DeviceBuffer<uint32_t> item_records_, source_, first_slot_, image_of_tile_, order_, blended_;
-    DeviceBuffer<Record<float>> records_;
+    DeviceBuffer<float> records_;
+    DeviceBuffer<RecordBox> boxes_;
     DeviceBuffer<ItemTiles> item_tiles_;
     DeviceBuffer<LargeRecord> large_;
     DeviceBuffer<TileEntry> entries_;
-    DeviceBuffer<unsigned long long> scratch_;  // the few tiles of records, then of the blend stage
+    DeviceBuffer<unsigned long long> scratch_;  // the few tiles of records, then lists that are spread
     DeviceBuffer<unsigned long long> tile_first_;
     DeviceBuffer<TilePlan> plans_;
     uint32_t num_plans_ = 0;
-    DeviceBuffer<unsigned char> cleared_;  // State, states of the scan, counts of the tiles
+    DeviceBuffer<unsigned char> cleared_;  // State, states of the scan, zeros of items, counts of the tiles
 
     std::vector<std::unique_ptr<Slot>> slots_;
     std::deque<Slot*> free_slots_;                // their frames may not be over yet
@@ -140,6 +152,7 @@ class Drawing {
     cudaStream_t stream_;
     Frame::Slot* slot_ = nullptr;
     Capacity capacity_{};  // that it was drawn with
+    PicturePlanes planes_[2]{};
     bool is_captured_ = false, is_settled_ = false;
 };
 

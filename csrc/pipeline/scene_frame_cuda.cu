@@ -9,7 +9,7 @@ namespace v3dg {
 namespace cuda {
 
 FrameImage frame_image(const Pinhole<float>& camera, int width, int height, const float background[3],
-                       float* color, float* alpha, float* depth) {
+                       const PicturePlanes& planes) {
     return {camera,
             width,
             height,
@@ -17,9 +17,7 @@ FrameImage frame_image(const Pinhole<float>& camera, int width, int height, cons
             (height + kFrameTileHeight - 1) / kFrameTileHeight,
             0,
             {background[0], background[1], background[2]},
-            color,
-            alpha,
-            depth};
+            planes};
 }
 
 static uint32_t num_tiles(const FrameImage& image) {
@@ -110,7 +108,7 @@ EyeImages images_of_eyes(const FrameImage& left, FrameImage right, float min_tra
     return {{left, right}, 2, min_transmittance};
 }
 
-FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures, bool fades,
+FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
                              cudaStream_t stream) {
     const FrameImage& last = pictures.image[pictures.count - 1];
     return {rows_.data(),
@@ -122,7 +120,9 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             has_coded_ ? coded_.data() : nullptr,
             scene.num_instances() > 1,
             pictures.min_transmittance,
-            fades};
+            rule.fade.is_on(),
+            nullptr,
+            Cut::num_zeros(scene, rule)};
 }
 
 // What a frame that was drawn once is drawn again with.
@@ -132,14 +132,15 @@ static SelectRule drawn_again(SelectRule rule) {
 }
 
 std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
-                                          const EyeImages& pictures, cudaStream_t stream) {
+                                          const EyeImages& pictures, cudaStream_t stream,
+                                          const Frame::Place& place) {
     return frame_.draw(
-        batch(scene, pictures, rule.fade.is_on(), stream),
+        batch(scene, pictures, rule, stream),
         [=, &scene, next = rule](const ItemList& items, cudaStream_t on) mutable {
             cut_.cut_items(scene, eyes, next, pictures, images_.data(), placements_.data(), items, on);
             next = drawn_again(next);
         },
-        stream);
+        stream, place);
 }
 
 std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, DevicePages& pages,
@@ -149,7 +150,7 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
     const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
     PartlyResident resident = pages.begin_frame(true, arrive, stream);
     SelectRule next = rule = pages.raised(rule);
-    FrameBatch of_pages = batch(scene, pictures, rule.fade.is_on(), stream);
+    FrameBatch of_pages = batch(scene, pictures, rule, stream);
     of_pages.packed = pages.packed();
     of_pages.coded = pages.coded();
     of_pages.guards_models = &pages.mutex();
@@ -169,12 +170,22 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
 std::unique_ptr<Drawing> SceneFrame::draw_cut(const SceneTables& scene, const Camera& camera,
                                               const GivenCut& given, const FrameImage& image,
                                               float min_transmittance, cudaStream_t stream) {
+    FrameBatch of_cut = batch(scene, {{image, {}}, 1, min_transmittance}, SelectRule{}, stream);
+    of_cut.has_faded_items = given.weight.size > 0;
     return frame_.draw(
-        batch(scene, {{image, {}}, 1, min_transmittance}, given.weight.size > 0, stream),
+        of_cut,
         [=, &scene](const ItemList& items, cudaStream_t on) {
             cut_.given_items(scene, camera, given, image, images_.data(), placements_.data(), items, on);
         },
         stream);
+}
+
+std::vector<std::pair<const char*, size_t>> SceneFrame::bytes() const {
+    auto parts = frame_.bytes();
+    const size_t tables = rows_.bytes() + packed_.bytes() + coded_.bytes() + images_.bytes();
+    parts.emplace_back("placements", placements_.bytes() + tables);
+    parts.emplace_back("cut", cut_.bytes());
+    return parts;
 }
 
 constexpr unsigned kModelThreads = 128;

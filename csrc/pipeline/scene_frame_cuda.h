@@ -10,7 +10,7 @@ namespace cuda {
 
 // The only picture of a frame; `first_tile` and the tiles are filled in.
 FrameImage frame_image(const Pinhole<float>& camera, int width, int height, const float background[3],
-                       float* color, float* alpha, float* depth);
+                       const PicturePlanes& planes);
 
 // Gaussians that stay as they are, and packed.
 class PackedModel {
@@ -71,9 +71,10 @@ class SceneFrame {
     void set_models(std::vector<DeviceModel> models,
                     std::vector<std::shared_ptr<const DevicePalette>> palettes, cudaStream_t stream);
 
-    // The scene stays as it is until the drawing is finished.
+    // The scene stays as it is until the drawing is finished. `place` is of pictures that have none.
     std::unique_ptr<Drawing> draw(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
-                                  const EyeImages& pictures, cudaStream_t stream);
+                                  const EyeImages& pictures, cudaStream_t stream,
+                                  const Frame::Place& place = {});
     // Draws what is resident of the bundles of a pool, with what comes in before; the pool stays, too. The
     // rule becomes the one that is used. A frame that is drawn again has the pages that are there by then.
     std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages, const Eyes& eyes,
@@ -82,9 +83,13 @@ class SceneFrame {
     std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera, const GivenCut& given,
                                       const FrameImage& image, float min_transmittance, cudaStream_t stream);
 
+    // Bytes of what it keeps on the device, by part, without the models.
+    std::vector<std::pair<const char*, size_t>> bytes() const;
+
   private:
     // Of the models that were set.
-    FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, bool fades, cudaStream_t stream);
+    FrameBatch batch(const SceneTables& scene, const EyeImages& pictures, const SelectRule& rule,
+                     cudaStream_t stream);
 
     std::vector<DeviceModel> models_;
     std::vector<std::shared_ptr<const DevicePalette>> palettes_;

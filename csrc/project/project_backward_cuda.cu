@@ -59,7 +59,7 @@ __device__ bool sum_of_slots(const GradientSlots& slots, const Value* of_slot, u
     return touched != 0;
 }
 
-__global__ void place_slots_kernel(ItemList items, const uint32_t* item_records, const Record<float>* records,
+__global__ void place_slots_kernel(ItemList items, const uint32_t* item_records, const RecordBox* boxes,
                                    uint32_t* first_slot) {
     if (!items.is_complete()) return;
     const unsigned long long num_items = items.counters->items;
@@ -69,7 +69,7 @@ __global__ void place_slots_kernel(ItemList items, const uint32_t* item_records,
     for (unsigned long long i = blockIdx.x; i < num_items; i += gridDim.x) {
         const uint32_t record = items.items[i].record + threadIdx.x;
         const bool is_record = threadIdx.x < item_records[i];
-        const uint32_t num = is_record ? num_slots_of(records[record]) : 0;
+        const uint32_t num = is_record ? num_slots_of(boxes[record]) : 0;
         const uint32_t end = warp_prefix(num);
         if (lane == 31) sum_of_warp[warp] = end;
         __syncthreads();
@@ -110,7 +110,7 @@ struct ShRow {
 };
 
 template <int kDegree>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     project_backward_kernel(ProjectBackwardInput in, GradientSlots slots, GaussianRows<float> out,
                             float* d_centers) {
     using Row = ShRow<kDegree>;
@@ -132,11 +132,14 @@ __global__ void __launch_bounds__(kThreads)
         load_row(in.rows.quats, i, g.quat);
         load_row(in.rows.scales, i, g.scale);
         g.opacity = in.rows.opacities[i];
-        for (int c = 0; c < 3; ++c) color[c] = in.records[record].color[c];
+        const float2 red_green = reinterpret_cast<const float2*>(in.records.ellipse)[4 * record + 3];
+        color[0] = red_green.x;
+        color[1] = red_green.y;
+        color[2] = in.records.rest[2 * record];
     }
     RecordGradient<float> d{};
     const bool used = sum_of_slots(slots, slots.slot, is_record ? slots.first[record] : 0,
-                                   is_record ? num_slots_of(in.records[record]) : 0, d);
+                                   is_record ? num_slots_of(in.records.box[record]) : 0, d);
     if (used) {
         is_used[i - first] = true;
         const float center[2] = {d.ellipse.u, d.ellipse.v};
@@ -202,7 +205,7 @@ __global__ void __launch_bounds__(kThreads)
     const bool is_record = threadIdx.x < in.item_records[blockIdx.x];
     CenterSize<float> size{};
     if (sum_of_slots(slots, slots.size, is_record ? slots.first[record] : 0,
-                     is_record ? num_slots_of(in.records[record]) : 0, size))
+                     is_record ? num_slots_of(in.records.box[record]) : 0, size))
         sizes[in.source[record]] = size;
 }
 
@@ -216,10 +219,10 @@ void start(const ProjectBackwardInput& in, const GradientSlots& slots, const Gau
 
 }  // namespace
 
-void place_slots(const ItemList& items, const uint32_t* item_records, const Record<float>* records,
+void place_slots(const ItemList& items, const uint32_t* item_records, const RecordBox* boxes,
                  uint32_t* first_slot, cudaStream_t stream) {
     launch("place_slots_kernel", &place_slots_kernel, 8 * num_multiprocessors(), kThreads, 0, stream, items,
-           item_records, records, first_slot);
+           item_records, boxes, first_slot);
 }
 
 void project_backward(const ProjectBackwardInput& in, const GradientSlots& slots,

@@ -34,9 +34,10 @@ template <class Model>
 struct WarpSpace {
     ItemTables<Model> tables;
     alignas(16) Queued queue[kQueue];
-    float4 records[kRecordVectors * 32];  // on their way out: written by lane, read in a row
-    unsigned num_large;                   // of the item's records so far,
-    uint8_t large[kItemSize];             // and which they are
+    float4 ellipses[kEllipseVectors * 32];  // of records on their way out: written by lane, read in a row,
+    float2 rests[32];                       // as RecordPlanes has them
+    unsigned num_large;                     // of the item's records so far,
+    uint8_t large[kItemSize];               // and which they are
 };
 
 // What is known of a gaussian from the sphere around it.
@@ -101,6 +102,15 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
+// A box as a word, and back.
+__device__ FewTiles word_of(const RecordBox& box) {
+    return FewTiles(box.x0) | FewTiles(box.x1) << 16 | FewTiles(box.y0) << 32 | FewTiles(box.y1) << 48;
+}
+__device__ RecordBox box_of_word(FewTiles word) {
+    return {static_cast<uint16_t>(word), static_cast<uint16_t>(word >> 16), static_cast<uint16_t>(word >> 32),
+            static_cast<uint16_t>(word >> 48)};
+}
+
 // Writes the records of up to 32 queued gaussians, in their order, and counts them into tiles. Returns how
 // many there are. `sharers` are the placements of a shared item.
 template <class Source, bool kIsShared>
@@ -124,12 +134,16 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
     TileBox tiles{0, 0, 1, 0};
     bool is_large = false;
     if (reaches_pixel) {
-        store_record(r, space.records + kRecordVectors * rank);
+        space.ellipses[kEllipseVectors * rank] = {r.u, r.v, r.l11, r.l12};
+        space.ellipses[kEllipseVectors * rank + 1] = {r.l22, r.log2_opacity, r.color[0], r.color[1]};
+        space.rests[rank] = {r.color[2], r.depth};
+        const RecordBox pixels{r.x0, r.x1, r.y0, r.y1};
         const EntryBox box = entry_box(r);
         tiles = tile_box(box);
         is_large = tiles.count > kFewTiles;
         out.few[first + rank] =
-            is_large ? kManyTiles : few_tiles(entry_depth(r.depth, in.image.camera.near_depth), box);
+            is_large ? word_of(pixels) : few_tiles(entry_depth(r.depth, in.image.camera.near_depth), box);
+        if (out.records.box != nullptr) out.records.box[first + rank] = pixels;
         if (is_large) tiles.count = 0;
         if (out.source != nullptr) out.source[first + rank] = g;
     }
@@ -143,20 +157,22 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
         if (lane == 0) space.num_large = before + __popc(large);
     }
     __syncwarp();
-    float4* vectors = reinterpret_cast<float4*>(out.records + first);
-    const unsigned num_vectors = kRecordVectors * __popc(kept);
+    float4* ellipses = reinterpret_cast<float4*>(out.records.ellipse) + kEllipseVectors * size_t(first);
+    const unsigned num_records = __popc(kept);
 #pragma unroll
-    for (unsigned w = lane; w < kRecordVectors * 32; w += 32)
-        if (w < num_vectors) vectors[w] = space.records[w];
+    for (unsigned w = lane; w < kEllipseVectors * 32; w += 32)
+        if (w < kEllipseVectors * num_records) ellipses[w] = space.ellipses[w];
+    if (lane < num_records) reinterpret_cast<float2*>(out.records.rest)[first + lane] = space.rests[lane];
     for (unsigned k = 0; __any_sync(kAllLanes, k < tiles.count); ++k)
         count_tile(out.tiles.count,
                    k < tiles.count
                        ? in.image.first_tile + tiles.row(k) * in.image.tile_columns + tiles.column(k)
                        : kNoTile);
-    return __popc(kept);
+    return num_records;
 }
 
-// The item's large records, in whole batches.
+// The item's large records, in whole batches. Their boxes wait where the scattering kernel looks for few
+// tiles.
 template <class Model>
 __device__ void write_large(const WarpSpace<Model>& space, FrameCounters& counters,
                             const ProjectOutput& out) {
@@ -166,9 +182,15 @@ __device__ void write_large(const WarpSpace<Model>& space, FrameCounters& counte
     unsigned long long place = 0;
     if (lane == 0) place = atomicAdd(&counters.large, static_cast<unsigned long long>(count));
     place = __shfl_sync(kAllLanes, place, 0);
-    for (unsigned k = lane; k < count && place + k < out.large_capacity; k += 32)
-        out.large[place + k] = {k < num_large ? space.tables.item.record + space.large[k] : kNoRecord,
-                                space.tables.placement.image};
+    for (unsigned k = lane; k < count; k += 32) {
+        LargeRecord large{kNoRecord, space.tables.placement.image, {}};
+        if (k < num_large) {
+            large.record = space.tables.item.record + space.large[k];
+            large.box = box_of_word(out.few[large.record]);
+            out.few[large.record] = kManyTiles;
+        }
+        if (place + k < out.large_capacity) out.large[place + k] = large;
+    }
 }
 
 // Whose tables a warp has.

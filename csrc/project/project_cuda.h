@@ -28,7 +28,7 @@ struct ProjectInput {
 };
 
 struct ProjectOutput {
-    Record<float>* records;
+    RecordPlanes records;
     FewTiles* few;           // of each record, as TileBinInput has it
     uint32_t* item_records;  // [items] how many of an item's gaussians became records
     ItemTiles* item_tiles;   // [items]

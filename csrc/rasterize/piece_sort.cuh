@@ -57,7 +57,7 @@ struct BlendShared {
             uint32_t warp_sum[kBlendWarps];
             uint16_t by_bucket[kPiece];
         };
-        float4 record[kRecordVectors][kBlendBatch];
+        float4 record[kRecordVectors][kBlendBatch];  // without their boxes
     };
     uint16_t sorted[kPiece];       // places in `key`
     uint32_t blocks[kBlendBatch];  // live ones that the batch's records may reach
@@ -142,16 +142,16 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
 
 // Whether the first entry is blended before the second: where the depths of the keys are equal, the records'
 // own decide.
-__device__ inline bool precedes(EntryKey first, EntryKey second, const Record<float>* records) {
+__device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPlanes& records) {
     if ((first ^ second) >> kDepthShift != 0) return first < second;
     const uint32_t a = record_of(TileEntry{first}), b = record_of(TileEntry{second});
     if (a == b) return false;
-    const float depth_a = records[a].depth, depth_b = records[b].depth;
+    const float depth_a = rest_of(records, a)->y, depth_b = rest_of(records, b)->y;
     return depth_a != depth_b ? depth_a < depth_b : a < b;
 }
 
 // Sorts the piece.
-__device__ inline void sort_piece(const Record<float>* records, uint32_t count, BlendShared& s) {
+__device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, BlendShared& s) {
     const Buckets buckets = buckets_over(s.lowest, s.highest, kLog2Sort, false);
     const bool few = count <= kFewEntries;
     if (few) {

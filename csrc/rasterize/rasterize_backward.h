@@ -13,7 +13,7 @@ namespace cuda {
 // A picture as it was drawn, the lists it was blended from, and its gradients, all on the device.
 struct RasterizeBackwardInput {
     FrameImage image;
-    const Record<float>* records;
+    RecordPlanes records;
     const unsigned long long* tile_first;  // [num_tiles + 1] into order
     const uint32_t* order;                 // each tile's records front to back
     const uint32_t* blended;  // [num_tiles] of them, those in front of where all pixels had stopped

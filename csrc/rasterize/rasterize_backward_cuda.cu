@@ -8,6 +8,7 @@
 #include <cmath>
 
 #include "base/scan.cuh"
+#include "frame/record.cuh"
 #include "rasterize/rasterize_backward.h"
 #include "rasterize/rasterize_math.h"
 
@@ -97,18 +98,18 @@ __device__ PixelGradient read_pixel(const RasterizeBackwardInput& in, int column
     PixelGradient p{column + 0.5f, row + 0.5f, {0, 0, 0}, 0, 0, 0, 0, -1};
     if (column >= in.image.width || row >= in.image.height) return p;
     const size_t at = static_cast<size_t>(row) * in.image.width + column;
-    const float alpha = in.image.alpha[at], t = 1 - alpha;
+    const float alpha = in.image.planes.alpha[at], t = 1 - alpha;
     p.transmittance = 1;
     p.d_weight = in.d_picture.alpha[at];
     for (int c = 0; c < 3; ++c) {
         const float d = in.d_picture.color[3 * at + c];
         p.d_color[c] = d;
         p.d_weight -= d * in.image.background[c];
-        p.total += d * (in.image.color[3 * at + c] - t * in.image.background[c]);
+        p.total += d * (in.image.planes.color[3 * at + c] - t * in.image.background[c]);
         d_background[c] = d * t;
     }
     if (in.d_picture.depth != nullptr && alpha > 0) {
-        const float depth = in.image.depth[at];
+        const float depth = in.image.planes.depth[at];
         p.d_depth = in.d_picture.depth[at] / alpha;
         p.d_weight -= p.d_depth * depth;
         p.total += p.d_depth * depth * alpha;
@@ -285,9 +286,9 @@ __global__ void __launch_bounds__(kThreads, 2)
             uint32_t warps = 0;
             if (first + i < count) {
                 const uint32_t r = order[first + i];
-                const Record<float> g = in.records[r];
+                const Record<float> g = load_record(in.records, r, in.records.box[r]);
                 s.record[i] = g;
-                batch.slot[i] = slots.first[r] + slot_of_tile(g, tile_column, tile_row);
+                batch.slot[i] = slots.first[r] + slot_of_tile(in.records.box[r], tile_column, tile_row);
                 warps = warps_of(g, left, top) & s.alive;
             }
             s.warps[i] = warps;

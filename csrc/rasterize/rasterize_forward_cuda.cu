@@ -2,7 +2,7 @@
 //
 // Lists are sorted piece by piece, nearest first. Entries over pixels that have all stopped by then are
 // dropped unsorted, and their records are never fetched. A list that does not fit into a piece is first
-// spread over buckets of depth, from one half of its memory to the other; a bucket too long for a window is
+// spread over buckets of depth, through shared memory or into scratch; a bucket too long for a window is
 // spread again. A list with far more than its share of a frame's entries is blended in parts of the tile,
 // side by side.
 //
@@ -31,10 +31,20 @@ static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) 
               "kPiece / kMostParts begins a class of plan_kernel");
 static_assert(kEntryBlockSize == kSubHeight && 2 * kEntryBlockSize == kSubWidth, "a sub-tile is two blocks");
 
-// Copies 16 bytes from device to shared memory; they are there once the thread has waited.
+// Copies 16 or 8 bytes from device to shared memory; they are there once the thread has waited.
 __device__ void copy_async(float4* shared, const float4* from) {
 #ifdef __CUDA_ARCH__
     asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(
+                     static_cast<unsigned>(__cvta_generic_to_shared(shared))),
+                 "l"(from)
+                 : "memory");
+#else
+    *shared = *from;
+#endif
+}
+__device__ void copy_async(float2* shared, const float2* from) {
+#ifdef __CUDA_ARCH__
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 8;" ::"r"(
                      static_cast<unsigned>(__cvta_generic_to_shared(shared))),
                  "l"(from)
                  : "memory");
@@ -160,7 +170,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
 
 // Blends the sorted piece.
 template <bool kWithDepth, class Stop>
-__device__ void blend_piece(const Record<float>* records, uint32_t count, int left, int top, Stop stop,
+__device__ void blend_piece(const RecordPlanes& records, uint32_t count, int left, int top, Stop stop,
                             BlendShared& s) {
     for (uint32_t first = 0; first < count && s.alive_blocks != 0; first += kBlendBatch) {
         uint32_t* reached = &s.reached[first / kBlendBatch % 2];
@@ -169,9 +179,12 @@ __device__ void blend_piece(const Record<float>* records, uint32_t count, int le
             if (first + i < count) {
                 const TileEntry entry{s.key[s.sorted[first + i]]};
                 blocks = blocks_of(entry) & s.alive_blocks;
-                const float4* from = reinterpret_cast<const float4*>(records + record_of(entry));
-                if (blocks != 0)
-                    for (int k = 0; k < kRecordVectors; ++k) copy_async(&s.record[k][i], from + k);
+                if (blocks != 0) {
+                    const float4* from = ellipse_of(records, record_of(entry));
+                    for (int k = 0; k < kEllipseVectors; ++k) copy_async(&s.record[k][i], from + k);
+                    copy_async(reinterpret_cast<float2*>(&s.record[kEllipseVectors][i]),
+                               rest_of(records, record_of(entry)));
+                }
             }
             s.blocks[i] = blocks;
             blocks = __reduce_or_sync(kAllLanes, blocks);
@@ -199,12 +212,12 @@ __device__ void blend_piece(const Record<float>* records, uint32_t count, int le
 
 // Blends the list of a tile. Returns how many of its entries were not dropped.
 template <bool kWithDepth, class Stop>
-__device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries, TileEntry* scratch,
-                               uint32_t count, const Buckets& spread_buckets, uint32_t* order, int left,
-                               int top, Stop stop, BlendShared& s) {
+__device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, TileEntry* scratch,
+                               uint32_t count, const TilePlan& plan, const Buckets& spread_buckets,
+                               uint32_t* order, int left, int top, Stop stop, BlendShared& s) {
     int depth = 0;  // of levels
     if (count > kPiece) {
-        if (threadIdx.x == 0) s.level[0] = {count, true, spread_buckets};
+        if (threadIdx.x == 0) s.level[0] = {count, plan.in_scratch, spread_buckets};
         depth = 1;
         __syncthreads();
     }
@@ -254,10 +267,16 @@ __device__ uint32_t blend_list(const Record<float>* records, TileEntry* entries,
     return blended;
 }
 
+// Where the image is, which lists.images has.
+__device__ const PicturePlanes& planes_of(const FrameLists& lists, const FrameImage& image) {
+    return image.planes.color != nullptr ? image.planes : lists.planes[&image - lists.images];
+}
+
 template <bool kWithDepth, class Stop>
-__device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint32_t tile,
+__device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, const TilePlan& plan,
                            const Buckets& spread_buckets, uint32_t own_blocks, const FrameImage& image,
                            Stop stop, BlendShared& s) {
+    const uint32_t tile = plan.tile;
     const int in_image = static_cast<int>(tile - image.first_tile);
     const int left = in_image % image.tile_columns * kFrameTileWidth;
     const int top = in_image / image.tile_columns * kFrameTileHeight;
@@ -290,20 +309,21 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, uint
     const unsigned long long first = lists.tile_first[tile];
     const uint32_t count = static_cast<uint32_t>(lists.tile_first[tile + 1] - first);
     const uint32_t blended = blend_list<kWithDepth>(
-        lists.records, lists.entries + first, lists.scratch + first, count, spread_buckets,
+        lists.records, lists.entries + first, lists.scratch + plan.first_scratch, count, plan, spread_buckets,
         tape.order == nullptr ? nullptr : tape.order + first, left, top, stop, s);
     if (tape.blended != nullptr && threadIdx.x == 0) tape.blended[tile] = blended;
 
+    const PicturePlanes& planes = planes_of(lists, image);
     for_each_pixel([&](int sub, int x, int y) {
         if (x >= image.width || y >= image.height) return;
         const size_t out = static_cast<size_t>(y) * image.width + x;
         const Finished<float> of = finished(s.pixels.transmittance[sub][lane], lists.min_transmittance);
         const float alpha = 1 - of.transmittance;
         for (int c = 0; c < 3; ++c)
-            image.color[3 * out + c] =
+            planes.color[3 * out + c] =
                 of.gain * s.pixels.color[c][sub][lane] + of.transmittance * image.background[c];
-        image.alpha[out] = alpha;
-        if (kWithDepth) image.depth[out] = alpha > 0 ? of.gain * s.pixels.depth[sub][lane] / alpha : 0.0f;
+        planes.alpha[out] = alpha;
+        if (kWithDepth) planes.depth[out] = alpha > 0 ? of.gain * s.pixels.depth[sub][lane] / alpha : 0.0f;
     });
 }
 
@@ -364,33 +384,63 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, ui
         TilePlan* plan = lists.plans + atomicAdd(&place[class_of(count)], 1u << log2_parts);
         const uint32_t image = lists.image_of_tile[tile];
         for (int part = 0; part < 1 << log2_parts; ++part)
-            plan[part] = {tile, image, 0, 0, 0, uint8_t(part), uint8_t(log2_parts), false};
+            plan[part] = {tile, image, 0, 0, 0, uint8_t(part), uint8_t(log2_parts), false, false, 0};
     });
     for (uint32_t i = num_planned + threadIdx.x; i < lists.num_plans; i += kPlanThreads)
         lists.plans[i].tile = kNoTile;
 }
 
-// Spreads the long lists, a block one after another.
-__global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists lists) {
-    __shared__ SpreadShared<kLog2Spread> s;
-    if (!lists.capacity.holds(*lists.counters)) return;
+// Room in the scratch for a list, for the whole block.
+__device__ unsigned long long take_scratch(const FrameLists& lists, uint32_t count) {
+    __shared__ unsigned long long first;
+    if (threadIdx.x == 0) first = atomicAdd(&lists.counters->spread, static_cast<unsigned long long>(count));
+    __syncthreads();
+    const unsigned long long taken = first;
+    __syncthreads();
+    return taken;
+}
+
+// Spreads the long lists, a block one after another: where they are, if `most_held` entries in shared memory
+// are enough, else into the scratch.
+__global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists lists, uint32_t most_held) {
+    using Shared = SpreadShared<kLog2Spread>;
+    static_assert(sizeof(Shared) % sizeof(TileEntry) == 0, "entries follow it");
+    Shared& s = *reinterpret_cast<Shared*>(shared_memory());
+    auto* held = reinterpret_cast<TileEntry*>(shared_memory() + sizeof(Shared));
+    if (!lists.capacity.holds_entries(*lists.counters)) return;
     for (uint32_t i = blockIdx.x; i < lists.num_plans; i += gridDim.x) {
         TilePlan& plan = lists.plans[i];
         if (plan.tile == kNoTile) return;
         const uint32_t count = count_of(lists, plan.tile);
         if (count >> plan.log2_parts < kPiece / kMostParts) return;  // and so are all that follow
         if (count <= kPiece || plan.part != 0) continue;
-        const unsigned long long first = lists.tile_first[plan.tile];
-        const Buckets buckets =
-            find_buckets<kPlanThreads>(lists.entries + first, 0, count, true, plan.log2_parts > 0, s);
-        spread<kPlanThreads>(lists.entries + first, lists.scratch + first, 0, count, buckets, s);
+        TileEntry* entries = lists.entries + lists.tile_first[plan.tile];
+        const bool is_held = count <= most_held, finely = plan.log2_parts > 0;
+        unsigned long long first_scratch = 0;
+        Buckets buckets;
+        if (is_held) {
+            for (uint32_t k = threadIdx.x; k < count; k += kPlanThreads)
+                copy_async(reinterpret_cast<float2*>(held + k), reinterpret_cast<const float2*>(entries + k));
+            wait_for_copies();
+            __syncthreads();
+            buckets = find_buckets<kPlanThreads>(held, 0, count, true, finely, s);
+            spread<kPlanThreads>(held, entries, 0, count, buckets, s);
+        } else {
+            first_scratch = take_scratch(lists, count);
+            if (first_scratch + count > lists.capacity.spread) continue;
+            buckets = find_buckets<kPlanThreads>(entries, 0, count, true, finely, s);
+            spread<kPlanThreads>(entries, lists.scratch + first_scratch, 0, count, buckets, s);
+        }
         // A bucket's counter now stands where the next one begins.
         bool is_long = false;
         for (uint32_t b = threadIdx.x; b <= buckets.last; b += kPlanThreads)
             is_long = is_long || s.bucket[b] - (b > 0 ? s.bucket[b - 1] : 0) > kWindow;
         is_long = __syncthreads_or(is_long);
+        if (is_long && is_held) first_scratch = take_scratch(lists, count);
         if (threadIdx.x == 0) {
             plan.fits_windows = !is_long;
+            plan.in_scratch = !is_held;
+            plan.first_scratch = first_scratch;
             plan.lowest = buckets.lowest;
             plan.last_bucket = static_cast<uint16_t>(buckets.last);
             plan.shift = static_cast<uint16_t>(buckets.shift);
@@ -401,20 +451,26 @@ __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists list
 template <class Stop>
 __global__ void __launch_bounds__(kBlendThreads, kBlocks)
     rasterize_kernel(FrameLists lists, RasterTape tape, Stop stop) {
+    if (blockIdx.x == 0 && threadIdx.x == 0 && lists.report != nullptr) *lists.report = *lists.counters;
     if (!lists.capacity.holds(*lists.counters)) return;
     BlendShared& s = *reinterpret_cast<BlendShared*>(shared_memory());
-    const uint32_t tile = lists.plans[blockIdx.x].tile;
-    if (tile == kNoTile) return;
+    if (lists.plans[blockIdx.x].tile == kNoTile) return;
     const int part = lists.plans[blockIdx.x].part;
-    const TilePlan plan = lists.plans[blockIdx.x - part];
+    const TilePlan& plan = lists.plans[blockIdx.x - part];
     if (part > 0 && !plan.fits_windows) return;  // the first blends it all
     const uint32_t own_blocks = blocks_of_part(part, plan.fits_windows ? plan.log2_parts : 0);
     const Buckets buckets{plan.lowest, plan.last_bucket, plan.shift, false};
     const FrameImage& image = lists.images[plan.image];
-    if (image.depth != nullptr)
-        blend_tile<true>(lists, tape, tile, buckets, own_blocks, image, stop, s);
+    if (planes_of(lists, image).depth != nullptr)
+        blend_tile<true>(lists, tape, plan, buckets, own_blocks, image, stop, s);
     else
-        blend_tile<false>(lists, tape, tile, buckets, own_blocks, image, stop, s);
+        blend_tile<false>(lists, tape, plan, buckets, own_blocks, image, stop, s);
+}
+
+// Entries that a block of spread_kernel holds, two of which share a multiprocessor.
+uint32_t most_held() {
+    const size_t of_two = shared_memory_of_multiprocessor() / 2 - 2048;  // the driver keeps 1024
+    return static_cast<uint32_t>((of_two - sizeof(SpreadShared<kLog2Spread>)) / sizeof(TileEntry));
 }
 
 uint32_t num_places() { return static_cast<uint32_t>(kBlocks) * num_multiprocessors(); }
@@ -427,10 +483,10 @@ uint32_t most_plans(uint32_t num_tiles) {
 }
 
 void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t stream) {
-    if (lists.num_tiles == 0) return;
     launch("plan_kernel", plan_kernel, 1, kPlanThreads, 0, stream, lists, num_places());
+    const uint32_t held = most_held();
     launch("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles), kPlanThreads,
-           0, stream, lists);
+           sizeof(SpreadShared<kLog2Spread>) + held * sizeof(TileEntry), stream, lists, held);
     with_stop<float>(lists.min_transmittance, [&](auto stop) {
         launch("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans, kBlendThreads,
                sizeof(BlendShared), stream, lists, tape == nullptr ? RasterTape{} : *tape, stop);

@@ -31,7 +31,7 @@ constexpr unsigned kCutBlocks = 4;  // on a multiprocessor
 constexpr unsigned kReportBlocks = 64;
 constexpr unsigned kPlaceThreads = 64;  // few, so that a few thousand instances spread over the device
 
-// Scratch of one cut, cleared before it; the states of the cut are cleared by place_kernel.
+// Scratch of one round of a cut: zeros, but for the states of cut_kernel, which place_kernel clears.
 struct Scratch {
     unsigned *place_ticket, *cut_ticket;
     unsigned* num_parts;
@@ -189,8 +189,11 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
     if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
     if (!Output::kFades) rule.fade = {};
+    // Where there is a block for each ticket, a block takes one, and the others none.
+    const bool is_enough = num_tickets <= gridDim.x;
+    if (is_enough && blockIdx.x >= num_tickets) return;
     for (unsigned ticket = take_ticket(scratch.cut_ticket); ticket < num_tickets;
-         ticket = take_ticket(scratch.cut_ticket)) {
+         ticket = is_enough ? num_tickets : take_ticket(scratch.cut_ticket)) {
         const unsigned p = ticket * kCutWarps + threadIdx.x / 32;
         LaneClusters mine{};
         if (p < num_parts) {
@@ -248,17 +251,13 @@ __global__ void __launch_bounds__(kCutThreads)
 // At least one: an empty scene has a picture, too.
 unsigned place_blocks(size_t num_instances) { return std::max(1u, blocks_for(num_instances, kPlaceThreads)); }
 
-// Words of Scratch before the states of the cut: three counters and the states of place_kernel's blocks.
-size_t cleared_words(size_t num_instances) { return 2 + place_blocks(num_instances); }
+// Zeros of a Scratch: three counters and the states of place_kernel's blocks.
+size_t zeros_of_round(size_t num_instances) { return 2 + place_blocks(num_instances); }
 
-size_t scratch_words(size_t num_instances, size_t num_tickets) {
-    return cleared_words(num_instances) + 2 * num_tickets;
-}
-
-Scratch scratch_in(Count* words, size_t num_instances, size_t num_tickets) {
-    auto* counters = reinterpret_cast<unsigned*>(words);
-    Count* states = words + cleared_words(num_instances);
-    return {counters, counters + 1, counters + 2, words + 2, states, states + num_tickets};
+// `states`: two words a ticket.
+Scratch scratch_in(Count* zeros, Count* states, size_t num_tickets) {
+    auto* counters = reinterpret_cast<unsigned*>(zeros);
+    return {counters, counters + 1, counters + 2, zeros + 2, states, states + num_tickets};
 }
 
 // Parts of all tables together, if every one is asked.
@@ -285,14 +284,20 @@ BudgetState* Cut::budget_state(cudaStream_t stream) {
     return budget_.data();
 }
 
+size_t Cut::num_zeros(const SceneTables& scene, const SelectRule& rule) {
+    const size_t of_round = zeros_of_round(scene.num_instances());
+    return rule.budget == kNoBudget ? of_round : 2 * of_round + kNumBudgetBins;
+}
+
 template <class Output>
 void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, const Target& target,
-              const Output& output, cudaStream_t stream, const PartlyResident* resident) {
+              const Output& output, Count* zeros, cudaStream_t stream, const PartlyResident* resident) {
     const size_t count = scene.num_instances(), parts = most_parts(scene);
-    const size_t num_tickets = blocks_for(parts, kCutWarps), words = scratch_words(count, num_tickets);
-    Count* scratch_of_rounds = scratch_.reserve(2 * words, stream);
-    const Scratch scratches[2] = {scratch_in(scratch_of_rounds, count, num_tickets),
-                                  scratch_in(scratch_of_rounds + words, count, num_tickets)};
+    const size_t num_tickets = blocks_for(parts, kCutWarps);
+    Count* states = states_.reserve(4 * num_tickets, stream);
+    const Scratch scratches[2] = {
+        scratch_in(zeros, states, num_tickets),
+        scratch_in(zeros + zeros_of_round(count), states + 2 * num_tickets, num_tickets)};
     const SceneOnDevice on_device = scene.on_device();
     const PlacedScene placed{resident == nullptr ? on_device.bundles : resident->bundles, on_device.instances,
                              views_.reserve(count, stream), tops_.reserve(count, stream),
@@ -300,15 +305,11 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
     const unsigned blocks = static_cast<unsigned>(
         std::clamp<size_t>(num_tickets, 1, (2048 / kCutThreads) * num_multiprocessors()));
     const bool has_budget = rule.budget != kNoBudget;
-    Count* change = has_budget ? change_.reserve(kNumBudgetBins, stream) : nullptr;
-    if (has_budget)
-        check(cudaMemsetAsync(change, 0, kNumBudgetBins * sizeof(Count), stream), "cudaMemsetAsync");
+    Count* change = zeros + 2 * zeros_of_round(count);  // with a budget
     BudgetState* state = has_budget ? budget_state(stream) : nullptr;
     for (const bool is_second : {false, true}) {
         const Scratch& scratch = scratches[is_second];
         const BudgetRound round{state, is_second};
-        check(cudaMemsetAsync(scratch.place_ticket, 0, cleared_words(count) * sizeof(Count), stream),
-              "cudaMemsetAsync");
         launch("place_kernel", place_kernel, place_blocks(count), kPlaceThreads, 0, stream, placed, eyes,
                rule, target.pictures, target.images, target.placements, round, scratch);
         if (!has_budget) break;
@@ -335,11 +336,11 @@ void Cut::cut_items(const SceneTables& scene, const Eyes& eyes, const SelectRule
     const Target target{pictures, images, placements, &items.counters->choice};
     const auto num_instances = static_cast<uint32_t>(scene.num_instances());
     if (rule.fade.is_on())
-        cut(scene, eyes, rule, target, ItemOutput<true>{items, pictures.count, num_instances}, stream,
-            resident);
+        cut(scene, eyes, rule, target, ItemOutput<true>{items, pictures.count, num_instances}, items.zeros,
+            stream, resident);
     else
-        cut(scene, eyes, rule, target, ItemOutput<false>{items, pictures.count, num_instances}, stream,
-            resident);
+        cut(scene, eyes, rule, target, ItemOutput<false>{items, pictures.count, num_instances}, items.zeros,
+            stream, resident);
 }
 
 void Cut::given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
@@ -350,9 +351,10 @@ void Cut::given_items(const SceneTables& scene, const Camera& camera, const Give
     const SceneOnDevice on_device = scene.on_device();
     const PlacedScene placed{on_device.bundles, on_device.instances, nullptr, nullptr, nullptr};
     const unsigned blocks = std::max(1u, blocks_for(given.instance.size, kCutThreads));
-    const size_t words = scratch_words(0, blocks);
-    const Scratch scratch = scratch_in(scratch_.reserve(words, stream), 0, blocks);
-    check(cudaMemsetAsync(scratch_.data(), 0, words * sizeof(Count), stream), "cudaMemsetAsync");
+    const size_t num_zeros = zeros_of_round(0), words = num_zeros + 2 * size_t(blocks);
+    Count* zeros = states_.reserve(words, stream);
+    const Scratch scratch = scratch_in(zeros, zeros + num_zeros, blocks);
+    check(cudaMemsetAsync(zeros, 0, words * sizeof(Count), stream), "cudaMemsetAsync");
     launch("place_all_kernel", place_all_kernel, place_blocks(scene.num_instances()), kPlaceThreads, 0,
            stream, placed, camera, image, images, placements);
     if (given.weight.size > 0)
@@ -369,6 +371,8 @@ void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectR
     const DeviceGuard guard(device_);
     const StreamLock lock = scene.lock(stream);
     Pairs* on_device = pairs_.reserve(1, stream);
+    const size_t num_words = num_zeros(scene, rule);
+    Count* zeros = zeros_.reserve(num_words, stream);
     Pairs counts{};
     const bool has_budget = rule.budget != kNoBudget;
     const bool keeps_bin = has_budget && last_bin != nullptr;
@@ -382,10 +386,11 @@ void Cut::select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectR
                                         &on_device->pairs,
                                         &on_device->gaussians};
         check(cudaMemsetAsync(on_device, 0, sizeof *on_device, stream), "cudaMemsetAsync");
+        check(cudaMemsetAsync(zeros, 0, num_words * sizeof(Count), stream), "cudaMemsetAsync");
         if (keeps_bin)
             check(cudaMemcpyAsync(bin_on_device, last_bin, sizeof *last_bin, cudaMemcpyHostToDevice, stream),
                   "cudaMemcpyAsync of the last bin");
-        cut(scene, eyes, rule, {{}, nullptr, nullptr, &on_device->choice}, output, stream, resident);
+        cut(scene, eyes, rule, {{}, nullptr, nullptr, &on_device->choice}, output, zeros, stream, resident);
         copy_to_host(&counts, on_device, 1, stream);
         check(cudaStreamSynchronize(stream), "cudaStreamSynchronize");
         if (counts.pairs <= capacity) break;
@@ -412,7 +417,7 @@ void Cut::select(const SceneTables& scene, const Eyes& eyes, const SelectRule& r
 }
 
 size_t Cut::bytes() const {
-    return views_.bytes() + tops_.bytes() + parts_.bytes() + scratch_.bytes() + change_.bytes() +
+    return views_.bytes() + tops_.bytes() + parts_.bytes() + states_.bytes() + zeros_.bytes() +
            budget_.bytes() + pair_instance_.bytes() + pair_cluster_.bytes() + pair_weight_.bytes() +
            pairs_.bytes();
 }

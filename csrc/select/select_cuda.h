@@ -45,9 +45,13 @@ class Cut {
   public:
     // Selected clusters as the items of a frame, once for each eye. Instance i of n becomes placement i of
     // model bundle[i] in image 0, and n + i in that of a second eye; `pictures` are written to `images`.
+    // Clears nothing.
     void cut_items(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
                    const EyeImages& pictures, FrameImage* images, Placement* placements,
                    const ItemList& items, cudaStream_t stream, const PartlyResident* resident = nullptr);
+
+    // How many zeros items.zeros has to have for that.
+    static size_t num_zeros(const SceneTables& scene, const SelectRule& rule);
 
     // The same for pairs that were selected before, on the device, and one camera.
     void given_items(const SceneTables& scene, const Camera& camera, const GivenCut& given,
@@ -69,7 +73,8 @@ class Cut {
     struct Target;
     template <class Output>
     void cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, const Target& target,
-             const Output& output, cudaStream_t stream, const PartlyResident* resident);
+             const Output& output, unsigned long long* zeros, cudaStream_t stream,
+             const PartlyResident* resident);
     template <bool kFades>
     void select_pairs(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, SelectOutput& out,
                       cudaStream_t stream, const PartlyResident* resident, uint32_t* last_bin);
@@ -79,7 +84,7 @@ class Cut {
     DeviceBuffer<InstanceView> views_;
     DeviceBuffer<uint8_t> tops_;
     DeviceBuffer<CutPart> parts_;
-    DeviceBuffer<unsigned long long> scratch_, change_;
+    DeviceBuffer<unsigned long long> states_, zeros_;
     DeviceBuffer<BudgetState> budget_;
     DeviceBuffer<int32_t> pair_instance_, pair_cluster_;
     DeviceBuffer<float> pair_weight_;

@@ -25,6 +25,7 @@ constexpr uint32_t kNoItem = ~0u;  // in place of a number of records
 struct LargeBatch {
     uint32_t image;
     uint32_t record;        // of this lane; the first one where it has none
+    RecordBox box;          // of that
     int first_row, rows;    // of tiles, of this lane; from `top` on
     int left, top;          // of the tiles that they all lie in
     int columns, all_rows;  // of those
@@ -38,16 +39,16 @@ using WindowRuns = uint16_t[kMostRows];
 
 __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first) {
     const LargeRecord mine = in.large[first + threadIdx.x % kLargeAtOnce];
-    const uint32_t first_record = __shfl_sync(kAllLanes, mine.record, 0);
-    LargeBatch batch{mine.image, first_record, 0, 0, 0, 0, 0, 0, 0, 0};
+    const LargeRecord& first_one = in.large[first];
+    LargeBatch batch{mine.image, first_one.record, first_one.box, 0, 0, 0, 0, 0, 0, 0, 0};
     int left = 1 << 20, top = left, right = -left, bottom = -left, boxes = 0;
     if (mine.record != kNoRecord) {
         batch.record = mine.record;
-        const Record<float> r = load_record(in.records + mine.record);
-        left = r.x0 / kFrameTileWidth;
-        right = r.x1 / kFrameTileWidth;
-        top = r.y0 / kFrameTileHeight;
-        bottom = r.y1 / kFrameTileHeight;
+        batch.box = mine.box;
+        left = mine.box.x0 / kFrameTileWidth;
+        right = mine.box.x1 / kFrameTileWidth;
+        top = mine.box.y0 / kFrameTileHeight;
+        bottom = mine.box.y1 / kFrameTileHeight;
         batch.rows = bottom - top + 1;
         boxes = batch.rows * (right - left + 1);
     }
@@ -83,7 +84,15 @@ __device__ LargeRows rows_of(const LargeBatch& batch, int first, int count) {
     return rows;
 }
 
-// Calls visit(row, record, run) for those rows of a batch's records, a lane a row.
+// The box of another lane of the warp.
+__device__ RecordBox box_of_lane(const RecordBox& box, int lane) {
+    const uint32_t columns = __shfl_sync(kAllLanes, box.x0 | uint32_t(box.x1) << 16, lane),
+                   rows = __shfl_sync(kAllLanes, box.y0 | uint32_t(box.y1) << 16, lane);
+    return {static_cast<uint16_t>(columns), static_cast<uint16_t>(columns >> 16), static_cast<uint16_t>(rows),
+            static_cast<uint16_t>(rows >> 16)};
+}
+
+// Calls visit(row, number, record, run) for those rows of a batch's records, a lane a row.
 template <class Visit>
 __device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, const LargeRows& rows,
                              const Visit& visit) {
@@ -97,9 +106,11 @@ __device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, co
         for (int step = kLargeAtOnce / 2; step > 0; step /= 2)
             if (__shfl_sync(kAllLanes, rows.rows_after, owner + step - 1) <= row) owner += step;
         const int row_of_owner = row - __shfl_sync(kAllLanes, before, owner);
-        const uint32_t record = __shfl_sync(kAllLanes, batch.record, owner);
-        if (first + lane < total)
-            visit(row, record, tile_run(load_record(in.records + record), row_of_owner));
+        const uint32_t number = __shfl_sync(kAllLanes, batch.record, owner);
+        const RecordBox box = box_of_lane(batch.box, owner);
+        if (first + lane >= total) continue;
+        const Record<float> record = load_record(in.records, number, box);
+        visit(row, number, record, tile_run(record, row_of_owner));
     }
 }
 
@@ -137,7 +148,7 @@ __device__ void for_each_window(const TileBinInput& in, const LargeBatch& batch,
     for (int first = part.number * batch.window_rows; first < batch.all_rows; first += step) {
         const LargeRows window = rows_of(batch, first, batch.window_rows);
         __syncwarp();  // the window before may still be read
-        for_each_run(in, batch, window, [&](int row, uint32_t, const TileRun& run) {
+        for_each_run(in, batch, window, [&](int row, uint32_t, const Record<float>&, const TileRun& run) {
             runs[row] = run.count == 0 ? 0 : static_cast<uint16_t>(run.first - batch.left | run.count << 8);
         });
         __syncwarp();
@@ -193,10 +204,12 @@ __global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinI
     for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
         const FrameImage& image = in.images[batch.image];
         if (batch.window_rows == 0) {
-            for_each_run(in, batch, rows_of(batch, part), [&](int, uint32_t, const TileRun& run) {
-                uint32_t* to = in.counts.count + image.first_tile + run.row * image.tile_columns + run.first;
-                for (int k = 0; k < run.count; ++k) atomicAdd(to + k, 1u);
-            });
+            for_each_run(in, batch, rows_of(batch, part),
+                         [&](int, uint32_t, const Record<float>&, const TileRun& run) {
+                             uint32_t* to = in.counts.count + image.first_tile +
+                                            run.row * image.tile_columns + run.first;
+                             for (int k = 0; k < run.count; ++k) atomicAdd(to + k, 1u);
+                         });
             return;
         }
         for_each_window(in, batch, part, runs, [&](const LargeRows& window) {
@@ -285,16 +298,16 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item, uint32_t r
 __device__ void scatter_runs(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
                              const LargePart& part) {
     const FrameImage& image = in.images[batch.image];
-    for_each_run(in, batch, rows_of(batch, part), [&](int, uint32_t record, const TileRun& run) {
-        const Record<float> r = load_record(in.records + record);
+    const auto visit = [&](int, uint32_t number, const Record<float>& r, const TileRun& run) {
         const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
         const EntryBox box = entry_box(r);
         for (int k = 0; k < run.count; ++k) {
             const uint32_t tile = image.first_tile + run.row * image.tile_columns + run.first + k;
             to.entries[to.tile_first[tile] + (atomicSub(to.left + tile, 1u) - 1)] =
-                tile_entry(depth, record, box, run.first + k, run.row);
+                tile_entry(depth, number, box, run.first + k, run.row);
         }
-    });
+    };
+    for_each_run(in, batch, rows_of(batch, part), visit);
 }
 
 // A batch with windows: what it has for a tile is written at once.
@@ -302,7 +315,7 @@ __device__ void scatter_windows(const TileBinInput& in, const Scatter& to, const
                                 const LargePart& part, WindowRuns& runs) {
     const FrameImage& image = in.images[batch.image];
     const unsigned lane = threadIdx.x % 32, mine = lane % kLargeAtOnce;
-    const Record<float> r = load_record(in.records + batch.record);
+    const Record<float> r = load_record(in.records, batch.record, batch.box);
     const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
     const EntryBox box = entry_box(r);
     for_each_window(in, batch, part, runs, [&](const LargeRows& window) {

@@ -14,7 +14,7 @@ size_t tile_bin_parts(size_t num_tiles);
 struct TileBinInput {
     const ItemTiles* items;
     const FewTiles* few;  // of each record, or kManyTiles where it is in `large`
-    const Record<float>* records;
+    RecordPlanes records;
     const FrameImage* images;
     uint32_t num_images, num_tiles;
     Capacity capacity;
