@@ -20,8 +20,9 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kWarps = 8;
-constexpr unsigned kBlocks = 4;  // on a multiprocessor
-constexpr unsigned kQueue = 64;  // fewer than 32 wait when 32 come
+constexpr unsigned kBlocks = 4;        // on a multiprocessor
+constexpr unsigned kQueue = 64;        // fewer than 32 wait when 32 come
+constexpr unsigned kMostWaiting = 64;  // large records, of which fewer than 32 wait when 32 come
 
 // A gaussian in front of the camera.
 struct Queued {
@@ -34,10 +35,10 @@ template <class Model>
 struct WarpSpace {
     ItemTables<Model> tables;
     alignas(16) Queued queue[kQueue];
-    float4 ellipses[kEllipseVectors * 32];  // of records on their way out: written by lane, read in a row,
-    float2 rests[32];                       // as RecordPlanes has them
-    unsigned num_large;                     // of the item's records so far,
-    uint8_t large[kItemSize];               // and which they are
+    float4 ellipses[kEllipseVectors * 32];  // of records on their way out: written by lane, read in a row
+    RecordBox boxes[kMostWaiting];          // of the item's large records that wait,
+    uint8_t large[kMostWaiting];            // which they are,
+    unsigned num_large;                     // and how many
 };
 
 // What is known of a gaussian from the sphere around it.
@@ -102,13 +103,40 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
-// A box as a word, and back.
-__device__ FewTiles word_of(const RecordBox& box) {
-    return FewTiles(box.x0) | FewTiles(box.x1) << 16 | FewTiles(box.y0) << 32 | FewTiles(box.y1) << 48;
-}
-__device__ RecordBox box_of_word(FewTiles word) {
-    return {static_cast<uint16_t>(word), static_cast<uint16_t>(word >> 16), static_cast<uint16_t>(word >> 32),
-            static_cast<uint16_t>(word >> 48)};
+// Writes the item's large records that wait: in whole batches, of which the last is filled up at the end of
+// the item and waits for more before.
+template <class Model>
+__device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, const ProjectOutput& out,
+                            bool is_end) {
+    const unsigned num_large = space.num_large, lane = threadIdx.x % 32;
+    const unsigned num_batches = is_end ? blocks_for(num_large, kLargeAtOnce) : num_large / kLargeAtOnce;
+    if (num_batches == 0) return;
+    const unsigned count = num_batches * kLargeAtOnce;
+    unsigned long long place = 0;
+    if (lane == 0) place = atomicAdd(&counters.large, static_cast<unsigned long long>(count));
+    place = __shfl_sync(kAllLanes, place, 0);
+    for (unsigned k = lane; k < count; k += 32) {
+        LargeRecord large{kNoRecord, space.tables.placement.image, {}};
+        if (k < num_large) {
+            large.record = space.tables.item.record + space.large[k];
+            large.box = space.boxes[k];
+        }
+        if (place + k < out.large_capacity) out.large[place + k] = large;
+    }
+    const unsigned left = num_large - min(count, num_large);
+    RecordBox box{};
+    uint8_t which = 0;
+    if (lane < left) {
+        box = space.boxes[count + lane];
+        which = space.large[count + lane];
+    }
+    __syncwarp();
+    if (lane < left) {
+        space.boxes[lane] = box;
+        space.large[lane] = which;
+    }
+    if (lane == 0) space.num_large = left;
+    __syncwarp();
 }
 
 // Writes the records of up to 32 queued gaussians, in their order, and counts them into tiles. Returns how
@@ -116,7 +144,8 @@ __device__ RecordBox box_of_word(FewTiles word) {
 template <class Source, bool kIsShared>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, const Placement* sharers,
                                   const typename Source::Place& start, unsigned head, unsigned count,
-                                  uint32_t first, const ProjectOutput& out, unsigned& num_in_frustum) {
+                                  uint32_t first, FrameCounters& counters, const ProjectOutput& out,
+                                  unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
     Record<float> r;
@@ -132,65 +161,45 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
     if (kept == 0) return 0;
     const unsigned rank = __popc(kept & ((1u << lane) - 1));
     TileBox tiles{0, 0, 1, 0};
+    RecordBox pixels{};
     bool is_large = false;
     if (reaches_pixel) {
         space.ellipses[kEllipseVectors * rank] = {r.u, r.v, r.l11, r.l12};
         space.ellipses[kEllipseVectors * rank + 1] = {r.l22, r.log2_opacity, r.color[0], r.color[1]};
-        space.rests[rank] = {r.color[2], r.depth};
-        const RecordBox pixels{r.x0, r.x1, r.y0, r.y1};
+        reinterpret_cast<float2*>(out.records.rest)[first + rank] = {r.color[2], r.depth};
+        pixels = {r.x0, r.x1, r.y0, r.y1};
         const EntryBox box = entry_box(r);
         tiles = tile_box(box);
         is_large = tiles.count > kFewTiles;
         out.few[first + rank] =
-            is_large ? word_of(pixels) : few_tiles(entry_depth(r.depth, in.image.camera.near_depth), box);
+            is_large ? kManyTiles : few_tiles(entry_depth(r.depth, in.image.camera.near_depth), box);
         if (out.records.box != nullptr) out.records.box[first + rank] = pixels;
         if (is_large) tiles.count = 0;
         if (out.source != nullptr) out.source[first + rank] = g;
     }
     const unsigned large = __ballot_sync(kAllLanes, is_large);
     if (large != 0) {
-        const unsigned before = space.num_large;
-        if (is_large)
-            space.large[before + __popc(large & ((1u << lane) - 1))] =
-                static_cast<uint8_t>(first + rank - in.item.record);
+        const unsigned before = space.num_large, place = before + __popc(large & ((1u << lane) - 1));
+        if (is_large) {
+            space.large[place] = static_cast<uint8_t>(first + rank - in.item.record);
+            space.boxes[place] = pixels;
+        }
         __syncwarp();
         if (lane == 0) space.num_large = before + __popc(large);
     }
     __syncwarp();
+    if (large != 0 && space.num_large >= 32) write_large(space, counters, out, false);
     float4* ellipses = reinterpret_cast<float4*>(out.records.ellipse) + kEllipseVectors * size_t(first);
     const unsigned num_records = __popc(kept);
 #pragma unroll
     for (unsigned w = lane; w < kEllipseVectors * 32; w += 32)
         if (w < kEllipseVectors * num_records) ellipses[w] = space.ellipses[w];
-    if (lane < num_records) reinterpret_cast<float2*>(out.records.rest)[first + lane] = space.rests[lane];
     for (unsigned k = 0; __any_sync(kAllLanes, k < tiles.count); ++k)
         count_tile(out.tiles.count,
                    k < tiles.count
                        ? in.image.first_tile + tiles.row(k) * in.image.tile_columns + tiles.column(k)
                        : kNoTile);
     return num_records;
-}
-
-// The item's large records, in whole batches. Their boxes wait where the scattering kernel looks for few
-// tiles.
-template <class Model>
-__device__ void write_large(const WarpSpace<Model>& space, FrameCounters& counters,
-                            const ProjectOutput& out) {
-    const unsigned num_large = space.num_large;
-    if (num_large == 0) return;
-    const unsigned lane = threadIdx.x % 32, count = blocks_for(num_large, kLargeAtOnce) * kLargeAtOnce;
-    unsigned long long place = 0;
-    if (lane == 0) place = atomicAdd(&counters.large, static_cast<unsigned long long>(count));
-    place = __shfl_sync(kAllLanes, place, 0);
-    for (unsigned k = lane; k < count; k += 32) {
-        LargeRecord large{kNoRecord, space.tables.placement.image, {}};
-        if (k < num_large) {
-            large.record = space.tables.item.record + space.large[k];
-            large.box = box_of_word(out.few[large.record]);
-            out.few[large.record] = kManyTiles;
-        }
-        if (place + k < out.large_capacity) out.large[place + k] = large;
-    }
 }
 
 // Whose tables a warp has.
@@ -268,13 +277,13 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         if (waiting < 32 && first + kRound < count) continue;
         // After the last there may be two rounds left.
         const unsigned taken = min(waiting, 32u);
-        written += write_records<Source, kIsShared>(space, sharers, start, head, taken,
-                                                    tables.item.record + written, out, num_in_frustum);
+        written += write_records<Source, kIsShared>(
+            space, sharers, start, head, taken, tables.item.record + written, counters, out, num_in_frustum);
         head += taken;
         waiting -= taken;
         __syncwarp();  // before the queue and the records are written again
     }
-    write_large(space, counters, out);
+    write_large(space, counters, out, true);
     return written;
 }
 
