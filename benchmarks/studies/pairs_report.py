@@ -17,6 +17,7 @@ from benchmarks.evaluation.markdown import Column, count_text, markdown
 Row = dict[str, Any]
 
 _OURS = ("ours", "merged")
+_COLUMNS = 3
 _STYLES = {
     "ours": ("o-", "tab:blue", "ours"),
     "merged": ("s--", "tab:cyan", "ours, merged only"),
@@ -172,41 +173,58 @@ def report(options: Report) -> None:
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:
-    """Count against FLIP and PSNR, a column for each size."""
+    """Count against FLIP, and below it PSNR, for each size: three sizes side by side, as wide as a page."""
     import matplotlib
 
     matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
     factors = sorted({row["factor"] for row in rows})
+    blocks = -(-len(factors) // _COLUMNS)
     figure, axes = pyplot.subplots(
-        2, len(factors), figsize=(2.7 * len(factors), 5.2), sharex=True, sharey="row", squeeze=False
+        2 * blocks,
+        _COLUMNS,
+        figsize=(9, 0.9 + 4.6 * blocks),
+        sharex=True,
+        squeeze=False,
+        layout="constrained",
     )
-    for column, factor in enumerate(factors):
-        for line, key in enumerate(("flip", "psnr")):
-            panel = axes[line][column]
-            for method, (style, color, label) in _STYLES.items():
-                points = sorted(
-                    (row["count"], row[key])
-                    for row in rows
-                    if row["method"] == method and row["factor"] == factor and row[key] is not None
-                )
-                if points:
-                    panel.plot(
-                        *zip(*points, strict=True), style, color=color, label=label, markersize=4, lw=1.3
-                    )
-            panel.set_xscale("log")
-            panel.grid(alpha=0.3, which="both", lw=0.5)
-        axes[0][column].set_yscale("log")
-        axes[0][column].set_title(f"{factor:g} times its own size", fontsize=10)
-        axes[1][column].set_xlabel("gaussians")
-    axes[0][0].set_ylabel("FLIP (less is better)")
-    axes[1][0].set_ylabel("PSNR, dB (more is better)")
+    for line, (key, label) in enumerate(
+        (("flip", "FLIP (less is better)"), ("psnr", "PSNR, dB (more is better)"))
+    ):
+        panels = axes[line::2].ravel()
+        for panel, factor in zip(panels, factors, strict=False):
+            _draw(panel, [row for row in rows if row["factor"] == factor], key)
+            panel.sharey(panels[0])
+            panel.label_outer()
+            panel.set_title(f"{factor:g} times its own size", fontsize=10)
+        for panel in panels[len(factors) :]:
+            panel.set_axis_off()
+        if key == "flip":
+            panels[0].set_yscale("log")
+            panels[0].yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5), numticks=12))
+            panels[0].yaxis.set_major_formatter("{x:g}")
+            panels[0].yaxis.set_minor_formatter(ticker.NullFormatter())
+        for panel in panels[::_COLUMNS]:
+            panel.set_ylabel(label)
+    for panel in axes[-1]:
+        panel.set_xlabel("gaussians")
+        panel.xaxis.set_major_formatter(lambda x, _: count_text(int(x)))
     total = max((row["gaussians"] for row in rows if row["method"] == "all"), default=0)
     of = f" of {count_text(total)} gaussians" if total else ""
-    figure.suptitle(f"{rows[0]['asset']}{of}", fontsize=11)
-    handles, labels = axes[0][-1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9, frameon=False)
-    figure.tight_layout(rect=(0, 0.05, 1, 1))
+    figure.suptitle(f"{rows[0]['asset']}{of}", fontsize=12)
+    figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=10)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
+
+
+def _draw(panel: Any, rows: Sequence[Row], key: str) -> None:
+    """The points of each method, at one size."""
+    for method, (style, color, label) in _STYLES.items():
+        points = sorted(
+            (row["count"], row[key]) for row in rows if row["method"] == method and row[key] is not None
+        )
+        if points:
+            panel.plot(*zip(*points, strict=True), style, color=color, label=label, markersize=4, lw=1.3)
+    panel.set_xscale("log")
+    panel.grid(alpha=0.3, which="both", lw=0.5)
