@@ -1,4 +1,4 @@
-"""`v3dg export`: scenes and bundles as web pages; tests/export_browser.py opens them in a browser."""
+"""`v3dg export`: scenes and bundles as web pages; tests/test_export_browser.py opens them in a browser."""
 
 import json
 import os
@@ -8,7 +8,7 @@ import pytest
 
 import v3dg
 from command_line import fails, run
-from random_bundle import random_bundle
+from random_bundle import random_bundle, random_gaussians
 from v3dg.export import write_site
 from v3dg.rotations import rotation_from_quaternion
 
@@ -115,9 +115,11 @@ def test_the_command_says_how_to_look_at_it(place):
 
 def test_bad_input_is_named_and_nothing_is_left(place):
     (place / "town.txt").touch()
+    v3dg.write_asset("asset.ply", random_gaussians(np.random.default_rng(0), 5))
     before = sorted(os.listdir(place))
     fails(2, "--chunk: expected at least 1, got 0", "export", "a b1.v3dg", "--chunk", "0", cwd=place)
-    fails(1, "expected a file ending in .v3dg, .json", "export", "town.txt", cwd=place)
+    fails(1, "expected a file ending in", "export", "town.txt", cwd=place)
+    fails(1, "got an asset; make one of it: v3dg build asset.ply", "export", "asset.ply", cwd=place)
     fails(1, "chunk: expected at least", "export", "a b1.v3dg", "-o", "x/y", "--chunk", "1", cwd=place)
     with pytest.raises(ValueError, match="scene: expected instances to export, got none"):
         write_site(v3dg.Scene(), "site")

@@ -240,3 +240,6 @@ def test_a_world_is_known_to_the_command_line(tmp_path):
     done = run("info", "a.usdc", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["instances"] == 2
+    done = run("export", "a.usdc", "--to", "tiles", "--json", "--quiet", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["instances"] == 2

@@ -112,7 +112,7 @@ def run(options: Compare) -> None:
     if mean["flip"] is None:
         lines.append(FLIP_MISSING)
     if finest is not None and all(row["gaussians_selected"] == finest for row in rows):
-        lines.append("every view needs the finest level; `--size 100 100` shows the test as from far away")
+        lines.append("every view needs the finest level; a smaller `--size` shows the test as from far away")
     _common.print_result(options.json, result, lines)
 
 

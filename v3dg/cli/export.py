@@ -11,13 +11,12 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from v3dg import export
-from v3dg.bundle import Bundle
-from v3dg.cameras import Axis, Camera
-from v3dg.cli._common import Common, bytes_text, check_usage, option, print_result, require_file
+from v3dg.cameras import Axis
+from v3dg.cli._common import Common, bytes_text, check_usage, option, print_result, require_subject
 from v3dg.cli._views import up_lines
 from v3dg.formats.usd import SUFFIXES as USD_SUFFIXES
-from v3dg.scene import Scene
-from v3dg.scene.file import read_scene
+from v3dg.gaussians import Gaussians
+from v3dg.opening import open_with_cameras
 from v3dg.upright import up_of
 
 
@@ -26,7 +25,7 @@ class Export(Common):
     """Write a scene or a bundle as a page for the web, as 3D Tiles, or as OpenUSD (docs/formats.md)."""
 
     subject: tyro.conf.Positional[Path]
-    """A scene (.json) or a bundle (.v3dg)."""
+    """A scene (.json), a bundle (.v3dg), or a world of OpenUSD."""
     output: Annotated[Path | None, option("FOLDER", "-o")] = None
     """Folder to write, made with those above it; the subject's name with _web if not given. With a name that
     ends in .usd, .usda or .usdc, the file to write."""
@@ -39,11 +38,14 @@ class Export(Common):
 
 
 def run(options: Export) -> None:
-    require_file(options.subject, ".v3dg", ".json")
+    require_subject(options.subject)
     check_usage("--chunk", options.chunk >= 1, f"at least 1, got {options.chunk}")
     folder = options.output or options.subject.with_name(f"{options.subject.stem}_web")
     start = time.perf_counter()
-    subject, cameras = _read(options.subject)
+    subject, cameras = open_with_cameras(options.subject)
+    if isinstance(subject, Gaussians):
+        expected = f"expected a scene or a bundle, got an asset; make one of it: v3dg build {options.subject}"
+        raise ValueError(f"{options.subject}: {expected}")
     up = options.up or up_of(subject, cameras, options.subject)[0]
     notes = up_lines(options.up, subject, cameras, path=options.subject)
     if folder.suffix.lower() in USD_SUFFIXES:
@@ -71,7 +73,3 @@ def run(options: Export) -> None:
         lines += ["it needs its engine beside it, once:", *(f"  {line.format(there)}" for line in needs)]
     lines += [f"to look at it: python -m http.server --bind 127.0.0.1 --directory {there}"]
     print_result(options.json, result, [*lines, "  then open http://127.0.0.1:8000/"])
-
-
-def _read(path: Path) -> tuple[Scene | Bundle, dict[str, Camera]]:
-    return (Bundle.open(path), {}) if path.suffix == ".v3dg" else read_scene(path)
