@@ -153,15 +153,19 @@ export class Overlay {
     context.clearRect(0, 0, 80, 80);
     const turned = M.inverse(this.app.camera.wxyz);
     const axes = ["x", "y", "z"].map((name, i) => [name, M.rotate(turned, AXES[name]), COLORS[i]]);
-    context.font = "11px system-ui";
+    context.font = "bold 12px system-ui";
+    context.lineJoin = "round";
     context.textAlign = "center";
     context.textBaseline = "middle";
     for (const [name, [x, y], color] of axes.sort((a, b) => b[1][2] - a[1][2])) {
-      context.strokeStyle = context.fillStyle = color;
-      context.lineWidth = 2;
       context.beginPath();
       context.moveTo(40, 40);
       context.lineTo(40 + 20 * x, 40 + 20 * y);
+      // A dark edge, to be seen on bright pictures, too.
+      [context.strokeStyle, context.lineWidth] = ["#000c", 5];
+      context.stroke();
+      context.strokeText(name, 40 + 28 * x, 40 + 28 * y);
+      [context.strokeStyle, context.lineWidth, context.fillStyle] = [color, 2, color];
       context.stroke();
       context.fillText(name, 40 + 28 * x, 40 + 28 * y);
     }
