@@ -17,7 +17,6 @@ from v3dg.viewer.server import Site
 
 FOLDER = Path(__file__).parent
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
-BARE = "#modes, #status, #compass, #refined { display: none }"
 MODES = (
     *("Colour", "Level", "Cluster", "Error", "Depth", "Alpha"),
     *("Gaussians per pixel", "Difference to all gaussians"),
@@ -97,9 +96,8 @@ def shot(page: Page) -> Image.Image:
 
 
 def shown(page: Page) -> Image.Image:
-    """The picture, without the buttons that lie over it."""
     box = page.locator("#stage").bounding_box()
-    return Image.open(io.BytesIO(page.screenshot(clip=box, style=BARE))).resize(
+    return Image.open(io.BytesIO(page.screenshot(clip=box))).resize(
         (360, round(360 * box["height"] / box["width"]))
     )
 
