@@ -1,7 +1,8 @@
 """Files that we write, in the engines of others, in Chromium: each draws what we draw.
 
-They need playwright, Chromium where PATH finds it, and the environment variable NODE_MODULES, which names the folder that
-`npm install playcanvas@2.23.3 three@0.187.0 @sparkjsdev/spark@2.2.0 babylonjs@9.28.0 babylonjs-loaders@9.28.0 @adobe/spz@0.2.2 fflate@0.8.3` makes.
+They need playwright, Chromium where PATH finds it, and the environment variable NODE_MODULES, which names the
+folder that `npm install playcanvas@2.23.3 three@0.187.0 @sparkjsdev/spark@2.2.0 babylonjs@9.28.0
+babylonjs-loaders@9.28.0 @adobe/spz@0.2.2 fflate@0.8.3` makes.
 With SCREENSHOTS, the name of a folder, the pictures are left there, ours beside them.
 """
 
@@ -36,9 +37,11 @@ SIDE, FOV = 300, 40
 EYE = (0.18, -0.38, 0.30)  # of the donut, whose z is up
 
 # Each page looks from EYE at the origin, with z up, and counts the pictures since its asset was there.
-HEAD = """<!doctype html><style>body { margin: 0; overflow: hidden } canvas { width: 100vw; height: 100vh; display: block }</style>
+HEAD = """<!doctype html>
+<style>body { margin: 0; overflow: hidden } canvas { width: 100vw; height: 100vh; display: block }</style>
 <canvas id="canvas"></canvas>
-<script>const file = "FILE", eye = EYE, canvas = document.getElementById("canvas"); window.frames_shown = 0;</script>
+<script>const file = "FILE", eye = EYE, canvas = document.getElementById("canvas");
+window.frames_shown = 0;</script>
 """
 PAGES = {
     "playcanvas": """<script type="module">
@@ -78,7 +81,8 @@ import * as THREE from "three";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 const renderer = new THREE.WebGLRenderer({ canvas });
 renderer.setSize(innerWidth, innerHeight);
-const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera(FOV, innerWidth / innerHeight, 0.01, 100);
+const scene = new THREE.Scene();
+const camera = new THREE.PerspectiveCamera(FOV, innerWidth / innerHeight, 0.01, 100);
 scene.add(new SparkRenderer({ renderer }));
 camera.up.set(0, 0, 1);
 camera.position.set(...eye);
@@ -96,7 +100,8 @@ const engine = new BABYLON.Engine(canvas, false), scene = new BABYLON.Scene(engi
 scene.clearColor = new BABYLON.Color4(0, 0, 0, 1);
 const glb = file.endsWith(".glb");
 scene.useRightHandedSystem = glb;
-const camera = new BABYLON.FreeCamera("camera", new BABYLON.Vector3(eye[0], glb ? eye[1] : -eye[1], eye[2]), scene);
+const place = new BABYLON.Vector3(eye[0], glb ? eye[1] : -eye[1], eye[2]);
+const camera = new BABYLON.FreeCamera("camera", place, scene);
 camera.upVector = new BABYLON.Vector3(0, 0, 1);
 camera.setTarget(BABYLON.Vector3.Zero());
 camera.fov = FOV * Math.PI / 180;
@@ -105,7 +110,8 @@ const local = (path) => new URL("modules/" + path, location).href;
 const splat = { deflateURL: local("fflate/umd/index.js"), spzLibraryUrl: local("@adobe/spz/dist/spz.js") };
 if (file.endsWith(".json")) {
   const folder = new URL(file, location), index = await (await fetch(folder)).json();
-  const streamed = new BABYLON.GaussianSplattingStream("streamed", index, new URL(".", folder).href, scene, splat);
+  const root = new URL(".", folder).href;
+  const streamed = new BABYLON.GaussianSplattingStream("streamed", index, root, scene, splat);
   streamed.rotation.x = 0;  // It turns an asset, so that y is up.
 } else {
   await BABYLON.ImportMeshAsync(file, scene, { pluginOptions: { splat } });
