@@ -44,6 +44,12 @@ def scene_of(rng, *, sh_degree=0):
     return scene
 
 
+def partly_there(rng, scene):
+    """Of each bundle: which pages are there, and where."""
+    there = [closed_residency(rng, bundle) for bundle in scene.bundles]
+    return there, [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
+
+
 def a_tolerance(rng, scene, camera):
     """The metric of some group, or about that."""
     metrics = np.concatenate(group_metrics(scene, camera))
@@ -82,8 +88,7 @@ def test_groups_are_refined_as_far_as_their_pages_have_faded_in(seed, fade):
     scene = scene_of(rng)
     camera = random_camera(rng)
     tolerance = a_tolerance(rng, scene, camera)
-    there = [closed_residency(rng, bundle) for bundle in scene.bundles]
-    shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
+    there, shifts = partly_there(rng, scene)
     begins, frames = zip(*(random_begins(rng, bundle) for bundle in scene.bundles), strict=True)
     frame = int(rng.choice(frames))
     one = rule(tolerance, fade=fade, cull=False, frame=frame)
@@ -133,8 +138,7 @@ def test_cut_refines_what_is_wanted_and_there(seed):
     scene = scene_of(rng)
     camera, min_level = random_camera(rng), int(rng.integers(0, 3))
     tolerance = a_tolerance(rng, scene, camera)
-    there = [closed_residency(rng, bundle) for bundle in scene.bundles]
-    shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
+    there, shifts = partly_there(rng, scene)
     cut = resident_scene(scene, shifts).select(camera.core, rule(tolerance, None, min_level, cull=False))
     expected = []
     for i, metrics in enumerate(group_metrics(scene, camera)):
@@ -206,8 +210,7 @@ def test_needs_are_what_the_cut_draws_or_misses(seed, fade):
     scene = scene_of(rng)
     camera = random_camera(rng)
     one = rule(a_tolerance(rng, scene, camera), fade=fade)
-    there = [closed_residency(rng, bundle) for bundle in scene.bundles]
-    shifts = [random_shift(rng, b, t)[0] for b, t in zip(scene.bundles, there, strict=True)]
+    _, shifts = partly_there(rng, scene)
     core = resident_scene(scene, shifts)
     cut, needs = core.select(camera.core, one), core.page_needs(camera.core, one)
     for i, c in zip(cut.instance_ids, cut.cluster_ids, strict=True):
