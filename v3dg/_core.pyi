@@ -148,22 +148,13 @@ def encode_page(gaussians: Rows, offset: Int64) -> Int32: ...
 def decode_page(page: Int32, offset: Int64, out: Rows) -> None: ...
 
 # pages
+DAMAGED: str
+
 def read_pages(
     path: str,
     descriptor: int,
-    out: Rows,
+    out: Rows | Int32,
     codec: str,
-    hashes: Uint8,
-    *,
-    first_page: int,
-    first_cluster: Int64,
-    offset: Int64,
-    places: Int64,
-) -> None: ...
-def read_codes(
-    path: str,
-    descriptor: int,
-    words: Int32,
     hashes: Uint8,
     *,
     first_page: int,

@@ -43,16 +43,13 @@ void naming_file(const py::object& path, const Body& body) {
     }
 }
 
-void read_rows(const py::object& path, int descriptor, const Rows& out, const std::string& codec,
-               const py::array& hashes, size_t first_page, const py::array& first_cluster,
-               const py::array& offset, const py::array& places) {
-    const PageRun run = run_of(hashes, first_page, first_cluster, offset, places);
+void read_rows(const py::object& path, int descriptor, const PageRun& run, PageCodec codec, const Rows& out) {
     const GaussianRows<float> rows = out.write();
     const auto count = static_cast<size_t>(run.offset[run.offset.size - 1] - run.offset[0]);
     if (!out.device().is_host() || rows.size != count)
         throw py::value_error("out: expected " + std::to_string(count) +
                               " gaussians on the host, got others");
-    const bool is_quantized = codec == "quantized";
+    const bool is_quantized = codec == PageCodec::quantized;
     for (size_t page = 0; page < run.size(); ++page) {
         const Span<const int64_t> clusters = run.clusters(page);
         const auto size = static_cast<size_t>(clusters[clusters.size - 1] - clusters[0]);
@@ -64,19 +61,26 @@ void read_rows(const py::object& path, int descriptor, const Rows& out, const st
     }
     naming_file(path, [&] {
         const PosixFile file = PosixFile::duplicate(descriptor);
-        read_pages(file, run, is_quantized ? PageCodec::quantized : PageCodec::float32, rows);
+        read_pages(file, run, codec, rows);
     });
 }
 
-void read_words(const py::object& path, int descriptor, const py::array& words, const py::array& hashes,
-                size_t first_page, const py::array& first_cluster, const py::array& offset,
-                const py::array& places) {
-    const PageRun run = run_of(hashes, first_page, first_cluster, offset, places);
+void read_words(const py::object& path, int descriptor, const PageRun& run, const py::array& out) {
     const int64_t num_bytes = run.places[run.size()] - run.places[0];
     if (num_bytes % 4 != 0)
         throw py::value_error("places: expected whole words, got " + std::to_string(num_bytes) + " bytes");
-    const Span<int32_t> out = span_of<int32_t>(words, "words", {static_cast<py::ssize_t>(num_bytes / 4)});
-    naming_file(path, [&] { read_codes(PosixFile::duplicate(descriptor), run, out); });
+    const Span<int32_t> words = span_of<int32_t>(out, "out", {static_cast<py::ssize_t>(num_bytes / 4)});
+    naming_file(path, [&] { read_codes(PosixFile::duplicate(descriptor), run, words); });
+}
+
+// `out` is rows, which are decoded, or an array of words, which are not.
+void read_run(const py::object& path, int descriptor, const py::object& out, const std::string& codec,
+              const py::array& hashes, size_t first_page, const py::array& first_cluster,
+              const py::array& offset, const py::array& places) {
+    const PageRun run = run_of(hashes, first_page, first_cluster, offset, places);
+    if (py::isinstance<py::array>(out)) return read_words(path, descriptor, run, out.cast<py::array>());
+    const PageCodec of = codec == "quantized" ? PageCodec::quantized : PageCodec::float32;
+    read_rows(path, descriptor, run, of, held<Rows>(out, "out"));
 }
 
 // With the arrays that it reads to and hashes.
@@ -120,12 +124,12 @@ void bind_pages(py::module_& m) {
         .def("wait", &BoundHashedRead::wait, "Waits until out is filled; whether the file has so much.")
         .def("digest", &BoundHashedRead::digest,
              "BLAKE2b-128 of what is in before and out together, once they are filled.");
-    m.def("read_pages", &read_rows, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a, py::kw_only(),
-          "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,
-          "Fills rows with the gaussians of neighbouring pages of a file, which have these hashes (n, 16).");
-    m.def("read_codes", &read_words, "path"_a, "descriptor"_a, "words"_a, "hashes"_a, py::kw_only(),
-          "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,
-          "Fills words (W,) int32 with neighbouring pages of codes, which have these hashes (n, 16).");
+    m.attr("DAMAGED") = kDamaged;
+    m.def(
+        "read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a, py::kw_only(),
+        "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,
+        "Fills rows with the gaussians of neighbouring pages of a file, which have these hashes (n, 16), or "
+        "an array of words (W,) int32 with what the pages are as they are.");
 }
 
 }  // namespace v3dg

@@ -21,7 +21,7 @@ from v3dg._numbers import check
 from v3dg.bundle import format as file_format
 from v3dg.bundle.codec import CODECS, Codec
 from v3dg.bundle.format import DTYPES, HASH_BYTES, entries_of, page_hash, page_tables, schema_of
-from v3dg.bundle.pages import DAMAGED, PageLayout, PageRun, on_threads
+from v3dg.bundle.pages import PageLayout, PageRun, on_threads
 from v3dg.bundle.tables import Clusters, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
@@ -204,7 +204,7 @@ class BundleFile:
     def verify(self) -> None:
         """Compare header and tables with the file's own hash, once, for which this waits; ValueError."""
         if self._reading.digest() != self._stored.tobytes():
-            self._fail(f"hash: the header and tables do not match it; {DAMAGED}")
+            self._fail(f"hash: the header and tables do not match it; {_core.DAMAGED}")
         del self._reading
 
     def _read(self, out: NDArray[np.uint8], offset: int) -> None:
@@ -234,5 +234,5 @@ class BundleFile:
         """The words of a run of quantised pages, verified."""
         words = np.empty((run.places[-1] - run.places[0]) // 4, np.int32)
         hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
-        _core.read_codes(self.path, self._fd, words, hashes, **vars(run))
+        _core.read_pages(self.path, self._fd, words, self.codec.name, hashes, **vars(run))
         return words

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _THREADS = 8
-DAMAGED = "the file is damaged, copy or build it again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +154,7 @@ class FilePages:
         try:
             return CodePages(self.layout, words, self.codec)
         except ValueError as error:
-            raise ValueError(f"{self._file.path}: {error}; {DAMAGED}") from None
+            raise ValueError(f"{self._file.path}: {error}; {_core.DAMAGED}") from None
 
     def _read(self, first_page: int, last_page: int) -> Gaussians:
         return self._file.read_pages(self.layout.run(first_page, last_page, self._file.places))
