@@ -305,6 +305,20 @@ def test_settling_ends_what_fades_in(scene, device):
             assert_same(renderer.render(camera, **options), whole.render(camera, **options))
 
 
+def test_what_is_read_since_settling_does_not_fade_in(scene, device):
+    """It comes with the next picture, and with that it is all there."""
+    renderer = Renderer(scene, device=device, memory="64MB")
+    pool = renderer._frame._pool.core
+    options = {"budget": None, "min_level": 0, "fade": 1.05, **FINE}
+    renderer._frame.settle(scene, CAMERA, seconds=0.0, **options)
+    while not pool.wait(1.0):
+        pass
+    assert renderer.render(CAMERA, **options).stats.bytes_in > 0
+    there = pool.resident(0)
+    assert there.sum() > 1
+    assert (pool.arrived(0)[there] == 8).all()
+
+
 def test_without_a_fade_pages_are_there_at_once(scene, device, monkeypatch):
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     _, arrived = film_of_arriving_pages(scene, device, FINE)

@@ -60,18 +60,15 @@ class Pool:
         core.reset_tolerance()
         last, known, end = time.monotonic(), -1, time.monotonic() + seconds
 
-        def ask() -> float:
-            with residency.lock if resident.device.is_cuda else nullcontext():  # it stays as it is
-                return core.ask(resident.core, *view)
-
         while True:
-            tolerance, status = ask(), core.status()
+            with residency.lock if resident.device.is_cuda else nullcontext():  # it stays as it is
+                tolerance = core.ask(resident.core, *view)
+            status = core.status()
             if status.failed:
                 raise (ValueError if status.is_damage else OSError)(status.error)
             if core.raise_tolerance(tolerance):
                 continue
             if not status.missing or time.monotonic() > end:
-                ask()  # takes what has been read since, which would fade in with the next picture
                 return
             if status.pages_in != known:
                 last, known = time.monotonic(), status.pages_in

@@ -77,7 +77,7 @@ struct PagePool::State {
     std::atomic<float> least_tolerance{0};
 
     // Of frames.
-    bool has_begun = false;
+    bool has_begun = false, has_looked = false;  // has_looked: the frame before was not bounded
     float least_of_frame = 0;
     std::vector<PageChange> changes;
     std::vector<unsigned char*> taken, returned;  // blocks of those changes; blocks to be used again
@@ -473,7 +473,8 @@ const std::vector<PageChange>& PagePool::begin_frame(bool is_bounded, Arrive arr
     State& state = *state_;
     state.least_of_frame = state.least_tolerance;
     if (std::exchange(state.has_begun, true)) state.take_changes(is_bounded);  // else the coarsest
-    state.arrivals.advance(state.changes, is_bounded ? arrive : Arrive::at_once);
+    const bool is_after_look = std::exchange(state.has_looked, !is_bounded);
+    state.arrivals.advance(state.changes, is_bounded && !is_after_look ? arrive : Arrive::at_once);
     return state.changes;
 }
 

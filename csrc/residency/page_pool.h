@@ -79,7 +79,8 @@ class PagePool {
 
     // Begins a frame: what comes and goes before it, in this order. The first time the coarsest pages come.
     // Their bytes stay until release() or the next call. A bounded frame waits for nothing; one that is not
-    // takes all that was read, and waits until that is decided, and ends all that fades in.
+    // takes all that was read, and waits until that is decided, and ends all that fades in, as the next one
+    // does: what was read since comes in with that.
     const std::vector<PageChange>& begin_frame(bool is_bounded, Arrive arrive = Arrive::at_once);
     void set_most_bytes_a_frame(size_t bytes);
     void release();
