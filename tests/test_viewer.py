@@ -165,7 +165,9 @@ def test_count_is_of_the_gaussians_that_a_pixel_is_blended_of(opacities, count):
     camera = AXIS.camera(33, 33, 0.01)
     cut = v3dg.select(scene_view.scene, camera, device="cpu")
     window = (0, 0, 33, 33)
-    _, _, counts, in_view = scene_view._values("count_cut", cut, camera, window, None, "appearance")
+    _, _, counts, in_view = scene_view._values(
+        _core.SceneFrame.count_cut, cut, camera, window, None, "appearance"
+    )
     assert counts[16, 16] == count
     assert in_view == len(opacities)
     alpha = v3dg.render(scene_view.scene, camera, device="cpu").alpha

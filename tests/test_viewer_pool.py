@@ -2,14 +2,16 @@
 
 import math
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import v3dg.pool
 from scenes_lod import blob, lod_bundle
-from v3dg import Bundle, Scene, _core
+from v3dg import Bundle, Renderer, Scene, _core, pick
 from v3dg.pictures import to_8bit
+from v3dg.pool import Pool
 from v3dg.viewer.frame import SceneView, Settings
 from v3dg.viewer.pacing import RenderLoop, Request
 from v3dg.viewer.view import look_at
@@ -66,15 +68,119 @@ def test_residency_shows_what_is_missing_until_it_is_there(scene):
     assert (first.pixels[..., 0] > first.pixels[..., 2] + 20).any()  # yellow or red
 
 
-def test_what_a_pool_cannot_show_is_not_offered(scene):
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Settings(shows="difference", tolerance=4.0),
+        Settings(shows="error"),
+        Settings(shows="count", fade=None),
+        Settings(split=0.4),
+        Settings(split=1.0),
+        Settings(split=0.4, shows="difference", budget=3000),
+        Settings(frozen=ASIDE),
+        Settings(frozen=ASIDE, shows="error", fade=None),
+    ],
+    ids=lambda s: f"{s.shows}-{s.split}-{'frozen' if s.frozen else 'free'}",
+)
+def test_what_is_compared_frozen_and_measured_is_that_of_all(scene, settings):
     whole, pooled = SceneView(scene, device="cpu", memory=None), SceneView(scene, device="cpu", memory="64MB")
-    assert "residency" not in whole.modes
-    assert "error" in whole.modes
-    assert set(pooled.modes) == {"appearance", "level", "cluster", "residency", "depth", "alpha"}
-    expected = pooled.frame(VIEW, SIZE, Settings(), None, None, math.inf)
-    for settings in (Settings(shows="difference"), Settings(split=0.5), Settings(frozen=ASIDE)):
+    assert set(pooled.modes) == {*whole.modes, "residency"}
+    assert pooled.shows_cuts
+    expected = whole.frame(VIEW, SIZE, settings)
+    frame = pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
+    np.testing.assert_array_equal(frame.pixels, expected.pixels)
+    np.testing.assert_array_equal(frame.figures.levels, expected.figures.levels)
+    assert frame.figures.missing == 0
+    assert frame.figures.tolerance == expected.figures.tolerance
+    assert (frame.value_range, frame.distance) == (expected.value_range, expected.distance)
+    if settings.frozen is not None:  # which is of another camera
+        free = pooled.frame(VIEW, SIZE, replace(settings, frozen=None), None, None, math.inf)
+        assert (free.pixels != frame.pixels).any()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("shows", ["appearance", "depth", "alpha"])
+def test_on_cuda_a_pool_offers_what_its_frames_have(scene, shows):
+    whole, pooled = (SceneView(scene, device="cuda", memory=memory) for memory in (None, "64MB"))
+    assert pooled.modes == ("appearance", "depth", "alpha")
+    assert whole.shows_cuts
+    assert not pooled.shows_cuts
+    for given in ({"tolerance": 1.0}, {"budget": 3000}):
+        settings = Settings(shows=shows, **given)
+        expected = whole.frame(VIEW, SIZE, settings)
         frame = pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
-        np.testing.assert_array_equal(frame.pixels, expected.pixels)
+        np.testing.assert_allclose(frame.pixels.astype(int), expected.pixels.astype(int), atol=1)
+        assert frame.figures.gaussians_selected == expected.figures.gaussians_selected
+        assert (frame.figures.missing, len(frame.figures.levels)) == (0, 0)
+
+
+def test_a_pool_without_room_for_all_compares_with_the_finest_that_it_has_room_for(scene):
+    pooled = SceneView(scene, device="cpu", memory=1_000_000)
+    coarse = Settings(shows="difference", tolerance=500.0, fade=None)
+    frame = pooled.frame(VIEW, SIZE, coarse, None, None, math.inf)
+    assert frame.figures.missing == 0
+    assert frame.figures.tolerance == 500.0
+    assert frame.pixels.any()
+    finest = Settings(shows="difference", tolerance=0.0, fade=None)
+    frame = pooled.frame(VIEW, SIZE, finest, None, None, math.inf)
+    assert frame.figures.tolerance > 0  # there is no room for all
+    assert not frame.pixels.any()  # both are of the same tolerance
+
+
+def test_a_click_finds_what_is_resident(scene):
+    whole, pooled = SceneView(scene, device="cpu", memory=None), SceneView(scene, device="cpu", memory="64MB")
+    settings = Settings(tolerance=0.5, fade=None)
+    places = [(x, y) for x in range(4, SIZE[0], 16) for y in range(4, SIZE[1], 16)]
+    early = [pooled.pick(VIEW, SIZE, *place, settings) for place in places]  # of the coarsest pages
+    assert {pick.level for pick in early if pick is not None} == {pooled.num_levels - 1}
+    pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
+    bytes_in = pooled.pool._frame._pool.core.status().bytes_in
+    found = [pooled.pick(VIEW, SIZE, *place, settings) for place in places]
+    expected = [whole.pick(VIEW, SIZE, *place, settings) for place in places]
+    assert pooled.pool._frame._pool.core.status().bytes_in == bytes_in
+    assert len([pick for pick in found if pick is not None]) > 5
+    for one, other in zip(found, expected, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None:
+            assert (one.instance, one.cluster, one.level) == (other.instance, other.cluster, other.level)
+            assert (one.weight, one.depth) == (other.weight, other.depth)
+
+
+def test_picks_of_a_renderer_without_a_pool_are_refused(scene):
+    camera = VIEW.camera(*SIZE, 0.01)
+    with pytest.raises(ValueError, match="renderer: expected one with a pool on the CPU"):
+        pick(scene, camera, 1, 1, renderer=Renderer(scene, device="cpu", memory=None))
+
+
+def test_a_still_is_cut_once_and_a_settled_one_twice(scene, monkeypatch):
+    """Once to see that nothing is missing, and once to draw."""
+    pooled, settings = SceneView(scene, device="cpu", memory="64MB"), Settings(tolerance=0.5)
+    pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
+    core, asks, selects = pooled.pool._frame._pool, [], []
+    asked = core.core
+
+    class Counting:
+        def __getattr__(self, name):
+            if name == "ask":
+                asks.append(name)
+            return getattr(asked, name)
+
+    settle = Pool.settle
+
+    def counted(pool, *given):
+        pool.core = Counting()
+        try:
+            settle(pool, *given)
+        finally:
+            pool.core = asked
+
+    monkeypatch.setattr(Pool, "settle", counted)
+    monkeypatch.setattr("v3dg.viewer.frame.select_by", lambda *given: selects.append(given))
+    pooled.frame(VIEW, SIZE, settings)
+    assert not asks
+    pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
+    assert len(asks) == 1
+    assert not selects
 
 
 @pytest.fixture

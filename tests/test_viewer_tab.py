@@ -195,14 +195,16 @@ def test_what_cannot_be_drawn_is_explained(blob_view):
         site.close()
 
 
-def test_click_finds_an_instance_and_its_point(site):
+@pytest.mark.parametrize("memory", [None, "64MB"])
+def test_click_finds_an_instance_and_its_point(site, memory):
     (one,) = site.scene.bundles
     scene = v3dg.Scene()
     scene.add(one, positions=[(0, 0, 0), (0, 30, 0), (0, 60, 5)], scales=np.full(3, 2.0))
-    lonely = Site(SceneView(scene, device="cpu"), port=0)
+    lonely = Site(SceneView(scene, device="cpu", memory=memory), port=0)
     try:
         with viewer_client.Tab(lonely.port) as tab:
             tab.look(look_at((-60, 30, 0), (0, 30, 0), (0, 0, 1), 0.9, SIZE[0] / SIZE[1]), SIZE)
+            settled(tab)
             tab.pick(at=(0.5, 0.5))
             wait_for(tab, lambda: "picked" in tab.answers)
             found = tab.answers.pop("picked")

@@ -297,6 +297,8 @@ class FrameStats:
     def select_ms(self) -> float: ...
     @property
     def draw_ms(self) -> float: ...
+    @property
+    def levels(self) -> list[int]: ...
 
 class Picture:
     """The planes of a picture."""
@@ -408,7 +410,7 @@ class Shade:
 class SceneFrame:
     """Draws scenes of the same bundles on one device."""
 
-    def __init__(self, device: int, moves: bool = False) -> None: ...
+    def __init__(self, device: int) -> None: ...
     def set_models(self, models: list[Model], palettes: list[Palette]) -> None: ...
     def draw(
         self,
@@ -417,6 +419,7 @@ class SceneFrame:
         rule: Rule,
         shade: Shade,
         stop: Stop | None = None,
+        steps: BudgetSteps | None = None,
     ) -> Drawing: ...
     def memory(self) -> dict[str, int]: ...
     def draw_resident(
@@ -427,9 +430,16 @@ class SceneFrame:
         rule: Rule,
         shade: Shade,
         stop: Stop | None = None,
+        steps: BudgetSteps | None = None,
+        *,
+        shows: str = "appearance",
         colors: list[Float32] = ...,
-        shows_missing: bool = False,
+        chooser: Camera | Eyes | None = None,
+        aside: bool = False,
     ) -> Drawing: ...
+    def pick_resident(
+        self, scene: ResidentScene, pool: PagePool, camera: Camera, rule: Rule
+    ) -> tuple[int, int, float, float] | None: ...
     def draw_cut(
         self,
         scene: ResidentScene,
@@ -463,7 +473,7 @@ class SceneFrame:
     ) -> Drawing: ...
     def pick_cut(
         self, scene: ResidentScene, camera: Camera, instance_ids: Int32, cluster_ids: Int32
-    ) -> tuple[int, float, float] | None: ...
+    ) -> tuple[int, int, float, float] | None: ...
 
 class AssetFrame:
     """Draws gaussians without levels on the device that they are on."""

@@ -63,6 +63,7 @@ class Stats:
             which it is met; 0 for an asset.
         select_ms: Time to choose the clusters.
         draw_ms: Time to draw them.
+        levels: Gaussians selected, by level; empty on CUDA, of an asset and of a cut that was given.
         missing: Pages that the picture misses, in place of which coarser ones are drawn; 0 where all is
             resident, or the renderer has settled. This and the next as far as is known.
         failed: Pages that cannot be read.
@@ -75,6 +76,7 @@ class Stats:
     tolerance: float
     select_ms: float
     draw_ms: float
+    levels: tuple[int, ...] = ()
     missing: int = 0
     failed: int = 0
     bytes_in: int = 0

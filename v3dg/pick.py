@@ -12,6 +12,7 @@ from v3dg._device import CPU
 from v3dg._numbers import check, check_type, whole
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
+from v3dg.render import Renderer
 from v3dg.residency import residency
 from v3dg.scene import Scene
 from v3dg.select import rule_of, select
@@ -47,6 +48,7 @@ def pick(
     tolerance: float | None = None,
     budget: int | None = None,
     min_level: int = 0,
+    renderer: Renderer | None = None,
 ) -> Pick | None:
     """Return what pixel (x, y) of the picture that `v3dg.render` draws shows most of; None where it is empty.
 
@@ -56,6 +58,7 @@ def pick(
         x: Column, from 0 at the left.
         y: Row, from 0 at the top.
         tolerance: As for the picture; so are `budget` and `min_level`.
+        renderer: With a pool on the CPU, of the same scene: look at what is resident there, and read nothing.
 
     Raises:
         ValueError: The pixel is not in the image, or another argument is not as in `v3dg.render`.
@@ -70,15 +73,17 @@ def pick(
         tolerance = cut.tolerance
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
     pixel = camera.core.window(x, y, x + 1, y + 1)
-    resident = residency.scene(scene, CPU)
-    pairs = resident.core.select(pixel, rule)
-    frame = _core.SceneFrame(CPU.number)
-    residency.set_models(frame, resident.bundles, CPU, "appearance")
-    found = frame.pick_cut(resident.core, pixel, pairs.instance_ids, pairs.cluster_ids)
+    if renderer is not None:
+        found = renderer._frame.pick(renderer._subject, pixel, rule)
+    else:
+        resident = residency.scene(scene, CPU)
+        pairs = resident.core.select(pixel, rule)
+        frame = _core.SceneFrame(CPU.number)
+        residency.set_models(frame, resident.bundles, CPU, "appearance")
+        found = frame.pick_cut(resident.core, pixel, pairs.instance_ids, pairs.cluster_ids)
     if found is None:
         return None
-    place, weight, depth = found
-    instance, cluster = int(pairs.instance_ids[place]), int(pairs.cluster_ids[place])
+    instance, cluster, weight, depth = found
     level = int(scene.bundles[scene.instance_bundle[instance]].clusters.level[cluster])
     ray = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
     position = camera.position + depth * ray @ camera.viewmat[:3, :3]

@@ -5,12 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
 
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg.build.memory import free_bytes
 from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
+from v3dg.false_color import ColorBy
 from v3dg.residency import ResidentScene, residency
 
 _RESERVE_BYTES = 1 << 30  # at most, for frames, tables and whatever else
@@ -36,6 +39,29 @@ def chosen_bytes(bundles: Sequence[Bundle], device: Device) -> int | None:
         if num_bytes > free - min(free // 4, _RESERVE_BYTES):
             return free_on(device) // 2
     return None
+
+
+@dataclass(frozen=True)
+class PoolLook:
+    """What a picture of a pool shows, and of which cut; anything but "appearance" is for the CPU alone.
+
+    Attributes:
+        shows: Colours as in `v3dg.render`, the share of the tolerance that metrics take as grey, or how many
+            gaussians a pixel is blended of, in place of depth.
+        chooser: Whose cut it is; None: that of the camera.
+        aside: Draw what was there for the last picture, and neither bring pages nor ask for any.
+    """
+
+    shows: ColorBy | Literal["error", "count"] = "appearance"
+    chooser: Camera | None = None
+    aside: bool = False
+
+    def options(self, bundles: Sequence[Bundle]) -> dict[str, Any]:
+        """What the core takes."""
+        by: Any = self.shows if self.shows in ("level", "cluster") else None
+        palettes = [] if by is None else [residency.palette(bundle, by) for bundle in bundles]
+        chooser = self.chooser and self.chooser.core
+        return {"shows": self.shows, "colors": palettes, "chooser": chooser, "aside": self.aside}
 
 
 class Pool:

@@ -16,7 +16,7 @@ from v3dg.cameras import Camera, StereoCamera, check_camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage, Stats
-from v3dg.pool import Pool, chosen_bytes
+from v3dg.pool import Pool, PoolLook, chosen_bytes
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene
 from v3dg.select import CutOptions, Selection, over_budget, rule_of
@@ -161,7 +161,8 @@ class Renderer:
         memory: int | str | None = "auto",
     ) -> None:
         self._subject = subject
-        self._frame = _Frame(subject, color_by, _device.resolve(device), memory, moves=True)
+        self._frame = _Frame(subject, color_by, _device.resolve(device), memory)
+        self._steps = _core.BudgetSteps()
 
     @property
     def memory(self) -> int | None:
@@ -195,7 +196,7 @@ class Renderer:
         shade = shade_of(background, min_transmittance, isinstance(self._subject, Gaussians), depth)
         options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
         drawn: RenderedImage | tuple[RenderedImage, RenderedImage] = self._frame.draw(
-            self._subject, camera, shade, cut, **options
+            self._subject, camera, shade, cut, None, self._steps, **options
         )
         return drawn
 
@@ -229,9 +230,7 @@ class Renderer:
 class _Frame:
     """Buffers that pictures of one subject are drawn with; it does not keep the subject alive."""
 
-    def __init__(
-        self, subject: _Subject, color_by: ColorBy, device: Device, memory: _Memory, moves: bool = False
-    ) -> None:
+    def __init__(self, subject: _Subject, color_by: ColorBy, device: Device, memory: _Memory) -> None:
         one_of(color_by, "color_by", get_args(ColorBy))
         self.device, self.color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
@@ -251,7 +250,7 @@ class _Frame:
         else:
             expected = f"'appearance' for a pool on a CUDA device, got {color_by!r}"
             check("color_by", memory is None or not is_whole, expected)
-            self._frame = _core.SceneFrame(device.number, moves)
+            self._frame = _core.SceneFrame(device.number)
             with residency.reading(subject, device) as resident:
                 self._take_models(resident)
 
@@ -262,13 +261,14 @@ class _Frame:
         shade: _core.Shade,
         cut: Selection | None,
         stop: _core.Stop | None = None,
+        steps: _core.BudgetSteps | None = None,
+        look: PoolLook | None = None,
         **options: Any,
     ) -> Any:
-        """A picture; of a stereo camera, one for each eye. Only with a pool, `stop` ends it."""
+        """A picture; of a stereo camera, one for each eye. `stop` is for the CPU, `look` for pools."""
         check_camera(camera)
         if isinstance(camera, StereoCamera) and (cut is not None or isinstance(subject, Gaussians)):
-            how = {"cut": cut, **options}
-            return tuple(self.draw(subject, eye, shade, **how) for eye in camera.eyes)
+            return tuple(self.draw(subject, eye, shade, cut, **options) for eye in camera.eyes)
         if isinstance(subject, Gaussians):
             _check_asset(self.color_by, cut=cut, **options)
             assert isinstance(camera, Camera)
@@ -282,10 +282,11 @@ class _Frame:
             if pool is not None:
                 check("cut", cut is None, "none for a pool, which has its own, got one; give memory=None")
                 before = pool.core.status().bytes_in
-                drawn = rule, shade, stop, *self._pool_colors(resident)
-                drawing = self._frame.draw_resident(resident.core, pool.core, camera.core, *drawn)
+                shown = (look or PoolLook(self.color_by)).options(resident.bundles)
+                drawn = camera.core, rule, shade, stop, steps
+                drawing = self._frame.draw_resident(resident.core, pool.core, *drawn, **shown)
             elif cut is None:
-                drawing = self._frame.draw(resident.core, camera.core, rule, shade)
+                drawing = self._frame.draw(resident.core, camera.core, rule, shade, stop, steps)
             else:
                 assert isinstance(camera, Camera)
                 _check_cut(cut, subject, resident, **options)
@@ -294,7 +295,7 @@ class _Frame:
                 drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade, weights=weights)
             if pool is not None:
                 now = pool.core.status()
-                came_in = {"missing": now.missing, "failed": now.failed, "bytes_in": now.bytes_in - before}
+                came_in: Any = dict(missing=now.missing, failed=now.failed, bytes_in=now.bytes_in - before)
             resident.add_drawing(drawing)
 
         def finish() -> Stats:
@@ -348,11 +349,12 @@ class _Frame:
             self._references = resident.references
             return self._pool
 
-    def _pool_colors(self, resident: ResidentScene) -> tuple[list[Any], bool]:
-        """Of clusters, unless they appear as they are; and whether they show what is missing."""
-        if self.color_by in ("appearance", "residency"):
-            return [], self.color_by == "residency"
-        return [residency.palette(bundle, self.color_by) for bundle in resident.bundles], False
+    def pick(self, subject: Any, pixel: _core.Camera, rule: _core.Rule) -> Any:
+        """(instance, cluster, weight, depth) of what a pool has there, or None; ValueError without a pool."""
+        check("renderer", self.memory and not self.device.is_cuda, "one with a pool on the CPU")
+        with residency.reading(subject, self.device) as resident:
+            pool: Any = self._take_models(resident)
+            return self._frame.pick_resident(resident.core, pool.core, pixel, rule)
 
     def _here(self, ids: Any) -> Any:
         if not self.device.is_cuda:
@@ -373,8 +375,8 @@ def shade_of(
     return _core.Shade(background=behind, min_transmittance=stop, with_depth=bool(depth))
 
 
-def _stats(stats: _core.FrameStats, tolerance: float) -> Stats:
-    return Stats(stats.gaussians, stats.in_frustum, tolerance, stats.select_ms, stats.draw_ms)
+def _stats(s: _core.FrameStats, tolerance: float) -> Stats:
+    return Stats(s.gaussians, s.in_frustum, tolerance, s.select_ms, s.draw_ms, tuple(s.levels))
 
 
 def _check_asset(color_by: ColorBy, **options: Any) -> None:

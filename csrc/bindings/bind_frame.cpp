@@ -1,11 +1,12 @@
 #include <algorithm>
-#include <atomic>
 #include <memory>
 #include <mutex>
+#include <optional>
+#include <string>
 #include <vector>
 
+#include "bindings/drawing.h"
 #include "bindings/operations.h"
-#include "bindings/picture.h"
 #include "bindings/pool.h"
 #include "bindings/resident.h"
 #include "pipeline/scene_frame.h"
@@ -14,138 +15,36 @@ namespace v3dg {
 
 namespace {
 
-// Asks, from any thread, for work under way to end early.
-class Stop {
-  public:
-    void request() { requested_.store(true, std::memory_order_relaxed); }
-    bool is_requested() const { return requested_.load(std::memory_order_relaxed); }
-    const std::atomic<bool>* flag() const { return &requested_; }
+// What a picture from a pool shows: colours, and where clusters have their own, those; or how many gaussians
+// each pixel is blended of, in place of depth.
+struct PoolLook {
+    SceneColors colors = SceneColors::own;
+    bool counts = false;
+    bool is_aside = false;
+    std::optional<Eyes> chooser;
+    py::list cluster_colors;
 
-  private:
-    std::atomic<bool> requested_{false};
-};
-
-const std::atomic<bool>* flag_of(const Stop* stop) { return stop == nullptr ? nullptr : stop->flag(); }
-
-// While it lives, one thread draws with a frame. Python's lock alone does not see to that, for torch gives it
-// up while it looks for memory; and so it is given up here, too, where another thread has its turn.
-class Turn {
-  public:
-    explicit Turn(std::mutex* mutex) {
-        if (mutex == nullptr) return;  // on the host, where frames have nothing that they share
-        lock_ = std::unique_lock<std::mutex>(*mutex, std::try_to_lock);
-        if (lock_.owns_lock()) return;
-        const py::gil_scoped_release unlocked;
-        lock_.lock();
+    bool is_plain() const {
+        return colors == SceneColors::own && !counts && !is_aside && !chooser && cluster_colors.empty();
     }
-
-  private:
-    std::unique_lock<std::mutex> lock_;
 };
 
-// What a frame came to; times in milliseconds.
-struct FrameStats {
-    int64_t gaussians;  // selected; where the budget is exceeded, what the coarsest cut has
-    uint64_t in_frustum, records, entries, items;
-    float tolerance_px2;
-    bool exceeds_budget;
-    double select_ms, draw_ms;
-};
-
-FrameStats stats_of(const SceneFrameCounts& c) {
-    return {c.gaussians,     c.render.in_frustum, c.render.records,       c.render.entries,    0,
-            c.tolerance_px2, c.exceeds_budget,    1e3 * c.select_seconds, 1e3 * c.draw_seconds};
+PoolLook pool_look(const std::string& shows, const py::list& cluster_colors, const BoundEyes* chooser,
+                   bool is_aside) {
+    PoolLook look;
+    if (shows == "residency") look.colors = SceneColors::missing;
+    if (shows == "error") look.colors = SceneColors::metrics;
+    look.counts = shows == "count";
+    look.is_aside = is_aside;
+    if (chooser != nullptr) look.chooser = chooser->eyes;
+    look.cluster_colors = cluster_colors;
+    return look;
 }
-
-// The pictures of a frame: of a camera, or of two eyes, left first.
-using NewPictures = std::vector<NewPicture>;
-
-// A frame that has been drawn, or enqueued on a device, with what it reads and writes.
-class BoundDrawing {
-  public:
-    BoundDrawing(NewPictures pictures, const FrameStats& stats)
-        : pictures_(std::move(pictures)), stats_(stats) {}
-
-#if V3DG_WITH_CUDA
-    // `kept` are the frame, which may have to draw again, and what it reads.
-    BoundDrawing(NewPictures pictures, py::object kept, Device device, std::shared_ptr<std::mutex> turns,
-                 std::unique_ptr<cuda::Drawing> drawing, const SelectRule& rule,
-                 cuda::DevicePages* pages = nullptr)
-        : pictures_(std::move(pictures)),
-          kept_(std::move(kept)),
-          device_(device),
-          turns_(std::move(turns)),
-          drawing_(std::move(drawing)),
-          pages_(pages),
-          rule_(rule) {}
-#endif
-
-    const NewPicture& picture() const { return pictures_.front(); }
-    const NewPicture& right() const { return pictures_.back(); }
-
-    const FrameStats& finish() {
-#if V3DG_WITH_CUDA
-        if (drawing_ != nullptr) {
-            const Work work(device_);
-            {
-                const py::gil_scoped_release unlocked;
-                drawing_->wait();
-            }
-            const Turn turn(turns_.get());
-            const cuda::FrameCounters& c = drawing_->finish();  // may draw
-            if (pages_ != nullptr) pages_->note_frames(work.stream());
-            const cuda::FrameTimes times = drawing_->times();
-            const bool exceeds = c.choice.exceeds_budget;
-            stats_ = {static_cast<int64_t>(exceeds ? c.choice.least : c.gaussians / pictures_.size()),
-                      c.in_frustum,
-                      c.records,
-                      c.entries,
-                      c.items,
-                      rule_.budget == kNoBudget ? rule_.tolerance_px2 : c.choice.tolerance_px2,
-                      exceeds,
-                      times.prepare_ms,
-                      times.draw_ms};
-        }
-#endif
-        return stats_;
-    }
-
-  private:
-    NewPictures pictures_;
-    FrameStats stats_{};
-#if V3DG_WITH_CUDA
-    py::object kept_;
-    Device device_;
-    std::shared_ptr<std::mutex> turns_;       // of the frame
-    std::unique_ptr<cuda::Drawing> drawing_;  // gone before what it needs
-    cuda::DevicePages* pages_ = nullptr;      // of the pool that it draws from, which `kept_` has
-    SelectRule rule_{};
-#endif
-};
-
-NewPicture picture_of(const Window& window, bool with_depth) {
-    return {window.height(), window.width(), {}, {}, py::none(), with_depth};
-}
-
-// On the host, new pictures of the windows of the eyes.
-struct HostPictures {
-    NewPictures out;
-    std::vector<Picture<float>> pictures;
-
-    HostPictures(const Eyes& eyes, const Shade& shade) {
-        for (int k = 0; k < eyes.count(); ++k) {
-            const Window window = window_of(eyes.camera[k]);
-            out.push_back(picture_of(window, shade.with_depth));
-            pictures.push_back(out.back().on_host<float>(window, shade));
-        }
-    }
-    Span<const Picture<float>> span() const { return {pictures.data(), pictures.size()}; }
-};
 
 // Draws scenes of the same bundles, or of the first of them, on one device.
 class BoundSceneFrame {
   public:
-    BoundSceneFrame(int device, bool moves) : device_{device}, moves_(moves) {
+    explicit BoundSceneFrame(int device) : device_{device} {
         const Work work(device_);
 #if V3DG_WITH_CUDA
         if (device_.is_host()) return;
@@ -180,57 +79,59 @@ class BoundSceneFrame {
         palettes_ = palettes;
     }
 
+    // With `steps`, of pictures that follow each other.
     std::unique_ptr<BoundDrawing> draw(const py::object& scene_object, const BoundEyes& camera,
-                                       const SelectRule& rule, const Shade& shade, const Stop* stop) {
+                                       const SelectRule& rule, const Shade& shade, const Stop* stop,
+                                       BudgetSteps* steps) {
         const Turn turn(turns_.get());
         auto& scene = checked(scene_object);
         const Eyes& eyes = camera.eyes;
-        BudgetSteps steps = steps_;
-        const SelectRule paced = moves_ ? steps.next(rule, eyes, scene.state()) : rule;
-        if (device_.is_host()) {
-            auto drawing = on_host(scene, eyes, shade, [&](HostScene host, Span<const Picture<float>> out) {
-                host.last_bin = &steps.last_bin;
-                return cpu::draw_scene(host, eyes, paced, out, flag_of(stop));
-            });
-            steps_ = steps;
-            return drawing;
-        }
+        const auto draw_paced = [&](const SelectRule& paced,
+                                    uint32_t* last_bin) -> std::unique_ptr<BoundDrawing> {
+            if (device_.is_host())
+                return on_host(scene, eyes, shade, [&](HostScene host, Span<const Picture<float>> out) {
+                    host.last_bin = last_bin;
+                    return cpu::draw_scene(host, eyes, paced, out, flag_of(stop));
+                });
 #if V3DG_WITH_CUDA
-        const Work work(device_);
-        NewPictures pictures;
-        const cuda::EyeImages images = new_images(eyes, shade, pictures);
-        const auto place = [&](cuda::PicturePlanes planes[2]) {
-            for (size_t k = 0; k < pictures.size(); ++k) planes[k] = pictures[k].on_device(device_);
-        };
-        auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream(), place);
-        steps_ = steps;
-        return std::make_unique<BoundDrawing>(std::move(pictures),
-                                              py::make_tuple(py::cast(this), scene_object), device_, turns_,
-                                              std::move(drawing), rule);
+            const Work work(device_);
+            NewPictures pictures;
+            const cuda::EyeImages images = new_images(eyes, shade, pictures);
+            const auto place = [&](cuda::PicturePlanes planes[2]) {
+                for (size_t k = 0; k < pictures.size(); ++k) planes[k] = pictures[k].on_device(device_);
+            };
+            auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream(), place);
+            return std::make_unique<BoundDrawing>(std::move(pictures),
+                                                  py::make_tuple(py::cast(this), scene_object), device_,
+                                                  turns_, std::move(drawing), rule);
 #else
-        return nullptr;
+            return nullptr;
 #endif
+        };
+        return in_steps(steps, rule, eyes, scene.state(), draw_paced);
     }
 
     // What is resident of the bundles of a pool, with what comes in before.
     std::unique_ptr<BoundDrawing> draw_resident(const py::object& scene_object, const py::object& pool_object,
                                                 const BoundEyes& camera, const SelectRule& rule,
-                                                const Shade& shade, const Stop* stop, const py::list& colors,
-                                                bool shows_missing) {
+                                                const Shade& shade, const Stop* stop, BudgetSteps* steps,
+                                                const std::string& shows, const py::list& cluster_colors,
+                                                const BoundEyes* chooser, bool is_aside) {
+        const PoolLook look = pool_look(shows, cluster_colors, chooser, is_aside);
+        auto& pool = checked_pool(scene_object, pool_object);
         const auto& scene = held<BoundScene>(scene_object, "scene");
-        auto& pool = held<BoundPool>(pool_object, "pool");
-        if (scene.device() != device_ || pool.device() != device_)
-            throw py::value_error("scene, pool: expected them on the frame's device");
         const std::shared_ptr<const SceneState> state = scene.state();
-        pool.check_scene(*state);
-        if (!device_.is_host() && (!colors.empty() || shows_missing))
-            throw py::value_error("colors, shows_missing: expected none on a CUDA device");
         const Turn turn(turns_.get());
         const Eyes& eyes = camera.eyes;
-        BudgetSteps steps = steps_;
-        const SelectRule paced = moves_ ? steps.next(rule, eyes, state) : rule;
+        if (!device_.is_host() && !look.is_plain())
+            throw py::value_error("shows, colors, chooser, aside: expected none on a CUDA device");
+        const auto draw_paced = [&](const SelectRule& paced,
+                                    uint32_t* last_bin) -> std::unique_ptr<BoundDrawing> {
+            if (device_.is_host()) {
+                const float wanted = rule.tolerance_px2;
+                return resident_on_host(*state, pool, eyes, paced, wanted, shade, stop, look, last_bin);
+            }
 #if V3DG_WITH_CUDA
-        if (!device_.is_host()) {
             const Work work(device_);
             NewPictures pictures;
             cuda::EyeImages images = new_images(eyes, shade, pictures);
@@ -239,37 +140,43 @@ class BoundSceneFrame {
             SelectRule used = paced;
             auto drawing =
                 frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images, work.stream());
-            steps_ = steps;
             return std::make_unique<BoundDrawing>(
                 std::move(pictures), py::make_tuple(py::cast(this), scene_object, pool_object), device_,
                 turns_, std::move(drawing), used, &pool.on_device());
-        }
+#else
+            return nullptr;
 #endif
-        HostPictures out(eyes, shade);
-        std::vector<SceneModel> models;
-        for (size_t b = 0; b < state->tables.size(); ++b) {
-            models.push_back(
-                {pool.on_host().planes(b), state->bundle(b).appearance(), {}, pool.on_host().codes(b)});
-            const auto clusters = static_cast<py::ssize_t>(state->tables[b].num_clusters());
-            if (colors.empty()) continue;
-            if (b >= colors.size()) throw py::value_error("colors: expected none, or of each bundle");
-            models.back().cluster_sh =
-                span_of<const float>(colors[b].cast<py::array>(), "colors", {clusters, 3}).data;
-        }
-        SceneFrameCounts counts{};
+        };
+        return in_steps(steps, rule, look.chooser ? *look.chooser : eyes, state, draw_paced);
+    }
+
+    // (instance, cluster, weight, depth) of what is resident, or None.
+    py::object pick_resident(const py::object& scene_object, const py::object& pool_object,
+                             const BoundCamera& camera, const SelectRule& rule) {
+        require_host("pick_resident");
+        auto& pool = checked_pool(scene_object, pool_object);
+        const auto state = held<BoundScene>(scene_object, "scene").state();
+        const std::vector<SceneModel> models = models_in(pool, *state, py::list());
+        const Eyes eyes = camera.camera;
+        SelectOutput cut;
+        ScenePick picked{};
+        bool shows_any = false;
         {
             const py::gil_scoped_release unlocked;
-            const auto cut = [&](auto tables, const SelectRule& raised, auto needs) {
-                HostScene host{
-                    tables, {models.data(), models.size()}, state->instances, needs, &steps.last_bin};
-                if (shows_missing) host.wanted_px2 = &rule.tolerance_px2;
-                counts = cpu::draw_scene(host, eyes, raised, out.span(), flag_of(stop));
-                return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
-            };
-            pool.frame_on_host(*state, paced, true, cut);
+            pool.frame_on_host(
+                *state, rule, PoolFrame::aside, [&](auto tables, const SelectRule& raised, auto needs) {
+                    const HostScene host{tables, {models.data(), models.size()}, state->instances};
+                    cpu::select({tables, state->instances, eyes, raised, needs}, cut);
+                    const GivenCut given{{cut.instance.data(), cut.instance.size()},
+                                         {cut.cluster.data(), cut.cluster.size()},
+                                         {cut.weight.data(), cut.weight.size()}};
+                    shows_any = cpu::pick_cut(host, camera.camera, given, picked);
+                    return raised.tolerance_px2;
+                });
         }
-        steps_ = steps;
-        return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
+        if (!shows_any) return py::none();
+        return py::make_tuple(cut.instance[picked.pair], cut.cluster[picked.pair], picked.weight,
+                              picked.depth);
     }
 
     std::unique_ptr<BoundDrawing> draw_cut(const py::object& scene_object, const BoundCamera& camera,
@@ -340,7 +247,7 @@ class BoundSceneFrame {
         return parts;
     }
 
-    // (place in the cut, weight, depth), or None.
+    // (instance, cluster, weight, depth), or None.
     py::object pick_cut(const py::object& scene_object, const BoundCamera& camera,
                         const py::array& instance_ids, const py::array& cluster_ids) {
         require_host("pick_cut");
@@ -354,10 +261,60 @@ class BoundSceneFrame {
             shows_any = cpu::pick_cut(host_scene(*state, models), camera.camera, given, picked);
         }
         if (!shows_any) return py::none();
-        return py::make_tuple(picked.pair, picked.weight, picked.depth);
+        return py::make_tuple(given.instance[picked.pair], given.cluster[picked.pair], picked.weight,
+                              picked.depth);
     }
 
   private:
+    BoundPool& checked_pool(const py::object& scene_object, const py::object& pool_object) const {
+        const auto& scene = held<BoundScene>(scene_object, "scene");
+        auto& pool = held<BoundPool>(pool_object, "pool");
+        if (scene.device() != device_ || pool.device() != device_)
+            throw py::value_error("scene, pool: expected them on the frame's device");
+        pool.check_scene(*scene.state());
+        return pool;
+    }
+
+    static std::vector<SceneModel> models_in(const BoundPool& pool, const SceneState& scene,
+                                             const py::list& colors) {
+        std::vector<SceneModel> models;
+        for (size_t b = 0; b < scene.tables.size(); ++b) {
+            models.push_back(
+                {pool.on_host().planes(b), scene.bundle(b).appearance(), {}, pool.on_host().codes(b)});
+            const auto clusters = static_cast<py::ssize_t>(scene.tables[b].num_clusters());
+            if (colors.empty()) continue;
+            if (b >= colors.size()) throw py::value_error("colors: expected none, or of each bundle");
+            models.back().cluster_sh =
+                span_of<const float>(colors[b].cast<py::array>(), "colors", {clusters, 3}).data;
+        }
+        return models;
+    }
+
+    static std::unique_ptr<BoundDrawing> resident_on_host(const SceneState& scene, BoundPool& pool,
+                                                          const Eyes& eyes, const SelectRule& rule,
+                                                          float wanted_px2, Shade shade, const Stop* stop,
+                                                          const PoolLook& look, uint32_t* last_bin) {
+        shade.with_depth |= look.counts;
+        HostPictures out(eyes, shade);
+        if (look.counts)
+            for (Picture<float>& picture : out.pictures) std::swap(picture.depth, picture.count);
+        const std::vector<SceneModel> models = models_in(pool, scene, look.cluster_colors);
+        SceneFrameCounts counts{};
+        const auto cut = [&](auto tables, const SelectRule& raised, auto needs) {
+            HostScene host{tables, {models.data(), models.size()}, scene.instances, needs, last_bin};
+            host.colors = look.colors;
+            host.wanted_px2 = wanted_px2;
+            if (look.chooser) host.chooser = &*look.chooser;
+            counts = cpu::draw_scene(host, eyes, raised, out.span(), flag_of(stop));
+            return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
+        };
+        {
+            const py::gil_scoped_release unlocked;
+            pool.frame_on_host(scene, rule, look.is_aside ? PoolFrame::aside : PoolFrame::flight, cut);
+        }
+        return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
+    }
+
     // Weights are of 0 to 1, or None where all are 1.
     GivenCut given_cut(const py::handle& instance_ids, const py::handle& cluster_ids,
                        const py::handle& weights) const {
@@ -443,8 +400,6 @@ class BoundSceneFrame {
     }
 
     Device device_;
-    bool moves_;         // pictures follow each other
-    BudgetSteps steps_;  // then
     py::list models_, palettes_;
     std::vector<size_t> num_gaussians_;  // of each bundle
     std::vector<SceneModel> host_;       // without what the scene knows of the clusters
@@ -519,7 +474,8 @@ void bind_frame(py::module_& m) {
         .def_readonly("tolerance_px2", &FrameStats::tolerance_px2)
         .def_readonly("exceeds_budget", &FrameStats::exceeds_budget)
         .def_readonly("select_ms", &FrameStats::select_ms)
-        .def_readonly("draw_ms", &FrameStats::draw_ms);
+        .def_readonly("draw_ms", &FrameStats::draw_ms)
+        .def_readonly("levels", &FrameStats::levels);
     py::class_<Shade>(m, "Shade",
                       "What is behind a picture, when its pixels stop, and whether their depth is drawn.")
         .def(py::init([](const std::array<double, 3>& background, float min_transmittance, bool with_depth) {
@@ -537,11 +493,14 @@ void bind_frame(py::module_& m) {
         .def_property_readonly("right", &BoundDrawing::right, "Of two eyes: what the right one sees.")
         .def("finish", &BoundDrawing::finish, py::return_value_policy::copy, "Waits for the picture.");
     py::class_<BoundSceneFrame>(m, "SceneFrame", "Draws scenes of the same bundles on one device.")
-        .def(py::init<int, bool>(), "device"_a, "moves"_a = false)
+        .def(py::init<int>(), "device"_a)
         .def("set_models", &BoundSceneFrame::set_models, "models"_a, "palettes"_a)
-        .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a, "stop"_a = nullptr)
+        .def("draw", &BoundSceneFrame::draw, "scene"_a, "camera"_a, "rule"_a, "shade"_a, "stop"_a = nullptr,
+             "steps"_a = nullptr)
         .def("draw_resident", &BoundSceneFrame::draw_resident, "scene"_a, "pool"_a, "camera"_a, "rule"_a,
-             "shade"_a, "stop"_a = nullptr, "colors"_a = py::list(), "shows_missing"_a = false)
+             "shade"_a, "stop"_a = nullptr, "steps"_a = nullptr, py::kw_only(), "shows"_a = "appearance",
+             "colors"_a = py::list(), "chooser"_a = nullptr, "aside"_a = false)
+        .def("pick_resident", &BoundSceneFrame::pick_resident, "scene"_a, "pool"_a, "camera"_a, "rule"_a)
         .def("draw_cut", &BoundSceneFrame::draw_cut, "scene"_a, "camera"_a, "instance_ids"_a, "cluster_ids"_a,
              "shade"_a, "stop"_a = nullptr, "weights"_a = py::none())
         .def("count_cut", &BoundSceneFrame::count_cut, "scene"_a, "camera"_a, "instance_ids"_a,

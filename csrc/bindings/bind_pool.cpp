@@ -190,7 +190,7 @@ float BoundPool::ask(const py::object& scene_object, const BoundEyes& camera, co
     }
 #endif
     const py::gil_scoped_release unlocked;
-    frame_on_host(*state, rule, false, [&](auto tables, const SelectRule& raised, auto needs) {
+    frame_on_host(*state, rule, PoolFrame::look, [&](auto tables, const SelectRule& raised, auto needs) {
         SelectOutput out;
         cpu::select({tables, state->instances, eyes, raised, needs}, out);
         return tolerance = out.fits_budget ? out.tolerance_px2 : raised.tolerance_px2;

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <memory>
 #include <mutex>
+#include <utility>
 #include <vector>
 
 #include "bindings/resident.h"
@@ -15,6 +16,10 @@
 #endif
 
 namespace v3dg {
+
+// Frames of a pool: one of a flight, a look at what a view needs, and one aside, for which pages neither come
+// nor are asked for: of what was there for the last one, as that was.
+enum class PoolFrame { flight, look, aside };
 
 class BoundPool {
   public:
@@ -28,27 +33,33 @@ class BoundPool {
     PoolStatus status() const { return pool_->status(); }
     void check_scene(const SceneState& scene) const;
 
-    // A frame on the host, bounded if it is one of a flight: brings pages, calls cut(tables, rule, needs),
-    // which returns the tolerance that was used, and takes note of what that needed. Without Python's lock.
+    // A frame on the host: brings pages, calls cut(tables, rule, needs), which returns the tolerance that was
+    // used, and takes note of what that needed. Without Python's lock.
     template <class Cut>
-    void frame_on_host(const SceneState& scene, SelectRule rule, bool is_bounded, const Cut& cut) {
+    void frame_on_host(const SceneState& scene, SelectRule rule, PoolFrame kind, const Cut& cut) {
         const std::lock_guard<std::mutex> lock(busy_);
-        const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
-        host_->apply(*pool_, pool_->begin_frame(is_bounded, arrive));
-        pool_->release();
+        const bool is_aside = kind == PoolFrame::aside && std::exchange(has_begun_, true);
+        const bool is_bounded = kind != PoolFrame::look;
+        if (!is_aside) {
+            const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
+            host_->apply(*pool_, pool_->begin_frame(is_bounded, arrive));
+            pool_->release();
+            has_begun_ = true;
+        }
         std::vector<ClusterTable> tables = scene.tables;
         std::vector<Span<uint32_t>> needs;
         for (size_t b = 0; b < tables.size(); ++b) {
             tables[b].pages.shift = pool_->shift(b);
             tables[b].pages.begins = pool_->begins(b);
+            if (is_aside) continue;
             needs_[b].assign(tables[b].num_pages(), 0);
             needs.push_back({needs_[b].data(), needs_[b].size()});
         }
         rule.tolerance_px2 = std::max(rule.tolerance_px2, pool_->least_tolerance_px2());
         rule.frame = pool_->arrivals().frame();
-        note_needs(cut(Span<const ClusterTable>{tables.data(), tables.size()}, rule,
-                       Span<const Span<uint32_t>>{needs.data(), needs.size()}),
-                   is_bounded);
+        const float used = cut(Span<const ClusterTable>{tables.data(), tables.size()}, rule,
+                               Span<const Span<uint32_t>>{needs.data(), needs.size()});
+        if (!is_aside) note_needs(used, is_bounded);
     }
     const HostPages& on_host() const { return *host_; }
 #if V3DG_WITH_CUDA
@@ -72,6 +83,7 @@ class BoundPool {
     std::unique_ptr<cuda::DevicePages> on_device_;
 #endif
     std::mutex busy_;
+    bool has_begun_ = false;                    // with a frame on the host
     std::vector<std::vector<uint32_t>> needs_;  // of each bundle
 };
 

@@ -240,27 +240,25 @@ class BoundScene {
         if (camera.eyes.are_two && rule.footprint == Footprint::paper)
             throw py::value_error("footprint: expected 'solid_angle' for two eyes, got 'paper'");
         const std::shared_ptr<const SceneState> state = state_;
-        SelectOutput out;
-        BudgetSteps now = steps == nullptr ? BudgetSteps{} : *steps;
-        const SelectRule paced = steps == nullptr ? rule : now.next(rule, camera.eyes, state);
         const Work work(device_);
-        {
+        const auto cut = [&](const SelectRule& paced, uint32_t* last_bin) {
             const py::gil_scoped_release unlocked;
+            SelectOutput out;
             if (device_.is_host())
                 cpu::select({{state->tables.data(), state->tables.size()},
                              state->instances,
                              camera.eyes,
                              paced,
                              {},
-                             &now.last_bin},
+                             last_bin},
                             out);
 #if V3DG_WITH_CUDA
             else
-                cut_->select(*on_device_, camera.eyes, paced, out, work.stream(), nullptr, &now.last_bin);
+                cut_->select(*on_device_, camera.eyes, paced, out, work.stream(), nullptr, last_bin);
 #endif
-        }
-        if (steps != nullptr) *steps = now;
-        return BoundCut(out);
+            return out;
+        };
+        return BoundCut(in_steps(steps, rule, camera.eyes, state, cut));
     }
 
     // Priorities of the pages of each bundle, on the host.

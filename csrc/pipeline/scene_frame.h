@@ -18,6 +18,10 @@ struct SceneModel {
     const float* cluster_sh = nullptr;
 };
 
+// What colours of a cut's clusters say: nothing, where finer pages are missing (see missing_color()), or the
+// share of the cut's tolerance that metrics take, as draw_metrics() has it.
+enum class SceneColors { own, missing, metrics };
+
 // A scene on the host: what selection reads of its bundles, their gaussians, and its instances.
 struct HostScene {
     Span<const ClusterTable> tables;
@@ -26,8 +30,9 @@ struct HostScene {
     // As SelectInput has them.
     Span<const Span<uint32_t>> needs = {};
     uint32_t* last_bin = nullptr;
-    // Colours say what is missing, where it is not of this tolerance, px2: see missing_color().
-    const float* wanted_px2 = nullptr;
+    SceneColors colors = SceneColors::own;
+    float wanted_px2 = 0.0f;        // what is missing, where it is not of this tolerance
+    const Eyes* chooser = nullptr;  // which the cut is for; null: those that look
 };
 
 // What one frame came to.
@@ -36,7 +41,8 @@ struct SceneFrameCounts {
     float tolerance_px2;  // that was used
     bool exceeds_budget;  // nothing was drawn then
     double select_seconds, draw_seconds;
-    RenderCounts render;  // of two pictures, the sums
+    RenderCounts render;          // of two pictures, the sums
+    std::vector<int64_t> levels;  // gaussians that were selected, of a scene by level
 
     // What another picture of the same frame came to.
     void add_picture(const SceneFrameCounts& other) {

@@ -136,32 +136,59 @@ SceneFrameCounts draw_pairs(const HostScene& scene, const Camera& camera, const 
     return counts;
 }
 
+int level_of(const ClusterTable& table, int32_t cluster) {
+    const int32_t own = table.own_group[cluster];
+    return own < 0 ? 0 : table.level[own];
+}
+
+std::vector<int64_t> levels_of(const HostScene& scene, const GivenCut& given) {
+    std::vector<int64_t> levels;
+    for (size_t s = 0; s < given.instance.size; ++s) {
+        const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
+        const auto level = static_cast<size_t>(level_of(table, given.cluster[s]));
+        if (level >= levels.size()) levels.resize(level + 1);
+        levels[level] += static_cast<int64_t>(table.num_gaussians(given.cluster[s]));
+    }
+    return levels;
+}
+
+// [S][3]: what pairs are drawn with in place of their colours; empty: nothing.
+std::vector<float> tint_of(const HostScene& scene, const Camera& camera, const SelectRule& rule,
+                           const GivenCut& given, float tolerance_px2) {
+    if (scene.colors == SceneColors::own) return {};
+    const bool is_metric = scene.colors == SceneColors::metrics;
+    // Of a budget, the tolerance that it comes to is wanted; a little more, for metrics are rounded.
+    const float wanted = is_metric || rule.budget != kNoBudget ? tolerance_px2 : scene.wanted_px2;
+    std::vector<float> tint(3 * given.instance.size);
+    const std::vector<float> share =
+        shares_of(scene, camera, rule, given, is_metric ? wanted : std::max(wanted, 1e-6f));
+    for (size_t s = 0; s < share.size(); ++s) {
+        const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
+        const bool is_finest = level_of(table, given.cluster[s]) <= rule.min_level;
+        const float grey = std::min(share[s], cpu::kMostShare);
+        const Rgb rgb = is_metric ? Rgb{grey, grey, grey}
+                                  : missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
+        set_tint(rgb, tint.data() + 3 * s);
+    }
+    return tint;
+}
+
 }  // namespace
 
 SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const SelectRule& rule,
                                  Span<const Picture<float>> pictures, const std::atomic<bool>* stop) {
     const double start = now();
     SelectOutput cut;
-    select({scene.tables, scene.instances, eyes, rule, scene.needs, scene.last_bin}, cut);
+    const Eyes& chooser = scene.chooser == nullptr ? eyes : *scene.chooser;
+    select({scene.tables, scene.instances, chooser, rule, scene.needs, scene.last_bin}, cut);
     const double select_seconds = now() - start;
     const GivenCut given{{cut.instance.data(), cut.instance.size()},
                          {cut.cluster.data(), cut.cluster.size()},
                          {cut.weight.data(), cut.weight.size()}};
-    std::vector<float> tint;
-    if (scene.wanted_px2 != nullptr && cut.fits_budget) {
-        // Of a budget, the tolerance that it comes to is wanted; a little more, for metrics are rounded.
-        const float wanted = rule.budget == kNoBudget ? *scene.wanted_px2 : cut.tolerance_px2;
-        tint.resize(3 * given.instance.size);
-        const std::vector<float> share =
-            shares_of(scene, eyes.camera[0], rule, given, std::max(wanted, 1e-6f));
-        for (size_t s = 0; s < share.size(); ++s) {
-            const ClusterTable& table = scene.tables[scene.instances.bundle[given.instance[s]]];
-            const int32_t own = table.own_group[given.cluster[s]];
-            const bool is_finest = own >= 0 && table.level[own] <= rule.min_level;
-            const Rgb rgb = missing_color(is_finest ? 0.0f : share[s], 1.0001f * rule.fade.factor);
-            set_tint(rgb, tint.data() + 3 * s);
-        }
-    }
+    // Metrics are those from here, whatever was missing was so for whom it was chosen for.
+    const Camera& judge = scene.colors == SceneColors::missing ? chooser.camera[0] : eyes.camera[0];
+    const std::vector<float> tint =
+        cut.fits_budget ? tint_of(scene, judge, rule, given, cut.tolerance_px2) : std::vector<float>{};
     SceneFrameCounts counts{};
     for (size_t k = 0; k < pictures.size && cut.fits_budget; ++k)
         counts.add_picture(draw_pairs(scene, eyes.camera[k], given, tint.empty() ? nullptr : tint.data(),
@@ -170,6 +197,7 @@ SceneFrameCounts cpu::draw_scene(const HostScene& scene, const Eyes& eyes, const
     counts.tolerance_px2 = cut.tolerance_px2;
     counts.exceeds_budget = !cut.fits_budget;
     counts.select_seconds = select_seconds;
+    counts.levels = levels_of(scene, given);
     return counts;
 }
 
@@ -182,12 +210,9 @@ SceneFrameCounts cpu::draw_metrics(const HostScene& scene, const Camera& camera,
                                    const GivenCut& given, const Picture<float>& picture,
                                    const std::atomic<bool>* stop) {
     static_cast<void>(CutDraws(scene, camera, given));  // which checks the pairs
-    std::vector<float> tint(3 * given.instance.size);
-    const std::vector<float> share = shares_of(scene, camera, rule, given, rule.tolerance_px2);
-    for (size_t s = 0; s < share.size(); ++s) {
-        const float grey = std::min(share[s], kMostShare);
-        set_tint({grey, grey, grey}, tint.data() + 3 * s);
-    }
+    HostScene shown = scene;
+    shown.colors = SceneColors::metrics;
+    const std::vector<float> tint = tint_of(shown, camera, rule, given, rule.tolerance_px2);
     return draw_pairs(scene, camera, given, tint.data(), picture, stop);
 }
 

@@ -38,4 +38,16 @@ class BudgetSteps {
     int32_t frames_at_rest_ = 0;
 };
 
+// What body(rule, last_bin) returns for the next of the pictures that `steps` knows, which count it unless it
+// throws. Null: nothing came before, and the rule is as it is.
+template <class Body>
+auto in_steps(BudgetSteps* steps, const SelectRule& rule, const Eyes& eyes,
+              const std::shared_ptr<const void>& scene, const Body& body) {
+    BudgetSteps now = steps == nullptr ? BudgetSteps{} : *steps;
+    const SelectRule next = steps == nullptr ? rule : now.next(rule, eyes, scene);
+    auto result = body(next, &now.last_bin);
+    if (steps != nullptr) *steps = now;
+    return result;
+}
+
 }  // namespace v3dg

@@ -19,8 +19,9 @@ from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
+from v3dg.pick import Pick, pick
 from v3dg.pictures import to_8bit
-from v3dg.pool import chosen_bytes
+from v3dg.pool import PoolLook, chosen_bytes
 from v3dg.render import Renderer, render, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Scene
@@ -29,13 +30,15 @@ from v3dg.viewer.view import View
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
 Window: TypeAlias = tuple[int, int, int, int]
+
 Shows: TypeAlias = Literal[
     "appearance", "level", "cluster", "error", "residency", "depth", "alpha", "count", "difference"
 ]
 
 # Gaussians in a pixel that get the brightest colour.
 MOST_COUNTED = 256
-_OF_POOLS: tuple[Shows, ...] = ("appearance", "depth", "alpha", "level", "cluster", "residency")
+_OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
+_OF_CUT = ("level", "cluster", "residency", "error", "count")  # colours of clusters, and what is not colours
 # So many gaussians are drawn whole while the camera moves, too.
 _FEW_GAUSSIANS = 500_000
 _SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
@@ -112,6 +115,18 @@ class Frame:
         return self.pixels.shape[1], self.pixels.shape[0]
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """How a picture is drawn: `chooser` is whose cut it is, None the camera's; `edge` where it is split."""
+
+    camera: Camera
+    chooser: Camera | None
+    edge: int
+    settings: Settings
+    stop: _core.Stop | None
+    steps: _core.BudgetSteps | None
+
+
 class Stopped(Exception):
     """A picture was given up because another one is wanted."""
 
@@ -122,8 +137,8 @@ class SceneView:
     Args:
         subject: A scene, a bundle, or an asset, which is split into clusters but gets no coarser levels.
         device: Where to draw: "cpu", "cuda", or "auto", which is CUDA where that works.
-        memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time, and nothing is frozen or
-            split, nor shown of what only all gaussians tell.
+        memory: As in `v3dg.Renderer`. With a pool, one picture is drawn at a time, and what is compared
+            with is the finest that it has room for, of the cut's camera; on CUDA nothing is.
 
     Attributes:
         scene: The subject as a scene.
@@ -147,7 +162,7 @@ class SceneView:
         if memory == "auto":
             memory = chosen_bytes(self.scene.bundles, self.device)
         self.pool = None if memory is None else Renderer(self.scene, device=self.device, memory=memory)
-        self._missing, self._drawing = 0, threading.Lock()
+        self._drawing = threading.Lock()
         self.center, self.radius = _bounds(self.scene)
         self.near = min(0.01, 1e-3 * self.radius)
         self.num_levels = max((bundle.num_levels for bundle in self.scene.bundles), default=1)
@@ -169,9 +184,14 @@ class SceneView:
     @property
     def modes(self) -> tuple[Shows, ...]:
         """What can be shown."""
-        if self.pool is None:
-            return tuple(mode for mode in get_args(Shows) if mode != "residency")
-        return _OF_POOLS[: 3 if self.device.is_cuda else None]
+        if self.pool is not None and self.device.is_cuda:
+            return _OF_POOLS_ON_CUDA
+        return tuple(mode for mode in get_args(Shows) if self.pool is not None or mode != "residency")
+
+    @property
+    def shows_cuts(self) -> bool:
+        """Whether cuts can be frozen, split and picked from: a pool on CUDA draws its own as they are."""
+        return self.pool is None or not self.device.is_cuda
 
     def frame(
         self,
@@ -190,127 +210,149 @@ class SceneView:
             Stopped: ``stop`` was requested; it is raised soon after.
             ValueError: The budget is too small for any cut, or a page that a pool lacks is damaged.
         """
-        if self.pool is None:
-            return self._frame_of(view, size, settings, stop, steps)
-        shows = settings.shows if settings.shows in self.modes else "appearance"
-        settings = replace(settings, shows=shows, split=0.0, frozen=None)
-        with self._drawing:
-            self._how, self._patience = {"min_level": settings.min_level, "fade": settings.fade}, patience
-            return self._frame_of(view, size, settings, stop, steps)
-
-    def _frame_of(
-        self, view: View, size: tuple[int, int], settings: Settings, stop: Any, steps: Any
-    ) -> Frame:
         _check(stop)
+        if self.pool is not None and self.device.is_cuda:  # which a link may not know
+            shows = settings.shows if settings.shows in self.modes else "appearance"
+            settings = replace(settings, shows=shows, split=0.0, frozen=None)
         camera = view.camera(*size, self.near)
-        chooser = camera if settings.frozen is None else settings.frozen.camera(*size, self.near)
-        start = time.perf_counter()
-        budget, fade = settings.budget, settings.fade
-        rule = rule_of(settings.tolerance, budget, settings.min_level, fade=fade)
-        cut = select_by(rule, self.scene, chooser, budget, self.device, steps)
-        selected = time.perf_counter()
-        width, height = size
-        edge = round(settings.split * width)
-        value_range, in_view, distance = None, 0, None
-        picture = np.zeros((height, width, 3), np.float32)
-        if edge < width:
-            shown = self._shown(cut, camera, (edge, 0, width, height), settings, stop)
-            picture[:, edge:], value_range, in_view, distance = shown
+        chooser = None if settings.frozen is None else settings.frozen.camera(*size, self.near)
+        start = 1e3 * time.perf_counter()
+        edge = round(settings.split * size[0])
+        asked = _Asked(camera, chooser, edge, settings, stop, steps)
+        if self.pool is None:
+            drawn = self._of_all(asked)
+        else:
+            with self._drawing:
+                drawn = self._of_pool(asked, self.pool, patience)
+        picture = np.zeros((size[1], size[0], 3), np.float32)
+        colors, value_range, distance = _painted(drawn, settings)
+        picture[:, -colors.shape[1] :] = colors
         if edge > 0:
-            picture[:, :edge] = self._all_gaussians(camera, (0, 0, edge, height), stop)
+            picture[:, :edge] = drawn.whole[:, :edge]
             picture[:, max(edge - 1, 0) : edge + 1] = 1.0
-        figures = Figures(
-            gaussians_selected=cut.num_gaussians,
-            gaussians_in_view=in_view,
-            tolerance=cut.tolerance,
-            select_ms=1e3 * (selected - start),
-            draw_ms=1e3 * (time.perf_counter() - selected),
-            levels=self._levels(cut),
-            memory_bytes=_resident_bytes(),
-            missing=self._missing,
-        )
+        figures = replace(drawn.figures, draw_ms=1e3 * time.perf_counter() - start - drawn.figures.select_ms)
         return Frame(to_8bit(picture), figures, settings.shows, value_range, view, distance)
 
-    def _shown(
-        self, cut: Selection, camera: Camera, window: Window, settings: Settings, stop: _core.Stop | None
-    ) -> tuple[npt.NDArray[np.float32], tuple[float, float] | None, int, float | None]:
-        """Colours of the window, values of darkest and brightest, gaussians in the frustum, the distance."""
-        shows = settings.shows
-        if shows == "count":
-            _, _, count, in_view = self._values("count_cut", cut, camera, window, stop, "appearance")
-            values = np.log2(np.maximum(count, 1)) / np.log2(MOST_COUNTED)
-            return _core.ramp(values) * (count > 0)[..., None], (1.0, MOST_COUNTED), in_view, None
-        if shows == "error":
-            rule = rule_of(cut.tolerance, None, 0)
-            share, alpha, depth, seen = self._values(
-                "draw_metrics", cut, camera, window, stop, "appearance", rule
-            )
-            mean = np.clip(share[..., 0] / np.maximum(alpha, 1e-6), 0, 1)
-            return _core.ramp(mean) * alpha[..., None], (0.0, cut.tolerance), seen, _distance(alpha, depth)
-        color_by: ColorBy = shows if shows in ("level", "cluster", "residency") else "appearance"
-        color, alpha, depth, in_view = self._draw(cut, camera, window, color_by, stop)
-        distance = _distance(alpha, depth)
-        if shows == "alpha":
-            return np.repeat(alpha[..., None], 3, axis=2), (0.0, 1.0), in_view, distance
-        if shows == "depth":
-            covered = depth[alpha > 0.5]
-            # A few gaussians far from all others would take all the colours.
-            near, far = np.percentile(covered, (1, 99)) if covered.size else (0.0, 1.0)
-            values = np.clip((far - depth) / max(far - near, 1e-12), 0, 1)
-            return _core.ramp(values) * alpha[..., None], (float(far), float(near)), in_view, distance
-        if shows == "difference":
-            difference = np.abs(color - self._all_gaussians(camera, window, stop))
-            return np.minimum(settings.gain * difference, np.float32(1)), None, in_view, distance
-        return color, None, in_view, distance
+    def pick(self, view: View, size: tuple[int, int], x: int, y: int, settings: Settings) -> Pick | None:
+        """Return what a pixel of a picture shows most of, of what is resident where there is a pool."""
+        cut: Any = {name: getattr(settings, name) for name in ("tolerance", "budget", "min_level")}
+        camera = view.camera(*size, self.near)
+        with self._drawing:
+            return pick(self.scene, camera, x, y, **cut, renderer=self.pool)
 
-    def _all_gaussians(self, camera: Camera, window: Window, stop: _core.Stop | None) -> Any:
-        cut = select(self.scene, camera, tolerance=0.0, device=self.device)
-        return self._draw(cut, camera, window, "appearance", stop)[0]
+    def _of_pool(self, asked: _Asked, pool: Renderer, patience: float) -> _Drawn:
+        """What a pool has; compared with the finest that it has room for, from whose pages both are drawn."""
+        settings, stop, edge, chooser = asked.settings, asked.stop, asked.edge, asked.chooser
+        wanted: Any = {name: getattr(settings, name) for name in ("tolerance", "budget", "min_level", "fade")}
+        finest: Any = {"tolerance": 0.0, "budget": None, "min_level": 0, "fade": None}
+        compares = edge > 0 or settings.shows == "difference"
+        if patience:
+            how = finest if compares else wanted
+            pool._frame.settle(self.scene, chooser or asked.camera, seconds=patience, **how)
+
+        def draw(steps: _core.BudgetSteps | None, look: PoolLook, options: Any) -> Any:
+            how = _SHADE, None, stop, steps, look
+            image = pool._frame.draw(self.scene, asked.camera, *how, **options)
+            _check(stop)
+            return image
+
+        finer = draw(None, PoolLook(chooser=chooser), finest) if compares else None
+        by: Any = settings.shows if settings.shows in _OF_CUT else "appearance"
+        image = draw(asked.steps, PoolLook(by, chooser, aside=compares), wanted)
+        first = min(edge, asked.camera.width - 1)
+        planes = (image.color, image.alpha, image.depth)
+        color, alpha, depth = (_device.to_host(plane)[:, first:] for plane in planes)
+        of, whole = image.stats, None if finer is None else finer.color
+        levels = np.zeros(self.num_levels if of.levels else 0, np.int64)
+        levels[: len(of.levels)] = of.levels
+        cost = of.gaussians_selected, of.gaussians_in_frustum, of.tolerance, of.select_ms, of.draw_ms
+        return _Drawn(color, alpha, depth, whole, Figures(*cost, levels, _resident_bytes(), of.missing))
+
+    def _of_all(self, asked: _Asked) -> _Drawn:
+        """What is resident, which is all; compared with all gaussians."""
+        camera, settings, stop, edge = asked.camera, asked.settings, asked.stop, asked.edge
+        rule = rule_of(settings.tolerance, settings.budget, settings.min_level, fade=settings.fade)
+        cut = select_by(rule, self.scene, asked.chooser or camera, settings.budget, self.device, asked.steps)
+        first, shows = min(edge, camera.width - 1), settings.shows
+        window = first, 0, camera.width, camera.height
+        if shows in ("count", "error"):
+            how: Any = _core.SceneFrame.count_cut if shows == "count" else _core.SceneFrame.draw_metrics
+            rules = [rule_of(cut.tolerance, None, 0)] if shows == "error" else []
+            planes = self._values(how, cut, camera, window, stop, "appearance", *rules)
+        else:
+            by: Any = shows if shows in _OF_CUT else "appearance"
+            planes = self._draw(cut, camera, window, by, stop)
+        whole, last = None, camera.width if shows == "difference" else edge
+        if last > 0:
+            finest = select(self.scene, camera, tolerance=0.0, device=self.device)
+            whole = self._draw(finest, camera, (0, 0, last, camera.height), "appearance", stop)[0]
+        cost = cut.num_gaussians, planes[3], cut.tolerance, 1e3 * cut.seconds, 0.0
+        return _Drawn(*planes[:3], whole, Figures(*cost, self._levels(cut), _resident_bytes(), 0))
 
     def _draw(
         self, cut: Selection, camera: Camera, window: Window, color_by: ColorBy, stop: _core.Stop | None
     ) -> tuple[Any, Any, Any, int]:
         """Colour, alpha and depth of the window, and the gaussians in the frustum of the whole picture."""
-        if self.pool is not None or self.device.is_cuda:
-            if self.pool is not None:
-                options: Any = {"tolerance": cut.tolerance, "budget": None, **self._how}
-                drawer = self.pool._frame
-                if self._patience:
-                    drawer.settle(self.scene, camera, seconds=self._patience, **options)
-                drawer.color_by = color_by
-                image = drawer.draw(self.scene, camera, _SHADE, None, stop, **options)
-                _check(stop)
-                self._missing = image.stats.missing
-            else:
-                how: Any = {"color_by": color_by, "depth": True, "device": self.device, "memory": None}
-                image = render(self.scene, camera, cut=cut, **how)
-            x0, y0, x1, y1 = window
-            planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
-            color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
-            return color, alpha, depth, image.stats.gaussians_in_frustum
-        return self._values("draw_cut", cut, camera, window, stop, color_by)
+        if not self.device.is_cuda:
+            return self._values(_core.SceneFrame.draw_cut, cut, camera, window, stop, color_by)
+        how: Any = {"color_by": color_by, "depth": True, "device": self.device, "memory": None}
+        image = render(self.scene, camera, cut=cut, **how)
+        x0, y0, x1, y1 = window
+        planes = (_device.to_host(plane) for plane in (image.color, image.alpha, image.depth))
+        color, alpha, depth = (plane[y0:y1, x0:x1] for plane in planes)
+        return color, alpha, depth, image.stats.gaussians_in_frustum
 
     def _values(
-        self, how: str, cut: Selection, camera: Camera, window: Window, stop: Any, by: ColorBy, *rule: Any
+        self, how: Any, cut: Selection, camera: Camera, window: Window, stop: Any, by: ColorBy, *rule: Any
     ) -> tuple[Any, Any, Any, int]:
         """As `_draw`, by a method of frames that are drawn on the CPU on any device."""
-        frame, scene = self._frame(by, cut)
+        frame, resident = _core.SceneFrame(CPU.number), residency.scene(self.scene, CPU)
+        cut.check(resident.revision)  # it still has the instances of the cut
+        residency.set_models(frame, resident.bundles, CPU, by)
         pairs, part = (cut.instance_ids, cut.cluster_ids), camera.core.window(*window)
-        drawing = getattr(frame, how)(scene, part, *rule, *pairs, _SHADE, stop, cut.given_weights)
+        drawing = how(frame, resident.core, part, *rule, *pairs, _SHADE, stop, cut.given_weights)
         _check(stop)
         return drawing.color, drawing.alpha, drawing.depth, drawing.finish().in_frustum
-
-    def _frame(self, color_by: ColorBy, cut: Selection) -> tuple[_core.SceneFrame, _core.ResidentScene]:
-        """A frame, and the scene as it is, which still has the instances of the cut."""
-        frame, resident = _core.SceneFrame(CPU.number), residency.scene(self.scene, CPU)
-        cut.check(resident.revision)
-        residency.set_models(frame, resident.bundles, CPU, color_by)
-        return frame, resident.core
 
     def _levels(self, cut: Selection) -> npt.NDArray[np.int64]:
         """(L,) selected gaussians by level."""
         level, size = cut._per_pair(lambda c: c.level), cut._per_pair(lambda c: np.diff(c.offset))
         return np.bincount(level, size, self.num_levels).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Planes of what is right of the split, what it is compared with from the left on, and what it cost."""
+
+    color: Any
+    alpha: Any
+    depth: Any  # or how many gaussians a pixel is blended of
+    whole: Any
+    figures: Figures
+
+
+def _painted(drawn: _Drawn, settings: Settings) -> tuple[Any, tuple[float, float] | None, float | None]:
+    """Colours right of the split, values of darkest and brightest, the distance."""
+    shows, alpha, depth = settings.shows, drawn.alpha, drawn.depth
+    if shows == "count":
+        values = np.log2(np.maximum(depth, 1)) / np.log2(MOST_COUNTED)
+        return _core.ramp(values) * (depth > 0)[..., None], (1.0, MOST_COUNTED), None
+    distance = _distance(alpha, depth)
+    if shows == "error":
+        mean = np.clip(drawn.color[..., 0] / np.maximum(alpha, 1e-6), 0, 1)
+        return _core.ramp(mean) * alpha[..., None], (0.0, drawn.figures.tolerance), distance
+    if shows == "alpha":
+        return np.repeat(alpha[..., None], 3, axis=2), (0.0, 1.0), distance
+    if shows == "depth":
+        covered = depth[alpha > 0.5]
+        # A few gaussians far from all others would take all the colours.
+        near, far = np.percentile(covered, (1, 99)) if covered.size else (0.0, 1.0)
+        values = np.clip((far - depth) / max(far - near, 1e-12), 0, 1)
+        return _core.ramp(values) * alpha[..., None], (float(far), float(near)), distance
+    if shows == "difference":
+        difference = np.abs(drawn.color - drawn.whole[:, -alpha.shape[1] :])
+        return np.minimum(settings.gain * difference, np.float32(1)), None, distance
+    return drawn.color, None, distance
 
 
 def _distance(alpha: npt.NDArray[np.float32], depth: npt.NDArray[np.float32]) -> float | None:

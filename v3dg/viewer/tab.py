@@ -24,7 +24,6 @@ from v3dg import _core
 from v3dg.bundle import Bundle
 from v3dg.camera_file import write_cameras
 from v3dg.io import read_asset
-from v3dg.pick import pick
 from v3dg.pictures import to_8bit
 from v3dg.scene.file import write_scene
 from v3dg.video import write_video
@@ -119,6 +118,7 @@ class Tab:
             "ramp": legend,
             "most_counted": MOST_COUNTED,
             "modes": shown.modes,
+            "shows_cuts": shown.shows_cuts,
             "missing_colors": to_8bit(_core.missing_colors(4.0 ** np.arange(4))).tolist(),
         }
 
@@ -152,13 +152,10 @@ class Tab:
         try:
             view, (width, height), settings, _ = message.look.request()
             answer: dict[str, Any] = {"type": "picked"}
-            if message.instance is None and self.scene_view.pool is None:  # which has all to look at
-                camera = view.camera(width, height, self.scene_view.near)
+            if message.instance is None and self.scene_view.shows_cuts:
                 x = min(int(message.at[0] * width), width - 1)
                 y = min(int(message.at[1] * height), height - 1)
-                names = ("tolerance", "budget", "min_level")
-                cut = {name: getattr(settings, name) for name in names}
-                found = pick(self.scene_view.scene, camera, x, y, **cut)
+                found = self.scene_view.pick(view, (width, height), x, y, settings)
                 if found is not None and found.weight >= _LEAST_WEIGHT:
                     answer |= self._instance(found.instance) | {"point": found.position.tolist()}
             elif message.instance is not None:

@@ -503,6 +503,7 @@ class App {
   // Instances.
 
   pick(x, y, flies) {
+    if (!this.scene.shows_cuts) return;
     this.fliesToPicked = flies;
     this.link.send({ type: "pick", look: this.look, at: [M.clamp(x, 0, 1), M.clamp(y, 0, 1)] });
   }

@@ -245,9 +245,7 @@ export class Panel {
     this.fade.set(settings.fade !== null);
     this.split.set(settings.split);
     this.freeze.set(settings.frozen !== null);
-    // A pool has not all gaussians, and chooses its cut by what it has.
-    const hasAll = app.scene.modes.includes("difference");
-    for (const control of [this.split, this.freeze]) control.hidden = !hasAll;
+    for (const control of [this.split, this.freeze]) control.hidden = !app.scene.shows_cuts;
     this.resolution.set(100 * app.resolution);
     this.speed.set(camera.speed);
     this.fov.set((camera.fov_y * 180) / Math.PI);
@@ -260,7 +258,7 @@ export class Panel {
     const text = (numbers) => numbers.map((x) => +x.toPrecision(4)).join(" ");
     this.selected.textContent = selected
       ? `#${selected.instance} of ${scene.instances.toLocaleString("en")}: ${selected.bundle || "asset"}, at ${text(selected.pose.position)}, scale ${text([selected.pose.scale])}`
-      : `${scene.instances.toLocaleString("en")} in the scene; click one to select it`;
+      : `${scene.instances.toLocaleString("en")} in the scene${scene.shows_cuts ? "; click one to select it" : ""}`;
     const items = app.bookmarks.map((bookmark, i) => {
       const item = make("li");
       this.button(item, `${i + 1}  ${bookmark.name}`, () => app.openBookmark(i));
