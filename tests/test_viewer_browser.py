@@ -356,6 +356,15 @@ def test_wrong_links_show_the_scene(browser, site, hash):
         assert (tab.settled().max(axis=2) > 30).mean() > 0.05
 
 
+def test_a_link_that_asks_for_what_is_not_there_is_told_so(browser, site):
+    with Tab(browser, site.url + "/#show=residency&split=0.5") as tab:
+        tab.page.wait_for_function("document.querySelector('#notices').innerText.includes('residency')")
+        assert "mode residency is not there" in tab.page.inner_text("#notices")
+        view = tab.view()
+        assert "show" not in view
+        assert float(view["split"]) == 0.5  # without a pool there is a split
+
+
 def test_bookmarks_outlive_the_page_and_lead_back(tab):
     tab.drag()
     first = tab.settled()

@@ -5,7 +5,7 @@ import { AXES, Camera } from "./camera.js";
 import { Input } from "./input.js";
 import { Link } from "./link.js";
 import { Overlay } from "./overlay.js";
-import { Panel, SHOWS, make } from "./panel.js";
+import { Panel, make } from "./panel.js";
 
 const MOST_RATIO = 2; // px of the picture for one of the page
 const MOST_FRAME_SECONDS = 0.1; // a tab that was hidden does not leap
@@ -439,14 +439,18 @@ class App {
     }
     if (MODES.includes(given.mode ?? "orbit")) this.changePage({ mode: given.mode ?? "orbit" });
     const last = Math.max(this.scene.level_colors.length - 1, 0);
+    const { modes, shows_cuts } = this.scene; // what a link may ask for that cannot be shown here
+    const shows = given.show ?? "appearance", split = number("split", 0, 1) ?? 0;
+    if (!modes.includes(shows)) this.notice(`The link's mode ${shows} is not there; ${modes.join(", ")} are.`);
+    if (split && !shows_cuts) this.notice("The link's split is not there: a pool on a GPU has none.");
     Object.assign(settings, {
-      shows: given.show === undefined ? "appearance" : given.show in SHOWS ? given.show : settings.shows,
+      shows: modes.includes(shows) ? shows : settings.shows,
       tolerance: number("tolerance", 0, 1e6) ?? settings.tolerance,
       budget: number("budget", 1, 1e12) === null ? null : Math.round(number("budget", 1, 1e12)),
       min_level: Math.round(number("level", 0, last) ?? 0),
       gain: number("gain", 1, 50) ?? 5,
       fade: given.fade === "0" ? null : this.greeting.settings.fade,
-      split: number("split", 0, 1) ?? 0,
+      split: shows_cuts ? split : 0,
     });
     this.resolution = number("resolution", 0.1, 1) ?? 1;
     camera.speed = number("speed", 0.01, 100) ?? 1;
