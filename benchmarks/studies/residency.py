@@ -230,7 +230,7 @@ def main(config: Config) -> None:
             truth[number] = pixels(roomy.render(cameras[number], tolerance=config.tolerance))
         del roomy
         result: dict[str, Any] = {
-            "config": {k: str(v) for k, v in vars(config).items()},
+            "config": {k: str(getattr(v, "name", v)) for k, v in vars(config).items()},  # without folders
             "gaussians": sum(bundle.num_gaussians for bundle in field.scene.bundles),
             "leaves": sum(int(b.clusters.offset[b.level_range(0).stop]) for b in field.scene.bundles),
             "file_bytes": sum(path.stat().st_size for path in field.paths),
