@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <memory>
 #include <mutex>
-#include <utility>
 #include <vector>
 
 #include "bindings/resident.h"
@@ -38,7 +37,7 @@ class BoundPool {
     template <class Cut>
     void frame_on_host(const SceneState& scene, SelectRule rule, PoolFrame kind, const Cut& cut) {
         const std::lock_guard<std::mutex> lock(busy_);
-        const bool is_aside = kind == PoolFrame::aside && std::exchange(has_begun_, true);
+        const bool is_aside = kind == PoolFrame::aside && has_begun_;
         const bool is_bounded = kind != PoolFrame::look;
         if (!is_aside) {
             const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
