@@ -1,6 +1,6 @@
 #pragma once
 
-// Memory on the host that grows by forgetting what it held.
+// Memory on the host that grows by forgetting what it held. On a device that is DeviceBuffer (device.h).
 
 #include <sys/mman.h>
 

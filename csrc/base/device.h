@@ -1,7 +1,8 @@
 #pragma once
 
 // Memory and errors of the CUDA half. A DeviceBuffer frees itself into a pool of its device, trim_pool()
-// gives what the pool keeps to the driver. Sources that include it are built only with CUDA.
+// gives what the pool keeps to the driver. v3dg/residency.py says when what stays on a device is freed.
+// Sources that include it are built only with CUDA.
 
 #include <cuda_runtime.h>
 

@@ -1,3 +1,5 @@
+// Hands the groups of a level to threads. What is done for one group is in fit_group/fit_group_cpu.cpp.
+
 #include "pipeline/fit_level.h"
 
 #include <omp.h>

@@ -1,6 +1,7 @@
 #pragma once
 
-// One gaussian over one pixel (or a vector of pixels): the blend step and its gradients.
+// One gaussian over one pixel (or a vector of pixels): its falloff, the blend step, and the gradients of
+// both.
 //
 // A pixel's transmittance is negative once it has stopped; its magnitude is then the final value.
 

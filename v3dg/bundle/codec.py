@@ -1,4 +1,8 @@
-"""The codecs: what the bytes of a page are."""
+"""The codecs: what the bytes of a page are.
+
+They are written here and read in the core, which knows each by its `PageCodec`
+(csrc/residency/page_source.h). CONTRIBUTING.md says what one more takes.
+"""
 
 from __future__ import annotations
 
