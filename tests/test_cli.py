@@ -343,6 +343,29 @@ def test_wrong_usage(folder):
     for number in (0, 2**32):
         fails(2, "--threads: expected 1 to 1,024", "build", "tuft.ply", "--threads", number, cwd=folder)
     fails(2, "--camera", "render", "tuft.ply", "--camera", "near", cwd=folder)
+    fails(2, "COMMAND: expected build, info,", "tuft.ply", cwd=folder)
+    fails(2, "--up: expected one of x, y, z, -x, -y, -z, got", "build", "tuft.ply", "--up", "q", cwd=folder)
+    fails(2, "--budget: expected whole numbers, got '1e6'", "render", "tuft.v3dg", "--budget=1e6", cwd=folder)
+    fails(2, "-89.99 to 89.99, got 90", "render", "tuft.v3dg", "--elevation", 90, cwd=folder)
+    fails(2, "leave it out", "export", "tuft.v3dg", "--to", "tiles", "-o", "a.usda", cwd=folder)
+    fails(2, "--seed: expected 0 to", "demo", "--seed", "-1", cwd=folder)
+
+
+def test_an_empty_argument_is_not_the_working_folder(folder):
+    """A shell gives one for a variable that is not set, and `build` would take all assets that are there."""
+    before = sorted(os.listdir(folder))
+    fails(2, "check what was to stand there", "build", "", "-o", "all.v3dg", cwd=folder)
+    assert sorted(os.listdir(folder)) == before
+
+
+def test_an_asset_with_wrong_values_is_drawn_without_them(folder, tmp_path):
+    asset = v3dg.read_asset(folder / "tuft.ply")
+    asset.means[::7] = np.nan
+    v3dg.write_asset(tmp_path / "nan.ply", asset)
+    done = run("render", "nan.ply", "--size", 32, 32, "--up", "z", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["pictures"][0]["gaussians_in_frustum"] > 100
+    fails(1, "v3dg.cleaning.examine", "convert", "nan.ply", "nan.spz", cwd=tmp_path)
 
 
 def test_failures(folder):
@@ -350,7 +373,10 @@ def test_failures(folder):
     fails(1, "broken.ply", "build", "broken.ply", cwd=folder)
     fails(1, "broken.ply", "info", "broken.ply", cwd=folder)
     fails(1, "expected a file name ending in .v3dg", "build", "tuft.ply", "-o", "tuft.zip", cwd=folder)
-    fails(1, "create it first", "build", "tuft.ply", "-o", "no/tuft.v3dg", cwd=folder)
+    fails(1, "error: no/tuft.v3dg: expected an", "build", "tuft.ply", "-o", "no/tuft.v3dg", cwd=folder)
+    fails(1, "got a folder; tuft.v3dg is one", "build", "tuft.ply", "-o", "./", cwd=folder)
+    fails(1, "got a folder", "info", ".", cwd=folder)
+    fails(1, "got 1,024 bytes", "build", "tuft.ply", "--memory", "1KB", "-o", "small.v3dg", cwd=folder)
     fails(1, "create it first", "render", "tuft.ply", "-o", "no/tuft.png", cwd=folder)
     fails(1, ".png", "render", "tuft.ply", "-o", "tuft.gif", cwd=folder)
     fails(1, "tolerance", "render", "tuft.v3dg", "--tolerance", "-1", cwd=folder)

@@ -45,9 +45,8 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
     drips = (0.07 * np.sin(np.array([[3], [5], [8], [13]]) * around + np.where(outside, *phase))).sum(0)
     icing = np.clip((np.sin(along) - 0.1 - drips) / 0.08, 0, 1)
     points, normals = _on_tube(around, along, _DOUGH + (_TUBE - _DOUGH) * np.sqrt(icing))
-    blotch = np.sin(points @ rng.normal(scale=9, size=(3, 6)) + rng.uniform(0, 6.28, 6)).mean(
-        1, keepdims=True
-    )
+    waves = np.sin(points @ rng.normal(scale=9, size=(3, 6)) + rng.uniform(0, 6.28, 6))
+    blotch = waves.mean(1, keepdims=True)
     pale = np.exp(-((along / 0.3) ** 2))[:, None]  # where it floated as it was baked
     dough = np.array([0.42, 0.17, 0.035]) * (1 + 0.5 * blotch)
     dough += (np.array([0.7, 0.46, 0.19]) - dough) * pale
@@ -63,13 +62,8 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
     middle = longest * np.exp(-rng.gamma(2, 0.25, num_gaussians))
     thinnest = middle * np.exp(-rng.gamma(3, 0.7, num_gaussians))
     opacities = 1 / (1 + np.exp(-rng.normal(1.5, 2, num_gaussians)))
-    arrays = (
-        points,
-        _quats(normals, rng),
-        np.stack([longest, middle, thinnest], 1),
-        opacities,
-        _lit(normals, albedo, gloss),
-    )
+    scales = np.stack([longest, middle, thinnest], 1)
+    arrays = points, _quats(normals, rng), scales, opacities, _lit(normals, albedo, gloss)
     return Gaussians(*(array[order].astype(np.float32) for array in arrays))
 
 

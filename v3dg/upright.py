@@ -75,6 +75,7 @@ def _middles(subject: Bundle | Gaussians) -> Floats:
 
 def _flat_axis(points: Floats) -> Axis | None:
     """The axis across the plane that points lie in, if they do; far outliers do not count."""
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 16:
         return None
     low, high = np.percentile(points, (5, 95), axis=0)

@@ -62,8 +62,8 @@ def build_file(
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As `read_asset` and `build_bundle`.
     """
     paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
-    bundle_path, config = Path(bundle_path), config or BuildConfig()
-    _files.check_folder(levels := levels_path(bundle_path))
+    bundle_path, levels, config = Path(bundle_path), levels_path(bundle_path), config or BuildConfig()
+    _files.check_folder(bundle_path)
     _files.status_of_replaced(bundle_path)
     devices, num_bytes = devices_for(device, asset), in_bytes(memory)  # before anything is read
     if not resume:

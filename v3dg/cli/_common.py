@@ -98,13 +98,14 @@ def check_usage(name: str, holds: object, expected: str) -> None:
         raise UsageError(f"{name}: expected {expected}")
 
 
-def check_range(name: str, value: int, least: int, most: int) -> None:
+def check_range(name: str, value: float, least: float, most: float) -> None:
     check_usage(name, least <= value <= most, f"{least:,} to {most:,}, got {value}")
 
 
 def require_file(path: Path, *suffixes: str) -> None:
     check(path, path.exists(), "a file, got a path where there is none; check it")
-    check(path, path.name.lower().endswith(suffixes), f"a file ending in {', '.join(suffixes)}")
+    got = "a folder" if path.is_dir() else "another name"
+    check(path, path.name.lower().endswith(suffixes), f"a file ending in {', '.join(suffixes)}, got {got}")
 
 
 def require_subject(path: Path) -> None:

@@ -20,7 +20,7 @@ import tyro
 
 from v3dg import _start
 from v3dg._version import __version__
-from v3dg.cli._common import FAILURES, UsageError, check_range, failure_text, tell
+from v3dg.cli._common import FAILURES, UsageError, check_range, check_usage, failure_text, tell
 
 # Options and what runs on them, by the command's name, in the order of the help.
 Commands: TypeAlias = Mapping[str, tuple[type[Any], Callable[[Any], None]]]
@@ -44,6 +44,8 @@ class Program:
         subcommands: Any = [
             Annotated[options, tyro.conf.subcommand(name)] for name, (options, _) in self.commands.items()
         ]
+        # A shell's variable that is not set; as a path it would be the working folder, and all in it.
+        check_usage("arguments", "" not in arguments, "no empty one, got ''; check what was to stand there")
         caught = io.StringIO()
         try:
             with contextlib.redirect_stderr(caught):
@@ -63,15 +65,14 @@ class Program:
         """The text of the first box that tyro drew, without rules and title, and what may be meant."""
         lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
         rule = next((i for i, line in enumerate(lines) if not line), len(lines))
-        rest = " ".join(line for line in lines[rule:] if line).replace("run:", "run")
-        help_at = rest.find(f"run {self.name}")
-        hint = rest[help_at:].split("--help")[0] if help_at >= 0 else f"run {self.name} "
         similar = "\n".join(lines[rule:]).partition("Perhaps you meant:")[2]
         meant = [name for name in re.findall(r"^--[a-z-]+", similar, re.M) if name not in arguments]
+        text, asked = _plainly(" ".join(lines[:rule]).rstrip(".")), " ".join([self.name, *arguments[:1]])
         if arguments and arguments[0] not in self.commands:
             meant = difflib.get_close_matches(arguments[0], self.commands)
+            text, asked = f"COMMAND: expected {', '.join(self.commands)}, got {arguments[0]}", self.name
         advice = f"; perhaps you meant {meant[0]}" if meant else ""
-        return " ".join(lines[:rule]).rstrip(".") + f"{advice}; {hint}--help"
+        return f"{text}{advice}; run {asked} --help"
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """Run one command, by default the one this program was started with, and return its exit code."""
@@ -115,6 +116,18 @@ class Program:
         except FAILURES as error:
             return _fail(failure_text(error), 1)
         return 0
+
+
+def _plainly(text: str) -> str:
+    """What tyro says of a value, without types of Python, and its choices in one order, without None."""
+    if match := re.match(r"Error parsing (--[a-z-]+): (.*)", text):
+        expected = "numbers" if "float" in match[2] else "whole numbers"
+        return f"{match[1]}: expected {expected}, got " + ", ".join(re.findall("'.*?'", match[2]))
+    if match := re.match(r"invalid choice (.*) for argument '(.*)'. Expected one of (.*)", text):
+        known = set(re.findall(r"'(.*?)'", match[3])) - {"None"}
+        expected = ", ".join(sorted(known, key=lambda name: (name[0] == "-", name)))
+        return f"{match[2]}: expected one of {expected}, got {match[1]}"
+    return text
 
 
 def _set_threads(threads: int | None) -> None:

@@ -15,7 +15,7 @@ from v3dg._numbers import check
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import DEFAULT_FOV_X, Axis, Camera, turntable
-from v3dg.cleaning import ball_of_most
+from v3dg.cleaning import ball_of_most, examine
 from v3dg.cli._common import check_range, check_usage, level_size, option, require_subject
 from v3dg.gaussians import Gaussians
 from v3dg.opening import Subject, is_scene
@@ -62,8 +62,7 @@ class ViewOptions(CameraFile):
         check_range("--views", self.views, 1, _MOST_VIEWS)
         for side in self.size:
             check_range("--size", side, 1, MOST_SIDE)
-        is_angle = -90 <= self.elevation <= 90
-        check_usage("--elevation", is_angle, f"-90 to 90 degrees, got {self.elevation}")
+        check_range("--elevation", self.elevation, -89.99, 89.99)
         is_from_file = self.cameras is not None or any(map(is_scene, subjects))
         expected = "--cameras or a scene (.json) to take it from; leave it out"
         check_usage("--camera", self.camera is None or is_from_file, expected)
@@ -102,7 +101,7 @@ def _one_camera(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
 def _turntable(subject: Subject, options: ViewOptions, up: Axis) -> dict[str, Camera]:
     """Cameras around where most of the gaussians are, at a distance that shows nearly all of it."""
     if isinstance(subject, Gaussians):
-        means = subject.means
+        means = subject.means[examine(subject).drawable]
     else:
         assert isinstance(subject, Bundle)
         levels = range(subject.num_levels)

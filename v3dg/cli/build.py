@@ -173,7 +173,8 @@ def _build(
     """Build and write one bundle; what was done, as JSON values."""
     for path in asset_paths:
         _common.require_file(path, *SUFFIXES)
-    check(output, output.suffix == ".v3dg", "a file name ending in .v3dg")
+    advice = f", got a folder; {output / asset_paths[0].stem}.v3dg is one" if output.is_dir() else ""
+    check(output, output.suffix == ".v3dg", f"a file name ending in .v3dg{advice}")
     start = time.perf_counter()
     config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
     if options.cluster_size is not None:

@@ -30,7 +30,8 @@ class Convert(_common.Cut, _common.Common):
     subject: tyro.conf.Positional[Path]
     """An asset in any format that is read (docs/formats.md), a bundle (.v3dg) or a scene (.json)."""
     output: tyro.conf.Positional[Path]
-    """File to write, .ply, .compressed.ply, .spz, .sog or .glb; of a bundle also .v3dg, with all levels."""
+    """File to write, .ply, .compressed.ply, .spz, .sog, .glb or .usd; of a bundle also .v3dg, with all its
+    levels."""
     codec: Annotated[Literal["float32", "quantized"] | None, _common.option("{float32,quantized}")] = None
     """How a .v3dg that is written keeps gaussians, as for `v3dg build`; as the bundle does if not given."""
     level: Annotated[int | None, _common.option("N")] = None
@@ -62,7 +63,8 @@ def run(options: Convert) -> None:
     told: dict[str, Any] = {}
     if to_bundle:
         if not isinstance(subject, Bundle) or is_cut or options.level is not None:
-            raise _common.UsageError(f"{output}: expected a bundle to write anew, and no level or cut of it")
+            expected = "a bundle to write anew, and no level or cut of it; v3dg build makes one of an asset"
+            raise _common.UsageError(f"{output}: expected {expected}")
         gaussians, codec = subject.gaussians, options.codec or subject.codec
         Bundle(subject.clusters, subject.groups, gaussians, subject.config, codec).write(output)
         told = {"codec": codec}

@@ -10,7 +10,7 @@ import tyro
 
 from v3dg.cli._common import Common, check_range, print_result, table_lines
 from v3dg.demo import run_demo
-from v3dg.select import DEFAULT_TOLERANCE
+from v3dg.select import DEFAULT_TOLERANCE, rule_of
 
 
 @dataclass
@@ -36,6 +36,8 @@ def run(options: Demo) -> None:
     check_range("--instances", options.instances, 1, 1_000_000)
     for side in options.size:
         check_range("--size", side, 16, 4096)
+    check_range("--seed", options.seed, 0, (1 << 58) - 1)
+    rule_of(options.tolerance, None, 0, "solid_angle", True)
     result = run_demo(
         options.output,
         num_gaussians=options.gaussians,

@@ -49,7 +49,7 @@ def _findings() -> Iterator[tuple[str, str | None, str]]:
     gpu = _answer("nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader")
     yield "GPU, driver", gpu, "to draw and build with CUDA; the CPU can do all of it, too"
     missing = _device.missing_for_cuda()
-    yield "CUDA", None if missing else "works", f"for which the next step is: {missing}"
+    yield "CUDA", None if missing else "works", f"to draw and build on a GPU: {missing}"
     for requirement, purpose in EXTRAS.values():
         name, version = requirement.partition(">=")[0], None
         with contextlib.suppress(metadata.PackageNotFoundError):
@@ -58,11 +58,7 @@ def _findings() -> Iterator[tuple[str, str | None, str]]:
     browser = None
     with contextlib.suppress(webbrowser.Error):
         browser = getattr(webbrowser.get(), "name", "there")
-    yield (
-        "web browser",
-        browser,
-        "or no screen: open the address that `v3dg view` prints in any browser",
-    )
+    yield "web browser", browser, "or no screen: open the address that `v3dg view` prints in any browser"
 
 
 def _answer(*command: str, line: int = 0) -> str | None:

@@ -49,6 +49,7 @@ def run(options: Export) -> None:
     up = options.up or up_of(subject, cameras, options.subject)[0]
     notes = up_lines(options.up, subject, cameras, path=options.subject)
     if folder.suffix.lower() in USD_SUFFIXES:
+        check_usage("--to", options.to == "sog", f"none for {folder}, got {options.to}; leave it out")
         size = export.write_usd(subject, folder, up=up)
         written = {"output": str(folder), "bytes": size, "seconds": time.perf_counter() - start}
         line = f"{folder}: {bytes_text(size)}, {written['seconds']:.1f} s"

@@ -90,7 +90,7 @@ def check_writable(gaussians: Gaussians) -> Gaussians:
     """The gaussians on the host; ValueError names the first value that a quantised format cannot hold."""
     host = gaussians.numpy()
     for name, values in vars(host).items():
-        check_all(name, values, np.isfinite(values), "finite values")
+        check_all(name, values, np.isfinite(values), "finite values (v3dg.cleaning.examine finds others)")
     check_all("quats", host.quats, (host.quats != 0).any(axis=1), "a length above 0")
     check_all("scales", host.scales, host.scales >= 0, "values >= 0")
     check_all("opacities", host.opacities, abs(host.opacities - 0.5) <= 0.5, "values in [0, 1]")
