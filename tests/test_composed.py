@@ -86,7 +86,7 @@ def test_budget_below_the_coarsest_cut_is_refused(device):
     assert image.stats.gaussians_selected == least
     with pytest.raises(ValueError, match=message):
         render(scene, camera, budget=least - 1, device=device).stats  # noqa: B018  waits for the picture
-    with pytest.raises(ValueError, match="budget: expected 0 gaussians or more, got -1"):
+    with pytest.raises(ValueError, match="budget: expected a whole number of gaussians, 0 or more, got -1"):
         select(scene, camera, budget=-1, device="cpu")
 
 

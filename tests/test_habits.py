@@ -118,6 +118,28 @@ def test_paths_in_place_of_objects_are_told_what_to_call(bundle, camera):
             call()
 
 
+@pytest.mark.parametrize("name", ["a.v3dg", "a.json"])
+def test_a_bundle_or_a_scene_read_as_an_asset_is_sent_to_open(name):
+    with pytest.raises(ValueError, match=r"v3dg\.open opens bundles \(\.v3dg\) and scenes"):
+        v3dg.read_asset(name)
+
+
+def test_no_camera_and_no_bundle_are_named(bundle, tmp_path):
+    with pytest.raises(TypeError, match=r"camera: expected .*, got NoneType"):
+        v3dg.render(bundle, None)
+    with pytest.raises(TypeError, match=r"bundle: expected a Bundle, got str; v3dg\.open reads files"):
+        v3dg.write_streamed_sog("donut.v3dg", tmp_path / "web")
+    with pytest.raises(ValueError, match="nowhere; create it first"):
+        v3dg.write_usd(bundle, tmp_path / "nowhere" / "a.usda")
+
+
+@pytest.mark.parametrize(("name", "got"), [("a.sog", "begins with b''"), ("a.glb", "whole, got 0 bytes")])
+def test_empty_files_are_told_in_our_words(tmp_path, name, got):
+    (tmp_path / name).touch()
+    with pytest.raises(ValueError, match=f"{name}: expected a .*{got}"):
+        v3dg.read_asset(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     ("typed", "message"),
     [

@@ -151,6 +151,13 @@ def test_number_is_used_or_named(name, argument):
             raise AssertionError(f"{name}({argument}={given[argument]!r}) {problem}: {text}")
 
 
+def test_text_is_no_number():
+    with pytest.raises(ValueError, match="tolerance: expected 0 px² or more, got '3'"):
+        v3dg.render(BUNDLE, CAMERA, tolerance="3")
+    with pytest.raises(ValueError, match=r"budget: expected a whole number .*, got 1000\.0"):
+        v3dg.render(BUNDLE, CAMERA, budget=1e3)
+
+
 def test_every_public_function_with_numbers_is_tried():
     tried = {name.split(" ")[0] for name in CALLS}
     kinds = (v3dg.Camera, v3dg.Scene, v3dg.Selection, v3dg.Renderer)

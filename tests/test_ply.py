@@ -394,7 +394,7 @@ HOSTILE = {
     ),
     "truncated": (
         header(*vertex_lines(2)) + b"\0" * (2 * ROW_BYTES - 1),
-        "expected 2 rows of element 'vertex' with 56 bytes each, got 111 bytes",
+        "expected 2 rows of element 'vertex' with 56 bytes each, got 111 bytes; the file is truncated",
     ),
     "property before element": (
         header("property float x"),

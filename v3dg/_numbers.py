@@ -57,7 +57,7 @@ def real(
 ) -> float:
     """One number of ``least`` to ``most``; ValueError otherwise."""
     try:
-        number = math.nan if getattr(value, "ndim", 0) else float(value)
+        number = math.nan if getattr(value, "ndim", 0) or isinstance(value, str) else float(value)
     except OverflowError:
         number = math.inf if value > 0 else -math.inf
     except (TypeError, ValueError, RuntimeError):

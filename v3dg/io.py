@@ -156,4 +156,5 @@ def _by_name(path: Path, formats: Mapping[str, Format]) -> Format:
     for ending, function in formats.items():
         if name.endswith(ending):
             return function
-    raise ValueError(f"{os.fspath(path)}: expected a file name that ends in {', '.join(formats)}")
+    advice = "; v3dg.open opens bundles (.v3dg) and scenes (.json)" if formats is not _WRITERS else ""
+    raise ValueError(f"{os.fspath(path)}: expected a file name that ends in {', '.join(formats)}{advice}")

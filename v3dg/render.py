@@ -115,11 +115,11 @@ def render(
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
     shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
     pictures: list[Any] = []
-    for view in [camera] if isinstance(camera, Camera | StereoCamera) else camera:
+    for view in camera if hasattr(camera, "__iter__") else [camera]:
         if cut is None:
             frame.settle(subject, view, **options)
         pictures.append(frame.draw(subject, view, shade, cut, **options))
-    return pictures[0] if isinstance(camera, Camera | StereoCamera) else pictures
+    return pictures if hasattr(camera, "__iter__") else pictures[0]
 
 
 class Renderer:

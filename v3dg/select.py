@@ -268,7 +268,7 @@ def rule_of(
         tolerance = DEFAULT_TOLERANCE if budget is None else 0.0
     tolerance = real(tolerance, "tolerance", "0 px² or more", 0)
     if budget is not None:
-        budget = whole(budget, "budget", "0 gaussians or more", 0, most=(1 << 63) - 1)
+        budget = whole(budget, "budget", "a whole number of gaussians, 0 or more", 0, most=(1 << 63) - 1)
     one_of(footprint, "footprint", get_args(Footprint))
     factor = 1.0 if fade is None else real(fade, "fade", "None or a factor of 1 to 1000", 1, 1000)
     if factor != 1 and footprint == "paper":

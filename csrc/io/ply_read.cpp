@@ -406,7 +406,8 @@ void check_size(const PlyFile& ply, const PlyElement& element, size_t offset) {
     if (row_bytes != 0 && element.count > (left + (is_text ? 1 : 0)) / row_bytes)
         throw PlyError("expected " + std::to_string(element.count) + " rows of element " +
                        quoted(element.name) + " with " + (is_text || element.has_lists() ? "at least " : "") +
-                       std::to_string(row_bytes) + " bytes each, got " + std::to_string(left) + " bytes");
+                       std::to_string(row_bytes) + " bytes each, got " + std::to_string(left) +
+                       " bytes; the file is truncated");
 }
 
 // Returns the offset after the element that begins at `offset`.

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
-from v3dg._numbers import check, whole
+from v3dg._numbers import check, check_type, whole
 from v3dg._progress import Bar, Progress
 from v3dg._version import __version__
 from v3dg.bundle import Bundle
@@ -88,7 +88,7 @@ def write_streamed_sog(
 
     Source: PlayCanvas, the streamed SOG format, version 1.
     """
-    turn, plan = _common.turn_upright(up or up_of(bundle)[0]), Plan.of(bundle, chunk)
+    plan, turn = Plan.of(bundle, chunk), _common.turn_upright(up or up_of(bundle)[0])
     total = bundle.num_gaussians
     with _common.replacing_folder(Path(folder)) as place, Bar(total, "export", progress) as bar:
         return write_levels(plan, place, turn, bar.update)
@@ -172,6 +172,7 @@ class Plan:
 
     @classmethod
     def of(cls, bundle: Bundle, chunk: int) -> Plan:
+        check_type("bundle", bundle, Bundle, "a Bundle")
         check("bundle", bundle.num_gaussians, "gaussians to export, got none")
         chunk = whole(chunk, "chunk", "gaussians, 1 or more", 1, 1 << 62)
         clusters, groups = bundle.clusters, bundle.groups

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from v3dg import _files
 from v3dg._numbers import check, one_of
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis
@@ -43,6 +44,7 @@ def write_usd(subject: Scene | Bundle, path: str | os.PathLike[str], *, up: Axis
     Source: Pixar, OpenUSD 26.11, UsdVol and UsdLod.
     """
     one_of(Path(path).suffix.lower(), "path", usd.SUFFIXES)
+    _files.check_folder(Path(path))
     pxr, scene = usd.pxr(), Scene.of(subject)
     check("scene", len(scene), "instances to export, got none")
     stage = usd.new_stage("Z")

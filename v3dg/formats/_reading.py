@@ -127,7 +127,7 @@ class Archive:
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self._path = path
         start = file.read(4)  # zipfile would look for a zip anywhere in the file
-        check(path, start == b"PK\3\4", f"a zip, got a file that begins with {start.hex(' ')}")
+        check(path, start == b"PK\3\4", f"a zip, got a file that begins with {start!r}")
         with telling(path, "a zip that is not damaged"):
             self._zip = zipfile.ZipFile(file)
             self._most = max(_FREE_BYTES, file.seek(0, os.SEEK_END))

@@ -118,6 +118,7 @@ class _Glb:
     def __init__(self, path: Path) -> None:
         self._path, self._claims, self._expanded = path, Claims(), 0
         content = self._claims.read(path)
+        check(path, len(content) >= 20, f"a .glb file, glTF 2.0 that is whole, got {len(content)} bytes")
         with telling(path, "a .glb file, glTF 2.0 that is whole"):
             magic, version, total, size, kind = struct.unpack_from("<IIIII", content)
             if (magic, version, total, kind) != (_MAGIC, 2, len(content), _JSON) or size > _MOST_JSON:
