@@ -345,6 +345,8 @@ def test_wrong_usage(folder):
     fails(2, "--camera", "render", "tuft.ply", "--camera", "near", cwd=folder)
     fails(2, "COMMAND: expected build, info,", "tuft.ply", cwd=folder)
     fails(2, "--up: expected one of x, y, z, -x, -y, -z, got", "build", "tuft.ply", "--up", "q", cwd=folder)
+    fails(2, "--size: expected 2 values, got fewer;", "render", "tuft.v3dg", "--size", 100, cwd=folder)
+    fails(2, "--output: expected 1 value, got fewer;", "render", "tuft.v3dg", "-o", cwd=folder)
     fails(2, "--budget: expected whole numbers, got '1e6'", "render", "tuft.v3dg", "--budget=1e6", cwd=folder)
     fails(2, "-89.99 to 89.99, got 90", "render", "tuft.v3dg", "--elevation", 90, cwd=folder)
     fails(2, "leave it out", "export", "tuft.v3dg", "--to", "tiles", "-o", "a.usda", cwd=folder)

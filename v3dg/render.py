@@ -244,7 +244,7 @@ class _Frame:
         memory = None if memory == "auto" else memory
         self.memory = None if memory is None else in_bytes(memory)  # of the pool
         if isinstance(subject, Gaussians):
-            check("memory", memory is None, f"None for an asset, which has no pages, got {memory}")
+            check("memory", memory is None, f"None for an asset, without pages, got {memory}; leave it out")
             _check_asset(color_by)
             self._asset = _core.AssetFrame(_core.Model(_device.place(subject, device).rows))
         else:

@@ -79,9 +79,7 @@ def _flat_axis(points: Floats) -> Axis | None:
     if len(points) < 16:
         return None
     low, high = np.percentile(points, (5, 95), axis=0)
-    points = points[((points >= low) & (points <= high)).all(axis=1)]
-    if len(points) < 8:
-        return None
+    points = points[((points >= low) & (points <= high)).all(axis=1)]  # at least ten
     variances, directions = np.linalg.eigh(np.cov(points.T))
     axis = int(np.abs(directions[:, 0]).argmax())
     is_flat = variances[0] < _FLAT**2 * variances[1]

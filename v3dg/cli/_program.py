@@ -127,6 +127,8 @@ def _plainly(text: str) -> str:
         known = set(re.findall(r"'(.*?)'", match[3])) - {"None"}
         expected = ", ".join(sorted(known, key=lambda name: (name[0] == "-", name)))
         return f"{match[2]}: expected one of {expected}, got {match[1]}"
+    if match := re.match(r"Missing value for argument '(?:.*/)?(--.*)'. Expected (\d) values", text):
+        return f"{match[1]}: expected {match[2]} value{'s' * (match[2] != '1')}, got fewer"
     return text
 
 
