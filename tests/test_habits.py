@@ -127,6 +127,10 @@ def test_a_bundle_or_a_scene_read_as_an_asset_is_sent_to_open(name):
 def test_no_camera_and_no_bundle_are_named(bundle, tmp_path):
     with pytest.raises(TypeError, match=r"camera: expected .*, got NoneType"):
         v3dg.render(bundle, None)
+    with pytest.raises(TypeError, match=r"camera: expected .*, got NoneType"):
+        v3dg.select(bundle, None)
+    with pytest.raises(ValueError, match="n: expected 0 cameras or more, got -3"):
+        v3dg.turntable((0, 0, 0), 1, -3)
     with pytest.raises(TypeError, match=r"bundle: expected a Bundle, got str; v3dg\.open reads files"):
         v3dg.write_streamed_sog("donut.v3dg", tmp_path / "web")
     with pytest.raises(ValueError, match="nowhere; create it first"):

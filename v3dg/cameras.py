@@ -228,7 +228,7 @@ def turntable(
         fov_x: Horizontal field of view in radians.
     """
     middle, axis = vector(center, "center"), vector(up, "up")
-    radius, n = positive(radius, "radius"), whole(n, "n", "a whole number", 0, _MOST_CAMERAS)
+    radius, n = positive(radius, "radius"), whole(n, "n", "0 cameras or more", 0, _MOST_CAMERAS)
     if not max(1e-150, 1e-12 * np.abs(middle).max()) < radius < 1e150:
         expected = "a circle that double precision resolves"
         raise ValueError(f"center, radius: expected {expected}, got {radius} around {_text(middle)}")

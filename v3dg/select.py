@@ -227,7 +227,7 @@ def select(
     """
     rule = rule_of(tolerance, budget, min_level, footprint, cull, fade)
     where = _device.resolve(device)
-    if not isinstance(camera, Camera | StereoCamera):
+    if hasattr(camera, "__iter__"):
         return [select_by(rule, subject, view, budget, where) for view in camera]
     return select_by(rule, subject, camera, budget, where)
 
