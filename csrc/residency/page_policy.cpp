@@ -23,6 +23,7 @@ constexpr size_t kAhead = 16;  // needs whose memory is fetched before their tur
 
 // Urgencies are told apart by a sixteenth of a power of two, from 1/2 on.
 constexpr uint32_t kNumKeys = 1024, kKeyShift = 19, kFirstKey = 0x3f000000u >> kKeyShift;
+constexpr uint32_t kKeysOfPower = 16;  // pages above are a power of two more urgent, or more
 
 uint32_t key_of(float priority) {
     uint32_t bits;  // of a positive float, so they order as it does
@@ -223,6 +224,16 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
         if (places.count == 0) continue;
         --places.count;
         todo[--places.end] = {w.bundle, w.page, 0};
+    }
+    // Within a power of two as the files have them, because a disk is quicker the more lies side by side.
+    // What was an end is where those of its key begin now.
+    for (uint32_t key = 0; key < kNumKeys; key += kKeysOfPower) {
+        const uint32_t next = key + kKeysOfPower;
+        const size_t last = next < kNumKeys ? places_of_key_[next].end : todo.size();
+        std::sort(todo.begin() + places_of_key_[key].end, todo.begin() + last,
+                  [](const auto& a, const auto& b) {
+                      return a.bundle != b.bundle ? a.bundle > b.bundle : a.page > b.page;
+                  });
     }
 }
 

@@ -106,8 +106,8 @@ class PagePolicy {
     // Takes note of what the cut of a frame needed, absent or resident, in any order. So many more pages are
     // needed as are left out, which is more than there is room for. `has_failures`: some pages cannot be had.
     void note(Span<const PageRequest> needs, size_t num_left_out, bool has_failures);
-    // What is read next for that, the most urgent last: no more than there will be room for, beside what is
-    // under way.
+    // What is read next for that, the most urgent last, of about as urgent ones those side by side that files
+    // have side by side: no more than there will be room for, beside what is under way.
     void choose(size_t under_way, std::vector<PageRequest>& todo);
     // Of that frame: pages that it misses, and slots that it would take.
     size_t missing() const { return missing_; }

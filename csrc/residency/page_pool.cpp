@@ -21,7 +21,7 @@ namespace {
 constexpr float kToleranceStep = 1.02f, kToleranceLeap = 1.189207f;
 constexpr double kRoomyShare = 0.7;
 constexpr int kTries = 3;
-constexpr size_t kMostAtOnce = 16;    // pages that a thread asks the disk for together
+constexpr size_t kMostAtOnce = 64;    // pages that a thread asks the disk for together
 constexpr size_t kSamples = 1 << 14;  // of the sizes of pages
 constexpr int kSpins = 64;            // before a frame does without what another thread holds
 
