@@ -66,10 +66,6 @@ class ViewOptions(CameraFile):
         is_from_file = self.cameras is not None or any(map(is_scene, subjects))
         expected = "--cameras or a scene (.json) to take it from; leave it out"
         check_usage("--camera", self.camera is None or is_from_file, expected)
-        for name, is_given in (("--views", self.views != 1), ("--elevation", self.elevation != 20.0)):
-            check_usage(
-                name, not (is_given and is_from_file), "a turntable, not cameras of a file; leave it out"
-            )
 
 
 # Field of a command's options that holds them; on the command line they stand beside the others.
