@@ -139,7 +139,9 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
         for number, bundle in enumerate(scene.bundles)
     ]
     total = sum(bundle["instances"] * bundle["asset_gaussians"] for bundle in bundles)
-    sizes = [{"name": name, "width": its.width, "height": its.height} for name, its in cameras.items()]
+    sizes = [
+        {"name": name, "width": camera.width, "height": camera.height} for name, camera in cameras.items()
+    ]
     result = {
         "path": str(path),
         "kind": "scene",
