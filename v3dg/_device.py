@@ -141,16 +141,6 @@ def to_host(array: Array) -> npt.NDArray[Any]:
     return host
 
 
-def copy_to_host(array: Array, out: npt.NDArray[Any]) -> None:
-    """Copy an array from any device into one of NumPy's."""
-    if isinstance(array, np.ndarray):
-        np.copyto(out, array)
-    else:
-        import torch
-
-        torch.from_numpy(out).copy_(array)
-
-
 @contextmanager
 def memory_errors() -> Iterator[None]:
     """Turn torch's error about missing device memory into what the core raises, MemoryError."""

@@ -51,8 +51,7 @@ def rasterize(
         check_type("gaussians", gaussians, Gaussians, "Gaussians")
     check_type("camera", camera, Camera, "a Camera")
     filter_px2 = real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0)
-    options: dict[str, Any] = {"filter_px2": filter_px2, "antialiased": bool(antialiased)}
-    options["with_depth"] = True
+    options: dict[str, Any] = {"filter_px2": filter_px2, "antialiased": bool(antialiased), "with_depth": True}
     shade = color(background, "background")
     if isinstance(gaussians.means, np.ndarray):
         planes = _core.rasterize(gaussians.rows, camera.core, background=shade, keep_tape=False, **options)

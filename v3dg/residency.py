@@ -110,9 +110,7 @@ class Residency:
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self._kept: weakref.WeakKeyDictionary[Scene | Bundle, dict[Hashable, Any]] = (
-            weakref.WeakKeyDictionary()
-        )
+        self._kept = weakref.WeakKeyDictionary[Scene | Bundle, dict[Hashable, Any]]()
         os.register_at_fork(after_in_child=self._renew_lock)
 
     def table(self, bundle: Bundle) -> _core.ClusterTable:
@@ -176,11 +174,10 @@ class Residency:
         self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy
     ) -> None:
         """Have a frame of a device draw these bundles, their gaussians or clusters in these colours."""
-        colors = [self.palette(bundle, color_by) for bundle in bundles]
         palettes = [
             _core.Palette(self.table(bundle), sh, device.number)
-            for bundle, sh in zip(bundles, colors, strict=True)
-            if sh is not None
+            for bundle in bundles
+            if (sh := self.palette(bundle, color_by)) is not None
         ]
         frame.set_models([self.model(bundle, device) for bundle in bundles], palettes)
 

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal, get_args, get_origin
 
+from v3dg._numbers import check
+
 # A target is drawn in one go that cannot be interrupted: in about a second.
 _MOST_SIDE = 8192
 # Samples along a pixel's side, in targets of deep levels; beyond, nothing is gained.
@@ -112,8 +114,7 @@ class BuildConfig:
         self.check_views(1)
 
     def _require(self, name: str, is_good: bool, expected: str) -> None:
-        if not is_good:
-            raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
+        check(name, is_good, f"{expected}, got {getattr(self, name)!r}")
 
     def check_views(self, most_gaussians: int) -> None:
         """Refuse, with ValueError, views of too many pixels for groups of at most so many gaussians."""
@@ -123,12 +124,10 @@ class BuildConfig:
             footprint_of_focal = 2 * math.pi * (1 - math.sqrt(1 - x2))
             radius2 = most_gaussians * self.px2_per_gaussian / footprint_of_focal * x2 / (1 - x2)
             side = math.ceil(2 * math.sqrt(radius2)) + 8
-        if side * self.samples_at(_DEEP) > _MOST_SIDE or side * side * self.num_views > _MOST_PIXELS_KEPT:
-            raise ValueError(
-                f"{name}: expected views of at most {_MOST_SIDE} px a side with `supersample`, and "
-                f"{_MOST_PIXELS_KEPT} px in all `num_views`, got {side} px a side; reduce one of them, "
-                "or `cluster_size`"
-            )
+        fits = side * self.samples_at(_DEEP) <= _MOST_SIDE and side**2 * self.num_views <= _MOST_PIXELS_KEPT
+        most = f"{_MOST_SIDE} px a side with `supersample`, and {_MOST_PIXELS_KEPT} px in all `num_views`"
+        found = f"{side} px a side; reduce one of them, or `cluster_size`"
+        check(name, fits, f"views of at most {most}, got {found}")
 
     def steps_at(self, level: int) -> int:
         """Steps of the groups of a level."""

@@ -134,10 +134,8 @@ class Unfinished:
                 self._path.unlink()
                 raise
         else:
-            raise ValueError(
-                f"{self._path}: holds something else, or levels of another asset, config, seed, device or "
-                "version; remove it to start again"
-            )
+            found = "holds something else, or levels of another asset, config, seed, device or version"
+            raise ValueError(f"{self._path}: {found}; remove it to start again")
 
     def __exit__(self, *_: object) -> None:
         if not self.is_whole and not any(number > 0 for _, number in self.levels):
@@ -149,10 +147,8 @@ class Unfinished:
         try:
             yield
         except (OSError, ValueError) as error:
-            raise ValueError(
-                f"{self._path}: expected levels of an interrupted build, could not read them "
-                f"({error}); remove it to start again"
-            ) from error
+            expected = f"expected levels of an interrupted build, could not read them ({error})"
+            raise ValueError(f"{self._path}: {expected}; remove it to start again") from error
 
     def _read_journal(self) -> None:
         """Take the levels up to a record that was cut off, and check their pages."""
@@ -224,7 +220,7 @@ class MemoryStore:
     def write(self, run: PageRun, gaussians: Gaussians) -> npt.NDArray[np.uint8]:
         place = vars(self._gaussians.subset(run.rows)).values()
         for array, out in zip(vars(gaussians).values(), place, strict=True):
-            _device.copy_to_host(array, out)
+            out[...] = _device.to_host(array)
         return np.empty((0, HASH_BYTES), np.uint8)
 
     def read(self, run: PageRun, hashes: npt.NDArray[np.uint8]) -> Gaussians:

@@ -81,10 +81,9 @@ def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
     """Check kinds and shapes, and take copies of arrays that could be changed after all checks."""
     columns = [column for column in SCHEMA if column[0].startswith(prefix)]
     arrays = [getattr(part, name.removeprefix(prefix)) for name, _, _, _ in columns]
-    for (name, _, _, _), array in zip(columns, arrays, strict=True):
-        check_type(name, array, np.ndarray, "a NumPy array")
-    count = part.level.size
+    count = np.size(part.level)
     for (name, kind, rows, rest), array in zip(columns, arrays, strict=True):
+        check_type(name, array, np.ndarray, "a NumPy array")
         dtype, shape = np.dtype(DTYPES[kind]), (count + (rows == "C+1"), *rest)
         if array.dtype != dtype or array.shape != shape:
             refuse(name, f"{dtype} {shape}, got {array.dtype} {array.shape}")

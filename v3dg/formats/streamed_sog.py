@@ -89,16 +89,13 @@ def _inside(node: Node) -> PurePosixPath:
 def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[range]]:
     """For each file, the runs of gaussians that are the finest level of a leaf."""
     found: dict[PurePosixPath, list[range]] = {}
-    todo = [iter([tree])]
+    todo = [tree]
     while todo:
-        node = next(todo[-1], None)
-        if node is None:
-            todo.pop()
-            continue
+        node = todo.pop()
         if not isinstance(node.value, dict):
             raise node.error("an object")
         if node.has("children"):
-            todo.append(node.field("children").items())
+            todo += reversed(list(node.field("children").items()))
         if not node.has("lods"):
             continue
         levels = node.field("lods")

@@ -112,10 +112,7 @@ class Save(msgspec.Struct, tag="save", forbid_unknown_fields=True):
             raise ValueError(f"path: expected at most {_MOST_SECONDS} s")
 
     def camera_path(self) -> CameraPath:
-        path = CameraPath()
-        for seconds, stop in self.path:
-            path.add(stop.view(), seconds)
-        return path
+        return CameraPath([(seconds, stop.view()) for seconds, stop in self.path])
 
 
 class Stop(msgspec.Struct, tag="stop", forbid_unknown_fields=True):

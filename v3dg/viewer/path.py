@@ -3,45 +3,29 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from v3dg._numbers import check
 from v3dg.cameras import Camera, Floats
 from v3dg.viewer.view import View
 
-# Between recorded views; more often shows nothing new.
-_SHORTEST_SECONDS = 1 / 30
 
-
-@dataclass
+@dataclass(frozen=True)
 class CameraPath:
-    """Views at growing times, seconds from the first."""
+    """Views, each with the seconds that it comes after the one before; those of the first do not count."""
 
-    times: list[float] = field(default_factory=list)
-    views: list[View] = field(default_factory=list)
+    stops: Sequence[tuple[float, View]] = ()
 
     def __len__(self) -> int:
-        return len(self.views)
+        return len(self.stops)
 
     @property
-    def seconds(self) -> float:
-        return self.times[-1] - self.times[0] if self.times else 0.0
-
-    def add(self, view: View, seconds: float) -> None:
-        """Append a view so long after the last one."""
-        self.times.append(self.times[-1] + seconds if self.times else 0.0)
-        self.views.append(view)
-
-    def record(self, view: View, now: float) -> None:
-        """Append a view seen at that time, if the last one is not from just before."""
-        if not self.times or now - self.times[-1] >= _SHORTEST_SECONDS:
-            self.times.append(now)
-            self.views.append(view)
-
-    def at(self, seconds: float) -> View:
-        """Return the view so long after the first; errors are those of `views_at`."""
-        return self.views_at(np.array([seconds]))[0]
+    def times(self) -> Floats:
+        """When the views are, seconds from the first."""
+        return np.cumsum([0.0, *(seconds for seconds, _ in self.stops[1:])])
 
     def views_at(self, seconds: Floats) -> list[View]:
         """Return the views so long after the first, on a smooth curve through all of them.
@@ -53,11 +37,11 @@ class CameraPath:
         Raises:
             ValueError: The path is empty.
         """
-        if not self.views:
-            raise ValueError("path: expected at least one view; add this one, or record while you fly")
-        if len(self.views) == 1:
-            return self.views * len(seconds)
-        times, rows = np.asarray(self.times) - self.times[0], _rows(self.views)
+        check("path", self.stops, "at least one view, got none; add this one, or record while you fly")
+        times, views = self.times, [view for _, view in self.stops]
+        if len(views) == 1:
+            return views * len(seconds)
+        rows = _rows(views)
         places = np.arange(len(times))
         before, after = np.maximum(places - 1, 0), np.minimum(places + 1, places[-1])
         slopes = (rows[after] - rows[before]) / (times[after] - times[before])[:, None]
@@ -73,7 +57,8 @@ class CameraPath:
 
     def film(self, fps: int) -> list[View]:
         """Return the views of a film: the first, the last, and those between at ``fps`` a second."""
-        return self.views_at(np.linspace(0.0, self.seconds, max(round(self.seconds * fps), 1) + 1))
+        seconds = self.times[-1]
+        return self.views_at(np.linspace(0.0, seconds, max(round(seconds * fps), 1) + 1))
 
     def cameras(self, fps: int, width: int, height: int, near: float) -> dict[str, Camera]:
         """Return the film's cameras by name."""

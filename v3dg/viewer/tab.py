@@ -112,8 +112,7 @@ class Tab:
             "radius": shown.radius,
             "near": shown.near,
             "instances": len(shown.scene),
-            "has_files": all(bundle.path is not None for bundle in shown.scene.bundles)
-            and self._folder is None,
+            "has_files": self._folder is None and all(bundle.path for bundle in shown.scene.bundles),
             "level_colors": levels,
             "ramp": legend,
             "most_counted": MOST_COUNTED,
