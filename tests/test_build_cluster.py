@@ -81,10 +81,10 @@ def test_units_of_an_asset_in_memory_go_along(folder, tmp_path, at_package):
 def test_processes_round_as_one_does(folder, tmp_path, at_package):
     asset = v3dg.read_asset(folder / "a.ply")
     with small_units(), spawned_processes(2) as executor:
-        build_bundle(asset, codec="quantized", **OPTIONS).write(tmp_path / "alone")
+        build_bundle(asset, codec="quantized", **OPTIONS).write(tmp_path / "alone.v3dg")
         options = {"executor": executor, "resume_path": tmp_path / "out"}
         build_bundle(asset, codec="quantized", **options, **OPTIONS)
-    assert (tmp_path / "out").read_bytes() == (tmp_path / "alone").read_bytes()
+    assert (tmp_path / "out").read_bytes() == (tmp_path / "alone.v3dg").read_bytes()
 
 
 def test_a_process_that_dies_leaves_what_can_be_gone_on_with(folder, tmp_path, at_package):

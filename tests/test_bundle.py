@@ -204,7 +204,7 @@ def test_format_page_lists_the_tables_in_file_order(saved):
 
 def test_same_bundle_gives_same_bytes(saved, tmp_path):
     _, path = saved
-    again, from_file, loaded = (tmp_path / name for name in ("again", "from_file", "loaded"))
+    again, from_file, loaded = (tmp_path / name for name in ("again.v3dg", "from_file.v3dg", "loaded.v3dg"))
     random_bundle(3, config={"seed": 3}, codec=saved[0].codec).write(again)
     Bundle.open(path).write(from_file)
     opened = Bundle.open(path)
@@ -816,12 +816,14 @@ def test_a_half_written_file_is_refused_and_replaced(saved):
 
 def test_save_refuses_what_is_not_a_file(saved, tmp_path):
     bundle, _ = saved
-    os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path / "pipe", os.devnull):
+    os.mkfifo(tmp_path / "pipe.v3dg")
+    (tmp_path / "null.v3dg").symlink_to(os.devnull)
+    for name in ("pipe.v3dg", "null.v3dg"):
         with pytest.raises(ValueError, match="expected the path of a file"):
-            bundle.write(path)
-    with pytest.raises(IsADirectoryError, match=tmp_path.name):
-        bundle.write(tmp_path)
+            bundle.write(tmp_path / name)
+    (tmp_path / "folder.v3dg").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"folder\.v3dg"):
+        bundle.write(tmp_path / "folder.v3dg")
     with pytest.raises(FileNotFoundError, match="nowhere"):
         bundle.write(tmp_path / "nowhere" / "a.v3dg")
 

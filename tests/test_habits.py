@@ -118,6 +118,68 @@ def test_paths_in_place_of_objects_are_told_what_to_call(bundle, camera):
             call()
 
 
+def test_nothing_is_written_that_cannot_be_opened(bundle, tmp_path):
+    bundle.write(tmp_path / "a.v3dg")
+    v3dg.write_asset(tmp_path / "a.ply", bundle.level_gaussians(0))
+    scene = v3dg.Scene.of(v3dg.open(tmp_path / "a.v3dg"))
+    before = sorted(tmp_path.iterdir())
+    for write in (
+        lambda: bundle.write(tmp_path / "x.ply"),
+        lambda: v3dg.build.build_file(tmp_path / "a.ply", tmp_path / "x.ply"),
+    ):
+        with pytest.raises(ValueError, match=r"x\.ply: expected a file name ending in \.v3dg"):
+            write()
+    for name in ("noname", "scene.txt", "meta.json"):
+        with pytest.raises(ValueError, match=rf"{name}: expected a file name ending in \.json, not meta"):
+            scene.save(tmp_path / name)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_axis_that_is_none_is_refused_where_it_is_set(bundle):
+    scene = v3dg.Scene.of(bundle)
+    scene.up = "-y"
+    with pytest.raises(ValueError, match=r"scene\.up: expected 'x' or .*, got 'q'"):
+        scene.up = "q"
+    assert scene.up == "-y"
+    scene.up = None
+    assert scene.up is None
+
+
+@pytest.mark.parametrize(
+    ("image", "error", "message"),
+    [
+        (np.zeros((3, 4)), ValueError, r"shape \(H, W, 3\) with at least one pixel, got \(3, 4\)"),
+        (np.zeros((0, 4, 3)), ValueError, r"at least one pixel, got \(0, 4, 3\)"),
+        (np.full((3, 4, 3), np.nan), ValueError, r"got some that are no numbers \(nan\)"),
+        (np.zeros((3, 4, 3), int), ValueError, r"uint8, or floats in \[0,1\], got int64"),
+        ([[[0, 0, 0]]], TypeError, "a NumPy array or a torch tensor, got list"),
+    ],
+)
+def test_what_is_no_picture_is_not_written(image, error, message, tmp_path):
+    with pytest.raises(error, match=f"^image: expected .*{message}"):
+        v3dg.pictures.write_picture(tmp_path / "a.png", image)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_tensor_of_a_training_is_written(tmp_path):
+    torch = pytest.importorskip("torch")
+    for kind, value in ((torch.float32, 1.0), (torch.uint8, 255)):
+        image = torch.full((2, 3, 3), value, dtype=kind, requires_grad=kind == torch.float32)
+        v3dg.pictures.write_picture(tmp_path / "a.png", image)
+        np.testing.assert_array_equal(v3dg.pictures.read_picture(tmp_path / "a.png"), 255)
+
+
+def test_cameras_without_names_are_told_so(bundle, camera, tmp_path):
+    bundle.write(tmp_path / "a.v3dg")
+    scene = v3dg.Scene.of(v3dg.open(tmp_path / "a.v3dg"))
+    for write in (v3dg.write_cameras, lambda path, cameras: scene.save(path, cameras)):
+        with pytest.raises(TypeError, match=r"^cameras: expected cameras by their names, .* got list"):
+            write(tmp_path / "t.json", [camera])
+        with pytest.raises(TypeError, match=r"cameras\['a'\]: expected a Camera, got NoneType"):
+            write(tmp_path / "t.json", {"a": None})
+    assert [path.name for path in tmp_path.iterdir()] == ["a.v3dg"]
+
+
 @pytest.mark.parametrize("name", ["a.v3dg", "a.json"])
 def test_a_bundle_or_a_scene_read_as_an_asset_is_sent_to_open(name):
     with pytest.raises(ValueError, match=r"v3dg\.open opens bundles \(\.v3dg\) and scenes"):

@@ -119,6 +119,11 @@ def check_folder(path: Path) -> None:
     check(path, path.parent.is_dir(), f"an existing folder, got {path.parent}; create it first")
 
 
+def check_bundle_name(path: str | os.PathLike[str]) -> None:
+    """Refuse, with ValueError, a name by which `v3dg.open` would not know a bundle."""
+    check(path, Path(path).suffix == ".v3dg", "a file name ending in .v3dg; v3dg.open goes by it")
+
+
 def open_regular(path: str | os.PathLike[str]) -> int:
     """A descriptor of a file to read; a directory, a device or a pipe is a ValueError, without waiting."""
     # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.

@@ -17,7 +17,7 @@ import numpy as np
 from v3dg import _extras
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import check, one_of
-from v3dg.cameras import Camera, Floats, intrinsics, is_rotation, viewmat_from_blender
+from v3dg.cameras import Camera, Floats, check_cameras, intrinsics, is_rotation, viewmat_from_blender
 
 # Names of COLMAP's models that are pinholes but for the distortion, which is looked at by itself.
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
@@ -135,6 +135,7 @@ def _read_colmap(folder: Path, distortion: str) -> dict[str, Camera]:
 
 def write_cameras(path: str | os.PathLike[str], cameras: Mapping[str, Camera]) -> None:
     """Write named cameras as a nerfstudio `transforms.json`; `read_cameras` gives the same cameras."""
+    check_cameras(cameras)
     frames = []
     for name, camera in cameras.items():
         to_world = np.eye(4)

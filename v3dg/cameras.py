@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from v3dg import _core
 from v3dg._numbers import Floats as Floats
 from v3dg._numbers import check, check_type, positive, real, vector, whole
 
+T = TypeVar("T")
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
 MatrixLike: TypeAlias = Sequence[Sequence[float]] | npt.NDArray[Any]
 Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -99,7 +100,7 @@ class Camera:
         check("up", is_aside, f"a direction that is not along the view, got {_text(up_vector)}")
         right /= length
         rotation = np.stack([right, np.cross(forward, right), forward])
-        return cls(_rigid(rotation, position), intrinsics(fov_x, None, width, height), width, height, near)
+        return cls(rigid(rotation, position), intrinsics(fov_x, None, width, height), width, height, near)
 
     @classmethod
     def from_blender(
@@ -206,6 +207,18 @@ def check_camera(camera: Any) -> None:
         check_type("camera", camera, Camera, "a Camera")
 
 
+def for_each(camera: Any, make: Callable[[Any], T]) -> T | list[T]:
+    """What is made for one camera, or a list of it for each of several."""
+    return [make(view) for view in camera] if hasattr(camera, "__iter__") else make(camera)
+
+
+def check_cameras(cameras: Any) -> None:
+    """Raise TypeError for what is not a mapping of names to cameras."""
+    check_type("cameras", cameras, Mapping, "cameras by their names, as {'front': camera}")
+    for name, camera in cameras.items():
+        check_type(f"cameras[{name!r}]", camera, Camera, "a Camera")
+
+
 def turntable(
     center: VectorLike,
     radius: float,
@@ -251,7 +264,8 @@ def turntable(
     return cameras
 
 
-def _rigid(rotation: Floats, eye: Floats) -> Floats:
+def rigid(rotation: Floats, eye: Floats) -> Floats:
+    """(4, 4) world to camera of an eye, and the rotation from the world to it."""
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
     with np.errstate(over="ignore", invalid="ignore"):  # the camera refuses what comes of it
@@ -278,7 +292,7 @@ def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
     axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
     _check_rotation(axes, "transform_matrix")
     left, _, right = np.linalg.svd(axes)
-    return _rigid((left @ right).T, matrix[:3, 3])
+    return rigid((left @ right).T, matrix[:3, 3])
 
 
 def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Floats:

@@ -16,7 +16,7 @@ from v3dg import _core, _extras
 from v3dg._device import Device
 from v3dg._numbers import check
 from v3dg.cameras import Camera
-from v3dg.pictures import Picture, to_8bit
+from v3dg.pictures import Picture, checked, to_8bit
 from v3dg.render import render
 
 FLIP_PIXELS_PER_DEGREE = 67.0
@@ -29,16 +29,11 @@ FLIP_MISSING = _extras.missing("flip_evaluator")
 
 
 def _picture(name: str, image: Any) -> NDArray[np.floating[Any]]:
-    """The picture as a float NumPy array (H,W,3), on the host, without gradient."""
-    if hasattr(image, "detach"):
-        image = image.detach().cpu().numpy()
-    if not isinstance(image, np.ndarray):
-        raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {type(image).__name__}")
-    fits = image.ndim == 3 and image.shape[2] == 3 and 0 not in image.shape
-    check(name, fits, f"shape (H, W, 3) with at least one pixel, got {image.shape}")
-    is_float = np.issubdtype(image.dtype, np.floating)
-    check(name, is_float, f"floats in [0, 1], got {image.dtype}; divide 8-bit pictures by 255")
-    return image
+    """The picture as `pictures.checked` has it, of floats."""
+    picture = checked(name, image)
+    is_float = np.issubdtype(picture.dtype, np.floating)
+    check(name, is_float, f"floats in [0, 1], got {picture.dtype}; divide 8-bit pictures by 255")
+    return picture
 
 
 def _pair(reference: Any, test: Any) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TypeAlias
 
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.formats import usd
-from v3dg.gaussians import Gaussians
-from v3dg.io import SUFFIXES, read_asset
-from v3dg.scene import Scene
-from v3dg.scene.file import read_scene
-
-Subject: TypeAlias = Scene | Bundle | Gaussians
+from v3dg.io import read_asset
+from v3dg.scene import Scene, Subject
+from v3dg.scene.file import is_scene, read_scene
 
 
 def open(path: str | os.PathLike[str]) -> Subject:
@@ -38,11 +34,6 @@ def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
     if path.suffix.lower() in usd.SUFFIXES and usd.has_instances(path):
         return read_usd_scene(path), None
     return Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path), None
-
-
-def is_scene(path: Path) -> bool:
-    """Whether a file is a scene by its name: JSON, but not the `meta.json` of an asset in SOG."""
-    return path.suffix == ".json" and not path.name.endswith(SUFFIXES)
 
 
 def read_usd_scene(

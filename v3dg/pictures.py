@@ -43,6 +43,17 @@ def to_8bit(image: Any) -> Picture:
     return pixels
 
 
+def checked(name: str, image: Any) -> NDArray[Any]:
+    """A picture as a NumPy array (H,W,3), on the host, without gradient; TypeError or ValueError if none."""
+    if hasattr(image, "detach"):
+        image = image.detach().cpu().numpy()
+    if not isinstance(image, np.ndarray):
+        raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {type(image).__name__}")
+    fits = image.ndim == 3 and image.shape[2] == 3 and 0 not in image.shape
+    check(name, fits, f"shape (H, W, 3) with at least one pixel, got {image.shape}")
+    return image
+
+
 def contact_sheet(rows: Sequence[Sequence[tuple[str, Picture]]]) -> Picture:
     """Lay rows of (text, picture) out as one picture, each text above its picture."""
     from PIL import Image, ImageDraw, ImageFont
@@ -135,7 +146,11 @@ def write_picture(path: str | os.PathLike[str], image: Any) -> None:
     from PIL import Image
 
     path = check_picture_path(path)
-    pixels = image if getattr(image, "dtype", None) == np.uint8 else to_8bit(image)
+    pixels = checked("image", image)
+    if pixels.dtype != np.uint8:
+        check("image", pixels.dtype.kind == "f", f"uint8, or floats in [0,1], got {pixels.dtype}")
+        check("image", not np.isnan(pixels).any(), "colours, got some that are no numbers (nan)")
+        pixels = to_8bit(pixels)
     kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
     with _files.replacing(path) as temporary:
         Image.fromarray(pixels).save(temporary, kind, quality=90)  # of JPEG

@@ -12,13 +12,13 @@ from v3dg._device import Device
 from v3dg._numbers import check, color, one_of, real
 from v3dg.build.memory import in_bytes, in_mib
 from v3dg.bundle import Bundle
-from v3dg.cameras import Camera, StereoCamera, check_camera
+from v3dg.cameras import Camera, StereoCamera, check_camera, for_each
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage, Stats
 from v3dg.pool import Pool, PoolLook, chosen_bytes
 from v3dg.residency import ResidentScene, residency
-from v3dg.scene import Scene
+from v3dg.scene import Scene, Subject
 from v3dg.select import CutOptions, Selection, over_budget, rule_of
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from typing_extensions import Unpack
 
-_Subject: TypeAlias = Scene | Bundle | Gaussians
 _Memory: TypeAlias = int | str | None
 
 _known_rule = lru_cache(64, typed=True)(rule_of)  # of pictures that follow each other
@@ -49,19 +48,17 @@ class _Options(_FrameOptions, total=False):
 
 
 @overload
-def render(
-    subject: Scene | Bundle | Gaussians, camera: Camera, **options: Unpack[_Options]
-) -> RenderedImage: ...
+def render(subject: Subject, camera: Camera, **options: Unpack[_Options]) -> RenderedImage: ...
 @overload
 def render(
-    subject: Scene | Bundle | Gaussians, camera: StereoCamera, **options: Unpack[_Options]
+    subject: Subject, camera: StereoCamera, **options: Unpack[_Options]
 ) -> tuple[RenderedImage, RenderedImage]: ...
 @overload
 def render(
-    subject: Scene | Bundle | Gaussians, camera: Sequence[Camera], **options: Unpack[_Options]
+    subject: Subject, camera: Sequence[Camera], **options: Unpack[_Options]
 ) -> list[RenderedImage]: ...
 def render(
-    subject: Scene | Bundle | Gaussians,
+    subject: Subject,
     camera: Camera | StereoCamera | Sequence[Camera],
     *,
     tolerance: float | None = None,
@@ -88,8 +85,7 @@ def render(
             eyes of a stereo camera share one cut, and one frame: two pictures, whose statistics are those of
             both together but for the gaussians that were selected.
         tolerance: As in `v3dg.select`; so are `budget` and `min_level`.
-        fade: As in `v3dg.select`; weights multiply opacities. Give `v3dg.DEFAULT_FADE` for pictures that
-            follow each other, as in a film.
+        fade: As in `v3dg.select`; weights multiply opacities. Give `v3dg.DEFAULT_FADE` for a film.
         cut: Draw what was selected before from this scene, whatever the camera: a cut to walk around. Takes
             the place of `tolerance`, `budget`, `min_level` and `fade`.
         color_by: "level" or "cluster" colours gaussians by their own, "residency" where pages are missing.
@@ -114,12 +110,13 @@ def render(
     frame = make() if isinstance(subject, Gaussians) else residency.frame(subject, key, make)
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
     shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
-    pictures: list[Any] = []
-    for view in camera if hasattr(camera, "__iter__") else [camera]:
+
+    def picture(view: Any) -> Any:
         if cut is None:
             frame.settle(subject, view, **options)
-        pictures.append(frame.draw(subject, view, shade, cut, **options))
-    return pictures if hasattr(camera, "__iter__") else pictures[0]
+        return frame.draw(subject, view, shade, cut, **options)
+
+    return for_each(camera, picture)
 
 
 class Renderer:
@@ -154,7 +151,7 @@ class Renderer:
 
     def __init__(
         self,
-        subject: Scene | Bundle | Gaussians,
+        subject: Subject,
         *,
         color_by: ColorBy = "appearance",
         device: str | Device = "auto",
@@ -230,7 +227,7 @@ class Renderer:
 class _Frame:
     """Buffers that pictures of one subject are drawn with; it does not keep the subject alive."""
 
-    def __init__(self, subject: _Subject, color_by: ColorBy, device: Device, memory: _Memory) -> None:
+    def __init__(self, subject: Subject, color_by: ColorBy, device: Device, memory: _Memory) -> None:
         one_of(color_by, "color_by", get_args(ColorBy))
         self.device, self.color_by = device, color_by
         self._num_models = 0  # of the first bundles, to which a scene only adds
@@ -256,7 +253,7 @@ class _Frame:
 
     def draw(
         self,
-        subject: _Subject,
+        subject: Subject,
         camera: Camera | StereoCamera,
         shade: _core.Shade,
         cut: Selection | None,
@@ -316,7 +313,7 @@ class _Frame:
         return eyes[0] if isinstance(camera, Camera) else eyes
 
     def settle(
-        self, subject: _Subject, camera: Camera | StereoCamera, timeout: float = 30.0, **options: Any
+        self, subject: Subject, camera: Camera | StereoCamera, timeout: float = 30.0, **options: Any
     ) -> None:
         """Bring in what a view needs, or what of it comes in so many `seconds`."""
         seconds = options.pop("seconds", math.inf)

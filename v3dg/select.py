@@ -14,7 +14,7 @@ from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import MOST_FLOAT, check, one_of, real, refuse, vector, whole
 from v3dg.bundle import Bundle, Clusters
-from v3dg.cameras import Camera, StereoCamera, VectorLike, check_camera
+from v3dg.cameras import Camera, StereoCamera, VectorLike, check_camera, for_each
 from v3dg.gaussians import Gaussians
 from v3dg.residency import residency
 from v3dg.scene import Scene
@@ -227,9 +227,7 @@ def select(
     """
     rule = rule_of(tolerance, budget, min_level, footprint, cull, fade)
     where = _device.resolve(device)
-    if hasattr(camera, "__iter__"):
-        return [select_by(rule, subject, view, budget, where) for view in camera]
-    return select_by(rule, subject, camera, budget, where)
+    return for_each(camera, lambda view: select_by(rule, subject, view, budget, where))
 
 
 def select_by(

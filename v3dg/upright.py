@@ -12,7 +12,7 @@ from v3dg._numbers import Floats
 from v3dg.bundle import Bundle
 from v3dg.cameras import AXES, Axis, Camera
 from v3dg.gaussians import Gaussians
-from v3dg.scene import Scene
+from v3dg.scene import Scene, Subject
 
 # Fewer cameras may all lie on their sides.
 _FEWEST_CAMERAS = 3
@@ -29,7 +29,7 @@ def direction_of(axis: Axis) -> tuple[float, float, float]:
 
 
 def up_of(
-    subject: Scene | Bundle | Gaussians,
+    subject: Subject,
     cameras: Mapping[str, Camera] | None = None,
     path: str | os.PathLike[str] = "",
 ) -> tuple[Axis, str]:

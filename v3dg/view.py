@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from v3dg._device import Device
-from v3dg.opening import Subject, open_with_cameras
+from v3dg.opening import open_with_cameras
+from v3dg.scene import Subject
 
 if TYPE_CHECKING:
     from v3dg.viewer.server import Site

@@ -43,8 +43,7 @@ def build_file(
 ) -> tuple[Bundle, bool]:
     """Build the bundle of an asset's file, or of several that make one asset, straight into a file.
 
-    Until it is whole, the bundle is at `levels_path`. An asset that does not fit in memory is brought into
-    order in a scratch folder beside it, which is removed.
+    Until then it is at `levels_path`, and an asset that does not fit in memory in a scratch folder beside it.
 
     Args:
         asset: What is in the asset's file, where it is in memory already.
@@ -58,11 +57,12 @@ def build_file(
         The bundle, opened from its file, and whether it was built.
 
     Raises:
-        ValueError: Memory is too little, and the message says how much is needed.
+        ValueError: Memory is too little (the message says how much is needed), or a name not one of a bundle.
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As `read_asset` and `build_bundle`.
     """
     paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
     bundle_path, levels, config = Path(bundle_path), levels_path(bundle_path), config or BuildConfig()
+    _files.check_bundle_name(bundle_path)
     _files.check_folder(bundle_path)
     _files.status_of_replaced(bundle_path)
     devices, num_bytes = devices_for(device, asset), in_bytes(memory)  # before anything is read

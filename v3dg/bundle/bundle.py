@@ -123,7 +123,12 @@ class Bundle:
 
         The file appears at ``path`` when it is complete and not before: on an error or an interrupt, what was
         there stays and nothing else is left.
+
+        Raises:
+            ValueError: The name does not end in `.v3dg`, or is of a device or a pipe.
+            OSError: The file cannot be written.
         """
+        _files.check_bundle_name(path)
         page_bytes = self._layout.page_bytes(self._codec)
         plan = BundlePlan(self._layout, self._codec, self.config)
         with _files.replacing(path) as temporary, open(temporary, "wb", buffering=0) as file:

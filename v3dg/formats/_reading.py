@@ -85,7 +85,7 @@ def telling(path: Path, expected: str) -> Iterator[None]:
     except MemoryError:
         raise
     except Exception as error:
-        text = str(error) or type(error).__name__
+        text = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{os.fspath(path)}: expected {expected}, got {ascii(text[:200])[1:-1]}") from None
 
 

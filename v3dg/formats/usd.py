@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from v3dg import _extras, _files
+from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
 from v3dg.formats._packing import check_writable, normalised
 from v3dg.formats._reading import AssetFile, telling
@@ -95,6 +96,7 @@ def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], 
 @contextlib.contextmanager
 def _opened(path: AnyPath, expected: str) -> Iterator[tuple[Any, Any]]:
     """The package, and the root of a file's prims, of which some must be gaussians."""
+    check(path, Path(path).suffix.lower() in SUFFIXES, f"a file name ending in {', '.join(SUFFIXES)}")
     usd = pxr()
     os.close(_files.open_regular(path))
     with telling(path, expected):

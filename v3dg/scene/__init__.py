@@ -1,3 +1,4 @@
 """Scenes: bundles placed many times, and their files."""
 
 from v3dg.scene.scene import Scene as Scene
+from v3dg.scene.scene import Subject as Subject

@@ -12,9 +12,10 @@ from typing import TypeAlias
 import numpy as np
 
 from v3dg._json import Node, read_json, write_json
-from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check, one_of
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check
 from v3dg.bundle import Bundle
-from v3dg.cameras import AXES, DEFAULT_FOV_X, Camera
+from v3dg.cameras import DEFAULT_FOV_X, Camera, check_cameras
+from v3dg.io import SUFFIXES
 from v3dg.scene import Scene
 
 FORMAT = "v3dg-scene"
@@ -23,6 +24,11 @@ VERSION = 1
 
 # Bundle, position, quaternion, scale and importance, as `Scene.add` takes them.
 _Instance: TypeAlias = tuple[Bundle, list[float], list[float], float, float]
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a file is a scene by its name: JSON, but not the `meta.json` of an asset in SOG."""
+    return path.suffix == ".json" and not path.name.endswith(SUFFIXES)
 
 
 def read_scene(
@@ -63,8 +69,11 @@ def write_scene(
             opened from if None.
 
     Raises:
-        ValueError: There is another number of paths, or a bundle has none: write it, and open that.
+        ValueError: There is another number of paths, or a bundle has none: write it, and open that. Or the
+            name is not of a scene.
     """
+    check(path, is_scene(Path(path)), "a file name ending in .json, not meta.json; v3dg.open goes by it")
+    check_cameras(cameras := cameras or {})
     if bundle_paths is None:
         found = "one in memory; write it and open that"
         for number, bundle in enumerate(scene.bundles):
@@ -74,8 +83,6 @@ def write_scene(
     if isinstance(bundle_paths, str) or not isinstance(bundle_paths, Sequence):
         raise TypeError(f"bundle_paths: expected a list of paths, got {type(bundle_paths).__name__}")
     count, given = len(scene.bundles), len(bundle_paths)
-    if scene.up is not None:
-        one_of(scene.up, "scene.up", AXES)
     check("bundle_paths", given == count, f"{count} paths, got {given}")
     scene = copy.copy(scene)  # which stays as it is
     names = [f"bundle_{b}" for b in range(len(bundle_paths))]
@@ -105,7 +112,7 @@ def write_scene(
                 "viewmat": camera.viewmat.tolist(),
                 "K": camera.K.tolist(),
             }
-            for name, camera in (cameras or {}).items()
+            for name, camera in cameras.items()
         ],
     }
     write_json(path, document)
@@ -136,9 +143,7 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
         cameras[name] = _read_camera(node, fields)
     scene = _scene_of(instances)
     if "up" in top:
-        if top["up"].value not in AXES:
-            raise top["up"].error("one of " + ", ".join(AXES))
-        scene.up = top["up"].value
+        top["up"].attempt(lambda: setattr(scene, "up", top["up"].value))
     return scene, cameras
 
 

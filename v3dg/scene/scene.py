@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from v3dg import _device
-from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, check_type, floats
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, check_type, floats, one_of
 from v3dg.bundle import Bundle
-from v3dg.cameras import Axis, Camera
+from v3dg.cameras import AXES, Axis, Camera
+from v3dg.gaussians import Gaussians
 from v3dg.rotations import rotation_from_quaternion
 
 # Held by whoever changes a scene, and by fork(), so that a child finds it free.
@@ -45,12 +46,9 @@ class Scene:
     Poses may be given as NumPy arrays, or as torch tensors on the host or on a CUDA device. Those of a device
     stay there, without a look at their values: an instance whose pose is not finite, or of no size, is not
     drawn.
-
-    Attributes:
-        up: The axis that is up, or None where nobody said: for viewers and exports, which may guess it.
     """
 
-    up: Axis | None = None
+    _up: Axis | None = None
 
     def __init__(self) -> None:
         poses = np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)
@@ -185,6 +183,17 @@ class Scene:
         self._state = state
 
     @property
+    def up(self) -> Axis | None:
+        """The axis that is up, or None where nobody said: for viewers and exports, which may guess it."""
+        return self._up
+
+    @up.setter
+    def up(self, axis: Axis | None) -> None:
+        if axis is not None:
+            one_of(axis, "scene.up", AXES)
+        self._up = axis
+
+    @property
     def bundles(self) -> tuple[Bundle, ...]:
         """The bundles, in the order in which they were first added."""
         return self._state.bundles
@@ -259,6 +268,9 @@ class Scene:
     def __repr__(self) -> str:
         return f"Scene({len(self)} instances of {len(self.bundles)} bundles)"
 
+
+Subject: TypeAlias = Scene | Bundle | Gaussians
+"""What can be drawn."""
 
 _ROW = {"positions": (3,), "quaternions": (4,), "scales": (), "importance": ()}
 _POSITIVE = {

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from v3dg import _core, _device
 from v3dg._device import CPU, Device
 from v3dg.build import BuildConfig, build_bundle
-from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
@@ -24,7 +23,7 @@ from v3dg.pictures import to_8bit
 from v3dg.pool import PoolLook, chosen_bytes
 from v3dg.render import Renderer, render, shade_of
 from v3dg.residency import residency
-from v3dg.scene import Scene
+from v3dg.scene import Scene, Subject
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, rule_of, select, select_by
 from v3dg.viewer.view import View
 
@@ -149,7 +148,7 @@ class SceneView:
 
     def __init__(
         self,
-        subject: Scene | Bundle | Gaussians,
+        subject: Subject,
         *,
         device: str | Device = "auto",
         memory: int | str | None = "auto",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from v3dg.cameras import Camera, VectorLike
+from v3dg.cameras import Camera, VectorLike, rigid
 from v3dg.rotations import quaternion_from_rotation, rotation_from_quaternion
 
 
@@ -38,9 +38,7 @@ class View:
         """Return the camera whose picture of that size fills the view; its pixels need not be square."""
         quaternion = np.asarray(self.wxyz, np.float64)
         rotation = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion)).T
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = rotation
-        viewmat[:3, 3] = -rotation @ np.asarray(self.position, np.float64)
+        viewmat = rigid(rotation, np.asarray(self.position, np.float64))
         half_y = math.tan(self.fov_y / 2)
         fx, fy = width / 2 / (half_y * self.aspect), height / 2 / half_y
         K = np.array([[fx, 0.0, width / 2], [0.0, fy, height / 2], [0.0, 0.0, 1.0]])
