@@ -348,9 +348,43 @@ def test_wrong_usage(folder):
     fails(2, "--size: expected 2 values, got fewer;", "render", "tuft.v3dg", "--size", 100, cwd=folder)
     fails(2, "--output: expected 1 value, got fewer;", "render", "tuft.v3dg", "-o", cwd=folder)
     fails(2, "--budget: expected whole numbers, got '1e6'", "render", "tuft.v3dg", "--budget=1e6", cwd=folder)
+    fails(2, "--elevation: expected numbers, got 'x'", "render", "tuft.v3dg", "--elevation=x", cwd=folder)
+    fails(2, "--views: expected 1 to 10,000, got 0", "render", "tuft.v3dg", "--views", 0, cwd=folder)
     fails(2, "-89.99 to 89.99, got 90", "render", "tuft.v3dg", "--elevation", 90, cwd=folder)
     fails(2, "leave it out", "export", "tuft.v3dg", "--to", "tiles", "-o", "a.usda", cwd=folder)
     fails(2, "--seed: expected 0 to", "demo", "--seed", "-1", cwd=folder)
+
+
+@pytest.mark.parametrize("option", [("--views", 1), ("--elevation", 20), ("--up", "z")])
+@pytest.mark.parametrize("command", ["render scene.json", "compare tuft.ply scene.json"])
+def test_options_of_a_turntable_are_refused_beside_cameras(folder, option, command):
+    """Whatever their values: those that are the defaults say nothing of what was given."""
+    message = f"{option[0]}: expected a turntable to set with it, got the cameras of scene.json; leave it out"
+    fails(2, message, *command.split(), *option, cwd=folder)
+
+
+def test_options_of_a_turntable_are_refused_beside_a_camera_file(folder, tmp_path):
+    v3dg.write_cameras(tmp_path / "t.json", {"front": v3dg.turntable((0, 0, 0), 4, 1)[0]})
+    command = ("render", "tuft.v3dg", "--cameras", tmp_path / "t.json", "--views", 2)
+    fails(2, f"got the cameras of {tmp_path / 't.json'}; leave it out", *command, cwd=folder)
+
+
+def test_a_file_that_is_read_is_not_written_over(folder, tmp_path):
+    """Under any of its names: what an asset has besides its gaussians would be gone."""
+    (tmp_path / "a.ply").write_bytes((folder / "tuft.ply").read_bytes())
+    (tmp_path / "a.v3dg").write_bytes((folder / "tuft.v3dg").read_bytes())
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    (tmp_path / "b.ply").symlink_to("a.ply")
+    (tmp_path / "b.v3dg").hardlink_to(tmp_path / "a.ply")
+    for command in (
+        ("convert", "a.ply", "./a.ply"),
+        ("convert", "a.ply", "b.ply"),
+        ("convert", "a.v3dg", "a.v3dg", "--codec", "quantized"),
+        ("build", "a.ply", "-o", "b.v3dg"),
+        ("export", "a.v3dg", "-o", "a.v3dg"),
+    ):
+        fails(2, "which is read; choose another name", *command, cwd=tmp_path)
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before
 
 
 def test_an_empty_argument_is_not_the_working_folder(folder):
@@ -378,7 +412,7 @@ def test_failures(folder):
     fails(1, "error: no/tuft.v3dg: expected an", "build", "tuft.ply", "-o", "no/tuft.v3dg", cwd=folder)
     fails(1, "got a folder; tuft.v3dg is one", "build", "tuft.ply", "-o", "./", cwd=folder)
     fails(1, "got a folder", "info", ".", cwd=folder)
-    fails(1, "got 1,024 bytes", "build", "tuft.ply", "--memory", "1KB", "-o", "small.v3dg", cwd=folder)
+    fails(1, "MiB, got 0.0 MiB", "build", "tuft.ply", "--memory", "1KB", "-o", "small.v3dg", cwd=folder)
     fails(1, "create it first", "render", "tuft.ply", "-o", "no/tuft.png", cwd=folder)
     fails(1, ".png", "render", "tuft.ply", "-o", "tuft.gif", cwd=folder)
     fails(1, "tolerance", "render", "tuft.v3dg", "--tolerance", "-1", cwd=folder)

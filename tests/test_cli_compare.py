@@ -158,7 +158,7 @@ def test_errors(folder, tmp_path):
     fails(1, "c.gif", "compare", "tuft.ply", "tuft.v3dg", "-o", "c.gif", cwd=folder)
     fails(2, "--supersample", "compare", "tuft.ply", "tuft.ply", "--supersample", 0, cwd=folder)
     (tmp_path / "compare.png").symlink_to("a.png")
-    fails(2, "expected another file than those to compare", "compare", "a.png", "b.png", cwd=tmp_path)
+    fails(2, "compare.png: expected another file than a.png", "compare", "a.png", "b.png", cwd=tmp_path)
 
 
 def chunk(kind, data):

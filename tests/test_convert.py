@@ -156,7 +156,9 @@ def test_what_cannot_be_meant_is_refused(folder):
         "1",
         cwd=folder,
     )
-    fails(2, "--camera: expected one of 2 cameras", "convert", "scene.json", "x.ply", cwd=folder)
+    fails(
+        2, "--camera: expected one camera to look from, got 2", "convert", "scene.json", "x.ply", cwd=folder
+    )
     fails(
         1,
         "x.obj: expected a file name that ends in .compressed.ply, .ply,",
@@ -165,6 +167,8 @@ def test_what_cannot_be_meant_is_refused(folder):
         "x.obj",
         cwd=folder,
     )
+    fails(2, "--up: expected a bundle or a scene", "convert", "tuft.ply", "x.ply", "--up", "z", cwd=folder)
+    fails(2, "--views: expected one camera", "convert", "tuft.v3dg", "x.ply", "--views", "3", cwd=folder)
     fails(2, "expected a bundle to write anew", "convert", "tuft.ply", "x.v3dg", cwd=folder)
     fails(2, "and no level or cut", "convert", "tuft.v3dg", "x.v3dg", "--level", "1", cwd=folder)
     fails(2, "--codec: expected an output", "convert", "tuft.ply", "x.ply", "--codec", "float32", cwd=folder)

@@ -147,6 +147,25 @@ def test_bad_files_are_refused(tmp_path):
         write_usd(v3dg.Scene(), tmp_path / "none.usda")
 
 
+def test_a_file_of_another_kind_is_told_by_its_name(tmp_path):
+    (tmp_path / "a.ply").touch()
+    with pytest.raises(ValueError, match=r"a\.ply: expected a file name ending in \.usd, \.usda, \.usdc$"):
+        v3dg.read_usd_scene(tmp_path / "a.ply")
+
+
+def test_a_world_without_cameras_is_drawn_from_those_of_a_file(tmp_path):
+    random_bundle(3).write(tmp_path / "a.v3dg")
+    scene = v3dg.Scene()
+    scene.add(v3dg.open(tmp_path / "a.v3dg"), positions=[[0, 0, 0], [1, 0, 0]])
+    write_usd(scene, tmp_path / "world.usda")
+    camera = v3dg.turntable((0, 0, 0), 8, 1, width=24, height=16)[0]
+    v3dg.write_cameras(tmp_path / "cameras.json", {"front": camera})
+    fails(1, "a file without any; give some with --cameras", "render", "world.usda", cwd=tmp_path)
+    done = run("render", "world.usda", "--cameras", "cameras.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "24 x 16" in done.stdout
+
+
 def test_without_usd_core_the_error_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     v3dg.formats.usd.pxr.cache_clear()

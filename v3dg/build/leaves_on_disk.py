@@ -154,7 +154,7 @@ class _Sizes:
         name = os.fspath(largest.path)
         why = f" for {name}, whose format can only be read whole (or convert it to .ply)"
         expected = f"at least {in_mib(least)}{why if largest.whole_bytes else ''}"
-        check("memory", memory >= least, f"{expected}, got {memory:,} bytes")
+        check("memory", memory >= least, f"{expected}, got {memory / (1 << 20):,.1f} MiB")
         memory -= reserved
         for_block = memory - overhead - largest.whole_bytes
         for_split = memory - _OVERHEAD_BYTES

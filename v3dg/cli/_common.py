@@ -108,6 +108,13 @@ def require_file(path: Path, *suffixes: str) -> None:
     check(path, path.name.lower().endswith(suffixes), f"a file ending in {', '.join(suffixes)}, got {got}")
 
 
+def check_output(output: Path, *inputs: Path) -> None:
+    """Refuse to write over a file that is read: what is written may be less than what is there."""
+    for path in inputs:
+        is_another = not (output.exists() and path.exists() and output.samefile(path))
+        check_usage(str(output), is_another, f"another file than {path}, which is read; choose another name")
+
+
 def require_subject(path: Path) -> None:
     """Check that a file is there and is a scene, a bundle or an asset by its name."""
     require_file(path, *SUFFIXES, ".v3dg", ".json")

@@ -121,7 +121,7 @@ class Program:
 def _plainly(text: str) -> str:
     """What tyro says of a value, without types of Python, and its choices in one order, without None."""
     if match := re.match(r"Error parsing (--[a-z-]+): (.*)", text):
-        expected = "numbers" if "float" in match[2] else "whole numbers"
+        expected = "numbers" if "float" in match[2].lower() else "whole numbers"
         return f"{match[1]}: expected {expected}, got " + ", ".join(re.findall("'.*?'", match[2]))
     if match := re.match(r"invalid choice (.*) for argument '(.*)'. Expected one of (.*)", text):
         known = set(re.findall(r"'(.*?)'", match[3])) - {"None"}

@@ -18,8 +18,9 @@ from v3dg.cameras import DEFAULT_FOV_X, Axis, Camera, turntable
 from v3dg.cleaning import ball_of_most, examine
 from v3dg.cli._common import check_range, check_usage, level_size, option, require_subject
 from v3dg.gaussians import Gaussians
-from v3dg.opening import Subject, is_scene
 from v3dg.pictures import MOST_SIDE, check_size
+from v3dg.scene import Scene, Subject
+from v3dg.scene.file import is_scene
 from v3dg.upright import direction_of, up_of
 
 # Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
@@ -46,12 +47,12 @@ class ViewOptions(CameraFile):
 
     camera: Annotated[str | None, option("NAME")] = None
     """Draw only this camera of a file with cameras: its name, or its place in the file, from 0."""
-    views: int = 1
-    """Views around the turntable."""
+    views: Annotated[int | None, option("N")] = None
+    """Views around the turntable; 1 if not given, and 8 to compare."""
     size: Annotated[tuple[int, int], tyro.conf.arg(metavar="W H")] = (800, 800)
     """Width and height in px of a turntable's pictures, and of cameras whose file gives them no size."""
-    elevation: float = 20.0
-    """Height of the turntable's cameras above the horizon in degrees."""
+    elevation: Annotated[float | None, option("DEGREES")] = None
+    """Height of the turntable's cameras above the horizon; 20 if not given."""
     up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
     """The turntable's axis; what the file says or what is guessed from it if not given."""
 
@@ -59,13 +60,20 @@ class ViewOptions(CameraFile):
         """Refuse, before anything is read, subjects that are none, and what cannot be meant for them."""
         for path in subjects:
             require_subject(path)
-        check_range("--views", self.views, 1, _MOST_VIEWS)
         for side in self.size:
             check_range("--size", side, 1, MOST_SIDE)
-        check_range("--elevation", self.elevation, -89.99, 89.99)
-        is_from_file = self.cameras is not None or any(map(is_scene, subjects))
+        file = self.cameras or next(filter(is_scene, subjects), None)
         expected = "--cameras or a scene (.json) to take it from; leave it out"
-        check_usage("--camera", self.camera is None or is_from_file, expected)
+        check_usage("--camera", self.camera is None or file, expected)
+        for name, value in self.turntable().items():
+            expected = f"a turntable to set with it, got the cameras of {file}; leave it out"
+            check_usage(name, value is None or not file, expected)
+        check_range("--views", 1 if self.views is None else self.views, 1, _MOST_VIEWS)
+        check_range("--elevation", self.elevation or 0, -89.99, 89.99)
+
+    def turntable(self) -> dict[str, object]:
+        """Options of the turntable, by name; None: not given."""
+        return {"--views": self.views, "--elevation": self.elevation, "--up": self.up}
 
 
 # Field of a command's options that holds them; on the command line they stand beside the others.
@@ -73,14 +81,14 @@ Views: TypeAlias = Annotated[ViewOptions, tyro.conf.OmitArgPrefixes]
 
 
 def choose_cameras(
-    options: ViewOptions, path: Path, subject: Subject, own: dict[str, Camera] | None
+    options: ViewOptions, path: Path, subject: Subject, own: dict[str, Camera] | None, views: int = 1
 ) -> dict[str, Camera]:
-    """The cameras of --cameras, else the subject's own, else a turntable around it."""
+    """The cameras of --cameras, else the subject's own, else a turntable around it, by default of `views`."""
     if options.cameras is not None:
         own = read_cameras(options.cameras, size=options.size, distortion=options.distortion)
     if own is None:
-        own = _turntable(subject, options, options.up or up_of(subject, path=path)[0])
-    check(options.cameras or path, own, "cameras, got a file without any; add some to it")
+        own = {} if isinstance(subject, Scene) else _around(subject, options, options.views or views, path)
+    check(options.cameras or path, own, "cameras, got a file without any; give some with --cameras")
     if options.camera is not None:
         own = _one_camera(own, options.camera)
     for name, camera in own.items():
@@ -98,12 +106,11 @@ def _one_camera(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
     return {name: cameras[name]}
 
 
-def _turntable(subject: Subject, options: ViewOptions, up: Axis) -> dict[str, Camera]:
+def _around(subject: Bundle | Gaussians, options: ViewOptions, views: int, path: Path) -> dict[str, Camera]:
     """Cameras around where most of the gaussians are, at a distance that shows nearly all of it."""
     if isinstance(subject, Gaussians):
         means = subject.means[examine(subject).drawable]
     else:
-        assert isinstance(subject, Bundle)
         levels = range(subject.num_levels)
         level = next((i for i in levels if level_size(subject, i) <= _ENOUGH_TO_FRAME), len(levels) - 1)
         means = subject.level_gaussians(level).means if levels else np.zeros((0, 3), np.float32)
@@ -113,23 +120,23 @@ def _turntable(subject: Subject, options: ViewOptions, up: Axis) -> dict[str, Ca
     cameras = turntable(
         centre,
         distance,
-        options.views,
-        math.radians(options.elevation),
-        up=direction_of(up),
+        views,
+        math.radians(20.0 if options.elevation is None else options.elevation),
+        up=direction_of(options.up or up_of(subject, path=path)[0]),
         width=options.size[0],
         height=options.size[1],
         near=min(0.01, 0.01 * distance),
     )
-    digits = len(str(options.views - 1))
+    digits = len(str(views - 1))
     return {f"{i:0{digits}}": camera for i, camera in enumerate(cameras)}
 
 
-def up_lines(
-    given: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None = None, *, path: Path
-) -> list[str]:
-    """What is said of the axis that was taken to be up, unless --up gave it."""
+def choose_up(
+    given: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
+) -> tuple[Axis, list[str]]:
+    """The axis that is up: of --up, or else as `up_of` takes it, with a line that says so."""
     axis, how = up_of(subject, cameras, path)
-    return [] if given else [f"{path.name}: {axis} is up, {how}; --up says otherwise"]
+    return given or axis, [] if given else [f"{path.name}: {axis} is up, {how}; --up says otherwise"]
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:

@@ -175,6 +175,7 @@ def _build(
         _common.require_file(path, *SUFFIXES)
     advice = f", got a folder; {output / asset_paths[0].stem}.v3dg is one" if output.is_dir() else ""
     check(output, output.suffix == ".v3dg", f"a file name ending in .v3dg{advice}")
+    _common.check_output(output, *asset_paths)
     start = time.perf_counter()
     config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
     if options.cluster_size is not None:

@@ -48,7 +48,7 @@ class Compare(_common.Cut, _common.OnDevice):
     """Show the view that differs most, or write a picture of every view."""
     supersample: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Draw the reference this many times larger and average it; with 2, aliasing is not taken for detail."""
-    view: Views = field(default_factory=lambda: ViewOptions(views=8))
+    view: Views = field(default_factory=ViewOptions)
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,7 @@ class _Pair:
 def run(options: Compare) -> None:
     output = pictures.check_picture_path(options.output)
     subjects = (options.reference, options.test)
-    is_another = output.resolve() not in [path.resolve() for path in subjects]
-    _common.check_usage("--output", is_another, f"another file than those to compare, got {output}")
+    _common.check_output(output, *subjects)
     are_pictures = [path.suffix.lower() in pictures.SUFFIXES for path in subjects]
     is_pair = any(are_pictures) == all(are_pictures)
     _common.check_usage("PATH", is_pair, "two pictures, or two subjects to draw, got one of each")
@@ -135,7 +134,7 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair], int | None]:
     own, path = reference_cameras, options.reference
     if own is None and test_cameras is not None:
         own, path = test_cameras, options.test
-    cameras = choose_cameras(options.view, path, reference, own)
+    cameras = choose_cameras(options.view, path, reference, own, views=8)
     for name, camera in cameras.items():
         pictures.check_size(f"camera {name}", camera.width, camera.height, pictures.MOST_PIXELS_COMPARED)
         sides = (side * options.supersample for side in (camera.width, camera.height))

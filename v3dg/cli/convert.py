@@ -18,8 +18,9 @@ from v3dg.cli import _common
 from v3dg.cli._views import ViewOptions, Views, choose_cameras
 from v3dg.gaussians import Gaussians
 from v3dg.io import WRITE_SUFFIXES, write_asset
-from v3dg.opening import is_scene, open_with_cameras
+from v3dg.opening import open_with_cameras
 from v3dg.scene import Scene
+from v3dg.scene.file import is_scene
 from v3dg.select import select
 
 
@@ -54,8 +55,11 @@ def run(options: Convert) -> None:
     fits = not options.spz_version or name.endswith(".spz")
     _common.check_usage("--spz-version", fits, f"a .spz to write, got {output}; leave it out")
     _files.check_folder(output)
-    given = (options.tolerance, options.budget, view.cameras, view.camera)
-    is_cut = is_scene(options.subject) or any(value is not None for value in given)
+    _common.check_output(output, options.subject)
+    part: dict[str, Any] = {"--level": options.level, "--tolerance": options.tolerance}
+    part |= {"--budget": options.budget, "--cameras": view.cameras, **view.turntable()}
+    given = [name for name, value in part.items() if value is not None]
+    is_cut = is_scene(options.subject) or any(name != "--level" for name in given)
     expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
     _common.check_usage("--level", options.level is None or not is_cut, expected)
     start = time.perf_counter()
@@ -69,8 +73,7 @@ def run(options: Convert) -> None:
         Bundle(subject.clusters, subject.groups, gaussians, subject.config, codec).write(output)
         told = {"codec": codec}
     elif isinstance(subject, Gaussians):
-        is_whole, names = not is_cut and options.level is None, "--level, --tolerance, --budget"
-        _common.check_usage(names, is_whole, "a bundle or a scene; build one first")
+        _common.check_usage(", ".join(given), not given, "a bundle or a scene; build one first")
         gaussians = subject
     elif isinstance(subject, Bundle) and not is_cut:
         level = options.level or 0
@@ -78,8 +81,8 @@ def run(options: Convert) -> None:
         gaussians, told = subject.level_gaussians(level), {"level": level}
     else:
         cameras = choose_cameras(view, options.subject, subject, own_cameras)
-        expected = f"one of {len(cameras)} cameras; give its name or its place"
-        _common.check_usage("--camera", len(cameras) == 1, expected)
+        expected = f"one camera to look from, got {len(cameras)}; choose one"
+        _common.check_usage("--views" if view.views else "--camera", len(cameras) == 1, expected)
         gaussians, told = _cut(options, subject, *cameras.items())
     if not to_bundle:
         write_asset(output, gaussians, version=options.spz_version)

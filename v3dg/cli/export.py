@@ -12,48 +12,47 @@ import tyro
 
 from v3dg import export
 from v3dg.cameras import Axis
-from v3dg.cli._common import Common, bytes_text, check_usage, option, print_result, require_subject
-from v3dg.cli._views import up_lines
+from v3dg.cli import _common
+from v3dg.cli._views import choose_up
 from v3dg.formats.usd import SUFFIXES as USD_SUFFIXES
 from v3dg.gaussians import Gaussians
 from v3dg.opening import open_with_cameras
-from v3dg.upright import up_of
 
 
 @dataclass
-class Export(Common):
+class Export(_common.Common):
     """Write a scene or a bundle as a page for the web, as 3D Tiles, or as OpenUSD (docs/formats.md)."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg), or a world of OpenUSD."""
-    output: Annotated[Path | None, option("FOLDER", "-o")] = None
+    output: Annotated[Path | None, _common.option("FOLDER", "-o")] = None
     """Folder to write, made with those above it; the subject's name with _web if not given. With a name that
     ends in .usd, .usda or .usdc, the file to write."""
     to: Literal["sog", "tiles"] = "sog"
     """Streamed SOG, for PlayCanvas and SuperSplat, or 3D Tiles, for CesiumJS."""
     chunk: int = export.DEFAULT_CHUNK
     """Most gaussians of an asset in a chunk of streamed SOG, for which the viewer chooses a level."""
-    up: Annotated[Axis | None, option("{x,y,z,-x,-y,-z}")] = None
+    up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
     """Which way is up; what the file says or what is guessed from it or its cameras if not given."""
 
 
 def run(options: Export) -> None:
-    require_subject(options.subject)
-    check_usage("--chunk", options.chunk >= 1, f"at least 1, got {options.chunk}")
+    _common.require_subject(options.subject)
+    _common.check_usage("--chunk", options.chunk >= 1, f"at least 1, got {options.chunk}")
     folder = options.output or options.subject.with_name(f"{options.subject.stem}_web")
+    _common.check_output(folder, options.subject)
     start = time.perf_counter()
     subject, cameras = open_with_cameras(options.subject)
     if isinstance(subject, Gaussians):
         expected = f"expected a scene or a bundle, got an asset; make one of it: v3dg build {options.subject}"
         raise ValueError(f"{options.subject}: {expected}")
-    up = options.up or up_of(subject, cameras, options.subject)[0]
-    notes = up_lines(options.up, subject, cameras, path=options.subject)
+    up, notes = choose_up(options.up, subject, cameras, options.subject)
     if folder.suffix.lower() in USD_SUFFIXES:
-        check_usage("--to", options.to == "sog", f"none for {folder}, got {options.to}; leave it out")
+        _common.check_usage("--to", options.to == "sog", f"none for {folder}, got {options.to}; leave it out")
         size = export.write_usd(subject, folder, up=up)
         written = {"output": str(folder), "bytes": size, "seconds": time.perf_counter() - start}
-        line = f"{folder}: {bytes_text(size)}, {written['seconds']:.1f} s"
-        print_result(options.json, written, [line, *notes])
+        line = f"{folder}: {_common.bytes_text(size)}, {written['seconds']:.1f} s"
+        _common.print_result(options.json, written, [line, *notes])
         return
     common: dict[str, Any] = {"up": up, "progress": not options.quiet}
     there = shlex.quote(str(folder))
@@ -69,8 +68,8 @@ def run(options: Export) -> None:
     result = {"output": str(folder), **asdict(done), "seconds": time.perf_counter() - start}
     seconds = f"{result['seconds']:.1f} s"
     instances = f"{done.instances:,} instance{'s' * (done.instances != 1)}"
-    lines = [f"{folder}: {instances}, {text}, {bytes_text(done.bytes)}, {seconds}", *notes]
+    lines = [f"{folder}: {instances}, {text}, {_common.bytes_text(done.bytes)}, {seconds}", *notes]
     if needs:
         lines += ["it needs its engine beside it, once:", *(f"  {line.format(there)}" for line in needs)]
     lines += [f"to look at it: python -m http.server --bind 127.0.0.1 --directory {there}"]
-    print_result(options.json, result, [*lines, "  then open http://127.0.0.1:8000/"])
+    _common.print_result(options.json, result, [*lines, "  then open http://127.0.0.1:8000/"])

@@ -11,7 +11,7 @@ import tyro
 from v3dg import _device
 from v3dg._progress import counted
 from v3dg.cli._common import Cut, OnPool, check_usage, finite, option, print_result, table_lines
-from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths, up_lines
+from v3dg.cli._views import ViewOptions, Views, choose_cameras, choose_up, picture_paths
 from v3dg.false_color import ColorBy
 from v3dg.opening import open_with_cameras
 from v3dg.pictures import check_picture_path, write_picture
@@ -73,5 +73,5 @@ def run(options: Render) -> None:
         "draw ms": "{draw_ms:.1f}",
     }
     result = {"subject": str(options.subject), "pictures": pictures}
-    notes = up_lines(options.view.up, subject, path=options.subject) if is_turntable else []
+    notes = choose_up(options.view.up, subject, None, options.subject)[1] if is_turntable else []
     print_result(options.json, result, [*table_lines(columns, pictures), *notes])

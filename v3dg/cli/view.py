@@ -22,9 +22,9 @@ from v3dg._start import SIGNALS
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import Axis
 from v3dg.cli._common import Cut, Flag, OnPool, check_usage, option, print_result, require_subject, tell
-from v3dg.cli._views import CameraFile, up_lines
+from v3dg.cli._views import CameraFile, choose_up
 from v3dg.opening import open_with_cameras
-from v3dg.upright import direction_of, up_of
+from v3dg.upright import direction_of
 
 # Between looks for a signal: a wait without an end misses one that comes just before it.
 _SECONDS = 0.1
@@ -68,7 +68,7 @@ def run(options: View) -> None:
     has_levels = not isinstance(subject, Gaussians)
     expected = f"a bundle or a scene, got the asset {options.subject}; build a bundle of it"
     check_usage("--budget", has_levels or options.budget is None, expected)
-    up = options.up or up_of(subject, cameras, options.subject)[0]
+    up, lines = choose_up(options.up, subject, cameras, options.subject)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
     with contextlib.suppress(ImportError):  # of which the site tells; it takes long
         importlib.import_module("v3dg.viewer.tab")
@@ -87,7 +87,6 @@ def run(options: View) -> None:
         try:
             if options.port not in (0, site.port) and not options.quiet:
                 tell(f"port {options.port} is taken, listening at {site.port}")
-            lines = up_lines(options.up, subject, cameras, path=options.subject)
             told = {"url": site.url, "subject": str(options.subject)}
             print_result(options.json, told, [f"{site.url} shows {options.subject}; Ctrl-C ends it", *lines])
             if not options.no_browser and not site.is_secret and _has_browser():
