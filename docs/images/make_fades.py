@@ -1,4 +1,7 @@
-"""Makes fades.webp: a slow drift, hard cut and fade, and below what changes beside the motion."""
+"""Makes fades.webp of the donut: a slow drift with a hard cut and with a fade, and below how errors change.
+
+python docs/images/make_fades.py donut.v3dg
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from PIL import Image
 from benchmarks.evaluation.steadiness import paths_from, true_picture
 from v3dg import DEFAULT_FADE, Bundle, Camera, Gaussians, render
 from v3dg.cleaning import ball_of_most
+from v3dg.pictures import contact_sheet, to_8bit
 
 SIDE, SCALE, FRAMES, GAIN = 160, 5, 48, 24.0
 WINDOW = slice(52, 108), slice(44, 116)  # that the object is in
@@ -26,17 +30,15 @@ def main(path: str) -> None:
     last: dict[str, np.ndarray] = {}
     frames = []
     for camera in cameras:
-        truth, columns = true_picture(bundle, camera, "cpu"), []
-        for name, fade in (("hard", None), ("fade", DEFAULT_FADE)):
+        truth, above, below = true_picture(bundle, camera, "cpu"), [], []
+        for name, fade in (("hard cut", None), (f"fade of {DEFAULT_FADE}", DEFAULT_FADE)):
             color = render(bundle, camera, fade=fade, device="cpu").color.clip(0, 1)
             error = color - truth
             change = 0.5 + GAIN * (error - last.get(name, error))
             last[name] = error
-            columns.append(np.concatenate([color[WINDOW], change[WINDOW].clip(0, 1)]))
-        pixels = (255 * np.concatenate(columns, axis=1)).astype(np.uint8)
-        picture = Image.fromarray(pixels)
-        size = SCALE * picture.width, SCALE * picture.height
-        frames.append(picture.resize(size, Image.Resampling.BICUBIC))
+            above.append((name, enlarged(color)))
+            below.append((f"what changes beside the motion, {GAIN:g} times", enlarged(change)))
+        frames.append(Image.fromarray(contact_sheet([above, below])))
     frames[1].save(
         Path(__file__).with_name("fades.webp"),
         save_all=True,
@@ -45,6 +47,13 @@ def main(path: str) -> None:
         loop=0,
         quality=60,
     )
+
+
+def enlarged(picture: np.ndarray) -> np.ndarray:
+    """The part with the object, as it is shown."""
+    pixels = Image.fromarray(to_8bit(picture[WINDOW]))
+    size = SCALE * pixels.width, SCALE * pixels.height
+    return np.asarray(pixels.resize(size, Image.Resampling.BICUBIC))
 
 
 if __name__ == "__main__":
