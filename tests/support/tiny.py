@@ -17,7 +17,7 @@ WORLDS = {
 # Options that are added to a command, where its own sizes would take long.
 OPTIONS = {
     "demo": ["--gaussians", "1000", "--instances", "20", "--size", "64", "64"],
-    "compare": ["--views", "2", "--size", "64", "64"],
+    "compare": ["--size", "64", "64"],
 }
 
 
@@ -54,4 +54,7 @@ if __name__ == "__main__":
     if arguments[0] == "view":  # serves until it is interrupted: here, its options are enough
         cli.parse(arguments)
         sys.exit()
-    sys.exit(cli.main([*arguments, *OPTIONS.get(arguments[0], [])]))
+    views = ["--views", "2"]  # of a turntable, which a scene has none of
+    if arguments[0] != "compare" or any(argument.endswith(".json") for argument in arguments):
+        views = []
+    sys.exit(cli.main([*arguments, *OPTIONS.get(arguments[0], []), *views]))
