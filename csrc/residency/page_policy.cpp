@@ -21,7 +21,8 @@ constexpr size_t kMostChosen = size_t(1) << 14;  // that are read before the nex
 constexpr int32_t kRootSlot = -2, kNoSlot = -1;
 constexpr size_t kAhead = 16;  // needs whose memory is fetched before their turn
 
-// Urgencies are told apart by a sixteenth of a power of two, from 1/2 on; a float has 23 bits below its power.
+// Urgencies are told apart by a sixteenth of a power of two, from 1/2 on: a float has 23 bits within one, of
+// which the upper four are looked at.
 constexpr uint32_t kNumKeys = 1024, kKeyShift = 19, kFirstKey = 0x3f000000u >> kKeyShift;
 constexpr uint32_t kKeysOfPower = 1 << (23 - kKeyShift);  // pages above are a power more urgent, or more
 
