@@ -138,7 +138,7 @@ def test_nothing_is_written_that_cannot_be_opened(bundle, tmp_path):
 def test_an_axis_that_is_none_is_refused_where_it_is_set(bundle):
     scene = v3dg.Scene.of(bundle)
     scene.up = "-y"
-    with pytest.raises(ValueError, match=r"scene\.up: expected 'x' or .*, got 'q'"):
+    with pytest.raises(ValueError, match=r"^up: expected 'x' or .*, got 'q'"):
         scene.up = "q"
     assert scene.up == "-y"
     scene.up = None

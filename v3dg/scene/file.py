@@ -143,7 +143,8 @@ def _read_scene(root: Node, folder: Path, known: dict[str, Bundle]) -> tuple[Sce
         cameras[name] = _read_camera(node, fields)
     scene = _scene_of(instances)
     if "up" in top:
-        top["up"].attempt(lambda: setattr(scene, "up", top["up"].value))
+        up = top["up"].text()
+        root.attempt(lambda: setattr(scene, "up", up))
     return scene, cameras
 
 

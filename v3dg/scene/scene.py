@@ -190,7 +190,7 @@ class Scene:
     @up.setter
     def up(self, axis: Axis | None) -> None:
         if axis is not None:
-            one_of(axis, "scene.up", AXES)
+            one_of(axis, "up", AXES)
         self._up = axis
 
     @property
