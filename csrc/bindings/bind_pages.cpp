@@ -83,6 +83,20 @@ void read_run(const py::object& path, int descriptor, const py::object& out, con
     read_rows(path, descriptor, run, of, held<Rows>(out, "out"));
 }
 
+std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
+    std::vector<Span<const uint8_t>> messages;
+    for (const py::array& array : arrays) messages.push_back(span_of<const uint8_t>(array, "messages", {-1}));
+    std::vector<PageHash> hashes(messages.size());
+    {
+        const py::gil_scoped_release unlocked;
+        blake2b({messages.data(), messages.size()}, hashes.data());
+    }
+    std::vector<py::bytes> digests;
+    for (const PageHash& hash : hashes)
+        digests.emplace_back(reinterpret_cast<const char*>(hash.data()), hash.size());
+    return digests;
+}
+
 // With the arrays that it reads to and hashes.
 class BoundHashedRead {
   public:
@@ -101,7 +115,7 @@ class BoundHashedRead {
         return is_whole;
     }
     py::bytes digest() {
-        std::array<uint8_t, kPageHashBytes> digest{};
+        PageHash digest{};
         {
             const py::gil_scoped_release unlocked;
             digest = read_->digest();
@@ -124,6 +138,7 @@ void bind_pages(py::module_& m) {
         .def("wait", &BoundHashedRead::wait, "Waits until out is filled; whether the file has so much.")
         .def("digest", &BoundHashedRead::digest,
              "BLAKE2b-128 of what is in before and out together, once they are filled.");
+    m.def("blake2b", &hash_messages, "messages"_a, "BLAKE2b-128 of several messages, side by side.");
     m.attr("DAMAGED") = kDamaged;
     m.def(
         "read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a, py::kw_only(),

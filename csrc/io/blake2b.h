@@ -4,12 +4,19 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "base/span.h"
+
 namespace v3dg {
 
-constexpr size_t kPageHashBytes = 16;
+constexpr size_t kPageHashBytes = 16, kHashBlockBytes = 128;
+using PageHash = std::array<uint8_t, kPageHashBytes>;
 
 // BLAKE2b with a digest of 16 bytes and no key; RFC 7693.
-std::array<uint8_t, kPageHashBytes> blake2b(const unsigned char* bytes, size_t size);
+PageHash blake2b(Span<const uint8_t> message);
+
+// The same of several messages, each in a lane of a vector where the processor has wide ones: quickest for
+// eight or more of about the same length.
+void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests);
 
 // The same of bytes that come one after another.
 class Blake2b {
@@ -17,14 +24,12 @@ class Blake2b {
     Blake2b();
     void add(const unsigned char* bytes, size_t size);
     // Of all that was added; nothing is added after it.
-    std::array<uint8_t, kPageHashBytes> digest();
+    PageHash digest();
 
   private:
-    static constexpr size_t kBlockBytes = 128;
-
     uint64_t state_[8];
     uint64_t num_bytes_ = 0;  // before those that wait
-    unsigned char waiting_[kBlockBytes] = {};
+    unsigned char waiting_[kHashBlockBytes] = {};
     size_t num_waiting_ = 0;
 };
 

@@ -57,7 +57,7 @@ size_t HashedRead::wait_for_more(size_t than) {
     return num_read_;
 }
 
-std::array<uint8_t, kPageHashBytes> HashedRead::hash() {
+PageHash HashedRead::hash() {
     Blake2b hash;
     hash.add(before_.data, before_.size);
     for (size_t done = 0; done < bytes_.size;) {
@@ -69,7 +69,7 @@ std::array<uint8_t, kPageHashBytes> HashedRead::hash() {
     return hash.digest();
 }
 
-std::array<uint8_t, kPageHashBytes> HashedRead::digest() {
+PageHash HashedRead::digest() {
     read_.wait();
     return hash_.get();
 }

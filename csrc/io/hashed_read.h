@@ -1,6 +1,5 @@
 #pragma once
 
-#include <array>
 #include <condition_variable>
 #include <future>
 #include <mutex>
@@ -23,11 +22,11 @@ class HashedRead {
     // Waits until all is read. Throws std::system_error; false where the file ends before.
     bool wait() { return read_.get(); }
     // Of all, once it is read.
-    std::array<uint8_t, kPageHashBytes> digest();
+    PageHash digest();
 
   private:
     bool read();
-    std::array<uint8_t, kPageHashBytes> hash();
+    PageHash hash();
     size_t wait_for_more(size_t than);
 
     const PosixFile file_;
@@ -41,7 +40,7 @@ class HashedRead {
     bool is_over_ = false;
     // Last, for they wait for the threads, which use all of the above.
     std::shared_future<bool> read_;
-    std::future<std::array<uint8_t, kPageHashBytes>> hash_;
+    std::future<PageHash> hash_;
 };
 
 }  // namespace v3dg

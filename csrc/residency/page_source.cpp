@@ -52,7 +52,7 @@ void read_verified(const PosixFile& file, size_t place, size_t size, const uint8
         throw PageError(where + ": " + error.code().message(), false, error.code().value());
     }
     if (got < size) throw PageError(where + " is not there; the file was truncated", true);
-    const auto digest = blake2b(bytes, size);
+    const PageHash digest = blake2b({bytes, size});
     if (!std::equal(digest.begin(), digest.end(), hash))
         throw PageError(where + ": the hash does not match; " + kDamaged, true);
 }
