@@ -440,6 +440,19 @@ def test_damaged_page_leaves_the_picture_coarser_and_is_named(path, device):
     assert_same(renderer.render(CAMERA, tolerance=0.0), whole)
 
 
+def test_of_pages_that_are_read_together_only_the_damaged_ones_fail(path, device):
+    damaged = [3, 4, 40]  # of the finest level, so none is below them
+    for page in damaged:
+        damage(path, page)
+    renderer = Renderer(Bundle.open(path), device=device, memory="64MB")
+    deadline = time.monotonic() + 30
+    while draws_coarser(renderer).stats.failed < 3 or status(renderer).missing > 3:
+        assert time.monotonic() < deadline
+    renderer.render(CAMERA, tolerance=0.0).stats  # noqa: B018  brings what was read since
+    assert status(renderer).failed == 3
+    assert np.flatnonzero(~renderer._frame._pool.core.resident(0)).tolist() == damaged
+
+
 def test_truncated_file_is_an_error_and_not_a_crash(path, device):
     bundle = Bundle.open(path)
     renderer = Renderer(bundle, device=device, memory="64MB")

@@ -40,12 +40,6 @@ PageHash Blake2b::digest() {
     return digest;
 }
 
-PageHash blake2b(Span<const uint8_t> message) {
-    Blake2b hash;
-    hash.add(message.data, message.size);
-    return hash.digest();
-}
-
 void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests) {
     V3DG_DISPATCH_ISA(hash_messages, messages, digests);
 }

@@ -6,7 +6,10 @@
 
 #include <fcntl.h>
 #include <sys/stat.h>
+#include <sys/uio.h>
 #include <unistd.h>
+
+#include "base/span.h"
 
 namespace v3dg {
 
@@ -45,6 +48,26 @@ class PosixFile {
             check(got);
             if (got == 0) break;
             done += static_cast<size_t>(got);
+        }
+        return done;
+    }
+
+    // The same into several pieces of memory, one behind another, at most 1024. Changes what it is given.
+    size_t read_at(size_t offset, Span<iovec> pieces) const {
+        size_t done = 0;
+        while (!pieces.empty()) {
+            const ssize_t got = ::preadv(descriptor_, pieces.data, static_cast<int>(pieces.size),
+                                         static_cast<off_t>(offset + done));
+            if (got < 0 && errno == EINTR) continue;
+            check(got);
+            if (got == 0) break;
+            done += static_cast<size_t>(got);
+            size_t left = static_cast<size_t>(got);
+            for (; !pieces.empty() && left >= pieces.data->iov_len; ++pieces.data, --pieces.size)
+                left -= pieces.data->iov_len;
+            if (left == 0) continue;
+            pieces.data->iov_base = static_cast<char*>(pieces.data->iov_base) + left;
+            pieces.data->iov_len -= left;
         }
         return done;
     }

@@ -21,9 +21,10 @@ namespace {
 constexpr float kToleranceStep = 1.02f, kToleranceLeap = 1.189207f;
 constexpr double kRoomyShare = 0.7;
 constexpr int kTries = 3;
-constexpr size_t kMostAtOnce = 64;    // pages that a thread asks the disk for together
-constexpr size_t kSamples = 1 << 14;  // of the sizes of pages
-constexpr int kSpins = 64;            // before a frame does without what another thread holds
+constexpr size_t kMostAtOnce = 64;                        // pages that a thread asks the disk for together
+constexpr size_t kMostBytesTogether = size_t(512) << 10;  // of those, that it then reads and hashes together
+constexpr size_t kSamples = 1 << 14;                      // of the sizes of pages
+constexpr int kSpins = 64;  // before a frame does without what another thread holds
 
 // A page that a thread reads.
 struct Reading {
@@ -100,8 +101,9 @@ struct PagePool::State {
     void decide_always();
 
     bool read_some(std::unique_lock<std::mutex>& lock, size_t most);
-    void expect(Reading* batch, size_t count) const;
-    void read_page(const Reading& reading, std::unique_lock<std::mutex>& lock);
+    void read_batch(Reading* batch, size_t count, std::unique_lock<std::mutex>& lock);
+    void read_together(uint32_t bundle, Span<PageReading> pages, std::unique_lock<std::mutex>& lock);
+    void finish(uint32_t bundle, const PageReading& of);
     void read_always();
 
     void exchange();
@@ -311,55 +313,71 @@ bool PagePool::State::read_some(std::unique_lock<std::mutex>& lock, size_t most)
     num_loading += count;
     if (count == 0) return false;
     lock.unlock();
-    if (count > 1) expect(batch, count);
-    for (size_t k = 0; k < count; ++k) read_page(batch[k], lock);
+    read_batch(batch, count, lock);
     lock.lock();
     return true;
 }
 
-// Without the lock: has the disk begin with all of them, those that lie side by side as one.
-void PagePool::State::expect(Reading* batch, size_t count) const {
+// Without the lock: has all read in the order of files, a few together, the disk begins with all at once.
+void PagePool::State::read_batch(Reading* batch, size_t count, std::unique_lock<std::mutex>& lock) {
     std::sort(batch, batch + count, [](const Reading& a, const Reading& b) {
         return a.page.bundle != b.page.bundle ? a.page.bundle < b.page.bundle : a.page.page < b.page.page;
     });
-    for (size_t first = 0, end = 1; first < count; first = end++) {
-        const PageRequest& page = batch[first].page;
-        while (end < count && batch[end].page.bundle == page.bundle &&
-               batch[end].page.page == page.page + (end - first))
-            ++end;
-        policy.source(page.bundle).expect(page.page, end - first);
+    PageReading pages[kMostAtOnce];
+    for (size_t k = 0; k < count; ++k) {
+        pages[k].page = batch[k].page.page;
+        pages[k].bytes = batch[k].block;
+    }
+    // Calls visit(bundle, pages of it) for so many bytes.
+    const auto for_each = [&](size_t most_bytes, const auto& visit) {
+        for (size_t first = 0, end = 0; first < count; first = end) {
+            const uint32_t bundle = batch[first].page.bundle;
+            for (size_t bytes = 0; end < count && batch[end].page.bundle == bundle; ++end) {
+                bytes += policy.source(bundle).num_bytes(pages[end].page);
+                if (end > first && bytes > most_bytes) break;
+            }
+            visit(bundle, Span<PageReading>{pages + first, end - first});
+        }
+    };
+    if (count > 1) for_each(SIZE_MAX, [&](uint32_t b, auto of) { policy.source(b).expect(of); });
+    for_each(kMostBytesTogether, [&](uint32_t b, auto of) { read_together(b, of, lock); });
+}
+
+// Without the lock: has pages of a bundle read. Those that are there are loaded at once, others tried again.
+void PagePool::State::read_together(uint32_t bundle, Span<PageReading> pages,
+                                    std::unique_lock<std::mutex>& lock) {
+    policy.source(bundle).read_pages(pages);
+    lock.lock();
+    for (const PageReading& of : pages)
+        if (!of.error) finish(bundle, of);
+    lock.unlock();
+    for (PageReading& of : pages) {
+        if (!of.error) continue;
+        for (int tried = 1; tried < kTries && of.error; ++tried) {
+            std::this_thread::sleep_for(std::chrono::milliseconds(tried == 1 ? 5 : 50));
+            of.error.reset();
+            policy.source(bundle).read_pages({&of, 1});
+        }
+        lock.lock();
+        finish(bundle, of);
+        lock.unlock();
     }
 }
 
-// Without the lock. A page is read, and is then either loaded or failed.
-void PagePool::State::read_page(const Reading& reading, std::unique_lock<std::mutex>& lock) {
-    const PageRequest& page = reading.page;
-    std::string problem;
-    bool is_damaged = false, is_read = false;
-    for (int tried = 0; tried < kTries && !is_read; ++tried) {
-        if (tried > 0) std::this_thread::sleep_for(std::chrono::milliseconds(tried == 1 ? 5 : 50));
-        try {
-            policy.source(page.bundle).read(page.page, reading.block);
-            is_read = true;
-        } catch (const PageError& caught) {
-            problem = caught.what();
-            is_damaged = caught.is_damage;
-        }
-    }
-    lock.lock();
+// Under the lock: a page is loaded, or has failed.
+void PagePool::State::finish(uint32_t bundle, const PageReading& of) {
     --num_loading;
-    policy.state(page.bundle, page.page) = is_read ? PageState::loaded : PageState::failed;
-    if (is_read) {
-        read.push_back({page.bundle, page.page, reading.block});
+    policy.state(bundle, of.page) = of.error ? PageState::failed : PageState::loaded;
+    if (!of.error) {
+        read.push_back({bundle, static_cast<uint32_t>(of.page), of.bytes});
         if (has_to_decide()) to_decide.notify_one();
     } else {
-        blocks.give_back(reading.block);
+        blocks.give_back(of.bytes);
         ++failed;
-        error = problem;
-        is_damage = is_damaged;
+        error = of.error->what();
+        is_damage = of.error->is_damage;
     }
     has_changed.notify_all();
-    lock.unlock();
 }
 
 void PagePool::State::read_always() {

@@ -5,10 +5,11 @@
 
 #include "base/buffer.h"
 #include "base/parallel_for.h"
-#include "io/blake2b.h"
 #include "quantize/quantize.h"
 
 namespace v3dg {
+
+constexpr size_t kFew = 8;  // pages that a thread reads at once: as many as are hashed side by side
 
 static std::string name_of(const PageRun& run, size_t page) {
     const Span<const int64_t> clusters = run.clusters(page);
@@ -16,44 +17,72 @@ static std::string name_of(const PageRun& run, size_t page) {
            " to " + std::to_string(clusters[clusters.size - 1] - 1) + ")";
 }
 
-static void read_bytes(const PosixFile& file, const PageRun& run, size_t page, unsigned char* bytes) {
-    read_verified(file, run.places[page], run.num_bytes(page), run.hashes.data + kPageHashBytes * page,
-                  name_of(run, page), bytes);
+// Reads so many pages to memory, one behind another, and calls use(page, bytes) for those up to the first
+// that cannot be had.
+template <class Use>
+static void read_few(const PosixFile& file, const PageRun& run, size_t first, size_t count,
+                     unsigned char* bytes, const Use& use) {
+    PageReading pages[kFew];
+    for (size_t k = 0; k < count; ++k) {
+        pages[k].page = first + k;
+        pages[k].bytes = bytes + (run.places[first + k] - run.places[first]);
+    }
+    read_verified(file, run.places, run.hashes.data, {pages, count},
+                  [&](size_t page) { return name_of(run, page); });
+    for (size_t k = 0; k < count; ++k) {
+        if (pages[k].error) throw PageError(*pages[k].error);
+        use(pages[k].page, pages[k].bytes);
+    }
+}
+
+// Calls read(first page, how many) on all threads.
+template <class Read>
+static void for_few_pages(const PageRun& run, const Read& read) {
+    const size_t share = run.size() / static_cast<size_t>(omp_get_max_threads());
+    const size_t few = std::clamp<size_t>(share, 1, kFew);
+    parallel_for((run.size() + few - 1) / few, 1,
+                 [&](size_t k) { read(k * few, std::min(few, run.size() - k * few)); });
+}
+
+static void decode(const PageRun& run, size_t page, PageCodec codec, const unsigned char* bytes,
+                   const GaussianRows<float>& out) {
+    std::vector<int64_t> clusters;
+    for (const int64_t row : run.clusters(page)) clusters.push_back(row - run.offset[0]);
+    const auto first = static_cast<size_t>(clusters.front());
+    const auto count = static_cast<size_t>(clusters.back()) - first;
+    if (codec == PageCodec::quantized) {
+        const auto* words = reinterpret_cast<const uint32_t*>(bytes);
+        try {
+            cpu::decode_page({{clusters.data(), clusters.size()}, words, out.sh_degree}, out);
+        } catch (const std::invalid_argument& error) {
+            throw PageError(name_of(run, page) + ": " + error.what() + "; " + kDamaged, true);
+        }
+        return;
+    }
+    const GaussianRows<const float> rows = rows_of_page(bytes, count, out.sh_degree);
+    const auto copy = [&](const float* from, float* to, size_t width) {
+        std::copy_n(from, count * width, to + first * width);
+    };
+    copy(rows.means, out.means, 3);
+    copy(rows.quats, out.quats, 4);
+    copy(rows.scales, out.scales, 3);
+    copy(rows.opacities, out.opacities, 1);
+    copy(rows.sh, out.sh, out.num_sh());
 }
 
 void read_pages(const PosixFile& file, const PageRun& run, PageCodec codec, const GaussianRows<float>& out) {
-    parallel_for(run.size(), 1, [&](size_t page) {
-        Buffer<uint32_t> words(run.num_bytes(page) / sizeof(uint32_t) + 1);
-        auto* const bytes = reinterpret_cast<unsigned char*>(words.data());
-        read_bytes(file, run, page, bytes);
-        std::vector<int64_t> clusters;
-        for (const int64_t row : run.clusters(page)) clusters.push_back(row - run.offset[0]);
-        const auto first = static_cast<size_t>(clusters.front());
-        const auto count = static_cast<size_t>(clusters.back()) - first;
-        if (codec == PageCodec::quantized) {
-            try {
-                cpu::decode_page({{clusters.data(), clusters.size()}, words.data(), out.sh_degree}, out);
-            } catch (const std::invalid_argument& error) {
-                throw PageError(name_of(run, page) + ": " + error.what() + "; " + kDamaged, true);
-            }
-            return;
-        }
-        const GaussianRows<const float> rows = rows_of_page(bytes, count, out.sh_degree);
-        const auto copy = [&](const float* from, float* to, size_t width) {
-            std::copy_n(from, count * width, to + first * width);
-        };
-        copy(rows.means, out.means, 3);
-        copy(rows.quats, out.quats, 4);
-        copy(rows.scales, out.scales, 3);
-        copy(rows.opacities, out.opacities, 1);
-        copy(rows.sh, out.sh, out.num_sh());
+    for_few_pages(run, [&](size_t first, size_t count) {
+        Buffer<uint32_t> words((run.places[first + count] - run.places[first]) / sizeof(uint32_t) + 1);
+        read_few(file, run, first, count, reinterpret_cast<unsigned char*>(words.data()),
+                 [&](size_t page, const unsigned char* bytes) { decode(run, page, codec, bytes, out); });
     });
 }
 
 void read_codes(const PosixFile& file, const PageRun& run, Span<int32_t> words) {
     auto* const bytes = reinterpret_cast<unsigned char*>(words.data);
-    parallel_for(run.size(), 1, [&](size_t page) {
-        read_bytes(file, run, page, bytes + (run.places[page] - run.places[0]));
+    for_few_pages(run, [&](size_t first, size_t count) {
+        read_few(file, run, first, count, bytes + (run.places[first] - run.places[0]),
+                 [](size_t, const unsigned char*) {});
     });
 }
 

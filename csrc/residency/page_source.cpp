@@ -1,6 +1,7 @@
 #include "residency/page_source.h"
 
 #include <algorithm>
+#include <cassert>
 #include <cstring>
 
 #include "io/blake2b.h"
@@ -43,33 +44,104 @@ FilePages::FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, 
       place_(place.begin(), place.end()),
       hash_(hash.begin(), hash.end()) {}
 
-void read_verified(const PosixFile& file, size_t place, size_t size, const uint8_t* hash,
-                   const std::string& where, unsigned char* bytes) {
-    size_t got = 0;
+static void read_one(const PosixFile& file, Span<const int64_t> places, PageReading& of,
+                     const std::function<std::string(size_t)>& name_of) {
+    const auto size = static_cast<size_t>(places[of.page + 1] - places[of.page]);
     try {
-        got = file.read_at(place, reinterpret_cast<char*>(bytes), size);
+        if (file.read_at(places[of.page], reinterpret_cast<char*>(of.bytes), size) < size)
+            of.error.emplace(name_of(of.page) + " is not there; the file was truncated", true);
     } catch (const std::system_error& error) {
-        throw PageError(where + ": " + error.code().message(), false, error.code().value());
+        of.error.emplace(name_of(of.page) + ": " + error.code().message(), false, error.code().value());
     }
-    if (got < size) throw PageError(where + " is not there; the file was truncated", true);
-    const PageHash digest = blake2b({bytes, size});
-    if (!std::equal(digest.begin(), digest.end(), hash))
-        throw PageError(where + ": the hash does not match; " + kDamaged, true);
 }
 
-void FilePages::read(size_t page, unsigned char* bytes) const {
-    const std::string where = name_ + ": page " + std::to_string(page);
-    read_verified(file_, place_[page], num_bytes(page), hash_.data() + kPageHashBytes * page, where, bytes);
+// Bytes between two pages that are read and thrown away rather than asked for twice around: a page or two.
+constexpr size_t kMostSkippedBytes = size_t(32) << 10;
+
+// Where the pages end that are read at once with the first.
+static size_t end_of_run(Span<const int64_t> places, Span<const PageReading> pages, size_t first) {
+    size_t end = first + 1;
+    while (end < pages.size && static_cast<size_t>(places[pages[end].page] -
+                                                   places[pages[end - 1].page + 1]) <= kMostSkippedBytes)
+        ++end;
+    return end;
+}
+
+static void read_run(const PosixFile& file, Span<const int64_t> places, Span<PageReading> run,
+                     const std::function<std::string(size_t)>& name_of) {
+    char skipped[kMostSkippedBytes];
+    iovec pieces[2 * kMostPagesTogether];
+    size_t count = 0;
+    int64_t at = places[run[0].page];
+    const auto add = [&](void* bytes, int64_t end) {
+        if (end > at) pieces[count++] = {bytes, static_cast<size_t>(end - at)};
+        at = end;
+    };
+    for (const PageReading& of : run) {
+        add(skipped, places[of.page]);
+        add(of.bytes, places[of.page + 1]);
+    }
+    const int64_t first = places[run[0].page];
+    try {
+        if (file.read_at(first, {pieces, count}) == static_cast<size_t>(at - first)) return;
+    } catch (const std::system_error&) {
+        // Of which page, and whether it lasts, is found out below.
+    }
+    for (PageReading& of : run) read_one(file, places, of, name_of);
+}
+
+void read_verified(const PosixFile& file, Span<const int64_t> places, const uint8_t* hashes,
+                   Span<PageReading> pages, const std::function<std::string(size_t)>& name_of) {
+    assert(pages.size <= kMostPagesTogether);
+    for (size_t first = 0, end = 0; first < pages.size; first = end) {
+        end = end_of_run(places, pages, first);
+        read_run(file, places, {pages.data + first, end - first}, name_of);
+    }
+    Span<const uint8_t> messages[kMostPagesTogether];
+    PageReading* read[kMostPagesTogether];
+    PageHash found[kMostPagesTogether];
+    size_t count = 0;
+    for (PageReading& of : pages) {
+        if (of.error) continue;
+        messages[count] = {of.bytes, static_cast<size_t>(places[of.page + 1] - places[of.page])};
+        read[count++] = &of;
+    }
+    blake2b({messages, count}, found);
+    for (size_t k = 0; k < count; ++k)
+        if (!std::equal(found[k].begin(), found[k].end(), hashes + kPageHashBytes * read[k]->page))
+            read[k]->error.emplace(name_of(read[k]->page) + ": the hash does not match; " + kDamaged, true);
+}
+
+void PageSource::read(size_t page, unsigned char* bytes) const {
+    PageReading reading{page, bytes, {}};
+    read_pages({&reading, 1});
+    if (reading.error) throw PageError(*reading.error);
+}
+
+void FilePages::expect(Span<const PageReading> pages) const {
+    const Span<const int64_t> places{place_.data(), place_.size()};
+    for (size_t first = 0, end = 0; first < pages.size; first = end) {
+        end = end_of_run(places, pages, first);
+        const int64_t begin = places[pages[first].page];
+        file_.expect(begin, places[pages[end - 1].page + 1] - begin);
+    }
+}
+
+void FilePages::read_pages(Span<PageReading> pages) const {
+    const auto name_of = [this](size_t page) { return name_ + ": page " + std::to_string(page); };
+    read_verified(file_, {place_.data(), place_.size()}, hash_.data(), pages, name_of);
     if (codec() == PageCodec::float32) return;
-    const PageCodes<const uint32_t> codes{clusters(page), reinterpret_cast<const uint32_t*>(bytes),
-                                          sh_degree()};
-    for (size_t c = 0; c < codes.num_clusters(); ++c) {
-        const uint32_t* words = codes.ranges(c);
-        if (!are_valid(*reinterpret_cast<const ClusterCode*>(words),
-                       reinterpret_cast<const uint16_t*>(words + sizeof(ClusterCode) / 4), sh_degree()))
-            throw PageError(
-                where + ": cluster " + std::to_string(c) + " has ranges that are not finite; " + kDamaged,
-                true);
+    for (PageReading& of : pages) {
+        const PageCodes<const uint32_t> codes{clusters(of.page), reinterpret_cast<const uint32_t*>(of.bytes),
+                                              sh_degree()};
+        for (size_t c = 0; c < codes.num_clusters() && !of.error; ++c) {
+            const uint32_t* words = codes.ranges(c);
+            if (!are_valid(*reinterpret_cast<const ClusterCode*>(words),
+                           reinterpret_cast<const uint16_t*>(words + sizeof(ClusterCode) / 4), sh_degree()))
+                of.error.emplace(name_of(of.page) + ": cluster " + std::to_string(c) +
+                                     " has ranges that are not finite; " + kDamaged,
+                                 true);
+        }
     }
 }
 
@@ -79,7 +151,11 @@ size_t MemoryPages::num_bytes(size_t page) const {
     return sizeof(float) * floats_of_gaussian(sh_degree()) * num_rows(page);
 }
 
-void MemoryPages::read(size_t page, unsigned char* bytes) const {
+void MemoryPages::read_pages(Span<PageReading> pages) const {
+    for (const PageReading& of : pages) copy(of.page, of.bytes);
+}
+
+void MemoryPages::copy(size_t page, unsigned char* bytes) const {
     const size_t first = first_row(page), count = num_rows(page);
     const auto add = [&](const float* rows, size_t width) {
         if (count > 0) std::memcpy(bytes, rows + first * width, sizeof(float) * count * width);

@@ -3,6 +3,8 @@
 // Where the bytes of a bundle's pages come from: a file, or memory. Read on any thread.
 
 #include <cstdint>
+#include <functional>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -25,9 +27,19 @@ class PageError : public std::runtime_error {
 
 constexpr const char* kDamaged = "the file is damaged, copy or build it again";
 
-// Reads all bytes of a page and compares their hash, [16]. Throws PageError, which begins with `where`.
-void read_verified(const PosixFile& file, size_t place, size_t size, const uint8_t* hash,
-                   const std::string& where, unsigned char* bytes);
+// A page that is to be read, and what is wrong with it.
+struct PageReading {
+    size_t page;
+    unsigned char* bytes;  // room for all of it
+    std::optional<PageError> error;
+};
+constexpr size_t kMostPagesTogether = 64;  // that are read at once, so that nothing is allocated for it
+
+// Reads pages of a file, ascending and no more than that: those that lie side by side at once, with what of
+// the file is between them where that is little, and compares their hashes side by side. `places` are the
+// first byte of each page and the end, `hashes` [16] of each. Errors begin with name_of(page).
+void read_verified(const PosixFile& file, Span<const int64_t> places, const uint8_t* hashes,
+                   Span<PageReading> pages, const std::function<std::string(size_t)>& name_of);
 
 enum class PageCodec { float32, quantized };
 
@@ -49,12 +61,13 @@ class PageSource {
 
     // With what it is filled up with.
     virtual size_t num_bytes(size_t page) const = 0;
-    // Writes all bytes of a page, verified. Throws PageError.
-    virtual void read(size_t page, unsigned char* bytes) const = 0;
-    // A run of pages will be read soon.
-    virtual void expect(size_t first_page, size_t num_pages) const {
-        static_cast<void>(first_page), static_cast<void>(num_pages);
-    }
+    // Writes all bytes of pages, ascending, at most kMostPagesTogether, verified; it is quickest for those
+    // that lie side by side.
+    virtual void read_pages(Span<PageReading> pages) const = 0;
+    // The same of one page. Throws PageError.
+    void read(size_t page, unsigned char* bytes) const;
+    // Such pages will be read soon.
+    virtual void expect(Span<const PageReading> pages) const { static_cast<void>(pages); }
 
     // The rows of a page, given its bytes: borrowed from them, or from `decoded`.
     GaussianRows<const float> rows(size_t page, const unsigned char* bytes,
@@ -75,10 +88,8 @@ class FilePages : public PageSource {
     FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, std::string name, int descriptor,
               Span<const int64_t> place, Span<const uint8_t> hash);
     size_t num_bytes(size_t page) const override { return place_[page + 1] - place_[page]; }
-    void read(size_t page, unsigned char* bytes) const override;
-    void expect(size_t first_page, size_t num_pages) const override {
-        file_.expect(place_[first_page], place_[first_page + num_pages] - place_[first_page]);
-    }
+    void read_pages(Span<PageReading> pages) const override;
+    void expect(Span<const PageReading> pages) const override;
 
   private:
     const std::string name_;
@@ -93,9 +104,11 @@ class MemoryPages : public PageSource {
     MemoryPages(const ClusterTable& table, const GaussianRows<const float>& rows)
         : PageSource(table, rows.sh_degree, PageCodec::float32), rows_(rows) {}
     size_t num_bytes(size_t page) const override;
-    void read(size_t page, unsigned char* bytes) const override;
+    void read_pages(Span<PageReading> pages) const override;
 
   private:
+    void copy(size_t page, unsigned char* bytes) const;
+
     const GaussianRows<const float> rows_;
 };
 
