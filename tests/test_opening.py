@@ -18,15 +18,35 @@ LARGE = 5 << 20  # bytes: what is read and hashed on threads of its own
 def test_what_is_read_is_hashed_behind_what_was_before(tmp_path, size, num_before):
     rng = np.random.default_rng(size + num_before)
     data, before = (rng.integers(0, 256, count, np.uint8) for count in (size, num_before))
+    digest = bytearray(hashlib.blake2b(before.tobytes() + data.tobytes(), digest_size=16).digest())
     path = tmp_path / "data"
-    path.write_bytes(b"other" + data.tobytes() + b"more")
-    out = np.empty(size, np.uint8)
-    with open(path, "rb") as file:
-        reading = _core.HashedRead(str(path), file.fileno(), before, 5, out)
-    assert reading.wait()
-    np.testing.assert_array_equal(out, data)
-    digest = hashlib.blake2b(before.tobytes() + data.tobytes(), digest_size=16).digest()
-    assert reading.digest() == digest
+    for is_sound in (True, False):
+        path.write_bytes(b"other" + data.tobytes() + digest + b"more")
+        with open(path, "rb") as file:
+            reading = _core.HashedReader().read(str(path), file.fileno(), before.tobytes(), 5, size + 16)
+        read = reading.wait()
+        np.testing.assert_array_equal(read[:size], data)
+        assert read[size:].tobytes() == digest
+        assert not read.flags.writeable
+        assert reading.is_sound() == is_sound
+        digest[size % 16] ^= 1 << size % 8
+
+
+def test_of_several_that_are_hashed_together_each_is_sound_or_not(tmp_path):
+    reader, before = _core.HashedReader(), bytes(8)
+    sizes = [100, 0, 5000, 70_000, LARGE, 1, 128, 120, 300_000, 8, *range(20)]
+    readings = []
+    for number, size in enumerate(sizes):
+        data = np.full(size, number, np.uint8)
+        digest = hashlib.blake2b(before + data.tobytes(), digest_size=16).digest()
+        path = tmp_path / str(number)
+        path.write_bytes(data.tobytes() + (digest if number % 3 else digest[::-1]))
+        with open(path, "rb") as file:
+            readings.append(reader.read(str(path), file.fileno(), before, 0, size + 16))
+        assert readings[-1].wait().ctypes.data % 8 == 0
+    for number, (reading, size) in enumerate(zip(readings, sizes, strict=True)):
+        assert reading.is_sound() == (number % 3 > 0)
+        np.testing.assert_array_equal(reading.wait()[:size], number)
 
 
 @pytest.mark.parametrize("size", [1000, LARGE])
@@ -34,18 +54,16 @@ def test_a_file_that_ends_before_is_told(tmp_path, size):
     path = tmp_path / "data"
     path.write_bytes(bytes(size - 1))
     with open(path, "rb") as file:
-        reading = _core.HashedRead(
-            str(path), file.fileno(), np.zeros(0, np.uint8), 0, np.empty(size, np.uint8)
-        )
-    assert not reading.wait()
+        reading = _core.HashedReader().read(str(path), file.fileno(), b"", 0, size)
+    with pytest.raises(ValueError, match=r"data: size: expected bytes at 0, .*truncated"):
+        reading.wait()
 
 
 @pytest.mark.parametrize("size", [1000, LARGE])
 def test_what_the_system_cannot_read_is_an_error_with_the_name(tmp_path, size):
     descriptor = os.open(tmp_path, os.O_RDONLY)
     try:
-        out = np.empty(size, np.uint8)
-        reading = _core.HashedRead(str(tmp_path), descriptor, np.zeros(0, np.uint8), 0, out)
+        reading = _core.HashedReader().read(str(tmp_path), descriptor, b"", 0, size)
         with pytest.raises(IsADirectoryError, match=tmp_path.name):
             reading.wait()
     finally:
@@ -140,6 +158,13 @@ def test_the_first_file_with_a_fault_is_named(tmp_path):
     paths[2].unlink()
     with pytest.raises(FileNotFoundError, match=r"[\\/]2\.v3dg"):
         Bundle.open_all(paths)
+    damaged = bytearray(paths[1].read_bytes())
+    damaged[-1] ^= 1  # its own hash, which is compared last
+    paths[1].write_bytes(damaged)
+    with pytest.raises(ValueError, match=r"[\\/]1\.v3dg: hash: "):
+        Bundle.open_all(paths)
+    with pytest.raises(ValueError, match=r"[\\/]1\.v3dg: hash: "):
+        Bundle.open_all([paths[0], paths[1]])
 
 
 def test_a_scene_file_has_its_bundles_once_and_by_name(tmp_path):

@@ -1,5 +1,10 @@
+#include <algorithm>
 #include <cerrno>
+#include <memory>
+#include <optional>
+#include <string_view>
 #include <system_error>
+#include <utility>
 
 #include "bindings/codes.h"
 #include "bindings/operations.h"
@@ -97,47 +102,118 @@ std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
     return digests;
 }
 
-// With the arrays that it reads to and hashes.
-class BoundHashedRead {
+class BoundReader;
+
+// With the array that it reads to and hashes.
+class BoundHashedRead : public std::enable_shared_from_this<BoundHashedRead> {
   public:
-    BoundHashedRead(py::object path, int descriptor, const py::array& before, size_t offset,
-                    const py::array& out)
-        : path_(std::move(path)), arrays_(py::make_tuple(before, out)) {
-        const Span<const uint8_t> first = span_of<const uint8_t>(before, "before", {-1});
-        const Span<uint8_t> bytes = span_of<uint8_t>(out, "out", {-1});
-        naming_file(path_, [&] {
-            read_ = std::make_unique<HashedRead>(PosixFile::duplicate(descriptor), first, offset, bytes);
-        });
+    BoundHashedRead(std::shared_ptr<BoundReader> reader, const py::object& path, int descriptor,
+                    size_t offset, py::array_t<uint8_t> message, size_t num_before)
+        : reader_(std::move(reader)),
+          path_(path),
+          message_(std::move(message)),
+          offset_(offset),
+          num_before_(num_before) {
+        const Span<uint8_t> bytes = span_of<uint8_t>(message_, "message", {-1});
+        naming_file(path_,
+                    [&] { read_.emplace(PosixFile::duplicate(descriptor), offset, bytes, num_before); });
     }
-    bool wait() {
-        bool is_whole = false;
-        naming_file(path_, [&] { is_whole = read_->wait(); });
-        return is_whole;
+    HashedRead& read() { return *read_; }
+    py::array wait();
+    bool is_sound();
+
+  private:
+    const std::shared_ptr<BoundReader> reader_;
+    const py::object path_;
+    const py::array_t<uint8_t> message_;
+    const size_t offset_, num_before_;
+    std::optional<HashedRead> read_;
+};
+
+// Parts of several files. Small ones come to pieces of memory together, for which the system takes large
+// pages, and are hashed together: by the thread that has read the last of a few, and the rest by whoever
+// first asks whether one is sound. With Python's lock, unless a function gives it up.
+class BoundReader : public std::enable_shared_from_this<BoundReader> {
+  public:
+    std::shared_ptr<BoundHashedRead> read(const py::object& path, int descriptor, const py::bytes& before,
+                                          size_t offset, size_t num_bytes) {
+        const auto first = before.cast<std::string_view>();
+        if (num_bytes < kPageHashBytes)
+            throw py::value_error("num_bytes: expected at least 16, got " + std::to_string(num_bytes));
+        py::array_t<uint8_t> message = take(first.size() + num_bytes);
+        std::copy(first.begin(), first.end(), message.mutable_data());
+        return std::make_shared<BoundHashedRead>(shared_from_this(), path, descriptor, offset,
+                                                 std::move(message), first.size());
     }
-    py::bytes digest() {
-        PageHash digest{};
-        {
-            const py::gil_scoped_release unlocked;
-            digest = read_->digest();
+    void add_read(const std::shared_ptr<BoundHashedRead>& read) {
+        read_.push_back(read);
+        if (read_.size() >= HashedRead::kHashedTogether) hash_small();
+    }
+    void hash_small() {
+        std::vector<std::shared_ptr<BoundHashedRead>> kept;
+        std::vector<HashedRead*> reads;
+        for (const auto& read : std::exchange(read_, {})) {
+            kept.push_back(read.lock());
+            if (kept.back() != nullptr) reads.push_back(&kept.back()->read());
         }
-        return {reinterpret_cast<const char*>(digest.data()), digest.size()};
+        const py::gil_scoped_release unlocked;
+        HashedRead::hash_small({reads.data(), reads.size()});
     }
 
   private:
-    const py::object path_;
-    const py::tuple arrays_;
-    std::unique_ptr<HashedRead> read_;
+    // Aligned to eight bytes.
+    py::array_t<uint8_t> take(size_t num_bytes) {
+        const size_t size = (num_bytes + 7) / 8 * 8;
+        if (size > left_) {
+            // Of the second, so that one alone takes no more than it has.
+            const bool is_small = size < HashedRead::kLargeBytes && piece_.size() > 0;
+            left_ = is_small ? size * kFilesOfPiece : size;
+            piece_ = py::array_t<uint64_t>(static_cast<py::ssize_t>(left_ / 8));
+        }
+        const auto* first = static_cast<const uint8_t*>(piece_.data()) + piece_.nbytes() - left_;
+        left_ -= size;
+        return py::array_t<uint8_t>(static_cast<py::ssize_t>(num_bytes), first, piece_);
+    }
+
+    static constexpr size_t kFilesOfPiece = 8;
+    py::array piece_;
+    size_t left_ = 0;                                   // of it
+    std::vector<std::weak_ptr<BoundHashedRead>> read_;  // and not hashed yet
 };
+
+py::array BoundHashedRead::wait() {
+    naming_file(path_, [&] {
+        if (!read_->wait())
+            throw PageError("size: expected bytes at " + std::to_string(offset_) +
+                                ", got the end of the file; it was truncated",
+                            true);
+    });
+    reader_->add_read(shared_from_this());
+    py::array bytes = message_[py::slice(num_before_, message_.size(), 1)];
+    bytes.attr("flags").attr("writeable") = false;
+    return bytes;
+}
+
+bool BoundHashedRead::is_sound() {
+    reader_->hash_small();
+    const py::gil_scoped_release unlocked;
+    return read_->is_sound();
+}
 
 }  // namespace
 
 void bind_pages(py::module_& m) {
-    py::class_<BoundHashedRead>(m, "HashedRead", "A part of a file that is read and hashed at the same time.")
-        .def(py::init<py::object, int, py::array, size_t, py::array>(), "path"_a, "descriptor"_a, "before"_a,
-             "offset"_a, "out"_a)
-        .def("wait", &BoundHashedRead::wait, "Waits until out is filled; whether the file has so much.")
-        .def("digest", &BoundHashedRead::digest,
-             "BLAKE2b-128 of what is in before and out together, once they are filled.");
+    py::class_<BoundHashedRead, std::shared_ptr<BoundHashedRead>>(
+        m, "HashedRead", "A part of a file that is read and hashed at the same time.")
+        .def("wait", &BoundHashedRead::wait,
+             "The bytes, once all are there; ValueError if the file has fewer.")
+        .def("is_sound", &BoundHashedRead::is_sound, "Whether all that was read has the hash at its end.");
+    py::class_<BoundReader, std::shared_ptr<BoundReader>>(
+        m, "HashedReader", "Reads parts of several files, of which small ones are hashed side by side.")
+        .def(py::init<>())
+        .def("read", &BoundReader::read, "path"_a, "descriptor"_a, "before"_a, "offset"_a, "num_bytes"_a,
+             "Bytes at one place of a file that end with their BLAKE2b-128, of `before` and them. They are "
+             "aligned to eight if `before` has a multiple of eight.");
     m.def("blake2b", &hash_messages, "messages"_a, "BLAKE2b-128 of several messages, side by side.");
     m.attr("DAMAGED") = kDamaged;
     m.def(

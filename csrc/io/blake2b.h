@@ -11,8 +11,8 @@ namespace v3dg {
 constexpr size_t kPageHashBytes = 16, kHashBlockBytes = 128;
 using PageHash = std::array<uint8_t, kPageHashBytes>;
 
-// BLAKE2b with a digest of 16 bytes and no key, RFC 7693, of several messages: each in a lane of a vector where
-// the processor has wide ones, so that eight of about the same length are quickest.
+// BLAKE2b with a digest of 16 bytes and no key, RFC 7693, of several messages: each in a lane of a vector
+// where the processor has wide ones, so that eight of about the same length are quickest.
 void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests);
 
 // The same of bytes that come one after another.

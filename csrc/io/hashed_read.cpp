@@ -2,6 +2,9 @@
 
 #include <algorithm>
 #include <utility>
+#include <vector>
+
+#include "base/parallel_for.h"
 
 namespace v3dg {
 
@@ -9,16 +12,18 @@ namespace {
 
 constexpr size_t kPieceBytes = size_t(1) << 20;
 constexpr size_t kPiecesAhead = 8;                  // that the disk is asked for together
-constexpr size_t kLargeBytes = 4 * kPieceBytes;     // what is worth two threads
 constexpr size_t kNeededBefore = size_t(64) << 10;  // of the coarsest page, which is in front of the tables
 
 }  // namespace
 
-HashedRead::HashedRead(PosixFile file, Span<const uint8_t> before, size_t offset, Span<uint8_t> bytes)
-    : file_(std::move(file)), before_(before), offset_(offset), bytes_(bytes) {
+HashedRead::HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before)
+    : file_(std::move(file)),
+      offset_(offset),
+      bytes_{message.data + num_before, message.size - num_before},
+      message_{message.data, message.size - kPageHashBytes} {
     const size_t first = offset - std::min(offset, kNeededBefore);
-    file_.expect(first, offset - first + std::min(bytes.size, kPieceBytes));
-    const auto how = bytes.size < kLargeBytes ? std::launch::deferred : std::launch::async;
+    file_.expect(first, offset - first + std::min(bytes_.size, kPieceBytes));
+    const auto how = is_large() ? std::launch::async : std::launch::deferred;
     read_ = std::async(how, [this] { return read(); }).share();
     hash_ = std::async(how, [this] { return hash(); });
 }
@@ -59,9 +64,10 @@ size_t HashedRead::wait_for_more(size_t than) {
 
 PageHash HashedRead::hash() {
     Blake2b hash;
-    hash.add(before_.data, before_.size);
-    for (size_t done = 0; done < bytes_.size;) {
-        const size_t end = wait_for_more(done);
+    const size_t num_before = static_cast<size_t>(bytes_.data - message_.data);
+    hash.add(message_.data, num_before);
+    for (size_t done = 0; num_before + done < message_.size;) {
+        const size_t end = std::min(wait_for_more(done), message_.size - num_before);
         if (end == done) break;  // the file ended, of which wait() tells
         hash.add(bytes_.data + done, end - done);
         done = end;
@@ -69,9 +75,37 @@ PageHash HashedRead::hash() {
     return hash.digest();
 }
 
-PageHash HashedRead::digest() {
-    read_.wait();
-    return hash_.get();
+std::optional<PageHash> HashedRead::digest() {
+    const std::lock_guard<std::mutex> lock(busy_);
+    return digest_;
+}
+
+void HashedRead::set_digest(const PageHash& digest) {
+    const std::lock_guard<std::mutex> lock(busy_);
+    digest_ = digest;
+}
+
+bool HashedRead::is_sound() {
+    if (!digest()) {
+        read_.wait();
+        set_digest(hash_.get());
+    }
+    const PageHash found = *digest();
+    return std::equal(found.begin(), found.end(), message_.end());
+}
+
+void HashedRead::hash_small(Span<HashedRead* const> reads) {
+    std::vector<HashedRead*> small;
+    for (HashedRead* read : reads)
+        if (!read->is_large() && !read->digest()) small.push_back(read);
+    parallel_for((small.size() + kHashedTogether - 1) / kHashedTogether, 1, [&](size_t k) {
+        Span<const uint8_t> messages[kHashedTogether];
+        PageHash digests[kHashedTogether];
+        const size_t first = k * kHashedTogether, count = std::min(kHashedTogether, small.size() - first);
+        for (size_t i = 0; i < count; ++i) messages[i] = small[first + i]->message_;
+        blake2b({messages, count}, digests);
+        for (size_t i = 0; i < count; ++i) small[first + i]->set_digest(digests[i]);
+    });
 }
 
 }  // namespace v3dg

@@ -3,6 +3,7 @@
 #include <condition_variable>
 #include <future>
 #include <mutex>
+#include <optional>
 
 #include "base/span.h"
 #include "io/blake2b.h"
@@ -10,34 +11,45 @@
 
 namespace v3dg {
 
-// A part of a file that is read and hashed at the same time, where it is large on threads of its own: the
-// caller may look at it while it is still hashed. Where it is small, in the threads that wait.
+// A part of a file, with its hash behind it, that is read and hashed at the same time, where it is large on
+// threads of its own: the caller may look at it while it is still hashed. Where it is small, in the threads
+// that wait.
 class HashedRead {
   public:
-    // What lies at `offset` comes to `bytes`, and is hashed behind what is in `before`. Both stay where they
-    // are as long as this lives.
-    HashedRead(PosixFile file, Span<const uint8_t> before, size_t offset, Span<uint8_t> bytes);
+    static constexpr size_t kLargeBytes = size_t(4) << 20;
+    static constexpr size_t kHashedTogether = 8;
+
+    // What lies at `offset` comes to `message` behind so many bytes, with which it is hashed: all but the
+    // hash at the end. They stay where they are as long as this lives.
+    HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before);
     HashedRead(const HashedRead&) = delete;
 
     // Waits until all is read. Throws std::system_error; false where the file ends before.
     bool wait() { return read_.get(); }
-    // Of all, once it is read.
-    PageHash digest();
+    // Whether all that was read has the hash at its end.
+    bool is_sound();
+    // Has it ready whether those that are small are sound, all of which wait() has read: they are hashed side
+    // by side.
+    static void hash_small(Span<HashedRead* const> reads);
 
   private:
+    bool is_large() const { return bytes_.size >= kLargeBytes; }
+    std::optional<PageHash> digest();
+    void set_digest(const PageHash& digest);
     bool read();
     PageHash hash();
     size_t wait_for_more(size_t than);
 
     const PosixFile file_;
-    const Span<const uint8_t> before_;
     const size_t offset_;
-    const Span<uint8_t> bytes_;
+    const Span<uint8_t> bytes_;          // that are read
+    const Span<const uint8_t> message_;  // that is hashed
 
     std::mutex busy_;
     std::condition_variable has_more_;
     size_t num_read_ = 0;
     bool is_over_ = false;
+    std::optional<PageHash> digest_;
     // Last, for they wait for the threads, which use all of the above.
     std::shared_future<bool> read_;
     std::future<PageHash> hash_;

@@ -87,7 +87,28 @@ class Bundle:
             ValueError: It is not a bundle, is newer than this build can read, or is damaged; the message says
                 which file and field. Damage in the gaussians is found when they are read.
         """
-        file = BundleFile(path)
+        return cls.open_all([path])[0]
+
+    @classmethod
+    def open_all(cls, paths: Iterable[str | os.PathLike[str]]) -> list[Bundle]:
+        """Open several bundle files as `open` does, at the same time.
+
+        Raises:
+            FileNotFoundError, ValueError: As `open`, for the first file with which something is wrong.
+        """
+        reader, paths = _core.HashedReader(), list(paths)
+        try:
+            opened = on_threads(lambda path: cls._open(BundleFile(path, reader)), paths)
+            for _, file in opened:
+                file.verify()  # the first time of all, because they are hashed side by side
+        except (OSError, ValueError):
+            list(map(cls.open, paths[:-1]))  # where one before has a fault as well, that is told
+            raise
+        return [bundle for bundle, _ in opened]
+
+    @classmethod
+    def _open(cls, file: BundleFile) -> tuple[Bundle, BundleFile]:
+        """Not verified yet."""
         tables = file.tables
         try:
             clusters = Clusters(**{f.name: tables[f"clusters.{f.name}"] for f in fields(Clusters)})
@@ -106,17 +127,7 @@ class Bundle:
         except ValueError as error:
             file.verify()  # for what is wrong with the tables is mostly damage
             raise ValueError(f"{file.path}: {error}") from None
-        file.verify()
-        return bundle
-
-    @classmethod
-    def open_all(cls, paths: Iterable[str | os.PathLike[str]]) -> list[Bundle]:
-        """Open several bundle files as `open` does, at the same time.
-
-        Raises:
-            FileNotFoundError, ValueError: As `open`, for the first file with which something is wrong.
-        """
-        return on_threads(cls.open, list(paths))
+        return bundle, file
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the bundle to a file; the same bundle gives the same bytes.

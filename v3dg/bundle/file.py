@@ -94,15 +94,15 @@ def read_pages(
 class BundleFile:
     """A bundle file: header and tables are read, pages are not; `verify` tells whether they are damaged.
 
-    Nothing is allocated that is larger than the file, which is closed when this is dropped.
+    What is allocated follows from the size of the file, which is closed when this is dropped.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], reader: _core.HashedReader) -> None:
         self.path = os.fspath(path)
         self._fd = _files.open_regular(path)
         weakref.finalize(self, os.close, self._fd)
         with _files.naming_errors(path):
-            self._read_header_and_tables()
+            self._read_header_and_tables(reader)
 
     def _fail(self, problem: str) -> NoReturn:
         raise ValueError(f"{self.path}: {problem}")
@@ -110,27 +110,22 @@ class BundleFile:
     def _check(self, name: str, holds: object, expected: str) -> None:
         check(f"{self.path}: {name}", holds, expected)
 
-    def _read_header_and_tables(self) -> None:
+    def _read_header_and_tables(self, reader: _core.HashedReader) -> None:
         self.num_bytes = os.fstat(self._fd).st_size
         check(self.path, self.num_bytes >= 8, f"a bundle, got a file of {self.num_bytes} bytes")
-        length = np.empty(8, np.uint8)
-        self._read(length, 0)
-        header_bytes = int.from_bytes(length.tobytes(), "little")
-        is_finished = header_bytes > 0
-        check(self.path, is_finished, "a bundle, got one that is not finished, or another kind of file")
+        header_bytes = int.from_bytes(self._read(8, 0), "little")
+        check(self.path, header_bytes > 0, "a bundle, got one that is not finished, or another kind of file")
         found = f"a header length of {header_bytes} in a file of {self.num_bytes} bytes"
         fits = header_bytes <= min(self.num_bytes - 8, file_format.MAX_HEADER_BYTES)
         expected = f"a bundle (safetensors), got {found}; it is another kind of file or it is truncated"
         self._check("header", fits, expected)
-        text = np.empty(8 + header_bytes, np.uint8)
-        text[:8] = length
-        self._read(text[8:], 8)
-        header = self._object("header", text[8:].tobytes())
+        text = header_bytes.to_bytes(8, "little") + self._read(header_bytes, 8)
+        header = self._object("header", text[8:])
         self._read_metadata(header.pop("__metadata__", None))
         self._data_start = 8 + header_bytes
         entries = self._check_entries(header)
         self.pages_bytes = int(entries["pages"]["data_offsets"][1])
-        self._read_tables(entries, text)
+        self._read_tables(entries, text, reader)
 
     def _read_metadata(self, metadata: Any) -> None:
         metadata = metadata if isinstance(metadata, dict) else {}
@@ -185,35 +180,26 @@ class BundleFile:
         self._check("size", wanted == given, f"{wanted} bytes, got {given}; the file is {problem}")
         return expected
 
-    def _read_tables(self, entries: dict[str, Any], header: NDArray[np.uint8]) -> None:
-        start = self.pages_bytes
-        end = entries["hash"]["data_offsets"][0]
-        # Of eight-byte elements, so that every table in it is aligned.
-        data = np.empty(-(-(end - start) // 8), np.int64).view(np.uint8)[: end - start]
-        self._stored = np.empty(HASH_BYTES, np.uint8)
-        self._reading = _core.HashedRead(self.path, self._fd, header, self._data_start + start, data)
-        if not self._reading.wait():
-            self._fail_truncated(self._data_start + start)
-        self._read(self._stored, self._data_start + end)
-        data.flags.writeable = False
+    def _read_tables(self, entries: dict[str, Any], text: bytes, reader: _core.HashedReader) -> None:
+        place = self._data_start + self.pages_bytes
+        self._reading = reader.read(self.path, self._fd, text, place, self.num_bytes - place)
+        data = self._reading.wait()  # with the hash at the end
         self.tables: dict[str, NDArray[Any]] = {}
         for name, dtype, _, _ in schema_of(self.codec.version):
-            first, last = (offset - start for offset in entries[name]["data_offsets"])
+            first, last = (offset - self.pages_bytes for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 
     def verify(self) -> None:
         """Compare header and tables with the file's own hash, once, for which this waits; ValueError."""
-        if self._reading.digest() != self._stored.tobytes():
+        if not self._reading.is_sound():
             self._fail(f"hash: the header and tables do not match it; {_core.DAMAGED}")
         del self._reading
 
-    def _read(self, out: NDArray[np.uint8], offset: int) -> None:
-        """Fill an array from one place of the file."""
+    def _read(self, num_bytes: int, offset: int) -> bytes:
+        out = np.empty(num_bytes, np.uint8)
         if not _files.read_at(self._fd, out, offset):
-            self._fail_truncated(offset)
-
-    def _fail_truncated(self, offset: int) -> NoReturn:
-        self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
+            self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
+        return out.tobytes()
 
     @property
     def places(self) -> NDArray[np.int64]:
@@ -223,8 +209,14 @@ class BundleFile:
     @property
     def source(self) -> tuple[str, int, str, int, NDArray[np.int64], NDArray[np.uint8]]:
         """What the core reads pages with: name, descriptor, codec, SH degree, places and hashes."""
-        codec = self.codec
-        return self.path, self._fd, codec.name, codec.sh_degree, self.places, self.tables["pages.hash"]
+        return (
+            self.path,
+            self._fd,
+            self.codec.name,
+            self.codec.sh_degree,
+            self.places,
+            self.tables["pages.hash"],
+        )
 
     def read_pages(self, run: PageRun) -> Gaussians:
         """The gaussians of a run of pages, verified."""
