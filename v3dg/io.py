@@ -9,19 +9,7 @@ from functools import partial
 from typing import Literal, TypeVar, get_args
 
 from v3dg._numbers import check, check_type, one_of
-from v3dg.formats import (
-    checkpoint,
-    compressed_ply,
-    gltf,
-    hier,
-    ksplat,
-    ply,
-    sog,
-    splat,
-    spz,
-    streamed_sog,
-    usd,
-)
+from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
 from v3dg.formats._reading import AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
 from v3dg.gaussians import Gaussians
@@ -44,7 +32,7 @@ _READERS: dict[str, Callable[[Path], AssetFile]] = {
     **dict.fromkeys((".ckpt", ".pt"), checkpoint.open_file),
 }
 _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
-    ".compressed.ply": compressed_ply.write,
+    ".compressed.ply": ply.write_compressed,
     ".ply": ply.write,
     ".spz": spz.write,
     ".glb": gltf.write,

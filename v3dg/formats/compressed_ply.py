@@ -35,13 +35,10 @@ _RGBA_SHIFT, _RGBA_MAX = (24, 16, 8, 0), (255, 255, 255, 255)
 class _Element:
     """Where its rows are in the file."""
 
+    kinds: dict[str, str]  # of its properties, by name
     dtype: np.dtype[Any]
     count: int
     offset: int
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.dtype.names or ()
 
     def rows(self, file: File, first: int, last: int) -> NDArray[Any]:
         return file.rows(self.dtype, self.offset + first * self.dtype.itemsize, last - first)
@@ -56,7 +53,7 @@ def open_file(path: Path) -> AssetFile:
         check(path, is_there, f"the elements chunk and vertex of a compressed .ply, got no {name}")
     chunk, vertex, sh = elements["chunk"], elements["vertex"], elements.get("sh")
     count = vertex.count
-    kinds = [kind for kind in _RANGES if kind != "color" or set(_range_names(kind)) & set(chunk.names)]
+    kinds = [kind for kind in _RANGES if kind != "color" or chunk.kinds.keys() & _range_names(kind)]
     for kind in kinds:
         _require(path, "chunk", chunk, _range_names(kind), "float")
     _require(path, "vertex", vertex, _PACKED, "uint")
@@ -70,7 +67,7 @@ def open_file(path: Path) -> AssetFile:
         rest = np.zeros((last - first, 0), np.uint8)
         if sh is not None:
             columns = sh.rows(file, first, last)
-            rest = np.stack([columns[f"f_rest_{i}"] for i in range(len(sh.names))], axis=1)
+            rest = np.stack([columns[f"f_rest_{i}"] for i in range(len(sh.kinds))], axis=1)
         chunk_from_row = np.arange(first, last) // _CHUNK - first_chunk
         return _decoded(vertex.rows(file, first, last), rest, degree, ranges, chunk_from_row)
 
@@ -185,7 +182,7 @@ def _ranges(chunk: NDArray[Any], kinds: Sequence[str]) -> dict[str, tuple[Floats
 def _degree(path: Path, sh: _Element | None, count: int) -> int:
     if sh is None:
         return 0
-    names = [f"f_rest_{i}" for i in range(len(sh.names))]
+    names = [f"f_rest_{i}" for i in range(len(sh.kinds))]
     degree = _packing.DEGREES.get(len(names) // 3, -1) if len(names) % 3 == 0 else -1
     check(path, degree >= 0, f"0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), got {len(names)}")
     _require(path, "sh", sh, names, "uchar")
@@ -195,7 +192,7 @@ def _degree(path: Path, sh: _Element | None, count: int) -> int:
 
 def _require(path: Path, shown: str, element: _Element, names: Sequence[str], kind: str) -> None:
     for name in names:
-        is_there = name in element.names and element.dtype[name] == np.dtype(_PLY_TYPES[kind])
+        is_there = element.kinds.get(name) == kind
         check(path, is_there, f"'property {kind} {name}' in element {shown}, got none")
 
 
@@ -215,7 +212,7 @@ def _elements(file: File) -> dict[str, _Element]:
         dtype, left = np.dtype([(field, _PLY_TYPES[kind]) for field, kind in fields]), given - offset
         wanted = f"{count} rows of {shown} with {dtype.itemsize} bytes each"
         check(path, count * dtype.itemsize <= left, f"{wanted}, got {left} bytes")
-        found[name] = _Element(dtype, count, offset)
+        found[name] = _Element(dict(fields), dtype, count, offset)
         offset += count * dtype.itemsize
     check(path, offset == given, f"the end of the file after {offset} bytes, got {given}")
     return found

@@ -135,14 +135,11 @@ class _Glb:
             for name in ("matrix", "translation", "rotation", "scale"):
                 if node.has(name):
                     raise node.problem(f"expected a node without a transform, got {name}; apply it first")
-        degrees = sorted({max(self._degrees(primitive)) for primitive in self.primitives})
+        attributes = [primitive.field("attributes") for primitive in self.primitives]
+        names = {f"{_NAME}:SH_DEGREE_{d}_COEF_0": d for d in (1, 2, 3)}
+        degrees = sorted({max((names[n] for n in names if a.has(n)), default=0) for a in attributes})
         check(path, len(degrees) == 1, f"one SH degree in all primitives, got {degrees}")
         self.degree = degrees[0]
-
-    @staticmethod
-    def _degrees(primitive: Node) -> list[int]:
-        attributes = primitive.field("attributes")
-        return [0, *(d for d in (1, 2, 3) if attributes.has(f"{_NAME}:SH_DEGREE_{d}_COEF_0"))]
 
     def _item(self, kind: str, node: Node, field: str) -> Node:
         """One of the root's arrays' values, by the number in a field."""

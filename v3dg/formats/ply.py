@@ -10,6 +10,7 @@ from v3dg.formats import compressed_ply
 from v3dg.formats._reading import AssetFile, Path
 from v3dg.gaussians import Gaussians
 
+write_compressed = compressed_ply.write
 PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 
 

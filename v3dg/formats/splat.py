@@ -6,10 +6,7 @@ and the quaternion w x y z (a byte each, 128 for 0). There is no header.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
 from v3dg.formats._reading import AssetFile, File, Path, check
@@ -25,16 +22,14 @@ def open_file(path: Path) -> AssetFile:
     check(path, is_whole, f"a multiple of 32 bytes, got {file.num_bytes}; is the file complete?")
 
     def read(first: int, last: int) -> Gaussians:
-        return _decoded(file.rows(_RECORD, first * size, last - first))
+        records = file.rows(_RECORD, first * size, last - first)
+
+        def decode(rows: slice) -> tuple[Floats, ...]:
+            block = records[rows]
+            rgba = block["rgba"] / 255.0
+            quats = normalised((block["quat"].astype(np.float64) - 128.0) / 128.0)
+            return block["mean"], quats, block["scale"], rgba[:, 3], (rgba[:, None, :3] - 0.5) / SH_C0
+
+        return assemble(len(records), 0, decode)
 
     return AssetFile(path, file.num_bytes // size, 0, read)
-
-
-def _decoded(records: NDArray[Any]) -> Gaussians:
-    def decode(rows: slice) -> tuple[Floats, ...]:
-        block = records[rows]
-        rgba = block["rgba"] / 255.0
-        quats = normalised((block["quat"].astype(np.float64) - 128.0) / 128.0)
-        return block["mean"], quats, block["scale"], rgba[:, 3], (rgba[:, None, :3] - 0.5) / SH_C0
-
-    return assemble(len(records), 0, decode)
