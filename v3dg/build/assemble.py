@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,12 +42,9 @@ def assemble(plan: Plan, tables: Sequence[LevelTables], config: BuildConfig) -> 
 
 def _groups_from(counts: Sequence[int], num_groups: Sequence[int], above: int) -> npt.NDArray[np.int32]:
     """The group, `above` levels up, that each of a level's rows belongs to; all have as many. -1 for none."""
-    first = np.cumsum([0, *num_groups])
-    parts: list[Any] = []
-    for number, count in enumerate(counts):
-        level = number + above
-        if level >= len(num_groups) or num_groups[level] == 0:
-            parts.append(np.full(count, -1))
-        else:
-            parts.append(first[level] + np.repeat(np.arange(num_groups[level]), count // num_groups[level]))
+    sizes = [*num_groups[above:], *[0] * above]  # of the level that each of them looks at
+    parts = [
+        first + np.repeat(np.arange(size), count // size) if size else np.full(count, -1)
+        for count, size, first in zip(counts, sizes, np.cumsum([0, *num_groups])[above:], strict=False)
+    ]
     return np.concatenate(parts).astype(np.int32)

@@ -26,10 +26,7 @@ _AT_ONCE = 1 << 18  # points that are read at a time: with what is computed of t
 
 
 def points_of(means: npt.NDArray[np.float32], index: npt.NDArray[np.integer]) -> Points:
-    points = np.empty((len(means), 4), np.uint32)
-    points[:, :3] = means.view(np.uint32)
-    points[:, 3] = index
-    return points
+    return np.column_stack([means.view(np.uint32), index.astype(np.uint32)])
 
 
 def split(files: tuple[RowFile, RowFile], count: int, depth: int, num_fitting: int, order: RowFile) -> None:
@@ -57,8 +54,7 @@ def _split_in_memory(points: Points, depth: int) -> Words:
     means = np.ascontiguousarray(points[:, :3]).view(np.float32)
     del points
     order, _ = _core.median_split(means, np.array([0, len(means)]), depth)
-    result: Words = index[order]
-    return result
+    return np.asarray(index[order])
 
 
 def _partition(source: RowFile, first: int, middle: int, last: int, target: RowFile) -> None:
@@ -111,5 +107,4 @@ def _ordered(bits: Words) -> Words:
     """Numbers that compare as the floats with these bits do; zeros of either sign are the same."""
     bits = (bits.view(np.float32) + np.float32(0)).view(np.uint32)
     sign = bits >> 31
-    result: Words = bits ^ ((np.uint32(0) - sign) | np.uint32(1 << 31))
-    return result
+    return np.asarray(bits ^ ((np.uint32(0) - sign) | np.uint32(1 << 31)))

@@ -78,9 +78,7 @@ class MemoryLeaves(Leaves):
         return np.take(rows, _device.to_host(order))
 
 
-def made_with(
-    leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None = None
-) -> dict[str, Any]:
+def made_with(leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None) -> dict[str, Any]:
     """What the config of a bundle says of how it was made."""
     seed = operator.index(seed)
     check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {seed}")

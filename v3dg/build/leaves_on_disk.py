@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -90,7 +90,8 @@ def leaves_on_disk(
     Their order is that of the median split of all of them, whatever the memory, of which `reserved` tells
     what is for others. The scratch folder is made where it is needed, and removed at the end.
     """
-    tiles = [_Tile.of(path) for path in paths]
+    files = map(open_asset, paths)  # one after the other, so that few are open
+    tiles = [_Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes) for file in files]
     count = sum(tile.num_gaussians for tile in tiles)
     check("asset", count < 1 << 32, f"fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
@@ -113,19 +114,13 @@ def leaves_on_disk(
             yield _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
 
 
-@dataclass(frozen=True)
-class _Tile:
+class _Tile(NamedTuple):
     """What the header of one file says."""
 
     path: str | os.PathLike[str]
     num_gaussians: int
     sh_degree: int
     whole_bytes: int
-
-    @staticmethod
-    def of(path: str | os.PathLike[str]) -> _Tile:
-        file = open_asset(path)
-        return _Tile(path, file.num_gaussians, file.sh_degree, file.whole_bytes)
 
     def open(self) -> AssetFile:
         file = open_asset(self.path)
@@ -134,8 +129,7 @@ class _Tile:
         return file
 
 
-@dataclass(frozen=True)
-class _Sizes:
+class _Sizes(NamedTuple):
     """Most gaussians that fit: of the asset at once, in a block, in a node that is split, in a bucket."""
 
     in_memory: int

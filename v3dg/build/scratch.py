@@ -6,7 +6,7 @@ import errno
 import fcntl
 import os
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from v3dg import _files
 
 
-class RowFile:
+class RowFile(AbstractContextManager["RowFile"]):
     """A file of rows of one width, float32 or uint32, in the byte order of the machine."""
 
     def __init__(self, path: Path, width: int, dtype: npt.DTypeLike, *, must_be_new: bool = False) -> None:
@@ -25,9 +25,6 @@ class RowFile:
         self._row_bytes = width * self._dtype.itemsize
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL if must_be_new else os.O_RDONLY
         self._descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-
-    def __enter__(self) -> RowFile:
-        return self
 
     def __exit__(self, *_: object) -> None:
         os.close(self._descriptor)
@@ -78,9 +75,8 @@ def lock(descriptor: int, path: str | os.PathLike[str]) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise RuntimeError(
-            f"{os.fspath(path)}: another build is using it; wait for it, or write to another place"
-        ) from None
+        advice = "wait for it, or write to another place"
+        raise RuntimeError(f"{os.fspath(path)}: another build is using it; {advice}") from None
     except OSError as error:
         # Some network file systems have no locks; there, two builds of one output are the user's to avoid.
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):

@@ -173,8 +173,7 @@ def _children(plan: Plan, below: int, number: int) -> Offsets:
 def _spheres(gaussians: Gaussians) -> Array:
     library = _device.library_of(gaussians.means)
     radius = library.amax(gaussians.scales, axis=1, keepdims=True)
-    spheres: Array = library.concatenate([gaussians.means, radius], axis=1)
-    return spheres
+    return library.concatenate([gaussians.means, radius], axis=1)
 
 
 def _target(below: Mapping[int, Level], numbers: range, config: BuildConfig) -> _core.FitTarget:
