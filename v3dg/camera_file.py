@@ -57,13 +57,15 @@ def read_cameras(
     one_of(applied_transform, "applied_transform", ("keep", "undo"))
     place = Path(path)
     run = place.parent if place.name == _RUN else place
-    if (run / _RUN).is_file():
+    is_run = (run / _RUN).is_file()
+    if is_run:
         path, applied_transform = _data_of(run), "undo"
     elif place.is_dir():
         return _read_colmap(place, distortion)
     root = read_json(path)
     top = root.some_fields(("frames",))
-    undo_transform = _applied(top) if applied_transform == "undo" else None
+    transforms = [_applied(top)] if applied_transform == "undo" else []
+    transforms += [_trained(run)] if is_run else []
     names, cameras = [], []
     for node in top["frames"].items():
         frame = node.some_fields(("transform_matrix",))
@@ -74,10 +76,8 @@ def read_cameras(
         near = fields["near"].positive() if "near" in fields else 0.01
         matrix = _rows(fields["transform_matrix"])
         viewmat = node.attempt(partial(viewmat_from_blender, matrix))
-        if undo_transform is not None:
-            viewmat = _undone(viewmat, *undo_transform)
-        if (run / _RUN).is_file():
-            viewmat = _undone(viewmat, *_trained(run))
+        for transform in transforms:
+            viewmat = _undone(viewmat, *transform)
         cameras.append(node.attempt(partial(Camera, viewmat, K, width, height, near)))
         names.append(frame["file_path"].text() if "file_path" in frame else "")
     if "" in names or len(set(names)) < len(names):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
@@ -49,6 +49,11 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
+    # Focal lengths and principal point in px, as K has them.
+    fx: float = field(init=False)
+    fy: float = field(init=False)
+    cx: float = field(init=False)
+    cy: float = field(init=False)
 
     def __post_init__(self) -> None:
         viewmat = vector(self.viewmat, "viewmat", (4, 4))
@@ -62,6 +67,7 @@ class Camera:
         width, height = _side(self.width, "width"), _side(self.height, "height")
         near = positive(self.near, "near")
         self.__dict__.update(viewmat=viewmat, K=K, width=width, height=height, near=near)
+        self.__dict__.update(fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]))
 
     @classmethod
     def look_at(
@@ -131,28 +137,11 @@ class Camera:
     @cached_property
     def core(self) -> _core.Camera:
         """The same camera as the compiled operations take it."""
-        return _core.Camera(
-            viewmat=self.viewmat, K=self.K, width=self.width, height=self.height, near=self.near
-        )
+        size = {"width": self.width, "height": self.height}
+        return _core.Camera(viewmat=self.viewmat, K=self.K, **size, near=self.near)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Camera, (self.viewmat, self.K, self.width, self.height, self.near)
-
-    @property
-    def fx(self) -> float:
-        return float(self.K[0, 0])
-
-    @property
-    def fy(self) -> float:
-        return float(self.K[1, 1])
-
-    @property
-    def cx(self) -> float:
-        return float(self.K[0, 2])
-
-    @property
-    def cy(self) -> float:
-        return float(self.K[1, 2])
 
     def scaled(self, factor: int) -> Camera:
         """Return this camera with ``factor`` times the resolution, for supersampling."""
