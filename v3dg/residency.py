@@ -126,9 +126,8 @@ class Residency:
             resident = self._once(subject, ("scene", device), lambda: ResidentScene(device))
             if resident.is_of(subject):
                 return resident
-            is_new = resident.revision[0] < 0
             scene = copy.copy(Scene.of(subject))
-            if not is_new and not device.is_cuda:
+            if resident.revision[0] >= 0 and not device.is_cuda:  # on the CPU it stays as it is
                 resident = ResidentScene(device)
             resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
             self._kept[subject]["scene", device] = resident

@@ -29,9 +29,7 @@ def direction_of(axis: Axis) -> tuple[float, float, float]:
 
 
 def up_of(
-    subject: Subject,
-    cameras: Mapping[str, Camera] | None = None,
-    path: str | os.PathLike[str] = "",
+    subject: Subject, cameras: Mapping[str, Camera] | None = None, path: str | os.PathLike[str] = ""
 ) -> tuple[Axis, str]:
     """Return the axis that is up in a subject, and how that is known, as a phrase.
 

@@ -86,23 +86,20 @@ def write_scene(
     check("bundle_paths", given == count, f"{count} paths, got {given}")
     scene = copy.copy(scene)  # which stays as it is
     names = [f"bundle_{b}" for b in range(len(bundle_paths))]
-    poses = (scene.positions, scene.quaternions, scene.scales)
-    columns = [column.tolist() for column in (scene.instance_bundle, *poses, scene.importance)]
+    columns = {"position": scene.positions, "quaternion": scene.quaternions, "scale": scene.scales}
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    instances = [
+        {"bundle": names[bundle], **dict(zip(columns, row, strict=True))}
+        for bundle, row in zip(scene.instance_bundle.tolist(), rows, strict=True)
+    ]
+    for number in np.flatnonzero(scene.importance != 1).tolist():
+        instances[number]["importance"] = scene.importance[number].item()
     document = {
         "format": FORMAT,
         "version": VERSION,
         **({} if scene.up is None else {"up": scene.up}),
         "bundles": dict(zip(names, bundle_paths, strict=True)),
-        "instances": [
-            {
-                "bundle": names[bundle],
-                "position": position,
-                "quaternion": quaternion,
-                "scale": scale,
-                **({} if importance == 1 else {"importance": importance}),
-            }
-            for bundle, position, quaternion, scale, importance in zip(*columns, strict=True)
-        ],
+        "instances": instances,
         "cameras": [
             {
                 "name": name,
@@ -250,9 +247,7 @@ def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[
     return dict(zip(names, cameras, strict=True))
 
 
-def _open_bundles(
-    wanted: Mapping[str, tuple[Node, list[str]]], folder: Path, known: dict[str, Bundle]
-) -> None:
+def _open_bundles(wanted: dict[str, tuple[Node, list[str]]], folder: Path, known: dict[str, Bundle]) -> None:
     """Make bundles known: each the one in the first of its places, relative to the folder, that there is."""
     found = {}
     for key, (node, places) in wanted.items():

@@ -136,10 +136,8 @@ class Scene:
         with _changing:
             keep = np.ones(len(self), bool)
             keep[self._ids(ids)] = False
-            left = {}
-            for name in ("bundle", *_ROW):
-                rows = getattr(self._state, name)
-                left[name] = rows[_like(rows, keep)]
+            columns = {name: getattr(self._state, name) for name in ("bundle", *_ROW)}
+            left = {name: rows[_like(rows, keep)] for name, rows in columns.items()}
             self._publish(changes=1, removals=int(not keep.all()), **left)
 
     def move(
