@@ -104,9 +104,9 @@ class Site:
         self._tabs: set[Tab] = set()
         self._gate = Gate(host, port)
         self.port, self.url, self.is_secret = self._gate.port, self._gate.url, self._gate.is_secret
-        self._loop, self._closing = asyncio.new_event_loop(), asyncio.Event()
-        is_serving = threading.Event()
-        self._thread = threading.Thread(target=self._run, args=(is_serving,), name="v3dg viewer", daemon=True)
+        self._closing, is_serving = asyncio.Event(), threading.Event()
+        serving = self._serve(is_serving)
+        self._thread = threading.Thread(target=asyncio.run, args=(serving,), name="v3dg viewer", daemon=True)
         self._thread.start()
         is_serving.wait()
 
@@ -117,18 +117,12 @@ class Site:
         self._thread.join(3 * _CLOSE_SECONDS)
         return not self._thread.is_alive() and not self._tabs
 
-    def _run(self, is_serving: threading.Event) -> None:
-        asyncio.set_event_loop(self._loop)
-        try:
-            self._loop.run_until_complete(self._serve(is_serving))
-        finally:
-            self._loop.close()
-
     async def _serve(self, is_serving: threading.Event) -> None:
         from websockets.asyncio.server import serve
 
         from v3dg.viewer.messages import MOST_BYTES
 
+        self._loop = asyncio.get_running_loop()
         self._loop.set_exception_handler(
             lambda _, context: _LOG.error(context["message"], exc_info=context.get("exception"))
         )
