@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -114,8 +114,7 @@ class Frame:
         return self.pixels.shape[1], self.pixels.shape[0]
 
 
-@dataclass(frozen=True)
-class _Asked:
+class _Asked(NamedTuple):
     """How a picture is drawn: `chooser` is whose cut it is, None the camera's; `edge` where it is split."""
 
     camera: Camera
@@ -147,11 +146,7 @@ class SceneView:
     """
 
     def __init__(
-        self,
-        subject: Subject,
-        *,
-        device: str | Device = "auto",
-        memory: int | str | None = "auto",
+        self, subject: Subject, *, device: str | Device = "auto", memory: int | str | None = "auto"
     ) -> None:
         if isinstance(subject, Gaussians):
             only_leaves = BuildConfig(min_clusters=1 << 31)
@@ -319,8 +314,7 @@ class SceneView:
         return np.bincount(level, size, self.num_levels).astype(np.int64)
 
 
-@dataclass(frozen=True)
-class _Drawn:
+class _Drawn(NamedTuple):
     """Planes of what is right of the split, what it is compared with from the left on, and what it cost."""
 
     color: Any

@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 from v3dg import _core
@@ -32,8 +32,7 @@ _COARSEST = 64.0
 _STEPS_AN_OCTAVE = 4
 
 
-@dataclass(frozen=True)
-class Draft:
+class Draft(NamedTuple):
     """How to draw what passes by: its size in px, and what the tolerance is multiplied by."""
 
     size: Size

@@ -39,6 +39,9 @@ _FPS = 30
 _LEAST_WEIGHT = 0.05
 
 
+_Send = Callable[[str | bytes], None]
+
+
 class Tab:
     """What a page that is connected to a `Site` sees and does, until `close`.
 
@@ -50,11 +53,7 @@ class Tab:
     """
 
     def __init__(
-        self,
-        scene_view: SceneView,
-        name: str,
-        send: Callable[[str | bytes], None],
-        moved: Callable[[SceneView], None],
+        self, scene_view: SceneView, name: str, send: _Send, moved: Callable[[SceneView], None]
     ) -> None:
         self.scene_view, self._name, self._send, self._moved = scene_view, name, send, moved
         self._exporter = Exporter(self._tell, lambda error: self.scene_view.explain(error))
