@@ -118,9 +118,7 @@ def _write_folders(
 ) -> tuple[list[str], list[dict[str, Any]], list[int]]:
     """Write a folder of SOG after another: their names, chunks as leaves of the tree, gaussians by level."""
     names, errors = list[str](), ChunkErrors()
-    leaves: list[dict[str, Any]] = [
-        {"lods": {}, "errors": errors.of_chunk[c]} for c in range(plan.num_chunks)
-    ]
+    leaves: list[Any] = [{"lods": {}, "errors": errors.of_chunk[c]} for c in range(plan.num_chunks)]
     counts = [0] * plan.bundle.num_levels
     for level in range(plan.bundle.num_levels):
         parts: list[Gaussians] = []

@@ -21,9 +21,7 @@ def open_file(path: Path) -> AssetFile:
     if any("packed_position" in dict(properties) for _, _, properties in elements):
         return compressed_ply.open_file(path)
     file = _core.PlyFile(name)
-    return AssetFile(
-        path, file.num_gaussians, file.sh_degree, lambda first, last: Gaussians(*file.read(first, last))
-    )
+    return AssetFile(path, file.num_gaussians, file.sh_degree, lambda a, b: Gaussians(*file.read(a, b)))
 
 
 def write(path: Path, gaussians: Gaussians, encoding: PlyEncoding = "binary_little_endian") -> None:

@@ -65,9 +65,8 @@ def read(path: AnyPath) -> Gaussians:
 def has_instances(path: AnyPath) -> bool:
     """Whether instances make a USD file a scene."""
     with _opened(path, "OpenUSD with gaussians") as (usd, root):
-        return any(
-            prim.IsInstanceProxy() or prim.IsA(usd.UsdGeom.PointInstancer) for prim in _prims(usd, root)
-        )
+        kind = usd.UsdGeom.PointInstancer
+        return any(prim.IsInstanceProxy() or prim.IsA(kind) for prim in _prims(usd, root))
 
 
 def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], Axis]:
@@ -138,8 +137,7 @@ def _placed(usd: Any, root: Any) -> Iterator[tuple[Any, Floats]]:
 
 def _to_world(usd: Any, prim: Any) -> Floats:
     # USD has vectors as rows.
-    matrix: Floats = np.array(usd.UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T
-    return matrix
+    return np.transpose(np.array(usd.UsdGeom.XformCache().GetLocalToWorldTransform(prim)))
 
 
 def _similarity(prim: Any, matrix: Floats) -> _Pose:
