@@ -110,9 +110,8 @@ def _run_many(options: Build, executor: Executor | None) -> None:
             if not options.quiet:
                 _common.tell(f"failed: {results[-1]['error']}")
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(
-                f"interrupted with {len(results)} of {len(outputs)} assets done; `--resume` continues"
-            ) from None
+            done = f"{len(results)} of {len(outputs)} assets done"
+            raise KeyboardInterrupt(f"interrupted with {done}; `--resume` continues") from None
     counts = Counter(result["status"] for result in results)
     summary = {name: counts[name] for name in ("built", "kept", "failed")}
     seconds = time.perf_counter() - start
@@ -130,11 +129,8 @@ def _run_many(options: Build, executor: Executor | None) -> None:
         if "bytes" in row:
             row |= {"left_out": sum(row["dropped"].values()), "size": _common.bytes_text(row["bytes"])}
     last = ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
-    _common.print_result(
-        options.json,
-        {**summary, "seconds": seconds, "assets": results},
-        [*_common.table_lines(columns, shown), "", last],
-    )
+    result = {**summary, "seconds": seconds, "assets": results}
+    _common.print_result(options.json, result, [*_common.table_lines(columns, shown), "", last])
     failed = [result for result in results if result["status"] == "failed"]
     if failed:
         others = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
@@ -167,15 +163,13 @@ def _outputs(options: Build) -> dict[Path, Path]:
     return {asset: output for output, asset in asset_of.items()}
 
 
-def _build(
-    options: Build, asset_paths: Sequence[Path], output: Path, executor: Executor | None
-) -> dict[str, Any]:
+def _build(options: Build, paths: Sequence[Path], output: Path, executor: Executor | None) -> dict[str, Any]:
     """Build and write one bundle; what was done, as JSON values."""
-    for path in asset_paths:
+    for path in paths:
         _common.require_file(path, *SUFFIXES)
-    advice = f", got a folder; {output / asset_paths[0].stem}.v3dg is one" if output.is_dir() else ""
+    advice = f", got a folder; {output / paths[0].stem}.v3dg is one" if output.is_dir() else ""
     check(output, output.suffix == ".v3dg", f"a file name ending in .v3dg{advice}")
-    _common.check_output(output, *asset_paths)
+    _common.check_output(output, *paths)
     start = time.perf_counter()
     config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
     if options.cluster_size is not None:
@@ -189,7 +183,7 @@ def _build(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AssetWarning)  # the result says it
             bundle, is_built = build_file(
-                asset_paths,
+                paths,
                 output,
                 config=config,
                 seed=options.seed,
@@ -207,7 +201,7 @@ def _build(
     except OSError as error:  # a full disk, say
         raise OSError(error.errno, f"{error.strerror}{to_resume()}", error.filename) from None
     return {
-        "asset": str(asset_paths[0]) if len(asset_paths) == 1 else [str(path) for path in asset_paths],
+        "asset": str(paths[0]) if len(paths) == 1 else [str(path) for path in paths],
         "output": str(output),
         "status": "built" if is_built else "kept",
         "asset_gaussians": bundle.config["asset_gaussians"],

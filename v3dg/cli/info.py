@@ -76,9 +76,8 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
         lines.append("means from {} to {}".format(*map(_point, boxes["box"])))
     if far.any():
         lines.append("without outliers from {} to {}".format(*map(_point, boxes["box_without_outliers"])))
-        lines.append(
-            f"{far.sum():,} outliers, {OUTLIER_DISTANCE:g} median distances from the median or farther"
-        )
+        how = f"{OUTLIER_DISTANCE:g} median distances from the median or farther"
+        lines.append(f"{far.sum():,} outliers, {how}")
     for name, (p5, p50, p95) in spread.items():
         name = name.replace("_", " ")
         lines.append(f"{name}: 5 % below {p5:.3g}, half below {p50:.3g}, 95 % below {p95:.3g}")
