@@ -90,8 +90,7 @@ def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
         return np.zeros(0, bool)
     exact = means.astype(np.float64)
     distance = np.linalg.norm(exact - np.median(exact, axis=0), axis=1)
-    far: npt.NDArray[np.bool_] = distance > OUTLIER_DISTANCE * np.median(distance)
-    return far
+    return np.asarray(distance > OUTLIER_DISTANCE * np.median(distance))
 
 
 def ball_of_most(points: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.floating[Any]], float]:

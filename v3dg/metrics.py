@@ -143,13 +143,6 @@ def draw_truth(
 
     Each sample is clipped to [0,1] as a screen does, before it is averaged over its pixel.
     """
-    larger = camera.scaled(supersampling)
-    color = render(
-        subject,
-        larger,
-        tolerance=0.0,
-        background=background,
-        min_transmittance=MIN_TRANSMITTANCE,
-        device=device,
-    ).color
+    how: Any = {"background": background, "min_transmittance": MIN_TRANSMITTANCE, "device": device}
+    color = render(subject, camera.scaled(supersampling), tolerance=0.0, **how).color
     return to_8bit(box_downsample(color.clip(0, 1), supersampling))

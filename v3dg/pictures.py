@@ -36,11 +36,9 @@ def to_8bit(image: Any) -> Picture:
     if hasattr(image, "detach"):
         import torch
 
-        tensor: Picture = (image.detach().clip(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
-        return tensor
+        return np.asarray((image.detach().clip(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
     clipped = np.clip(np.asarray(image, dtype=np.float32), 0, 1)
-    pixels: Picture = (clipped * np.float32(255) + np.float32(0.5)).astype(np.uint8)
-    return pixels
+    return np.asarray((clipped * np.float32(255) + np.float32(0.5)).astype(np.uint8))
 
 
 def checked(name: str, image: Any) -> NDArray[Any]:

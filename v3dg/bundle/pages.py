@@ -86,8 +86,7 @@ class PageRun:
     def clusters_of(self, number: int) -> NDArray[np.int64]:
         """Gaussians of each cluster of one page, by its place in the run, among those of all; and the end."""
         first, last = self.first_cluster[number : number + 2].tolist()
-        offset: NDArray[np.int64] = self.offset[first : last + 1] - self.offset[0]
-        return offset
+        return np.asarray(self.offset[first : last + 1] - self.offset[0])
 
 
 class MemoryPages:
