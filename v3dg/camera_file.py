@@ -62,8 +62,7 @@ def read_cameras(
         path, applied_transform = _data_of(run), "undo"
     elif place.is_dir():
         return _read_colmap(place, distortion)
-    root = read_json(path)
-    top = root.some_fields(("frames",))
+    top = read_json(path).some_fields(("frames",))
     transforms = [_applied(top)] if applied_transform == "undo" else []
     transforms += [_trained(run)] if is_run else []
     names, cameras = [], []
@@ -74,8 +73,7 @@ def read_cameras(
         focal = frame if "fl_x" in frame or "camera_angle_x" in frame else top
         K, width, height = _intrinsics(node, fields, focal, size)
         near = fields["near"].positive() if "near" in fields else 0.01
-        matrix = _rows(fields["transform_matrix"])
-        viewmat = node.attempt(partial(viewmat_from_blender, matrix))
+        viewmat = node.attempt(partial(viewmat_from_blender, _rows(fields["transform_matrix"])))
         for transform in transforms:
             viewmat = _undone(viewmat, *transform)
         cameras.append(node.attempt(partial(Camera, viewmat, K, width, height, near)))

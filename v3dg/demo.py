@@ -110,5 +110,4 @@ def _drawn(
     }
     name = "SSIM" if numbers["flip"] is None else "FLIP"
     cost = f"{stats.gaussians_in_frustum:,} gaussians, {stats.select_ms + stats.draw_ms:,.0f} ms"
-    text = f"{cost}, {name} {numbers[name.lower()]:.3f}"
-    return numbers, text, picture
+    return numbers, f"{cost}, {name} {numbers[name.lower()]:.3f}", picture

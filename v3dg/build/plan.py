@@ -101,8 +101,7 @@ class Plan:
         """The pages of the bundle."""
         clusters, gaussians = [], []
         for level, count in zip(self.levels, self._num_pages, strict=True):
-            each = level.num_clusters // count
-            clusters.append(np.full(count, each, np.int64))
+            clusters.append(np.full(count, level.num_clusters // count, np.int64))
             gaussians.append(np.diff(level.offset))
         return PageLayout(_offset_of(np.concatenate(clusters)), _offset_of(np.concatenate(gaussians)))
 
@@ -117,8 +116,7 @@ def _next_shape(below: LevelPlan, config: BuildConfig) -> tuple[int, int] | None
 
 
 def _level_above(below: LevelPlan, num_groups: int, clusters_made: int) -> LevelPlan:
-    into = np.diff(below.offset[:: below.num_clusters // num_groups])
-    sizes = (into + 1) // 2
+    sizes = (np.diff(below.offset[:: below.num_clusters // num_groups]) + 1) // 2
     group_offset = _offset_of(sizes)
     weight = np.maximum((1 / sizes).astype(np.float32), below.weight.reshape(num_groups, -1).max(axis=1))
     leaf_offset = np.ascontiguousarray(below.leaf_offset[:: below.num_groups // num_groups])

@@ -50,8 +50,7 @@ def write_usd(subject: Scene | Bundle, path: str | os.PathLike[str], *, up: Axis
     stage = usd.new_stage("Z")
     world = pxr.UsdGeom.Xform.Define(stage, "/world")
     stage.SetDefaultPrim(world.GetPrim())
-    turn = _common.rotation_to(up or up_of(subject)[0], "z")
-    w, *xyz = quaternion_from_rotation(turn)
+    w, *xyz = quaternion_from_rotation(_common.rotation_to(up or up_of(subject)[0], "z"))
     world.AddOrientOp().Set(pxr.Gf.Quatf(w, *xyz))
     above = "/world/instances" if isinstance(subject, Scene) else "/world"
     paths = [f"{above}/{pxr.Tf.MakeValidIdentifier(name)}" for name in _common.names_of(scene)]

@@ -160,8 +160,7 @@ def _decode(version: int, degree: int, fraction_bits: int, sections: list[memory
         higher = (rest[block].astype(np.float64) - 128.0) / 128.0
         sh = np.concatenate([color[:, None], higher.reshape(len(color), -1, 3)], axis=1)
         log = scales[block] / 16.0 - 10.0
-        quats = _quats(rotations[block])
-        return means(block), quats, np.exp(log), opacities[block, 0] / 255.0, sh
+        return means(block), _quats(rotations[block]), np.exp(log), opacities[block, 0] / 255.0, sh
 
     return assemble(count, degree, decode)
 
