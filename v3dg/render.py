@@ -282,6 +282,8 @@ class _Frame:
                 shown = (look or PoolLook(self.color_by)).options(resident.bundles)
                 drawn = camera.core, rule, shade, stop, steps
                 drawing = self._frame.draw_resident(resident.core, pool.core, *drawn, **shown)
+                now = pool.core.status()
+                came_in: Any = dict(missing=now.missing, failed=now.failed, bytes_in=now.bytes_in - before)
             elif cut is None:
                 drawing = self._frame.draw(resident.core, camera.core, rule, shade, stop, steps)
             else:
@@ -290,9 +292,6 @@ class _Frame:
                 pairs = self._here(cut.instance_ids), self._here(cut.cluster_ids)
                 weights = None if cut.given_weights is None else self._here(cut.given_weights)
                 drawing = self._frame.draw_cut(resident.core, camera.core, *pairs, shade, weights=weights)
-            if pool is not None:
-                now = pool.core.status()
-                came_in: Any = dict(missing=now.missing, failed=now.failed, bytes_in=now.bytes_in - before)
             resident.add_drawing(drawing)
 
         def finish() -> Stats:
