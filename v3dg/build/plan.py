@@ -99,11 +99,10 @@ class Plan:
     @property
     def layout(self) -> PageLayout:
         """The pages of the bundle."""
-        clusters, gaussians = [], []
-        for level, count in zip(self.levels, self._num_pages, strict=True):
-            clusters.append(np.full(count, level.num_clusters // count, np.int64))
-            gaussians.append(np.diff(level.offset))
-        return PageLayout(_offset_of(np.concatenate(clusters)), _offset_of(np.concatenate(gaussians)))
+        num_pages = np.array(self._num_pages, np.int64)
+        clusters = np.repeat([level.num_clusters for level in self.levels] // num_pages, num_pages)
+        gaussians = np.concatenate([np.diff(level.offset) for level in self.levels])
+        return PageLayout(_offset_of(clusters), _offset_of(gaussians))
 
 
 def _next_shape(below: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:
