@@ -24,6 +24,7 @@ from v3dg.opening import open as open  # not in __all__: with `*` it would hide 
 from v3dg.opening import read_usd_scene
 from v3dg.pick import Pick, pick
 from v3dg.rasterize import rasterize
+from v3dg.refine import refine_bundle
 from v3dg.render import Renderer, render
 from v3dg.scene import Scene
 from v3dg.scene.file import read_scene, write_scene
@@ -31,7 +32,7 @@ from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, select
 from v3dg.view import view
 
 __all__ = ["BuildConfig", "Bundle", "Clusters", "Gaussians", "Groups"]
-__all__ += ["__version__", "build_bundle", "read_asset", "write_asset"]
+__all__ += ["__version__", "build_bundle", "read_asset", "refine_bundle", "write_asset"]
 __all__ += ["Camera", "Scene", "read_cameras", "read_scene", "turntable", "write_cameras", "write_scene"]
 __all__ += ["DEFAULT_FADE", "DEFAULT_TOLERANCE", "Image", "Pick", "RenderedImage", "Renderer", "Stats"]
 __all__ += ["Selection", "StereoCamera", "pick", "rasterize", "render", "select", "view"]

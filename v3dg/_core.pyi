@@ -541,5 +541,16 @@ def fit_level(
     stream: Int64,
     progress: FitProgress,
 ) -> Float32: ...
+
+# Writes over `gaussians`.
+def refine_cuts(
+    config: FitConfig,
+    target: FitTarget,
+    gaussians: Rows,
+    offset: Int64,
+    radius: Float32,
+    views: Sequence[tuple[Camera, Int32]],
+    progress: FitProgress,
+) -> None: ...
 def ssim(picture: Float32 | Float64, target: Float32 | Float64) -> float: ...
 def dssim(picture: Float32, target: Float32) -> tuple[float, Float32]: ...

@@ -47,6 +47,7 @@ from v3dg import _device
 from v3dg._judges import Judges
 from v3dg.metrics import draw_truth, errors_of
 from v3dg.pictures import Picture, to_8bit
+from v3dg.refine import refine_bundle
 
 Row = dict[str, Any]
 
@@ -82,6 +83,8 @@ class Measure:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
     """How ours are built; merging alone is the same without a step."""
+    refine: int = 0
+    """Steps by which ours are refined, too."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +153,8 @@ class Study:
         config = self._config.build if name == "ours" else replace(self._config.build, steps=0)
         start = time.perf_counter()
         bundle = v3dg.build_bundle(subject.asset, config=config, device=self.device, progress=False)
+        if name == "ours" and self._config.refine > 0:
+            bundle = refine_bundle(bundle, steps=self._config.refine, device=self.device, progress=False)
         seconds = round(time.perf_counter() - start, 2)
         self.builds.setdefault(subject.name, {})[f"{name}_seconds"] = seconds
         return bundle
@@ -238,6 +243,7 @@ def measure(config: Measure) -> None:
         raise SystemExit(f"--only: expected some of {', '.join(about)}, got {missing[0]}")
     settings = {"factors": list(config.factors), "widest": config.widest, "views": config.views}
     changes = dict(asdict(config.build).items() - asdict(v3dg.BuildConfig()).items())
+    changes |= {"refine": config.refine} if config.refine > 0 else {}
     rows = known_rows(config.known, settings)
     config.output.mkdir(parents=True, exist_ok=True)
     study, judges = Study(config), Judges()

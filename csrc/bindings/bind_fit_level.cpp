@@ -8,6 +8,8 @@
 #include "pipeline/fit_level.h"
 #include "pipeline/fit_level_cuda.h"
 #include "pipeline/model.h"
+#include "pipeline/refine_cuts.h"
+#include "pipeline/refine_cuts_cuda.h"
 
 namespace v3dg {
 
@@ -96,6 +98,40 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, 
     return error.object;
 }
 
+void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, const Rows& gaussians,
+                        const py::array& offset, const py::array& radius,
+                        const std::vector<std::pair<BoundCamera, py::array>>& views, FitProgress& progress) {
+    if (gaussians.device() != target.device() || gaussians.sh_degree() != target.sh_degree())
+        throw py::value_error("gaussians: expected the device and the SH degree of the target, got others");
+    const auto count = static_cast<py::ssize_t>(gaussians.size());
+    const CutRows levels{gaussians.write(), span_of<const int64_t>(offset, "offset", {-1}),
+                         span_of<const float>(radius, "radius", {count})};
+    const Span<const int64_t>& ends = levels.offset;
+    if (ends.size == 0 || ends[0] != 0 || ends[ends.size - 1] != count ||
+        !std::is_sorted(ends.begin(), ends.end()))
+        throw py::value_error("offset: expected numbers from 0 up to that of the gaussians, got others");
+    if (!std::all_of(levels.radius.begin(), levels.radius.end(), [](float r) { return r > 0; }))
+        throw py::value_error("radius: expected positive numbers, got one that is not");
+    std::vector<CutView> all;
+    for (const auto& [camera, clusters] : views) {
+        all.push_back({camera.camera, span_of<const int32_t>(clusters, "clusters", {-1})});
+        for (const int32_t c : all.back().clusters)
+            if (c < 0 || static_cast<size_t>(c) + 1 >= ends.size)
+                throw py::value_error("clusters: expected numbers of clusters, got " + std::to_string(c));
+    }
+    const Span<const CutView> seen{all.data(), all.size()};
+    const Work work(gaussians.device());
+    if constexpr (V3DG_WITH_CUDA != 0)
+        if (!work.device().is_host()) {
+            const cuda::DeviceFitTarget on_device = target.on_device();
+            const py::gil_scoped_release unlocked;
+            cuda::refine_cuts(config, on_device, levels, seen, progress, work.stream());
+            return;
+        }
+    const py::gil_scoped_release unlocked;
+    refine_cuts(config, target.on_host(), target.size(), levels, seen, progress);
+}
+
 FitConfig make_config(int steps, int views_per_step, int num_views, int supersample, int image_size,
                       float px2_per_gaussian, float distance, float filter_px2, bool antialiased,
                       float loss_l1, float loss_dssim, float loss_alpha, float step_position,
@@ -178,6 +214,10 @@ void bind_fit_level(py::module_& m) {
           "ball"_a, "stream"_a, "progress"_a,
           "Fits groups of gaussians, in place, to look like groups of the target inside their balls (G, 4). "
           "Returns the residuals (G, 2) in colour and alpha.");
+    m.def("refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "offset"_a, "radius"_a,
+          "views"_a, "progress"_a,
+          "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
+          "view, which is a camera and the clusters that it shows.");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
           "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
     m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,

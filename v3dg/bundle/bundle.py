@@ -58,9 +58,7 @@ class Bundle:
         kept = codec_of(codec, gaussians.sh_degree)
         gaussians = kept.rounded(gaussians.numpy(), clusters.offset)
         if codec != Codec.name:
-            filled = np.diff(clusters.offset)[:, None, None] > 0
-            box = np.where(filled, _core.bound_by_boxes(gaussians.rows, clusters.offset), clusters.box)
-            clusters = replace(clusters, box=box)
+            clusters = clusters.around(gaussians)
         layout = PageLayout.of(clusters)
         in_memory = MemoryPages if codec == Codec.name else CodePages.of
         self._set(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from v3dg import _core
 from v3dg._numbers import check, check_type, refuse
 from v3dg.bundle.format import DTYPES, SCHEMA
+from v3dg.gaussians import Gaussians
 
 NESTING_MARGIN = _core.nesting_margin
 """A group's ball contains the balls of the groups below it with this relative margin; see docs/format.md."""
@@ -45,6 +46,12 @@ class Clusters:
 
     def __len__(self) -> int:
         return len(self.level)
+
+    def around(self, gaussians: Gaussians) -> Clusters:
+        """The same clusters with boxes around other gaussians."""
+        is_filled = np.diff(self.offset)[:, None, None] > 0
+        box = np.where(is_filled, _core.bound_by_boxes(gaussians.rows, self.offset), self.box)
+        return replace(self, box=box)
 
 
 @dataclass(frozen=True, eq=False)

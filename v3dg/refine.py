@@ -1,0 +1,164 @@
+"""Levels of a bundle made better together: as cuts show them, next to what hides parts of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from v3dg import _core, _device
+from v3dg._device import Device
+from v3dg._numbers import check, check_type, whole
+from v3dg._progress import Bar, Progress
+from v3dg.build.config import BuildConfig
+from v3dg.build.fit import fit_config, run_fit
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera
+from v3dg.select import select
+
+_RATE = 0.2  # of the step sizes of a fit, from whose result this starts
+_SAMPLES = 4  # of a side of a pixel of the pictures that cuts are to look like
+_WIDEST_PX, _NARROWEST_PX = 256, 8  # of a side of a picture; of wider ones windows are compared
+_LEAST_SIZE, _OCTAVES = 0.25, 5.0  # of pictures, a side, in the size at which so many gaussians are at home
+_TOWARDS_LARGE, _TOWARDS_MANY = 0.7, 2.0  # powers of what is uniform: how often pictures are large, cuts fine
+_MOST = 0.7  # of the asset's gaussians, in a cut
+_DISTANCE = 2.5  # of the cameras around an asset, in its radii
+_SHARE = 0.99  # of the gaussians that an asset's radius holds; the rest may float far away
+_SAMPLED = 256  # gaussians that tell which part of them is in a picture, and what a window shows
+
+
+def refine_bundle(
+    bundle: Bundle,
+    *,
+    steps: int = 4000,
+    cameras: Sequence[Camera] | None = None,
+    seed: int = 0,
+    device: str | Device = "auto",
+    progress: Progress = True,
+) -> Bundle:
+    """Make the levels of a bundle look more like its asset, in small pictures and large ones; a copy.
+
+    A build fits every group alone, seen from all sides, at the size at which it is selected. This moves the
+    gaussians of all levels but the first, as many as there were, until pictures of cuts, in which they stand
+    next to each other and hide each other, are those of the asset. Cuts have from as many gaussians as level
+    1 down to those of the last, and pictures 1/4 to 8 times the size at which they are at home: 2 px² a
+    gaussian. docs/levels.md has what is gained. What no picture shows stays as it was.
+
+    The same bundle, steps, cameras and seed give the same bits on the same kind of device.
+
+    Args:
+        bundle: What `build_bundle` made; all of its gaussians are in memory meanwhile.
+        steps: Pictures that cuts are compared with, one after another.
+        cameras: From where an asset is seen from inside, as those that photographed a room. By default it is
+            looked at from all around.
+        seed: Of the pictures.
+        device: Where to compute.
+        progress: As for `build_bundle`.
+
+    Raises:
+        ValueError: There are no steps or no cameras.
+        RuntimeError: The device is "cuda", and something is missing for it.
+        KeyboardInterrupt: Ctrl-C; threads have stopped.
+    """
+    check_type("bundle", bundle, Bundle, "a Bundle")
+    steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
+    check(
+        "cameras", cameras is None or len(cameras), "one or more, or None to look from all around, got none"
+    )
+    where = _device.resolve(device)
+    if bundle.num_levels < 2:
+        return bundle
+    views = _Views(bundle, cameras, np.random.default_rng(seed))
+    chosen = [views.random() for _ in range(steps)]
+    everything = bundle.gaussians
+    gaussians = _device.place(everything.subset(np.arange(len(everything))), where)
+    clusters, balls = bundle.clusters, bundle.groups.ball
+    target = _core.FitTarget(gaussians.subset(slice(0, views.num_leaves)).rows, 0.0, False)
+    radius = np.where(clusters.own_group < 0, np.float32(1), balls[clusters.own_group, 3])
+    radius = np.repeat(radius, np.diff(clusters.offset))
+    config = _config(float(clusters.filter_px2[-1]), steps, seed)
+    with Bar(steps, "refine", progress) as bar:
+        run_fit(
+            lambda state: _core.refine_cuts(
+                config, target, gaussians.rows, clusters.offset, radius, chosen, state
+            ),
+            where,
+            lambda state: bar.update(state.groups_done - bar.done),
+        )
+    refined = gaussians.numpy()
+    made = {**bundle.config, "refined": {"steps": steps, "seed": seed}}
+    return Bundle(clusters.around(refined), bundle.groups, refined, made, bundle.codec)
+
+
+def _config(filter_px2: float, steps: int, seed: int) -> _core.FitConfig:
+    default = BuildConfig()
+    changes: dict[str, Any] = {
+        name: _RATE * v for name, v in vars(default).items() if name.startswith("step_")
+    }
+    changes |= {"steps": steps, "first_steps": steps, "supersample": _SAMPLES, "filter_px2": filter_px2}
+    return fit_config(replace(default, **changes), seed, 1)
+
+
+class _Views:
+    """Pictures of a bundle's cuts."""
+
+    def __init__(self, bundle: Bundle, cameras: Sequence[Camera] | None, rng: np.random.Generator) -> None:
+        asset = bundle.level_gaussians(0)
+        self.num_leaves = len(asset)
+        self._bundle, self._cameras, self._rng = bundle, cameras, rng
+        offset = bundle.clusters.offset
+        self._most = _MOST * self.num_leaves
+        self._least = float(offset[-1] - offset[bundle.level_range(bundle.num_levels - 1).start])
+        self._means = asset.means.astype(np.float64)
+        self._center = np.median(self._means, axis=0)
+        distance = np.linalg.norm(self._means - self._center, axis=1)
+        self._radius = float(np.quantile(distance, _SHARE)) or 1.0
+        area = np.sort(asset.scales.astype(np.float64), axis=1)[:, 1:].prod(axis=1)
+        self._weight = np.cumsum(asset.opacities * np.sqrt(area))  # what is twice as large counts twice
+
+    def random(self) -> tuple[_core.Camera, npt.NDArray[np.int32]]:
+        """A window of a picture, and the clusters of a cut that it shows."""
+        rng = self._rng
+        count = self._most * (self._least / self._most) ** (rng.uniform() ** _TOWARDS_MANY)
+        size = _LEAST_SIZE * 2 ** (_OCTAVES * rng.uniform() ** _TOWARDS_LARGE)
+        camera, window = self._pictures(size * size * count)
+        budget = math.ceil(count)
+        tolerance = select(self._bundle, camera, budget=budget, cull=False, device="cpu").tolerance
+        return window.core, select(self._bundle, window, tolerance=tolerance, device="cpu").cluster_ids
+
+    def _pictures(self, count: float) -> tuple[Camera, Camera]:
+        """A picture in which so many gaussians are at home, and a window of it."""
+        rng, given = self._rng, self._cameras
+        camera = self._around() if given is None else given[int(rng.integers(len(given)))]
+        some = np.searchsorted(self._weight, rng.uniform(high=self._weight[-1], size=_SAMPLED))
+        px, is_in = self._on_image(camera, some)
+        px2 = BuildConfig().px2_per_gaussian * count * max(is_in.mean(), 1 / _SAMPLED)
+        sides = np.array([camera.width, camera.height], np.float64)
+        scale = max(math.sqrt(px2 / sides.prod()), _NARROWEST_PX / sides.min())
+        K, whole_size = camera.K * np.array([[scale], [scale], [1.0]]), np.ceil(scale * sides)
+        size = np.minimum(whole_size, _WIDEST_PX)
+        middle = scale * px[np.argmax(is_in)] if is_in.any() else whole_size / 2
+        K_window = K.copy()
+        K_window[:2, 2] -= np.clip(np.round(middle - size / 2), 0, whole_size - size)
+        kinds = ((K, whole_size), (K_window, size))
+        first, second = (Camera(camera.viewmat, k, int(s[0]), int(s[1]), camera.near) for k, s in kinds)
+        return first, second
+
+    def _around(self) -> Camera:
+        outwards, up = self._rng.normal(size=(2, 3))
+        eye = self._center + _DISTANCE * self._radius * outwards / np.linalg.norm(outwards)
+        fov, near = 2 * math.asin(1 / _DISTANCE), 0.01 * self._radius
+        return Camera.look_at(eye, self._center, up, fov, width=1024, height=1024, near=near)
+
+    def _on_image(
+        self, camera: Camera, which: npt.NDArray[np.int64]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        """Where gaussians are, (N, 2) px, and which of them are in the picture."""
+        seen = self._means[which] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        is_before = seen[:, 2:] > camera.near
+        px = (seen @ camera.K.T)[:, :2] / np.where(is_before, seen[:, 2:], 1)
+        return px, (is_before & (px >= 0) & (px < [camera.width, camera.height])).all(axis=1)
