@@ -18,6 +18,7 @@ from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
+from v3dg.scene import Scene
 from v3dg.select import select
 
 _RATE = 0.2  # of the step sizes of a fit, from whose result this starts
@@ -26,6 +27,7 @@ _WIDEST_PX, _NARROWEST_PX = 256, 8  # of a side of a picture; of wider ones wind
 _LEAST_SIZE, _OCTAVES = 0.25, 5.0  # of pictures, a side, in the size at which so many gaussians are at home
 _TOWARDS_LARGE, _TOWARDS_MANY = 0.7, 2.0  # powers of what is uniform: how often pictures are large, cuts fine
 _MOST = 0.7  # of the asset's gaussians, in a cut
+_HOME_PX2 = BuildConfig().px2_per_gaussian
 _DISTANCE = 2.5  # of the cameras around an asset, in its radii
 _SHARE = 0.99  # of the gaussians that an asset's radius holds; the rest may float far away
 _SAMPLED = 256  # gaussians that tell which part of them is in a picture, and what a window shows
@@ -109,7 +111,7 @@ class _Views:
     def __init__(self, bundle: Bundle, cameras: Sequence[Camera] | None, rng: np.random.Generator) -> None:
         asset = bundle.level_gaussians(0)
         self.num_leaves = len(asset)
-        self._bundle, self._cameras, self._rng = bundle, cameras, rng
+        self._scene, self._cameras, self._rng = Scene.of(bundle), cameras, rng
         offset = bundle.clusters.offset
         self._most = _MOST * self.num_leaves
         self._least = float(offset[-1] - offset[bundle.level_range(bundle.num_levels - 1).start])
@@ -127,8 +129,8 @@ class _Views:
         size = _LEAST_SIZE * 2 ** (_OCTAVES * rng.uniform() ** _TOWARDS_LARGE)
         camera, window = self._pictures(size * size * count)
         budget = math.ceil(count)
-        tolerance = select(self._bundle, camera, budget=budget, cull=False, device="cpu").tolerance
-        return window.core, select(self._bundle, window, tolerance=tolerance, device="cpu").cluster_ids
+        tolerance = select(self._scene, camera, budget=budget, cull=False, device="cpu").tolerance
+        return window.core, select(self._scene, window, tolerance=tolerance, device="cpu").cluster_ids
 
     def _pictures(self, count: float) -> tuple[Camera, Camera]:
         """A picture in which so many gaussians are at home, and a window of it."""
@@ -136,7 +138,7 @@ class _Views:
         camera = self._around() if given is None else given[int(rng.integers(len(given)))]
         some = np.searchsorted(self._weight, rng.uniform(high=self._weight[-1], size=_SAMPLED))
         px, is_in = self._on_image(camera, some)
-        px2 = BuildConfig().px2_per_gaussian * count * max(is_in.mean(), 1 / _SAMPLED)
+        px2 = _HOME_PX2 * count * max(is_in.mean(), 1 / _SAMPLED)
         sides = np.array([camera.width, camera.height], np.float64)
         scale = max(math.sqrt(px2 / sides.prod()), _NARROWEST_PX / sides.min())
         K, whole_size = camera.K * np.array([[scale], [scale], [1.0]]), np.ceil(scale * sides)
