@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,10 @@ from v3dg.select import select
 _RATE = 0.2  # of the step sizes of a fit, from whose result this starts
 _SAMPLES = 4  # of a side of a pixel of the pictures that cuts are to look like
 _WIDEST_PX, _NARROWEST_PX = 256, 8  # of a side of a picture; of wider ones windows are compared
-_LEAST_SIZE, _OCTAVES = 0.25, 5.0  # of pictures, a side, in the size at which so many gaussians are at home
-_TOWARDS_LARGE, _TOWARDS_MANY = 0.7, 2.0  # powers of what is uniform: how often pictures are large, cuts fine
+_MOST_PX = 1 << 15  # of a side of such a wider one
+# Of pictures, a side, in the size at which so many gaussians are at home. Cuts of the default tolerance are
+# seen at a quarter to half of that.
+_LEAST_SIZE, _OCTAVES = 0.18, 5.5
 _MOST = 0.7  # of the asset's gaussians, in a cut
 _HOME_PX2 = BuildConfig().px2_per_gaussian
 _DISTANCE = 2.5  # of the cameras around an asset, in its radii
@@ -36,7 +39,7 @@ _SAMPLED = 256  # gaussians that tell which part of them is in a picture, and wh
 def refine_bundle(
     bundle: Bundle,
     *,
-    steps: int = 4000,
+    steps: int = 10_000,
     cameras: Sequence[Camera] | None = None,
     seed: int = 0,
     device: str | Device = "auto",
@@ -46,8 +49,8 @@ def refine_bundle(
 
     A build fits every group alone, seen from all sides, at the size at which it is selected. This moves the
     gaussians of all levels but the first, as many as there were, until pictures of cuts, in which they stand
-    next to each other and hide each other, are those of the asset. Cuts have from as many gaussians as level
-    1 down to those of the last, and pictures 1/4 to 8 times the size at which they are at home: 2 px² a
+    next to each other and hide each other, are those of the asset. Cuts have 0.7 of the asset's gaussians
+    down to those of the last level, and pictures 0.18 to 8 times the size at which they are at home, 2 px² a
     gaussian. docs/levels.md has what is gained. What no picture shows stays as it was.
 
     The same bundle, steps, cameras and seed give the same bits on the same kind of device.
@@ -68,9 +71,7 @@ def refine_bundle(
     """
     check_type("bundle", bundle, Bundle, "a Bundle")
     steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
-    check(
-        "cameras", cameras is None or len(cameras), "one or more, or None to look from all around, got none"
-    )
+    check("cameras", cameras is None or len(cameras), "one or more, or None for all sides, got none")
     where = _device.resolve(device)
     if bundle.num_levels < 2:
         return bundle
@@ -83,26 +84,19 @@ def refine_bundle(
     radius = np.where(clusters.own_group < 0, np.float32(1), balls[clusters.own_group, 3])
     radius = np.repeat(radius, np.diff(clusters.offset))
     config = _config(float(clusters.filter_px2[-1]), steps, seed)
+    given = (config, target, gaussians.rows, clusters.offset, radius, chosen)
     with Bar(steps, "refine", progress) as bar:
-        run_fit(
-            lambda state: _core.refine_cuts(
-                config, target, gaussians.rows, clusters.offset, radius, chosen, state
-            ),
-            where,
-            lambda state: bar.update(state.groups_done - bar.done),
-        )
+        refine = partial(_core.refine_cuts, *given)
+        run_fit(refine, where, lambda state: bar.update(state.groups_done - bar.done))
     refined = gaussians.numpy()
     made = {**bundle.config, "refined": {"steps": steps, "seed": seed}}
     return Bundle(clusters.around(refined), bundle.groups, refined, made, bundle.codec)
 
 
 def _config(filter_px2: float, steps: int, seed: int) -> _core.FitConfig:
-    default = BuildConfig()
-    changes: dict[str, Any] = {
-        name: _RATE * v for name, v in vars(default).items() if name.startswith("step_")
-    }
-    changes |= {"steps": steps, "first_steps": steps, "supersample": _SAMPLES, "filter_px2": filter_px2}
-    return fit_config(replace(default, **changes), seed, 1)
+    sizes: Any = {k: _RATE * v for k, v in vars(BuildConfig()).items() if k.startswith("step_")}
+    config = BuildConfig(steps=steps, first_steps=steps, supersample=_SAMPLES, filter_px2=filter_px2)
+    return fit_config(replace(config, **sizes), seed, 1)
 
 
 class _Views:
@@ -125,8 +119,8 @@ class _Views:
     def random(self) -> tuple[_core.Camera, npt.NDArray[np.int32]]:
         """A window of a picture, and the clusters of a cut that it shows."""
         rng = self._rng
-        count = self._most * (self._least / self._most) ** (rng.uniform() ** _TOWARDS_MANY)
-        size = _LEAST_SIZE * 2 ** (_OCTAVES * rng.uniform() ** _TOWARDS_LARGE)
+        count = self._most * (self._least / self._most) ** rng.uniform() ** 2
+        size = _LEAST_SIZE * 2 ** (_OCTAVES * rng.uniform())
         camera, window = self._pictures(size * size * count)
         budget = math.ceil(count)
         tolerance = select(self._scene, camera, budget=budget, cull=False, device="cpu").tolerance
@@ -140,7 +134,8 @@ class _Views:
         px, is_in = self._on_image(camera, some)
         px2 = _HOME_PX2 * count * max(is_in.mean(), 1 / _SAMPLED)
         sides = np.array([camera.width, camera.height], np.float64)
-        scale = max(math.sqrt(px2 / sides.prod()), _NARROWEST_PX / sides.min())
+        scale = min(math.sqrt(px2 / sides.prod()), _MOST_PX / sides.max())
+        scale = max(scale, _NARROWEST_PX / sides.min())
         K, whole_size = camera.K * np.array([[scale], [scale], [1.0]]), np.ceil(scale * sides)
         size = np.minimum(whole_size, _WIDEST_PX)
         middle = scale * px[np.argmax(is_in)] if is_in.any() else whole_size / 2

@@ -214,10 +214,11 @@ void bind_fit_level(py::module_& m) {
           "ball"_a, "stream"_a, "progress"_a,
           "Fits groups of gaussians, in place, to look like groups of the target inside their balls (G, 4). "
           "Returns the residuals (G, 2) in colour and alpha.");
-    m.def("refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "offset"_a, "radius"_a,
-          "views"_a, "progress"_a,
-          "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
-          "view, which is a camera and the clusters that it shows.");
+    m.def(
+        "refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "offset"_a, "radius"_a,
+        "views"_a, "progress"_a,
+        "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
+        "view, which is a camera and the clusters that it shows.");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
           "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
     m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,

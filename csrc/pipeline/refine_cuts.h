@@ -18,9 +18,10 @@ struct CutRows {
     Span<const float> radius;    // a length for each gaussian, which no scale outgrows
 };
 
-// Moves gaussians until pictures of cuts are those of the target: a step of Adam a view, of the gaussians that it
-// shows. The first `target_count` of them, level 0, are the target's, and stay. A group is fitted alone, seen from all sides at one size (fit_level.h); here it is seen as a cut
-// shows it: next to groups of its own level and of others, which hide parts of it, at the sizes of the views.
+// Moves gaussians until pictures of cuts are those of the target: a step of Adam a view, of the gaussians
+// that it shows. The first `target_count` of them, level 0, are the target's, and stay. A group is fitted
+// alone, seen from all sides at one size (fit_level.h); here it is seen as a cut shows it: next to groups of
+// its own level and of others, which hide parts of it, at the sizes of the views.
 //
 // The target's pictures are drawn config.supersample times as large, small ones twice that, and box-averaged.
 // The loss is that of the fit without D-SSIM; positions move in steps of a part of the radius. Of `config`,

@@ -48,9 +48,8 @@ void compare(const FitConfig& config, int samples, Canvas& picture, Canvas& targ
             loss_of_row[y] += loss_of_pixel(config.loss, color, alpha);
         }
     });
-    const float weight =
-        weight_of_picture(std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0),
-                          static_cast<double>(width * height));
+    const float weight = weight_of_picture(std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0),
+                                           static_cast<double>(width * height));
     for (size_t i = 0; i < 3 * width * height; ++i)
         picture.color()[i] = slope_of(picture.color()[i], config.loss.l1 / 3 * weight);
     for (size_t i = 0; i < width * height; ++i)

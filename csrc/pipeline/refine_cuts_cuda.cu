@@ -57,8 +57,7 @@ __global__ void difference_kernel(PicturePlanes picture, PicturePlanes target, P
         const size_t x = pixel % width, y = pixel / width;
         float* color = difference.color + 3 * pixel;
         for (size_t k = 0; k < 3; ++k)
-            color[k] =
-                picture.color[3 * pixel + k] - box_average(target.color, width, 3, k, x, y, samples);
+            color[k] = picture.color[3 * pixel + k] - box_average(target.color, width, 3, k, x, y, samples);
         const float alpha = picture.alpha[pixel] - box_average(target.alpha, width, 1, 0, x, y, samples);
         difference.alpha[pixel] = alpha;
         own = loss_of_pixel(loss, color, alpha);
@@ -109,8 +108,9 @@ __global__ void move_kernel(GaussianRows<float> rows, Span<const uint32_t> index
 // Writes the slope of the loss by each value of the picture.
 class Comparison {
   public:
-    const PicturePlanes& slopes(const FitConfig& config, int samples, const Camera& camera, const PicturePlanes& picture,
-                                const PicturePlanes& target, cudaStream_t stream) {
+    const PicturePlanes& slopes(const FitConfig& config, int samples, const Camera& camera,
+                                const PicturePlanes& picture, const PicturePlanes& target,
+                                cudaStream_t stream) {
         const auto width = static_cast<unsigned>(camera.width), height = static_cast<unsigned>(camera.height);
         const size_t num_pixels = size_t(width) * height;
         const unsigned num_blocks = blocks_for(num_pixels, kThreads);
@@ -162,9 +162,9 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
             rows_in(shown_values.reserve(num * count, stream), count, rows.sh_degree);
         const unsigned num_blocks = blocks_for(count, kGaussiansABlock);
         launch("gather_kernel", gather_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index, shown);
-        of_cut->draw(picture_of(shown, config.filter_px2, config.antialiased, camera,
-                                drawn.start(camera, stream)),
-                     stream);
+        of_cut->draw(
+            picture_of(shown, config.filter_px2, config.antialiased, camera, drawn.start(camera, stream)),
+            stream);
         const PicturePlanes& slopes =
             comparison.slopes(config, samples, camera, drawn.planes(), wanted.planes(), stream);
         const GaussianRows<float> gradient =

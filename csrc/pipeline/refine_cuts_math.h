@@ -2,6 +2,7 @@
 
 // Formulas of refine_cuts, for both of its halves.
 
+#include <cfloat>
 #include <vector>
 
 #include "fit_group/fit_group_math.h"
@@ -41,9 +42,9 @@ V3DG_HD inline float loss_of_pixel(const LossWeights& loss, const float color[3]
            loss.alpha * ::fabsf(alpha);
 }
 
-// A picture counts by how much of its loss is taken away, not by how large that is: else small pictures, which
-// levels are farther off in, would be made better at the cost of large ones. Below this loss a picture is
-// right, and counts by what is left.
+// A picture counts by how much of its loss is taken away, not by how large that is: else small pictures,
+// which levels are farther off in, would be made better at the cost of large ones. Below this loss a picture
+// is right, and counts by what is left.
 constexpr double kLeastLoss = 1e-4;
 V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
     return static_cast<float>(1 / (loss_sum + kLeastLoss * num_pixels));
@@ -66,6 +67,7 @@ V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
                                   const FitStep& step, float beta2, const Moments& moments) {
     size_t at = i;
     const auto moved = [&](float value, float slope, float size) {
+        if (!(::fabsf(slope) <= FLT_MAX)) slope = 0;  // would never be forgotten
         const float next = adam_step(value, slope, moments.m[at], moments.v[at], size, beta2,
                                      step.correction1, step.correction2);
         at += rows.size;
@@ -112,8 +114,8 @@ V3DG_HD inline size_t num_values(const GaussianRows<const float>& rows) {
     return 11 + static_cast<size_t>(rows.num_sh());
 }
 
-// `count` rows in one piece of memory, num_values() for each gaussian; what has to lie at a multiple of 16 bytes
-// comes first.
+// `count` rows in one piece of memory, num_values() for each gaussian; what has to lie at a multiple of 16
+// bytes comes first.
 V3DG_HD inline GaussianRows<float> rows_in(float* memory, size_t count, int sh_degree) {
     const size_t num_sh = 3 * static_cast<size_t>(num_sh_bases(sh_degree));
     float* rest = memory + (4 + num_sh) * count;
