@@ -41,6 +41,10 @@ def exported(write, **given):
 
 # Each function with arguments that are right; those that are numbers, or arrays of them, are tried.
 CALLS = {
+    "refine_bundle": (
+        lambda **numbers: v3dg.refine_bundle(BUNDLE, device="cpu", progress=False, **numbers),
+        {"steps": 1, "seed": 0},
+    ),
     "Camera": (v3dg.Camera, {"viewmat": EYE4, "K": EYE3, "width": 8, "height": 8, "near": 0.01}),
     "Camera.look_at": (
         v3dg.Camera.look_at,

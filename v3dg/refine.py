@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,7 +12,7 @@ import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check, check_type, whole
+from v3dg._numbers import check_type, whole
 from v3dg._progress import Bar, Progress
 from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
@@ -33,14 +32,12 @@ _MOST = 0.7  # of the asset's gaussians, in a cut
 _HOME_PX2 = BuildConfig().px2_per_gaussian
 _DISTANCE = 2.5  # of the cameras around an asset, in its radii
 _SHARE = 0.99  # of the gaussians that an asset's radius holds; the rest may float far away
-_SAMPLED = 256  # gaussians that tell which part of them is in a picture, and what a window shows
 
 
 def refine_bundle(
     bundle: Bundle,
     *,
     steps: int = 10_000,
-    cameras: Sequence[Camera] | None = None,
     seed: int = 0,
     device: str | Device = "auto",
     progress: Progress = True,
@@ -51,31 +48,30 @@ def refine_bundle(
     gaussians of all levels but the first, as many as there were, until pictures of cuts, in which they stand
     next to each other and hide each other, are those of the asset. Cuts have 0.7 of the asset's gaussians
     down to those of the last level, and pictures 0.18 to 8 times the size at which they are at home, 2 px² a
-    gaussian. docs/levels.md has what is gained. What no picture shows stays as it was.
+    gaussian, taken all around the asset: what is seen from inside alone, as a room is, stays as it was.
+    docs/levels.md has what is gained.
 
-    The same bundle, steps, cameras and seed give the same bits on the same kind of device.
+    The same bundle, steps and seed give the same bits on the same kind of device.
 
     Args:
         bundle: What `build_bundle` made; all of its gaussians are in memory meanwhile.
         steps: Pictures that cuts are compared with, one after another.
-        cameras: From where an asset is seen from inside, as those that photographed a room. By default it is
-            looked at from all around.
         seed: Of the pictures.
         device: Where to compute.
         progress: As for `build_bundle`.
 
     Raises:
-        ValueError: There are no steps or no cameras.
+        ValueError: There are no steps, or the seed is out of range.
         RuntimeError: The device is "cuda", and something is missing for it.
         KeyboardInterrupt: Ctrl-C; threads have stopped.
     """
     check_type("bundle", bundle, Bundle, "a Bundle")
     steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
-    check("cameras", cameras is None or len(cameras), "one or more, or None for all sides, got none")
+    seed = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1)
     where = _device.resolve(device)
     if bundle.num_levels < 2:
         return bundle
-    views = _Views(bundle, cameras, np.random.default_rng(seed))
+    views = _Views(bundle, np.random.default_rng(seed))
     chosen = [views.random() for _ in range(steps)]
     everything = bundle.gaussians
     gaussians = _device.place(everything.subset(np.arange(len(everything))), where)
@@ -102,10 +98,10 @@ def _config(filter_px2: float, steps: int, seed: int) -> _core.FitConfig:
 class _Views:
     """Pictures of a bundle's cuts."""
 
-    def __init__(self, bundle: Bundle, cameras: Sequence[Camera] | None, rng: np.random.Generator) -> None:
+    def __init__(self, bundle: Bundle, rng: np.random.Generator) -> None:
         asset = bundle.level_gaussians(0)
         self.num_leaves = len(asset)
-        self._scene, self._cameras, self._rng = Scene.of(bundle), cameras, rng
+        self._scene, self._rng = Scene.of(bundle), rng
         offset = bundle.clusters.offset
         self._most = _MOST * self.num_leaves
         self._least = float(offset[-1] - offset[bundle.level_range(bundle.num_levels - 1).start])
@@ -114,13 +110,12 @@ class _Views:
         distance = np.linalg.norm(self._means - self._center, axis=1)
         self._radius = float(np.quantile(distance, _SHARE)) or 1.0
         area = np.sort(asset.scales.astype(np.float64), axis=1)[:, 1:].prod(axis=1)
-        self._weight = np.cumsum(asset.opacities * np.sqrt(area))  # what is twice as large counts twice
+        self._weight = np.cumsum(asset.opacities * np.sqrt(area))
 
     def random(self) -> tuple[_core.Camera, npt.NDArray[np.int32]]:
         """A window of a picture, and the clusters of a cut that it shows."""
-        rng = self._rng
-        count = self._most * (self._least / self._most) ** rng.uniform() ** 2
-        size = _LEAST_SIZE * 2 ** (_OCTAVES * rng.uniform())
+        count = self._most * (self._least / self._most) ** self._rng.uniform() ** 2
+        size = _LEAST_SIZE * 2 ** (_OCTAVES * self._rng.uniform())
         camera, window = self._pictures(size * size * count)
         budget = math.ceil(count)
         tolerance = select(self._scene, camera, budget=budget, cull=False, device="cpu").tolerance
@@ -128,34 +123,16 @@ class _Views:
 
     def _pictures(self, count: float) -> tuple[Camera, Camera]:
         """A picture in which so many gaussians are at home, and a window of it."""
-        rng, given = self._rng, self._cameras
-        camera = self._around() if given is None else given[int(rng.integers(len(given)))]
-        some = np.searchsorted(self._weight, rng.uniform(high=self._weight[-1], size=_SAMPLED))
-        px, is_in = self._on_image(camera, some)
-        px2 = _HOME_PX2 * count * max(is_in.mean(), 1 / _SAMPLED)
-        sides = np.array([camera.width, camera.height], np.float64)
-        scale = min(math.sqrt(px2 / sides.prod()), _MOST_PX / sides.max())
-        scale = max(scale, _NARROWEST_PX / sides.min())
-        K, whole_size = camera.K * np.array([[scale], [scale], [1.0]]), np.ceil(scale * sides)
-        size = np.minimum(whole_size, _WIDEST_PX)
-        middle = scale * px[np.argmax(is_in)] if is_in.any() else whole_size / 2
-        K_window = K.copy()
-        K_window[:2, 2] -= np.clip(np.round(middle - size / 2), 0, whole_size - size)
-        kinds = ((K, whole_size), (K_window, size))
-        first, second = (Camera(camera.viewmat, k, int(s[0]), int(s[1]), camera.near) for k, s in kinds)
-        return first, second
-
-    def _around(self) -> Camera:
-        outwards, up = self._rng.normal(size=(2, 3))
+        rng = self._rng
+        outwards, up = rng.normal(size=(2, 3))
         eye = self._center + _DISTANCE * self._radius * outwards / np.linalg.norm(outwards)
-        fov, near = 2 * math.asin(1 / _DISTANCE), 0.01 * self._radius
-        return Camera.look_at(eye, self._center, up, fov, width=1024, height=1024, near=near)
-
-    def _on_image(
-        self, camera: Camera, which: npt.NDArray[np.int64]
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-        """Where gaussians are, (N, 2) px, and which of them are in the picture."""
-        seen = self._means[which] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        is_before = seen[:, 2:] > camera.near
-        px = (seen @ camera.K.T)[:, :2] / np.where(is_before, seen[:, 2:], 1)
-        return px, (is_before & (px >= 0) & (px < [camera.width, camera.height])).all(axis=1)
+        side = math.ceil(min(max(math.sqrt(_HOME_PX2 * count), _NARROWEST_PX), _MOST_PX))
+        near, fov = 0.01 * self._radius, 2 * math.asin(1 / _DISTANCE)
+        camera = Camera.look_at(eye, self._center, up, fov, width=side, height=side, near=near)
+        size = min(side, _WIDEST_PX)
+        # What is twice as large in the asset is seen twice as often.
+        shown = self._means[np.searchsorted(self._weight, rng.uniform(high=self._weight[-1]))]
+        seen = camera.K @ (camera.viewmat[:3, :3] @ shown + camera.viewmat[:3, 3])
+        K = camera.K.copy()
+        K[:2, 2] -= np.clip(np.round(seen[:2] / max(seen[2], near) - size / 2), 0, side - size)
+        return camera, replace(camera, K=K, width=size, height=size)
