@@ -253,7 +253,7 @@ def measure(config: Measure) -> None:
             subject = Subject(config.assets, name, about[name], config.views)
             rows = rows | by_key(study.rows(subject, judges))
             print(f"{name}: {len(subject.asset)} gaussians, {time.perf_counter() - start:.0f} s", flush=True)
-            result = {"settings": settings, "changes": changes, "builds": study.builds}
+            result: Row = {"settings": settings, "changes": changes, "builds": study.builds}
             result |= {"rows": list(rows.values())}
             record.write(config.output / "pairs.json", result, study.device)
     finally:

@@ -1,0 +1,97 @@
+"""Cuts of levels as they are built, and refined together.
+
+    python -m benchmarks.studies.refined --asset donut.ply --layout donutsea.json -o refined
+    python -m benchmarks.studies.refined --asset donut.ply --picture refined.png --device cpu
+
+With a layout of instances, FLIP, PSNR and SSIM of the same cuts from some of its cameras, to all gaussians at
+3 x 3 samples a pixel. With a picture, the asset, and a cut of 1/16 of its gaussians four times as large as it
+is at home, built and refined.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+import v3dg
+from benchmarks.evaluation import record
+from benchmarks.evaluation.assets import read_layout
+from benchmarks.studies.pairs import errors
+from v3dg import _device
+from v3dg._judges import Judges
+from v3dg.metrics import draw_truth
+from v3dg.pictures import Picture, contact_sheet, to_8bit, write_picture
+
+Row = dict[str, Any]
+_SAMPLES, _PART, _SIZE = 3, 16, 4
+
+
+@dataclass
+class Config:
+    asset: Path
+    layout: Path | None = None
+    cameras: tuple[int, ...] = (59, 45)
+    tolerances: tuple[float, ...] = (3.0, 9.4, 40.0)
+    steps: int = 10_000
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    picture: Path | None = None
+    output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+
+
+def pictures(config: Config, bundles: dict[str, v3dg.Bundle]) -> Iterator[tuple[Row, Picture, Picture]]:
+    for number in config.cameras:
+        truth = None
+        for name, bundle in bundles.items():
+            scene, cameras = read_layout(str(config.layout), bundle)
+            camera = list(cameras.values())[number]
+            if truth is None:
+                truth = draw_truth(scene, camera, config.device, _SAMPLES)
+            for tolerance in config.tolerances:
+                image = v3dg.render(scene, camera, tolerance=tolerance, device=config.device)
+                row = {"camera": number, "tolerance": tolerance, "levels": name}
+                yield row, truth, to_8bit(image.color)
+
+
+def sheet(config: Config, asset: v3dg.Gaussians, bundles: dict[str, v3dg.Bundle]) -> Picture:
+    """The asset, and its cuts."""
+    budget = len(asset) // _PART
+    side = _SIZE * math.ceil(math.sqrt(2 * budget))
+    center = np.median(asset.means, axis=0)
+    radius = float(np.quantile(np.linalg.norm(asset.means - center, axis=1), 0.99))
+    camera = v3dg.turntable(center, 2.5 * radius, 1, 0.7, width=side, height=side)[0]
+    row = [("all gaussians", draw_truth(asset, camera, config.device, 4))]
+    for name, bundle in bundles.items():
+        image = v3dg.render(bundle, camera, budget=budget, device=config.device)
+        row.append((f"{image.stats.gaussians_selected:,}, {name}", to_8bit(image.color)))
+    return contact_sheet([row])
+
+
+def main(config: Config) -> None:
+    asset = v3dg.read_asset(config.asset)
+    built = v3dg.build_bundle(asset, device=config.device, progress=False)
+    start = time.perf_counter()
+    refined = v3dg.refine_bundle(built, steps=config.steps, device=config.device, progress=False)
+    result: Row = {"steps": config.steps, "refine_seconds": round(time.perf_counter() - start, 1)}
+    bundles = {"built": built, "refined": refined}
+    if config.picture is not None:
+        write_picture(config.picture, sheet(config, asset, bundles))
+    if config.layout is not None:
+        judges = Judges()
+        try:
+            measured = judges.measured(pictures(config, bundles), errors)
+            result["rows"] = [row | found for (row, _, _), found in measured]
+        finally:
+            judges.close()
+    print(result)
+    record.write(config.output, result, "cuda" if _device.resolve(config.device).is_cuda else "cpu")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
