@@ -4,7 +4,7 @@
     python -m benchmarks.studies.refined --asset donut.ply --picture refined.png --device cpu
 
 With a layout of instances, FLIP, PSNR and SSIM of the same cuts from some of its cameras, to all gaussians at
-3 x 3 samples a pixel. With a picture, the asset, and a cut of 1/16 of its gaussians four times as large as it
+3 x 3 samples a pixel. With a picture, the asset, and a cut of a sixth of its gaussians three times as large as it
 is at home, built and refined.
 """
 
@@ -30,7 +30,7 @@ from v3dg.metrics import draw_truth
 from v3dg.pictures import Picture, contact_sheet, to_8bit, write_picture
 
 Row = dict[str, Any]
-_SAMPLES, _PART, _SIZE = 3, 16, 4
+_SAMPLES, _PART, _SIZE = 3, 6, 3
 
 
 @dataclass

@@ -53,8 +53,8 @@ class Build(_common.OnDevice):
     resume: _common.Flag = False
     """Continue after the last finished level; keep bundles of these gaussians and settings."""
     refine: Annotated[int, _common.option("STEPS")] = 0
-    """Refine all levels together, too, by so many pictures: 10000 take some minutes on a CPU, seconds on a
-    GPU, and the same gaussians look better at every size (docs/levels.md)."""
+    """Refine all levels together, too, by so many pictures: 10000 take minutes on a CPU, 12 to 20 s on a GPU,
+    and the same gaussians look better at nearly every size (docs/levels.md)."""
     memory: Annotated[str | None, _common.option("SIZE")] = None
     """Memory of the host for the build, as 8GiB; half of what is free if not given. An asset that does not
     fit is brought into order on the disk of the output."""
