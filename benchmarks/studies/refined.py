@@ -4,8 +4,8 @@
     python -m benchmarks.studies.refined --asset donut.ply --picture refined.png --device cpu
 
 With a layout of instances, FLIP, PSNR and SSIM of the same cuts from some of its cameras, to all gaussians at
-3 x 3 samples a pixel. With a picture, the asset, and a cut of a sixth of its gaussians three times as large as it
-is at home, built and refined.
+3 x 3 samples a pixel. With a picture, the asset, and a cut of a sixth of its gaussians three times as large
+as it is at home, built and refined.
 """
 
 from __future__ import annotations
