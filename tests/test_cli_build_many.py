@@ -55,22 +55,6 @@ def test_bundles_go_to_the_output_folder_and_are_those_of_single_builds(folder):
     assert (folder / "c.v3dg").read_bytes() == (folder / "new" / "out" / "c.v3dg").read_bytes()
 
 
-def test_levels_are_refined_where_that_is_asked_for(folder):
-    for steps in (0, 3):
-        done = run("build", "a.ply", *FAST, "--refine", steps, "--json", cwd=folder)
-        assert done.returncode == 0, done.stderr
-        refined = v3dg.Bundle.open(folder / "a.v3dg")
-        assert refined.config.get("refined") == ({"steps": steps, "seed": 0} if steps else None)
-        assert json.loads(done.stdout)["bytes"] == (folder / "a.v3dg").stat().st_size
-    fails(2, "--refine: expected 1 step or more", "build", "a.ply", "--refine", -1, cwd=folder)
-    fails(
-        2,
-        "--refine: expected 1 step or more, and no --resume",
-        *("build", "a.ply", "--resume", "--refine", 9),
-        cwd=folder,
-    )
-
-
 def test_resume_keeps_what_is_done_with_these_settings(folder):
     (folder / "b.ply").unlink()
 

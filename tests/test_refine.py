@@ -10,6 +10,7 @@ import pytest
 
 import v3dg
 from devices import host, on
+from random_bundle import random_bundle
 from v3dg import BuildConfig, _core
 from v3dg.build.fit import fit_config
 from v3dg.donut import make_donut
@@ -94,6 +95,14 @@ def test_a_bundle_without_levels_stays_as_it_is(device):
     )
     assert only.num_levels == 1
     assert refine_bundle(only, device=device) is only
+
+
+def test_a_bundle_whose_asset_is_empty_stays_as_it_is(device):
+    empty = random_bundle(0, num_levels=3)
+    gaussians = empty.gaussians.subset(slice(0, 0))
+    clusters = replace(empty.clusters, offset=np.zeros_like(empty.clusters.offset))
+    nothing = v3dg.Bundle(clusters, empty.groups, gaussians)
+    assert refine_bundle(nothing, device=device) is nothing
 
 
 def test_wrong_arguments_are_told(bundle):

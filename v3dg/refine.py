@@ -48,19 +48,20 @@ def refine_bundle(
     gaussians of all levels but the first, as many as there were, until pictures of cuts, in which they stand
     next to each other and hide each other, are those of the asset. Cuts have 0.7 of the asset's gaussians
     down to those of the last level, and pictures 0.18 to 8 times the size at which they are at home, 2 px² a
-    gaussian, taken all around the asset: what is seen from inside alone, as a room is, stays as it was.
-    docs/levels.md has what is gained.
+    gaussian. docs/levels.md has what is gained. Pictures are taken all around the asset: what is seen from
+    inside, as a room is, gets worse.
 
     The same bundle, steps and seed give the same bits on the same kind of device.
 
     Args:
-        bundle: What `build_bundle` made; all of its gaussians are in memory meanwhile.
+        bundle: What `build_bundle` made. About six times what its gaussians take is in memory meanwhile.
         steps: Pictures that cuts are compared with, one after another.
         seed: Of the pictures.
         device: Where to compute.
         progress: As for `build_bundle`.
 
     Raises:
+        TypeError: The bundle is none.
         ValueError: There are no steps, or the seed is out of range.
         RuntimeError: The device is "cuda", and something is missing for it.
         KeyboardInterrupt: Ctrl-C; threads have stopped.
@@ -69,19 +70,20 @@ def refine_bundle(
     steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
     seed = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1)
     where = _device.resolve(device)
-    if bundle.num_levels < 2:
+    num_leaves = len(bundle.level_gaussians(0)) if bundle.num_levels > 1 else 0
+    if num_leaves == 0:
         return bundle
-    views = _Views(bundle, np.random.default_rng(seed))
-    chosen = [views.random() for _ in range(steps)]
     everything = bundle.gaussians
     gaussians = _device.place(everything.subset(np.arange(len(everything))), where)
     clusters, balls = bundle.clusters, bundle.groups.ball
-    target = _core.FitTarget(gaussians.subset(slice(0, views.num_leaves)).rows, 0.0, False)
+    target = _core.FitTarget(gaussians.subset(slice(0, num_leaves)).rows, 0.0, False)
     radius = np.where(clusters.own_group < 0, np.float32(1), balls[clusters.own_group, 3])
     radius = np.repeat(radius, np.diff(clusters.offset))
     config = _config(float(clusters.filter_px2[-1]), steps, seed)
-    given = (config, target, gaussians.rows, clusters.offset, radius, chosen)
     with Bar(steps, "refine", progress) as bar:
+        views = _Views(bundle, np.random.default_rng(seed))
+        chosen = [views.random() for _ in range(steps)]
+        given = (config, target, gaussians.rows, clusters.offset, radius, chosen)
         refine = partial(_core.refine_cuts, *given)
         run_fit(refine, where, lambda state: bar.update(state.groups_done - bar.done))
     refined = gaussians.numpy()
@@ -96,14 +98,13 @@ def _config(filter_px2: float, steps: int, seed: int) -> _core.FitConfig:
 
 
 class _Views:
-    """Pictures of a bundle's cuts."""
+    """Pictures of a bundle's cuts, as they are before anything moves."""
 
     def __init__(self, bundle: Bundle, rng: np.random.Generator) -> None:
         asset = bundle.level_gaussians(0)
-        self.num_leaves = len(asset)
         self._scene, self._rng = Scene.of(bundle), rng
         offset = bundle.clusters.offset
-        self._most = _MOST * self.num_leaves
+        self._most = _MOST * len(asset)
         self._least = float(offset[-1] - offset[bundle.level_range(bundle.num_levels - 1).start])
         self._means = asset.means.astype(np.float64)
         self._center = np.median(self._means, axis=0)

@@ -107,6 +107,8 @@ void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, cons
     const CutRows levels{gaussians.write(), span_of<const int64_t>(offset, "offset", {-1}),
                          span_of<const float>(radius, "radius", {count})};
     const Span<const int64_t>& ends = levels.offset;
+    if (gaussians.size() > UINT32_MAX)
+        throw py::value_error("gaussians: expected fewer than 2^32, got " + std::to_string(gaussians.size()));
     if (ends.size == 0 || ends[0] != 0 || ends[ends.size - 1] != count ||
         !std::is_sorted(ends.begin(), ends.end()))
         throw py::value_error("offset: expected numbers from 0 up to that of the gaussians, got others");

@@ -23,10 +23,12 @@ struct CutRows {
 // alone, seen from all sides at one size (fit_level.h); here it is seen as a cut shows it: next to groups of
 // its own level and of others, which hide parts of it, at the sizes of the views.
 //
-// The target's pictures are drawn config.supersample times as large, small ones twice that, and box-averaged.
-// The loss is that of the fit without D-SSIM; positions move in steps of a part of the radius. Of `config`,
-// sizes and numbers of its own views are not looked at. The result does not depend on the number of threads.
-// Returns early once `progress.cancel` is set; `progress.groups_done` counts views.
+// Cuts are drawn with the filter of `config`, level 0 too, which shows without one: where pictures are small
+// that is a third of what cuts are off. The target's pictures are drawn config.supersample times as large,
+// small ones twice that, and box-averaged. The loss is that of the fit without D-SSIM; positions move in
+// steps of a part of the radius. Of `config`, sizes and numbers of its own views are not looked at. The
+// result does not depend on the number of threads. Returns early once `progress.cancel` is set;
+// `progress.groups_done` counts views.
 void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t target_count,
                  const CutRows& levels, Span<const CutView> views, FitProgress& progress);
 

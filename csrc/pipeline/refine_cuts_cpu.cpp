@@ -51,9 +51,9 @@ void compare(const FitConfig& config, int samples, Canvas& picture, Canvas& targ
     const float weight = weight_of_picture(std::accumulate(loss_of_row.begin(), loss_of_row.end(), 0.0),
                                            static_cast<double>(width * height));
     for (size_t i = 0; i < 3 * width * height; ++i)
-        picture.color()[i] = slope_of(picture.color()[i], config.loss.l1 / 3 * weight);
+        picture.color()[i] = l1_vjp(picture.color()[i], config.loss.l1 / 3 * weight);
     for (size_t i = 0; i < width * height; ++i)
-        picture.alpha()[i] = slope_of(picture.alpha()[i], config.loss.alpha * weight);
+        picture.alpha()[i] = l1_vjp(picture.alpha()[i], config.loss.alpha * weight);
 }
 
 }  // namespace

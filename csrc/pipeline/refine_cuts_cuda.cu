@@ -87,8 +87,8 @@ __global__ void slope_kernel(PicturePlanes difference, size_t num_pixels, LossWe
     const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
     if (pixel >= num_pixels) return;
     float* color = difference.color + 3 * pixel;
-    for (int k = 0; k < 3; ++k) color[k] = slope_of(color[k], loss.l1 / 3 * *weight);
-    difference.alpha[pixel] = slope_of(difference.alpha[pixel], loss.alpha * *weight);
+    for (int k = 0; k < 3; ++k) color[k] = l1_vjp(color[k], loss.l1 / 3 * *weight);
+    difference.alpha[pixel] = l1_vjp(difference.alpha[pixel], loss.alpha * *weight);
 }
 
 // A thread a gaussian of the view, which `index` places among all.

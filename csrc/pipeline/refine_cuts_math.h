@@ -50,18 +50,13 @@ V3DG_HD inline float weight_of_picture(double loss_sum, double num_pixels) {
     return static_cast<float>(1 / (loss_sum + kLeastLoss * num_pixels));
 }
 
-// Slope of the loss by a value of the picture.
-V3DG_HD inline float slope_of(float difference, float weight) {
-    return difference > 0 ? weight : difference < 0 ? -weight : 0.0f;
-}
-
 // What Adam keeps of value k of gaussian i of n, at k * n + i.
 struct Moments {
     float *m, *v;
 };
 
 // A step of gaussian i, of which `gradient` has row g: position in parts of `radius`, scales by their
-// logarithm, opacity by its logit, each in the range that a fit keeps it in.
+// logarithm and opacity by its logit, both in the range that a fit keeps them in.
 V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
                                   const GaussianRows<const float>& gradient, size_t g, float radius,
                                   const FitStep& step, float beta2, const Moments& moments) {

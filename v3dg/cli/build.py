@@ -18,12 +18,10 @@ import tyro
 from v3dg import _extras
 from v3dg._numbers import check
 from v3dg.build import BuildConfig, build_file, levels_path
-from v3dg.bundle import Bundle
 from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
 from v3dg.io import SUFFIXES
-from v3dg.refine import refine_bundle
 
 _PATIENCE_S = 20  # for a scheduler's answer
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
@@ -52,9 +50,6 @@ class Build(_common.OnDevice):
     """Refuse an asset with wrong values, instead of leaving out the gaussians that have them."""
     resume: _common.Flag = False
     """Continue after the last finished level; keep bundles of these gaussians and settings."""
-    refine: Annotated[int, _common.option("STEPS")] = 0
-    """Refine all levels together, too, by so many pictures: 10000 take minutes on a CPU, 12 to 20 s on a GPU,
-    and the same gaussians look better at nearly every size (docs/levels.md)."""
     memory: Annotated[str | None, _common.option("SIZE")] = None
     """Memory of the host for the build, as 8GiB; half of what is free if not given. An asset that does not
     fit is brought into order on the disk of the output."""
@@ -66,9 +61,6 @@ class Build(_common.OnDevice):
 def run(options: Build) -> None:
     expected = "one or more assets, or a folder of them, got nothing; run v3dg build --help"
     _common.check_usage("PATH", options.assets, expected)
-    goes = options.refine == 0 or (options.refine > 0 and not options.resume)
-    expected = f"1 step or more, and no --resume, which would begin anew, got {options.refine}"
-    _common.check_usage("--refine", goes, expected)
     is_one = options.output is not None and options.output.suffix == ".v3dg"
     with _executor_at(options.scheduler) as executor:
         if is_one or (len(options.assets) == 1 and not options.assets[0].is_dir()):
@@ -204,10 +196,6 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
                 memory=options.memory,
                 executor=executor,
             )
-        if options.refine:
-            look: dict[str, Any] = {"device": options.device, "progress": not options.quiet}
-            refine_bundle(bundle, steps=options.refine, seed=options.seed, **look).write(output)
-            bundle = Bundle.open(output)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{to_resume()}") from None
     except OSError as error:  # a full disk, say
