@@ -89,13 +89,16 @@ def _inside(node: Node) -> PurePosixPath:
 def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[range]]:
     """For each file, the runs of gaussians that are the finest level of a leaf."""
     found: dict[PurePosixPath, list[range]] = {}
-    todo = [tree]
+    todo = [iter([tree])]  # not a list of nodes: a million empty ones would take as much as a scene
     while todo:
-        node = todo.pop()
+        node = next(todo[-1], None)
+        if node is None:
+            todo.pop()
+            continue
         if not isinstance(node.value, dict):
             raise node.error("an object")
         if node.has("children"):
-            todo += reversed(list(node.field("children").items()))
+            todo.append(node.field("children").items())
         if not node.has("lods"):
             continue
         levels = node.field("lods")
