@@ -28,7 +28,12 @@ class BoundTarget {
 
     Device device() const { return rows_.device(); }
     size_t size() const { return rows_.size(); }
-    int sh_degree() const { return rows_.sh_degree(); }
+    // Throws unless the gaussians can be fitted to it.
+    void check_alike(const Rows& gaussians) const {
+        if (gaussians.device() != device() || gaussians.sh_degree() != rows_.sh_degree())
+            throw py::value_error(
+                "gaussians: expected the device and the SH degree of the target, got others");
+    }
     FitTarget on_host() const { return {&model_->planes(), filter_px2_, antialiased_}; }
     cuda::DeviceFitTarget on_device() const { return {rows_.read<float>(), filter_px2_, antialiased_}; }
 
@@ -72,8 +77,7 @@ std::vector<FitGroup> groups_of(const py::array& target_range, const py::array& 
 py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, const py::array& target_range,
                             const Rows& gaussians, const py::array& range, const py::array& ball,
                             const py::array& stream, FitProgress& progress) {
-    if (gaussians.device() != target.device() || gaussians.sh_degree() != target.sh_degree())
-        throw py::value_error("gaussians: expected the device and the SH degree of the target, got others");
+    target.check_alike(gaussians);
     const std::vector<FitGroup> groups =
         groups_of(target_range, range, ball, stream, target.size(), gaussians.size());
     for (const FitGroup& group : groups) check_size(config, group);
@@ -101,8 +105,7 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, 
 void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, const Rows& gaussians,
                         const py::array& offset, const py::array& radius,
                         const std::vector<std::pair<BoundCamera, py::array>>& views, FitProgress& progress) {
-    if (gaussians.device() != target.device() || gaussians.sh_degree() != target.sh_degree())
-        throw py::value_error("gaussians: expected the device and the SH degree of the target, got others");
+    target.check_alike(gaussians);
     const auto count = static_cast<py::ssize_t>(gaussians.size());
     const CutRows levels{gaussians.write(), span_of<const int64_t>(offset, "offset", {-1}),
                          span_of<const float>(radius, "radius", {count})};
