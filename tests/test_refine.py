@@ -14,8 +14,9 @@ from random_bundle import random_bundle
 from v3dg import BuildConfig, _core
 from v3dg.build.fit import fit_config
 from v3dg.donut import make_donut
-from v3dg.metrics import draw_truth
-from v3dg.refine import _Views, refine_bundle
+from v3dg.metrics import box_downsample, draw_truth
+from v3dg.refine import _pictures, refine_bundle
+from v3dg.residency import residency
 
 SIZES = ("step_position", "step_quat", "step_log_scale", "step_logit", "step_sh0", "step_sh_rest")
 
@@ -110,6 +111,8 @@ def test_wrong_arguments_are_told(bundle):
         refine_bundle(bundle, steps=0)
     with pytest.raises(TypeError, match="bundle: expected a Bundle, got Gaussians"):
         refine_bundle(make_donut(1000))
+    with pytest.raises(TypeError, match=r"cameras\[1\]: expected a Camera, got str"):
+        refine_bundle(bundle, cameras=[v3dg.turntable((0, 0, 0), 3.0, 1)[0], "front"])
 
 
 def test_what_a_progress_function_raises_ends_it(bundle):
@@ -120,31 +123,98 @@ def test_what_a_progress_function_raises_ends_it(bundle):
         refine_bundle(bundle, steps=300, device="cpu", progress=stop)
 
 
-def test_pictures_are_of_all_sizes(bundle):
-    views = _Views(bundle, np.random.default_rng(0))
-    for count in (10, 1000, 100_000, 1e12):
-        for _ in range(20):
-            picture, window = views._pictures(count)
-            assert 8 <= picture.width == picture.height <= 1 << 15
-            assert window.width == window.height == min(picture.width, 256)
-            corner = picture.K[:2, 2] - window.K[:2, 2]
-            assert (corner >= 0).all()
-            assert (corner + window.width <= picture.width).all()
-    counts = [len(views.random()[1]) for _ in range(50)]
+def pictures_of(bundle, cameras=()):
+    return _pictures(bundle, bundle.level_gaussians(0), cameras, 0)
+
+
+def place_of(view):
+    """Where a window's camera is, and its size."""
+    camera, clusters, samples = view
+    return tuple(camera.position), camera.width, camera.height
+
+
+def test_pictures_are_of_all_sizes_from_all_around(bundle):
+    pictures = pictures_of(bundle)
+    views = [pictures.view(number) for number in range(200)]
+    asset = bundle.level_gaussians(0)
+    center = np.median(asset.means, axis=0)
+    outwards = np.array([camera.position for camera, _, _ in views]) - center
+    distance = np.linalg.norm(outwards, axis=1)
+    np.testing.assert_allclose(distance, distance[0], rtol=1e-6)
+    assert np.abs((outwards / distance[:, None]).mean(axis=0)).max() < 0.2
+    widths = np.array([camera.width for camera, _, _ in views])
+    assert widths.min() == 8
+    assert 256 < widths.max() <= 512
+    assert {samples for _, _, samples in views} == {2, 3, 8}
+    assert all(camera.width == camera.height for camera, _, _ in views)
+    counts = [len(clusters) for _, clusters, _ in views]
     assert min(counts) < 3
     assert max(counts) > 10
 
 
-def arguments(bundle, device, config, clusters, camera):
+def test_a_picture_follows_from_its_number(bundle):
+    first, again = pictures_of(bundle), pictures_of(bundle)
+    for number in (0, 7, 1 << 40):
+        one, other = first.view(number), again.view(number)
+        assert place_of(one) == place_of(other)
+        np.testing.assert_array_equal(one[1], other[1])
+    assert place_of(first.view(0)) != place_of(first.view(1))
+
+
+def test_what_a_window_shows_is_the_cut_of_its_picture(bundle):
+    """Each path has one of its clusters at most, and what is left out is outside."""
+    pictures, parent = pictures_of(bundle), bundle.clusters.parent_group
+    made = bundle.clusters.own_group
+    for number in range(50):
+        _, clusters, _ = pictures.view(number)
+        below = set(made[clusters]) - {-1}
+        above = set(parent[clusters]) - {-1}
+        assert not below & above
+
+
+def test_pictures_from_cameras_are_taken_there(bundle):
+    cameras = v3dg.turntable((0, 0, 0), 3.0, 3, width=640, height=360)
+    known = {tuple(camera.core.position) for camera in cameras}
+    views = [pictures_of(bundle, cameras).view(number) for number in range(100)]
+    assert {tuple(camera.position) for camera, _, _ in views} == known
+    whole = [camera for camera, _, _ in views if camera.width < 256]
+    assert len(whole) > 10
+    for camera in whole:
+        assert abs(camera.height - camera.width * 9 / 16) <= 1
+
+
+def test_a_camera_that_sees_nothing_changes_nothing(bundle, device):
+    away = v3dg.Camera.look_at((0, 0, 5), (0, 0, 9), (0, 1, 0), width=64, height=64)
+    refined = refine_bundle(bundle, cameras=[away], steps=3, device=device, progress=False)
+    for name, values in vars(bundle.gaussians).items():
+        np.testing.assert_array_equal(values, getattr(refined.gaussians, name))
+    assert refined.config["refined"] == {"steps": 3, "seed": 0, "cameras": 1}
+
+
+def test_cuts_from_a_camera_come_closer_to_the_asset(bundle, device):
+    """By more than they do from all around, in as many steps."""
+    camera = v3dg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), width=96, height=96)
+    truth = draw_truth(bundle.level_gaussians(0), camera, "cpu", 4).astype(np.float32) / 255
+
+    def error(refined):
+        budgets = (1200, 300, 80)
+        drawn = [v3dg.render(refined, camera, budget=b, device=device).color for b in budgets]
+        return np.mean([np.abs(host(picture) - truth).mean() for picture in drawn])
+
+    around = refine_bundle(bundle, steps=150, device=device, progress=False)
+    there = refine_bundle(bundle, cameras=[camera], steps=150, device=device, progress=False)
+    assert error(there) < error(around) < error(bundle)
+
+
+def arguments(bundle, device, config, pictures):
     gaussians = on(device, bundle.gaussians.subset(np.arange(bundle.num_gaussians)))
     leaves = gaussians.subset(slice(0, len(bundle.level_gaussians(0))))
     given = {
         "config": fit_config(config, 0, 1),
         "target": _core.FitTarget(leaves.rows, 0.0, False),
         "gaussians": gaussians.rows,
-        "offset": bundle.clusters.offset,
         "radius": np.full(bundle.num_gaussians, 2.0, np.float32),
-        "views": [(camera.core, np.asarray(clusters, np.int32))],
+        "pictures": pictures,
         "progress": _core.FitProgress(),
     }
     return gaussians, given
@@ -154,63 +224,88 @@ def test_a_step_goes_down_the_slope_of_the_loss(bundle, device):
     """The first step of Adam has the size of the step and the sign of the slope, whatever that is."""
     torch = pytest.importorskip("torch")
     sizes = dict(zip(SIZES, (1e-4, 2e-4, 3e-4, 4e-4, 5e-4, 6e-4), strict=True))
-    config = replace(BuildConfig(), steps=1, first_steps=1, supersample=1, filter_px2=0.1, **sizes)
+    config = replace(BuildConfig(), steps=1, first_steps=1, filter_px2=0.1, **sizes)
     camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=160, height=160)[0]
-    clusters = bundle.level_range(2)
-    gaussians, given = arguments(bundle, device, config, clusters, camera)
+    pictures = pictures_of(bundle, [camera])
+    window, clusters, samples = pictures.view(0)
+    gaussians, given = arguments(bundle, device, config, pictures)
     _core.refine_cuts(**given)
     moved = host(gaussians)
 
     offset = bundle.clusters.offset
-    rows = slice(int(offset[clusters.start]), int(offset[clusters.stop]))
+    rows = np.concatenate([np.arange(offset[c], offset[c + 1]) for c in clusters])
     start = bundle.gaussians.subset(rows)
+    shown = replace(camera, K=window.K, width=window.width, height=window.height)
     tensors = [torch.tensor(a.astype(np.float64), requires_grad=True) for a in vars(start).values()]
-    drawn = v3dg.rasterize(v3dg.Gaussians(*tensors), camera, filter_px2=0.1, antialiased=True)
-    leaves = v3dg.Gaussians(
-        *(torch.tensor(a.astype(np.float64)) for a in vars(bundle.level_gaussians(0)).values())
-    )
-    wanted = v3dg.rasterize(leaves, camera)
-    loss = (drawn.color - wanted.color).abs().mean() + 0.5 * (drawn.alpha - wanted.alpha).abs().mean()
+    drawn = v3dg.rasterize(v3dg.Gaussians(*tensors), shown, filter_px2=0.1, antialiased=True)
+    leaves = bundle.level_gaussians(0)
+    larger = v3dg.rasterize(leaves, shown.scaled(samples))
+    wanted = [torch.tensor(box_downsample(a, samples).astype(np.float64)) for a in (larger.color, larger.alpha)]
+    loss = (drawn.color - wanted[0]).abs().mean() + 0.5 * (drawn.alpha - wanted[1]).abs().mean()
     loss.backward()
     slopes = dict(zip(vars(start), (t.grad.numpy() for t in tensors), strict=True))
     is_faint = start.opacities < 0.99  # beyond, the logit of a float has few digits
+    is_level_0 = rows < len(leaves)
 
     def logit(gaussians):
         opacities = gaussians.opacities[is_faint].astype(np.float64)
         return np.log(opacities / (1 - opacities))
 
-    moved = moved.subset(rows)
-    slopes["opacities"] = slopes["opacities"][is_faint]
+    after = moved.subset(rows)
     steps = {
-        "means": (moved.means - start.means, 2.0 * sizes["step_position"]),
-        "scales": (np.log(moved.scales / start.scales), sizes["step_log_scale"]),
-        "opacities": (logit(moved) - logit(start), sizes["step_logit"]),
-        "sh": (moved.sh - start.sh, sizes["step_sh0"]),
+        "means": (after.means - start.means, 2.0 * sizes["step_position"]),
+        "scales": (np.log(after.scales / start.scales), sizes["step_log_scale"]),
+        "opacities": (logit(after) - logit(start), sizes["step_logit"]),
+        "sh": (after.sh - start.sh, sizes["step_sh0"]),
     }
     for name, (step, size) in steps.items():
-        slope = slopes[name]
+        slope, moves = slopes[name], ~is_level_0
+        if name == "opacities":
+            slope, moves = slope[is_faint], moves[is_faint]
         if name == "sh":
             step, slope = step[:, 0], slope[:, 0]
+        step, slope = step[moves], slope[moves]
         is_steep = np.abs(slope) > 0.05 * np.abs(slope).max()
         assert is_steep.sum() > 20
         np.testing.assert_allclose(step[is_steep], -size * np.sign(slope[is_steep]), rtol=0.05, err_msg=name)
     others = np.ones(bundle.num_gaussians, bool)
-    others[rows] = False
+    others[rows[~is_level_0]] = False
     for name, values in vars(bundle.gaussians).items():
-        np.testing.assert_array_equal(getattr(host(gaussians), name)[others], values[others])
+        np.testing.assert_array_equal(getattr(moved, name)[others], values[others])
 
 
 def test_the_core_refuses_what_does_not_fit(bundle, device):
-    camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=16, height=16)[0]
-    _, given = arguments(bundle, device, BuildConfig(steps=1), [0], camera)
+    _, given = arguments(bundle, device, BuildConfig(steps=1), pictures_of(bundle))
     count = bundle.num_gaussians
     wrong = {
-        "offset: expected numbers from 0": {"offset": bundle.clusters.offset[:-1]},
         "radius: expected positive": {"radius": np.zeros(count, np.float32)},
         "radius: expected": {"radius": np.ones(count - 1, np.float32)},
-        "clusters: expected numbers of clusters, got -1": {"views": [(camera.core, np.int32([-1]))]},
-        f"got {len(bundle.clusters)}": {"views": [(camera.core, np.int32([len(bundle.clusters)]))]},
+        f"gaussians: expected {count}, which the table has, got {count - 1}": {
+            "gaussians": on(device, bundle.gaussians.subset(np.arange(count - 1))).rows,
+            "radius": np.ones(count - 1, np.float32),
+        },
     }
     for message, change in wrong.items():
         with pytest.raises(ValueError, match=message):
             _core.refine_cuts(**(given | change))
+
+
+def test_pictures_are_refused_of_nothing(bundle):
+    given = {
+        "table": residency.table(bundle),
+        "counts": (10.0, 5.0),
+        "means": np.zeros((2, 3), np.float32),
+        "weight": np.arange(1.0, 3.0),
+        "ball": (0.0, 0.0, 0.0, 1.0),
+        "cameras": [],
+        "seed": 0,
+    }
+    _core.CutPictures(**given).view(0)
+    wrong = {
+        "counts: expected the most and the least": {"counts": (5.0, 10.0)},
+        "weight, ball: expected gaussians": {"ball": (0.0, 0.0, 0.0, 0.0)},
+        "means: expected shape": {"means": np.zeros((3, 3), np.float32)},
+    }
+    for message, change in wrong.items():
+        with pytest.raises(ValueError, match=message):
+            _core.CutPictures(**(given | change))

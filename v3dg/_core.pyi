@@ -32,6 +32,12 @@ class Camera:
     def window(self, x0: int, y0: int, x1: int, y1: int) -> Camera: ...
     @property
     def position(self) -> Float64: ...
+    @property
+    def K(self) -> Float64: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
 
 class Eyes:
     """Two cameras that look the same way and share a cut; or a camera."""
@@ -525,6 +531,20 @@ class FitProgress:
     def loss_sum(self) -> float: ...
     def cancel(self) -> None: ...
 
+class CutPictures:
+    def __init__(
+        self,
+        *,
+        table: ClusterTable,
+        counts: tuple[float, float],
+        means: Float32,
+        weight: Float64,
+        ball: tuple[float, float, float, float],
+        cameras: Sequence[Camera],
+        seed: int,
+    ) -> None: ...
+    def view(self, number: int) -> tuple[Camera, Int32, int]: ...
+
 class FitTarget:
     """The gaussians that groups should look like."""
 
@@ -547,9 +567,8 @@ def refine_cuts(
     config: FitConfig,
     target: FitTarget,
     gaussians: Rows,
-    offset: Int64,
     radius: Float32,
-    views: Sequence[tuple[Camera, Int32]],
+    pictures: CutPictures,
     progress: FitProgress,
 ) -> None: ...
 def ssim(picture: Float32 | Float64, target: Float32 | Float64) -> float: ...

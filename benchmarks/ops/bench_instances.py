@@ -51,6 +51,8 @@ class Config:
     crops: int = 4
     """Crops of a field, each of 64 x 36 px, on which it is compared with all of its gaussians."""
     repeats: int = 11
+    refine: int = 0
+    """Steps by which the levels are refined together, too."""
     gsplat: bool = True
     output: str | None = None
 
@@ -60,7 +62,9 @@ def main(config: Config) -> None:
     with gpu.PeakMemory():  # takes note of an idle process
         torch.zeros(1, device=gpu.DEVICE)
     bundle = build_bundle(asset, progress=False, device=gpu.DEVICE)
-    result: dict[str, Any] = {"repeats": config.repeats}
+    result: dict[str, Any] = {"repeats": config.repeats, "refine": config.refine}
+    if config.refine > 0:
+        bundle = v3dg.refine_bundle(bundle, steps=config.refine, device=gpu.DEVICE, progress=False)
     judge = Judge()
     if config.layout is not None:
         scene, cameras = read_layout(config.layout, bundle)

@@ -2,14 +2,18 @@
 
     python -m benchmarks.studies.refined --asset donut.ply --layout donutsea.json -o refined
     python -m benchmarks.studies.refined --asset donut.ply --picture refined.png --device cpu
+    python -m benchmarks.studies.refined --asset room.ply --eyes transforms.json -o refined
 
 With a layout of instances, FLIP, PSNR and SSIM of the same cuts from some of its cameras, to all gaussians at
 3 x 3 samples a pixel. With a picture, the asset, and a cut of a sixth of its gaussians three times as large
-as it is at home, built and refined.
+as it is at home, built and refined. With eyes, cameras in a scene: errors of cuts of some shares of the
+gaussians in the frustum from these eyes, built, refined from all around, and refined from other cameras that
+stand beside them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Iterator
@@ -23,7 +27,9 @@ import tyro
 import v3dg
 from benchmarks.evaluation import record
 from benchmarks.evaluation.assets import read_layout
+from benchmarks.studies import unseen
 from benchmarks.studies.pairs import errors
+from benchmarks.studies.unseen import others_of
 from v3dg import _device
 from v3dg._judges import Judges
 from v3dg.metrics import draw_truth
@@ -39,8 +45,10 @@ class Config:
     layout: Path | None = None
     cameras: tuple[int, ...] = (59, 45)
     tolerances: tuple[float, ...] = (3.0, 9.4, 40.0)
-    steps: int = 10_000
+    steps: int = 30_000
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    eyes: Path | None = None
+    shares: tuple[float, ...] = (0.9, 0.7, 0.5, 0.3)
     picture: Path | None = None
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
 
@@ -57,6 +65,23 @@ def pictures(config: Config, bundles: dict[str, v3dg.Bundle]) -> Iterator[tuple[
                 image = v3dg.render(scene, camera, tolerance=tolerance, device=config.device)
                 row = {"camera": number, "tolerance": tolerance, "levels": name}
                 yield row, truth, to_8bit(image.color)
+
+
+def seen_from(
+    config: Config, bundles: dict[str, v3dg.Bundle], eyes: list[v3dg.Camera]
+) -> Iterator[tuple[Row, Picture, Picture]]:
+    """Cuts from eyes in a scene."""
+    for number, camera in enumerate(eyes):
+        truth = draw_truth(bundles["built"], camera, config.device, _SAMPLES)
+        everything = v3dg.select(bundles["built"], camera, tolerance=0, device="cpu").num_gaussians
+        for share in (1.0, *config.shares):
+            for name, bundle in bundles.items():
+                budget = {"budget": round(share * everything)} if share < 1 else {"tolerance": 0.0}
+                try:
+                    image = v3dg.render(bundle, camera, device=config.device, **budget)
+                except ValueError:  # the eye is inside of groups, of which too much is left
+                    continue
+                yield {"eye": number, "share": share, "levels": name}, truth, to_8bit(image.color)
 
 
 def sheet(config: Config, asset: v3dg.Gaussians, bundles: dict[str, v3dg.Bundle]) -> Picture:
@@ -80,15 +105,16 @@ def main(config: Config) -> None:
     refined = v3dg.refine_bundle(built, steps=config.steps, device=config.device, progress=False)
     result: Row = {"steps": config.steps, "refine_seconds": round(time.perf_counter() - start, 1)}
     bundles = {"built": built, "refined": refined}
+    eyes = [] if config.eyes is None else list(v3dg.read_cameras(config.eyes).values())
+    if eyes:
+        beside = others_of(unseen.Config(config.asset, others=96, turn=0.5, width=eyes[0].width), eyes)
+        how: Row = {"steps": config.steps, "device": config.device, "progress": False}
+        bundles["refined from beside"] = v3dg.refine_bundle(built, cameras=beside, **how)
     if config.picture is not None:
         write_picture(config.picture, sheet(config, asset, bundles))
-    if config.layout is not None:
-        judges = Judges()
-        try:
-            measured = judges.measured(pictures(config, bundles), errors)
-            result["rows"] = [row | found for (row, _, _), found in measured]
-        finally:
-            judges.close()
+    shown = pictures(config, bundles) if config.layout is not None else seen_from(config, bundles, eyes)
+    with contextlib.closing(Judges()) as judges:
+        result["rows"] = [row | found for (row, _, _), found in judges.measured(shown, errors)]
     print(result)
     record.write(config.output, result, "cuda" if _device.resolve(config.device).is_cuda else "cpu")
 

@@ -2,6 +2,7 @@
 #include <memory>
 
 #include "bindings/operations.h"
+#include "bindings/tables.h"
 #include "bindings/types.h"
 #include "fit_group/dssim.h"
 #include "fit_group/ssim.h"
@@ -102,39 +103,69 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, 
     return error.object;
 }
 
+// Pictures of cuts, with the arrays that they borrow from.
+class BoundPictures {
+  public:
+    BoundPictures(const BoundTable& table, std::pair<double, double> counts, const py::array& means,
+                  const py::array& weight, const std::array<double, 4>& ball,
+                  const std::vector<BoundCamera>& cameras, uint64_t seed)
+        : arrays_{means, weight} {
+        for (const BoundCamera& camera : cameras) cameras_.push_back(camera.camera);
+        const Span<const double> weights = span_of<const double>(weight, "weight", {-1});
+        const auto num_targets = static_cast<py::ssize_t>(weights.size);
+        if (!(counts.first >= counts.second && counts.second >= 1))
+            throw py::value_error("counts: expected the most and the least gaussians, 1 or more, got others");
+        if (num_targets == 0 || !(ball[3] > 0))
+            throw py::value_error("weight, ball: expected gaussians and a positive radius, got none");
+        pictures_ = std::make_unique<CutPictures>(
+            CutPictures{table.table(),
+                        counts.first,
+                        counts.second,
+                        span_of<const float>(means, "means", {num_targets, 3}),
+                        weights,
+                        {ball[0], ball[1], ball[2]},
+                        ball[3],
+                        {cameras_.data(), cameras_.size()},
+                        seed});
+    }
+
+    const CutPictures& pictures() const { return *pictures_; }
+    py::tuple view(uint64_t number) const {
+        const CutView view = cut_view(*pictures_, number);
+        const auto count = static_cast<py::ssize_t>(view.clusters.size());
+        return py::make_tuple(BoundCamera{{}, view.camera}, py::array_t<int32_t>(count, view.clusters.data()),
+                              view.samples);
+    }
+
+  private:
+    py::array arrays_[2];
+    std::vector<Camera> cameras_;
+    std::unique_ptr<CutPictures> pictures_;
+};
+
 void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, const Rows& gaussians,
-                        const py::array& offset, const py::array& radius,
-                        const std::vector<std::pair<BoundCamera, py::array>>& views, FitProgress& progress) {
+                        const py::array& radius, const BoundPictures& pictures, FitProgress& progress) {
     target.check_alike(gaussians);
     const auto count = static_cast<py::ssize_t>(gaussians.size());
-    const CutRows levels{gaussians.write(), span_of<const int64_t>(offset, "offset", {-1}),
-                         span_of<const float>(radius, "radius", {count})};
-    const Span<const int64_t>& ends = levels.offset;
+    const CutRows levels{gaussians.write(), span_of<const float>(radius, "radius", {count})};
     if (gaussians.size() > UINT32_MAX)
         throw py::value_error("gaussians: expected fewer than 2^32, got " + std::to_string(gaussians.size()));
-    if (ends.size == 0 || ends[0] != 0 || ends[ends.size - 1] != count ||
-        !std::is_sorted(ends.begin(), ends.end()))
-        throw py::value_error("offset: expected numbers from 0 up to that of the gaussians, got others");
+    const Span<const int64_t>& offset = pictures.pictures().table.offset;
+    if (offset[offset.size - 1] != count)
+        throw py::value_error("gaussians: expected " + std::to_string(offset[offset.size - 1]) +
+                              ", which the table has, got " + std::to_string(count));
     if (!std::all_of(levels.radius.begin(), levels.radius.end(), [](float r) { return r > 0; }))
         throw py::value_error("radius: expected positive numbers, got one that is not");
-    std::vector<CutView> all;
-    for (const auto& [camera, clusters] : views) {
-        all.push_back({camera.camera, span_of<const int32_t>(clusters, "clusters", {-1})});
-        for (const int32_t c : all.back().clusters)
-            if (c < 0 || static_cast<size_t>(c) + 1 >= ends.size)
-                throw py::value_error("clusters: expected numbers of clusters, got " + std::to_string(c));
-    }
-    const Span<const CutView> seen{all.data(), all.size()};
     const Work work(gaussians.device());
     if constexpr (V3DG_WITH_CUDA != 0)
         if (!work.device().is_host()) {
             const cuda::DeviceFitTarget on_device = target.on_device();
             const py::gil_scoped_release unlocked;
-            cuda::refine_cuts(config, on_device, levels, seen, progress, work.stream());
+            cuda::refine_cuts(config, on_device, levels, pictures.pictures(), progress, work.stream());
             return;
         }
     const py::gil_scoped_release unlocked;
-    refine_cuts(config, target.on_host(), target.size(), levels, seen, progress);
+    refine_cuts(config, target.on_host(), target.size(), levels, pictures.pictures(), progress);
 }
 
 FitConfig make_config(int steps, int views_per_step, int num_views, int supersample, int image_size,
@@ -219,11 +250,20 @@ void bind_fit_level(py::module_& m) {
           "ball"_a, "stream"_a, "progress"_a,
           "Fits groups of gaussians, in place, to look like groups of the target inside their balls (G, 4). "
           "Returns the residuals (G, 2) in colour and alpha.");
-    m.def(
-        "refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "offset"_a, "radius"_a,
-        "views"_a, "progress"_a,
-        "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
-        "view, which is a camera and the clusters that it shows.");
+    py::class_<BoundPictures>(m, "CutPictures",
+                              "Pictures of cuts of at most and at least so many gaussians, around a ball "
+                              "(center, radius) or from cameras. Windows are around gaussians of the asset: "
+                              "their means, and how often each is looked at, as the sum up to it.")
+        .def(py::init<const BoundTable&, std::pair<double, double>, const py::array&, const py::array&,
+                      const std::array<double, 4>&, const std::vector<BoundCamera>&, uint64_t>(),
+             py::kw_only(), "table"_a, "counts"_a, "means"_a, "weight"_a, "ball"_a, "cameras"_a, "seed"_a,
+             py::keep_alive<1, 2>())
+        .def("view", &BoundPictures::view, "number"_a,
+             "The camera of a window, the clusters that it shows, and the samples of a side of a pixel.");
+    m.def("refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "radius"_a, "pictures"_a,
+          "progress"_a,
+          "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
+          "picture.");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
           "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
     m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,

@@ -57,6 +57,12 @@ py::array_t<double> position_of(const BoundCamera& camera) {
     return py::array_t<double>(3, camera.camera.eye);
 }
 
+py::array_t<double> intrinsics_of(const BoundCamera& bound) {
+    const Camera& camera = bound.camera;
+    const double K[9] = {camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1};
+    return py::array_t<double>({3, 3}, K);
+}
+
 BoundEyes make_eyes(const BoundCamera& left, const BoundCamera& right) {
     if (!std::equal(left.camera.rotation, left.camera.rotation + 9, right.camera.rotation))
         throw py::value_error("left, right: expected cameras of the same rotation");
@@ -173,7 +179,10 @@ void bind_types(py::module_& m) {
         .def(py::init(&make_camera), py::kw_only(), "viewmat"_a, "K"_a, "width"_a, "height"_a, "near"_a)
         .def("window", &window_of_camera, "x0"_a, "y0"_a, "x1"_a, "y1"_a,
              "The same camera, of whose image only the pixels [x0, x1) x [y0, y1) are wanted.")
-        .def_property_readonly("position", &position_of, "Where it is in the world: (3,).");
+        .def_property_readonly("position", &position_of, "Where it is in the world: (3,).")
+        .def_property_readonly("K", &intrinsics_of, "In px: (3, 3).")
+        .def_property_readonly("width", &BoundCamera::width)
+        .def_property_readonly("height", &BoundCamera::height);
     py::class_<BoundEyes>(m, "Eyes", "Two cameras that look the same way and share a cut; or a camera.")
         .def(py::init([](const BoundCamera& only) { return BoundEyes{only.camera}; }), "camera"_a)
         .def(py::init(&make_eyes), "left"_a, "right"_a);

@@ -13,7 +13,7 @@ namespace v3dg {
 
 namespace {
 
-constexpr size_t kGaussiansAtOnce = 256;
+constexpr size_t kGaussiansAtOnce = 256, kViewsAtOnce = 32;
 
 // Colour and alpha of one picture.
 class Canvas {
@@ -59,15 +59,19 @@ void compare(const FitConfig& config, int samples, Canvas& picture, Canvas& targ
 }  // namespace
 
 void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t target_count,
-                 const CutRows& levels, Span<const CutView> views, FitProgress& progress) {
+                 const CutRows& levels, const CutPictures& pictures, FitProgress& progress) {
     const GaussianRows<float>& rows = levels.rows;
     const size_t num = num_values(rows);
     std::vector<float> moments(2 * num * rows.size, 0.0f), shown_values, gradients;
     Workspace<float> of_target, of_cut;
     Canvas wanted, drawn;
-    for (size_t i = 0; i < views.size && !progress.cancel; ++i) {
-        const Camera& camera = views[i].camera;
-        const int samples = samples_of(config, camera);
+    std::vector<CutView> views(kViewsAtOnce);
+    for (size_t i = 0; i < static_cast<size_t>(config.steps) && !progress.cancel; ++i) {
+        if (i % kViewsAtOnce == 0)
+            parallel_for(kViewsAtOnce, 1, [&](size_t k) { views[k] = cut_view(pictures, i + k); });
+        const CutView& view = views[i % kViewsAtOnce];
+        const Camera& camera = view.camera;
+        const int samples = view.samples;
         const Camera larger = enlarged(camera, samples);
         render<float>({{target.model,
                         0,
@@ -76,7 +80,7 @@ void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t targ
                         {target.filter_px2, target.antialiased}}},
                       pinhole_of<float>(larger), wanted.start(larger), false, of_target);
 
-        const std::vector<uint32_t> index = gaussians_of(levels, views[i]);
+        const std::vector<uint32_t> index = gaussians_of(pictures.table, view);
         shown_values.resize(num * index.size());
         const GaussianRows<float> shown = rows_in(shown_values.data(), index.size(), rows.sh_degree);
         parallel_for(index.size(), kGaussiansAtOnce,

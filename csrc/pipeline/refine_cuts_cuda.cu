@@ -1,5 +1,7 @@
 #include "pipeline/refine_cuts_cuda.h"
 
+#include "base/ahead.h"
+#include "base/device_guard.h"
 #include "base/launch.cuh"
 #include "pipeline/refine_cuts_math.h"
 #include "pipeline/render_backward_cuda.h"
@@ -11,25 +13,43 @@ namespace {
 
 constexpr unsigned kThreads = 256;
 constexpr unsigned kGaussiansABlock = 64;  // few, so that a level of some thousands spreads over the device
+// Pictures of the target that are drawn at once, and that are there ahead of their steps.
+constexpr unsigned kThreadsAhead = 3, kPicturesAhead = 2 * kThreadsAhead;
 
-// A frame that goes back where it came from, unless drawing failed.
-class LentFrame {
+class OwnStream {
   public:
-    LentFrame() : frame_(take_frame()) {}
-    DifferentiableFrame* operator->() const { return frame_.get(); }
-    void give_back() { cuda::give_back(std::move(frame_)); }
+    OwnStream() { check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking), "cudaStreamCreate"); }
+    ~OwnStream() { cudaStreamDestroy(stream_); }
+    OwnStream(const OwnStream&) = delete;
+    OwnStream& operator=(const OwnStream&) = delete;
+    cudaStream_t get() const { return stream_; }
 
   private:
-    std::unique_ptr<DifferentiableFrame> frame_;
+    cudaStream_t stream_ = nullptr;
 };
+
+class Event {
+  public:
+    Event() { check(cudaEventCreateWithFlags(&event_, cudaEventDisableTiming), "cudaEventCreate"); }
+    ~Event() { cudaEventDestroy(event_); }
+    Event(const Event&) = delete;
+    Event& operator=(const Event&) = delete;
+    cudaEvent_t get() const { return event_; }
+
+  private:
+    cudaEvent_t event_ = nullptr;
+};
+
+size_t num_pixels(const Camera& camera) {
+    return static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height);
+}
 
 // Colour and alpha of one picture.
 class Canvas {
   public:
     const PicturePlanes& start(const Camera& camera, cudaStream_t stream) {
-        const size_t num_pixels = static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height);
-        float* color = values_.reserve(4 * num_pixels, stream);
-        planes_ = {color, color + 3 * num_pixels, nullptr};
+        float* color = values_.reserve(4 * num_pixels(camera), stream);
+        planes_ = {color, color + 3 * num_pixels(camera), nullptr};
         return planes_;
     }
     const PicturePlanes& planes() const { return planes_; }
@@ -47,18 +67,27 @@ ModelPicture picture_of(const GaussianRows<const float>& rows, float filter_px2,
                         static_cast<int>(camera.height), black, planes)};
 }
 
+// A thread a pixel: of a picture that is `samples` times as wide.
+__global__ void average_kernel(PicturePlanes larger, PicturePlanes picture, unsigned width, unsigned height,
+                               int samples) {
+    const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
+    if (pixel >= size_t(width) * height) return;
+    const size_t x = pixel % width, y = pixel / width;
+    for (size_t k = 0; k < 3; ++k)
+        picture.color[3 * pixel + k] = box_average(larger.color, width, 3, k, x, y, samples);
+    picture.alpha[pixel] = box_average(larger.alpha, width, 1, 0, x, y, samples);
+}
+
 // A thread a pixel: how far it is off, and the loss of the block's pixels.
 __global__ void difference_kernel(PicturePlanes picture, PicturePlanes target, PicturePlanes difference,
-                                  unsigned width, unsigned height, int samples, LossWeights loss,
-                                  double* loss_of_block) {
+                                  size_t num_pixels, LossWeights loss, double* loss_of_block) {
     const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
     double own = 0;
-    if (pixel < size_t(width) * height) {
-        const size_t x = pixel % width, y = pixel / width;
+    if (pixel < num_pixels) {
         float* color = difference.color + 3 * pixel;
         for (size_t k = 0; k < 3; ++k)
-            color[k] = picture.color[3 * pixel + k] - box_average(target.color, width, 3, k, x, y, samples);
-        const float alpha = picture.alpha[pixel] - box_average(target.alpha, width, 1, 0, x, y, samples);
+            color[k] = picture.color[3 * pixel + k] - target.color[3 * pixel + k];
+        const float alpha = picture.alpha[pixel] - target.alpha[pixel];
         difference.alpha[pixel] = alpha;
         own = loss_of_pixel(loss, color, alpha);
     }
@@ -108,21 +137,19 @@ __global__ void move_kernel(GaussianRows<float> rows, Span<const uint32_t> index
 // Writes the slope of the loss by each value of the picture.
 class Comparison {
   public:
-    const PicturePlanes& slopes(const FitConfig& config, int samples, const Camera& camera,
-                                const PicturePlanes& picture, const PicturePlanes& target,
-                                cudaStream_t stream) {
-        const auto width = static_cast<unsigned>(camera.width), height = static_cast<unsigned>(camera.height);
-        const size_t num_pixels = size_t(width) * height;
-        const unsigned num_blocks = blocks_for(num_pixels, kThreads);
+    const PicturePlanes& slopes(const LossWeights& loss, const Camera& camera, const PicturePlanes& picture,
+                                const PicturePlanes& target, cudaStream_t stream) {
+        const size_t count = num_pixels(camera);
+        const unsigned num_blocks = blocks_for(count, kThreads);
         slope_.start(camera, stream);
         double* losses = losses_.reserve(num_blocks, stream);
         float* weight = weight_.reserve(1, stream);
         launch("difference_kernel", difference_kernel, num_blocks, kThreads, 0, stream, picture, target,
-               slope_.planes(), width, height, samples, config.loss, losses);
-        launch("weigh_kernel", weigh_kernel, 1, 32, 0, stream, losses, num_blocks,
-               static_cast<double>(num_pixels), weight);
-        launch("slope_kernel", slope_kernel, num_blocks, kThreads, 0, stream, slope_.planes(), num_pixels,
-               config.loss, weight);
+               slope_.planes(), count, loss, losses);
+        launch("weigh_kernel", weigh_kernel, 1, 32, 0, stream, losses, num_blocks, static_cast<double>(count),
+               weight);
+        launch("slope_kernel", slope_kernel, num_blocks, kThreads, 0, stream, slope_.planes(), count, loss,
+               weight);
         return slope_.planes();
     }
 
@@ -132,52 +159,120 @@ class Comparison {
     DeviceBuffer<float> weight_;
 };
 
+// What one step needs: the view, its gaussians, and what it should look like.
+struct Wanted {
+    Camera camera;
+    size_t num_gaussians;
+    DeviceBuffer<uint32_t> gaussians;
+    Canvas picture;
+    Event made, used;
+};
+
+// Draws what steps need ahead of them: a step waits for the host as often as it draws, and leaves most of the
+// device idle.
+class WantedAhead {
+  public:
+    WantedAhead(const FitConfig& config, const DeviceFitTarget& target, const CutPictures& pictures,
+                cudaStream_t stream)
+        : config_(config),
+          target_(target),
+          pictures_(pictures),
+          stream_(stream),
+          device_(current_device()),
+          ahead_(static_cast<uint64_t>(config.steps), kThreadsAhead, kPicturesAhead,
+                 [this](uint64_t number) { make(number); }) {}
+    // Of whom no more is used, also where a step has failed.
+    ~WantedAhead() { cudaStreamSynchronize(stream_); }
+
+    const Wanted& wait_for_next() {
+        ahead_.wait_for_next();
+        const Wanted& wanted = wanted_[used_ % kPicturesAhead];
+        check(cudaStreamWaitEvent(stream_, wanted.made.get(), 0), "cudaStreamWaitEvent");
+        return wanted;
+    }
+    void next_is_used() {
+        check(cudaEventRecord(wanted_[used_++ % kPicturesAhead].used.get(), stream_), "cudaEventRecord");
+        ahead_.next_is_used();
+    }
+
+  private:
+    struct Worker {
+        OwnStream stream;
+        DifferentiableFrame frame;
+        Canvas larger;
+    };
+
+    void make(uint64_t number) {
+        const DeviceGuard guard(device_);
+        Worker& worker = workers_[number % kThreadsAhead];
+        Wanted& wanted = wanted_[number % kPicturesAhead];
+        const cudaStream_t stream = worker.stream.get();
+        check(cudaStreamWaitEvent(stream, wanted.used.get(), 0), "cudaStreamWaitEvent");
+        const CutView view = cut_view(pictures_, number);
+        const std::vector<uint32_t> gaussians = gaussians_of(pictures_.table, view);
+        wanted.camera = view.camera;
+        wanted.num_gaussians = gaussians.size();
+        wanted.gaussians.copy_from({gaussians.data(), gaussians.size()}, stream);
+        const Camera camera = enlarged(view.camera, view.samples);
+        const PicturePlanes& larger = worker.larger.start(camera, stream);
+        worker.frame.draw(picture_of(target_.rows, target_.filter_px2, target_.antialiased, camera, larger),
+                           stream);
+        launch("average_kernel", average_kernel, blocks_for(num_pixels(view.camera), kThreads), kThreads, 0,
+               stream, larger, wanted.picture.start(view.camera, stream),
+               static_cast<unsigned>(view.camera.width), static_cast<unsigned>(view.camera.height), view.samples);
+        check(cudaEventRecord(wanted.made.get(), stream), "cudaEventRecord");
+    }
+
+    const FitConfig& config_;
+    const DeviceFitTarget& target_;
+    const CutPictures& pictures_;
+    const cudaStream_t stream_;
+    const int device_;
+    uint64_t used_ = 0;
+    Worker workers_[kThreadsAhead];
+    Wanted wanted_[kPicturesAhead];
+    Ahead ahead_;  // the last, for its threads use all else
+};
+
 }  // namespace
 
 void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const CutRows& levels,
-                 Span<const CutView> views, FitProgress& progress, Stream stream) {
+                 const CutPictures& pictures, FitProgress& progress, Stream stream) {
     const GaussianRows<float>& rows = levels.rows;
     const size_t num = num_values(rows), num_moments = 2 * num * rows.size;
     const DeviceBuffer<float> moments(num_moments, stream), radius(levels.radius, stream),
         background(3, stream);
     if (num_moments > 0)
         check(cudaMemsetAsync(moments.data(), 0, num_moments * sizeof(float), stream), "cudaMemsetAsync");
-    DeviceBuffer<uint32_t> indices;
+    check(cudaStreamSynchronize(stream), "refine_cuts");  // what pictures are made of is there for all streams
     DeviceBuffer<float> shown_values, gradients;
-    LentFrame of_target, of_cut;
-    Canvas wanted, drawn;
+    DifferentiableFrame frame;
+    Canvas drawn;
     Comparison comparison;
-    for (size_t i = 0; i < views.size && !progress.cancel; ++i) {
-        const Camera& camera = views[i].camera;
-        const int samples = samples_of(config, camera);
-        const Camera larger = enlarged(camera, samples);
-        of_target->draw(picture_of(target.rows, target.filter_px2, target.antialiased, larger,
-                                   wanted.start(larger, stream)),
-                        stream);
-
-        const std::vector<uint32_t> gaussians = gaussians_of(levels, views[i]);
-        const size_t count = gaussians.size();
-        const Span<const uint32_t> index{indices.copy_from({gaussians.data(), count}, stream), count};
+    WantedAhead ahead(config, target, pictures, stream);
+    for (int i = 0; i < config.steps && !progress.cancel; ++i) {
+        const Wanted& wanted = ahead.wait_for_next();
+        const size_t count = wanted.num_gaussians;
+        const Span<const uint32_t> index{wanted.gaussians.data(), count};
         const GaussianRows<float> shown =
             rows_in(shown_values.reserve(num * count, stream), count, rows.sh_degree);
         const unsigned num_blocks = blocks_for(count, kGaussiansABlock);
         launch("gather_kernel", gather_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index, shown);
-        of_cut->draw(
-            picture_of(shown, config.filter_px2, config.antialiased, camera, drawn.start(camera, stream)),
-            stream);
+        frame.draw(picture_of(shown, config.filter_px2, config.antialiased, wanted.camera,
+                               drawn.start(wanted.camera, stream)),
+                    stream);
         const PicturePlanes& slopes =
-            comparison.slopes(config, samples, camera, drawn.planes(), wanted.planes(), stream);
+            comparison.slopes(config.loss, wanted.camera, drawn.planes(), wanted.picture.planes(), stream);
         const GaussianRows<float> gradient =
             rows_in(gradients.reserve(num * count, stream), count, rows.sh_degree);
-        of_cut->backward({slopes.color, slopes.alpha, nullptr}, gradient, {}, background.data(), stream);
+        frame.backward({slopes.color, slopes.alpha, nullptr}, gradient, {}, background.data(), stream);
         launch("move_kernel", move_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index, gradient,
-               radius.data(), target.rows.size, fit_step(config, static_cast<int>(i)), config.beta2,
+               radius.data(), target.rows.size, fit_step(config, i), config.beta2,
                Moments{moments.data(), moments.data() + num * rows.size});
+        ahead.next_is_used();
         ++progress.groups_done;
     }
     check(cudaStreamSynchronize(stream), "refine_cuts");
-    of_target.give_back();
-    of_cut.give_back();
 }
 
 }  // namespace cuda

@@ -9,7 +9,7 @@ namespace cuda {
 // As v3dg::refine_cuts, with rows on the device and all else on the host. Returns when all is done. Every run
 // gives the same bytes.
 void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const CutRows& levels,
-                 Span<const CutView> views, FitProgress& progress, Stream stream);
+                 const CutPictures& pictures, FitProgress& progress, Stream stream);
 
 }  // namespace cuda
 }  // namespace v3dg

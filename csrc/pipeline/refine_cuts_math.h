@@ -19,12 +19,6 @@ V3DG_HD inline Camera enlarged(Camera camera, int factor) {
     return camera;
 }
 
-// A side of a pixel of the target's picture. What is small is not smooth, and costs little.
-constexpr double kSmallPx = 128;
-V3DG_HD inline int samples_of(const FitConfig& config, const Camera& camera) {
-    return max_of(camera.width, camera.height) <= kSmallPx ? 2 * config.supersample : config.supersample;
-}
-
 // Colour or alpha of a pixel of the target, from `samples` a side: value k of each of `width` pixels.
 V3DG_HD inline float box_average(const float* plane, size_t width, size_t num_values, size_t k, size_t x,
                                  size_t y, int samples) {
@@ -118,10 +112,10 @@ V3DG_HD inline GaussianRows<float> rows_in(float* memory, size_t count, int sh_d
 }
 
 // The gaussians of a view's clusters.
-inline std::vector<uint32_t> gaussians_of(const CutRows& levels, const CutView& view) {
+inline std::vector<uint32_t> gaussians_of(const ClusterTable& table, const CutView& view) {
     std::vector<uint32_t> gaussians;
     for (const int32_t c : view.clusters)
-        for (int64_t i = levels.offset[c]; i < levels.offset[c + 1]; ++i)
+        for (int64_t i = table.offset[c]; i < table.offset[c + 1]; ++i)
             gaussians.push_back(static_cast<uint32_t>(i));
     return gaussians;
 }

@@ -6,11 +6,12 @@ stdout.
 
 from __future__ import annotations
 
-from v3dg.cli import build, compare, completion, convert, demo, doctor, export, info, render, view
+from v3dg.cli import build, compare, completion, convert, demo, doctor, export, info, refine, render, view
 from v3dg.cli._program import Commands, Program
 
 COMMANDS: Commands = {
     "build": (build.Build, build.run),
+    "refine": (refine.Refine, refine.run),
     "info": (info.Info, info.run),
     "render": (render.Render, render.run),
     "view": (view.View, view.run),

@@ -1,0 +1,168 @@
+#include "pipeline/cut_views.h"
+
+#include <algorithm>
+#include <cfloat>
+#include <cmath>
+
+#include "base/random.h"
+#include "math/solid_angle.h"
+#include "math/vec.h"
+#include "select/select.h"
+
+namespace v3dg {
+
+namespace {
+
+constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // of a side of a picture
+constexpr double kHomePx2 = 2;  // a gaussian: the size at which a cut is selected at the default tolerance
+// A side of a picture, in the size at which its cut is at home. Cuts of the default tolerance are seen at a
+// quarter to half of that.
+constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
+constexpr double kDistance = 2.5;      // from the centre, in radii
+constexpr double kNear = 0.01;         // in radii
+constexpr int kMostTries = 16;         // to find a gaussian that a picture shows
+
+// Numbers of one view.
+class Random {
+  public:
+    Random(uint64_t seed, uint64_t stream) : seed_(seed), stream_(stream) {}
+    double uniform() { return random_uniform(seed_, stream_, counter_++); }
+    void direction(double out[3]) {
+        const double z = 2 * uniform() - 1, angle = 2 * kPi * uniform(), flat = std::sqrt(1 - z * z);
+        out[0] = flat * std::cos(angle);
+        out[1] = flat * std::sin(angle);
+        out[2] = z;
+    }
+
+  private:
+    uint64_t seed_, stream_, counter_ = 0;
+};
+
+// Looks at the centre from anywhere around it, one px wide.
+Camera camera_around(const CutPictures& pictures, Random& random) {
+    double outwards[3], up[3], right[3], down[3];
+    random.direction(outwards);
+    double length = 0;
+    while (length < 1e-3) {
+        random.direction(up);
+        cross3(up, outwards, right);
+        length = std::sqrt(dot3(right, right));
+    }
+    for (double& x : right) x /= length;
+    cross3(right, outwards, down);
+    Camera camera{};
+    for (int k = 0; k < 3; ++k) {
+        camera.rotation[k] = right[k];
+        camera.rotation[3 + k] = down[k];
+        camera.rotation[6 + k] = -outwards[k];
+        camera.eye[k] = pictures.center[k] + kDistance * pictures.radius * outwards[k];
+    }
+    for (int row = 0; row < 3; ++row) camera.translation[row] = -dot3(camera.rotation + 3 * row, camera.eye);
+    // The ball fills the picture.
+    camera.fx = camera.fy = std::sqrt(kDistance * kDistance - 1) / 2;
+    camera.cx = camera.cy = 0.5;
+    camera.width = camera.height = 1;
+    camera.near = kNear * pictures.radius;
+    return camera;
+}
+
+// The same picture, so many times as large.
+Camera resized(Camera camera, double scale) {
+    const double width = std::ceil(scale * camera.width), height = std::ceil(scale * camera.height);
+    camera.cx = scale * camera.cx + (width - scale * camera.width) / 2;
+    camera.cy = scale * camera.cy + (height - scale * camera.height) / 2;
+    camera.fx *= scale;
+    camera.fy *= scale;
+    camera.width = camera.x1 = width;
+    camera.height = camera.y1 = height;
+    camera.x0 = camera.y0 = 0;
+    return camera;
+}
+
+// A part of the picture around a gaussian. What is twice as large in the asset is seen twice as often.
+Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures, Random& random) {
+    double at[2] = {camera.width / 2, camera.height / 2};
+    for (int tries = 0; tries < kMostTries; ++tries) {
+        const Span<const double>& weight = pictures.weight;
+        const double wanted = random.uniform() * weight[weight.size - 1];
+        const double* found = std::upper_bound(weight.begin(), weight.end(), wanted);
+        const auto i = std::min(static_cast<size_t>(found - weight.begin()), weight.size - 1);
+        double p[3];
+        for (int row = 0; row < 3; ++row) {
+            p[row] = camera.translation[row];
+            for (int k = 0; k < 3; ++k)
+                p[row] += camera.rotation[3 * row + k] * static_cast<double>(pictures.means[3 * i + k]);
+        }
+        if (!(p[2] > camera.near)) continue;
+        const double x = camera.fx * p[0] / p[2] + camera.cx, y = camera.fy * p[1] / p[2] + camera.cy;
+        if (!(x >= 0 && x < camera.width && y >= 0 && y < camera.height)) continue;
+        at[0] = x;
+        at[1] = y;
+        break;
+    }
+    Camera window = camera;
+    window.width = window.x1 = std::min(camera.width, widest_px);
+    window.height = window.y1 = std::min(camera.height, widest_px);
+    window.cx -= std::clamp(std::round(at[0] - window.width / 2), 0.0, camera.width - window.width);
+    window.cy -= std::clamp(std::round(at[1] - window.height / 2), 0.0, camera.height - window.height);
+    return window;
+}
+
+SelectOutput selected(const ClusterTable& table, const Camera& camera, const SelectRule& rule) {
+    const int32_t bundle = 0;
+    const double position[3] = {}, quaternion[4] = {1, 0, 0, 0}, scale = 1;
+    const float importance = 1;
+    SelectInput in{{&table, 1}, {{&bundle, 1}, {position, 3}, {quaternion, 4}, {&scale, 1}, {&importance, 1}},
+                   Eyes(camera), rule};
+    SelectOutput out;
+    cpu::select(in, out);
+    return out;
+}
+
+// How a picture is compared: a window of at most so many px, and the samples of a side of a pixel of the asset.
+// The larger its gaussians are seen, the smoother it is; what is small costs little. `size`: of the picture,
+// in that at which the asset itself is at home.
+struct Comparison {
+    double widest_px;
+    int samples;
+};
+Comparison comparison_of(double size, double longer_px) {
+    if (size >= 2) return {512, 2};
+    if (size >= 1) return {512, 3};
+    return {256, longer_px <= 128 ? 8 : 4};
+}
+
+}  // namespace
+
+CutView cut_view(const CutPictures& pictures, uint64_t number) {
+    Random random(pictures.seed, number);
+    const double part = random.uniform();
+    const double share = pictures.most * std::pow(pictures.least / pictures.most, part * part) /
+                   static_cast<double>(pictures.weight.size);
+    const double size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform());
+    double all = static_cast<double>(pictures.weight.size);  // gaussians that the picture has without levels
+    Camera camera;
+    SelectRule rule{};
+    rule.culls = pictures.cameras.size > 0;
+    if (rule.culls) {
+        const size_t n = pictures.cameras.size;
+        camera = pictures.cameras[static_cast<size_t>(random.uniform() * static_cast<double>(n))];
+        all = static_cast<double>(selected(pictures.table, camera, rule).num_gaussians);
+    } else {
+        camera = camera_around(pictures, random);
+    }
+    const double longer = std::max(camera.width, camera.height);
+    const double area_px2 = size * size * kHomePx2 * share * all / (camera.width * camera.height);
+    const double longer_px = std::clamp(longer * std::sqrt(area_px2), kNarrowestPx, kMostPx);
+    camera = resized(camera, longer_px / longer);
+    rule.budget = static_cast<uint64_t>(std::ceil(share * all));
+    const SelectOutput whole = selected(pictures.table, camera, rule);
+    rule.budget = kNoBudget;
+    rule.tolerance_px2 = whole.fits_budget ? whole.tolerance_px2 : FLT_MAX;
+    rule.culls = true;
+    const Comparison comparison = comparison_of(size * std::sqrt(share), longer_px);
+    const Camera window = window_of(camera, comparison.widest_px, pictures, random);
+    return {window, selected(pictures.table, window, rule).cluster, comparison.samples};
+}
+
+}  // namespace v3dg

@@ -1,0 +1,34 @@
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "math/camera.h"
+#include "residency/cluster_table.h"
+
+namespace v3dg {
+
+// A window of a picture of a cut, and the clusters that it shows. The asset is drawn `samples` times as large.
+struct CutView {
+    Camera camera;
+    std::vector<int32_t> clusters;
+    int samples;
+};
+
+// Pictures of cuts of one bundle: of random budgets, at random sizes, from random sides of what lies around a
+// centre, or from cameras that are given.
+struct CutPictures {
+    const ClusterTable& table;
+    double most, least;         // gaussians of a cut
+    Span<const float> means;    // [N * 3] of the asset, and
+    Span<const double> weight;  // [N] how often each is looked at, as the sum up to it, which ascends
+    double center[3], radius;   // that is looked at
+    Span<const Camera> cameras;
+    uint64_t seed;
+};
+
+// Picture number `number`. The same arguments give the same view. A cut from a given camera has the share of
+// the gaussians in its frustum, and is as large, that a cut from around has of all.
+CutView cut_view(const CutPictures& pictures, uint64_t number);
+
+}  // namespace v3dg

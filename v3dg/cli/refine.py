@@ -1,0 +1,50 @@
+"""`v3dg refine`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from v3dg._files import check_folder
+from v3dg.bundle import Bundle
+from v3dg.camera_file import read_cameras
+from v3dg.cli import _common
+from v3dg.refine import refine_bundle
+
+
+@dataclass
+class Refine(_common.OnDevice):
+    """Make the levels of a bundle look more like its asset, small and large, which takes far longer than
+    building it."""
+
+    bundle: tyro.conf.Positional[Path]
+    """What `v3dg build` made (.v3dg)."""
+    output: tyro.conf.Positional[Path]
+    """Bundle to write (.v3dg)."""
+    steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000
+    """Pictures of cuts that are compared with the asset's; a third leaves a third of what is gained."""
+    cameras: Annotated[Path | None, _common.option("PATH")] = None
+    """A file or folder of cameras from which the asset is seen, as for `v3dg render`: for a room, which is
+    seen from inside. All around if not given."""
+    seed: int = 0
+    """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
+
+
+def run(options: Refine) -> None:
+    _common.require_file(options.bundle, ".v3dg")
+    _common.check_usage(str(options.output), options.output.suffix == ".v3dg", "a file name ending in .v3dg")
+    check_folder(options.output)
+    _common.check_output(options.output, options.bundle)
+    cameras = [] if options.cameras is None else list(read_cameras(options.cameras).values())
+    start = time.perf_counter()
+    how: dict[str, Any] = {"steps": options.steps, "seed": options.seed, "device": options.device}
+    bundle = Bundle.open(options.bundle)
+    refined = refine_bundle(bundle, cameras=cameras, progress=not options.quiet, **how)
+    refined.write(options.output)
+    result = {"output": str(options.output), "steps": options.steps, "seconds": time.perf_counter() - start}
+    line = f"{options.output}: {options.steps:,} steps, {result['seconds']:.1f} s"
+    _common.print_result(options.json, result, [line])
