@@ -56,7 +56,7 @@ def test_version():
 
 @pytest.mark.parametrize(
     "command",
-    ["build", "info", "render", "compare", "convert", "export", "demo", "doctor", "completion"],
+    ["build", "refine", "info", "render", "compare", "convert", "export", "demo", "doctor", "completion"],
 )
 def test_help(command):
     done = run(command, "--help")

@@ -1,0 +1,51 @@
+"""`v3dg refine`."""
+
+import json
+
+import pytest
+
+import v3dg
+from command_line import fails, run
+from v3dg.donut import make_donut
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("refine")
+    asset = make_donut(2000)
+    v3dg.write_asset(folder / "donut.ply", asset)
+    config = v3dg.BuildConfig(steps=0, cluster_size=128)
+    v3dg.build_bundle(asset, config=config, device="cpu", progress=False).write(folder / "donut.v3dg")
+    v3dg.write_cameras(folder / "eyes.json", {"front": v3dg.turntable((0, 0, 0), 3, 1)[0]})
+    return folder
+
+
+def test_a_bundle_is_refined(folder):
+    options = ("--steps", 5, "--seed", 3, "--device", "cpu")
+    done = run("refine", "donut.v3dg", "refined.v3dg", *options, "--json", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["output"], result["steps"]) == ("refined.v3dg", 5)
+    written = v3dg.Bundle.open(folder / "refined.v3dg")
+    assert written.config["refined"] == {"steps": 5, "seed": 3}
+    assert written.num_gaussians == v3dg.Bundle.open(folder / "donut.v3dg").num_gaussians
+
+
+def test_cameras_say_from_where(folder):
+    options = ("--steps", 2, "--cameras", "eyes.json", "--device", "cpu", "--quiet")
+    done = run("refine", "donut.v3dg", "seen.v3dg", *options, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert done.stdout.startswith("seen.v3dg: 2 steps, ")
+    assert v3dg.Bundle.open(folder / "seen.v3dg").config["refined"]["cameras"] == 1
+
+
+def test_what_cannot_be_meant_is_told(folder):
+    before = sorted(folder.iterdir())
+    fails(2, "another file than donut.v3dg", "refine", "donut.v3dg", "donut.v3dg", cwd=folder)
+    fails(2, "x.ply: expected a file name ending in .v3dg", "refine", "donut.v3dg", "x.ply", cwd=folder)
+    fails(1, "a file ending in .v3dg, got another name", "refine", "donut.ply", "x.v3dg", cwd=folder)
+    fails(1, "create it first", "refine", "donut.v3dg", "no/x.v3dg", cwd=folder)
+    fails(1, "steps: expected 1 step or more", "refine", "donut.v3dg", "x.v3dg", "--steps", 0, cwd=folder)
+    fails(1, "none.json", "refine", "donut.v3dg", "x.v3dg", "--cameras", "none.json", cwd=folder)
+    assert sorted(folder.iterdir()) == before
