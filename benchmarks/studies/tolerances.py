@@ -45,6 +45,8 @@ class Config:
     widths: tuple[int, ...] = (512, 256, 128, 64, 32)
     """px."""
     views: int = 4
+    refine: int = 0
+    """Steps by which the levels are refined together, too."""
     device: str = "auto"
 
 
@@ -65,6 +67,8 @@ def measure(config: Config, subject: Subject, judges: Judges) -> list[Row]:
 def _drawn(config: Config, subject: Subject) -> Iterator[tuple[Row, Picture, Picture]]:
     device = "cuda" if _device.resolve(config.device).is_cuda else "cpu"
     bundle = v3dg.build_bundle(subject.asset, device=device, progress=False)
+    if config.refine > 0:
+        bundle = v3dg.refine_bundle(bundle, steps=config.refine, device=device, progress=False)
     for width in config.widths:
         for view in subject.cameras:
             camera = scaled(view, width / view.width)
@@ -117,7 +121,7 @@ def main(config: Config) -> None:
     try:
         for name in config.only or about:
             rows += measure(config, Subject(config.assets, name, about[name], config.views), judges)
-            settings = {"widths": config.widths, "views": config.views}
+            settings = {"widths": config.widths, "views": config.views, "refine": config.refine}
             record.write(config.output, {"settings": settings, "rows": rows}, config.device)
             print(f"{name} done", flush=True)
     finally:
