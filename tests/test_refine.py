@@ -129,7 +129,7 @@ def pictures_of(bundle, cameras=()):
 
 def place_of(view):
     """Where a window's camera is, and its size."""
-    camera, clusters, samples = view
+    camera, *_ = view
     return tuple(camera.position), camera.width, camera.height
 
 
@@ -240,7 +240,9 @@ def test_a_step_goes_down_the_slope_of_the_loss(bundle, device):
     drawn = v3dg.rasterize(v3dg.Gaussians(*tensors), shown, filter_px2=0.1, antialiased=True)
     leaves = bundle.level_gaussians(0)
     larger = v3dg.rasterize(leaves, shown.scaled(samples))
-    wanted = [torch.tensor(box_downsample(a, samples).astype(np.float64)) for a in (larger.color, larger.alpha)]
+    wanted = [
+        torch.tensor(box_downsample(a, samples).astype(np.float64)) for a in (larger.color, larger.alpha)
+    ]
     loss = (drawn.color - wanted[0]).abs().mean() + 0.5 * (drawn.alpha - wanted[1]).abs().mean()
     loss.backward()
     slopes = dict(zip(vars(start), (t.grad.numpy() for t in tensors), strict=True))

@@ -39,8 +39,8 @@ def refine_bundle(
     A build fits every group alone, seen from all sides, at the size at which it is selected. This moves the
     gaussians of all levels but the first, as many as there were, until pictures of cuts, in which they stand
     next to each other and hide each other, are those of the asset. Cuts have 0.7 of the asset's gaussians
-    down to those of the last level, and pictures 0.18 to 8 times the size at which they are at home, 2 px² a
-    gaussian. docs/levels.md has what is gained.
+    down to those of the last level, and pictures 0.18 to 9.7 times the size at which they are at home, 2 px²
+    a gaussian. docs/levels.md has what is gained.
 
     The same bundle, cameras, steps and seed give the same bits on the same kind of device.
 

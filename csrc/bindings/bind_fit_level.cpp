@@ -117,16 +117,16 @@ class BoundPictures {
             throw py::value_error("counts: expected the most and the least gaussians, 1 or more, got others");
         if (num_targets == 0 || !(ball[3] > 0))
             throw py::value_error("weight, ball: expected gaussians and a positive radius, got none");
-        pictures_ = std::make_unique<CutPictures>(
-            CutPictures{table.table(),
-                        counts.first,
-                        counts.second,
-                        span_of<const float>(means, "means", {num_targets, 3}),
-                        weights,
-                        {ball[0], ball[1], ball[2]},
-                        ball[3],
-                        {cameras_.data(), cameras_.size()},
-                        seed});
+        pictures_ =
+            std::make_unique<CutPictures>(CutPictures{table.table(),
+                                                      counts.first,
+                                                      counts.second,
+                                                      span_of<const float>(means, "means", {num_targets, 3}),
+                                                      weights,
+                                                      {ball[0], ball[1], ball[2]},
+                                                      ball[3],
+                                                      {cameras_.data(), cameras_.size()},
+                                                      seed});
     }
 
     const CutPictures& pictures() const { return *pictures_; }
@@ -260,10 +260,11 @@ void bind_fit_level(py::module_& m) {
              py::keep_alive<1, 2>())
         .def("view", &BoundPictures::view, "number"_a,
              "The camera of a window, the clusters that it shows, and the samples of a side of a pixel.");
-    m.def("refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "radius"_a, "pictures"_a,
-          "progress"_a,
-          "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
-          "picture.");
+    m.def(
+        "refine_cuts", &refine_cuts_arrays, "config"_a, "target"_a, "gaussians"_a, "radius"_a, "pictures"_a,
+        "progress"_a,
+        "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
+        "picture.");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
           "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
     m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,

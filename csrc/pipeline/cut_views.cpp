@@ -18,9 +18,9 @@ constexpr double kHomePx2 = 2;  // a gaussian: the size at which a cut is select
 // A side of a picture, in the size at which its cut is at home. Cuts of the default tolerance are seen at a
 // quarter to half of that.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
-constexpr double kDistance = 2.5;      // from the centre, in radii
-constexpr double kNear = 0.01;         // in radii
-constexpr int kMostTries = 16;         // to find a gaussian that a picture shows
+constexpr double kDistance = 2.5;  // from the centre, in radii
+constexpr double kNear = 0.01;     // in radii
+constexpr int kMostTries = 16;     // to find a gaussian that a picture shows
 
 // Numbers of one view.
 class Random {
@@ -112,16 +112,18 @@ SelectOutput selected(const ClusterTable& table, const Camera& camera, const Sel
     const int32_t bundle = 0;
     const double position[3] = {}, quaternion[4] = {1, 0, 0, 0}, scale = 1;
     const float importance = 1;
-    SelectInput in{{&table, 1}, {{&bundle, 1}, {position, 3}, {quaternion, 4}, {&scale, 1}, {&importance, 1}},
-                   Eyes(camera), rule};
+    SelectInput in{{&table, 1},
+                   {{&bundle, 1}, {position, 3}, {quaternion, 4}, {&scale, 1}, {&importance, 1}},
+                   Eyes(camera),
+                   rule};
     SelectOutput out;
     cpu::select(in, out);
     return out;
 }
 
-// How a picture is compared: a window of at most so many px, and the samples of a side of a pixel of the asset.
-// The larger its gaussians are seen, the smoother it is; what is small costs little. `size`: of the picture,
-// in that at which the asset itself is at home.
+// How a picture is compared: a window of at most so many px, and the samples of a side of a pixel of the
+// asset. The larger its gaussians are seen, the smoother it is; what is small costs little. `size`: of the
+// picture, in that at which the asset itself is at home.
 struct Comparison {
     double widest_px;
     int samples;
@@ -138,7 +140,7 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
     Random random(pictures.seed, number);
     const double part = random.uniform();
     const double share = pictures.most * std::pow(pictures.least / pictures.most, part * part) /
-                   static_cast<double>(pictures.weight.size);
+                         static_cast<double>(pictures.weight.size);
     const double size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform());
     double all = static_cast<double>(pictures.weight.size);  // gaussians that the picture has without levels
     Camera camera;

@@ -8,7 +8,8 @@
 
 namespace v3dg {
 
-// A window of a picture of a cut, and the clusters that it shows. The asset is drawn `samples` times as large.
+// A window of a picture of a cut, and the clusters that it shows. The asset is drawn `samples` times as
+// large.
 struct CutView {
     Camera camera;
     std::vector<int32_t> clusters;

@@ -85,8 +85,7 @@ __global__ void difference_kernel(PicturePlanes picture, PicturePlanes target, P
     double own = 0;
     if (pixel < num_pixels) {
         float* color = difference.color + 3 * pixel;
-        for (size_t k = 0; k < 3; ++k)
-            color[k] = picture.color[3 * pixel + k] - target.color[3 * pixel + k];
+        for (size_t k = 0; k < 3; ++k) color[k] = picture.color[3 * pixel + k] - target.color[3 * pixel + k];
         const float alpha = picture.alpha[pixel] - target.alpha[pixel];
         difference.alpha[pixel] = alpha;
         own = loss_of_pixel(loss, color, alpha);
@@ -216,10 +215,11 @@ class WantedAhead {
         const Camera camera = enlarged(view.camera, view.samples);
         const PicturePlanes& larger = worker.larger.start(camera, stream);
         worker.frame.draw(picture_of(target_.rows, target_.filter_px2, target_.antialiased, camera, larger),
-                           stream);
+                          stream);
         launch("average_kernel", average_kernel, blocks_for(num_pixels(view.camera), kThreads), kThreads, 0,
                stream, larger, wanted.picture.start(view.camera, stream),
-               static_cast<unsigned>(view.camera.width), static_cast<unsigned>(view.camera.height), view.samples);
+               static_cast<unsigned>(view.camera.width), static_cast<unsigned>(view.camera.height),
+               view.samples);
         check(cudaEventRecord(wanted.made.get(), stream), "cudaEventRecord");
     }
 
@@ -244,7 +244,8 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
         background(3, stream);
     if (num_moments > 0)
         check(cudaMemsetAsync(moments.data(), 0, num_moments * sizeof(float), stream), "cudaMemsetAsync");
-    check(cudaStreamSynchronize(stream), "refine_cuts");  // what pictures are made of is there for all streams
+    check(cudaStreamSynchronize(stream),
+          "refine_cuts");  // what pictures are made of is there for all streams
     DeviceBuffer<float> shown_values, gradients;
     DifferentiableFrame frame;
     Canvas drawn;
@@ -259,8 +260,8 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
         const unsigned num_blocks = blocks_for(count, kGaussiansABlock);
         launch("gather_kernel", gather_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index, shown);
         frame.draw(picture_of(shown, config.filter_px2, config.antialiased, wanted.camera,
-                               drawn.start(wanted.camera, stream)),
-                    stream);
+                              drawn.start(wanted.camera, stream)),
+                   stream);
         const PicturePlanes& slopes =
             comparison.slopes(config.loss, wanted.camera, drawn.planes(), wanted.picture.planes(), stream);
         const GaussianRows<float> gradient =

@@ -26,7 +26,7 @@ class Refine(_common.OnDevice):
     output: tyro.conf.Positional[Path]
     """Bundle to write (.v3dg)."""
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000
-    """Pictures of cuts that are compared with the asset's; a third leaves a third of what is gained."""
+    """Pictures of cuts that are compared with the asset's, one after another."""
     cameras: Annotated[Path | None, _common.option("PATH")] = None
     """A file or folder of cameras from which the asset is seen, as for `v3dg render`: for a room, which is
     seen from inside. All around if not given."""
