@@ -41,8 +41,8 @@ namespace cuda {
 constexpr int kItemSize = 256;
 constexpr unsigned kItemClusters = 8;
 
-// A model in front of a picture's camera.
-struct Placement {
+// A model in front of a picture's camera. Aligned, so that threads write it in few instructions.
+struct alignas(16) Placement {
     ModelView<float> view;
     uint32_t model, image;
 };
