@@ -44,34 +44,79 @@ __device__ Placement placement_of(const InstanceAxes& axes, const Pose& pose, in
     return {model_view_from_instance(axes, pose), static_cast<uint32_t>(bundle), eye};
 }
 
-// Where the cut of instance i is found. Writes what the kernels after this one need of it.
-__device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
-                                    const SelectRule& rule, Placement* placements) {
-    const Pose pose = scene.instances.pose(i);
-    if (!is_placed(pose)) return CutSource::nowhere;
-    const int32_t b = scene.instances.bundle[i];
-    const ClusterTable& table = scene.bundles[b].table;
-    const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
-    const InstanceView view = view_from_instance(eyes, frustum_sides(eyes, table.pad_px), axes, pose,
-                                                 scene.instances.importance[i]);
-    const CutSource source = source_of_cut(table, view, rule, kLaneClusters);
-    if (source == CutSource::nowhere) return source;
-    if (placements != nullptr) {
-        placements[i] = placement_of(axes, pose, b, 0);
-        if (eyes.are_two)
-            placements[scene.instances.scale.size + i] =
-                placement_of(axes_of_instance(eyes.camera[1], pose), pose, b, 1);
+// Writes the records of the lanes that have one, whose places follow each other from `first` on, as whole
+// rows of memory; for whole warps. `space` is the warp's.
+template <class Record>
+__device__ void write_row(uint4* space, bool has_one, const Record& mine, Record* first) {
+    constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
+    static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
+                  "records are whole vectors");
+    const unsigned lane = threadIdx.x % 32, writers = __ballot_sync(kAllLanes, has_one);
+    if (writers == 0) return;
+    if (has_one) reinterpret_cast<Record*>(space)[lane] = mine;
+    __syncwarp();
+    auto* vectors = reinterpret_cast<uint4*>(first);
+#pragma unroll
+    for (unsigned k = 0; k < kVectors; ++k) {
+        const unsigned v = 32 * k + lane;
+        if (writers >> v / kVectors & 1) vectors[v] = space[v];
     }
-    if (source == CutSource::table) {
-        scene.views[i] = view;
-        return source;
-    }
-    const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
+    __syncwarp();  // before the next row
+}
+
+// An instance in front of the camera, or of two.
+struct SeenInstance {
+    Pose pose;
+    int32_t bundle;
+    InstanceAxes axes;
+    InstanceView view;
+};
+
+// Where the cut of instance i is found, and which of its tops are drawn, where it is found there.
+__device__ CutSource see_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
+                                  const SelectRule& rule, SeenInstance& seen) {
+    seen.pose = scene.instances.pose(i);
+    if (!is_placed(seen.pose)) return CutSource::nowhere;
+    seen.bundle = scene.instances.bundle[i];
+    const ClusterTable& table = scene.bundles[seen.bundle].table;
+    seen.axes = axes_of_instance(eyes.camera[0], seen.pose);
+    seen.view = view_from_instance(eyes, frustum_sides(eyes, table.pad_px), seen.axes, seen.pose,
+                                   scene.instances.importance[i]);
+    const CutSource source = source_of_cut(table, seen.view, rule, kLaneClusters);
+    if (source != CutSource::tops) return source;
+    const InstanceCut<AskedGroups> cut{table, seen.view, rule, {table, seen.view, rule}, rule.culls};
     unsigned drawn = 0;
     for (unsigned k = 0; k < table.top_cluster.size; ++k)
         if (!cut.is_culled(table.top_cluster[k])) drawn |= 1u << k;
     scene.tops[i] = static_cast<uint8_t>(drawn);
     return drawn != 0 ? source : CutSource::nowhere;
+}
+
+// Where the cut of instance i is found, if there is one. Writes what the kernels after this one need of it.
+// For whole warps, of neighbours.
+__device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
+                                    const SelectRule& rule, Placement* placements) {
+    __shared__ InstanceView space[kPlaceThreads];  // for the rows of each warp
+    static_assert(sizeof(Placement) <= sizeof(InstanceView), "the space is enough for both");
+    auto* of_warp = reinterpret_cast<uint4*>(space + threadIdx.x / 32 * 32);
+    const size_t num_instances = scene.instances.scale.size, first = i - threadIdx.x % 32;
+    SeenInstance seen;
+    const CutSource source =
+        i < num_instances ? see_instance(scene, i, eyes, rule, seen) : CutSource::nowhere;
+    const bool is_seen = source != CutSource::nowhere;
+    if (placements != nullptr) {
+        Placement placement;
+        if (is_seen) placement = placement_of(seen.axes, seen.pose, seen.bundle, 0);
+        write_row(of_warp, is_seen, placement, placements + first);
+        if (eyes.are_two) {
+            if (is_seen)
+                placement =
+                    placement_of(axes_of_instance(eyes.camera[1], seen.pose), seen.pose, seen.bundle, 1);
+            write_row(of_warp, is_seen, placement, placements + num_instances + first);
+        }
+    }
+    write_row(of_warp, source == CutSource::table, seen.view, scene.views + first);
+    return source;
 }
 
 __global__ void place_kernel(PlacedScene scene, Eyes eyes, SelectRule rule, EyeImages pictures,
@@ -80,9 +125,7 @@ __global__ void place_kernel(PlacedScene scene, Eyes eyes, SelectRule rule, EyeI
     rule.tolerance_px2 = round.least_tolerance(rule);
     const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
     if (i < pictures.count) images[i] = pictures.image[i];
-    const size_t num_instances = scene.instances.scale.size;
-    const CutSource source =
-        i < num_instances ? place_instance(scene, i, eyes, rule, placements) : CutSource::nowhere;
+    const CutSource source = place_instance(scene, i, eyes, rule, placements);
 
     // Tops of neighbours with no table in between make one part, which the first of them writes.
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
