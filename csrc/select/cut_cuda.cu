@@ -29,7 +29,20 @@ namespace {
 
 constexpr unsigned kCutBlocks = 4;  // on a multiprocessor
 constexpr unsigned kReportBlocks = 64;
+constexpr unsigned kFewBundles = 8;
 constexpr unsigned kPlaceThreads = 64;  // few, so that a few thousand instances spread over the device
+
+// The sides of the frustum for each bundle, which every instance would take eight divisions of doubles to
+// find out: as an argument where there are few bundles, in memory where there are more.
+struct BundleSides {
+    FrustumSides few[kFewBundles];
+    const FrustumSides* many;  // null where there are few
+
+    __device__ FrustumSides operator[](size_t bundle) const {
+        if (many != nullptr) return many[bundle];
+        return few[bundle];
+    }
+};
 
 // Scratch of one round of a cut: zeros, but for the states of cut_kernel, which place_kernel clears.
 struct Scratch {
@@ -74,14 +87,14 @@ struct SeenInstance {
 
 // Where the cut of instance i is found, and which of its tops are drawn, where it is found there.
 __device__ CutSource see_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
-                                  const SelectRule& rule, SeenInstance& seen) {
+                                  const BundleSides& sides, const SelectRule& rule, SeenInstance& seen) {
     seen.pose = scene.instances.pose(i);
     if (!is_placed(seen.pose)) return CutSource::nowhere;
     seen.bundle = scene.instances.bundle[i];
     const ClusterTable& table = scene.bundles[seen.bundle].table;
     seen.axes = axes_of_instance(eyes.camera[0], seen.pose);
-    seen.view = view_from_instance(eyes, frustum_sides(eyes, table.pad_px), seen.axes, seen.pose,
-                                   scene.instances.importance[i]);
+    seen.view =
+        view_from_instance(eyes, sides[seen.bundle], seen.axes, seen.pose, scene.instances.importance[i]);
     const CutSource source = source_of_cut(table, seen.view, rule, kLaneClusters);
     if (source != CutSource::tops) return source;
     const InstanceCut<AskedGroups> cut{table, seen.view, rule, {table, seen.view, rule}, rule.culls};
@@ -95,14 +108,14 @@ __device__ CutSource see_instance(const PlacedScene& scene, size_t i, const Eyes
 // Where the cut of instance i is found, if there is one. Writes what the kernels after this one need of it.
 // For whole warps, of neighbours.
 __device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
-                                    const SelectRule& rule, Placement* placements) {
+                                    const BundleSides& sides, const SelectRule& rule, Placement* placements) {
     __shared__ InstanceView space[kPlaceThreads];  // for the rows of each warp
     static_assert(sizeof(Placement) <= sizeof(InstanceView), "the space is enough for both");
     auto* of_warp = reinterpret_cast<uint4*>(space + threadIdx.x / 32 * 32);
     const size_t num_instances = scene.instances.scale.size, first = i - threadIdx.x % 32;
     SeenInstance seen;
     const CutSource source =
-        i < num_instances ? see_instance(scene, i, eyes, rule, seen) : CutSource::nowhere;
+        i < num_instances ? see_instance(scene, i, eyes, sides, rule, seen) : CutSource::nowhere;
     const bool is_seen = source != CutSource::nowhere;
     if (placements != nullptr) {
         Placement placement;
@@ -119,13 +132,21 @@ __device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Ey
     return source;
 }
 
-__global__ void place_kernel(PlacedScene scene, Eyes eyes, SelectRule rule, EyeImages pictures,
-                             FrameImage* images, Placement* placements, BudgetRound round, Scratch scratch) {
+// A thread a bundle.
+__global__ void sides_kernel(const BundleOnDevice* bundles, size_t num_bundles, Eyes eyes,
+                             FrustumSides* sides) {
+    const size_t b = size_t(blockIdx.x) * blockDim.x + threadIdx.x;
+    if (b < num_bundles) sides[b] = frustum_sides(eyes, bundles[b].table.pad_px);
+}
+
+__global__ void place_kernel(PlacedScene scene, Eyes eyes, BundleSides sides, SelectRule rule,
+                             EyeImages pictures, FrameImage* images, Placement* placements, BudgetRound round,
+                             Scratch scratch) {
     if (round.is_over()) return;
     rule.tolerance_px2 = round.least_tolerance(rule);
     const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
     if (i < pictures.count) images[i] = pictures.image[i];
-    const CutSource source = place_instance(scene, i, eyes, rule, placements);
+    const CutSource source = place_instance(scene, i, eyes, sides, rule, placements);
 
     // Tops of neighbours with no table in between make one part, which the first of them writes.
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
@@ -350,11 +371,22 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
     const bool has_budget = rule.budget != kNoBudget;
     Count* change = zeros + 2 * zeros_of_round(count);  // with a budget
     BudgetState* state = has_budget ? budget_state(stream) : nullptr;
+    BundleSides sides{};
+    const size_t num_bundles = scene.num_bundles();
+    if (num_bundles > kFewBundles) {
+        FrustumSides* many = sides_.reserve(num_bundles, stream);
+        launch("sides_kernel", sides_kernel, blocks_for(num_bundles, kCutThreads), kCutThreads, 0, stream,
+               placed.bundles, num_bundles, eyes, many);
+        sides.many = many;
+    } else {
+        for (size_t b = 0; b < num_bundles; ++b)
+            sides.few[b] = frustum_sides(eyes, scene.bundle(b).on_device().table.pad_px);
+    }
     for (const bool is_second : {false, true}) {
         const Scratch& scratch = scratches[is_second];
         const BudgetRound round{state, is_second};
         launch("place_kernel", place_kernel, place_blocks(count), kPlaceThreads, 0, stream, placed, eyes,
-               rule, target.pictures, target.images, target.placements, round, scratch);
+               sides, rule, target.pictures, target.images, target.placements, round, scratch);
         if (!has_budget) break;
         choose_tolerance(placed, rule, round, blocks, scratch.num_parts, change, target.choice, state,
                          stream);
@@ -460,9 +492,9 @@ void Cut::select(const SceneTables& scene, const Eyes& eyes, const SelectRule& r
 }
 
 size_t Cut::bytes() const {
-    return views_.bytes() + tops_.bytes() + parts_.bytes() + states_.bytes() + zeros_.bytes() +
-           budget_.bytes() + pair_instance_.bytes() + pair_cluster_.bytes() + pair_weight_.bytes() +
-           pairs_.bytes();
+    return sides_.bytes() + views_.bytes() + tops_.bytes() + parts_.bytes() + states_.bytes() +
+           zeros_.bytes() + budget_.bytes() + pair_instance_.bytes() + pair_cluster_.bytes() +
+           pair_weight_.bytes() + pairs_.bytes();
 }
 
 }  // namespace cuda

@@ -81,6 +81,7 @@ class Cut {
     BudgetState* budget_state(cudaStream_t stream);
 
     const int device_ = current_device();
+    DeviceBuffer<FrustumSides> sides_;
     DeviceBuffer<InstanceView> views_;
     DeviceBuffer<uint8_t> tops_;
     DeviceBuffer<CutPart> parts_;
