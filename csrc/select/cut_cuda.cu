@@ -29,6 +29,7 @@ namespace {
 
 constexpr unsigned kCutBlocks = 4;  // on a multiprocessor
 constexpr unsigned kReportBlocks = 64;
+constexpr unsigned kPlaceBlocks = 12;  // on a multiprocessor
 constexpr unsigned kFewBundles = 8;
 constexpr unsigned kPlaceThreads = 64;  // few, so that a few thousand instances spread over the device
 
@@ -57,78 +58,76 @@ __device__ Placement placement_of(const InstanceAxes& axes, const Pose& pose, in
     return {model_view_from_instance(axes, pose), static_cast<uint32_t>(bundle), eye};
 }
 
-// Writes the records of the lanes that have one, whose places follow each other from `first` on, as whole
-// rows of memory; for whole warps. `space` is the warp's.
+// A record of each lane of a warp, on its way between registers and memory.
 template <class Record>
-__device__ void write_row(uint4* space, bool has_one, const Record& mine, Record* first) {
-    constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
-    static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
-                  "records are whole vectors");
-    const unsigned lane = threadIdx.x % 32, writers = __ballot_sync(kAllLanes, has_one);
-    if (writers == 0) return;
-    if (has_one) reinterpret_cast<Record*>(space)[lane] = mine;
-    __syncwarp();
-    auto* vectors = reinterpret_cast<uint4*>(first);
+struct RecordRow {
+    Record* records;
+
+    __device__ void set(const Record& mine) const { records[threadIdx.x % 32] = mine; }
+    // Writes those of the lanes that have one to their places, which follow each other from `first` on, as
+    // whole rows of memory; for whole warps.
+    __device__ void write(bool has_one, Record* first) const {
+        constexpr unsigned kVectors = sizeof(Record) / sizeof(uint4);
+        static_assert(sizeof(Record) % sizeof(uint4) == 0 && alignof(Record) % sizeof(uint4) == 0,
+                      "records are whole vectors");
+        const unsigned writers = __ballot_sync(kAllLanes, has_one);
+        __syncwarp();
+        if (writers == 0) return;
+        const auto* from = reinterpret_cast<const uint4*>(records);
+        auto* to = reinterpret_cast<uint4*>(first);
 #pragma unroll
-    for (unsigned k = 0; k < kVectors; ++k) {
-        const unsigned v = 32 * k + lane;
-        if (writers >> v / kVectors & 1) vectors[v] = space[v];
+        for (unsigned k = 0; k < kVectors; ++k) {
+            const unsigned v = 32 * k + threadIdx.x % 32;
+            if (writers >> v / kVectors & 1) to[v] = from[v];
+        }
+        __syncwarp();  // before the next records are set
     }
-    __syncwarp();  // before the next row
-}
-
-// An instance in front of the camera, or of two.
-struct SeenInstance {
-    Pose pose;
-    int32_t bundle;
-    InstanceAxes axes;
-    InstanceView view;
 };
-
-// Where the cut of instance i is found, and which of its tops are drawn, where it is found there.
-__device__ CutSource see_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
-                                  const BundleSides& sides, const SelectRule& rule, SeenInstance& seen) {
-    seen.pose = scene.instances.pose(i);
-    if (!is_placed(seen.pose)) return CutSource::nowhere;
-    seen.bundle = scene.instances.bundle[i];
-    const ClusterTable& table = scene.bundles[seen.bundle].table;
-    seen.axes = axes_of_instance(eyes.camera[0], seen.pose);
-    seen.view =
-        view_from_instance(eyes, sides[seen.bundle], seen.axes, seen.pose, scene.instances.importance[i]);
-    const CutSource source = source_of_cut(table, seen.view, rule, kLaneClusters);
-    if (source != CutSource::tops) return source;
-    const InstanceCut<AskedGroups> cut{table, seen.view, rule, {table, seen.view, rule}, rule.culls};
-    unsigned drawn = 0;
-    for (unsigned k = 0; k < table.top_cluster.size; ++k)
-        if (!cut.is_culled(table.top_cluster[k])) drawn |= 1u << k;
-    scene.tops[i] = static_cast<uint8_t>(drawn);
-    return drawn != 0 ? source : CutSource::nowhere;
-}
 
 // Where the cut of instance i is found, if there is one. Writes what the kernels after this one need of it.
 // For whole warps, of neighbours.
 __device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
                                     const BundleSides& sides, const SelectRule& rule, Placement* placements) {
-    __shared__ InstanceView space[kPlaceThreads];  // for the rows of each warp
-    static_assert(sizeof(Placement) <= sizeof(InstanceView), "the space is enough for both");
-    auto* of_warp = reinterpret_cast<uint4*>(space + threadIdx.x / 32 * 32);
+    __shared__ InstanceView space[kPlaceThreads];
+    static_assert(sizeof(Placement) <= sizeof(InstanceView), "rows of both take turns");
+    InstanceView* of_warp = space + threadIdx.x / 32 * 32;
+    const RecordRow<Placement> placement_row{reinterpret_cast<Placement*>(of_warp)};
+    const RecordRow<InstanceView> view_row{of_warp};
     const size_t num_instances = scene.instances.scale.size, first = i - threadIdx.x % 32;
-    SeenInstance seen;
-    const CutSource source =
-        i < num_instances ? see_instance(scene, i, eyes, sides, rule, seen) : CutSource::nowhere;
-    const bool is_seen = source != CutSource::nowhere;
-    if (placements != nullptr) {
-        Placement placement;
-        if (is_seen) placement = placement_of(seen.axes, seen.pose, seen.bundle, 0);
-        write_row(of_warp, is_seen, placement, placements + first);
-        if (eyes.are_two) {
-            if (is_seen)
-                placement =
-                    placement_of(axes_of_instance(eyes.camera[1], seen.pose), seen.pose, seen.bundle, 1);
-            write_row(of_warp, is_seen, placement, placements + num_instances + first);
+    const Pose pose = i < num_instances ? scene.instances.pose(i) : Pose{nullptr, nullptr, 0.0};
+    CutSource source = CutSource::nowhere;
+    int32_t bundle = 0;
+    InstanceView view;
+    if (i < num_instances && is_placed(pose)) {
+        bundle = scene.instances.bundle[i];
+        const ClusterTable& table = scene.bundles[bundle].table;
+        {
+            const InstanceAxes axes = axes_of_instance(eyes.camera[0], pose);
+            view = view_from_instance(eyes, sides[bundle], axes, pose, scene.instances.importance[i]);
+            // Before it is known whether it is seen, so that the axes need not be kept until then.
+            if (placements != nullptr) placement_row.set(placement_of(axes, pose, bundle, 0));
+        }
+        source = source_of_cut(table, view, rule, kLaneClusters);
+        if (source == CutSource::tops) {
+            const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
+            unsigned drawn = 0;
+            for (unsigned k = 0; k < table.top_cluster.size; ++k)
+                if (!cut.is_culled(table.top_cluster[k])) drawn |= 1u << k;
+            scene.tops[i] = static_cast<uint8_t>(drawn);
+            if (drawn == 0) source = CutSource::nowhere;
         }
     }
-    write_row(of_warp, source == CutSource::table, seen.view, scene.views + first);
+    const bool is_seen = source != CutSource::nowhere;
+    if (placements != nullptr) {
+        placement_row.write(is_seen, placements + first);
+        if (eyes.are_two) {
+            if (is_seen)
+                placement_row.set(placement_of(axes_of_instance(eyes.camera[1], pose), pose, bundle, 1));
+            placement_row.write(is_seen, placements + num_instances + first);
+        }
+    }
+    if (source == CutSource::table) view_row.set(view);
+    view_row.write(source == CutSource::table, scene.views + first);
     return source;
 }
 
@@ -139,10 +138,13 @@ __global__ void sides_kernel(const BundleOnDevice* bundles, size_t num_bundles, 
     if (b < num_bundles) sides[b] = frustum_sides(eyes, bundles[b].table.pad_px);
 }
 
-__global__ void place_kernel(PlacedScene scene, Eyes eyes, BundleSides sides, SelectRule rule,
-                             EyeImages pictures, FrameImage* images, Placement* placements, BudgetRound round,
-                             Scratch scratch) {
+// `kAreTwo`: whether the eyes are.
+template <bool kAreTwo>
+__global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kPlaceBlocks)
+    place_kernel(PlacedScene scene, Eyes eyes, BundleSides sides, SelectRule rule, EyeImages pictures,
+                 FrameImage* images, Placement* placements, BudgetRound round, Scratch scratch) {
     if (round.is_over()) return;
+    eyes.are_two = kAreTwo;
     rule.tolerance_px2 = round.least_tolerance(rule);
     const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
     if (i < pictures.count) images[i] = pictures.image[i];
@@ -385,8 +387,9 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
     for (const bool is_second : {false, true}) {
         const Scratch& scratch = scratches[is_second];
         const BudgetRound round{state, is_second};
-        launch("place_kernel", place_kernel, place_blocks(count), kPlaceThreads, 0, stream, placed, eyes,
-               sides, rule, target.pictures, target.images, target.placements, round, scratch);
+        launch("place_kernel", eyes.are_two ? place_kernel<true> : place_kernel<false>, place_blocks(count),
+               kPlaceThreads, 0, stream, placed, eyes, sides, rule, target.pictures, target.images,
+               target.placements, round, scratch);
         if (!has_budget) break;
         choose_tolerance(placed, rule, round, blocks, scratch.num_parts, change, target.choice, state,
                          stream);
