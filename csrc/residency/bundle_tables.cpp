@@ -56,7 +56,7 @@ std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const ClusterA
 
 BundleTables::BundleTables(const ClusterTable& table, const ClusterAppearance& appearance,
                            cudaStream_t stream)
-    : on_device_{table, appearance, {}, nullptr} {
+    : on_device_{table, appearance, {}, nullptr, runs_of_clusters(table)} {
     static_assert(kClustersOfBounds <= 8, "a byte says which of them are drawn together");
     const std::vector<ClusterBounds> bounds = bounds_of_clusters(table);
     const std::vector<uint8_t> joins = joins_of_clusters(table, appearance);

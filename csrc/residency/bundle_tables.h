@@ -9,7 +9,7 @@
 namespace v3dg {
 namespace cuda {
 
-// What kernels read of a bundle; everything lies on the device.
+// What kernels read of a bundle; all that it points to lies on the device.
 struct BundleOnDevice {
     ClusterTable table;
     ClusterAppearance appearance;
@@ -17,6 +17,7 @@ struct BundleOnDevice {
     // A byte for each of the bounds; bit k: its cluster k is drawn together with the one before, since its
     // rows follow and it looks the same.
     const uint8_t* joins;
+    ClusterRuns runs;
 };
 
 // A byte for each kClustersOfBounds clusters, as BundleOnDevice::joins has them.

@@ -9,6 +9,9 @@ namespace v3dg {
 
 namespace {
 
+// Its square is far above where float32 loses digits.
+constexpr float kLeastRunRadius = 1e-15f;
+
 // Contains the centres of the balls. At the origin where there are none.
 Ball ball_of_centers(Span<const Ball> balls) {
     double middle[3] = {0, 0, 0}, radius2 = 0;
@@ -60,6 +63,36 @@ std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table) {
         bounds[k] = bounds_of(table, first, std::min(first + kClustersOfBounds, count));
     });
     return bounds;
+}
+
+ClusterRuns runs_of_clusters(const ClusterTable& table) {
+    const size_t count = table.num_clusters();
+    constexpr size_t kLeast = kClustersOfBounds * kMostRuns;
+    ClusterRuns runs{};
+    runs.size = static_cast<uint32_t>(kClustersOfBounds * std::max<size_t>(1, (count + kLeast - 1) / kLeast));
+    runs.count = static_cast<uint32_t>((count + runs.size - 1) / runs.size);
+    runs.groups = ball_of_centers(table.ball);
+    float most_radius = runs.groups.radius, least_radius = INFINITY;
+    for (const Ball& ball : table.ball) {
+        most_radius = std::max(most_radius, ball.radius);
+        least_radius = std::min(least_radius, ball.radius);
+    }
+    runs.least_distance = least_radius >= kLeastRunRadius ? 2 * most_radius : INFINITY;
+    runs.least_level = INT32_MAX;
+    for (const int32_t level : table.level) runs.least_level = std::min(runs.least_level, level);
+    const auto size_of = [&](int32_t g) { return table.ball[g].radius * std::sqrt(table.weight[g]); };
+    for (uint32_t k = 0; k < runs.count; ++k) {
+        float most_parent = 0, least_own = INFINITY;
+        for (size_t c = size_t(k) * runs.size; c < std::min(count, size_t(k + 1) * runs.size); ++c) {
+            const int32_t own = table.own_group[c], parent = table.parent_group[c];
+            const float above = parent < 0 ? NAN : size_of(parent);
+            if (!(above <= most_parent)) most_parent = std::isnan(most_parent) ? NAN : above;
+            least_own = std::min(least_own, own < 0 ? 0 : size_of(own));
+        }
+        runs.most_parent[k] = most_parent;
+        runs.least_own[k] = least_own;
+    }
+    return runs;
 }
 
 }  // namespace v3dg

@@ -1,7 +1,7 @@
 #pragma once
 
-// What holds of a few neighbouring clusters whatever the view, so that selection can pass over them together.
-// The tests that read it are in select_math.h.
+// What holds of neighbouring clusters whatever the view, so that selection can pass over them together. The
+// tests that read it are in select_math.h.
 
 #include <vector>
 
@@ -22,5 +22,21 @@ struct ClusterBounds {
 
 // [ceil(C / kClustersOfBounds)]
 std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table);
+
+constexpr uint32_t kMostRuns = 16;
+
+// The clusters of a table in a few runs, which are told apart by one distance to all of them. Levels follow
+// each other in a table, so of a distant instance most runs are too fine, and of a near one some too coarse.
+struct ClusterRuns {
+    uint32_t count, size;  // of runs; of clusters in each, whole bounds
+    Ball groups;           // contains the centres of the balls of all groups
+    float least_distance;  // of a ball, from which on the tests hold
+    int32_t least_level;   // of all groups
+    // Radius times root of weight. Of the groups above, NaN where a cluster has none; of their own, 0 where a
+    // cluster has none.
+    float most_parent[kMostRuns], least_own[kMostRuns];
+};
+
+ClusterRuns runs_of_clusters(const ClusterTable& table);
 
 }  // namespace v3dg

@@ -1,7 +1,7 @@
 // A cut takes two kernels. place_kernel, a thread an instance: the camera in its frame, and where its cut is
-// found: nowhere, among its tops, or in its table. That is dealt out as parts: 256 clusters of a table, or
-// the tops of up to 32 neighbouring instances. cut_kernel, a warp a part: which clusters are drawn, and their
-// places in the list by a prefix sum over parts.
+// found: nowhere, among its tops, or in its table. That is dealt out as parts: 256 of the clusters of a table
+// that its distance leaves to be asked, or the tops of up to 32 neighbouring instances. cut_kernel, a warp a
+// part: which clusters are drawn, and their places in the list by a prefix sum over parts.
 //
 // For a budget, the kernels of budget_cuda.cu run in between, for two rounds with place_kernel before each.
 
@@ -84,10 +84,16 @@ struct RecordRow {
     }
 };
 
-// Where the cut of instance i is found, if there is one. Writes what the kernels after this one need of it.
-// For whole warps, of neighbours.
-__device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
-                                    const BundleSides& sides, const SelectRule& rule, Placement* placements) {
+// Where the cut of an instance is found, and which clusters are asked where that is a table.
+struct Placed {
+    CutSource source;
+    ClusterRange asked;
+};
+
+// Places instance i, if there is one. Writes what the kernels after this one need of it. For whole warps, of
+// neighbours.
+__device__ Placed place_instance(const PlacedScene& scene, size_t i, const Eyes& eyes,
+                                 const BundleSides& sides, const SelectRule& rule, Placement* placements) {
     __shared__ InstanceView space[kPlaceThreads];
     static_assert(sizeof(Placement) <= sizeof(InstanceView), "rows of both take turns");
     InstanceView* of_warp = space + threadIdx.x / 32 * 32;
@@ -96,6 +102,7 @@ __device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Ey
     const size_t num_instances = scene.instances.scale.size, first = i - threadIdx.x % 32;
     const Pose pose = i < num_instances ? scene.instances.pose(i) : Pose{nullptr, nullptr, 0.0};
     CutSource source = CutSource::nowhere;
+    ClusterRange asked{0, 0};
     int32_t bundle = 0;
     InstanceView view;
     if (i < num_instances && is_placed(pose)) {
@@ -116,6 +123,11 @@ __device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Ey
             scene.tops[i] = static_cast<uint8_t>(drawn);
             if (drawn == 0) source = CutSource::nowhere;
         }
+        // A budget's tolerance is not known yet.
+        if (source == CutSource::table)
+            asked =
+                clusters_to_ask(table, scene.bundles[bundle].runs, view, rule,
+                                rule.budget == kNoBudget ? Tolerances::this_one : Tolerances::from_this_on);
     }
     const bool is_seen = source != CutSource::nowhere;
     if (placements != nullptr) {
@@ -128,7 +140,7 @@ __device__ CutSource place_instance(const PlacedScene& scene, size_t i, const Ey
     }
     if (source == CutSource::table) view_row.set(view);
     view_row.write(source == CutSource::table, scene.views + first);
-    return source;
+    return {source, asked};
 }
 
 // A thread a bundle.
@@ -148,7 +160,7 @@ __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kP
     rule.tolerance_px2 = round.least_tolerance(rule);
     const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
     if (i < pictures.count) images[i] = pictures.image[i];
-    const CutSource source = place_instance(scene, i, eyes, sides, rule, placements);
+    const auto [source, asked] = place_instance(scene, i, eyes, sides, rule, placements);
 
     // Tops of neighbours with no table in between make one part, which the first of them writes.
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
@@ -158,9 +170,7 @@ __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kP
     const unsigned from = table_below != 0 ? 32 - __clz(static_cast<int>(table_below)) : 0;
     const unsigned to = table_above != 0 ? __ffs(table_above) - 1 : 32;
     const bool begins = source == CutSource::tops && (tops & below) >> from == 0;
-    unsigned parts = begins ? 1 : 0;
-    if (source == CutSource::table)
-        parts = blocks_for(scene.bundles[scene.instances.bundle[i]].table.num_clusters(), kPartSize);
+    const unsigned parts = begins ? 1 : blocks_for(asked.end - asked.first, kPartSize);
 
     unsigned total;
     const unsigned before_in_block = block_prefix(parts, total);
@@ -176,7 +186,8 @@ __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kP
         const unsigned until = to < 32 ? (1u << to) - 1 : kAllLanes;
         *part = {static_cast<uint32_t>(i), 0, (tops & until) >> lane};
     } else {
-        for (unsigned p = 0; p < parts; ++p) part[p] = {static_cast<uint32_t>(i), p * kPartSize, 0};
+        for (unsigned p = 0; p < parts; ++p)
+            part[p] = {static_cast<uint32_t>(i), asked.first + p * kPartSize, 0};
     }
     // The block clears the tickets whose first part is one of its own.
     for (unsigned t = blocks_for(before, kCutWarps) + threadIdx.x; t < blocks_for(before + total, kCutWarps);

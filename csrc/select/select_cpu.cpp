@@ -288,13 +288,21 @@ void cpu::pair_metrics(const SelectInput& in, const GivenCut& given, Span<float>
 void cpu::bounds_may_draw(const SelectInput& in, Tolerances tolerances, Span<const int64_t> first,
                           Span<uint8_t> may_draw) {
     std::vector<std::vector<ClusterBounds>> bounds;
-    for (const ClusterTable& table : in.bundles) bounds.push_back(bounds_of_clusters(table));
+    std::vector<ClusterRuns> runs;
+    for (const ClusterTable& table : in.bundles) {
+        bounds.push_back(bounds_of_clusters(table));
+        runs.push_back(runs_of_clusters(table));
+    }
     const View view(in);
+    std::fill(may_draw.begin(), may_draw.end(), uint8_t(0));
     parallel_for(in.instances.bundle.size, kChunk, [&](size_t i) {
         const SeenInstance seen(view, i);
-        uint8_t* out = may_draw.data + first[i];
-        for (const ClusterBounds& b : bounds[in.instances.bundle[i]])
-            *out++ = seen.is_placed && v3dg::may_draw(seen.table, b, seen.view, in.rule, tolerances);
+        if (!seen.is_placed) return;
+        const int32_t bundle = in.instances.bundle[i];
+        const ClusterRange asked = clusters_to_ask(seen.table, runs[bundle], seen.view, in.rule, tolerances);
+        for (size_t k = asked.first / kClustersOfBounds; k * kClustersOfBounds < asked.end; ++k)
+            may_draw[first[i] + k] =
+                v3dg::may_draw(seen.table, bounds[bundle][k], seen.view, in.rule, tolerances);
     });
 }
 
