@@ -25,28 +25,28 @@ __global__ void change_kernel(PlacedScene scene, SelectRule rule, BudgetRound ro
     __shared__ Count at_first;
     if (threadIdx.x == 0) at_first = 0;
     __syncthreads();
-    for (unsigned p = blockIdx.x * kCutWarps + threadIdx.x / 32; p < *num_parts; p += gridDim.x * kCutWarps) {
-        const LaneClusters mine = clusters_of_lane(scene, scene.parts[p]);
+    const unsigned count = *num_parts;
+    for (unsigned first = blockIdx.x * kCutWarps; first < count; first += gridDim.x * kCutWarps) {
+        const unsigned p = first + threadIdx.x / 32;
+        LaneClusters mine{};
+        if (p < count) mine = clusters_of_lane(scene, scene.parts[p]);
         Count kept = 0;
-        if (mine.are_tops) {
-            for (unsigned k = 0; k < kLaneClusters; ++k)
-                if (mine.drawn >> k & 1) kept += mine.size(k);
-        } else {
-            const ClusterTable& table = mine.bundle->table;
-            const InstanceView view = scene.views[mine.instance];
+        for (unsigned k = 0; k < kLaneClusters; ++k)
+            if (mine.drawn >> k & 1) kept += mine.size(k);
+        const auto add = [&](const BundleOnDevice& bundle, const InstanceView& view, int32_t c) {
+            const ClusterTable& table = bundle.table;
             const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
-            ask_clusters(mine, view, rule, Tolerances::from_this_on, [&](int32_t c) {
-                const BinRange bins = cut.bins(c);
-                if (bins.is_empty()) return false;
-                const Count size = static_cast<Count>(table.num_gaussians(c));
-                if (bins.first == 0)
-                    kept += size;
-                else
-                    atomicAdd(&change[bins.first], size);
-                if (bins.end < kNumBudgetBins) atomicAdd(&change[bins.end], ~size + 1);
-                return true;
-            });
-        }
+            const BinRange bins = cut.bins(c);
+            if (bins.is_empty()) return false;
+            const Count size = static_cast<Count>(table.num_gaussians(c));
+            if (bins.first == 0)
+                kept += size;
+            else
+                atomicAdd(&change[bins.first], size);
+            if (bins.end < kNumBudgetBins) atomicAdd(&change[bins.end], ~size + 1);
+            return true;
+        };
+        ask_clusters<false>(scene, rule, Tolerances::from_this_on, mine, add);
         kept = warp_sum(kept);
         if (threadIdx.x % 32 == 0 && kept > 0) atomicAdd(&at_first, kept);
     }

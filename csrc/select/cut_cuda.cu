@@ -1,7 +1,7 @@
 // A cut takes two kernels. place_kernel, a thread an instance: the camera in its frame, and where its cut is
 // found: nowhere, among its tops, or in its table. That is dealt out as parts: 256 of the clusters of a table
-// that its distance leaves to be asked, or the tops of up to 32 neighbouring instances. cut_kernel, a warp a
-// part: which clusters are drawn, and their places in the list by a prefix sum over parts.
+// that its distance leaves to be asked, or the tops of up to 32 neighbouring instances. cut_kernel, a block
+// eight parts and a warp each: which clusters are drawn, and their places in the list by a prefix sum.
 //
 // For a budget, the kernels of budget_cuda.cu run in between, for two rounds with place_kernel before each.
 
@@ -273,22 +273,14 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
          ticket = is_enough ? num_tickets : take_ticket(scratch.cut_ticket)) {
         const unsigned p = ticket * kCutWarps + threadIdx.x / 32;
         LaneClusters mine{};
-        if (p < num_parts) {
-            mine = clusters_of_lane(scene, scene.parts[p]);
-            if (!mine.are_tops) {
-                const ClusterTable& table = mine.bundle->table;
-                const InstanceView view = scene.views[mine.instance];
-                const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
-                const uint32_t bundle = scene.instances.bundle[mine.instance];
-                mine.drawn = ask_clusters(
-                    mine, view, rule, Tolerances::this_one,
-                    [&](int32_t c) {
-                        if constexpr (kTells) tell_need(cut, c, bundle, needs);
-                        return cut.drawn_weight(c);
-                    },
-                    Output::kFades ? &mine.weights : nullptr);
-            }
-        }
+        if (p < num_parts) mine = clusters_of_lane(scene, scene.parts[p]);
+        const auto weigh = [&](const BundleOnDevice& bundle, const InstanceView& view, int32_t c) {
+            const ClusterTable& table = bundle.table;
+            const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
+            if constexpr (kTells) tell_need(cut, c, static_cast<uint32_t>(&bundle - scene.bundles), needs);
+            return cut.drawn_weight(c);
+        };
+        ask_clusters<Output::kFades>(scene, rule, Tolerances::this_one, mine, weigh);
         write_clusters(mine, ticket, ticket + 1 == num_tickets, scratch.unit_state, scratch.count_state,
                        output);
     }

@@ -56,9 +56,9 @@ void choose_tolerance(const PlacedScene& scene, const SelectRule& rule, const Bu
                       unsigned num_blocks, unsigned* num_parts, Count* change, CutChoice* choice,
                       BudgetState* state, cudaStream_t stream);
 
-// Weights of a lane's clusters, kWhole or less each. The lane picks one by shifting, for an index would put
-// them into memory.
-struct LaneWeights {
+// Weights of a lane's clusters, kWhole or less each: 16 bits for each, from the lowest on. The lane picks one
+// by shifting, for an index would put them into memory.
+struct alignas(16) LaneWeights {
     uint64_t low, high;
 
     static __device__ LaneWeights all(int32_t weight) {
@@ -106,49 +106,67 @@ __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const 
     return mine;
 }
 
-// Hands the answers of the kLaneClusters lanes from `from` on to this lane, unless that is 32.
-__device__ inline void keep_weights(int32_t answer, unsigned from, LaneWeights& weights) {
-    LaneWeights found{};
-#pragma unroll
-    for (unsigned k = 0; k < kLaneClusters; ++k) {
-        const uint64_t weight = __shfl_sync(kAllLanes, max(answer, 0), (from + k) % 32);
-        (k < 4 ? found.low : found.high) |= weight << 16 * (k % 4);
+// Asks the clusters of the tables that the warps of a block have parts of, for the lanes whose bounds do not
+// tell that none of theirs is drawn; for the whole block. All warps ask together, a lane a cluster and four
+// owners at a time, so that none waits long for another whose part has more to ask. Gives each owner a bit
+// for each of its clusters for which ask(bundle, view, cluster) was positive, and what that was where it
+// `kKeepsWeights`.
+template <bool kKeepsWeights, class Ask>
+__device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, Tolerances tolerances,
+                             LaneClusters& mine, const Ask& ask) {
+    struct Table {
+        const BundleOnDevice* bundle;
+        uint32_t first;  // cluster
+    };
+    __shared__ InstanceView views[kCutWarps];
+    __shared__ Table tables[kCutWarps];
+    __shared__ unsigned num_owners[kCutWarps];
+    __shared__ uint8_t owners[kCutThreads], drawn[kCutThreads];  // threads that own clusters; of each thread
+    __shared__ LaneWeights weights[kKeepsWeights ? kCutThreads : 1];
+    static_assert(kCutThreads <= 256, "a byte says which thread");
+    const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    bool is_owner = false;
+    if (mine.bundle != nullptr && !mine.are_tops) {  // the same in the whole warp
+        const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.instance);
+        for (unsigned w = lane; w < sizeof(InstanceView) / sizeof *view; w += 32)
+            reinterpret_cast<uint32_t*>(views + warp)[w] = view[w];
+        if (lane == 0) tables[warp] = {mine.bundle, mine.first};
+        __syncwarp();
+        const ClusterTable& table = mine.bundle->table;
+        is_owner = mine.first < table.num_clusters() &&
+                   may_draw(table, mine.bounds(), views[warp], rule, tolerances);
     }
-    if (from < 32) weights = found;
-}
-
-// Asks the clusters of a part of a table, a lane a cluster, for the lanes whose bounds do not tell that none
-// of theirs is drawn; four such lanes at a time. Returns to each lane a bit for each of its own clusters for
-// which ask(cluster) was positive, and keeps what it was where `weights` is not null.
-template <class Ask>
-__device__ unsigned ask_clusters(const LaneClusters& mine, const InstanceView& view, const SelectRule& rule,
-                                 Tolerances tolerances, const Ask& ask, LaneWeights* weights = nullptr) {
-    const unsigned lane = threadIdx.x % 32;
-    const uint32_t part_first = mine.first - kLaneClusters * lane;
-    const bool asks = mine.first < mine.bundle->table.num_clusters() &&
-                      may_draw(mine.bundle->table, mine.bounds(), view, rule, tolerances);
-    unsigned todo = __ballot_sync(kAllLanes, asks), found = 0;
-    while (todo != 0) {
-        unsigned owners = 0, owner = 32;  // in bytes; that this lane asks for
-        for (unsigned at = 0; at < 32; at += kLaneClusters) {
-            const unsigned next = todo != 0 ? __ffs(todo) - 1 : 32;
-            todo &= todo - 1;
-            owners |= next << at;
-            if (lane / kLaneClusters == at / kLaneClusters) owner = next;
+    const unsigned in_warp = __ballot_sync(kAllLanes, is_owner);
+    if (lane == 0) num_owners[warp] = __popc(in_warp);
+    __syncthreads();
+    unsigned before = 0, total = 0;
+    for (unsigned w = 0; w < kCutWarps; ++w) {
+        if (w < warp) before += num_owners[w];
+        total += num_owners[w];
+    }
+    if (is_owner) owners[before + __popc(in_warp & ((1u << lane) - 1))] = static_cast<uint8_t>(threadIdx.x);
+    __syncthreads();
+    constexpr unsigned kAtOnce = 32 / kLaneClusters;
+    for (unsigned first = kAtOnce * warp; first < total; first += kAtOnce * kCutWarps) {
+        const unsigned place = first + lane / kLaneClusters;
+        const bool is_one = place < total;
+        const unsigned owner = is_one ? owners[place] : 0, k = lane % kLaneClusters;
+        int32_t answer = 0;
+        if (is_one) {
+            const Table& of = tables[owner / 32];
+            const uint32_t c = of.first + kLaneClusters * (owner % 32) + k;
+            if (c < of.bundle->table.num_clusters())
+                answer = static_cast<int32_t>(ask(*of.bundle, views[owner / 32], static_cast<int32_t>(c)));
         }
-        const uint32_t c = part_first + kLaneClusters * owner + lane % kLaneClusters;
-        const bool is_one = owner < 32 && c < mine.bundle->table.num_clusters();
-        const int32_t answer = is_one ? static_cast<int32_t>(ask(static_cast<int32_t>(c))) : 0;
         const unsigned bits = __ballot_sync(kAllLanes, answer > 0);
-        unsigned from = 32;  // where this lane's clusters were asked
-        for (unsigned at = 0; at < 32; at += kLaneClusters)
-            if ((owners >> at & 255) == lane) {
-                found = bits >> at & 255;
-                from = at;
-            }
-        if (weights != nullptr) keep_weights(answer, from, *weights);
+        if (is_one && k == 0) drawn[owner] = static_cast<uint8_t>(bits >> lane);
+        if (kKeepsWeights && is_one)
+            reinterpret_cast<uint16_t*>(weights + owner)[k] = static_cast<uint16_t>(max(answer, 0));
     }
-    return found;
+    __syncthreads();
+    if (!is_owner) return;
+    mine.drawn = drawn[threadIdx.x];
+    if (kKeepsWeights) mine.weights = weights[threadIdx.x];
 }
 
 }  // namespace cuda
