@@ -203,9 +203,10 @@ __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool i
                                Count* count_state, const Output& output) {
     __shared__ Count before_units, before_gaussians;
     const WriteCount count = output.count(mine);
-    unsigned num_units, num_gaussians;
-    const unsigned units_before = block_prefix(count.units, num_units),
-                   gaussians_before = block_prefix(count.gaussians, num_gaussians);
+    Count in_block;  // both numbers in one word, whose halves hold what a block adds
+    const Count before_in_block = block_prefix(Count{count.units} << 32 | count.gaussians, in_block);
+    const auto num_units = static_cast<unsigned>(in_block >> 32),
+               num_gaussians = static_cast<unsigned>(in_block);
     if (threadIdx.x < 64) {  // a warp each
         const bool is_units = threadIdx.x < 32;
         const Count before =
@@ -213,7 +214,8 @@ __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool i
         if (threadIdx.x % 32 == 0) (is_units ? before_units : before_gaussians) = before;
     }
     __syncthreads();
-    output.write(mine, before_units + units_before, before_gaussians + gaussians_before);
+    output.write(mine, before_units + (before_in_block >> 32),
+                 before_gaussians + static_cast<unsigned>(before_in_block));
     if (is_last && threadIdx.x == 0)
         output.finish(before_units + num_units, before_gaussians + num_gaussians);
 }
