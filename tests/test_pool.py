@@ -256,6 +256,42 @@ def test_pages_are_there_together_with_those_above_them(scene, device, seed, mon
     assert num_changes > 0  # pages left, too
 
 
+def order_of_reading(scene, monkeypatch):
+    """(bundle, page) of what a picture misses, in the order in which it is read; a page comes with each."""
+    monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
+    renderer = Renderer(scene, device="cpu", memory="64MB")
+    renderer.render(CAMERA, **FINE)
+    core, order = renderer._frame._pool.core, []
+    missing, before = core.status().missing, [core.resident(b) for b in range(len(scene.bundles))]
+    for _ in range(missing):
+        assert core.read_one()
+        renderer.render(CAMERA, **FINE)
+        there = [core.resident(b) for b in range(len(scene.bundles))]
+        came = [np.flatnonzero(now & ~then) for now, then in zip(there, before, strict=True)]
+        (new,) = [(b, int(page)) for b, pages in enumerate(came) for page in pages]
+        order.append(new)
+        before = there
+    assert status(renderer).missing == 0
+    return order
+
+
+def test_no_page_is_read_before_those_above_it(scene, monkeypatch):
+    """Each can be drawn from the next picture on."""
+    assert len(order_of_reading(scene, monkeypatch)) > 100
+
+
+def test_neighbours_in_a_file_are_read_one_after_another(path, monkeypatch):
+    """Levels are as long as a stretch of 512 KiB or shorter, but the finest one, which is longer."""
+    bundle = Bundle.open(path)
+    scene = Scene()
+    scene.add(bundle)
+    pages = np.array([page for _, page in order_of_reading(scene, monkeypatch)])
+    assert len(pages) > 100
+    level = bundle.groups.level[pages]
+    assert (np.diff(pages) < 0).sum() <= bundle.num_levels + 1
+    assert (np.diff(level[np.diff(pages, prepend=-1) < 0]) <= 0).all()
+
+
 def film_of_arriving_pages(scene, device, options, num_frames=150):
     """Pictures of a camera at rest from the coarsest level on, and in how many frames pages have faded in."""
     renderer, pictures, arrived = Renderer(scene, device=device, memory="64MB"), [], []

@@ -24,7 +24,14 @@ constexpr size_t kAhead = 16;  // needs whose memory is fetched before their tur
 // Urgencies are told apart by a sixteenth of a power of two, from 1/2 on: a float has 23 bits within one, of
 // which the upper four are looked at.
 constexpr uint32_t kNumKeys = 1024, kKeyShift = 19, kFirstKey = 0x3f000000u >> kKeyShift;
-constexpr uint32_t kKeysOfPower = 1 << (23 - kKeyShift);  // pages above are a power more urgent, or more
+constexpr uint32_t kKeyOfMissed =
+    (0x3f800000u >> kKeyShift) - kFirstKey;  // of 1: those below are asked ahead
+
+// A disk is quicker the more it reads at once, and neighbours in a file are neighbours in space, of one
+// level: mostly of about the same urgency. So about so many bytes of them are a stretch, which is as urgent
+// as the most urgent page of it that is wanted.
+constexpr size_t kStretchBytes = size_t(512) << 10;
+constexpr uint32_t kNoStretch = UINT32_MAX;
 
 uint32_t key_of(float priority) {
     uint32_t bits;  // of a positive float, so they order as it does
@@ -172,6 +179,7 @@ size_t PagePolicy::ask(const PageRequest& request, bool has_failures) {
             wanted_.push_back({request.bundle, id - bundles_[request.bundle].first_page, 0});
         page.stamp = noted_;
         page.priority = priority;
+        page.stretch = kNoStretch;
     }
     return num_missing;
 }
@@ -198,6 +206,46 @@ void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool h
     num_needed_ = needed_.now;
 }
 
+// Has the keys of what is wanted be those of its stretches, and the pages in the order of the files. No
+// stretch has a page and one below it, and that above is the more urgent.
+void PagePolicy::find_stretches() {
+    std::sort(wanted_.begin(), wanted_.end(), [](const Wanted& a, const Wanted& b) {
+        return a.bundle != b.bundle ? a.bundle < b.bundle : a.page < b.page;
+    });
+    key_of_stretch_.clear();
+    uint32_t bundle = UINT32_MAX;
+    size_t pages_of_stretch = 1, number = 0;  // number: of the stretch, in the bundle
+    int32_t least_above = 0;                  // of its pages
+    for (const Wanted& w : wanted_) {
+        const auto id = static_cast<int32_t>(id_of(w.bundle, w.page));
+        if (w.bundle != bundle)
+            pages_of_stretch = std::max<size_t>(1, kStretchBytes / bundles_[w.bundle].most_bytes);
+        const bool is_next = w.bundle != bundle || w.page / pages_of_stretch != number || id >= least_above;
+        if (is_next) {
+            key_of_stretch_.push_back(0);
+            bundle = w.bundle;
+            number = w.page / pages_of_stretch;
+            least_above = INT32_MAX;
+        }
+        Page& page = pages_[id];
+        page.stretch = static_cast<uint32_t>(key_of_stretch_.size() - 1);
+        least_above = std::min(least_above, page.parent);
+        key_of_stretch_.back() = std::max(key_of_stretch_.back(), w.key);
+    }
+    // Pages come after those below them, so what a stretch is raised to is known when its first page is.
+    for (Wanted& w : wanted_) {
+        const Page& page = pages_[id_of(w.bundle, w.page)];
+        const Page& above = pages_[page.parent];
+        const uint32_t key = key_of_stretch_[page.stretch];
+        if (above.stamp == noted_ && above.stretch != kNoStretch) {
+            uint32_t& key_above = key_of_stretch_[above.stretch];
+            key_above = std::min(std::max(key_above, key + 1), kNumKeys - 1);
+        }
+        // What is asked for ahead waits until nothing is missed.
+        w.key = w.key < kKeyOfMissed ? std::min(key, kKeyOfMissed - 1) : key;
+    }
+}
+
 void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
     size_t num_missed = 0;
     std::fill(places_of_key_.begin(), places_of_key_.end(), Places{});
@@ -205,8 +253,9 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
         const float priority = pages_[id_of(w.bundle, w.page)].priority;
         num_missed += priority > 1;
         w.key = key_of(priority);
-        ++places_of_key_[w.key].count;
     }
+    find_stretches();
+    for (const Wanted& w : wanted_) ++places_of_key_[w.key].count;
     const size_t unneeded = num_old(needed_), unused = num_old(used_);
     const size_t room = num_missed > unused ? std::min(num_missed, unneeded) : unused;
     const size_t most = std::min(room > under_way ? room - under_way : 0, kMostChosen);
@@ -225,16 +274,6 @@ void PagePolicy::choose(size_t under_way, std::vector<PageRequest>& todo) {
         if (places.count == 0) continue;
         --places.count;
         todo[--places.end] = {w.bundle, w.page, 0};
-    }
-    // Within a power of two as the files have them, because a disk is quicker the more lies side by side.
-    // What was an end is where those of its key begin now.
-    for (uint32_t key = 0; key < kNumKeys; key += kKeysOfPower) {
-        const uint32_t next = key + kKeysOfPower;
-        const size_t last = next < kNumKeys ? places_of_key_[next].end : todo.size();
-        std::sort(todo.begin() + places_of_key_[key].end, todo.begin() + last,
-                  [](const auto& a, const auto& b) {
-                      return a.bundle != b.bundle ? a.bundle > b.bundle : a.page > b.page;
-                  });
     }
 }
 

@@ -106,8 +106,8 @@ class PagePolicy {
     // Takes note of what the cut of a frame needed, absent or resident, in any order. So many more pages are
     // needed as are left out, which is more than there is room for. `has_failures`: some pages cannot be had.
     void note(Span<const PageRequest> needs, size_t num_left_out, bool has_failures);
-    // What is read next for that, the most urgent last, of about as urgent ones those side by side that files
-    // have side by side: no more than there will be room for, beside what is under way.
+    // What is read next for that, the most urgent stretch last and each from its end, those above before
+    // those below: no more than there will be room for, beside what is under way.
     void choose(size_t under_way, std::vector<PageRequest>& todo);
     // Of that frame: pages that it misses, and slots that it would take.
     size_t missing() const { return missing_; }
@@ -125,9 +125,10 @@ class PagePolicy {
         size_t most_rows = 1, most_clusters = 1, most_bytes = 1;  // of its pages but the coarsest
     };
     struct Page {
-        int32_t parent = -1;  // all pages are numbered together; -1: the coarsest has none
-        uint32_t stamp = 0;   // view that asked for it last
-        float priority = 0;   // then
+        int32_t parent = -1;   // all pages are numbered together; -1: the coarsest has none
+        uint32_t stamp = 0;    // view that asked for it last
+        float priority = 0;    // then
+        uint32_t stretch = 0;  // of that view, where it is wanted
     };
     struct Slot {
         int32_t bundle = -1;
@@ -144,7 +145,7 @@ class PagePolicy {
         size_t now = 0, before = 0;
     };
     struct Wanted {
-        uint32_t bundle, page, key;
+        uint32_t bundle, page, key;  // key: of its urgency
     };
     // Of what is as urgent: places that are left, and where they end.
     struct Places {
@@ -166,6 +167,7 @@ class PagePolicy {
     void use(int32_t slot, bool is_needed);
     size_t ask(const PageRequest& request, bool has_failures);
     int32_t block_above(int32_t id) const;
+    void find_stretches();
     void touch(uint32_t& last, uint32_t value, Kept& kept);
     // What this view and the one before did without.
     bool is_old(uint32_t last) const { return last < noted_; }
@@ -198,6 +200,7 @@ class PagePolicy {
     Kept needed_, used_;
     size_t missing_ = 0, num_needed_ = 0;
     std::vector<Wanted> wanted_;
+    std::vector<uint32_t> key_of_stretch_;
     std::vector<Places> places_of_key_;
     // A heap, those first that were not used for longest. It lasts from frame to frame: what comes to be old
     // meanwhile is younger than what it has.
