@@ -96,7 +96,8 @@ class Bundle:
         """
         reader, paths = _core.HashedReader(), list(paths)
         try:
-            opened = on_threads(lambda path: cls._open(BundleFile(path, reader)), paths)
+            # Also where there are fewer processors: a disk answers several at once.
+            opened = on_threads(lambda path: cls._open(BundleFile(path, reader)), paths, most=8)
             for _, file in opened:
                 file.verify()  # the first time of all, because they are hashed side by side
         except (OSError, ValueError):

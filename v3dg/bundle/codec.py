@@ -40,7 +40,7 @@ class Codec:
     ) -> NDArray[np.int64]:
         """Sizes of pages of so many, with what they are filled up with."""
         num_bytes = num_gaussians * self.gaussian_bytes + num_clusters * self.cluster_bytes
-        return num_bytes + -num_bytes % self.alignment
+        return (num_bytes + self.alignment - 1) & -self.alignment  # a power of two
 
     def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
         """Arrays whose bytes, one after another, are the page of the clusters that begin at these rows."""

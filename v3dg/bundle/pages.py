@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
-_THREADS = 8
+_MOST = min(8, os.cpu_count() or 1)  # threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,11 +159,11 @@ class FilePages:
         return self._file.read_pages(self.layout.run(first_page, last_page, self._file.places))
 
 
-def on_threads(work: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
-    """What work makes of all items, on threads if there are several."""
+def on_threads(work: Callable[[_Item], _Result], items: Sequence[_Item], most: int = _MOST) -> list[_Result]:
+    """What work makes of all items, on so many threads at most if there are several."""
     if len(items) < 2:
         return list(map(work, items))
-    with ThreadPoolExecutor(min(_THREADS, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(most) as pool:
         return list(pool.map(work, items))
 
 
