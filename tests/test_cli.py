@@ -343,7 +343,7 @@ def test_wrong_usage(folder):
     for number in (0, 2**32):
         fails(2, "--threads: expected 1 to 1,024", "build", "tuft.ply", "--threads", number, cwd=folder)
     fails(2, "--camera", "render", "tuft.ply", "--camera", "near", cwd=folder)
-    fails(2, "COMMAND: expected build, info,", "tuft.ply", cwd=folder)
+    fails(2, "COMMAND: expected build, refine, info,", "tuft.ply", cwd=folder)
     fails(2, "--up: expected one of x, y, z, -x, -y, -z, got", "build", "tuft.ply", "--up", "q", cwd=folder)
     fails(2, "--size: expected 2 values, got fewer;", "render", "tuft.v3dg", "--size", 100, cwd=folder)
     fails(2, "--output: expected 1 value, got fewer;", "render", "tuft.v3dg", "-o", cwd=folder)
