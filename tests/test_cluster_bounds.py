@@ -71,6 +71,18 @@ def test_what_is_drawn_is_never_passed_over(seed, distance, min_level, footprint
             assert not (one & ~three).any()
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_nothing_is_passed_over_because_a_float_overflows(seed):
+    rng = np.random.default_rng(seed)
+    scene, camera = scene_of(rng), random_camera(rng, distance=100.0)
+    scene.set_importance(10 ** rng.uniform(33, 36, len(scene)))
+    metrics = np.concatenate(group_metrics(scene, camera))
+    for tolerance in rng.choice(metrics[np.isfinite(metrics) & (metrics > 0)], 20):
+        together = may_draw(scene, camera, tolerance=tolerance)
+        for one, two in zip(drawn(scene, camera, tolerance=tolerance), together, strict=True):
+            assert not (one & ~two).any()
+
+
 @pytest.mark.parametrize("tolerance", [0.05, 1.0, 20.0])
 def test_much_of_what_is_not_drawn_is_passed_over(tolerance):
     rng = np.random.default_rng(3)

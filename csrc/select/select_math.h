@@ -408,7 +408,7 @@ struct ClusterRange {
 // A ball whose radius is at most half of its distance covers between pi and this times pi x2 steradians.
 constexpr float kMostOfPi = 1.08f;
 // Far from where float32 loses digits, and from where squares overflow.
-constexpr float kLeastRunTolerance = 1e-20f, kMostRunDistance = 1e18f;
+constexpr float kLeastRunTolerance = 1e-20f, kLeastRunX2 = 1e-30f, kMostRunDistance = 1e18f;
 
 // Whole runs of clusters outside of which none is drawn at these tolerances, as bounds tell it.
 V3DG_HD inline ClusterRange clusters_to_ask(const ClusterTable& table, const ClusterRuns& runs,
@@ -416,14 +416,14 @@ V3DG_HD inline ClusterRange clusters_to_ask(const ClusterTable& table, const Clu
                                             Tolerances tolerances) {
     const float distance = sqrtf(distance2_to(runs.groups, view));
     const float nearest = distance - runs.groups.radius, farthest = distance + runs.groups.radius;
+    const float x2 = rule.tolerance_px2 / (float(kPi) * view.px2_per_steradian);  // of the tolerance's ball
     uint32_t first = 0, last = runs.count;
     if (rule.footprint == Footprint::solid_angle && nearest >= runs.least_distance &&
-        farthest <= kMostRunDistance && rule.tolerance_px2 >= kLeastRunTolerance) {
-        const float unit_px2 = float(kPi) * view.px2_per_steradian;
-        const float low = (1.0f - kBoundMargin) * rule.tolerance_px2 / (unit_px2 * rule.fade.factor);
+        farthest <= kMostRunDistance && rule.tolerance_px2 >= kLeastRunTolerance && x2 >= kLeastRunX2) {
+        const float low = (1.0f - kBoundMargin) * x2 / rule.fade.factor;
         const float most = nearest * sqrtf(low / kMostOfPi);
         while (first < last && runs.most_parent[first] <= most) ++first;
-        const float high = (1.0f + kBoundMargin) * rule.tolerance_px2 / (unit_px2 * rule.fade.inverse);
+        const float high = (1.0f + kBoundMargin) * x2 / rule.fade.inverse;
         const float least = farthest * sqrtf(high);
         if (tolerances == Tolerances::this_one && table.pages.is_whole() && runs.least_level > rule.min_level)
             while (first < last && runs.least_own[last - 1] > least) --last;
