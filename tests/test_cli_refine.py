@@ -40,7 +40,19 @@ def test_cameras_say_from_where(folder):
     assert v3dg.Bundle.open(folder / "seen.v3dg").config["refined"]["cameras"] == 1
 
 
+def test_lens_distortion_is_left_out_if_told(folder):
+    """As most models of COLMAP have it."""
+    document = json.loads((folder / "eyes.json").read_text())
+    (folder / "bent.json").write_text(json.dumps(document | {"camera_model": "OPENCV", "k1": 0.1}))
+    command = ("refine", "donut.v3dg", "bent.v3dg", "--steps", 1, "--cameras", "bent.json", "--device", "cpu")
+    fails(1, "expected no lens distortion", *command, cwd=folder)
+    done = run(*command, "--distortion", "ignore", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert v3dg.Bundle.open(folder / "bent.v3dg").config["refined"]["cameras"] == 1
+
+
 def test_what_cannot_be_meant_is_told(folder):
+    (folder / "no_eyes.json").write_text('{"frames": []}')
     before = sorted(folder.iterdir())
     fails(2, "another file than donut.v3dg", "refine", "donut.v3dg", "donut.v3dg", cwd=folder)
     fails(2, "x.ply: expected a file name ending in .v3dg", "refine", "donut.v3dg", "x.ply", cwd=folder)
@@ -48,4 +60,6 @@ def test_what_cannot_be_meant_is_told(folder):
     fails(1, "create it first", "refine", "donut.v3dg", "no/x.v3dg", cwd=folder)
     fails(1, "steps: expected 1 step or more", "refine", "donut.v3dg", "x.v3dg", "--steps", 0, cwd=folder)
     fails(1, "none.json", "refine", "donut.v3dg", "x.v3dg", "--cameras", "none.json", cwd=folder)
+    found = "cameras, got a file without any"
+    fails(1, found, "refine", "donut.v3dg", "x.v3dg", "--cameras", "no_eyes.json", cwd=folder)
     assert sorted(folder.iterdir()) == before

@@ -40,6 +40,14 @@ class CameraFile:
     distortion: Literal["refuse", "ignore"] = "refuse"
     """Whether lens distortion in that file is an error, or left out of the pictures."""
 
+    def read(self, size: tuple[int, int] = (800, 800)) -> dict[str, Camera]:
+        """The cameras of --cameras, of this size where their file has none; none if it is not given."""
+        if self.cameras is None:
+            return {}
+        cameras = read_cameras(self.cameras, size=size, distortion=self.distortion)
+        check(self.cameras, cameras, "cameras, got a file without any")
+        return cameras
+
 
 @dataclass
 class ViewOptions(CameraFile):
@@ -84,11 +92,10 @@ def choose_cameras(
     options: ViewOptions, path: Path, subject: Subject, own: dict[str, Camera] | None, views: int = 1
 ) -> dict[str, Camera]:
     """The cameras of --cameras, else the subject's own, else a turntable around it, by default of `views`."""
-    if options.cameras is not None:
-        own = read_cameras(options.cameras, size=options.size, distortion=options.distortion)
+    own = options.read(options.size) or own
     if own is None:
         own = {} if isinstance(subject, Scene) else _around(subject, options, options.views or views, path)
-    check(options.cameras or path, own, "cameras, got a file without any; give some with --cameras")
+    check(path, own, "cameras, got a file without any; give some with --cameras")
     if options.camera is not None:
         own = _one_camera(own, options.camera)
     for name, camera in own.items():

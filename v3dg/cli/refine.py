@@ -11,13 +11,13 @@ import tyro
 
 from v3dg._files import check_folder
 from v3dg.bundle import Bundle
-from v3dg.camera_file import read_cameras
 from v3dg.cli import _common
+from v3dg.cli._views import CameraFile
 from v3dg.refine import refine_bundle
 
 
-@dataclass
-class Refine(_common.OnDevice):
+@dataclass(kw_only=True)
+class Refine(CameraFile, _common.OnDevice):
     """Make the levels of a bundle look more like its asset, small and large, which takes far longer than
     building it."""
 
@@ -39,7 +39,7 @@ def run(options: Refine) -> None:
     _common.check_usage(str(options.output), options.output.suffix == ".v3dg", "a file name ending in .v3dg")
     check_folder(options.output)
     _common.check_output(options.output, options.bundle)
-    cameras = [] if options.cameras is None else list(read_cameras(options.cameras).values())
+    cameras = list(options.read().values())
     start = time.perf_counter()
     how: dict[str, Any] = {"steps": options.steps, "seed": options.seed, "device": options.device}
     bundle = Bundle.open(options.bundle)

@@ -19,7 +19,6 @@ from typing import Annotated
 import tyro
 
 from v3dg._start import SIGNALS
-from v3dg.camera_file import read_cameras
 from v3dg.cameras import Axis
 from v3dg.cli._common import Cut, Flag, OnPool, check_usage, option, print_result, require_subject, tell
 from v3dg.cli._views import CameraFile, choose_up
@@ -28,7 +27,6 @@ from v3dg.upright import direction_of
 
 # Between looks for a signal: a wait without an end misses one that comes just before it.
 _SECONDS = 0.1
-_SIZE = (800, 800)  # px, of cameras whose file has none; the page has its own
 
 
 @dataclass
@@ -61,10 +59,8 @@ def run(options: View) -> None:
     rule_of(tolerance, options.budget, 0, "solid_angle", True)
     check_usage("--tolerance", math.isfinite(tolerance), f"a number, got {tolerance}")
     subject, cameras = open_with_cameras(options.subject)
-    photographs = None
-    if options.cameras is not None:
-        cameras = read_cameras(options.cameras, size=_SIZE, distortion=options.distortion)
-        photographs = _photographs(options.cameras, cameras)
+    cameras = options.read() or cameras
+    photographs = None if options.cameras is None else _photographs(options.cameras, cameras or {})
     has_levels = not isinstance(subject, Gaussians)
     expected = f"a bundle or a scene, got the asset {options.subject}; build a bundle of it"
     check_usage("--budget", has_levels or options.budget is None, expected)
