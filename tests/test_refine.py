@@ -183,6 +183,19 @@ def test_pictures_from_cameras_are_taken_there(bundle):
         assert abs(camera.height - camera.width * 9 / 16) <= 1
 
 
+def test_cameras_come_by_name_too_and_one_by_one(bundle):
+    cameras = v3dg.turntable((0, 0, 0), 3.0, 2, width=64, height=64)
+
+    def refined(given):
+        return refine_bundle(bundle, cameras=given, steps=2, device="cpu", progress=False)
+
+    wanted = refined(cameras)
+    for given in ({"front": cameras[0], "back": cameras[1]}, iter(cameras)):
+        found = refined(given)
+        assert found.config["refined"]["cameras"] == 2
+        np.testing.assert_array_equal(found.gaussians.means, wanted.gaussians.means)
+
+
 def test_a_camera_that_sees_nothing_changes_nothing(bundle, device):
     away = v3dg.Camera.look_at((0, 0, 5), (0, 0, 9), (0, 1, 0), width=64, height=64)
     refined = refine_bundle(bundle, cameras=[away], steps=3, device=device, progress=False)

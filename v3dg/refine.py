@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -28,7 +27,7 @@ _SHARE = 0.99  # of the gaussians that an asset's radius holds; the rest may flo
 def refine_bundle(
     bundle: Bundle,
     *,
-    cameras: Sequence[Camera] = (),
+    cameras: Iterable[Camera] | Mapping[str, Camera] = (),
     steps: int = 30_000,
     seed: int = 0,
     device: str | Device = "auto",
@@ -46,8 +45,8 @@ def refine_bundle(
 
     Args:
         bundle: What `build_bundle` made. About six times what its gaussians take is in memory meanwhile.
-        cameras: From where the asset is seen: for a room those of its photographs. What is seen from
-            elsewhere may get worse. Without any, pictures are taken from all around.
+        cameras: Where the asset is seen from, also by name: for a room those of its photographs. What is
+            seen from elsewhere may get worse. Without any, pictures are taken from all around.
         steps: Pictures that cuts are compared with, one after another.
         seed: Of the pictures.
         device: Where to compute.
@@ -60,26 +59,26 @@ def refine_bundle(
         KeyboardInterrupt: Ctrl-C; threads have stopped.
     """
     check_type("bundle", bundle, Bundle, "a Bundle")
+    cameras = list(cameras.values() if isinstance(cameras, Mapping) else cameras)
     for number, camera in enumerate(cameras):
         check_type(f"cameras[{number}]", camera, Camera, "a Camera")
     steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
     seed = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1)
     where = _device.resolve(device)
-    asset = bundle.level_gaussians(0)
-    if bundle.num_levels < 2 or len(asset) == 0:
+    num_leaves = int(bundle.clusters.offset[bundle.level_range(0).stop]) if bundle.num_levels > 1 else 0
+    if num_leaves == 0:
         return bundle
     everything, clusters = bundle.gaussians, bundle.clusters
     gaussians = _device.place(everything.subset(np.arange(len(everything))), where)
-    target = _core.FitTarget(gaussians.subset(slice(0, len(asset))).rows, 0.0, False)
+    target = _core.FitTarget(gaussians.subset(slice(0, num_leaves)).rows, 0.0, False)
     radius = np.where(clusters.own_group < 0, np.float32(1), bundle.groups.ball[clusters.own_group, 3])
     radius = np.repeat(radius, np.diff(clusters.offset))
     sizes: Any = {k: _RATE * v for k, v in vars(BuildConfig()).items() if k.startswith("step_")}
     filter_px2 = float(clusters.filter_px2[-1])
-    config = replace(BuildConfig(steps=steps, first_steps=steps, filter_px2=filter_px2), **sizes)
-    pictures = _pictures(bundle, asset, cameras, seed)
-    given = fit_config(config, seed, 1), target, gaussians.rows, radius, pictures
+    config = BuildConfig(steps=steps, first_steps=steps, filter_px2=filter_px2, **sizes)
+    pictures = _pictures(bundle, everything.subset(slice(0, num_leaves)), cameras, seed)
+    refine = partial(_core.refine_cuts, fit_config(config, seed, 1), target, gaussians.rows, radius, pictures)
     with Bar(steps, "refine", progress) as bar:
-        refine = partial(_core.refine_cuts, *given)
         run_fit(refine, where, lambda state: bar.update(state.groups_done - bar.done))
     refined = gaussians.numpy()
     about = {"steps": steps, "seed": seed} | ({"cameras": len(cameras)} if cameras else {})

@@ -42,8 +42,7 @@ def run(options: Refine) -> None:
     cameras = list(options.read().values())
     start = time.perf_counter()
     how: dict[str, Any] = {"steps": options.steps, "seed": options.seed, "device": options.device}
-    bundle = Bundle.open(options.bundle)
-    refined = refine_bundle(bundle, cameras=cameras, progress=not options.quiet, **how)
+    refined = refine_bundle(Bundle.open(options.bundle), cameras=cameras, progress=not options.quiet, **how)
     refined.write(options.output)
     result = {"output": str(options.output), "steps": options.steps, "seconds": time.perf_counter() - start}
     line = f"{options.output}: {options.steps:,} steps, {result['seconds']:.1f} s"
