@@ -40,16 +40,8 @@ class PosixFile {
 
     // Returns how many bytes were read: fewer than `size` only at the end of the file.
     size_t read_at(size_t offset, char* bytes, size_t size) const {
-        size_t done = 0;
-        while (done < size) {
-            const ssize_t got =
-                ::pread(descriptor_, bytes + done, size - done, static_cast<off_t>(offset + done));
-            if (got < 0 && errno == EINTR) continue;
-            check(got);
-            if (got == 0) break;
-            done += static_cast<size_t>(got);
-        }
-        return done;
+        iovec piece{bytes, size};
+        return read_at(offset, Span<iovec>{&piece, 1});
     }
 
     // The same into several pieces of memory, one behind another, at most 1024. Changes what it is given.
