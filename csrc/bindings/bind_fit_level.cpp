@@ -114,9 +114,11 @@ class BoundPictures {
         const Span<const double> weights = span_of<const double>(weight, "weight", {-1});
         const auto num_targets = static_cast<py::ssize_t>(weights.size);
         if (!(counts.first >= counts.second && counts.second >= 1))
-            throw py::value_error("counts: expected the most and the least gaussians, 1 or more, got others");
-        if (num_targets == 0 || !(ball[3] > 0))
-            throw py::value_error("weight, ball: expected gaussians and a positive radius, got none");
+            throw py::value_error("counts: expected the most and the least gaussians, 1 or more, got " +
+                                  std::to_string(counts.first) + " and " + std::to_string(counts.second));
+        if (num_targets == 0) throw py::value_error("weight: expected one or more, got none");
+        if (!(ball[3] > 0))
+            throw py::value_error("ball: expected a positive radius, got " + std::to_string(ball[3]));
         pictures_ =
             std::make_unique<CutPictures>(CutPictures{table.table(),
                                                       counts.first,
@@ -154,8 +156,9 @@ void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, cons
     if (offset[offset.size - 1] != count)
         throw py::value_error("gaussians: expected " + std::to_string(offset[offset.size - 1]) +
                               ", which the table has, got " + std::to_string(count));
-    if (!std::all_of(levels.radius.begin(), levels.radius.end(), [](float r) { return r > 0; }))
-        throw py::value_error("radius: expected positive numbers, got one that is not");
+    for (const float radius_of_one : levels.radius)
+        if (!(radius_of_one > 0))
+            throw py::value_error("radius: expected positive numbers, got " + std::to_string(radius_of_one));
     const Work work(gaussians.device());
     if constexpr (V3DG_WITH_CUDA != 0)
         if (!work.device().is_host()) {

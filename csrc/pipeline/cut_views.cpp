@@ -154,8 +154,9 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
         camera = camera_around(pictures, random);
     }
     const double longer = std::max(camera.width, camera.height);
-    const double area_px2 = size * size * kHomePx2 * share * all / (camera.width * camera.height);
-    const double longer_px = std::clamp(longer * std::sqrt(area_px2), kNarrowestPx, kMostPx);
+    const double area_px2 = size * size * kHomePx2 * share * all;
+    const double scale = std::sqrt(area_px2 / (camera.width * camera.height));
+    const double longer_px = std::clamp(longer * scale, kNarrowestPx, kMostPx);
     camera = resized(camera, longer_px / longer);
     rule.budget = static_cast<uint64_t>(std::ceil(share * all));
     const SelectOutput whole = selected(pictures.table, camera, rule);
