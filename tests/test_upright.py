@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import scenes_lod
 import v3dg
 from command_line import run
 from v3dg.cameras import AXES
+from v3dg.cli._views import choose_up
 from v3dg.upright import direction_of, up_of
 
 
@@ -117,3 +119,8 @@ def test_bundle_keeps_what_is_up_and_commands_say_what_they_took(rng, tmp_path):
     done = run("export", tmp_path / "flat.v3dg", "-o", tmp_path / "web", "--quiet")
     assert done.returncode == 0, done.stderr
     assert "flat.v3dg: x is up, as its file says; --up says otherwise\n" in done.stdout
+
+
+def test_what_is_told_is_not_guessed():
+    """Of an asset of 100 million gaussians a guess looks at all clusters."""
+    assert choose_up("x", None, None, Path("asset.ply")) == ("x", [])

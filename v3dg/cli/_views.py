@@ -142,8 +142,8 @@ def choose_up(
     given: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
 ) -> tuple[Axis, list[str]]:
     """The axis that is up: of --up, or else as `up_of` takes it, with a line that says so."""
-    axis, how = up_of(subject, cameras, path)
-    return given or axis, [] if given else [f"{path.name}: {axis} is up, {how}; --up says otherwise"]
+    axis, how = (given, "") if given else up_of(subject, cameras, path)
+    return axis, [] if given else [f"{path.name}: {axis} is up, {how}; --up says otherwise"]
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
