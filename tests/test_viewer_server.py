@@ -215,6 +215,13 @@ def test_command_refuses_what_cannot_be_meant(arguments, message, tmp_path, monk
     assert message in capsys.readouterr().err
 
 
+def test_cameras_without_names_are_refused(blob_view):
+    before = set(threading.enumerate())
+    with pytest.raises(TypeError, match=r"cameras: expected cameras by their names.*, got list"):
+        Site(blob_view, port=0, cameras=v3dg.turntable((0, 0, 0), 3.0, 2))
+    assert set(threading.enumerate()) == before
+
+
 def test_closing_leaves_no_thread_behind(blob_view):
     before = set(threading.enumerate())
     Site(blob_view, port=0).close()

@@ -19,7 +19,7 @@ from v3dg import _files
 from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
 from v3dg.bundle import Bundle
-from v3dg.cameras import Axis, Camera
+from v3dg.cameras import Axis, Camera, check_cameras
 from v3dg.export import _common
 from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, Plan, write_levels
 from v3dg.scene import Scene
@@ -74,9 +74,11 @@ def write_site(
         up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
 
     Raises:
+        TypeError: Cameras are none, or without names.
         ValueError: As `write_streamed_sog`, or a scene without instances.
         OSError: A file cannot be written.
     """
+    check_cameras(cameras := cameras or {})
     folder = Path(folder)
     is_scene, scene = isinstance(subject, Scene), Scene.of(subject)
     axis = up or up_of(subject, cameras)[0]
@@ -102,7 +104,7 @@ def write_site(
             "camera_rotation": _common.rotation_to(axis, "y").T.tolist(),
             "bundles": listed,
             "instances": _instances(scene),
-            "cameras": _cameras(cameras or {}),
+            "cameras": _cameras(cameras),
         }
         _common.write_document(place / SITE, document)
         _common.write_page(place, "site.html")

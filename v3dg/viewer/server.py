@@ -22,7 +22,7 @@ from PIL import Image
 
 from v3dg import _extras
 from v3dg._version import __version__
-from v3dg.cameras import Camera, VectorLike
+from v3dg.cameras import Camera, VectorLike, check_cameras
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE
 from v3dg.viewer.frame import SceneView
 from v3dg.viewer.view import View, look_at
@@ -65,6 +65,7 @@ class Site:
 
     Raises:
         ImportError: The extra is not installed.
+        TypeError: Cameras are none, or without names.
     """
 
     def __init__(
@@ -87,7 +88,8 @@ class Site:
 
         self._make_tab = Tab
         self._scene_view, self._name = scene_view, name
-        self._photographs = [dict(photographs or {}).get(camera) for camera in cameras or {}]
+        check_cameras(cameras := cameras or {})
+        self._photographs = [dict(photographs or {}).get(camera) for camera in cameras]
         self._greeting = {
             "type": "hello",
             "version": __version__,
@@ -96,7 +98,7 @@ class Site:
             "settings": {"tolerance": tolerance, "budget": budget, "fade": DEFAULT_FADE},
             "cameras": [
                 {"name": camera, "photograph": photograph is not None, "view": asdict(View.of_camera(at))}
-                for (camera, at), photograph in zip((cameras or {}).items(), self._photographs, strict=True)
+                for (camera, at), photograph in zip(cameras.items(), self._photographs, strict=True)
             ],
         }
         page = files("v3dg.viewer").joinpath("page")
