@@ -203,10 +203,12 @@ __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool i
                                Count* count_state, const Output& output) {
     __shared__ Count before_units, before_gaussians;
     const WriteCount count = output.count(mine);
-    Count in_block;  // both numbers in one word, whose halves hold what a block adds
-    const Count before_in_block = block_prefix(Count{count.units} << 32 | count.gaussians, in_block);
-    const auto num_units = static_cast<unsigned>(in_block >> 32),
-               num_gaussians = static_cast<unsigned>(in_block);
+    // Both numbers in one word: an item has up to 256 gaussians, so that the 28 bits of units last as long as
+    // the 36 of gaussians. What is beyond those is lost, but never counts as a unit.
+    constexpr unsigned kUnitBits = 28, kUnits = (1u << kUnitBits) - 1;
+    Count in_block;
+    const Count before_in_block = block_prefix(Count{count.gaussians} << kUnitBits | count.units, in_block);
+    const Count num_units = in_block & kUnits, num_gaussians = in_block >> kUnitBits;
     if (threadIdx.x < 64) {  // a warp each
         const bool is_units = threadIdx.x < 32;
         const Count before =
@@ -214,8 +216,8 @@ __device__ void write_clusters(const LaneClusters& mine, unsigned ticket, bool i
         if (threadIdx.x % 32 == 0) (is_units ? before_units : before_gaussians) = before;
     }
     __syncthreads();
-    output.write(mine, before_units + (before_in_block >> 32),
-                 before_gaussians + static_cast<unsigned>(before_in_block));
+    output.write(mine, before_units + (before_in_block & kUnits),
+                 before_gaussians + (before_in_block >> kUnitBits));
     if (is_last && threadIdx.x == 0)
         output.finish(before_units + num_units, before_gaussians + num_gaussians);
 }
