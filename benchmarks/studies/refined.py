@@ -14,6 +14,7 @@ stand beside them.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import time
 from collections.abc import Iterator
@@ -112,7 +113,8 @@ def main(config: Config) -> None:
         bundles["refined from beside"] = v3dg.refine_bundle(built, cameras=beside, **how)
     if config.picture is not None:
         write_picture(config.picture, sheet(config, asset, bundles))
-    shown = pictures(config, bundles) if config.layout is not None else seen_from(config, bundles, eyes)
+    of_layout = () if config.layout is None else pictures(config, bundles)
+    shown = itertools.chain(of_layout, seen_from(config, bundles, eyes))
     with contextlib.closing(Judges()) as judges:
         result["rows"] = [row | found for (row, _, _), found in judges.measured(shown, errors)]
     print(result)
