@@ -291,6 +291,31 @@ def test_frustum_drops_most_of_what_lies_outside():
     assert len(select(scene, behind, tolerance=0.5, device="cpu")) == 0
 
 
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("num_bundles", [8, 9, 40])
+def test_bundles_of_different_filters_are_cut_as_if_alone(device, num_bundles):
+    # A wide filter reaches far beyond the frustum, so each bundle has a frustum of its own.
+    rng = np.random.default_rng(num_bundles)
+    scene = Scene()
+    for b in range(num_bundles):
+        filter_px2 = float(b % 10) ** 2
+        bundle = lod_bundle(rng, blob(rng, 60, size=0.1), 8, filter_px2=filter_px2)
+        scene.add(bundle, positions=[0, 0, 4] + rng.normal(size=(20, 3)) * [4, 4, 1])
+    camera = Camera(np.eye(4), [[50, 0, 32], [0, 50, 32], [0, 0, 1]], 64, 64)
+    cut = select(scene, camera, tolerance=0.5, device=device)
+    kept = []
+    for b, bundle in enumerate(scene.bundles):
+        mine = np.flatnonzero(scene.instance_bundle == b)
+        alone = Scene()
+        alone.add(bundle, scene.positions[mine])
+        expected = select(alone, camera, tolerance=0.5, device=device)
+        own = np.isin(cut.instance_ids, mine)
+        np.testing.assert_array_equal(cut.instance_ids[own], mine[expected.instance_ids])
+        np.testing.assert_array_equal(cut.cluster_ids[own], expected.cluster_ids)
+        kept.append(len(expected))
+    assert max(kept[:8]) > 1.5 * min(kept[:8])  # or the filters would not matter here
+
+
 @given(bundle=bundles(), other=bundles(), seed=seeds)
 def test_order_counts_and_scenes_of_several_bundles(bundle, other, seed):
     rng = np.random.default_rng(seed)
