@@ -21,13 +21,13 @@ def folder(tmp_path_factory):
 
 
 def test_a_bundle_is_refined(folder):
-    options = ("--steps", 5, "--seed", 3, "--device", "cpu")
+    options = ("--steps", 5, "--drop", 0, "--seed", 3, "--device", "cpu")
     done = run("refine", "donut.v3dg", "refined.v3dg", *options, "--json", cwd=folder)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert (result["output"], result["steps"]) == ("refined.v3dg", 5)
     written = v3dg.Bundle.open(folder / "refined.v3dg")
-    assert written.config["refined"] == {"steps": 5, "seed": 3}
+    assert written.config["refined"] == {"steps": 5, "drop": 0, "seed": 3}
     assert written.num_gaussians == v3dg.Bundle.open(folder / "donut.v3dg").num_gaussians
 
 

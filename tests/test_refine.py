@@ -15,7 +15,7 @@ from v3dg import BuildConfig, _core
 from v3dg.build.fit import fit_config
 from v3dg.donut import make_donut
 from v3dg.metrics import box_downsample, draw_truth
-from v3dg.refine import _pictures, refine_bundle
+from v3dg.refine import _without_least, refine_bundle
 from v3dg.residency import residency
 
 SIZES = ("step_position", "step_quat", "step_log_scale", "step_logit", "step_sh0", "step_sh_rest")
@@ -40,14 +40,14 @@ def distance_to_asset(bundle, device):
 
 
 def test_cuts_come_closer_to_the_asset(bundle, device):
-    refined = refine_bundle(bundle, steps=400, device=device, progress=False)
+    refined = refine_bundle(bundle, steps=400, drop=0, device=device, progress=False)
     before, after = distance_to_asset(bundle, device), distance_to_asset(refined, device)
     assert after.mean() < 0.9 * before.mean()
 
 
 def test_tables_and_level_0_stay(bundle, device):
-    refined = refine_bundle(bundle, steps=3, seed=5, device=device, progress=False)
-    assert refined.config == bundle.config | {"refined": {"steps": 3, "seed": 5}}
+    refined = refine_bundle(bundle, steps=3, drop=0, seed=5, device=device, progress=False)
+    assert refined.config == bundle.config | {"refined": {"steps": 3, "drop": 0, "seed": 5}}
     assert refined.codec == bundle.codec
     for table in ("clusters", "groups"):
         for name, values in vars(getattr(bundle, table)).items():
@@ -64,13 +64,13 @@ def test_tables_and_level_0_stay(bundle, device):
 
 def test_a_quantised_bundle_stays_one(bundle, device):
     coded = v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, bundle.config, "quantized")
-    refined = refine_bundle(coded, steps=3, device=device, progress=False)
+    refined = refine_bundle(coded, steps=3, drop=0, device=device, progress=False)
     assert refined.codec == "quantized"
 
 
 def test_the_same_seed_gives_the_same_bits(bundle, device):
     def values(seed):
-        refined = refine_bundle(bundle, steps=20, seed=seed, device=device, progress=False)
+        refined = refine_bundle(bundle, steps=20, drop=0, seed=seed, device=device, progress=False)
         return np.concatenate([array.ravel() for array in vars(refined.gaussians).values()])
 
     first = values(0)
@@ -82,7 +82,7 @@ def test_threads_do_not_change_the_result(bundle, tmp_path):
     bundle.write(tmp_path / "bundle.v3dg")
     program = (
         "import v3dg, sys; b = v3dg.Bundle.open(sys.argv[1]);"
-        "v3dg.refine_bundle(b, steps=10, device='cpu', progress=False).write(sys.argv[2])"
+        "v3dg.refine_bundle(b, steps=10, drop=0, device='cpu', progress=False).write(sys.argv[2])"
     )
     for threads in ("1", "3"):
         command = [sys.executable, "-c", program, tmp_path / "bundle.v3dg", tmp_path / f"{threads}.v3dg"]
@@ -109,6 +109,9 @@ def test_a_bundle_whose_asset_is_empty_stays_as_it_is(device):
 def test_wrong_arguments_are_told(bundle):
     with pytest.raises(ValueError, match="steps: expected 1 step or more, got 0"):
         refine_bundle(bundle, steps=0)
+    for share in (-0.1, 0.6, np.nan, "some"):
+        with pytest.raises(ValueError, match=f"drop: expected a share of 0 to 0.5, got '?{share}"):
+            refine_bundle(bundle, drop=share)
     with pytest.raises(TypeError, match="bundle: expected a Bundle, got Gaussians"):
         refine_bundle(make_donut(1000))
     with pytest.raises(TypeError, match=r"cameras\[1\]: expected a Camera, got str"):
@@ -120,11 +123,16 @@ def test_what_a_progress_function_raises_ends_it(bundle):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        refine_bundle(bundle, steps=300, device="cpu", progress=stop)
+        refine_bundle(bundle, steps=300, drop=0, device="cpu", progress=stop)
 
 
 def pictures_of(bundle, cameras=()):
-    return _pictures(bundle, bundle.level_gaussians(0), cameras, 0)
+    return _core.CutPictures(
+        table=residency.table(bundle),
+        asset=bundle.level_gaussians(0).rows,
+        cameras=[camera.core for camera in cameras],
+        seed=0,
+    )
 
 
 def place_of(view):
@@ -187,7 +195,7 @@ def test_cameras_come_by_name_too_and_one_by_one(bundle):
     cameras = v3dg.turntable((0, 0, 0), 3.0, 2, width=64, height=64)
 
     def refined(given):
-        return refine_bundle(bundle, cameras=given, steps=2, device="cpu", progress=False)
+        return refine_bundle(bundle, cameras=given, steps=2, drop=0, device="cpu", progress=False)
 
     wanted = refined(cameras)
     for given in ({"front": cameras[0], "back": cameras[1]}, iter(cameras)):
@@ -201,7 +209,7 @@ def test_a_camera_that_sees_nothing_changes_nothing(bundle, device):
     refined = refine_bundle(bundle, cameras=[away], steps=3, device=device, progress=False)
     for name, values in vars(bundle.gaussians).items():
         np.testing.assert_array_equal(values, getattr(refined.gaussians, name))
-    assert refined.config["refined"] == {"steps": 3, "seed": 0, "cameras": 1}
+    assert refined.config["refined"] == {"steps": 3, "drop": 0.02, "seed": 0, "cameras": 1}
 
 
 def test_cuts_from_a_camera_come_closer_to_the_asset(bundle, device):
@@ -214,9 +222,85 @@ def test_cuts_from_a_camera_come_closer_to_the_asset(bundle, device):
         drawn = [v3dg.render(refined, camera, budget=b, device=device).color for b in budgets]
         return np.mean([np.abs(host(picture) - truth).mean() for picture in drawn])
 
-    around = refine_bundle(bundle, steps=150, device=device, progress=False)
-    there = refine_bundle(bundle, cameras=[camera], steps=150, device=device, progress=False)
+    around = refine_bundle(bundle, steps=150, drop=0, device=device, progress=False)
+    there = refine_bundle(bundle, cameras=[camera], steps=150, drop=0, device=device, progress=False)
     assert error(there) < error(around) < error(bundle)
+
+
+def weights_of(bundle, device, steps, cameras=()):
+    """What `steps` pictures show of each gaussian."""
+    gaussians = on(device, bundle.gaussians)
+    config = fit_config(BuildConfig(steps=steps, first_steps=steps, filter_px2=0.1), 0, 1)
+    return _core.weigh_cuts(config, gaussians.rows, pictures_of(bundle, cameras), _core.FitProgress())
+
+
+def test_what_is_seen_of_gaussians_adds_up_to_the_alpha_of_pictures(bundle, device):
+    camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=160, height=160)[0]
+    weight = weights_of(bundle, device, 1, [camera])
+    window, clusters, _ = pictures_of(bundle, [camera]).view(0)
+    offset = bundle.clusters.offset
+    rows = np.concatenate([np.arange(offset[c], offset[c + 1]) for c in clusters])
+    shown = replace(camera, K=window.K, width=window.width, height=window.height)
+    drawn = v3dg.rasterize(bundle.gaussians.subset(rows), shown, filter_px2=0.1, antialiased=True)
+    assert weight.sum() == pytest.approx(drawn.alpha.mean(), rel=1e-4)
+    assert weight.min() >= 0
+    others = np.ones(bundle.num_gaussians, bool)
+    others[rows] = False
+    assert not weight[others].any()
+
+
+def levels_inside_a_shell():
+    """A bundle of a closed shell of opaque gaussians around some that nobody sees."""
+    rng = np.random.default_rng(0)
+    outwards = rng.normal(size=(3000, 3))
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    means = np.concatenate([outwards, 0.5 * outwards[:600]]).astype(np.float32)
+    asset = v3dg.Gaussians(
+        means=means,
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(means), 1)),
+        scales=np.full((len(means), 3), 0.06, np.float32),
+        opacities=np.full(len(means), 0.99, np.float32),
+        sh=rng.uniform(-1, 1, (len(means), 1, 3)).astype(np.float32),
+    )
+    config = BuildConfig(steps=0, cluster_size=64)
+    return v3dg.build_bundle(asset, config=config, device="cpu", progress=False)
+
+
+def test_what_nobody_sees_is_dropped_of_all_levels_but_the_first(device, tmp_path):
+    bundle = levels_inside_a_shell()
+    refined = refine_bundle(bundle, steps=3, device=device, progress=False)
+    assert len(refined.level_gaussians(0)) == len(bundle.level_gaussians(0))
+    for level in (1, 2):
+        before, after = (
+            np.linalg.norm(b.level_gaussians(level).means, axis=1) < 0.7 for b in (bundle, refined)
+        )
+        assert after.sum() < 0.1 * before.sum()
+        assert (~after).sum() > 0.9 * (~before).sum()
+    for name in ("level", "own_group", "parent_group", "filter_px2"):
+        np.testing.assert_array_equal(getattr(refined.clusters, name), getattr(bundle.clusters, name))
+    refined.write(tmp_path / "refined.v3dg")
+    again = v3dg.Bundle.open(tmp_path / "refined.v3dg")
+    camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=64, height=64)[0]
+    for tolerance in (0.0, 2.0, np.inf):
+        cuts = [v3dg.select(b, camera, tolerance=tolerance, device=device) for b in (bundle, again)]
+        np.testing.assert_array_equal(cuts[0].cluster_ids, cuts[1].cluster_ids)
+        assert cuts[1].num_gaussians <= cuts[0].num_gaussians
+
+
+def test_what_is_dropped_has_the_share_together(bundle):
+    """Of each level, and no gaussian that stays has less than one that goes."""
+    weight = np.random.default_rng(0).exponential(size=bundle.num_gaussians)
+    for share in (0.01, 0.3):
+        offset = bundle.clusters.offset
+        left = _without_least(bundle, weight, share)
+        for level in range(1, bundle.num_levels):
+            of_level = bundle.level_range(level)
+            weights = weight[offset[of_level.start] : offset[of_level.stop]]
+            least = np.sort(weights)
+            num_dropped = int((np.cumsum(least) < share * weights.sum()).sum())
+            assert len(left.level_gaussians(level)) == len(weights) - num_dropped
+            kept = bundle.level_gaussians(level).means[weights >= least[num_dropped]]
+            np.testing.assert_array_equal(left.level_gaussians(level).means, kept)
 
 
 def arguments(bundle, device, config, pictures):
@@ -306,21 +390,14 @@ def test_the_core_refuses_what_does_not_fit(bundle, device):
 
 
 def test_pictures_are_refused_of_nothing(bundle):
-    given = {
-        "table": residency.table(bundle),
-        "counts": (10.0, 5.0),
-        "means": np.zeros((2, 3), np.float32),
-        "weight": np.arange(1.0, 3.0),
-        "ball": (0.0, 0.0, 0.0, 1.0),
-        "cameras": [],
-        "seed": 0,
-    }
-    _core.CutPictures(**given).view(0)
-    wrong = {
-        "counts: expected the most and the least .*, got 5.0+ and 10.0+": {"counts": (5.0, 10.0)},
-        "ball: expected a positive radius, got 0": {"ball": (0.0, 0.0, 0.0, 0.0)},
-        "means: expected shape": {"means": np.zeros((3, 3), np.float32)},
-    }
-    for message, change in wrong.items():
-        with pytest.raises(ValueError, match=message):
-            _core.CutPictures(**(given | change))
+    given = {"table": residency.table(bundle), "cameras": [], "seed": 0}
+    nothing = bundle.gaussians.subset(slice(0, 0))
+    with pytest.raises(ValueError, match="asset: expected gaussians on the host, got none"):
+        _core.CutPictures(asset=nothing.rows, **given)
+
+
+@pytest.mark.gpu
+def test_pictures_are_refused_of_an_asset_elsewhere(bundle):
+    given = {"table": residency.table(bundle), "cameras": [], "seed": 0}
+    with pytest.raises(ValueError, match="asset: expected gaussians on the host, got others"):
+        _core.CutPictures(asset=on("cuda", bundle.level_gaussians(0)).rows, **given)

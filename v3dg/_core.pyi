@@ -536,10 +536,7 @@ class CutPictures:
         self,
         *,
         table: ClusterTable,
-        counts: tuple[float, float],
-        means: Float32,
-        weight: Float64,
-        ball: tuple[float, float, float, float],
+        asset: Rows,
         cameras: Sequence[Camera],
         seed: int,
     ) -> None: ...
@@ -571,5 +568,8 @@ def refine_cuts(
     pictures: CutPictures,
     progress: FitProgress,
 ) -> None: ...
+def weigh_cuts(
+    config: FitConfig, gaussians: Rows, pictures: CutPictures, progress: FitProgress
+) -> Float64: ...
 def ssim(picture: Float32 | Float64, target: Float32 | Float64) -> float: ...
 def dssim(picture: Float32, target: Float32) -> tuple[float, Float32]: ...

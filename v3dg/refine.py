@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check_type, whole
+from v3dg._numbers import check_type, real, whole
 from v3dg._progress import Bar, Progress
 from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
@@ -19,9 +21,9 @@ from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.residency import residency
 
+_T = TypeVar("_T")
 _RATE = 0.2  # of the step sizes of a fit, from whose result this starts
-_MOST = 0.7  # of the asset's gaussians, in a cut
-_SHARE = 0.99  # of the gaussians that an asset's radius holds; the rest may float far away
+_WEIGHED = 2_000  # pictures that tell how much is seen of each gaussian
 
 
 def refine_bundle(
@@ -29,32 +31,34 @@ def refine_bundle(
     *,
     cameras: Iterable[Camera] | Mapping[str, Camera] = (),
     steps: int = 30_000,
+    drop: float = 0.02,
     seed: int = 0,
     device: str | Device = "auto",
     progress: Progress = True,
 ) -> Bundle:
     """Make the levels of a bundle look more like its asset, in small pictures and large ones; a copy.
 
-    A build fits every group alone, seen from all sides, at the size at which it is selected. This moves the
-    gaussians of all levels but the first, as many as there were, until pictures of cuts, in which they stand
-    next to each other and hide each other, are those of the asset. Cuts have 0.7 of the asset's gaussians
-    down to those of the last level, and pictures 0.18 to 9.7 times the size at which they are at home, 2 px²
-    a gaussian. docs/levels.md has what is gained.
+    A build fits every group alone, seen from all sides, at the size at which it is selected. Pictures of cuts
+    show gaussians next to each other, where they hide each other. By these, this drops gaussians of all
+    levels but the first of which least is seen, and moves the others until such pictures are those of the
+    asset. Cuts have 0.7 of the asset's gaussians down to those of the last level, and pictures 0.18 to 9.7
+    times the size at which they are at home, 2 px² a gaussian. docs/levels.md has what is gained.
 
-    The same bundle, cameras, steps and seed give the same bits on the same kind of device.
+    The same bundle, cameras, steps, share and seed give the same bits on the same kind of device.
 
     Args:
         bundle: What `build_bundle` made. About six times what its gaussians take is in memory meanwhile.
         cameras: Where the asset is seen from, also by name: for a room those of its photographs. What is
             seen from elsewhere may get worse. Without any, pictures are taken from all around.
         steps: Pictures that cuts are compared with, one after another.
+        drop: Share of what is seen of a level that the dropped gaussians have together, below 1; 0 keeps all.
         seed: Of the pictures.
         device: Where to compute.
         progress: As for `build_bundle`.
 
     Raises:
         TypeError: The bundle or a camera is none.
-        ValueError: There are no steps, or the seed is out of range.
+        ValueError: There are no steps, or the share or the seed is out of range.
         RuntimeError: The device is "cuda", and something is missing for it.
         KeyboardInterrupt: Ctrl-C; threads have stopped.
     """
@@ -63,42 +67,71 @@ def refine_bundle(
     for number, camera in enumerate(cameras):
         check_type(f"cameras[{number}]", camera, Camera, "a Camera")
     steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
+    drop = real(drop, "drop", "a share of 0 to 0.5", 0, 0.5)
     seed = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1)
     where = _device.resolve(device)
-    num_leaves = int(bundle.clusters.offset[bundle.level_range(0).stop]) if bundle.num_levels > 1 else 0
-    if num_leaves == 0:
+    if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
         return bundle
-    everything, clusters = bundle.gaussians, bundle.clusters
-    gaussians = _device.place(everything.subset(np.arange(len(everything))), where)
-    target = _core.FitTarget(gaussians.subset(slice(0, num_leaves)).rows, 0.0, False)
-    radius = np.where(clusters.own_group < 0, np.float32(1), bundle.groups.ball[clusters.own_group, 3])
-    radius = np.repeat(radius, np.diff(clusters.offset))
-    sizes: Any = {k: _RATE * v for k, v in vars(BuildConfig()).items() if k.startswith("step_")}
-    filter_px2 = float(clusters.filter_px2[-1])
-    config = BuildConfig(steps=steps, first_steps=steps, filter_px2=filter_px2, **sizes)
-    pictures = _pictures(bundle, everything.subset(slice(0, num_leaves)), cameras, seed)
-    refine = partial(_core.refine_cuts, fit_config(config, seed, 1), target, gaussians.rows, radius, pictures)
-    with Bar(steps, "refine", progress) as bar:
-        run_fit(refine, where, lambda state: bar.update(state.groups_done - bar.done))
-    refined = gaussians.numpy()
-    about = {"steps": steps, "seed": seed} | ({"cameras": len(cameras)} if cameras else {})
+    if drop > 0:
+        weight = _Cuts(bundle, cameras, seed, where, progress).run("weigh", _WEIGHED, _core.weigh_cuts)
+        bundle = _without_least(bundle, weight, drop)
+    refined = _Cuts(bundle, cameras, seed, where, progress).refined(steps)
+    about = {"steps": steps, "drop": drop, "seed": seed} | ({"cameras": len(cameras)} if cameras else {})
     made: dict[str, Any] = {**bundle.config, "refined": about}
-    return Bundle(clusters.around(refined), bundle.groups, refined, made, bundle.codec)
+    return Bundle(bundle.clusters.around(refined), bundle.groups, refined, made, bundle.codec)
 
 
-def _pictures(bundle: Bundle, asset: Gaussians, cameras: Sequence[Camera], seed: int) -> _core.CutPictures:
-    """Pictures of the bundle's cuts. What is twice as large in the asset is looked at twice as often."""
-    means = asset.means.astype(np.float64)
-    center = np.median(means, axis=0)
-    radius = float(np.quantile(np.linalg.norm(means - center, axis=1), _SHARE)) or 1.0
-    area = np.sort(asset.scales.astype(np.float64), axis=1)[:, 1:].prod(axis=1)
-    least = float(len(bundle.level_gaussians(bundle.num_levels - 1)))
-    return _core.CutPictures(
-        table=residency.table(bundle),
-        counts=(max(_MOST * len(asset), least), least),
-        means=asset.means,
-        weight=np.cumsum(asset.opacities * np.sqrt(area)),
-        ball=(*center.tolist(), radius),
-        cameras=[camera.core for camera in cameras],
-        seed=seed,
-    )
+class _Cuts:
+    """Pictures of a bundle's cuts, and copies of its gaussians on a device, which are moved by them."""
+
+    def __init__(
+        self, bundle: Bundle, cameras: Sequence[Camera], seed: int, where: Device, progress: Progress
+    ) -> None:
+        self._bundle, self._seed, self._where, self._progress = bundle, seed, where, progress
+        everything, self._leaves = (
+            bundle.gaussians,
+            slice(0, int(bundle.clusters.offset[bundle.level_range(0).stop])),
+        )
+        self._gaussians = _device.place(everything.subset(np.arange(len(everything))), where)
+        self._pictures = _core.CutPictures(
+            table=residency.table(bundle),
+            asset=everything.subset(self._leaves).rows,
+            cameras=[camera.core for camera in cameras],
+            seed=seed,
+        )
+
+    def refined(self, steps: int) -> Gaussians:
+        groups, of_cluster = self._bundle.groups, self._bundle.clusters.own_group
+        radius = np.where(of_cluster < 0, np.float32(1), groups.ball[of_cluster, 3])
+        radius = np.repeat(radius, np.diff(self._bundle.clusters.offset))
+        target = _core.FitTarget(self._gaussians.subset(self._leaves).rows, 0.0, False)
+        self.run("refine", steps, partial(_core.refine_cuts, target=target, radius=radius))
+        return self._gaussians.numpy()
+
+    def run(self, name: str, steps: int, operation: Callable[..., _T]) -> _T:
+        """Do something by so many pictures; what it returns."""
+        sizes: Any = {k: _RATE * v for k, v in vars(BuildConfig()).items() if k.startswith("step_")}
+        filter_px2 = float(self._bundle.clusters.filter_px2[-1])
+        config = BuildConfig(steps=steps, first_steps=steps, filter_px2=filter_px2, **sizes)
+        given = {"gaussians": self._gaussians.rows, "pictures": self._pictures}
+        work = partial(operation, config=fit_config(config, self._seed, 1), **given)
+        with Bar(steps, name, self._progress) as bar:
+            return run_fit(
+                lambda state: work(progress=state),
+                self._where,
+                lambda state: bar.update(state.groups_done - bar.done),
+            )
+
+
+def _without_least(bundle: Bundle, weight: npt.NDArray[np.float64], share: float) -> Bundle:
+    """Drop, of each level but the first, those of least weight that have this share of it together."""
+    offset, is_kept = bundle.clusters.offset, np.ones(bundle.num_gaussians, bool)
+    for level in range(1, bundle.num_levels):
+        here = bundle.level_range(level)
+        rows = slice(offset[here.start], offset[here.stop])
+        order = np.argsort(weight[rows], kind="stable")
+        below = np.cumsum(weight[rows][order])
+        is_kept[rows][order[below < share * weight[rows].sum()]] = False
+    kept = np.flatnonzero(is_kept)
+    clusters = replace(bundle.clusters, offset=np.searchsorted(kept, offset))
+    return Bundle(clusters, bundle.groups, bundle.gaussians.subset(kept), bundle.config, bundle.codec)

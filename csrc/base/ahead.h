@@ -5,11 +5,13 @@
 #include <omp.h>
 
 #include <condition_variable>
+#include <cstddef>
 #include <cstdint>
 #include <exception>
 #include <functional>
 #include <mutex>
 #include <thread>
+#include <utility>
 #include <vector>
 
 namespace v3dg {
@@ -32,11 +34,12 @@ class Ahead {
     Ahead(const Ahead&) = delete;
     Ahead& operator=(const Ahead&) = delete;
 
-    // Waits for the next thing. Throws what making it threw.
-    void wait_for_next() {
+    // Waits for the next thing and returns its place. Throws what making it threw.
+    size_t wait_for_next() {
         std::unique_lock<std::mutex> lock(busy_);
         changed_.wait(lock, [&] { return is_made_[used_ % num_places_] || error_; });
         if (error_) std::rethrow_exception(error_);
+        return used_ % num_places_;
     }
     // Its place may be made anew.
     void next_is_used() {

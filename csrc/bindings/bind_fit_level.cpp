@@ -103,46 +103,51 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, 
     return error.object;
 }
 
-// Pictures of cuts, with the arrays that they borrow from.
+// Pictures of cuts, with what they borrow from.
 class BoundPictures {
   public:
-    BoundPictures(const BoundTable& table, std::pair<double, double> counts, const py::array& means,
-                  const py::array& weight, const std::array<double, 4>& ball,
-                  const std::vector<BoundCamera>& cameras, uint64_t seed)
-        : arrays_{means, weight} {
-        for (const BoundCamera& camera : cameras) cameras_.push_back(camera.camera);
-        const Span<const double> weights = span_of<const double>(weight, "weight", {-1});
-        const auto num_targets = static_cast<py::ssize_t>(weights.size);
-        if (!(counts.first >= counts.second && counts.second >= 1))
-            throw py::value_error("counts: expected the most and the least gaussians, 1 or more, got " +
-                                  std::to_string(counts.first) + " and " + std::to_string(counts.second));
-        if (num_targets == 0) throw py::value_error("weight: expected one or more, got none");
-        if (!(ball[3] > 0))
-            throw py::value_error("ball: expected a positive radius, got " + std::to_string(ball[3]));
-        pictures_ =
-            std::make_unique<CutPictures>(CutPictures{table.table(),
-                                                      counts.first,
-                                                      counts.second,
-                                                      span_of<const float>(means, "means", {num_targets, 3}),
-                                                      weights,
-                                                      {ball[0], ball[1], ball[2]},
-                                                      ball[3],
-                                                      {cameras_.data(), cameras_.size()},
-                                                      seed});
-    }
+    BoundPictures(const BoundTable& table, const Rows& asset, const std::vector<BoundCamera>& cameras,
+                  uint64_t seed)
+        : asset_(asset),
+          cameras_(cameras_of(cameras)),
+          pictures_(
+              pictures_of_cuts(table.table(), on_host(asset), {cameras_.data(), cameras_.size()}, seed)) {}
 
-    const CutPictures& pictures() const { return *pictures_; }
+    const CutPictures& pictures() const { return pictures_; }
     py::tuple view(uint64_t number) const {
-        const CutView view = cut_view(*pictures_, number);
+        const CutView view = cut_view(pictures_, number);
         const auto count = static_cast<py::ssize_t>(view.clusters.size());
         return py::make_tuple(BoundCamera{{}, view.camera}, py::array_t<int32_t>(count, view.clusters.data()),
                               view.samples);
     }
+    // Throws unless these are the gaussians of the table.
+    void check_all(const Rows& gaussians) const {
+        if (gaussians.size() > UINT32_MAX)
+            throw py::value_error("gaussians: expected fewer than 2^32, got " +
+                                  std::to_string(gaussians.size()));
+        const Span<const int64_t>& offset = pictures_.table.offset;
+        const auto wanted = static_cast<size_t>(offset[offset.size - 1]);
+        if (gaussians.size() != wanted)
+            throw py::value_error("gaussians: expected " + std::to_string(wanted) +
+                                  ", which the table has, got " + std::to_string(gaussians.size()));
+    }
 
   private:
-    py::array arrays_[2];
+    static std::vector<Camera> cameras_of(const std::vector<BoundCamera>& bound) {
+        std::vector<Camera> cameras;
+        for (const BoundCamera& camera : bound) cameras.push_back(camera.camera);
+        return cameras;
+    }
+    static GaussianRows<const float> on_host(const Rows& asset) {
+        if (!asset.device().is_host() || asset.size() == 0)
+            throw py::value_error("asset: expected gaussians on the host, got " +
+                                  std::string(asset.size() == 0 ? "none" : "others"));
+        return asset.read<float>();
+    }
+
+    Rows asset_;
     std::vector<Camera> cameras_;
-    std::unique_ptr<CutPictures> pictures_;
+    CutPictures pictures_;
 };
 
 void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, const Rows& gaussians,
@@ -150,12 +155,7 @@ void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, cons
     target.check_alike(gaussians);
     const auto count = static_cast<py::ssize_t>(gaussians.size());
     const CutRows levels{gaussians.write(), span_of<const float>(radius, "radius", {count})};
-    if (gaussians.size() > UINT32_MAX)
-        throw py::value_error("gaussians: expected fewer than 2^32, got " + std::to_string(gaussians.size()));
-    const Span<const int64_t>& offset = pictures.pictures().table.offset;
-    if (offset[offset.size - 1] != count)
-        throw py::value_error("gaussians: expected " + std::to_string(offset[offset.size - 1]) +
-                              ", which the table has, got " + std::to_string(count));
+    pictures.check_all(gaussians);
     for (const float radius_of_one : levels.radius)
         if (!(radius_of_one > 0))
             throw py::value_error("radius: expected positive numbers, got " + std::to_string(radius_of_one));
@@ -169,6 +169,26 @@ void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, cons
         }
     const py::gil_scoped_release unlocked;
     refine_cuts(config, target.on_host(), target.size(), levels, pictures.pictures(), progress);
+}
+
+py::object weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians, const BoundPictures& pictures,
+                             FitProgress& progress) {
+    pictures.check_all(gaussians);
+    const GaussianRows<const float> rows = gaussians.read<float>();
+    const NewArray<double> weight({}, {static_cast<py::ssize_t>(gaussians.size())});
+    std::fill(weight.span.begin(), weight.span.end(), 0.0);
+    const Work work(gaussians.device());
+    {
+        const py::gil_scoped_release unlocked;
+        if constexpr (V3DG_WITH_CUDA != 0) {
+            if (!work.device().is_host()) {
+                cuda::weigh_cuts(config, rows, pictures.pictures(), weight.span, progress, work.stream());
+                return weight.object;
+            }
+        }
+        weigh_cuts(config, rows, pictures.pictures(), weight.span, progress);
+    }
+    return weight.object;
 }
 
 FitConfig make_config(int steps, int views_per_step, int num_views, int supersample, int image_size,
@@ -254,13 +274,9 @@ void bind_fit_level(py::module_& m) {
           "Fits groups of gaussians, in place, to look like groups of the target inside their balls (G, 4). "
           "Returns the residuals (G, 2) in colour and alpha.");
     py::class_<BoundPictures>(m, "CutPictures",
-                              "Pictures of cuts of at most and at least so many gaussians, around a ball "
-                              "(center, radius) or from cameras. Windows are around gaussians of the asset: "
-                              "their means, and how often each is looked at, as the sum up to it.")
-        .def(py::init<const BoundTable&, std::pair<double, double>, const py::array&, const py::array&,
-                      const std::array<double, 4>&, const std::vector<BoundCamera>&, uint64_t>(),
-             py::kw_only(), "table"_a, "counts"_a, "means"_a, "weight"_a, "ball"_a, "cameras"_a, "seed"_a,
-             py::keep_alive<1, 2>())
+                              "Pictures of cuts from all around an asset, which is level 0, or from cameras.")
+        .def(py::init<const BoundTable&, const Rows&, const std::vector<BoundCamera>&, uint64_t>(),
+             py::kw_only(), "table"_a, "asset"_a, "cameras"_a, "seed"_a, py::keep_alive<1, 2>())
         .def("view", &BoundPictures::view, "number"_a,
              "The camera of a window, the clusters that it shows, and the samples of a side of a pixel.");
     m.def(
@@ -268,6 +284,10 @@ void bind_fit_level(py::module_& m) {
         "progress"_a,
         "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
         "picture.");
+    m.def(
+        "weigh_cuts", &weigh_cuts_arrays, "config"_a, "gaussians"_a, "pictures"_a, "progress"_a,
+        "How much as many pictures of cuts as there are steps show of each gaussian (N,): its blend weights, "
+        "in parts of the pixels of each picture.");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
           "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
     m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,

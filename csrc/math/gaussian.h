@@ -41,6 +41,18 @@ struct GaussianRows {
     }
 };
 
+// Copies all of row `from` but its SH coefficients to row `to`.
+template <class T>
+V3DG_HD inline void copy_shape(const GaussianRows<const T>& source, size_t from, const GaussianRows<T>& rows,
+                               size_t to) {
+    for (size_t k = 0; k < 3; ++k) {
+        rows.means[3 * to + k] = source.means[3 * from + k];
+        rows.scales[3 * to + k] = source.scales[3 * from + k];
+    }
+    for (size_t k = 0; k < 4; ++k) rows.quats[4 * to + k] = source.quats[4 * from + k];
+    rows.opacities[to] = source.opacities[from];
+}
+
 // The same as the CPU's rasterizer reads them: a plane an attribute. Planes hold `kPlanePadding` elements
 // more than there are gaussians, so that a vector load may run past the last.
 constexpr size_t kPlanePadding = 16;

@@ -18,9 +18,37 @@ constexpr double kHomePx2 = 2;  // a gaussian: the size at which a cut is select
 // A side of a picture, in the size at which its cut is at home. Cuts of the default tolerance are seen at a
 // quarter to half of that.
 constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
-constexpr double kDistance = 2.5;  // from the centre, in radii
-constexpr double kNear = 0.01;     // in radii
-constexpr int kMostTries = 16;     // to find a gaussian that a picture shows
+constexpr double kDistance = 2.5;     // from the centre, in radii
+constexpr double kNear = 0.01;        // in radii
+constexpr int kMostTries = 16;        // to find a gaussian that a picture shows
+constexpr double kMostOfAsset = 0.7;  // of its gaussians, in a cut
+constexpr double kShare = 0.99;       // of the gaussians that the radius holds; the rest may float far away
+
+double median(std::vector<double> values) {
+    const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+    std::nth_element(values.begin(), middle, values.end());
+    if (values.size() % 2 > 0) return *middle;
+    return (*std::max_element(values.begin(), middle) + *middle) / 2;
+}
+
+// The ball that is looked at.
+void find_ball(CutPictures& pictures) {
+    const Span<const float>& means = pictures.means;
+    std::vector<double> values(means.size / 3);
+    for (size_t k = 0; k < 3; ++k) {
+        for (size_t i = 0; i < values.size(); ++i) values[i] = static_cast<double>(means[3 * i + k]);
+        pictures.center[k] = median(values);
+    }
+    for (size_t i = 0; i < values.size(); ++i) {
+        double d[3];
+        for (size_t k = 0; k < 3; ++k) d[k] = static_cast<double>(means[3 * i + k]) - pictures.center[k];
+        values[i] = std::sqrt(dot3(d, d));
+    }
+    const auto farthest = static_cast<std::ptrdiff_t>(kShare * static_cast<double>(values.size() - 1));
+    std::nth_element(values.begin(), values.begin() + farthest, values.end());
+    pictures.radius = values[static_cast<size_t>(farthest)];
+    if (!(pictures.radius > 0)) pictures.radius = 1;
+}
 
 // Numbers of one view.
 class Random {
@@ -83,10 +111,9 @@ Camera resized(Camera camera, double scale) {
 Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures, Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};
     for (int tries = 0; tries < kMostTries; ++tries) {
-        const Span<const double>& weight = pictures.weight;
-        const double wanted = random.uniform() * weight[weight.size - 1];
-        const double* found = std::upper_bound(weight.begin(), weight.end(), wanted);
-        const auto i = std::min(static_cast<size_t>(found - weight.begin()), weight.size - 1);
+        const std::vector<double>& weight = pictures.weight;
+        const auto found = std::upper_bound(weight.begin(), weight.end(), random.uniform() * weight.back());
+        const auto i = std::min(static_cast<size_t>(found - weight.begin()), weight.size() - 1);
         double p[3];
         for (int row = 0; row < 3; ++row) {
             p[row] = camera.translation[row];
@@ -136,13 +163,34 @@ Comparison comparison_of(double size, double longer_px) {
 
 }  // namespace
 
+CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const float>& asset,
+                             Span<const Camera> cameras, uint64_t seed) {
+    CutPictures pictures{table, {asset.means, 3 * asset.size}, cameras, seed, 0, 0, {}, {}, 0};
+    for (const int32_t c : table.top_cluster)
+        pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
+    pictures.least = std::max(pictures.least, 1.0);
+    pictures.most = std::max(kMostOfAsset * static_cast<double>(asset.size), pictures.least);
+    find_ball(pictures);
+    // What is twice as large is looked at twice as often.
+    double sum = 0;
+    for (size_t i = 0; i < asset.size; ++i) {
+        double scale[3];
+        for (size_t k = 0; k < 3; ++k) scale[k] = static_cast<double>(asset.scales[3 * i + k]);
+        std::sort(scale, scale + 3);
+        sum += static_cast<double>(asset.opacities[i]) * std::sqrt(scale[1] * scale[2]);
+        pictures.weight.push_back(sum);
+    }
+    return pictures;
+}
+
 CutView cut_view(const CutPictures& pictures, uint64_t number) {
     Random random(pictures.seed, number);
     const double part = random.uniform();
     const double share = pictures.most * std::pow(pictures.least / pictures.most, part * part) /
-                         static_cast<double>(pictures.weight.size);
+                         static_cast<double>(pictures.weight.size());
     const double size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform());
-    double all = static_cast<double>(pictures.weight.size);  // gaussians that the picture has without levels
+    double all =
+        static_cast<double>(pictures.weight.size());  // gaussians that the picture has without levels
     Camera camera;
     SelectRule rule{};
     rule.culls = pictures.cameras.size > 0;

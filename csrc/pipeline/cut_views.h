@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "math/camera.h"
+#include "math/gaussian.h"
 #include "residency/cluster_table.h"
 
 namespace v3dg {
@@ -20,13 +21,18 @@ struct CutView {
 // centre, or from cameras that are given.
 struct CutPictures {
     const ClusterTable& table;
-    double most, least;         // gaussians of a cut
-    Span<const float> means;    // [N * 3] of the asset, and
-    Span<const double> weight;  // [N] how often each is looked at, as the sum up to it, which ascends
-    double center[3], radius;   // that is looked at
+    Span<const float> means;  // [N * 3] of the asset
     Span<const Camera> cameras;
     uint64_t seed;
+    double most, least;          // gaussians of a cut
+    std::vector<double> weight;  // [N] how often each of the asset is looked at, as the sum up to it
+    double center[3], radius;    // that is looked at
 };
+
+// Those of a bundle and its asset, which has gaussians: of cuts of 0.7 of these down to the coarsest one.
+// Borrows all but the seed.
+CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const float>& asset,
+                             Span<const Camera> cameras, uint64_t seed);
 
 // Picture number `number`. The same arguments give the same view. A cut from a given camera has the share of
 // the gaussians in its frustum, and is as large, that a cut from around has of all.

@@ -24,4 +24,9 @@ struct CutRows {
 void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t target_count,
                  const CutRows& levels, const CutPictures& pictures, FitProgress& progress);
 
+// What config.steps pictures of cuts show of each gaussian: adds its blend weights to `weight`, in parts of
+// the pixels of each picture. Cuts are drawn as refine_cuts draws them.
+void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
+                Span<double> weight, FitProgress& progress);
+
 }  // namespace v3dg

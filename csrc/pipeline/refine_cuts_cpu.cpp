@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <numeric>
+#include <optional>
 #include <vector>
 
 #include "base/parallel_for.h"
@@ -56,23 +57,103 @@ void compare(const FitConfig& config, int samples, Canvas& picture, Canvas& targ
         picture.alpha()[i] = l1_vjp(picture.alpha()[i], config.loss.alpha * weight);
 }
 
+// The views of pictures, some ahead.
+class Views {
+  public:
+    Views(const CutPictures& pictures, size_t count)
+        : pictures_(pictures), count_(count), views_(kViewsAtOnce) {}
+    // Of number 0 first, and then of one after another.
+    const CutView& operator[](size_t number) {
+        if (number % kViewsAtOnce == 0)
+            parallel_for(std::min(kViewsAtOnce, count_ - number), 1,
+                         [&](size_t k) { views_[k] = cut_view(pictures_, number + k); });
+        return views_[number % kViewsAtOnce];
+    }
+
+  private:
+    const CutPictures& pictures_;
+    const size_t count_;
+    std::vector<CutView> views_;
+};
+
+// The gaussians of one view, the picture of them, and the way back.
+class CutFrame {
+  public:
+    explicit CutFrame(const FitConfig& config) : appearance_{config.filter_px2, config.antialiased} {}
+
+    // The rows of so many gaussians, which are written before they are drawn.
+    const GaussianRows<float>& start(size_t count, int sh_degree) {
+        values_.resize(num_values(sh_degree) * count);
+        rows_ = rows_in(values_.data(), count, sh_degree);
+        return rows_;
+    }
+    // The picture, in whose place its slopes are put.
+    Canvas& draw(const Camera& camera) {
+        model_.emplace(rows_);
+        draw_ = {&model_->planes(), 0, rows_.size, view_of_world<float>(camera), appearance_};
+        pinhole_ = pinhole_of<float>(camera);
+        picture_ = canvas_.start(camera);
+        render<float>({draw_}, pinhole_, picture_, true, workspace_);
+        return canvas_;
+    }
+    GaussianRows<const float> backward() {
+        gradients_.assign(values_.size(), 0.0f);
+        const GaussianRows<float> gradient = rows_in(gradients_.data(), rows_.size, rows_.sh_degree);
+        float d_background[3] = {};
+        render_backward<float>(draw_, pinhole_, picture_, {canvas_.color(), canvas_.alpha(), nullptr},
+                               workspace_, gradient, {}, d_background);
+        return gradient;
+    }
+
+  private:
+    Appearance<float> appearance_;
+    std::vector<float> values_, gradients_;
+    GaussianRows<float> rows_{};
+    std::optional<Model<float>> model_;
+    Draw<float> draw_{};
+    Pinhole<float> pinhole_{};
+    Canvas canvas_;
+    Picture<float> picture_{};
+    Workspace<float> workspace_;
+};
+
 }  // namespace
+
+void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
+                Span<double> weight, FitProgress& progress) {
+    const auto steps = static_cast<size_t>(config.steps);
+    Views views(pictures, steps);
+    CutFrame frame(config);
+    for (size_t i = 0; i < steps && !progress.cancel; ++i) {
+        const CutView& view = views[i];
+        const std::vector<uint32_t> index = gaussians_of(pictures.table, view);
+        const GaussianRows<float>& shown = frame.start(index.size(), 0);
+        parallel_for(index.size(), kGaussiansAtOnce,
+                     [&](size_t g) { copy_in_grey(rows, index[g], shown, g); });
+        Canvas& picture = frame.draw(view.camera);
+        const size_t count = picture.num_pixels();
+        for (size_t k = 0; k < 3 * count; ++k) picture.color()[k] = k % 3 == 0 ? 1.0f : 0.0f;
+        std::fill_n(picture.alpha(), count, 0.0f);
+        const GaussianRows<const float> gradient = frame.backward();
+        for (size_t g = 0; g < index.size(); ++g) weight[index[g]] += blend_weight(gradient.sh[3 * g], count);
+        ++progress.groups_done;
+    }
+}
 
 void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t target_count,
                  const CutRows& levels, const CutPictures& pictures, FitProgress& progress) {
     const GaussianRows<float>& rows = levels.rows;
-    const size_t num = num_values(rows);
-    std::vector<float> moments(2 * num * rows.size, 0.0f), shown_values, gradients;
-    Workspace<float> of_target, of_cut;
-    Canvas wanted, drawn;
-    std::vector<CutView> views(kViewsAtOnce);
-    for (size_t i = 0; i < static_cast<size_t>(config.steps) && !progress.cancel; ++i) {
-        if (i % kViewsAtOnce == 0)
-            parallel_for(kViewsAtOnce, 1, [&](size_t k) { views[k] = cut_view(pictures, i + k); });
-        const CutView& view = views[i % kViewsAtOnce];
-        const Camera& camera = view.camera;
-        const int samples = view.samples;
-        const Camera larger = enlarged(camera, samples);
+    const size_t num = num_values(rows.sh_degree);
+    std::vector<float> moments(2 * num * rows.size, 0.0f);
+    const Moments kept{moments.data(), moments.data() + num * rows.size};
+    Workspace<float> of_target;
+    Canvas wanted;
+    const auto steps = static_cast<size_t>(config.steps);
+    Views views(pictures, steps);
+    CutFrame frame(config);
+    for (size_t i = 0; i < steps && !progress.cancel; ++i) {
+        const CutView& view = views[i];
+        const Camera larger = enlarged(view.camera, view.samples);
         render<float>({{target.model,
                         0,
                         target_count,
@@ -81,28 +162,13 @@ void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t targ
                       pinhole_of<float>(larger), wanted.start(larger), false, of_target);
 
         const std::vector<uint32_t> index = gaussians_of(pictures.table, view);
-        shown_values.resize(num * index.size());
-        const GaussianRows<float> shown = rows_in(shown_values.data(), index.size(), rows.sh_degree);
+        const GaussianRows<float>& shown = frame.start(index.size(), rows.sh_degree);
         parallel_for(index.size(), kGaussiansAtOnce,
                      [&](size_t g) { copy_gaussian(rows, index[g], shown, g); });
-        const Model<float> model(shown);
-        const Draw<float> draw{&model.planes(),
-                               0,
-                               index.size(),
-                               view_of_world<float>(camera),
-                               {config.filter_px2, config.antialiased}};
-        const Pinhole<float> pinhole = pinhole_of<float>(camera);
-        const Picture<float> picture = drawn.start(camera);
-        render<float>({draw}, pinhole, picture, true, of_cut);
-        compare(config, samples, drawn, wanted);
-        gradients.assign(num * index.size(), 0.0f);
-        const GaussianRows<float> gradient = rows_in(gradients.data(), index.size(), rows.sh_degree);
-        float d_background[3] = {};
-        render_backward<float>(draw, pinhole, picture, {drawn.color(), drawn.alpha(), nullptr}, of_cut,
-                               gradient, {}, d_background);
+        compare(config, view.samples, frame.draw(view.camera), wanted);
+        const GaussianRows<const float> gradient = frame.backward();
 
         const FitStep step = fit_step(config, static_cast<int>(i));
-        const Moments kept{moments.data(), moments.data() + num * rows.size};
         parallel_for(index.size(), kGaussiansAtOnce, [&](size_t g) {
             if (index[g] < target_count) return;
             move_gaussian(rows, index[g], gradient, g, levels.radius[index[g]], step, config.beta2, kept);

@@ -19,7 +19,11 @@ constexpr unsigned kThreadsAhead = 3, kPicturesAhead = 2 * kThreadsAhead;
 class OwnStream {
   public:
     OwnStream() { check(cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking), "cudaStreamCreate"); }
-    ~OwnStream() { cudaStreamDestroy(stream_); }
+    // Waits for its work, which reads what belongs to whoever called, also where a step has failed.
+    ~OwnStream() {
+        cudaStreamSynchronize(stream_);
+        cudaStreamDestroy(stream_);
+    }
     OwnStream(const OwnStream&) = delete;
     OwnStream& operator=(const OwnStream&) = delete;
     cudaStream_t get() const { return stream_; }
@@ -119,11 +123,29 @@ __global__ void slope_kernel(PicturePlanes difference, size_t num_pixels, LossWe
     difference.alpha[pixel] = l1_vjp(difference.alpha[pixel], loss.alpha * *weight);
 }
 
+// A thread a pixel: the slope of the sum of one channel.
+__global__ void sum_slope_kernel(PicturePlanes slope, size_t num_pixels) {
+    const size_t pixel = size_t(blockIdx.x) * kThreads + threadIdx.x;
+    if (pixel >= num_pixels) return;
+    for (int k = 0; k < 3; ++k) slope.color[3 * pixel + k] = k == 0 ? 1.0f : 0.0f;
+    slope.alpha[pixel] = 0;
+}
+
 // A thread a gaussian of the view, which `index` places among all.
 __global__ void gather_kernel(GaussianRows<const float> rows, Span<const uint32_t> index,
                               GaussianRows<float> shown) {
     const size_t g = size_t(blockIdx.x) * kGaussiansABlock + threadIdx.x;
     if (g < index.size) copy_gaussian(rows, index[g], shown, g);
+}
+__global__ void gather_in_grey_kernel(GaussianRows<const float> rows, Span<const uint32_t> index,
+                                      GaussianRows<float> shown) {
+    const size_t g = size_t(blockIdx.x) * kGaussiansABlock + threadIdx.x;
+    if (g < index.size) copy_in_grey(rows, index[g], shown, g);
+}
+__global__ void weight_kernel(Span<const uint32_t> index, GaussianRows<const float> gradient,
+                              size_t num_pixels, double* weight) {
+    const size_t g = size_t(blockIdx.x) * kGaussiansABlock + threadIdx.x;
+    if (g < index.size) weight[index[g]] += blend_weight(gradient.sh[3 * g], num_pixels);
 }
 __global__ void move_kernel(GaussianRows<float> rows, Span<const uint32_t> index,
                             GaussianRows<const float> gradient, const float* radius, size_t num_fixed,
@@ -158,6 +180,39 @@ class Comparison {
     DeviceBuffer<float> weight_;
 };
 
+// The gaussians of one view, the picture of them, and the way back.
+class CutFrame {
+  public:
+    CutFrame(const FitConfig& config, cudaStream_t stream)
+        : config_(config), stream_(stream), background_(3, stream) {}
+
+    // The rows of so many gaussians, which are written before they are drawn.
+    const GaussianRows<float>& start(size_t count, int sh_degree) {
+        rows_ = rows_in(values_.reserve(num_values(sh_degree) * count, stream_), count, sh_degree);
+        return rows_;
+    }
+    const PicturePlanes& draw(const Camera& camera) {
+        const PicturePlanes& planes = picture_.start(camera, stream_);
+        frame_.draw(picture_of(rows_, config_.filter_px2, config_.antialiased, camera, planes), stream_);
+        return planes;
+    }
+    GaussianRows<const float> backward(const PicturePlanes& slopes) {
+        const GaussianRows<float> gradient =
+            rows_in(gradients_.reserve(num_values(rows_.sh_degree) * rows_.size, stream_), rows_.size,
+                    rows_.sh_degree);
+        frame_.backward({slopes.color, slopes.alpha, nullptr}, gradient, {}, background_.data(), stream_);
+        return gradient;
+    }
+
+  private:
+    const FitConfig& config_;
+    const cudaStream_t stream_;
+    DeviceBuffer<float> values_, gradients_, background_;
+    GaussianRows<float> rows_{};
+    DifferentiableFrame frame_;
+    Canvas picture_;
+};
+
 // What one step needs: the view, its gaussians, and what it should look like.
 struct Wanted {
     Camera camera;
@@ -180,17 +235,16 @@ class WantedAhead {
           device_(current_device()),
           ahead_(static_cast<uint64_t>(config.steps), kThreadsAhead, kPicturesAhead,
                  [this](uint64_t number) { make(number); }) {}
-    // Of whom no more is used, also where a step has failed.
+    // Steps read what is here until they are done.
     ~WantedAhead() { cudaStreamSynchronize(stream_); }
 
     const Wanted& wait_for_next() {
-        ahead_.wait_for_next();
-        const Wanted& wanted = wanted_[used_ % kPicturesAhead];
-        check(cudaStreamWaitEvent(stream_, wanted.made.get(), 0), "cudaStreamWaitEvent");
-        return wanted;
+        next_ = &wanted_[ahead_.wait_for_next()];
+        check(cudaStreamWaitEvent(stream_, next_->made.get(), 0), "cudaStreamWaitEvent");
+        return *next_;
     }
     void next_is_used() {
-        check(cudaEventRecord(wanted_[used_++ % kPicturesAhead].used.get(), stream_), "cudaEventRecord");
+        check(cudaEventRecord(next_->used.get(), stream_), "cudaEventRecord");
         ahead_.next_is_used();
     }
 
@@ -228,7 +282,7 @@ class WantedAhead {
     const CutPictures& pictures_;
     const cudaStream_t stream_;
     const int device_;
-    uint64_t used_ = 0;
+    Wanted* next_ = nullptr;
     Worker workers_[kThreadsAhead];
     Wanted wanted_[kPicturesAhead];
     Ahead ahead_;  // the last, for its threads use all else
@@ -239,34 +293,24 @@ class WantedAhead {
 void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const CutRows& levels,
                  const CutPictures& pictures, FitProgress& progress, Stream stream) {
     const GaussianRows<float>& rows = levels.rows;
-    const size_t num = num_values(rows), num_moments = 2 * num * rows.size;
-    const DeviceBuffer<float> moments(num_moments, stream), radius(levels.radius, stream),
-        background(3, stream);
+    const size_t num = num_values(rows.sh_degree), num_moments = 2 * num * rows.size;
+    const DeviceBuffer<float> moments(num_moments, stream), radius(levels.radius, stream);
     if (num_moments > 0)
         check(cudaMemsetAsync(moments.data(), 0, num_moments * sizeof(float), stream), "cudaMemsetAsync");
     check(cudaStreamSynchronize(stream),
           "refine_cuts");  // what pictures are made of is there for all streams
-    DeviceBuffer<float> shown_values, gradients;
-    DifferentiableFrame frame;
-    Canvas drawn;
+    CutFrame frame(config, stream);
     Comparison comparison;
     WantedAhead ahead(config, target, pictures, stream);
     for (int i = 0; i < config.steps && !progress.cancel; ++i) {
         const Wanted& wanted = ahead.wait_for_next();
-        const size_t count = wanted.num_gaussians;
-        const Span<const uint32_t> index{wanted.gaussians.data(), count};
-        const GaussianRows<float> shown =
-            rows_in(shown_values.reserve(num * count, stream), count, rows.sh_degree);
-        const unsigned num_blocks = blocks_for(count, kGaussiansABlock);
-        launch("gather_kernel", gather_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index, shown);
-        frame.draw(picture_of(shown, config.filter_px2, config.antialiased, wanted.camera,
-                              drawn.start(wanted.camera, stream)),
-                   stream);
-        const PicturePlanes& slopes =
-            comparison.slopes(config.loss, wanted.camera, drawn.planes(), wanted.picture.planes(), stream);
-        const GaussianRows<float> gradient =
-            rows_in(gradients.reserve(num * count, stream), count, rows.sh_degree);
-        frame.backward({slopes.color, slopes.alpha, nullptr}, gradient, {}, background.data(), stream);
+        const Span<const uint32_t> index{wanted.gaussians.data(), wanted.num_gaussians};
+        const unsigned num_blocks = blocks_for(index.size, kGaussiansABlock);
+        launch("gather_kernel", gather_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index,
+               frame.start(index.size, rows.sh_degree));
+        const PicturePlanes& drawn = frame.draw(wanted.camera);
+        const GaussianRows<const float> gradient = frame.backward(
+            comparison.slopes(config.loss, wanted.camera, drawn, wanted.picture.planes(), stream));
         launch("move_kernel", move_kernel, num_blocks, kGaussiansABlock, 0, stream, rows, index, gradient,
                radius.data(), target.rows.size, fit_step(config, i), config.beta2,
                Moments{moments.data(), moments.data() + num * rows.size});
@@ -274,6 +318,35 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
         ++progress.groups_done;
     }
     check(cudaStreamSynchronize(stream), "refine_cuts");
+}
+
+void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
+                Span<double> weight, FitProgress& progress, Stream stream) {
+    const DeviceBuffer<double> weights(Span<const double>(weight), stream);
+    CutFrame frame(config, stream);
+    DeviceBuffer<uint32_t> gaussians;
+    Canvas slopes;
+    for (int i = 0; i < config.steps && !progress.cancel; ++i) {
+        const CutView view = cut_view(pictures, static_cast<uint64_t>(i));
+        const std::vector<uint32_t> shown = gaussians_of(pictures.table, view);
+        gaussians.copy_from({shown.data(), shown.size()}, stream);
+        const Span<const uint32_t> index{gaussians.data(), shown.size()};
+        const unsigned num_blocks = blocks_for(index.size, kGaussiansABlock);
+        launch("gather_in_grey_kernel", gather_in_grey_kernel, num_blocks, kGaussiansABlock, 0, stream, rows,
+               index, frame.start(index.size, 0));
+        frame.draw(view.camera);
+        const PicturePlanes& slope = slopes.start(view.camera, stream);
+        const size_t count = num_pixels(view.camera);
+        launch("sum_slope_kernel", sum_slope_kernel, blocks_for(count, kThreads), kThreads, 0, stream, slope,
+               count);
+        launch("weight_kernel", weight_kernel, num_blocks, kGaussiansABlock, 0, stream, index,
+               frame.backward(slope), count, weights.data());
+        ++progress.groups_done;
+    }
+    check(cudaMemcpyAsync(weight.data, weights.data(), weight.size * sizeof(double), cudaMemcpyDeviceToHost,
+                          stream),
+          "weigh_cuts");
+    check(cudaStreamSynchronize(stream), "weigh_cuts");
 }
 
 }  // namespace cuda

@@ -11,5 +11,9 @@ namespace cuda {
 void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const CutRows& levels,
                  const CutPictures& pictures, FitProgress& progress, Stream stream);
 
+// As v3dg::weigh_cuts, likewise.
+void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
+                Span<double> weight, FitProgress& progress, Stream stream);
+
 }  // namespace cuda
 }  // namespace v3dg

@@ -88,19 +88,27 @@ V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
 // Copies gaussian `from` to row `to`.
 V3DG_HD inline void copy_gaussian(const GaussianRows<const float>& source, size_t from,
                                   const GaussianRows<float>& rows, size_t to) {
-    const auto copy = [](const float* in, float* out, size_t count, size_t from, size_t to) {
-        for (size_t k = 0; k < count; ++k) out[count * to + k] = in[count * from + k];
-    };
-    copy(source.means, rows.means, 3, from, to);
-    copy(source.quats, rows.quats, 4, from, to);
-    copy(source.scales, rows.scales, 3, from, to);
-    copy(source.opacities, rows.opacities, 1, from, to);
-    copy(source.sh, rows.sh, static_cast<size_t>(source.num_sh()), from, to);
+    copy_shape(source, from, rows, to);
+    const auto num_sh = static_cast<size_t>(source.num_sh());
+    for (size_t k = 0; k < num_sh; ++k) rows.sh[num_sh * to + k] = source.sh[num_sh * from + k];
+}
+
+// The same in grey, of SH degree 0: its gradient by that colour is what is seen of it, whatever its own is.
+V3DG_HD inline void copy_in_grey(const GaussianRows<const float>& source, size_t from,
+                                 const GaussianRows<float>& rows, size_t to) {
+    copy_shape(source, from, rows, to);
+    for (size_t k = 0; k < 3; ++k) rows.sh[3 * to + k] = 0;
+}
+
+// The part of a picture of so many pixels that a gaussian fills, from the gradient of the picture's sum by
+// the colour of a gaussian that copy_in_grey made.
+V3DG_HD inline double blend_weight(float gradient, size_t num_pixels) {
+    return static_cast<double>(gradient) / (kShBase0 * static_cast<double>(num_pixels));
 }
 
 // How many values a gaussian has.
-V3DG_HD inline size_t num_values(const GaussianRows<const float>& rows) {
-    return 11 + static_cast<size_t>(rows.num_sh());
+V3DG_HD inline size_t num_values(int sh_degree) {
+    return 11 + 3 * static_cast<size_t>(num_sh_bases(sh_degree));
 }
 
 // `count` rows in one piece of memory, num_values() for each gaussian; what has to lie at a multiple of 16

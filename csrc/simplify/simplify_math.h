@@ -196,17 +196,6 @@ V3DG_HD inline void join(MergeNode& a, const MergeNode& b) {
     a.opacity = opacity < 1 ? opacity : 1;
 }
 
-// Copies all of a row but its SH coefficients.
-V3DG_HD inline void copy_shape(const GaussianRows<const float>& in, int64_t from,
-                               const GaussianRows<float>& out, int64_t to) {
-    for (int k = 0; k < 3; ++k) {
-        out.means[3 * to + k] = in.means[3 * from + k];
-        out.scales[3 * to + k] = in.scales[3 * from + k];
-    }
-    for (int k = 0; k < 4; ++k) out.quats[4 * to + k] = in.quats[4 * from + k];
-    out.opacities[to] = in.opacities[from];
-}
-
 // Writes place, shape and opacity of a joined gaussian.
 V3DG_HD inline void write_joined(const MergeNode& node, const GaussianRows<float>& out, int64_t to) {
     double scale[3], axes[3][3], quat[4];

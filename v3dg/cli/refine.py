@@ -30,6 +30,8 @@ class Refine(CameraFile, _common.OnDevice):
     cameras: Annotated[Path | None, _common.option("PATH")] = None
     """A file or folder of cameras from which the asset is seen, as for `v3dg render`: for a room, which is
     seen from inside. All around if not given."""
+    drop: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.02
+    """What all gaussians together show that are dropped of a level, in parts of what it shows; 0: none."""
     seed: int = 0
     """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
 
@@ -41,7 +43,7 @@ def run(options: Refine) -> None:
     _common.check_output(options.output, options.bundle)
     cameras = list(options.read().values())
     start = time.perf_counter()
-    how: dict[str, Any] = {"steps": options.steps, "seed": options.seed, "device": options.device}
+    how: dict[str, Any] = {name: getattr(options, name) for name in ("steps", "drop", "seed", "device")}
     refined = refine_bundle(Bundle.open(options.bundle), cameras=cameras, progress=not options.quiet, **how)
     refined.write(options.output)
     result = {"output": str(options.output), "steps": options.steps, "seconds": time.perf_counter() - start}
