@@ -1,7 +1,5 @@
 """Where work runs: on the CPU, with NumPy arrays, or on a CUDA device, with torch tensors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields

@@ -1,7 +1,5 @@
 """Packages that v3dg can do without: what each is for, and how to get it."""
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Files that are complete or not there, and the first step of reading files of strangers."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

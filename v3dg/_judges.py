@@ -1,7 +1,5 @@
 """Many pictures measured, a core each, and means of what was found."""
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Numbers that users pass: as the core takes them, or an error of one line that names them."""
 
-from __future__ import annotations
-
 import math
 import operator
 import os

@@ -1,7 +1,5 @@
 """How far long work is: a bar of one line in a terminal, a few lines in a log, or told to a function."""
 
-from __future__ import annotations
-
 import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator

@@ -3,8 +3,6 @@
 And folders with cameras: nerfstudio's runs, and COLMAP's models, with its own library.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What is wrong with an asset: gaussians that cannot be drawn, and such as lie far from all others."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ The result is one picture: the full asset above, the selected cut below, a colum
 gaussians drawn, the time, and the error to the full asset at twice the resolution.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import time

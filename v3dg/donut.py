@@ -1,7 +1,5 @@
 """An asset that needs no download: a glazed donut, made from a seed, and a field of many."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """False colours: palettes that show the level or the cluster that gaussians belong to, or what is missing."""
 
-from __future__ import annotations
-
 from typing import Literal, TypeAlias
 
 import numpy as np

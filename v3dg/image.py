@@ -1,7 +1,5 @@
 """Image: what drawing gives."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Reading and writing Gaussians by file name; a format is a module of v3dg.formats."""
 
-from __future__ import annotations
-
 import os
 import pathlib
 from collections.abc import Callable, Mapping

@@ -4,8 +4,6 @@ All take a reference and a test picture (H,W,3), display values in [0,1] (sRGB a
 NumPy arrays or torch tensors, and are means over the whole picture. Nothing is cropped.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from typing import Any
 

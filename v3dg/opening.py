@@ -1,7 +1,5 @@
 """Files by their names: scenes, bundles and assets."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

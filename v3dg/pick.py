@@ -1,7 +1,5 @@
 """Picking: what a pixel shows."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass
 

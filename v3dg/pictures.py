@@ -1,7 +1,5 @@
 """Pictures of 8 bits: from colours, on contact sheets, in files that are written whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

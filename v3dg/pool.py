@@ -1,7 +1,5 @@
 """Pools: the part of a scene's bundles that is resident, in memory of a fixed size."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext

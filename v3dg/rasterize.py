@@ -1,7 +1,5 @@
 """Draw gaussians as they are: project, bin, blend; differentiable on torch tensors."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Levels of a bundle made better together: as cuts show them, next to what hides parts of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -3,8 +3,6 @@
 What is there is freed with its bundle or scene, or by `residency.clear()`.
 """
 
-from __future__ import annotations
-
 import atexit
 import copy
 import os

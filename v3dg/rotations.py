@@ -1,7 +1,5 @@
 """Rotations and quaternions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from v3dg.cameras import Floats

@@ -1,7 +1,5 @@
 """Which axis is up: what a file says, or else a guess from cameras, from a ground plane, or by custom."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from typing import Any

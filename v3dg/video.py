@@ -1,7 +1,5 @@
 """Videos: pictures in a row in one file, written whole or not at all. Needs the extra `video`."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable
 from typing import Any

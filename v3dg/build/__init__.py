@@ -1,7 +1,5 @@
 """Build a bundle from an asset: split it into clusters, then halve and fit level after level."""
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import Executor
 from typing import Literal

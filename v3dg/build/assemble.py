@@ -1,7 +1,5 @@
 """The tables of a bundle, from the plan and what was measured of each level."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The digest of an asset: docs/format.md has the definition."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor

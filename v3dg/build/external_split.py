@@ -4,8 +4,6 @@ A node that does not fit is split in passes over its points: for the longest sid
 median of that axis (the upper and the lower half of its bits), and once to move the points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

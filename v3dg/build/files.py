@@ -1,7 +1,5 @@
 """From files of an asset to a bundle's: built if need be, and gone on with after an interrupt."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor

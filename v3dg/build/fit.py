@@ -1,7 +1,5 @@
 """The core's fit: its settings, and running it so that Ctrl-C and whoever shows progress stay alive."""
 
-from __future__ import annotations
-
 import _thread
 import threading
 import time

@@ -1,7 +1,5 @@
 """The leaves of a build: the gaussians of an asset that can be drawn, in the order of the median split."""
 
-from __future__ import annotations
-
 import operator
 import threading
 import warnings

@@ -1,7 +1,5 @@
 """How much memory of the host a build may use, and what that is enough for."""
 
-from __future__ import annotations
-
 import os
 import re
 from contextlib import suppress

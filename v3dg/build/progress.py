@@ -1,7 +1,5 @@
 """The bar of a build."""
 
-from __future__ import annotations
-
 import threading
 
 from v3dg import _core, _progress

@@ -1,7 +1,5 @@
 """Scratch: a folder of files of rows that is gone when the work is done."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """The unit of work: from the leaves of an asset or of a subtree of it to the levels above them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice

@@ -4,8 +4,6 @@ They are written here and read in the core, which knows each by its `PageCodec`
 (csrc/residency/page_source.h). CONTRIBUTING.md says what one more takes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, ClassVar
 

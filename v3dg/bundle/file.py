@@ -4,8 +4,6 @@ docs/format.md says what is in the file and why. This module moves bytes and tru
 tables mean is checked by `v3dg.bundle.tables`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -4,8 +4,6 @@ Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted. Errors are one lin
 stdout.
 """
 
-from __future__ import annotations
-
 from v3dg.cli import build, compare, completion, convert, demo, doctor, export, info, refine, render, view
 from v3dg.cli._program import Commands, Program
 

@@ -1,7 +1,5 @@
 """What several commands do: read files, print results."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

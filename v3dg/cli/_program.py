@@ -1,7 +1,5 @@
 """A program of several commands: parses, runs one, and turns what may fail into one line and an exit code."""
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 import functools

@@ -1,7 +1,5 @@
 """Where commands look from: the cameras of a file, a scene's own, or a turntable around the subject."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`v3dg build`."""
 
-from __future__ import annotations
-
 import logging
 import time
 import warnings

@@ -1,7 +1,5 @@
 """`v3dg compare`."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`v3dg completion`."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from dataclasses import dataclass

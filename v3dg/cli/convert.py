@@ -1,7 +1,5 @@
 """`v3dg convert`."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`v3dg doctor`."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import platform

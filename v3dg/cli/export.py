@@ -1,7 +1,5 @@
 """`v3dg export`."""
 
-from __future__ import annotations
-
 import shlex
 import time
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """`v3dg info`."""
 
-from __future__ import annotations
-
 import json
 import textwrap
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`v3dg refine`."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`v3dg render`."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any

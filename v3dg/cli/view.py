@@ -1,7 +1,5 @@
 """`v3dg view`."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import math

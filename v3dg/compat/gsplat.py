@@ -3,8 +3,6 @@
 Pictures and gradients are those of `v3dg.rasterize`, on the CPU and on CUDA devices.
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass, fields
 from typing import Any

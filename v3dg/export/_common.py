@@ -1,7 +1,5 @@
 """What exports share: which way is up, turning gaussians, and folders that are complete or not there."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -1,7 +1,5 @@
 """How far the coarser levels of chunks are from the finest, in pictures of them: `errors` of streamed SOG."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import numpy as np

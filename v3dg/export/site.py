@@ -3,8 +3,6 @@
 The page needs nothing but a static server and PlayCanvas's engine, one file of its npm package.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -5,8 +5,6 @@ of the asset. An instance is a tile that transforms the tileset of its bundle. G
 which a renderer's screen-space error of 16 px, the usual limit, is v3dg's tolerance of 3 px².
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Scenes and bundles as OpenUSD: levels of detail under UsdLod, instances as a PointInstancer."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path

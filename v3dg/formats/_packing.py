@@ -1,7 +1,5 @@
 """What the readers and writers of quantised formats share."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias

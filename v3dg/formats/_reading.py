@@ -1,7 +1,5 @@
 """What readers of strangers' files share: assets that are read in parts, and how much claims may cost."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import weakref

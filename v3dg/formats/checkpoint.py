@@ -6,8 +6,6 @@ numbers of each tensor. The pickle is followed as far as it builds dicts, plain 
 that it names is imported or called, and only the numbers of the gaussians are read.
 """
 
-from __future__ import annotations
-
 import math
 import pickletools
 from typing import Any, NamedTuple

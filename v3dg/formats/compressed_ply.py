@@ -6,8 +6,6 @@ component, 10 bits each for the others), colour and opacity (8 bits each), and e
 coefficient, channel by channel, for -4 to 4. See docs/formats.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

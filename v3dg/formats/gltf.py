@@ -4,8 +4,6 @@ Written is one primitive; read are all primitives that are gaussians, of nodes w
 are passed on as they are stored; glTF's have y up.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

@@ -5,8 +5,6 @@ of degree 3, then the number of nodes, the nodes, and boxes. A number below zero
 positions is in half precision.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -7,8 +7,6 @@ mean (float32, or 16 bits a coordinate around its bucket's centre), its scales a
 bytes for the range in the header), band by band and there channel by channel. See docs/formats.md.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import struct

@@ -1,7 +1,5 @@
 """`.ply`, as trainers write it: the core reads and writes it. See docs/formats.md."""
 
-from __future__ import annotations
-
 import os
 from typing import Literal
 

@@ -5,8 +5,6 @@ tables of 256 values, quaternions three bytes and the index of the largest compo
 higher SH an index into a palette of whole sets of coefficients. See docs/formats.md.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

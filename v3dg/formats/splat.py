@@ -4,8 +4,6 @@ A record is the mean (3 float32), the scales (3 float32, not logs), red, green, 
 and the quaternion w x y z (a byte each, 128 for 0). There is no header.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from v3dg.formats._packing import SH_C0, Floats, assemble, normalised

@@ -6,8 +6,6 @@ zstd stream an attribute. Version 1 has positions in half precision, 1 and 2 qua
 Coordinates are passed on as they are stored. See docs/formats.md.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

@@ -3,8 +3,6 @@
 The leaves of a tree say for each level which gaussians of which folder stand for what is in their bounds.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path, PurePosixPath

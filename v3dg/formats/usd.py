@@ -5,8 +5,6 @@ each of them once and where it stands. Of levels of detail, the first is read. C
 they are stored.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Scene files: JSON that says which bundles there are, where they stand and from where to look."""
 
-from __future__ import annotations
-
 import copy
 import os
 from collections.abc import Iterable, Mapping, Sequence

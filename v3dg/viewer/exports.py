@@ -1,7 +1,5 @@
 """What a tab does that takes long, such as files that it saves, and the thread that it is done in."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import tempfile

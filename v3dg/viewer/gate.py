@@ -4,8 +4,6 @@ Any web page can have its visitor's browser connect to this machine. The browser
 (Origin) and which name it looked up (Host), and no page can change that.
 """
 
-from __future__ import annotations
-
 import errno
 import hmac
 import ipaddress

@@ -1,7 +1,5 @@
 """What a page may say to the viewer: JSON of these kinds, with numbers in bounds, and nothing else."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """How large to draw, and when: small while things move, larger step by step once they rest."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import threading

@@ -1,7 +1,5 @@
 """Camera paths: views at times, and the smooth way through them."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

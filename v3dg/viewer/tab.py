@@ -1,7 +1,5 @@
 """A browser tab: what its page asks for, the loop that draws it, and what the page is told."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import functools
