@@ -95,18 +95,50 @@ def test_transform_names_what_is_wrong(arguments, message):
         random_gaussians(np.random.default_rng(0), 5).transform(*arguments)
 
 
-def test_paths_in_place_of_objects_are_told_what_to_call(bundle, camera):
+def test_files_stand_for_what_is_in_them(bundle, camera, tmp_path):
+    asset, file, scene = (str(tmp_path / name) for name in ("a.ply", "a.v3dg", "a.json"))
+    v3dg.write_asset(asset, bundle.level_gaussians(0))
+    bundle.write(file)
+    placed = v3dg.Scene()
+    placed.add(file, positions=[[0, 0, 0], [3, 0, 0]])
+    placed.save(scene, {"front": camera})
+    for path in (tmp_path / "a.ply", asset, file, scene):
+        for draw in (
+            lambda what: v3dg.render(what, camera, device="cpu"),
+            lambda what: v3dg.Renderer(what, device="cpu").render(camera),
+        ):
+            np.testing.assert_array_equal(draw(path).color, draw(v3dg.open(path)).color)
+    for path in (file, scene):
+        for chosen in (
+            lambda what: v3dg.select(what, camera, device="cpu").cluster_ids,
+            lambda what: v3dg.pick(what, camera, 24, 16),
+        ):
+            np.testing.assert_equal(chosen(path), chosen(v3dg.open(path)))
+        v3dg.write_tiles(path, tmp_path / "tiles")
+        v3dg.write_site(path, tmp_path / "site")
+    assert json.loads((tmp_path / "site" / "site.json").read_text())["cameras"][0]["name"] == "front"
+    v3dg.write_streamed_sog(file, tmp_path / "sog")
+    drawn = v3dg.rasterize(asset, camera)
+    np.testing.assert_array_equal(drawn.color, v3dg.rasterize(v3dg.open(asset), camera).color)
+    config = v3dg.BuildConfig(steps=0)
+    built = v3dg.build_bundle(asset, config=config, device="cpu", progress=False)
+    assert built.config == v3dg.build_bundle(v3dg.open(asset), config=config, device="cpu").config
+    v3dg.write_asset(tmp_path / "b.ply", asset)
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+
+
+def test_files_of_another_kind_are_named(bundle, camera, tmp_path):
+    v3dg.write_asset(tmp_path / "a.ply", bundle.level_gaussians(0))
     for call in (
-        lambda: v3dg.render("a.v3dg", camera),
-        lambda: v3dg.select("a.v3dg", camera),
-        lambda: v3dg.Renderer("a.json"),
-        lambda: v3dg.Scene().add("a.v3dg"),
-        lambda: v3dg.build_bundle("a.ply"),
-        lambda: v3dg.rasterize("a.ply", camera),
-        lambda: v3dg.write_asset("a.ply", "b.ply"),
-        lambda: v3dg.write_site("a.v3dg", "folder"),
+        lambda: v3dg.select(tmp_path / "a.ply", camera),
+        lambda: v3dg.write_site(tmp_path / "a.ply", tmp_path / "site"),
+        lambda: v3dg.write_tiles(tmp_path / "a.ply", tmp_path / "tiles"),
+        lambda: v3dg.write_streamed_sog(tmp_path / "a.ply", tmp_path / "sog"),
     ):
-        with pytest.raises(TypeError, match=r"got str; v3dg\.open reads files"):
+        with pytest.raises(TypeError, match=r"expected .*a Bundle, got Gaussians"):
+            call()
+    for call in (lambda: v3dg.render("none.v3dg", camera), lambda: v3dg.Scene().add("none.v3dg")):
+        with pytest.raises(FileNotFoundError, match=r"none\.v3dg"):
             call()
     for call in (
         lambda: v3dg.render(bundle, "a.json"),
@@ -193,8 +225,8 @@ def test_no_camera_and_no_bundle_are_named(bundle, tmp_path):
         v3dg.select(bundle, None)
     with pytest.raises(ValueError, match="n: expected 0 cameras or more, got -3"):
         v3dg.turntable((0, 0, 0), 1, -3)
-    with pytest.raises(TypeError, match=r"bundle: expected a Bundle, got str; v3dg\.open reads files"):
-        v3dg.write_streamed_sog("donut.v3dg", tmp_path / "web")
+    with pytest.raises(TypeError, match=r"bundle: expected a Bundle, got int"):
+        v3dg.write_streamed_sog(3, tmp_path / "web")
     with pytest.raises(ValueError, match="nowhere; create it first"):
         v3dg.write_usd(bundle, tmp_path / "nowhere" / "a.usda")
 

@@ -56,6 +56,25 @@ def test_taken_port_is_passed_over(blob_view):
         first.close()
 
 
+@pytest.mark.parametrize(
+    ("options", "up"),
+    [({}, (0, -1, 0)), ({"up": "x"}, (1, 0, 0)), ({"up": (0, 0, -1)}, (0, 0, -1))],
+)
+def test_the_viewer_in_python_takes_the_axis_of_the_commands(blob_bundle, options, up):
+    scene = v3dg.Scene.of(blob_bundle)
+    scene.up = "-y"
+    site = v3dg.view(scene, port=0, device="cpu", **options)
+    try:
+        assert site._greeting["up"] == list(up)
+    finally:
+        site.close()
+
+
+def test_an_axis_that_is_none_is_refused_by_the_viewer(blob_bundle):
+    with pytest.raises(ValueError, match=r"^up: expected 'x' or .*, got 'Z'"):
+        v3dg.view(blob_bundle, up="Z")
+
+
 def test_address_of_another_machine_is_refused(blob_view):
     with pytest.raises(ValueError, match=r"host: expected an address of this machine, got 192\.0\.2\.1"):
         Site(blob_view, host="192.0.2.1")

@@ -95,9 +95,8 @@ def refuse(name: str | os.PathLike[str], expected: str) -> NoReturn:
 def check_type(name: str, value: object, kind: type, expected: str) -> None:
     """Raise TypeError unless a value is of a kind, as which it is expected."""
     if not isinstance(value, kind):
-        is_file = isinstance(value, str | os.PathLike) and kind.__module__.startswith("v3dg.")
-        reader = "read_cameras" if kind.__name__ == "Camera" else "open"
-        advice = f"; v3dg.{reader} reads files" if is_file else ""
+        is_file = isinstance(value, str | os.PathLike) and kind.__name__ == "Camera"
+        advice = "; v3dg.read_cameras reads files" if is_file else ""
         raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}{advice}")
 
 

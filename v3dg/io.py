@@ -79,6 +79,11 @@ def read_asset(path: Path) -> Gaussians:
     return file.read(0, file.num_gaussians)
 
 
+def loaded(asset: Gaussians | Path) -> Gaussians:
+    """An asset, or the one in a file."""
+    return read_asset(asset) if isinstance(asset, str | os.PathLike) else asset
+
+
 def open_asset(path: Path) -> AssetFile:
     """Open an asset of any kind that `read_asset` reads, to read it in parts; errors as there.
 
@@ -95,7 +100,7 @@ def asset_bytes(path: Path) -> int:
 
 def write_asset(
     path: Path,
-    gaussians: Gaussians,
+    gaussians: Gaussians | Path,
     *,
     encoding: PlyEncoding = "binary_little_endian",
     version: Literal[2, 3, 4] | None = None,
@@ -114,6 +119,7 @@ def write_asset(
     - `.sog`: version 2. The order changes.
 
     Args:
+        gaussians: The asset, or its file.
         encoding: Of a `.ply`; the others have one only.
         version: Of a `.spz`; 3 if None. Version 2 is for viewers from before 2025, 4 for those since 2026.
 
@@ -123,6 +129,7 @@ def write_asset(
             length zero.
         OSError: The file cannot be written.
     """
+    gaussians = loaded(gaussians)
     check_type("gaussians", gaussians, Gaussians, "Gaussians")
     write = _by_name(path, _WRITERS)
     if version is not None:

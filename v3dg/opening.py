@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
@@ -10,6 +11,9 @@ from v3dg.formats import usd
 from v3dg.io import read_asset
 from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene, read_scene
+
+File: TypeAlias = str | os.PathLike[str]
+"""A file by its name, which may stand in place of what `open` makes of it."""
 
 
 def open(path: str | os.PathLike[str]) -> Subject:
@@ -23,6 +27,11 @@ def open(path: str | os.PathLike[str]) -> Subject:
         OSError: It cannot be read.
     """
     return open_with_cameras(Path(path))[0]
+
+
+def opened(subject: Any) -> Any:
+    """What a file is, where one is given, and all else as it is, for whoever checks it."""
+    return open(subject) if isinstance(subject, str | os.PathLike) else subject
 
 
 def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:

@@ -10,6 +10,7 @@ from v3dg._device import CPU
 from v3dg._numbers import check, check_type, whole
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
+from v3dg.opening import File, opened
 from v3dg.render import Renderer
 from v3dg.residency import residency
 from v3dg.scene import Scene
@@ -38,7 +39,7 @@ class Pick:
 
 
 def pick(
-    subject: Scene | Bundle,
+    subject: Scene | Bundle | File,
     camera: Camera,
     x: int,
     y: int,
@@ -53,6 +54,7 @@ def pick(
     Looks at nothing but the pixel, on the CPU; the cut is the same on every device.
 
     Args:
+        subject: What the picture shows, or the file of it.
         x: Column, from 0 at the left.
         y: Row, from 0 at the top.
         tolerance: As for the picture; so are `budget` and `min_level`.
@@ -65,7 +67,7 @@ def pick(
     x, y = whole(x, "x", "a column", 0), whole(y, "y", "a row", 0)
     is_inside = x < camera.width and y < camera.height
     check("x, y", is_inside, f"a pixel of {camera.width} x {camera.height}, got ({x}, {y})")
-    scene = copy.copy(Scene.of(subject))  # which stays as it is
+    scene = copy.copy(Scene.of(opened(subject)))  # which stays as it is
     if budget is not None:  # which is for the whole picture
         cut = select(scene, camera, tolerance=tolerance, budget=budget, min_level=min_level, device=CPU)
         tolerance = cut.tolerance

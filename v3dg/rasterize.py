@@ -1,6 +1,7 @@
 """Draw gaussians as they are: project, bin, blend; differentiable on torch tensors."""
 
 import functools
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,10 +12,11 @@ from v3dg._numbers import check_type, color, real
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
 from v3dg.image import Image
+from v3dg.io import loaded
 
 
 def rasterize(
-    gaussians: Gaussians,
+    gaussians: Gaussians | str | os.PathLike[str],
     camera: Camera,
     *,
     filter_px2: float = 0.0,
@@ -32,7 +34,7 @@ def rasterize(
     same on every run.
 
     Args:
-        gaussians: N gaussians in world space.
+        gaussians: N gaussians in world space; or the file of an asset.
         camera: Pinhole camera.
         filter_px2: Variance of the low-pass filter in screen space, px²; 0.3 draws assets that were trained
             with the original 3DGS code as they were trained.
@@ -45,6 +47,7 @@ def rasterize(
             on a CUDA device.
         RuntimeError: The gaussians are on a CUDA device, and v3dg was built without CUDA.
     """
+    gaussians = loaded(gaussians)
     if not hasattr(gaussians, "means"):  # whatever has their arrays will do
         check_type("gaussians", gaussians, Gaussians, "Gaussians")
     check_type("camera", camera, Camera, "a Camera")

@@ -1,5 +1,6 @@
 """Levels of a bundle made better together: as cuts show them, next to what hides parts of them."""
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,6 +18,7 @@ from v3dg.build.fit import fit_config, run_fit
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
 from v3dg.gaussians import Gaussians
+from v3dg.opening import File
 from v3dg.residency import residency
 
 _T = TypeVar("_T")
@@ -25,7 +27,7 @@ _WEIGHED = 2_000  # pictures that tell how much is seen of each gaussian
 
 
 def refine_bundle(
-    bundle: Bundle,
+    bundle: Bundle | File,
     *,
     cameras: Iterable[Camera] | Mapping[str, Camera] = (),
     steps: int = 30_000,
@@ -45,7 +47,7 @@ def refine_bundle(
     The same bundle, cameras, steps, share and seed give the same bits on the same kind of device.
 
     Args:
-        bundle: What `build_bundle` made. About six times what its gaussians take is in memory meanwhile.
+        bundle: What `build_bundle` made, or its file. About six times what that takes is in memory meanwhile.
         cameras: Where the asset is seen from, also by name: for a room those of its photographs. What is
             seen from elsewhere may get worse. Without any, pictures are taken from all around.
         steps: Pictures that cuts are compared with, one after another.
@@ -60,14 +62,14 @@ def refine_bundle(
         RuntimeError: The device is "cuda", and something is missing for it.
         KeyboardInterrupt: Ctrl-C; threads have stopped.
     """
+    bundle = Bundle.open(bundle) if isinstance(bundle, str | os.PathLike) else bundle
     check_type("bundle", bundle, Bundle, "a Bundle")
     cameras = list(cameras.values() if isinstance(cameras, Mapping) else cameras)
     for number, camera in enumerate(cameras):
         check_type(f"cameras[{number}]", camera, Camera, "a Camera")
     steps = whole(steps, "steps", "1 step or more", 1, 1_000_000)
     drop = real(drop, "drop", "a share of 0 to 0.5", 0, 0.5)
-    seed = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1)
-    where = _device.resolve(device)
+    seed, where = whole(seed, "seed", "0 to 2^58 - 1", 0, (1 << 58) - 1), _device.resolve(device)
     if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
         return bundle
     if drop > 0:

@@ -16,6 +16,7 @@ from v3dg.cameras import Camera, StereoCamera, check_camera, for_each
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
 from v3dg.image import RenderedImage, Stats
+from v3dg.opening import File, opened
 from v3dg.pool import Pool, PoolLook, chosen_bytes
 from v3dg.residency import ResidentScene, residency
 from v3dg.scene import Scene, Subject
@@ -48,17 +49,17 @@ class _Options(_FrameOptions, total=False):
 
 
 @overload
-def render(subject: Subject, camera: Camera, **options: Unpack[_Options]) -> RenderedImage: ...
+def render(subject: Subject | File, camera: Camera, **options: Unpack[_Options]) -> RenderedImage: ...
 @overload
 def render(
-    subject: Subject, camera: StereoCamera, **options: Unpack[_Options]
+    subject: Subject | File, camera: StereoCamera, **options: Unpack[_Options]
 ) -> tuple[RenderedImage, RenderedImage]: ...
 @overload
 def render(
-    subject: Subject, camera: Sequence[Camera], **options: Unpack[_Options]
+    subject: Subject | File, camera: Sequence[Camera], **options: Unpack[_Options]
 ) -> list[RenderedImage]: ...
 def render(
-    subject: Subject,
+    subject: Subject | File,
     camera: Camera | StereoCamera | Sequence[Camera],
     *,
     tolerance: float | None = None,
@@ -80,7 +81,7 @@ def render(
     metric is in docs/levels.md). An asset is drawn whole, without a filter.
 
     Args:
-        subject: What to draw, in world space.
+        subject: What to draw, in world space; or the file of it, which is then opened anew by every call.
         camera: Pinhole camera. With several, each has its own cut and its own picture, as if drawn alone. The
             eyes of a stereo camera share one cut, and one frame: two pictures, whose statistics are those of
             both together but for the gaussians that were selected.
@@ -105,16 +106,16 @@ def render(
             CUDA that is raised where the picture is looked at.
         RuntimeError: `device` is "cuda" and something is missing for it.
     """
-    where = _device.resolve(device)
-    make, key = partial(_Frame, subject, color_by, where, memory), (color_by, where, memory)
-    frame = make() if isinstance(subject, Gaussians) else residency.frame(subject, key, make)
+    where, shown = _device.resolve(device), opened(subject)
+    make, key = partial(_Frame, shown, color_by, where, memory), (color_by, where, memory)
+    frame = make() if isinstance(shown, Gaussians) else residency.frame(shown, key, make)
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
-    shade = shade_of(background, min_transmittance, isinstance(subject, Gaussians), depth)
+    shade = shade_of(background, min_transmittance, isinstance(shown, Gaussians), depth)
 
     def picture(view: Any) -> Any:
         if cut is None:
-            frame.settle(subject, view, **options)
-        return frame.draw(subject, view, shade, cut, **options)
+            frame.settle(shown, view, **options)
+        return frame.draw(shown, view, shade, cut, **options)
 
     return for_each(camera, picture)
 
@@ -139,6 +140,7 @@ class Renderer:
     fits.
 
     Args:
+        subject: As in `v3dg.render`.
         color_by: As in `v3dg.render`; with a pool on a CUDA device, "appearance".
         device: As in `v3dg.render`. The renderer stays on it, whichever device is torch's current one later.
         memory: Of a pool for gaussians on the device: bytes, or text like "2GB". All are resident if None.
@@ -151,14 +153,14 @@ class Renderer:
 
     def __init__(
         self,
-        subject: Subject,
+        subject: Subject | File,
         *,
         color_by: ColorBy = "appearance",
         device: str | Device = "auto",
         memory: int | str | None = "auto",
     ) -> None:
-        self._subject = subject
-        self._frame = _Frame(subject, color_by, _device.resolve(device), memory)
+        self._subject: Subject = opened(subject)
+        self._frame = _Frame(self._subject, color_by, _device.resolve(device), memory)
         self._steps = _core.BudgetSteps()
 
     @property

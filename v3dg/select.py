@@ -16,6 +16,7 @@ from v3dg._numbers import MOST_FLOAT, check, one_of, real, refuse, vector, whole
 from v3dg.bundle import Bundle, Clusters
 from v3dg.cameras import Camera, StereoCamera, VectorLike, check_camera, for_each
 from v3dg.gaussians import Gaussians
+from v3dg.opening import File, opened
 from v3dg.residency import residency
 from v3dg.scene import Scene
 
@@ -175,14 +176,14 @@ class _Options(CutOptions, total=False):
 
 @overload
 def select(
-    subject: Scene | Bundle, camera: Camera | StereoCamera, **options: Unpack[_Options]
+    subject: Scene | Bundle | File, camera: Camera | StereoCamera, **options: Unpack[_Options]
 ) -> Selection: ...
 @overload
 def select(
-    subject: Scene | Bundle, camera: Sequence[Camera], **options: Unpack[_Options]
+    subject: Scene | Bundle | File, camera: Sequence[Camera], **options: Unpack[_Options]
 ) -> list[Selection]: ...
 def select(
-    subject: Scene | Bundle,
+    subject: Scene | Bundle | File,
     camera: Camera | StereoCamera | Sequence[Camera],
     *,
     tolerance: float | None = None,
@@ -200,6 +201,7 @@ def select(
     only what is left out.
 
     Args:
+        subject: What to choose from, or the file of it, which is then opened anew by every call.
         camera: Pinhole camera. For a stereo camera, what is chosen is detailed enough for the nearer eye, and
             what either may see is left in; not with the paper's footprint.
         tolerance: Screen area in px² that one gaussian of a coarser cluster may stand for; 0 chooses the
@@ -226,8 +228,8 @@ def select(
     Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the budget is ours.
     """
     rule = rule_of(tolerance, budget, min_level, footprint, cull, fade)
-    where = _device.resolve(device)
-    return for_each(camera, lambda view: select_by(rule, subject, view, budget, where))
+    where, place = _device.resolve(device), opened(subject)
+    return for_each(camera, lambda view: select_by(rule, place, view, budget, where))
 
 
 def select_by(

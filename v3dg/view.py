@@ -7,18 +7,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from v3dg._device import Device
-from v3dg.opening import open_with_cameras
+from v3dg._numbers import one_of
+from v3dg.cameras import AXES, Axis, VectorLike
+from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Subject
+from v3dg.upright import direction_of, up_of
 
 if TYPE_CHECKING:
     from v3dg.viewer.server import Site
 
 
 def view(
-    subject: Subject | str | os.PathLike[str],
+    subject: Subject | File,
     *,
     device: str | Device = "auto",
     memory: int | str | None = "auto",
+    up: Axis | VectorLike | None = None,
     **options: Any,
 ) -> Site:
     """Show a scene, a bundle or an asset, or the file of one, in a web browser (docs/viewer.md).
@@ -29,8 +33,9 @@ def view(
     Args:
         device: As in `v3dg.render`.
         memory: As in `v3dg.Renderer`.
-        options: As `v3dg.viewer.server.Site` takes them, such as `cameras`, by name, `port`, `tolerance`,
-            `budget` and `up`. A scene's file brings its own cameras.
+        up: What is up at first, an axis or a direction; as `v3dg.upright.up_of` takes it if None.
+        options: As `v3dg.viewer.server.Site` takes them, such as `cameras`, by name, `port`, `tolerance` and
+            `budget`. A scene's file brings its own cameras.
 
     Raises:
         ImportError: The extra `viewer` is not installed.
@@ -38,10 +43,14 @@ def view(
     from v3dg.viewer.frame import SceneView
     from v3dg.viewer.server import Site
 
+    path = Path(subject) if isinstance(subject, str | os.PathLike) else Path()
     if isinstance(subject, str | os.PathLike):
-        path = Path(subject)
         subject, cameras = open_with_cameras(path)
         options = {"name": path.stem, "cameras": cameras} | options
-    site = Site(SceneView(subject, device=device, memory=memory), **options)
+    up = up_of(subject, options.get("cameras"), path)[0] if up is None else up
+    if isinstance(up, str):
+        one_of(up, "up", AXES)
+        up = direction_of(up)
+    site = Site(SceneView(subject, device=device, memory=memory), up=up, **options)
     print(f"{site.url} shows it until close() is called")
     return site

@@ -14,12 +14,13 @@ from v3dg.build.unfinished import discard_levels
 from v3dg.build.whole import build_into, devices_for
 from v3dg.bundle import Bundle
 from v3dg.gaussians import Gaussians
+from v3dg.io import loaded
 
 __all__ = ["BuildConfig", "build_bundle", "build_file", "discard_levels", "levels_path"]
 
 
 def build_bundle(
-    asset: Gaussians,
+    asset: Gaussians | str | os.PathLike[str],
     *,
     config: BuildConfig | None = None,
     seed: int = 0,
@@ -36,7 +37,7 @@ def build_bundle(
     (on one instruction set or one kind of GPU: others round differently).
 
     Args:
-        asset: At least one gaussian that can be drawn.
+        asset: At least one gaussian that can be drawn; or the file of it, as for `read_asset`.
         config: Settings; ours by default.
         seed: Of the views that groups are fitted to.
         progress: Show a bar with the level, its groups done, the time left and their mean loss; four lines
@@ -65,6 +66,7 @@ def build_bundle(
         MemoryError: The device has too little memory; the message has the numbers.
         KeyboardInterrupt: Ctrl-C; threads have stopped, what is finished is at `resume_path`.
     """
+    asset = loaded(asset)
     check_type("asset", asset, Gaussians, "Gaussians")
     config = config or BuildConfig()
     devices = devices_for(device, asset)

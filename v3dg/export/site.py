@@ -20,6 +20,7 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Camera, check_cameras
 from v3dg.export import _common
 from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, Plan, write_levels
+from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 from v3dg.upright import up_of
@@ -52,7 +53,7 @@ class Site:
 
 
 def write_site(
-    subject: Scene | Bundle,
+    subject: Scene | Bundle | File,
     folder: str | os.PathLike[str],
     cameras: Mapping[str, Camera] | None = None,
     *,
@@ -66,6 +67,7 @@ def write_site(
     PlayCanvas's engine is taken from an earlier export, or from `node_modules` here or above.
 
     Args:
+        subject: Or its file, of which a scene's brings cameras.
         folder: Where to; new, empty, or with an earlier export. Folders above it are made.
         cameras: From where to look, by name; the page begins with the first.
         chunk: As in `write_streamed_sog`.
@@ -76,9 +78,11 @@ def write_site(
         ValueError: As `write_streamed_sog`, or a scene without instances.
         OSError: A file cannot be written.
     """
+    if isinstance(subject, str | os.PathLike):
+        found: Any = open_with_cameras(Path(subject))
+        return write_site(found[0], folder, cameras or found[1], chunk=chunk, up=up, progress=progress)
     check_cameras(cameras := cameras or {})
-    folder = Path(folder)
-    is_scene, scene = isinstance(subject, Scene), Scene.of(subject)
+    folder, is_scene, scene = Path(folder), isinstance(subject, Scene), Scene.of(subject)
     axis = up or up_of(subject, cameras)[0]
     # A bundle alone is turned to what viewers take to be up; a scene's stay as its instances have them.
     turn = _common.turn_upright("-y" if is_scene else axis)
@@ -91,8 +95,8 @@ def write_site(
             for name, plan in zip(_common.names_of(scene) if is_scene else ["."], plans, strict=True):
                 (place / name).mkdir(exist_ok=True)
                 done = write_levels(plan, place / name, turn, bar.update)
-                index = INDEX if name == "." else f"{name}/{INDEX}"
-                listed.append({"url": index, "counts": done.counts, **_common.detail_of(plan.bundle)})
+                url = INDEX if name == "." else f"{name}/{INDEX}"
+                listed.append({"url": url, "counts": done.counts, **_common.detail_of(plan.bundle)})
                 counts.append((done.counts[0], done.counts[-1]))
         document = {
             "version": 1,
@@ -108,8 +112,8 @@ def write_site(
         _common.write_page(place, "site.html")
         has_engine = _bring_engine(folder, place)
         size = _common.bytes_below(place)
-    finest, coarsest = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
-    return Site(len(listed), len(scene), finest, coarsest, size, has_engine)
+    ends = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
+    return Site(len(listed), len(scene), *ends, size, has_engine)
 
 
 def _instances(scene: Scene) -> dict[str, list[Any]]:

@@ -32,6 +32,7 @@ from v3dg.export.chunk_errors import ChunkErrors
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
+from v3dg.opening import File, opened
 from v3dg.rotations import rotation_from_quaternion
 from v3dg.upright import up_of
 
@@ -61,7 +62,7 @@ class Export:
 
 
 def write_streamed_sog(
-    bundle: Bundle,
+    bundle: Bundle | File,
     folder: str | os.PathLike[str],
     *,
     chunk: int = DEFAULT_CHUNK,
@@ -74,6 +75,7 @@ def write_streamed_sog(
     and for 128 KiB of pictures a chunk.
 
     Args:
+        bundle: Or the file of it.
         folder: Where to; new, empty, or with an earlier export. Folders above it are made.
         chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view more closely, and fewer
             of their levels go together exactly, whichever each of them has.
@@ -88,8 +90,9 @@ def write_streamed_sog(
 
     Source: PlayCanvas, the streamed SOG format, version 1.
     """
-    plan, turn = Plan.of(bundle, chunk), _common.turn_upright(up or up_of(bundle)[0])
-    total = bundle.num_gaussians
+    found = opened(bundle)
+    plan, turn = Plan.of(found, chunk), _common.turn_upright(up or up_of(found)[0])
+    total = found.num_gaussians
     with _common.replacing_folder(Path(folder)) as place, Bar(total, "export", progress) as bar:
         return write_levels(plan, place, turn, bar.update)
 

@@ -24,6 +24,7 @@ from v3dg.export import _common
 from v3dg.formats import gltf
 from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
+from v3dg.opening import File, opened
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
 from v3dg.upright import up_of
@@ -59,7 +60,7 @@ class Tiles:
 
 
 def write_tiles(
-    subject: Scene | Bundle,
+    subject: Scene | Bundle | File,
     folder: str | os.PathLike[str],
     *,
     up: Axis | None = None,
@@ -71,6 +72,7 @@ def write_tiles(
     out. The world's origin is at that of the tiles, the Earth's centre; viewers can put it elsewhere.
 
     Args:
+        subject: Or the file of it.
         folder: Where to; new, empty, or with an earlier export. Folders above it are made.
         up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
 
@@ -81,9 +83,9 @@ def write_tiles(
 
     Source: OGC, 3D Tiles 1.1; Khronos, KHR_gaussian_splatting and its compression by SPZ.
     """
-    root = np.eye(4)
-    root[:3, :3] = _common.rotation_to(up or up_of(subject)[0], "z")
-    scene = Scene.of(subject)
+    found, root = opened(subject), np.eye(4)
+    scene = Scene.of(found)
+    root[:3, :3] = _common.rotation_to(up or up_of(found)[0], "z")
     check("scene", len(scene), "instances to export, got none")
     for bundle in scene.bundles:
         check("bundle", bundle.num_gaussians, "gaussians to export, got none")

@@ -13,6 +13,7 @@ from v3dg.cameras import Axis
 from v3dg.export import _common
 from v3dg.formats import usd
 from v3dg.formats._packing import check_writable
+from v3dg.opening import File, opened
 from v3dg.rotations import quaternion_from_rotation
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
@@ -22,7 +23,7 @@ _PIXELS = 1920 * 1080  # of the picture for which levels have the default tolera
 _LEAST = 1e-30  # of a distance
 
 
-def write_usd(subject: Scene | Bundle, path: str | os.PathLike[str], *, up: Axis | None = None) -> int:
+def write_usd(subject: Scene | Bundle | File, path: str | os.PathLike[str], *, up: Axis | None = None) -> int:
     """Write a scene or a bundle as OpenUSD, and return the bytes written; needs the extra `usd`.
 
     Each bundle is a prim with UsdLod's LODRootAPI, whose children are its levels, finest first, as
@@ -31,6 +32,7 @@ def write_usd(subject: Scene | Bundle, path: str | os.PathLike[str], *, up: Axis
     out.
 
     Args:
+        subject: Or the file of it.
         path: File to write, .usd, .usda or .usdc.
         up: What is up in the world, which is turned to z; as `v3dg.upright.up_of` takes it if None.
 
@@ -43,16 +45,17 @@ def write_usd(subject: Scene | Bundle, path: str | os.PathLike[str], *, up: Axis
     """
     one_of(Path(path).suffix.lower(), "path", usd.SUFFIXES)
     _files.check_folder(Path(path))
-    pxr, scene = usd.pxr(), Scene.of(subject)
+    found = opened(subject)
+    pxr, scene = usd.pxr(), Scene.of(found)
     check("scene", len(scene), "instances to export, got none")
     stage = usd.new_stage("Z")
     world = pxr.UsdGeom.Xform.Define(stage, "/world")
     stage.SetDefaultPrim(world.GetPrim())
-    w, *xyz = quaternion_from_rotation(_common.rotation_to(up or up_of(subject)[0], "z"))
+    w, *xyz = quaternion_from_rotation(_common.rotation_to(up or up_of(found)[0], "z"))
     world.AddOrientOp().Set(pxr.Gf.Quatf(w, *xyz))
-    above = "/world/instances" if isinstance(subject, Scene) else "/world"
+    above = "/world/instances" if isinstance(found, Scene) else "/world"
     paths = [f"{above}/{pxr.Tf.MakeValidIdentifier(name)}" for name in _common.names_of(scene)]
-    if isinstance(subject, Scene):
+    if isinstance(found, Scene):
         vectors, quats = pxr.Vt.Vec3fArray.FromNumpy, np.roll(scene.quaternions, -1, axis=1)
         instancer = pxr.UsdGeom.PointInstancer.Define(stage, "/world/instances")
         instancer.CreatePrototypesRel().SetTargets(paths)

@@ -84,7 +84,7 @@ class Scene:
 
     def add(
         self,
-        bundle: Bundle | Sequence[Bundle],
+        bundle: Bundle | str | os.PathLike[str] | Sequence[Bundle],
         positions: Any = (0.0, 0.0, 0.0),
         quaternions: Any = None,
         scales: Any = None,
@@ -93,7 +93,7 @@ class Scene:
         """Place a bundle I times and return the ids of the new instances.
 
         Args:
-            bundle: One for all, or a sequence of I.
+            bundle: One for all, also by its file, or a sequence of I.
             positions: (I, 3), or (3,) for one instance; world units.
             quaternions: (I, 4) or (4,) w x y z of any length but zero; no rotation if None.
             scales: (I,) or one number for all, > 0; 1 if None.
@@ -104,6 +104,8 @@ class Scene:
             TypeError: ``bundle`` is not a bundle.
             ValueError: A shape or a value is not as above.
         """
+        if isinstance(bundle, str | os.PathLike):
+            bundle = Bundle.open(bundle)
         given = bundle if isinstance(bundle, list | tuple) else [bundle]
         for one in given:
             check_type("bundle", one, Bundle, "a Bundle")
