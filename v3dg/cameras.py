@@ -1,7 +1,5 @@
 """Pinhole cameras: made from matrices, from two points, from Blender's convention, or on a turntable."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -80,7 +78,7 @@ class Camera:
         width: int,
         height: int,
         near: float = 0.01,
-    ) -> Camera:
+    ) -> "Camera":
         """Make a camera at ``eye`` that has ``target`` at the image's centre and ``up`` upwards.
 
         Args:
@@ -118,7 +116,7 @@ class Camera:
         fov_y: float | None = None,
         *,
         near: float = 0.01,
-    ) -> Camera:
+    ) -> "Camera":
         """Make a camera from a camera-to-world matrix in Blender's convention: x right, y up, z backward.
 
         Args:
@@ -143,7 +141,7 @@ class Camera:
     def __reduce__(self) -> tuple[Any, ...]:
         return Camera, (self.viewmat, self.K, self.width, self.height, self.near)
 
-    def scaled(self, factor: int) -> Camera:
+    def scaled(self, factor: int) -> "Camera":
         """Return this camera with ``factor`` times the resolution, for supersampling."""
         factor = _side(factor, "factor")
         K = self.K * np.array([[factor], [factor], [1.0]])
@@ -171,7 +169,7 @@ class StereoCamera:
         check("right", np.array_equal(*rotations), expected)
 
     @classmethod
-    def of(cls, camera: Camera, eye_distance: float) -> StereoCamera:
+    def of(cls, camera: Camera, eye_distance: float) -> "StereoCamera":
         """Eyes to the left and the right of a camera, so far apart in world units."""
         aside = np.zeros((4, 4))
         aside[0, 3] = 0.5 * positive(eye_distance, "eye_distance")

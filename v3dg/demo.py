@@ -99,13 +99,8 @@ def _drawn(
     """Numbers and text of one picture, and the picture."""
     image = render(scene, camera, tolerance=tolerance, background=_SKY, device=device)
     picture, stats = to_8bit(image.color), image.stats
-    numbers = {
-        "gaussians": stats.gaussians_in_frustum,
-        "gaussians_selected": stats.gaussians_selected,
-        "select_ms": stats.select_ms,
-        "draw_ms": stats.draw_ms,
-        **errors_of(truth, picture),
-    }
+    numbers = {name: getattr(stats, name) for name in ("gaussians_selected", "select_ms", "draw_ms")}
+    numbers |= {"gaussians": stats.gaussians_in_frustum, **errors_of(truth, picture)}
     name = "SSIM" if numbers["flip"] is None else "FLIP"
     cost = f"{stats.gaussians_in_frustum:,} gaussians, {stats.select_ms + stats.draw_ms:,.0f} ms"
     return numbers, f"{cost}, {name} {numbers[name.lower()]:.3f}", picture

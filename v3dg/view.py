@@ -1,7 +1,5 @@
 """The viewer, started from Python."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +22,7 @@ def view(
     memory: int | str | None = "auto",
     up: Axis | VectorLike | None = None,
     **options: Any,
-) -> Site:
+) -> "Site":
     """Show a scene, a bundle or an asset, or the file of one, in a web browser (docs/viewer.md).
 
     The viewer's server runs on threads of this process. Its address is printed, and is the `url` of what is

@@ -5,8 +5,6 @@ where they are split (`external_split`) as far as into *buckets*, nodes that are
 when they are read. The second time every gaussian goes to its bucket. docs/size.md counts the bytes.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shutil
@@ -138,7 +136,7 @@ class _Sizes(NamedTuple):
     in_bucket: int
 
     @staticmethod
-    def of(memory: int, reserved: int, degree: int, tiles: Sequence[_Tile]) -> _Sizes:
+    def of(memory: int, reserved: int, degree: int, tiles: Sequence[_Tile]) -> "_Sizes":
         """What fits in so much memory; ValueError where too little does."""
         gaussian = gaussian_bytes(degree)
         # Beside the block, a piece of it as it is decoded, in double precision.

@@ -1,7 +1,5 @@
 """The shape of every level, from counts alone: what a group is made of is known before anything is built."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass
@@ -41,7 +39,7 @@ class LevelPlan:
     def num_gaussians(self) -> int:
         return int(self.offset[-1])
 
-    def groups(self, first: int, last: int) -> LevelPlan:
+    def groups(self, first: int, last: int) -> "LevelPlan":
         """A run of the groups, their gaussians counted from 0."""
         made = self.num_clusters // self.num_groups
         clusters = self.offset[first * made : last * made + 1]
@@ -61,7 +59,7 @@ class Plan:
     levels: tuple[LevelPlan, ...]
 
     @staticmethod
-    def of(num_gaussians: int, config: BuildConfig) -> Plan:
+    def of(num_gaussians: int, config: BuildConfig) -> "Plan":
         """The plan of an asset with so many gaussians."""
         depth = _core.num_halvings(num_gaussians, config.cluster_size)
         offset = halved(np.array([num_gaussians]), depth)
@@ -70,13 +68,13 @@ class Plan:
             levels.append(_level_above(levels[-1], *shape))
         return Plan(tuple(levels))
 
-    def subtree(self, level: int, first_group: int, last_group: int) -> Plan:
+    def subtree(self, level: int, first_group: int, last_group: int) -> "Plan":
         """What is under a run of groups of one level, up to that level."""
         top = self.levels[level].num_groups
         levels = ((below, below.num_groups // top) for below in self.levels[: level + 1])
         return Plan(tuple(below.groups(first_group * n, last_group * n) for below, n in levels))
 
-    def units(self, most_leaves: int) -> list[Plan]:
+    def units(self, most_leaves: int) -> "list[Plan]":
         """Cut the plan into parts that share no page, each above so many leaves at most where it can."""
         wanted = 1 << max(0, math.ceil(self.levels[0].num_gaussians / most_leaves) - 1).bit_length()
         if wanted == 1 or len(self.levels) == 1:

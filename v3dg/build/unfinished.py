@@ -5,8 +5,6 @@ end begins the journal: a record for each finished level of each part, with its 
 pages. The first bytes, a header of no length and the digest of what is built, tell it from a bundle.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import stat
@@ -46,7 +44,7 @@ class FinishedLevel:
     tables: LevelTables
     hashes: npt.NDArray[np.uint8]  # (n, 16) of the pages
 
-    def read(self, pages: PageFile | MemoryStore, run: PageRun) -> Level:
+    def read(self, pages: "PageFile | MemoryStore", run: PageRun) -> Level:
         """The level, from its pages."""
         return Level(pages.read(run, self.hashes), self.tables)
 
@@ -105,7 +103,7 @@ class Unfinished:
         self._end = plan.num_bytes  # of the journal
         self._lock = threading.Lock()
 
-    def __enter__(self) -> Unfinished:
+    def __enter__(self) -> "Unfinished":
         check("resume_path", self._path.parent.is_dir(), f"a file in an existing folder, got {self._path}")
         self._file = _open_locked(self._path)
         try:

@@ -1,7 +1,5 @@
 """The build of a whole asset: its units on an executor, then what is above them."""
 
-from __future__ import annotations
-
 import os
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -208,7 +206,7 @@ class _Build:
     def _todo(self) -> list[int]:
         return [n for n in range(len(self.units)) if (n, self.num_low - 1) not in self.store.levels]
 
-    def _task(self, unit: int, leaves: Leaves) -> UnitTask:
+    def _task(self, unit: int, leaves: Leaves) -> "UnitTask":
         plan = self.units[unit]
         first = int(self.plan.levels[0].offset[plan.levels[0].first_group])
         finished = {n: level for (part, n), level in self.store.levels.items() if part == unit}

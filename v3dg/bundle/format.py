@@ -1,7 +1,5 @@
 """What a bundle file is made of: its tables, its header, its hashes. docs/format.md says why."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -54,7 +52,7 @@ def schema_of(version: int) -> list[tuple[str, str, str, tuple[int, ...]]]:
     return [table for table in SCHEMA if version == 1 or table[0] not in _ONLY_IN_1]
 
 
-def page_tables(layout: PageLayout, codec: Codec) -> dict[str, NDArray[Any]]:
+def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[Any]]:
     """The tables of the pages except the hashes; all follow from what is in each page."""
     ends = np.cumsum(layout.page_bytes(codec))
     tables = {
@@ -88,7 +86,7 @@ def entries_of(
     return entries
 
 
-def header_of(entries: dict[str, Any], codec: Codec, config: dict[str, Any]) -> bytes:
+def header_of(entries: dict[str, Any], codec: "Codec", config: dict[str, Any]) -> bytes:
     """The length and the JSON, filled up with spaces so that the data starts aligned."""
     metadata = {"format": FORMAT, "version": str(codec.version), "sh_degree": str(codec.sh_degree)}
     metadata |= {"codec": codec.name} if codec.version > 1 else {}

@@ -1,7 +1,5 @@
 """Pages: which clusters lie together, and where the gaussians of a page come from. Bytes are codec.py's."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -34,7 +32,7 @@ class PageLayout:
     offset: NDArray[np.int64]  # (C+1,) gaussians of each cluster
 
     @staticmethod
-    def of(clusters: Clusters) -> PageLayout:
+    def of(clusters: Clusters) -> "PageLayout":
         """The pages of clusters: those that share a parent group are neighbours."""
         parent = clusters.parent_group
         starts = np.flatnonzero(parent[1:] != parent[:-1]) + 1
@@ -59,7 +57,7 @@ class PageLayout:
         """(P,) of each page, with what it is filled up with."""
         return codec.page_bytes(np.diff(self.first_gaussian), np.diff(self.first_cluster))
 
-    def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> PageRun:
+    def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> "PageRun":
         """A run of the pages, of which all begin at these bytes of a file, and end."""
         clusters, places = (a[first_page : last_page + 1] for a in (self.first_cluster, places))
         offset = self.offset[clusters[0] : clusters[-1] + 1]
@@ -109,7 +107,7 @@ class CodePages:
         self.codes = _core.Codes(words, layout.first_cluster, layout.offset, codec.sh_degree)
 
     @staticmethod
-    def of(layout: PageLayout, gaussians: Gaussians, codec: Codec) -> CodePages:
+    def of(layout: PageLayout, gaussians: Gaussians, codec: Codec) -> "CodePages":
         """The pages of gaussians on the host."""
         ends = np.cumsum(layout.page_bytes(codec) // 4)  # of the words of each page
         places = np.concatenate([np.zeros(1, np.int64), ends])
@@ -130,7 +128,7 @@ class CodePages:
 class FilePages:
     """Pages that are read from a file when they are asked for; a single one is kept until the next."""
 
-    def __init__(self, layout: PageLayout, file: BundleFile) -> None:
+    def __init__(self, layout: PageLayout, file: "BundleFile") -> None:
         self.layout, self.codec = layout, file.codec
         self._file = file
         self._last_page: tuple[int, Gaussians] | None = None

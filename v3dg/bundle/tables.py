@@ -1,7 +1,5 @@
 """The tables of a bundle, which selection reads, and the checks that make its cut exact."""
 
-from __future__ import annotations
-
 import operator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -47,7 +45,7 @@ class Clusters:
     def __len__(self) -> int:
         return len(self.level)
 
-    def around(self, gaussians: Gaussians) -> Clusters:
+    def around(self, gaussians: Gaussians) -> "Clusters":
         """The same clusters with boxes around other gaussians."""
         is_filled = np.diff(self.offset)[:, None, None] > 0
         box = np.where(is_filled, _core.bound_by_boxes(gaussians.rows, self.offset), self.box)

@@ -112,8 +112,8 @@ def write_site(
         _common.write_page(place, "site.html")
         has_engine = _bring_engine(folder, place)
         size = _common.bytes_below(place)
-    ends = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
-    return Site(len(listed), len(scene), *ends, size, has_engine)
+    finest, coarsest = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
+    return Site(len(listed), len(scene), finest, coarsest, size, has_engine)
 
 
 def _instances(scene: Scene) -> dict[str, list[Any]]:

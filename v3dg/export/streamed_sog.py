@@ -6,8 +6,6 @@ chunk has the gaussians that are nearest to it. Chunks of one level are stored s
 and `lod-meta.json` says which gaussians of which folder they are.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -97,7 +95,7 @@ def write_streamed_sog(
         return write_levels(plan, place, turn, bar.update)
 
 
-def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int], Any]) -> Export:
+def write_levels(plan: "Plan", place: Path, turn: Floats, advance: Callable[[int], Any]) -> Export:
     """Fill a folder with the levels of a bundle, turned by a quaternion (4,)."""
     names, leaves, counts = _write_folders(place, plan, turn, advance)
     index = {
@@ -117,7 +115,7 @@ def write_levels(plan: Plan, place: Path, turn: Floats, advance: Callable[[int],
 
 
 def _write_folders(
-    place: Path, plan: Plan, turn: Floats, advance: Callable[[int], Any]
+    place: Path, plan: "Plan", turn: Floats, advance: Callable[[int], Any]
 ) -> tuple[list[str], list[dict[str, Any]], list[int]]:
     """Write a folder of SOG after another: their names, chunks as leaves of the tree, gaussians by level."""
     names, errors = list[str](), ChunkErrors()
@@ -172,7 +170,7 @@ class Plan:
     chunk_of_group: NDArray[np.int64]
 
     @classmethod
-    def of(cls, bundle: Bundle, chunk: int) -> Plan:
+    def of(cls, bundle: Bundle, chunk: int) -> "Plan":
         check_type("bundle", bundle, Bundle, "a Bundle")
         check("bundle", bundle.num_gaussians, "gaussians to export, got none")
         chunk = whole(chunk, "chunk", "gaussians, 1 or more", 1, 1 << 62)

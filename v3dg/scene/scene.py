@@ -1,7 +1,5 @@
 """Scenes: bundles placed many times by similarity transforms."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Mapping, Sequence
@@ -60,7 +58,7 @@ class Scene:
         self._publish()  # for arrays that were unpickled can be written to
 
     @classmethod
-    def of(cls, subject: Scene | Bundle) -> Scene:
+    def of(cls, subject: "Scene | Bundle") -> "Scene":
         """Return a scene as it is, and a bundle as a scene of one instance at the origin."""
         if isinstance(subject, Scene):
             return subject
@@ -70,7 +68,7 @@ class Scene:
         return scene
 
     @staticmethod
-    def load(path: str | os.PathLike[str]) -> Scene:
+    def load(path: str | os.PathLike[str]) -> "Scene":
         """Read a scene as `v3dg.read_scene` does, which also has its cameras."""
         from v3dg.scene.file import read_scene
 

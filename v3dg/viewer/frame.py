@@ -1,7 +1,5 @@
 """One picture of the viewer: a scene, a view and settings become pixels and figures."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time
@@ -234,7 +232,7 @@ class SceneView:
         with self._drawing:
             return pick(self.scene, camera, x, y, **cut, renderer=self.pool)
 
-    def _of_pool(self, asked: _Asked, pool: Renderer, patience: float) -> _Drawn:
+    def _of_pool(self, asked: _Asked, pool: Renderer, patience: float) -> "_Drawn":
         """What a pool has; compared with the finest that it has room for, from whose pages both are drawn."""
         settings, stop, edge, chooser = asked.settings, asked.stop, asked.edge, asked.chooser
         wanted: Any = {name: getattr(settings, name) for name in ("tolerance", "budget", "min_level", "fade")}
@@ -262,7 +260,7 @@ class SceneView:
         cost = of.gaussians_selected, of.gaussians_in_frustum, of.tolerance, of.select_ms, of.draw_ms
         return _Drawn(color, alpha, depth, whole, Figures(*cost, levels, _resident_bytes(), of.missing))
 
-    def _of_all(self, asked: _Asked) -> _Drawn:
+    def _of_all(self, asked: _Asked) -> "_Drawn":
         """What is resident, which is all; compared with all gaussians."""
         camera, settings, stop, edge = asked.camera, asked.settings, asked.stop, asked.edge
         rule = rule_of(settings.tolerance, settings.budget, settings.min_level, fade=settings.fade)

@@ -127,17 +127,9 @@ class Tab:
         picture, quality = io.BytesIO(), _FINAL_QUALITY if is_final else _DRAFT_QUALITY
         Image.fromarray(frame.pixels).save(picture, "jpeg", quality=quality, subsampling=0 if is_final else 2)
         figures = asdict(frame.figures) | {"levels": frame.figures.levels.tolist()}
-        message = {
-            "type": "picture",
-            "final": is_final,
-            "number": number,
-            "size": frame.size,
-            "view": asdict(frame.view),
-            "shows": frame.shows,
-            "range": frame.value_range,
-            "distance": frame.distance,
-            "figures": figures,
-        }
+        message = {"type": "picture", "final": is_final, "number": number, "size": frame.size}
+        message |= {"view": asdict(frame.view), "shows": frame.shows, "range": frame.value_range}
+        message |= {"distance": frame.distance, "figures": figures}
         self._tell(message, picture.getvalue())
 
     def _fail(self, error: Exception) -> None:

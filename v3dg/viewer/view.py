@@ -1,7 +1,5 @@
 """From where a tab looks: what a browser knows of its camera, and the pinhole camera that it makes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -28,7 +26,7 @@ class View:
     aspect: float
 
     @classmethod
-    def of_camera(cls, camera: Camera) -> View:
+    def of_camera(cls, camera: Camera) -> "View":
         """Take over pose and field of view; a principal point off the middle is lost."""
         half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
         wxyz = quaternion_from_rotation(camera.viewmat[:3, :3].T)
