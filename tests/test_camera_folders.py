@@ -46,10 +46,12 @@ def cameras():
 
 
 @pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("place", [".", "sparse", "sparse/0"])
+@pytest.mark.parametrize("place", [".", "sparse", "sparse/0", "0"])
 def test_models_of_colmap_are_read(tmp_path, cameras, text, place):
     write_model(tmp_path / "scene" / place, cameras, text=text)
     assert_same(read_cameras(tmp_path / "scene"), cameras)
+    file = "images.txt" if text else "images.bin"
+    assert_same(read_cameras(tmp_path / "scene" / place / file), cameras)
 
 
 def test_distortion_is_refused_or_left_out(tmp_path, cameras):

@@ -21,6 +21,7 @@ from v3dg.cameras import Camera, Floats, check_cameras, intrinsics, is_rotation,
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _RUN = "config.yml"  # by which a run of nerfstudio is known
+_MODEL = ("images.bin", "images.txt")  # by which a model of COLMAP is
 _DATA = re.compile(r"^\s*data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:\s*- .*\n)+)", re.MULTILINE)
 # From a camera with x right, y up, z backward to one with x right, y down, z forward.
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -54,7 +55,9 @@ def read_cameras(
     one_of(distortion, "distortion", ("refuse", "ignore"))
     one_of(applied_transform, "applied_transform", ("keep", "undo"))
     place = Path(path)
-    run = place.parent if place.name == _RUN else place
+    if place.name in (_RUN, *_MODEL):
+        place = place.parent
+    run = place
     is_run = (run / _RUN).is_file()
     if is_run:
         path, applied_transform = _data_of(run), "undo"
@@ -108,8 +111,8 @@ def _trained(run: Path) -> tuple[Floats, float]:
 
 
 def _read_colmap(folder: Path, distortion: str) -> dict[str, Camera]:
-    places = [folder / part for part in ("", "sparse/0", "sparse")]
-    models = [place for place in places for end in ("bin", "txt") if (place / f"images.{end}").is_file()]
+    places = [folder / part for part in ("", "sparse/0", "sparse", "0")]
+    models = [place for place in places for name in _MODEL if (place / name).is_file()]
     expected = "a model of COLMAP (images.bin or images.txt) or a run of nerfstudio (config.yml)"
     check(folder, models, f"{expected}, got a folder without")
     pycolmap, cameras = _extras.load("pycolmap"), {}

@@ -121,6 +121,8 @@ def _plainly(text: str) -> str:
     if match := re.match(r"Error parsing (--[a-z-]+): (.*)", text):
         expected = "numbers" if "float" in match[2].lower() else "whole numbers"
         return f"{match[1]}: expected {expected}, got " + ", ".join(re.findall("'.*?'", match[2]))
+    if match := re.match(r"Missing from [^:]*: (\S+) (.*?)\.? \(required\)", text):
+        return f"{match[1]}: expected {match[2][:1].lower()}{match[2][1:]}, got nothing"
     if match := re.match(r"invalid choice (.*) for argument '(.*)'. Expected one of (.*)", text):
         known = set(re.findall(r"'(.*?)'", match[3])) - {"None"}
         expected = ", ".join(sorted(known, key=lambda name: (name[0] == "-", name)))

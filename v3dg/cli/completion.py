@@ -2,10 +2,13 @@
 
 import contextlib
 import io
+import json
 from dataclasses import dataclass
 from typing import Literal
 
 import tyro
+
+from v3dg.cli._common import Common
 
 # What to change in tyro's scripts, so that files are completed where neither a command nor an option fits.
 _OR_FILES = {
@@ -16,7 +19,7 @@ _OR_FILES = {
 
 
 @dataclass
-class Completion:
+class Completion(Common):
     """Print a script that completes commands, options and files (docs/install.md says where to put it)."""
 
     shell: tyro.conf.Positional[Literal["bash", "zsh", "fish"]]
@@ -29,4 +32,5 @@ def run(options: Completion) -> None:
     script = io.StringIO()
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
         parse(["--tyro-write-completion", options.shell, "-"])
-    print(script.getvalue().replace(*_OR_FILES[options.shell]))
+    text = script.getvalue().replace(*_OR_FILES[options.shell])
+    print(json.dumps({"shell": options.shell, "script": text}) if options.json else text)
