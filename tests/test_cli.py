@@ -63,6 +63,8 @@ def test_help(command):
     assert done.returncode == 0
     assert f"usage: v3dg {command}" in done.stdout
     assert "(default: None)" not in done.stdout
+    assert "--json" in done.stdout
+    assert "--quiet" in done.stdout
     assert command in run("--help").stdout
 
 
@@ -75,6 +77,25 @@ def test_completion_is_a_script_that_knows_commands_and_options(shell):
     # Where nothing else fits, files are completed.
     files = {"bash": "complete -o default -F", "zsh": '-z "$completions"', "fish": "complete --command"}
     assert files[shell] in done.stdout
+    told = json.loads(run("completion", shell, "--json", "--quiet").stdout)
+    assert told["shell"] == shell
+    assert len(told["script"]) == len(done.stdout) - 1
+
+
+def test_what_is_missing_is_named(tmp_path):
+    fails(2, "PATH: expected file to describe, got nothing; run v3dg info --help", "info", cwd=tmp_path)
+
+
+def test_a_name_that_is_nearly_there_is_proposed(tmp_path):
+    (tmp_path / "donut.v3dg").touch()
+    fails(
+        1,
+        "donut.v3d: expected a file, got a path where there is none; perhaps you meant donut.v3dg",
+        "info",
+        "donut.v3d",
+        cwd=tmp_path,
+    )
+    fails(1, "got a path where there is none; check it", "info", "tree.v3dg", cwd=tmp_path)
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")

@@ -11,6 +11,7 @@ import v3dg
 from benchmarks.worlds.procedural import make_asset
 from command_line import COMMAND, ENVIRONMENT, fails, run
 from v3dg.build import build_file
+from v3dg.io import run_files
 
 FAST = ("--quiet", "--cluster-size", 64)
 
@@ -197,3 +198,52 @@ def test_an_asset_larger_than_memory_makes_the_same_bundle(tmp_path, monkeypatch
     build_file(tmp_path / "a.ply", tmp_path / "disk.v3dg", **options)
     assert (tmp_path / "disk.v3dg").read_bytes() == (tmp_path / "whole.v3dg").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "disk.v3dg", "whole.v3dg"]
+
+
+def gsplat_checkpoint(path, asset):
+    torch = pytest.importorskip("torch")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names = ("means", "quats", "scales", "opacities")
+    splats = {name: torch.from_numpy(getattr(asset, name).copy()) for name in names}
+    splats["scales"] = splats["scales"].log()
+    splats["opacities"] = splats["opacities"].clamp(1e-3, 1 - 1e-3).logit()
+    sh = torch.from_numpy(asset.sh.copy())
+    torch.save({"splats": splats | {"sh0": sh[:, :1], "shN": sh[:, 1:]}}, path)
+
+
+def test_a_run_of_gsplat_is_one_asset_of_its_last_step(tmp_path):
+    parts = [tiny(1), tiny(2)]
+    gsplat_checkpoint(tmp_path / "garden" / "ckpts" / "ckpt_6999_rank0.pt", tiny(3))
+    for rank, part in enumerate(parts):
+        gsplat_checkpoint(tmp_path / "garden" / "ckpts" / f"ckpt_29999_rank{rank}.pt", part)
+    done = run("build", "garden", *FAST, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["asset"] == [f"garden/ckpts/ckpt_29999_rank{rank}.pt" for rank in (0, 1)]
+    assert result["asset_gaussians"] == v3dg.open(tmp_path / "garden.v3dg").config["asset_gaussians"] == 600
+
+
+@pytest.mark.parametrize(
+    ("last", "before"),
+    [
+        ("nerfstudio_models/step-000029999.ckpt", "nerfstudio_models/step-000002000.ckpt"),
+        ("point_cloud/iteration_30000/point_cloud.ply", "point_cloud/iteration_7000/point_cloud.ply"),
+    ],
+)
+def test_the_last_step_of_a_run_counts(tmp_path, last, before):
+    for name in (last, before):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert run_files(tmp_path) == [tmp_path / last]
+
+
+def test_several_runs_are_bundles_named_after_them(tmp_path):
+    for name in ("first", "second.run"):
+        file = tmp_path / name / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+        file.parent.mkdir(parents=True)
+        v3dg.write_asset(file, tiny(len(name)))
+    done = run("build", "first", "second.run", "-o", "out", *FAST, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert sorted(os.listdir(tmp_path / "out")) == ["first.v3dg", "second.run.v3dg"]
+    assert run("build", ".", *FAST, cwd=tmp_path / "first").returncode == 0
+    assert (tmp_path / "first.v3dg").read_bytes() == (tmp_path / "out" / "first.v3dg").read_bytes()

@@ -11,6 +11,7 @@ EXTRAS = {
     "av": ("av>=12", "videos"),
     "pxr": ("usd-core>=26.11", "OpenUSD"),
     "pycolmap": ("pycolmap>=4.0", "cameras of COLMAP"),
+    "fsspec": ("fsspec[http]>=2024.2", "files at URLs"),
     "distributed": ("distributed>=2024.1", "builds on many machines"),
 }
 """By module: what pip is to install, and what it is for."""
@@ -19,7 +20,8 @@ EXTRAS = {
 def missing(module: str) -> str:
     """What to say where one is not installed, or too old."""
     requirement, purpose = EXTRAS[module]
-    return f"{purpose}: expected {requirement}, got none or an older one; pip install '{requirement}'"
+    needed = " ".join(f"'{other}'" for other, what in EXTRAS.values() if what == purpose)
+    return f"{purpose}: expected {requirement}, got none or an older one; pip install {needed}"
 
 
 def load(module: str) -> Any:

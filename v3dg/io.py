@@ -2,11 +2,13 @@
 
 import os
 import pathlib
+import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Literal, TypeVar, get_args
 
 from v3dg._numbers import check, check_type, one_of
+from v3dg._urls import beside, local
 from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
 from v3dg.formats._reading import AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
@@ -44,6 +46,9 @@ _FILES: dict[str, Callable[[pathlib.Path], list[pathlib.Path]]] = {
     "": lambda path: [path],
 }
 
+# Checkpoints of gsplat, one for each GPU, and of nerfstudio, and what the code of the 3DGS paper writes.
+_RUNS = ("ckpts/ckpt_*.pt", "nerfstudio_models/step-*.ckpt", "point_cloud/iteration_*/point_cloud.ply")
+
 SUFFIXES = tuple(_READERS)
 """How the names of files end that `read_asset` reads."""
 
@@ -68,6 +73,9 @@ def read_asset(path: Path) -> Gaussians:
     - `.pt` and `.ckpt`, checkpoints of gsplat's trainer and of nerfstudio's splatfacto, from which nothing
       but tensors is taken.
 
+    With the extra `fsspec`, that file may be at a URL, which is fetched once by a process; not if it names
+    others.
+
     Coordinates are those of the file: no axes are turned. Memory and time are bounded by the size of the file
     (docs/robustness.md).
 
@@ -90,12 +98,22 @@ def open_asset(path: Path) -> AssetFile:
     `.ply`, `.splat` and `.compressed.ply` are read row by row. Of the others, reading the first rows takes
     the memory for all.
     """
-    return _by_name(path, _READERS)(path)
+    return _by_name(path, _READERS)(local(path))
+
+
+def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
+    """What a run of gsplat, nerfstudio or the code of the 3DGS paper came to last: one asset together."""
+    steps: dict[int, list[pathlib.Path]] = {}
+    for pattern in _RUNS:
+        for file in sorted(folder.glob(pattern)):
+            number = re.search(r"(?:step-|ckpt_|iteration_)(\d+)", "/".join(file.parts[-2:]))
+            steps.setdefault(int(number[1]) if number else -1, []).append(file)
+    return steps[max(steps)] if steps else []
 
 
 def asset_bytes(path: Path) -> int:
     """Bytes on disk of an asset that can be read: of all files that it names and that are there."""
-    return bytes_of(_by_name(path, _FILES)(pathlib.Path(path)))
+    return bytes_of(_by_name(path, _FILES)(pathlib.Path(local(path))))
 
 
 def write_asset(
@@ -145,7 +163,7 @@ def write_asset(
 
 
 def _by_name(path: Path, formats: Mapping[str, Format]) -> Format:
-    name = os.path.basename(os.fspath(path)).lower()
+    name = beside(path).name.lower()
     for ending, function in formats.items():
         if name.endswith(ending):
             return function

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from v3dg import _core, _files
 from v3dg._json import parse_json
 from v3dg._numbers import check, check_all, check_type
+from v3dg._urls import local
 from v3dg.bundle.codec import Codec, codec_of
 from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES, config_to_json, page_tables
@@ -78,14 +79,15 @@ class Bundle:
     def open(cls, path: str | os.PathLike[str]) -> Bundle:
         """Open a bundle file: read and check its header and tables, leave the gaussians on disk until used.
 
-        The file stays open, so a file that is later saved over it does not change this bundle.
+        The file stays open, so a file that is later saved over it does not change this bundle. With the extra
+        `fsspec` it may be at a URL, which is fetched once by a process.
 
         Raises:
             FileNotFoundError: There is no such file.
             ValueError: It is not a bundle, is newer than this build can read, or is damaged; the message says
                 which file and field. Damage in the gaussians is found when they are read.
         """
-        return cls.open_all([path])[0]
+        return cls.open_all([local(path)])[0]
 
     @classmethod
     def open_all(cls, paths: Iterable[str | os.PathLike[str]]) -> list[Bundle]:
@@ -101,7 +103,8 @@ class Bundle:
             for _, file in opened:
                 file.verify()  # the first time of all, because they are hashed side by side
         except (OSError, ValueError):
-            list(map(cls.open, paths[:-1]))  # where one before has a fault as well, that is told
+            for path in paths[:-1]:
+                cls.open_all([path])  # where one before has a fault as well, that is told
             raise
         return [bundle for bundle, _ in opened]
 

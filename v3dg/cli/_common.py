@@ -1,7 +1,9 @@
 """What several commands do: read files, print results."""
 
+import difflib
 import json
 import math
+import os
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import tyro
 
 from v3dg._numbers import check
+from v3dg._urls import beside, is_url
 from v3dg.bundle import Bundle
 from v3dg.io import SUFFIXES
 
@@ -101,9 +104,20 @@ def check_range(name: str, value: float, least: float, most: float) -> None:
 
 
 def require_file(path: Path, *suffixes: str) -> None:
-    check(path, path.exists(), "a file, got a path where there is none; check it")
+    check(path, is_url(path) or path.exists(), f"a file, got a path where there is none{_similar(path)}")
     got = "a folder" if path.is_dir() else "another name"
-    check(path, path.name.lower().endswith(suffixes), f"a file ending in {', '.join(suffixes)}, got {got}")
+    check(
+        path,
+        beside(path).name.lower().endswith(suffixes),
+        f"a file ending in {', '.join(suffixes)}, got {got}",
+    )
+
+
+def _similar(path: Path) -> str:
+    """What may be meant in place of a file that is not there."""
+    names = os.listdir(path.parent) if path.parent.is_dir() else []
+    meant = difflib.get_close_matches(path.name, names, 1, 0.75)
+    return f"; perhaps you meant {path.with_name(meant[0])}" if meant else "; check it"
 
 
 def check_output(output: Path, *inputs: Path) -> None:
@@ -132,12 +146,13 @@ def print_result(as_json: bool, result: dict[str, Any], lines: Iterable[str]) ->
     print(json.dumps(result, indent=1) if as_json else "\n".join(map(printable, lines)), flush=True)
 
 
-def table_lines(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Lines of a table: by each column's head, how its cells show a row; `-` where that lacks a value.
+def table_lines(columns: str, rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Lines of a table: by `HEAD = CELL; ...`, how cells show a row; `-` where that lacks a value.
 
     The first column is to the left, the others to the right.
     """
-    table = [list(columns), *([_cell(form, row) for form in columns.values()] for row in rows)]
+    forms = dict(column.split(" = ") for column in columns.split("; "))
+    table = [list(forms), *([_cell(form, row) for form in forms.values()] for row in rows)]
     first, *others = (max(map(len, column)) for column in zip(*table, strict=True))
     line = "  ".join([f"{{:<{first}}}", *(f"{{:>{width}}}" for width in others)])
     return [line.format(*row).rstrip() for row in table]

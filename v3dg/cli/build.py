@@ -15,11 +15,12 @@ import tyro
 
 from v3dg import _extras
 from v3dg._numbers import check
+from v3dg._urls import beside
 from v3dg.build import BuildConfig, build_file, levels_path
 from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
-from v3dg.io import SUFFIXES
+from v3dg.io import SUFFIXES, run_files
 
 _PATIENCE_S = 20  # for a scheduler's answer
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
@@ -60,13 +61,15 @@ def run(options: Build) -> None:
     expected = "one or more assets, or a folder of them, got nothing; run v3dg build --help"
     _common.check_usage("PATH", options.assets, expected)
     is_one = options.output is not None and options.output.suffix == ".v3dg"
+    assets = _assets_of(options.assets)
     with _executor_at(options.scheduler) as executor:
-        if is_one or (len(options.assets) == 1 and not options.assets[0].is_dir()):
-            assets = _files_of(options.assets)
-            result = _build(options, assets, options.output or assets[0].with_suffix(".v3dg"), executor)
+        if is_one or list(assets) == list(options.assets[:1]):
+            output = options.output or _output_of(options.assets[0], None)
+            files = list(dict.fromkeys(file for files in assets.values() for file in files))
+            result = _build(options, files, output, executor)
             _common.print_result(options.json, result, _lines(result))
         else:
-            _run_many(options, executor)
+            _run_many(options, assets, executor)
 
 
 @contextmanager
@@ -94,15 +97,15 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
         yield client.get_executor()
 
 
-def _run_many(options: Build, executor: Executor | None) -> None:
-    outputs = _outputs(options)
+def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor | None) -> None:
+    outputs = _outputs(list(assets), options.output)
     start = time.perf_counter()
     results: list[dict[str, Any]] = []
     for asset, output in outputs.items():
         if not options.quiet:
             _common.tell(f"[{len(results) + 1}/{len(outputs)}] {asset}")
         try:
-            results.append(_build(options, [asset], output, executor))
+            results.append(_build(options, assets[asset], output, executor))
         except _common.FAILURES as error:
             results.append({"asset": str(asset), "status": "failed", "error": _common.failure_text(error)})
             if not options.quiet:
@@ -113,15 +116,10 @@ def _run_many(options: Build, executor: Executor | None) -> None:
     counts = Counter(result["status"] for result in results)
     summary = {name: counts[name] for name in ("built", "kept", "failed")}
     seconds = time.perf_counter() - start
-    columns = {
-        "asset": "{asset}",
-        "bundle": "{status}",
-        "levels": "{levels}",
-        "gaussians": "{gaussians:,}",
-        "left out": "{left_out:,}",
-        "size": "{size}",
-        "time": "{seconds:.1f} s",
-    }
+    columns = (
+        "asset = {asset}; bundle = {status}; levels = {levels}; gaussians = {gaussians:,}; "
+        "left out = {left_out:,}; size = {size}; time = {seconds:.1f} s"
+    )
     shown = [{**result} for result in results]
     for row in shown:
         if "bytes" in row:
@@ -135,27 +133,36 @@ def _run_many(options: Build, executor: Executor | None) -> None:
         raise RuntimeError(f"{len(failed)} of {len(results)} assets failed: {failed[0]['error']}{others}")
 
 
-def _files_of(paths: Sequence[Path]) -> list[Path]:
-    """Files as they are, and those of folders; each once."""
-    assets: list[Path] = []
+def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
+    """The files of each asset, by what it is named after: a file, one of a folder, or the folder of a run."""
+    assets: dict[Path, list[Path]] = {}
     for path in paths:
-        found = [path]
-        if path.is_dir():
+        if not path.is_dir():
+            assets[path] = [path]
+        elif files := run_files(path):
+            assets[path] = files
+        else:
             found = sorted(p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file())
-            check(path, found, f"a folder with assets ({', '.join(SUFFIXES)}), got one without")
-        assets += found
-    return list(dict.fromkeys(assets))
+            expected = f"a folder with assets ({', '.join(SUFFIXES)}), or a run of a trainer"
+            check(path, found, f"{expected}, got one without")
+            assets |= {file: [file] for file in found}
+    return assets
 
 
-def _outputs(options: Build) -> dict[Path, Path]:
+def _output_of(name: Path, folder: Path | None) -> Path:
+    """Where the bundle of an asset goes that is named after that."""
+    name = name.resolve() if name.is_dir() else beside(name)
+    stem = name.name if name.is_dir() else name.stem
+    return (folder or name.parent) / f"{stem}.v3dg"
+
+
+def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
     """Where the bundle of each asset goes, by asset."""
-    folder = options.output
-    assets = _files_of(options.assets)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     asset_of: dict[Path, Path] = {}
     for asset in assets:
-        output = (asset if folder is None else folder / asset.name).with_suffix(".v3dg")
+        output = _output_of(asset, folder)
         other = asset_of.setdefault(output, asset)
         check(output, other == asset, f"one asset for it, got {other} and {asset}; rename one")
     return {asset: output for output, asset in asset_of.items()}

@@ -92,13 +92,10 @@ def run(options: Compare) -> None:
         "worst": worst[1]["camera"],
         "views": rows,
     }
-    columns = {
-        "view": "{camera}",
-        "FLIP": "{flip:.4f}",
-        "PSNR": "{psnr:.2f}",
-        "SSIM": "{ssim:.4f}",
-        "gaussians": "{gaussians_selected:,.0f}",
-    }
+    columns = (
+        "view = {camera}; FLIP = {flip:.4f}; PSNR = {psnr:.2f}; SSIM = {ssim:.4f}; "
+        "gaussians = {gaussians_selected:,.0f}"
+    )
     shown = "reference and test" if mean["flip"] is None else "reference, test and FLIP"
     lines = [
         *_common.table_lines(columns, rows if len(rows) == 1 else [*rows, {"camera": "mean", **mean}]),

@@ -45,14 +45,10 @@ def run(options: Demo) -> None:
         seed=options.seed,
         progress=not options.quiet,
     )
-    columns = {
-        "drawn": "{name}, distance {distance:g}",
-        "gaussians": "{gaussians:,}",
-        "select ms": "{select_ms:.1f}",
-        "draw ms": "{draw_ms:.1f}",
-        "FLIP": "{flip:.4f}",
-        "PSNR": "{psnr:.2f}",
-    }
+    columns = (
+        "drawn = {name}, distance {distance:g}; gaussians = {gaussians:,}; "
+        "select ms = {select_ms:.1f}; draw ms = {draw_ms:.1f}; FLIP = {flip:.4f}; PSNR = {psnr:.2f}"
+    )
     panels = [
         {"name": name, "distance": column["distance"], **column[name]}
         for column in result["columns"]

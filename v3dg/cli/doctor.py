@@ -3,6 +3,7 @@
 import contextlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import webbrowser
@@ -49,7 +50,7 @@ def _findings() -> Iterator[tuple[str, str | None, str]]:
     missing = _device.missing_for_cuda()
     yield "CUDA", None if missing else "works", f"to draw and build on a GPU: {missing}"
     for requirement, purpose in EXTRAS.values():
-        name, version = requirement.partition(">=")[0], None
+        name, version = re.split(r"[\[>]", requirement)[0], None
         with contextlib.suppress(metadata.PackageNotFoundError):
             version = metadata.version(name)
         yield name, version, f"for {purpose}: pip install '{requirement}'"

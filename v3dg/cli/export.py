@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from v3dg import export
+from v3dg._urls import beside
 from v3dg.cameras import Axis
 from v3dg.cli import _common
 from v3dg.cli._views import choose_up
@@ -37,7 +38,7 @@ class Export(_common.Common):
 def run(options: Export) -> None:
     _common.require_subject(options.subject)
     _common.check_usage("--chunk", options.chunk >= 1, f"at least 1, got {options.chunk}")
-    folder = options.output or options.subject.with_name(f"{options.subject.stem}_web")
+    folder = options.output or beside(options.subject).with_name(f"{options.subject.stem}_web")
     _common.check_output(folder, options.subject)
     start = time.perf_counter()
     subject, cameras = open_with_cameras(options.subject)

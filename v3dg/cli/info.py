@@ -93,14 +93,10 @@ def _point(values: list[float]) -> str:
 
 def _bundle_info(path: Path, bundle: Bundle) -> _Description:
     result = {**bundle.info(), "path": str(path), "kind": "bundle"}
-    columns = {
-        "level": "{level}",
-        "clusters": "{clusters:,}",
-        "gaussians": "{gaussians:,}",
-        "size": "{size}",
-        "colour error": "{error_color:.4f}",
-        "alpha error": "{error_alpha:.4f}",
-    }
+    columns = (
+        "level = {level}; clusters = {clusters:,}; gaussians = {gaussians:,}; size = {size}; "
+        "colour error = {error_color:.4f}; alpha error = {error_alpha:.4f}"
+    )
     levels = [{**level, "size": _common.bytes_text(level["bytes"])} for level in result["levels"]]
     leaves = _common.level_size(bundle, 0) if len(bundle.level_range(0)) else 0
     each = f", {result['bytes'] / leaves:.1f} bytes a gaussian of level 0" if leaves else ""
@@ -147,14 +143,14 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
         "bundles": bundles,
         "cameras": sizes,
     }
-    columns = {"bundle": "{path}", "instances": "{instances:,}", "asset gaussians": "{asset_gaussians:,}"}
+    columns = "bundle = {path:s}; instances = {instances:,}; asset gaussians = {asset_gaussians:,}"
     lines = [
         f"{path}: scene, {len(scene):,} instances, {total:,} gaussians at full detail",
         "",
         *_common.table_lines(columns, bundles),
     ]
     if sizes:
-        lines += ["", *_common.table_lines({"camera": "{name}", "size": "{width} x {height}"}, sizes)]
+        lines += ["", *_common.table_lines("camera = {name}; size = {width} x {height}", sizes)]
     return result, lines
 
 

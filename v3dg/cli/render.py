@@ -62,14 +62,10 @@ def run(options: Render) -> None:
         view = {"camera": name, "width": camera.width, "height": camera.height}
         cost = asdict(image.stats) | {"tolerance": finite(image.stats.tolerance)}
         pictures.append({"picture": str(path), **view, **cost})
-    columns = {
-        "picture": "{picture}",
-        "size": "{width} x {height}",
-        "selected": "{gaussians_selected:,}",
-        "in frustum": "{gaussians_in_frustum:,}",
-        "select ms": "{select_ms:.1f}",
-        "draw ms": "{draw_ms:.1f}",
-    }
+    columns = (
+        "picture = {picture}; size = {width} x {height}; selected = {gaussians_selected:,}; "
+        "in frustum = {gaussians_in_frustum:,}; select ms = {select_ms:.1f}; draw ms = {draw_ms:.1f}"
+    )
     result = {"subject": str(options.subject), "pictures": pictures}
     notes = choose_up(options.view.up, subject, None, options.subject)[1] if is_turntable else []
     print_result(options.json, result, [*table_lines(columns, pictures), *notes])

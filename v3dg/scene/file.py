@@ -11,6 +11,7 @@ import numpy as np
 
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check
+from v3dg._urls import is_fetched
 from v3dg.bundle import Bundle
 from v3dg.cameras import DEFAULT_FOV_X, Camera, check_cameras
 from v3dg.io import SUFFIXES
@@ -73,9 +74,10 @@ def write_scene(
     check(path, is_scene(Path(path)), "a file name ending in .json, not meta.json; v3dg.open goes by it")
     check_cameras(cameras := cameras or {})
     if bundle_paths is None:
-        found = "one in memory; write it and open that"
+        found = "one in memory or at a URL; write it and open that"
         for number, bundle in enumerate(scene.bundles):
-            check(f"scene.bundles[{number}]", bundle.path, f"one that was opened from a file, got {found}")
+            is_here = bundle.path and not is_fetched(bundle.path)
+            check(f"scene.bundles[{number}]", is_here, f"one that was opened from a file, got {found}")
         folder = os.path.dirname(os.path.abspath(path))
         bundle_paths = [os.path.relpath(bundle.path or "", folder) for bundle in scene.bundles]
     if isinstance(bundle_paths, str) or not isinstance(bundle_paths, Sequence):
@@ -99,14 +101,8 @@ def write_scene(
         "bundles": dict(zip(names, bundle_paths, strict=True)),
         "instances": instances,
         "cameras": [
-            {
-                "name": name,
-                "width": camera.width,
-                "height": camera.height,
-                "near": camera.near,
-                "viewmat": camera.viewmat.tolist(),
-                "K": camera.K.tolist(),
-            }
+            {"name": name, "width": camera.width, "height": camera.height, "near": camera.near}
+            | {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
             for name, camera in cameras.items()
         ],
     }
