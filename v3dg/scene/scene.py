@@ -264,7 +264,9 @@ class Scene:
         return len(self._state.bundle)
 
     def __repr__(self) -> str:
-        return f"Scene({len(self)} instances of {len(self.bundles)} bundles)"
+        instances, bundles = len(self), len(self.bundles)
+        of = f"{bundles} bundle{'s' * (bundles != 1)}"
+        return f"Scene({instances} instance{'s' * (instances != 1)} of {of})"
 
 
 Subject: TypeAlias = Scene | Bundle | Gaussians
