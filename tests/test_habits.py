@@ -64,7 +64,7 @@ def test_scenes_are_saved_and_loaded(bundle, camera, tmp_path):
 
 
 def test_a_scene_of_bundles_in_memory_says_what_to_do_first(bundle, tmp_path):
-    with pytest.raises(ValueError, match=r"scene.bundles\[0\]: .* got one in memory; write it and open that"):
+    with pytest.raises(ValueError, match=r"scene.bundles\[0\]: .* got one in memory or at a URL; write it"):
         v3dg.Scene.of(bundle).save(tmp_path / "a.json")
     assert list(tmp_path.iterdir()) == []
 

@@ -72,18 +72,10 @@ def run_demo(
             columns[-1][name], text, picture = _drawn(scene, camera, px2, truth, where)
             row.append((f"{name}, distance {distance:g}: {text}", picture))
     write_picture(path, contact_sheet(rows))
-    return {
-        "picture": str(path),
-        "asset_gaussians": len(asset),
-        "instances": instances,
-        "levels": bundle.num_levels,
-        "bundle_gaussians": bundle.num_gaussians,
-        "tolerance": tolerance,
-        "device": str(where),
-        "build_seconds": build_seconds,
-        "seconds": time.perf_counter() - start,
-        "columns": columns,
-    }
+    result = {"picture": str(path), "asset_gaussians": len(asset), "instances": instances}
+    result |= {"levels": bundle.num_levels, "bundle_gaussians": bundle.num_gaussians}
+    result |= {"tolerance": tolerance, "device": str(where), "build_seconds": build_seconds}
+    return result | {"seconds": time.perf_counter() - start, "columns": columns}
 
 
 def _camera(distance: float, elevation: float, width: int, height: int) -> Camera:

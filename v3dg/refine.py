@@ -88,10 +88,8 @@ class _Cuts:
         self, bundle: Bundle, cameras: Sequence[Camera], seed: int, where: Device, progress: Progress
     ) -> None:
         self._bundle, self._seed, self._where, self._progress = bundle, seed, where, progress
-        everything, self._leaves = (
-            bundle.gaussians,
-            slice(0, int(bundle.clusters.offset[bundle.level_range(0).stop])),
-        )
+        everything = bundle.gaussians
+        self._leaves = slice(0, int(bundle.clusters.offset[bundle.level_range(0).stop]))
         self._gaussians = _device.place(everything.subset(np.arange(len(everything))), where)
         self._pictures = _core.CutPictures(
             table=residency.table(bundle),

@@ -205,18 +205,16 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
         raise KeyboardInterrupt(f"interrupted{to_resume()}") from None
     except OSError as error:  # a full disk, say
         raise OSError(error.errno, f"{error.strerror}{to_resume()}", error.filename) from None
-    return {
-        "asset": str(paths[0]) if len(paths) == 1 else [str(path) for path in paths],
+    asset = str(paths[0]) if len(paths) == 1 else [str(path) for path in paths]
+    result: dict[str, Any] = {
+        "asset": asset,
         "output": str(output),
         "status": "built" if is_built else "kept",
-        "asset_gaussians": bundle.config["asset_gaussians"],
-        "dropped": bundle.config["dropped"],
-        "gaussians": bundle.num_gaussians,
-        "clusters": len(bundle.clusters),
-        "levels": bundle.num_levels,
-        "bytes": output.stat().st_size,
-        "seconds": time.perf_counter() - start,
     }
+    result |= {name: bundle.config[name] for name in ("asset_gaussians", "dropped")}
+    result |= {"gaussians": bundle.num_gaussians, "clusters": len(bundle.clusters)}
+    result |= {"levels": bundle.num_levels, "bytes": output.stat().st_size}
+    return result | {"seconds": time.perf_counter() - start}
 
 
 def _lines(result: dict[str, Any]) -> list[str]:

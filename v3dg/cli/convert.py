@@ -84,14 +84,8 @@ def run(options: Convert) -> None:
         gaussians, told = _cut(options, subject, *cameras.items())
     if not to_bundle:
         write_asset(output, gaussians, version=options.spz_version)
-    result = {
-        "output": str(output),
-        "gaussians": len(gaussians),
-        "sh_degree": gaussians.sh_degree,
-        "bytes": output.stat().st_size,
-        "seconds": time.perf_counter() - start,
-        **told,
-    }
+    result = {"output": str(output), "gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}
+    result |= {"bytes": output.stat().st_size, "seconds": time.perf_counter() - start, **told}
     size = _common.bytes_text(output.stat().st_size)
     text = f"{output}: {len(gaussians):,} gaussians, SH degree {gaussians.sh_degree}, {size}"
     _common.print_result(options.json, result, [text])

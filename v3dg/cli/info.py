@@ -135,14 +135,8 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
     sizes = [
         {"name": name, "width": camera.width, "height": camera.height} for name, camera in cameras.items()
     ]
-    result = {
-        "path": str(path),
-        "kind": "scene",
-        "instances": len(scene),
-        "gaussians_at_full_detail": total,
-        "bundles": bundles,
-        "cameras": sizes,
-    }
+    result = {"path": str(path), "kind": "scene", "instances": len(scene)}
+    result |= {"gaussians_at_full_detail": total, "bundles": bundles, "cameras": sizes}
     columns = "bundle = {path:s}; instances = {instances:,}; asset gaussians = {asset_gaussians:,}"
     lines = [
         f"{path}: scene, {len(scene):,} instances, {total:,} gaussians at full detail",

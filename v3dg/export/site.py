@@ -89,9 +89,8 @@ def write_site(
     check("scene", len(scene), "instances to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
     with _common.replacing_folder(folder) as place:
-        total = sum(bundle.num_gaussians for bundle in scene.bundles)
         listed, counts = [], []
-        with Bar(total, "export", progress) as bar:
+        with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
             for name, plan in zip(_common.names_of(scene) if is_scene else ["."], plans, strict=True):
                 (place / name).mkdir(exist_ok=True)
                 done = write_levels(plan, place / name, turn, bar.update)
@@ -111,9 +110,8 @@ def write_site(
         _common.write_document(place / SITE, document)
         _common.write_page(place, "site.html")
         has_engine = _bring_engine(folder, place)
-        size = _common.bytes_below(place)
     finest, coarsest = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
-    return Site(len(listed), len(scene), finest, coarsest, size, has_engine)
+    return Site(len(listed), len(scene), finest, coarsest, _common.bytes_below(folder), has_engine)
 
 
 def _instances(scene: Scene) -> dict[str, list[Any]]:
