@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from v3dg import _core
 from v3dg._numbers import Floats as Floats
-from v3dg._numbers import check, check_type, positive, real, vector, whole
+from v3dg._numbers import check, check_type, positive, real, refuse, vector, whole
 
 T = TypeVar("T")
 VectorLike: TypeAlias = Sequence[float] | npt.NDArray[Any]
@@ -56,16 +56,18 @@ class Camera:
     def __post_init__(self) -> None:
         viewmat = vector(self.viewmat, "viewmat", (4, 4))
         _check_rotation(viewmat[:3, :3], "viewmat", "; put scale into the scene instead")
-        last = viewmat[3]
-        check("viewmat", np.array_equal(last, [0, 0, 0, 1]), f"the last row 0 0 0 1, got {_text(last)}")
+        if viewmat[3].tolist() != [0, 0, 0, 1]:
+            refuse("viewmat", f"the last row 0 0 0 1, got {_text(viewmat[3])}")
         K = vector(self.K, "K", (3, 3))
-        check("K", K[0, 0] > 0 and K[1, 1] > 0, f"positive focal lengths, got {K[0, 0]:g} and {K[1, 1]:g}")
-        is_plain = K[0, 1] == 0 == K[1, 0] and np.array_equal(K[2], [0, 0, 1])
+        # Numbers of Python's: of nine or sixteen, which every frame of a flight has anew, NumPy takes longer.
+        (fx, skew, cx), (turn, fy, cy), last = K.tolist()
+        if not (fx > 0 and fy > 0):
+            refuse("K", f"positive focal lengths, got {fx:g} and {fy:g}")
+        is_plain = skew == 0 == turn and last == [0, 0, 1]
         check("K", is_plain, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got a matrix with skew or scale")
-        width, height = _side(self.width, "width"), _side(self.height, "height")
+        size = {"width": _side(self.width, "width"), "height": _side(self.height, "height")}
         near = positive(self.near, "near")
-        self.__dict__.update(viewmat=viewmat, K=K, width=width, height=height, near=near)
-        self.__dict__.update(fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]))
+        self.__dict__.update(size, viewmat=viewmat, K=K, near=near, fx=fx, fy=fy, cx=cx, cy=cy)
 
     @classmethod
     def look_at(
@@ -262,10 +264,12 @@ def rigid(rotation: Floats, eye: Floats) -> Floats:
 
 def is_rotation(matrix: Floats) -> bool:
     """Whether a (3, 3) matrix is a rotation, up to what float32 text loses."""
-    if np.abs(matrix).max() > 2:  # squares of huge numbers would overflow
-        return False
-    off = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    return bool(off <= ROTATION_TOLERANCE and np.linalg.det(matrix) > 0)
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    squares = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
+    products = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
+    off: float = max(map(abs, (*(square - 1 for square in squares), *products)))
+    volume: float = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+    return off <= ROTATION_TOLERANCE and volume > 0
 
 
 def _check_rotation(matrix: Floats, name: str, advice: str = "") -> None:
