@@ -114,11 +114,11 @@ class _Cuts:
         given = {"gaussians": self._gaussians.rows, "pictures": self._pictures}
         work = partial(operation, config=fit_config(config, self._seed, 1), **given)
         with Bar(steps, name, self._progress) as bar:
-            return run_fit(
-                lambda state: work(progress=state),
-                self._where,
-                lambda state: bar.update(state.groups_done - bar.done),
-            )
+
+            def show(state: _core.FitProgress) -> None:
+                bar.update(state.groups_done - bar.done)
+
+            return run_fit(lambda state: work(progress=state), self._where, show)
 
 
 def _without_least(bundle: Bundle, weight: npt.NDArray[np.float64], share: float) -> Bundle:
