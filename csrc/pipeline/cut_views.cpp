@@ -186,11 +186,9 @@ CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const
 CutView cut_view(const CutPictures& pictures, uint64_t number) {
     Random random(pictures.seed, number);
     const double part = random.uniform();
-    const double share = pictures.most * std::pow(pictures.least / pictures.most, part * part) /
-                         static_cast<double>(pictures.weight.size());
+    double all = static_cast<double>(pictures.weight.size());  // that a picture has without levels
+    const double share = pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
     const double size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform());
-    double all =
-        static_cast<double>(pictures.weight.size());  // gaussians that the picture has without levels
     Camera camera;
     SelectRule rule{};
     rule.culls = pictures.cameras.size > 0;
