@@ -197,10 +197,10 @@ def test_no_lock_is_held_for_ever_in_a_child():
 
 def test_what_is_no_scene_is_refused(where):
     for call in (
-        lambda: residency.scene("donut", where),
-        lambda: render("donut", CAMERA, device=where),
-        lambda: Renderer("donut", device=where),
-        lambda: select("donut", CAMERA, device=where),
+        lambda: residency.scene(7, where),
+        lambda: render(7, CAMERA, device=where),
+        lambda: Renderer(7, device=where),
+        lambda: select(7, CAMERA, device=where),
     ):
-        with pytest.raises(TypeError, match="subject: expected a Scene or a Bundle, got str"):
+        with pytest.raises(TypeError, match="subject: expected a Scene or a Bundle, got int"):
             call()
