@@ -31,6 +31,18 @@ def test_a_bundle_is_refined(folder):
     assert written.num_gaussians == v3dg.Bundle.open(folder / "donut.v3dg").num_gaussians
 
 
+def test_info_tells_how_levels_were_built_from_how_they_were_refined(folder):
+    """Also where a setting has the name and the default of one of the build."""
+    bundle = v3dg.Bundle.open(folder / "donut.v3dg")
+    about = {"refined": {"steps": v3dg.BuildConfig().steps, "drop": 0.1, "seed": 3}}
+    config = bundle.config | about
+    v3dg.Bundle(bundle.clusters, bundle.groups, bundle.gaussians, config).write(folder / "told.v3dg")
+    text = " ".join(run("info", "told.v3dg", cwd=folder).stdout.split())
+    assert f"refined drop=0.1, refined seed=3, refined steps={about['refined']['steps']}" in text
+    assert " steps=0," in text
+    assert text.count(" seed=") == 2
+
+
 def test_cameras_say_from_where(folder):
     options = ("--steps", 2, "--cameras", "eyes.json", "--device", "cpu", "--quiet")
     done = run("refine", "donut.v3dg", "seen.v3dg", *options, cwd=folder)

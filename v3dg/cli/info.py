@@ -148,10 +148,10 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
     return result, lines
 
 
-def _settings(config: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Names and values of a bundle's config, without its nesting."""
+def _settings(config: dict[str, Any], of: str = "") -> Iterator[tuple[str, Any]]:
+    """Names and values of a bundle's config; names of what is nested, but for the build's, say where."""
     for name, value in config.items():
         if isinstance(value, dict):
-            yield from _settings(value)
+            yield from _settings(value, "" if name == "build" else f"{name} ")
         else:
-            yield name, value
+            yield f"{of}{name}", value
