@@ -81,8 +81,8 @@ def test_the_same_seed_gives_the_same_bits(bundle, device):
 def test_threads_do_not_change_the_result(bundle, tmp_path):
     bundle.write(tmp_path / "bundle.v3dg")
     program = (
-        "import v3dg, sys; b = v3dg.Bundle.open(sys.argv[1]);"
-        "v3dg.refine_bundle(b, steps=10, drop=0, device='cpu', progress=False).write(sys.argv[2])"
+        "import v3dg, v3dg.refine, sys; b = v3dg.Bundle.open(sys.argv[1]); v3dg.refine._WEIGHED = 50;"
+        "v3dg.refine_bundle(b, steps=10, drop=0.1, device='cpu', progress=False).write(sys.argv[2])"
     )
     for threads in ("1", "3"):
         command = [sys.executable, "-c", program, tmp_path / "bundle.v3dg", tmp_path / f"{threads}.v3dg"]
@@ -118,12 +118,13 @@ def test_wrong_arguments_are_told(bundle):
         refine_bundle(bundle, cameras=[v3dg.turntable((0, 0, 0), 3.0, 1)[0], "front"])
 
 
-def test_what_a_progress_function_raises_ends_it(bundle):
+@pytest.mark.parametrize("drop", [0, 0.1])
+def test_what_a_progress_function_raises_ends_it(bundle, drop):
     def stop(done, total, text):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        refine_bundle(bundle, steps=300, drop=0, device="cpu", progress=stop)
+        refine_bundle(bundle, steps=300, drop=drop, device="cpu", progress=stop)
 
 
 def pictures_of(bundle, cameras=()):
