@@ -39,10 +39,10 @@ def refine_bundle(
     """Make the levels of a bundle look more like its asset, in small pictures and large ones; a copy.
 
     A build fits every group alone, seen from all sides, at the size at which it is selected. Pictures of cuts
-    show gaussians next to each other, where they hide each other. By these, this drops gaussians of all
-    levels but the first of which least is seen, and moves the others until such pictures are those of the
-    asset. Cuts have 0.7 of the asset's gaussians down to those of the last level, and pictures 0.18 to 9.7
-    times the size at which they are at home, 2 px² a gaussian. docs/levels.md has what is gained.
+    show gaussians next to each other, where they hide each other. By these, this drops the least seen
+    gaussians of all levels but the first, and moves the others until such pictures are those of the asset.
+    Cuts have 0.7 of the asset's gaussians down to those of the last level, and pictures 0.18 to 9.7 times the
+    size at which they are at home, 2 px² a gaussian. docs/levels.md has what is gained.
 
     The same bundle, cameras, steps, share and seed give the same bits on the same kind of device.
 
@@ -51,7 +51,8 @@ def refine_bundle(
         cameras: Where the asset is seen from, also by name: for a room those of its photographs. What is
             seen from elsewhere may get worse. Without any, pictures are taken from all around.
         steps: Pictures that cuts are compared with, one after another.
-        drop: Share of what is seen of a level that the dropped gaussians have together, below 1; 0 keeps all.
+        drop: The least seen gaussians of a level are dropped, up to this share of what is seen of it: 0,
+            which keeps all, to 0.5. A bundle that was refined before loses gaussians again.
         seed: Of the pictures.
         device: Where to compute.
         progress: As for `build_bundle`.

@@ -58,8 +58,8 @@ class Groups:
 
     Attributes:
         ball: (G,4) float32. Centre and radius in the asset's frame; contains the balls of the groups below.
-        weight: (G,) float32. One over the number of gaussians the group was simplified to, at least the
-            largest weight below.
+        weight: (G,) float32. One over the number of gaussians the group was simplified to by the build, at
+            least the largest weight below.
         parent: (G,) int32. Group above, -1 for those that made the last level.
         level: (G,) int32. Level of the clusters that the group makes; 1 or more.
         error: (G,2) float32. Final residual of the fit in colour and alpha; not a number where not known.

@@ -29,7 +29,7 @@ class Refine(CameraFile, _common.OnDevice):
     """A file or folder of cameras from which the asset is seen, as for `v3dg render`: for a room, which is
     seen from inside. All around if not given."""
     drop: Annotated[float, tyro.conf.arg(metavar="SHARE")] = 0.02
-    """What all gaussians together show that are dropped of a level, in parts of what it shows; 0: none."""
+    """The least seen gaussians of a level are dropped, up to this share of what is seen of it; 0: none."""
     seed: int = 0
     """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
 
