@@ -229,7 +229,7 @@ def test_cuts_from_a_camera_come_closer_to_the_asset(bundle, device):
 
 
 def weights_of(bundle, device, steps, cameras=()):
-    """What `steps` pictures show of each gaussian."""
+    """What `steps` pictures show of each gaussian, and how many have it in their cuts."""
     gaussians = on(device, bundle.gaussians)
     config = fit_config(BuildConfig(steps=steps, first_steps=steps, filter_px2=0.1), 0, 1)
     return _core.weigh_cuts(config, gaussians.rows, pictures_of(bundle, cameras), _core.FitProgress())
@@ -237,7 +237,7 @@ def weights_of(bundle, device, steps, cameras=()):
 
 def test_what_is_seen_of_gaussians_adds_up_to_the_alpha_of_pictures(bundle, device):
     camera = v3dg.turntable((0, 0, 0), 3.0, 1, width=160, height=160)[0]
-    weight = weights_of(bundle, device, 1, [camera])
+    weight, num_looks = weights_of(bundle, device, 1, [camera])
     window, clusters, _ = pictures_of(bundle, [camera]).view(0)
     offset = bundle.clusters.offset
     rows = np.concatenate([np.arange(offset[c], offset[c + 1]) for c in clusters])
@@ -248,6 +248,31 @@ def test_what_is_seen_of_gaussians_adds_up_to_the_alpha_of_pictures(bundle, devi
     others = np.ones(bundle.num_gaussians, bool)
     others[rows] = False
     assert not weight[others].any()
+    np.testing.assert_array_equal(num_looks, ~others)
+
+
+def test_looks_are_counted(bundle, device):
+    """Of a gaussian that is in a picture's cut, whether it shows there or not."""
+    _, num_looks = weights_of(bundle, device, 12)
+    pictures, offset = pictures_of(bundle), bundle.clusters.offset
+    expected = np.zeros(bundle.num_gaussians, int)
+    for number in range(12):
+        for cluster in pictures.view(number)[1]:
+            expected[offset[cluster] : offset[cluster + 1]] += 1
+    np.testing.assert_array_equal(num_looks, expected)
+
+
+def test_what_is_not_looked_at_stays(bundle, device):
+    """A camera that sees one side alone tells nothing of the other."""
+    camera = v3dg.Camera.look_at((0.75, 0, 0.6), (0.75, 0, 0), (0, 1, 0), 0.5, width=64, height=64)
+    _, num_looks = weights_of(bundle, "cpu", 2000, [camera])
+    assert (num_looks == 0).any()
+    refined = refine_bundle(bundle, cameras=[camera], steps=1, drop=0.5, device=device, progress=False)
+    offset = bundle.clusters.offset[:-1]
+    is_unseen = np.maximum.reduceat(num_looks, offset) == 0
+    before, after = (np.diff(b.clusters.offset) for b in (bundle, refined))
+    np.testing.assert_array_equal(before[is_unseen], after[is_unseen])
+    assert after.sum() < before.sum()
 
 
 def levels_inside_a_shell():
@@ -290,7 +315,9 @@ def test_what_nobody_sees_is_dropped_of_all_levels_but_the_first(device, tmp_pat
 
 def test_what_is_dropped_has_the_share_together(bundle):
     """Of each level, and no gaussian that stays has less than one that goes."""
-    weight = np.random.default_rng(0).exponential(size=bundle.num_gaussians)
+    rng = np.random.default_rng(0)
+    weight = rng.exponential(size=bundle.num_gaussians)
+    weight[rng.random(len(weight)) < 0.1] = np.nan  # not known
     for share in (0.01, 0.3):
         offset = bundle.clusters.offset
         left = _without_least(bundle, weight, share)
@@ -298,9 +325,9 @@ def test_what_is_dropped_has_the_share_together(bundle):
             of_level = bundle.level_range(level)
             weights = weight[offset[of_level.start] : offset[of_level.stop]]
             least = np.sort(weights)
-            num_dropped = int((np.cumsum(least) < share * weights.sum()).sum())
+            num_dropped = int((np.cumsum(least) < share * np.nansum(weights)).sum())
             assert len(left.level_gaussians(level)) == len(weights) - num_dropped
-            kept = bundle.level_gaussians(level).means[weights >= least[num_dropped]]
+            kept = bundle.level_gaussians(level).means[~(weights < least[num_dropped])]
             np.testing.assert_array_equal(left.level_gaussians(level).means, kept)
 
 

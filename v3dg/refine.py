@@ -23,7 +23,9 @@ from v3dg.residency import residency
 
 _T = TypeVar("_T")
 _RATE = 0.2  # of the step sizes of a fit, from whose result this starts
-_WEIGHED = 2_000  # pictures that tell how much is seen of each gaussian
+# Pictures that tell how much is seen of each gaussian, and how many of them must have it in their cuts: of a
+# very large asset windows show parts, and what none of them looks at is not known.
+_WEIGHED, _LEAST_LOOKS = 2_000, 8
 
 
 def refine_bundle(
@@ -74,8 +76,8 @@ def refine_bundle(
     if bundle.num_levels < 2 or bundle.clusters.offset[bundle.level_range(0).stop] == 0:
         return bundle
     if drop > 0:
-        weight = _Cuts(bundle, cameras, seed, where, progress).run("weigh", _WEIGHED, _core.weigh_cuts)
-        bundle = _without_least(bundle, weight, drop)
+        seen, looks = _Cuts(bundle, cameras, seed, where, progress).run("weigh", _WEIGHED, _core.weigh_cuts)
+        bundle = _without_least(bundle, np.where(looks < _LEAST_LOOKS, np.nan, seen), drop)
     refined = _Cuts(bundle, cameras, seed, where, progress).refined(steps)
     about = {"steps": steps, "drop": drop, "seed": seed} | ({"cameras": len(cameras)} if cameras else {})
     made: dict[str, Any] = {**bundle.config, "refined": about}
@@ -123,14 +125,17 @@ class _Cuts:
 
 
 def _without_least(bundle: Bundle, weight: npt.NDArray[np.float64], share: float) -> Bundle:
-    """Drop, of each level but the first, those of least weight that have this share of it together."""
+    """Drop, of each level but the first, those of least weight that have this share of it together.
+
+    What has no number stays, and has none of it.
+    """
     offset, is_kept = bundle.clusters.offset, np.ones(bundle.num_gaussians, bool)
     for level in range(1, bundle.num_levels):
         here = bundle.level_range(level)
         rows = slice(offset[here.start], offset[here.stop])
         order = np.argsort(weight[rows], kind="stable")
         below = np.cumsum(weight[rows][order])
-        is_kept[rows][order[below < share * weight[rows].sum()]] = False
+        is_kept[rows][order[below < share * np.nansum(weight[rows])]] = False
     kept = np.flatnonzero(is_kept)
     clusters = replace(bundle.clusters, offset=np.searchsorted(kept, offset))
     return Bundle(clusters, bundle.groups, bundle.gaussians.subset(kept), bundle.config, bundle.codec)

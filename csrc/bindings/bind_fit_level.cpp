@@ -171,24 +171,31 @@ void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, cons
     refine_cuts(config, target.on_host(), target.size(), levels, pictures.pictures(), progress);
 }
 
-py::object weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians, const BoundPictures& pictures,
-                             FitProgress& progress) {
+py::tuple weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians, const BoundPictures& pictures,
+                            FitProgress& progress) {
     pictures.check_all(gaussians);
     const GaussianRows<const float> rows = gaussians.read<float>();
-    const NewArray<double> weight({}, {static_cast<py::ssize_t>(gaussians.size())});
+    const auto count = static_cast<py::ssize_t>(gaussians.size());
+    const NewArray<double> weight({}, {count});
+    const NewArray<int32_t> num_looks({}, {count});
     std::fill(weight.span.begin(), weight.span.end(), 0.0);
+    std::fill(num_looks.span.begin(), num_looks.span.end(), 0);
+    const SeenOfGaussians seen{weight.span, num_looks.span};
+    const py::tuple answer = py::make_tuple(weight.object, num_looks.object);
     const Work work(gaussians.device());
+    if constexpr (V3DG_WITH_CUDA != 0)
+        if (!work.device().is_host()) {
+            {
+                const py::gil_scoped_release unlocked;
+                cuda::weigh_cuts(config, rows, pictures.pictures(), seen, progress, work.stream());
+            }
+            return answer;
+        }
     {
         const py::gil_scoped_release unlocked;
-        if constexpr (V3DG_WITH_CUDA != 0) {
-            if (!work.device().is_host()) {
-                cuda::weigh_cuts(config, rows, pictures.pictures(), weight.span, progress, work.stream());
-                return weight.object;
-            }
-        }
-        weigh_cuts(config, rows, pictures.pictures(), weight.span, progress);
+        weigh_cuts(config, rows, pictures.pictures(), seen, progress);
     }
-    return weight.object;
+    return answer;
 }
 
 FitConfig make_config(int steps, int views_per_step, int num_views, int supersample, int image_size,
@@ -284,10 +291,10 @@ void bind_fit_level(py::module_& m) {
         "progress"_a,
         "Moves the gaussians of clusters, in place, until pictures of cuts are those of the target: a step a "
         "picture.");
-    m.def(
-        "weigh_cuts", &weigh_cuts_arrays, "config"_a, "gaussians"_a, "pictures"_a, "progress"_a,
-        "How much as many pictures of cuts as there are steps show of each gaussian (N,): its blend weights, "
-        "in parts of the pixels of each picture.");
+    m.def("weigh_cuts", &weigh_cuts_arrays, "config"_a, "gaussians"_a, "pictures"_a, "progress"_a,
+          "What pictures of cuts, one a step, show of each gaussian: the sum (N,) of its blend weights, in "
+          "parts "
+          "of the pixels of each picture, and in how many of the cuts it was (N,).");
     m.def("dssim", &dssim_of, "picture"_a, "target"_a,
           "Mean of 1 - SSIM of one channel, and its gradient by the picture.");
     m.def("ssim", &ssim_of_pictures, "picture"_a, "target"_a,

@@ -24,9 +24,14 @@ struct CutRows {
 void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t target_count,
                  const CutRows& levels, const CutPictures& pictures, FitProgress& progress);
 
-// What config.steps pictures of cuts show of each gaussian: adds its blend weights to `weight`, in parts of
-// the pixels of each picture. Cuts are drawn as refine_cuts draws them.
+// How much is seen of gaussians, one element for each.
+struct SeenOfGaussians {
+    Span<double> weight;      // blend weights, in parts of the pixels of each picture, added up
+    Span<int32_t> num_looks;  // pictures whose cuts have it, whether it shows or not
+};
+
+// Adds what config.steps pictures of cuts, drawn as refine_cuts draws them, show of each gaussian.
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
-                Span<double> weight, FitProgress& progress);
+                const SeenOfGaussians& seen, FitProgress& progress);
 
 }  // namespace v3dg

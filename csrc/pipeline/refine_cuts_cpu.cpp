@@ -120,7 +120,7 @@ class CutFrame {
 }  // namespace
 
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
-                Span<double> weight, FitProgress& progress) {
+                const SeenOfGaussians& seen, FitProgress& progress) {
     const auto steps = static_cast<size_t>(config.steps);
     Views views(pictures, steps);
     CutFrame frame(config);
@@ -135,7 +135,10 @@ void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, 
         for (size_t k = 0; k < 3 * count; ++k) picture.color()[k] = k % 3 == 0 ? 1.0f : 0.0f;
         std::fill_n(picture.alpha(), count, 0.0f);
         const GaussianRows<const float> gradient = frame.backward();
-        for (size_t g = 0; g < index.size(); ++g) weight[index[g]] += blend_weight(gradient.sh[3 * g], count);
+        for (size_t g = 0; g < index.size(); ++g) {
+            seen.weight[index[g]] += blend_weight(gradient.sh[3 * g], count);
+            ++seen.num_looks[index[g]];
+        }
         ++progress.groups_done;
     }
 }

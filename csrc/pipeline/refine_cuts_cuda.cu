@@ -321,14 +321,15 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
 }
 
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
-                Span<double> weight, FitProgress& progress, Stream stream) {
-    const DeviceBuffer<double> weights(Span<const double>(weight), stream);
+                const SeenOfGaussians& seen, FitProgress& progress, Stream stream) {
+    const DeviceBuffer<double> weights(Span<const double>(seen.weight), stream);
     CutFrame frame(config, stream);
     DeviceBuffer<uint32_t> gaussians;
     Canvas slopes;
     for (int i = 0; i < config.steps && !progress.cancel; ++i) {
         const CutView view = cut_view(pictures, static_cast<uint64_t>(i));
         const std::vector<uint32_t> shown = gaussians_of(pictures.table, view);
+        for (const uint32_t i : shown) ++seen.num_looks[i];
         gaussians.copy_from({shown.data(), shown.size()}, stream);
         const Span<const uint32_t> index{gaussians.data(), shown.size()};
         const unsigned num_blocks = blocks_for(index.size, kGaussiansABlock);
@@ -343,8 +344,8 @@ void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, 
                frame.backward(slope), count, weights.data());
         ++progress.groups_done;
     }
-    check(cudaMemcpyAsync(weight.data, weights.data(), weight.size * sizeof(double), cudaMemcpyDeviceToHost,
-                          stream),
+    check(cudaMemcpyAsync(seen.weight.data, weights.data(), seen.weight.size * sizeof(double),
+                          cudaMemcpyDeviceToHost, stream),
           "weigh_cuts");
     check(cudaStreamSynchronize(stream), "weigh_cuts");
 }

@@ -13,7 +13,7 @@ void refine_cuts(const FitConfig& config, const DeviceFitTarget& target, const C
 
 // As v3dg::weigh_cuts, likewise.
 void weigh_cuts(const FitConfig& config, const GaussianRows<const float>& rows, const CutPictures& pictures,
-                Span<double> weight, FitProgress& progress, Stream stream);
+                const SeenOfGaussians& seen, FitProgress& progress, Stream stream);
 
 }  // namespace cuda
 }  // namespace v3dg
