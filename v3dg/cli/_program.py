@@ -60,17 +60,26 @@ class Program:
             raise UsageError(self._one_line(caught.getvalue(), arguments)) from None
 
     def _one_line(self, boxed: str, arguments: Sequence[str]) -> str:
-        """The text of the first box that tyro drew, without rules and title, and what may be meant."""
+        """The text of the first box that tyro drew, or which name is unknown, and what may be meant."""
         lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
         rule = next((i for i, line in enumerate(lines) if not line), len(lines))
-        similar = "\n".join(lines[rule:]).partition("Perhaps you meant:")[2]
-        meant = [name for name in re.findall(r"^--[a-z-]+", similar, re.M) if name not in arguments]
-        text, asked = _plainly(" ".join(lines[:rule]).rstrip(".")), " ".join([self.name, *arguments[:1]])
-        if arguments and arguments[0] not in self.commands:
-            meant = difflib.get_close_matches(arguments[0], self.commands)
-            text, asked = f"COMMAND: expected {', '.join(self.commands)}, got {arguments[0]}", self.name
-        advice = f"; perhaps you meant {meant[0]}" if meant else ""
-        return f"{text}{advice}; run {asked} --help"
+        text, asked = _plainly(" ".join(lines[:rule]).rstrip(".")), self.name
+        known, slips = list(self.commands), arguments[:1]
+        if slips and slips[0] not in known:
+            text = f"COMMAND: expected {', '.join(known)}, got {slips[0]}"
+        elif slips:
+            asked, known = f"{self.name} {slips[0]}", self._options(slips[0])
+            names = [name.partition("=")[0].replace("_", "-") for name in arguments[1:]]
+            slips = [name for name in names if name.startswith("--") and name not in known]
+            text = f"{slips[0]}: expected an option of {asked}, got none" if slips else text
+        meant = difflib.get_close_matches(slips[0], known, 1, 0.7) if slips else []
+        return f"{text}{f'; perhaps you meant {meant[0]}' if meant else ''}; run {asked} --help"
+
+    def _options(self, command: str) -> list[str]:
+        """Names of the options that the help of a command has."""
+        with contextlib.redirect_stdout(io.StringIO()) as told, contextlib.suppress(SystemExit):
+            self.parse([command, "--help"])
+        return re.findall(r"--[a-z][a-z-]*", told.getvalue())
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """Run one command, by default the one this program was started with, and return its exit code."""

@@ -85,13 +85,8 @@ def run(options: Compare) -> None:
         worst[1]["picture"] = str(output)
         _write(options, *worst)
     mean = mean_of(rows, "flip", "psnr", "ssim", "gaussians_selected")
-    result = {
-        "reference": str(options.reference),
-        "test": str(options.test),
-        "mean": mean,
-        "worst": worst[1]["camera"],
-        "views": rows,
-    }
+    result: dict[str, Any] = {"reference": str(options.reference), "test": str(options.test)}
+    result |= {"mean": mean, "worst": worst[1]["camera"], "views": rows}
     columns = (
         "view = {camera}; FLIP = {flip:.4f}; PSNR = {psnr:.2f}; SSIM = {ssim:.4f}; "
         "gaussians = {gaussians_selected:,.0f}"

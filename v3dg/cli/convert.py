@@ -95,10 +95,8 @@ def _cut(
     options: Convert, subject: Scene | Bundle, named_camera: tuple[str, Camera]
 ) -> tuple[Gaussians, dict[str, Any]]:
     name, camera = named_camera
-    is_all = options.outside == "keep"
-    selection = select(
-        subject, camera, tolerance=options.tolerance, budget=options.budget, cull=not is_all, device=CPU
-    )
+    how: Any = {"tolerance": options.tolerance, "budget": options.budget, "cull": options.outside == "drop"}
+    selection = select(subject, camera, **how, device=CPU)
     if isinstance(subject, Bundle) and len(selection):  # its clusters alone are read
         gaussians = Gaussians.concatenate([subject.cluster_gaussians(int(c)) for c in selection.cluster_ids])
     else:

@@ -56,7 +56,6 @@ def run(options: Export) -> None:
     common: dict[str, Any] = {"up": up, "progress": not options.quiet}
     there = shlex.quote(str(folder))
     done: export.Site | export.Tiles
-    needs: tuple[str, ...]
     if options.to == "tiles":
         done = export.write_tiles(subject, folder, **common)
         text, needs = f"{done.tiles:,} tiles", () if (folder / export.CESIUM).exists() else export.TILES_NEED

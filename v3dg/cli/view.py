@@ -51,9 +51,8 @@ def run(options: View) -> None:
     from v3dg.viewer.frame import SceneView
     from v3dg.viewer.server import Site
 
-    tolerance = options.tolerance
-    if tolerance is None:
-        tolerance = DEFAULT_TOLERANCE if options.budget is None else 0.0
+    usual = DEFAULT_TOLERANCE if options.budget is None else 0.0
+    tolerance = usual if options.tolerance is None else options.tolerance
     rule_of(tolerance, options.budget, 0, "solid_angle", True)
     check_usage("--tolerance", math.isfinite(tolerance), f"a number, got {tolerance}")
     subject, cameras = open_with_cameras(options.subject)
