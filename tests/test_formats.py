@@ -633,6 +633,14 @@ def test_glb_of_splat_transform_is_read_as_it_is():
     assert_within(found.transform((0, 0, 0, 1)), reference, {})
 
 
+def test_a_glb_says_that_its_views_are_of_vertices(tmp_path):
+    """glTF-Validator asks for it."""
+    write_asset(tmp_path / "a.glb", read_asset(FIXTURES / "sh3.ply"))
+    content = (tmp_path / "a.glb").read_bytes()
+    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    assert {view["target"] for view in document["bufferViews"]} == {34962}
+
+
 def glb(change):
     """The fixture with its JSON changed by a function, or its bytes by another."""
     content = (FIXTURES / "sh3.glb").read_bytes()

@@ -91,6 +91,7 @@ def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
         "accessors": accessors,
         "bufferViews": [
             {"buffer": 0, "byteOffset": first, "byteLength": len(part)}
+            | ({} if compressed else {"target": 34962})  # ARRAY_BUFFER, which validators ask for
             for first, part in zip(ends, packed, strict=False)
         ],
         "buffers": [{"byteLength": ends[-1]}],
