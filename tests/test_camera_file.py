@@ -197,6 +197,11 @@ def test_bad_values_are_named_by_their_place(tmp_path, case):
         read_cameras(put(tmp_path, document))
 
 
+def test_distortion_is_refused_with_what_leaves_it_out(tmp_path):
+    with pytest.raises(ValueError, match=r"distortion='ignore', or --distortion ignore$"):
+        read_cameras(put(tmp_path, with_frame(k2=-0.1)))
+
+
 def test_an_applied_transform_that_scales_is_not_undone(tmp_path):
     path = put(tmp_path, {**CAPTURE, "applied_transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]})
     read_cameras(path)

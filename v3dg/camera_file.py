@@ -20,6 +20,7 @@ from v3dg.cameras import Camera, Floats, check_cameras, intrinsics, is_rotation,
 # Names of COLMAP's models that are pinholes but for the distortion, which is looked at by itself.
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_UNDISTORT = "undistort the pictures first, or leave it out: distortion='ignore', or --distortion ignore"
 _RUN = "config.yml"  # by which a run of nerfstudio is known
 _MODEL = ("images.bin", "images.txt")  # by which a model of COLMAP is
 _DATA = re.compile(r"^\s*data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:\s*- .*\n)+)", re.MULTILINE)
@@ -123,7 +124,7 @@ def _read_colmap(folder: Path, distortion: str) -> dict[str, Camera]:
     for _, image in sorted(model.images.items()):
         camera = model.cameras[image.camera_id]
         is_right = camera.is_perspective_pinhole() and (camera.is_undistorted() or distortion == "ignore")
-        found = f"{camera.model_name}; undistort the pictures first, or ignore it"
+        found = f"{camera.model_name}; {_UNDISTORT}"
         check(f"{models[0]}: {image.name}", is_right, f"a pinhole without lens distortion, got {found}")
         K, viewmat = np.diag([camera.focal_length_x, camera.focal_length_y, 1.0]), np.eye(4)
         K[:2, 2] = camera.principal_point_x, camera.principal_point_y
@@ -155,7 +156,7 @@ def _check_is_pinhole(fields: Mapping[str, Node], distortion: str) -> None:
         raise fisheye.error("a pinhole camera", "undistort the pictures first")
     for name in _DISTORTION if distortion == "refuse" else ():
         if name in fields and fields[name].number() != 0:
-            raise fields[name].error("no lens distortion", "undistort the pictures first, or ignore it")
+            raise fields[name].error("no lens distortion", _UNDISTORT)
 
 
 def _rows(node: Node) -> Floats:

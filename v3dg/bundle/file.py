@@ -115,7 +115,7 @@ class BundleFile:
         check(self.path, header_bytes > 0, "a bundle, got one that is not finished, or another kind of file")
         found = f"a header length of {header_bytes} in a file of {self.num_bytes} bytes"
         fits = header_bytes <= min(self.num_bytes - 8, file_format.MAX_HEADER_BYTES)
-        expected = f"a bundle (safetensors), got {found}; it is another kind of file or it is truncated"
+        expected = f"a bundle (safetensors), got {found}; it is truncated, or no bundle: see v3dg.open"
         self._check("header", fits, expected)
         text = header_bytes.to_bytes(8, "little") + self._read(header_bytes, 8)
         header = self._object("header", text[8:])
