@@ -106,7 +106,7 @@ def test_frame_is_the_picture_of_render(scene_view, view, device, shows, fade):
     picture, stats = drawn(scene_view, view, device, tolerance=20.0, color_by=shows, fade=fade)
     np.testing.assert_array_equal(frame.pixels, picture)
     assert frame.figures.gaussians_selected == stats.gaussians_selected
-    assert frame.figures.gaussians_in_view == stats.gaussians_in_frustum
+    assert frame.figures.gaussians_in_frustum == stats.gaussians_in_frustum
     assert frame.size == SIZE
 
 
@@ -152,7 +152,7 @@ def test_an_empty_picture_is_black_in_every_mode(scene_view):
     for shows in ("appearance", "level", "depth", "alpha", "count", "error", "difference"):
         frame = scene_view.frame(away, SIZE, Settings(shows=shows, split=0.0))
         assert not frame.pixels.any()
-        assert frame.figures.gaussians_in_view == 0
+        assert frame.figures.gaussians_in_frustum == 0
 
 
 @pytest.mark.parametrize(

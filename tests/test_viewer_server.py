@@ -91,7 +91,7 @@ def test_missing_extra_is_named_with_all_that_it_needs(blob_view, monkeypatch, m
 def test_tab_begins_with_all_of_the_scene_in_view(blob_view, up):
     view = start_view(blob_view, up)
     figures = blob_view.frame(view, (160, 90), Settings(tolerance=0.0)).figures
-    assert figures.gaussians_in_view > 0.95 * blob_view.num_gaussians
+    assert figures.gaussians_in_frustum > 0.95 * blob_view.num_gaussians
     above = np.dot(np.array(view.position) - blob_view.center, up)
     assert above > 0.3 * blob_view.radius
     camera = view.camera(160, 90, blob_view.near)

@@ -70,15 +70,15 @@ class Figures:
     """What a picture cost.
 
     Attributes:
-        gaussians_selected, gaussians_in_view, tolerance, select_ms, draw_ms: As in `v3dg.Stats`, of the cut;
-            times of the whole picture.
+        gaussians_selected, gaussians_in_frustum, tolerance: As in `v3dg.Stats`, of the cut.
+        select_ms, draw_ms: As there, of the whole picture.
         levels: (L,) selected gaussians by level.
         memory_bytes: Of the whole process.
         missing: Pages that a pool lacks for the picture.
     """
 
     gaussians_selected: int
-    gaussians_in_view: int
+    gaussians_in_frustum: int
     tolerance: float
     select_ms: float
     draw_ms: float

@@ -274,7 +274,7 @@ export class Panel {
     const number = (x) => x.toLocaleString("en");
     const rows = [
       ["selected", number(figures.gaussians_selected)],
-      ["in the frustum", number(figures.gaussians_in_view)],
+      ["in the frustum", number(figures.gaussians_in_frustum)],
       ["tolerance", `${+figures.tolerance.toPrecision(3)} px²`],
       ["select", `${figures.select_ms.toFixed(1)} ms`],
       ["draw", `${figures.draw_ms.toFixed(1)} ms`],
