@@ -358,7 +358,7 @@ def test_wrong_links_show_the_scene(browser, site, hash):
 
 def test_a_link_that_asks_for_what_is_not_there_is_told_so(browser, site):
     with Tab(browser, site.url + "/#show=residency&split=0.5") as tab:
-        tab.page.wait_for_function("document.querySelector('#notices').innerText.includes('residency')")
+        tab.page.wait_for_function("() => document.querySelector('#notices').innerText.includes('residency')")
         assert "mode residency is not there" in tab.page.inner_text("#notices")
         view = tab.view()
         assert "show" not in view
