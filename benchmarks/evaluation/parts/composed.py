@@ -122,7 +122,8 @@ def tables(result: dict[str, Any]) -> str:
 OVERVIEW = (
     "Full is every gaussian at one sample a pixel, ours the cut at the default tolerance, both drawn by the "
     "same rasterizer. Mean is over all distances from near to far, far is the farthest. FLIP is the error "
-    "against the full scene at twice the resolution: less is better."
+    "against the full scene at twice the resolution: how different two pictures look to someone who flips "
+    "between them, from 0 (not at all) to 1."
 )
 _OVERVIEW_COLUMNS = (
     Column("scene", "scene"),
