@@ -245,6 +245,16 @@ def test_info_of_a_scene(folder):
     assert (result["instances"], result["gaussians_at_full_detail"]) == (3, 3000)
 
 
+def test_info_does_not_list_hundreds_of_cameras(folder, tmp_path):
+    scene, cameras = v3dg.read_scene(folder / "scene.json")
+    camera = next(iter(cameras.values()))
+    scene.save(tmp_path / "many.json", {f"camera {i}": camera for i in range(300)})
+    told = run("info", tmp_path / "many.json").stdout.splitlines()
+    assert len([line for line in told if line.startswith("camera ")]) == 1 + 20
+    assert told[-1] == "and 280 more; --json has all"
+    assert len(json.loads(run("info", tmp_path / "many.json", "--json").stdout)["cameras"]) == 300
+
+
 @pytest.mark.parametrize("subject", ["tuft.ply", "tuft.v3dg"])
 def test_render_turntable(folder, tmp_path, subject):
     done = run(

@@ -23,6 +23,8 @@ from v3dg.scene import Scene
 # JSON values, and lines of text.
 _Description = tuple[dict[str, Any], list[str]]
 
+_MOST_SHOWN = 20  # cameras in a list: with hundreds, nothing else is left on the screen
+
 
 @dataclass
 class Info(_common.Common):
@@ -132,9 +134,7 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
         for number, bundle in enumerate(scene.bundles)
     ]
     total = sum(bundle["instances"] * bundle["asset_gaussians"] for bundle in bundles)
-    sizes = [
-        {"name": name, "width": camera.width, "height": camera.height} for name, camera in cameras.items()
-    ]
+    sizes = [{"name": name, "width": at.width, "height": at.height} for name, at in cameras.items()]
     result = {"path": str(path), "kind": "scene", "instances": len(scene)}
     result |= {"gaussians_at_full_detail": total, "bundles": bundles, "cameras": sizes}
     columns = "bundle = {path:s}; instances = {instances:,}; asset gaussians = {asset_gaussians:,}"
@@ -144,7 +144,9 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
         *_common.table_lines(columns, bundles),
     ]
     if sizes:
-        lines += ["", *_common.table_lines("camera = {name}; size = {width} x {height}", sizes)]
+        lines += ["", *_common.table_lines("camera = {name}; size = {width} x {height}", sizes[:_MOST_SHOWN])]
+    if len(sizes) > _MOST_SHOWN:
+        lines += [f"and {len(sizes) - _MOST_SHOWN:,} more; --json has all"]
     return result, lines
 
 

@@ -58,9 +58,8 @@ def run(options: View) -> None:
     subject, cameras = open_with_cameras(options.subject)
     cameras = options.read() or cameras
     photographs = None if options.cameras is None else _photographs(options.cameras, cameras or {})
-    has_levels = not isinstance(subject, Gaussians)
     expected = f"a bundle or a scene, got the asset {options.subject}; build a bundle of it"
-    check_usage("--budget", has_levels or options.budget is None, expected)
+    check_usage("--budget", options.budget is None or not isinstance(subject, Gaussians), expected)
     up, lines = choose_up(options.up, subject, cameras, options.subject)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
     with contextlib.suppress(ImportError):  # of which the site tells; it takes long
