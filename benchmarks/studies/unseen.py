@@ -3,23 +3,24 @@
     python -m benchmarks.studies.unseen ASSETS --only Paljassaare -o unseen_cpu
 
 ASSETS is a folder as `benchmarks.studies.pairs` describes it; its scenes are measured from their own
-cameras. How much is seen of a gaussian is its blend weight, summed over the pixels of other cameras, which
-stand beside those and look elsewhere: the gradient of a picture's sum by the gaussian's colour. Those with
-the least are dropped. What is left may be refitted to pictures of all gaussians, 3 x 3 samples a pixel, from
-the same other cameras. Errors are to all gaussians at 4 x 4 samples a pixel. The table has the share of the
-gaussians in the frustum, and FLIP by that of all gaussians at one sample.
+cameras. What other cameras, which stand beside those and look elsewhere, see least of is dropped, as by
+`examples/drop_unseen.py`. What is left may be refitted to pictures of all gaussians from the same other
+cameras, 3 x 3 samples a pixel. Errors are to all gaussians at 4 x 4 samples a pixel. The table has the share
+of the gaussians in the frustum, and FLIP by that of all gaussians at one sample.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import random
+import runpy
 import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -28,7 +29,6 @@ import v3dg
 from benchmarks.evaluation import record
 from benchmarks.evaluation.markdown import Column, markdown
 from benchmarks.studies.pairs_subject import Subject, scaled
-from v3dg import _core
 from v3dg.metrics import draw_truth, errors_of
 from v3dg.pictures import to_8bit
 
@@ -36,9 +36,11 @@ Row = dict[str, Any]
 
 _NARROWEST, _WIDEST = 0.9, 1.25  # of the pictures' tangent, in that of the scene's own cameras
 _PITCH = 0.4  # radians, at most
-# Adam's step sizes; positions in median scales.
-_STEPS = {"means": 0.02, "quats": 0.001, "scales": 0.004, "opacities": 0.015, "sh0": 0.003, "rest": 0.0004}
-_FINAL_STEP = 0.1
+_EXAMPLE = Path(__file__).parents[2] / "examples" / "drop_unseen.py"
+# Of a refit, Adam's first step sizes: means in median scales, scales as logarithms, opacities as logits.
+_SIZES = {"means": 3e-3, "quats": 1.5e-4, "scales": 6e-4, "opacities": 2e-3, "sh0": 4.5e-4, "rest": 6e-5}
+_LAST_STEP = 0.01  # of the first
+_SAMPLES = 3
 
 
 @dataclass
@@ -53,10 +55,8 @@ class Config:
     """Of the gaussians that are seen at all: what is kept."""
     refit: tuple[float, ...] = ()
     """Those of them that are refitted."""
-    steps: int = 240
+    steps: int = 4000
     """Of a refit, a picture each."""
-    rate: float = 0.1
-    """Factor of its step sizes."""
     width: int = 384
     """px of the pictures that weights are measured in and that is fitted to."""
     widths: tuple[int, ...] = (384,)
@@ -70,6 +70,7 @@ class Config:
     turn: float = math.pi
     """Radians by which another camera is turned at most."""
     seed: int = 0
+    device: Literal["cpu", "cuda"] = "cpu"
 
 
 def others_of(config: Config, cameras: Sequence[v3dg.Camera]) -> list[v3dg.Camera]:
@@ -95,52 +96,40 @@ def others_of(config: Config, cameras: Sequence[v3dg.Camera]) -> list[v3dg.Camer
     return made
 
 
-def weights_in(asset: v3dg.Gaussians, camera: v3dg.Camera) -> Any:
-    """(N,) blend weight of each gaussian, summed over the pixels."""
-    plain = np.full((len(asset), 1, 3), 0.5, np.float32)
-    rows = v3dg.Gaussians(asset.means, asset.quats, asset.scales, asset.opacities, plain).rows
-    options: dict[str, Any] = {"filter_px2": 0.0, "antialiased": False, "background": (0.0, 0.0, 0.0)}
-    options |= {"with_depth": False, "keep_tape": True, "plain_colors": True}
-    *_, tape = _core.rasterize(rows, camera.core, **options)
-    by_color = np.zeros((camera.height, camera.width, 3), np.float32)
-    by_color[..., 0] = 1
-    return np.asarray(_core.rasterize_backward(tape, by_color, None, None)[4])[:, 0, 0]
-
-
-def refitted(config: Config, kept: v3dg.Gaussians, asset: v3dg.Gaussians, cameras: Any) -> v3dg.Gaussians:
-    """What is kept, fitted to pictures of all gaussians."""
+def refitted(
+    kept: v3dg.Gaussians, asset: v3dg.Gaussians, cameras: Sequence[v3dg.Camera], steps: int, device: str
+) -> v3dg.Gaussians:
+    """What is kept, moved by Adam until pictures of it are those of the asset: a step a picture."""
     import torch
 
-    truths = [draw_truth(asset, camera, "cpu", 3) for camera in cameras]
-    start = {"means": kept.means, "quats": kept.quats, "scales": np.log(kept.scales.clip(1e-12))}
-    odds = kept.opacities.clip(1e-4, 1 - 1e-4)
-    start |= {"opacities": np.log(odds / (1 - odds)), "sh0": kept.sh[:, :1], "rest": kept.sh[:, 1:]}
-    values = {name: torch.tensor(array).requires_grad_() for name, array in start.items()}
-    size = float(np.median(kept.scales.max(axis=1)))
-    groups = [
-        {"params": [value], "lr": config.rate * _STEPS[name] * (size if name == "means" else 1)}
-        for name, value in values.items()
-    ]
+    whole = asset.torch(device)
+    truths = [torch.tensor(draw_truth(whole, camera, device, _SAMPLES)) for camera in cameras]
+    start = kept.torch(device)
+    values: dict[str, Any] = {"means": start.means, "quats": start.quats}
+    values |= {"scales": start.scales.clamp(1e-12).log(), "opacities": start.opacities.logit(1e-4)}
+    values |= {"sh0": start.sh[:, :1], "rest": start.sh[:, 1:]}
+    values = {name: value.clone().requires_grad_() for name, value in values.items()}
+    sizes = _SIZES | {"means": _SIZES["means"] * float(start.scales.amax(dim=1).median())}
+    groups = [{"params": [values[name]], "lr": size} for name, size in sizes.items()]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(adam, _FINAL_STEP ** (1 / config.steps))
+    smaller = torch.optim.lr_scheduler.ExponentialLR(adam, _LAST_STEP ** (1 / steps))
 
     def gaussians() -> v3dg.Gaussians:
+        shape = values["scales"].exp(), values["opacities"].sigmoid()
         quats = torch.nn.functional.normalize(values["quats"])
         sh = torch.cat([values["sh0"], values["rest"]], dim=1)
-        shape = values["scales"].exp(), values["opacities"].sigmoid()
         return v3dg.Gaussians(values["means"], quats, *shape, sh)
 
-    order = np.random.default_rng(config.seed)
-    for step in range(config.steps):
-        if step % len(cameras) == 0:
-            turn = order.permutation(len(cameras))
-        number = int(turn[step % len(cameras)])
-        truth = torch.tensor(truths[number].astype(np.float32) / 255)
-        loss = (v3dg.rasterize(gaussians(), cameras[number]).color - truth).abs().mean()
+    order = random.Random(0)
+    left: list[int] = []
+    for _ in range(steps):
+        left = left or order.sample(range(len(cameras)), len(cameras))
+        number = left.pop()
+        wanted = truths[number].to(device).float() / 255
         adam.zero_grad()
-        loss.backward()
+        (v3dg.rasterize(gaussians(), cameras[number]).color - wanted).abs().mean().backward()
         adam.step()
-        schedule.step()
+        smaller.step()
     with torch.no_grad():
         return gaussians().numpy()
 
@@ -149,18 +138,20 @@ def measure(config: Config, subject: Subject) -> list[Row]:
     """Means over the views, for each width and what is kept."""
     asset = subject.asset.numpy()
     others = others_of(config, subject.cameras)
-    weights = np.sum([weights_in(asset, camera) for camera in others], axis=0, dtype=np.float64)
+    weights_in = runpy.run_path(str(_EXAMPLE))["weights_in"]
+    weights = np.sum([weights_in(asset, camera, config.device) for camera in others], axis=0)
     seen = np.flatnonzero(weights > 0)
-    order = seen[np.argsort(weights[seen], kind="stable")]
+    seen = seen[np.argsort(weights[seen], kind="stable")]
     shown = [(width, scaled(view, width / view.width)) for width in config.widths for view in subject.cameras]
-    truths = [draw_truth(asset, camera, "cpu", 4) for _, camera in shown]
+    whole_asset = asset.torch(config.device)
+    truths = [draw_truth(whole_asset, camera, config.device, 4) for _, camera in shown]
     rows: list[Row] = []
     whole: list[Row] = []
 
     def add(kept: v3dg.Gaussians, part: float, steps: int) -> None:
         found = []
         for (width, camera), truth in zip(shown, truths, strict=True):
-            image = v3dg.render(kept, camera, device="cpu")
+            image = v3dg.render(kept.torch(config.device), camera, device=config.device)
             count = image.stats.gaussians_in_frustum
             found.append({"width": width, "count": count, **errors_of(truth, to_8bit(image.color))})
         if part == 0:
@@ -179,10 +170,10 @@ def measure(config: Config, subject: Subject) -> list[Row]:
 
     add(asset, 0, 0)
     for part in sorted({*config.parts, *config.refit}, reverse=True):
-        kept = asset.subset(np.sort(order[round(len(seen) * (1 - part)) :]))
+        kept = asset.subset(np.sort(seen[round(len(seen) * (1 - part)) :]))
         add(kept, part, 0)
         if part in config.refit:
-            add(refitted(config, kept, asset, others), part, config.steps)
+            add(refitted(kept, asset, others, config.steps, config.device), part, config.steps)
     return rows
 
 
@@ -206,8 +197,9 @@ def main(config: Config) -> None:
     for name in config.only or tuple(name for name in about if "cameras" in about[name]):
         start = time.perf_counter()
         rows += measure(config, Subject(config.assets, name, about[name], config.views))
-        settings = {"width": config.width, "others": config.others, "distance": config.distance}
-        record.write(config.output, {"settings": settings | {"turn": config.turn}, "rows": rows}, "cpu")
+        names = ("width", "others", "distance", "turn", "steps")
+        settings = {setting: getattr(config, setting) for setting in names}
+        record.write(config.output, {"settings": settings, "rows": rows}, config.device)
         print(f"{name} done, {time.perf_counter() - start:.0f} s", flush=True)
     print(markdown(_COLUMNS, rows))
 
