@@ -1,0 +1,158 @@
+"""The composed worlds with levels as they are built, and refined together: what fewer gaussians are enough.
+
+    python -m benchmarks.studies.refined_worlds --steps 10000 --persons 3 --device cuda -o refined_worlds
+    python -m benchmarks.studies.refined_worlds --report refined_worlds.json
+
+Cuts of several tolerances, from cameras near to far, are compared with all gaussians at 2 x 2 samples a
+pixel. The report has, for each camera and each FLIP that a cut of the levels as they are built has, how many
+gaussians are enough for it with refined levels, by how many are with those; and FLIP at the default tolerance
+by that of all gaussians at one sample.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import multiprocessing
+import os
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+import v3dg
+from benchmarks import worlds
+from benchmarks.evaluation import record
+from benchmarks.studies.pairs import errors
+from v3dg._judges import Judges
+from v3dg.metrics import draw_truth
+from v3dg.pictures import Picture, to_8bit
+
+Row = dict[str, Any]
+
+
+@dataclass
+class Config:
+    names: tuple[Literal["forest", "temples", "crowd"], ...] = ("forest", "temples", "crowd")
+    scale: Literal["small", "full"] = "full"
+    persons: int = 16
+    """Different ones in the crowd, each of which has to be refined."""
+    cameras: tuple[int, ...] = (43, 47, 51, 55, 59)
+    """Of the world's, the fourth to the last of twenty from near to far."""
+    built: tuple[float, ...] = (3.0, 6.0, 9.4)
+    """Tolerances of cuts of the levels as they are built; all gaussians besides."""
+    refined: tuple[float, ...] = (3.0, 4.5, 6.0, 9.4, 13.0, 18.0)
+    """Tolerances of cuts of the refined ones."""
+    steps: int = 30_000
+    device: Literal["cpu", "cuda"] = "cpu"
+    report: Path | None = None
+    """Recorded results; nothing is measured then."""
+    output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+
+
+def world_of(config: Config, name: str) -> worlds.World:
+    how: Row = dict(worlds.SMALL[name]) if config.scale == "small" else {}
+    if name == "crowd":
+        how["persons"] = config.persons
+    return worlds.WORLDS[name](**how, seed=0)
+
+
+def make_asset(asset: worlds.Asset) -> v3dg.Gaussians:
+    return asset.make()
+
+
+def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture]]:
+    """What is drawn of each world, the truth and the picture; tells what it made in `about`."""
+    how: Row = {"device": config.device, "progress": False}
+    for name in config.names:
+        world, start = world_of(config, name), time.perf_counter()
+        with multiprocessing.get_context("spawn").Pool(min(len(world.assets), os.cpu_count() or 1)) as pool:
+            assets = dict(zip(world.assets, pool.map(make_asset, world.assets.values(), 1), strict=True))
+        built = {key: v3dg.build_bundle(asset, **how) for key, asset in assets.items()}
+        refined = {key: v3dg.refine_bundle(b, steps=config.steps, **how) for key, b in built.items()}
+        seconds = round(time.perf_counter() - start, 1)
+        about[name] = {"assets": len(assets), "instances": world.num_instances, "seconds": seconds}
+        about[name]["gaussians"] = world.num_gaussians
+        scenes = {
+            "built": (worlds.scene_of(world, built), (0.0, *config.built)),
+            "refined": (worlds.scene_of(world, refined), config.refined),
+        }
+        cameras = list(world.cameras().items())
+        for label, camera in (cameras[number] for number in config.cameras):
+            truth = draw_truth(scenes["built"][0], camera, config.device)
+            for levels, (scene, tolerances) in scenes.items():
+                for tolerance in tolerances:
+                    image = v3dg.render(scene, camera, tolerance=tolerance, device=config.device)
+                    row = {"world": name, "camera": label, "levels": levels, "tolerance": tolerance}
+                    row["gaussians"] = image.stats.gaussians_in_frustum
+                    yield row, truth, to_8bit(image.color)
+
+
+def count_at(flip: float, rows: Sequence[Row]) -> float:
+    """The fewest gaussians of these cuts that have at most this FLIP, between two by the logarithm."""
+    fewest = math.inf
+    finest_first = sorted(rows, key=lambda row: -row["gaussians"])
+    for row, coarser in zip(finest_first, [*finest_first[1:], None], strict=True):
+        if row["flip"] > flip:
+            continue
+        fewest = row["gaussians"]
+        if coarser is not None and coarser["flip"] > flip:
+            part = (flip - row["flip"]) / (coarser["flip"] - row["flip"])
+            fewest *= (coarser["gaussians"] / fewest) ** part
+    return fewest
+
+
+def share_at(tolerance: float, built: Sequence[Row], refined: Sequence[Row]) -> float | None:
+    """Gaussians with refined levels by those with levels as they are built, at the FLIP of one of these cuts.
+
+    None where the coarsest cut is nearer than that: then fewer than are known may be enough. Where no refined
+    cut is as near, nothing is gained.
+    """
+    flip = next(row["flip"] for row in built if row["tolerance"] == tolerance)
+    coarsest = max(built, key=lambda row: row["tolerance"])
+    if coarsest["flip"] < flip:
+        return None
+    return min(1.0, count_at(flip, refined) / count_at(flip, built))
+
+
+def report(rows: Sequence[Row]) -> None:
+    def of(world: str, camera: str, levels: str) -> list[Row]:
+        wanted = (world, camera, levels)
+        return [row for row in rows if (row["world"], row["camera"], row["levels"]) == wanted]
+
+    for world in dict.fromkeys(row["world"] for row in rows):
+        cameras = dict.fromkeys(row["camera"] for row in rows if row["world"] == world)
+        sets = [(of(world, camera, "built"), of(world, camera, "refined")) for camera in cameras]
+        print(world, *cameras)
+        for tolerance in sorted({row["tolerance"] for row in sets[0][0]} - {0.0}):
+            shares = [share_at(tolerance, *cuts) for cuts in sets]
+            known = [share for share in shares if share is not None]
+            text = " ".join("  -  " if share is None else f"{share:.3f}" for share in shares)
+            print(f"  {tolerance}: {text} mean {statistics.fmean(known):.3f}")
+        for levels in (0, 1):
+            at_default = [
+                next(row["flip"] for row in found[levels] if row["tolerance"] == v3dg.DEFAULT_TOLERANCE)
+                / next(row["flip"] for row in found[0] if row["tolerance"] == 0)
+                for found in sets
+            ]
+            print("  FLIP by that of all,", ("built:", "refined:")[levels], *(f"{x:.3f}" for x in at_default))
+
+
+def main(config: Config) -> None:
+    if config.report is not None:
+        report(json.loads(config.report.read_text(encoding="utf-8"))["rows"])
+        return
+    about: Row = {}
+    with contextlib.closing(Judges()) as judges:
+        rows = [row | found for (row, _, _), found in judges.measured(pictures(config, about), errors)]
+    record.write(config.output, {"steps": config.steps, "worlds": about, "rows": rows}, config.device)
+    report(rows)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
