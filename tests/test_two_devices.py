@@ -49,7 +49,7 @@ def first_device():
 
 @pytest.mark.parametrize("subject", [composed_scene(0), asset(1)], ids=["scene", "asset"])
 def test_picture_is_the_same_on_the_other_device(subject):
-    here, there = (render(subject, CAMERA, device=f"cuda:{number}") for number in (0, 1))
+    here, there = (render(subject, CAMERA, depth=True, device=f"cuda:{number}") for number in (0, 1))
     assert_same(here, there)
     assert_same(there, here, "cuda:1")
     assert there.stats.gaussians_in_frustum == here.stats.gaussians_in_frustum
@@ -60,8 +60,8 @@ def test_pools_are_on_their_own_devices():
     renderers = [Renderer(scene, device=f"cuda:{number}", memory="64MB") for number in (0, 1)]
     for renderer in renderers:
         renderer.settle(CAMERA)
-    here, there = (renderer.render(CAMERA) for renderer in renderers)
-    assert_same(here, render(scene, CAMERA, device="cuda:0"))
+    here, there = (renderer.render(CAMERA, depth=True) for renderer in renderers)
+    assert_same(here, render(scene, CAMERA, depth=True, device="cuda:0"))
     assert_same(there, here, "cuda:1")
 
 
@@ -75,11 +75,11 @@ def test_renderer_stays_on_its_device(subject):
     renderers = [Renderer(subject, device=f"cuda:{number}") for number in (0, 1)]
     with torch.cuda.device(1):
         renderers.append(Renderer(subject, device="cuda"))
-    expected = renderers[0].render(CAMERA)
+    expected = renderers[0].render(CAMERA, depth=True)
     for current in (0, 1, 0):
         with torch.cuda.device(current):
             for renderer, device in zip(renderers, ("cuda:0", "cuda:1", "cuda:1"), strict=True):
-                assert_same(renderer.render(CAMERA), expected, device)
+                assert_same(renderer.render(CAMERA, depth=True), expected, device)
             assert torch.cuda.current_device() == current
 
 
@@ -90,7 +90,7 @@ def test_scene_that_moves_is_drawn_on_both():
     scene = composed_scene(5)
     for number in (0, 1, 0):
         scene.move(positions=torch.tensor(scene.positions + 0.1, device=f"cuda:{number}"))
-        pictures = [render(scene, CAMERA, device=f"cuda:{other}") for other in (0, 1)]
+        pictures = [render(scene, CAMERA, depth=True, device=f"cuda:{other}") for other in (0, 1)]
         assert_same(*pictures)
 
 
@@ -103,7 +103,7 @@ def test_cut_is_the_same_on_the_other_device():
     assert [str(g.means.device) for g in gathered] == ["cuda:0", "cuda:1"]
     for name in scenes.NAMES:
         np.testing.assert_array_equal(*(host(getattr(g, name)) for g in gathered))
-    images = [render(scene, CAMERA, cut=here, device=f"cuda:{number}") for number in (0, 1)]
+    images = [render(scene, CAMERA, cut=here, depth=True, device=f"cuda:{number}") for number in (0, 1)]
     assert_same(*images)
 
 
