@@ -181,10 +181,10 @@ POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\ns
         (b"not a picture", "expected a PNG or a JPEG, got another file"),
         (b"", "expected a PNG or a JPEG, got another file"),
         (POSTSCRIPT, "expected a PNG or a JPEG, got another file"),
-        (grey_png(8)[:50], "expected a PNG or a JPEG, got one that cannot be read"),
+        (grey_png(8)[:50], "expected a PNG or a JPEG that is not damaged, got"),
         (grey_png(12_000), "expected a picture of at most 65,500 px a side and 33,554,432 px in all"),
-        (grey_png(20_000), "expected a PNG or a JPEG, got one that cannot be read: Image size"),
-        (grey_png(2**31 - 1), "expected a PNG or a JPEG, got one that cannot be read: Image size"),
+        (grey_png(20_000), "expected a PNG or a JPEG that is not damaged, got Image size"),
+        (grey_png(2**31 - 1), "expected a PNG or a JPEG that is not damaged, got Image size"),
         (grey_png(8, depth=16, rows=8), "expected 8 bits a channel, got 16"),
     ],
 )

@@ -93,6 +93,18 @@ def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -
         raise OSError(error.errno, os.strerror(error.errno), os.fspath(path)) from error
 
 
+@contextlib.contextmanager
+def telling(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
+    """Turn all that a library raises for damaged content, which none documents, into one error."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{os.fspath(path)}: expected {expected}, got {ascii(text[:200])[1:-1]}") from None
+
+
 def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int) -> None:
     """Write all of the data to one place of a file; signals are heard now and then."""
     view = memoryview(data)

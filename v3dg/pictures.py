@@ -1,10 +1,9 @@
 """Pictures of 8 bits: from colours, on contact sheets, in files that are written whole or not at all."""
 
-import contextlib
 import io
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -106,26 +105,14 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
     name = os.fspath(path)
     with warnings.catch_warnings(), open(_files.open_regular(path), "rb") as file:
         warnings.simplefilter("ignore")  # about what else the file holds, such as more pictures
-        with _naming_damage(name):
+        is_known = file.read(8).startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8"))
+        check(name, is_known, "a PNG or a JPEG, got another file")
+        with _files.telling(name, "a PNG or a JPEG that is not damaged"):
             image = Image.open(file, formats=("PNG", "JPEG"))  # of others, Pillow starts programs
         check_size(name, *image.size, MOST_PIXELS_COMPARED)
         check(name, not image.mode.startswith("I"), "8 bits a channel, got 16; convert it first")
-        with _naming_damage(name):
+        with _files.telling(name, "a PNG or a JPEG that is not damaged"):
             return np.asarray(image.convert("RGB"))
-
-
-@contextlib.contextmanager
-def _naming_damage(name: str) -> Iterator[None]:
-    from PIL import UnidentifiedImageError
-
-    try:
-        yield
-    except MemoryError:
-        raise
-    except UnidentifiedImageError:
-        raise ValueError(f"{name}: expected a PNG or a JPEG, got another file") from None
-    except Exception as error:  # Pillow raises many kinds
-        raise ValueError(f"{name}: expected a PNG or a JPEG, got one that cannot be read: {error}") from error
 
 
 def encode_png(image: Any) -> bytes:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _files
+from v3dg._files import telling as telling
 from v3dg._json import Node
 from v3dg._numbers import check as check
 from v3dg.gaussians import Gaussians, gaussian_bytes
@@ -73,18 +74,6 @@ class File:
             is_whole = _files.read_at(self._descriptor, rows, offset)
         check(self.path, is_whole, "the file not to change while it is read, got a shorter one")
         return rows
-
-
-@contextlib.contextmanager
-def telling(path: Path, expected: str) -> Iterator[None]:
-    """Turn all that a library raises for damaged content, which none documents, into one error."""
-    try:
-        yield
-    except MemoryError:
-        raise
-    except Exception as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{os.fspath(path)}: expected {expected}, got {ascii(text[:200])[1:-1]}") from None
 
 
 def least_bytes(count: int) -> int:
