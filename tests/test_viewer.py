@@ -112,14 +112,13 @@ def test_frame_is_the_picture_of_render(scene_view, view, device, shows, fade):
 
 def test_figures_count_gaussians_by_level(scene_view, view):
     figures = scene_view.frame(view, SIZE, Settings(tolerance=20.0)).figures
-    assert figures.levels.sum() == figures.gaussians_selected
+    assert sum(figures.levels) == figures.gaussians_selected
     assert np.count_nonzero(figures.levels) > 2
     finest = scene_view.frame(view, SIZE, Settings(tolerance=0.0)).figures
     assert finest.levels[0] == finest.gaussians_selected > figures.gaussians_selected
     coarse = scene_view.frame(view, SIZE, Settings(tolerance=0.0, min_level=2)).figures
-    assert (coarse.levels[:2] == 0).all()
+    assert coarse.levels[:2] == (0, 0)
     assert coarse.levels[2] == coarse.gaussians_selected
-    assert figures.memory_bytes > 10 << 20
 
 
 def test_budget_is_kept_and_one_too_small_is_an_error(scene_view, view):

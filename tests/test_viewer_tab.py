@@ -138,6 +138,7 @@ def test_settings_change_the_cut(tab):
 
     everything = selected(tolerance=0)
     assert sum(tab.figures["levels"]) == everything
+    assert tab.figures["memory_bytes"] > 10 << 20
     assert selected(tolerance=32) < 0.7 * everything
     assert selected(tolerance=0, min_level=2) < 0.7 * everything
     assert 0 < selected(min_level=0, budget=10_000) <= 10_000

@@ -16,6 +16,7 @@ from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
+from v3dg.image import Stats
 from v3dg.pick import Pick, pick
 from v3dg.pictures import to_8bit
 from v3dg.pool import PoolLook, chosen_bytes
@@ -66,34 +67,12 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Figures:
-    """What a picture cost.
-
-    Attributes:
-        gaussians_selected, gaussians_in_frustum, tolerance: As in `v3dg.Stats`, of the cut.
-        select_ms, draw_ms: As there, of the whole picture.
-        levels: (L,) selected gaussians by level.
-        memory_bytes: Of the whole process.
-        missing: Pages that a pool lacks for the picture.
-    """
-
-    gaussians_selected: int
-    gaussians_in_frustum: int
-    tolerance: float
-    select_ms: float
-    draw_ms: float
-    levels: npt.NDArray[np.int64]
-    memory_bytes: int
-    missing: int
-
-
-@dataclass(frozen=True)
 class Frame:
     """A picture.
 
     Attributes:
         pixels: (H, W, 3).
-        figures: What it cost.
+        figures: What it cost; times are those of the whole picture, all else is the cut's.
         shows: As in its settings.
         value_range: The values of the darkest and the brightest colour, where colours are values.
         view: From where it is seen.
@@ -101,7 +80,7 @@ class Frame:
     """
 
     pixels: Pixels
-    figures: Figures
+    figures: Stats
     shows: Shows
     value_range: tuple[float, float] | None
     view: View
@@ -254,11 +233,9 @@ class SceneView:
         first = min(edge, asked.camera.width - 1)
         planes = (image.color, image.alpha, image.depth)
         color, alpha, depth = (_device.to_host(plane)[:, first:] for plane in planes)
-        of, whole = image.stats, None if finer is None else finer.color
-        levels = np.zeros(self.num_levels if of.levels else 0, np.int64)
-        levels[: len(of.levels)] = of.levels
-        cost = of.gaussians_selected, of.gaussians_in_frustum, of.tolerance, of.select_ms, of.draw_ms
-        return _Drawn(color, alpha, depth, whole, Figures(*cost, levels, _resident_bytes(), of.missing))
+        levels = image.stats.levels and (*image.stats.levels, *[0] * self.num_levels)[: self.num_levels]
+        whole = None if finer is None else finer.color
+        return _Drawn(color, alpha, depth, whole, replace(image.stats, levels=levels))
 
     def _of_all(self, asked: _Asked) -> "_Drawn":
         """What is resident, which is all; compared with all gaussians."""
@@ -279,7 +256,9 @@ class SceneView:
             finest = select(self.scene, camera, tolerance=0.0, device=self.device)
             whole = self._draw(finest, camera, (0, 0, last, camera.height), "appearance", stop)[0]
         cost = cut.num_gaussians, planes[3], cut.tolerance, 1e3 * cut.seconds, 0.0
-        return _Drawn(*planes[:3], whole, Figures(*cost, self._levels(cut), _resident_bytes(), 0))
+        level, size = cut._per_pair(lambda c: c.level), cut._per_pair(lambda c: np.diff(c.offset))
+        levels = np.bincount(level, size, self.num_levels).astype(int).tolist()
+        return _Drawn(*planes[:3], whole, Stats(*cost, tuple(levels)))
 
     def _draw(
         self, cut: Selection, camera: Camera, window: Window, color_by: ColorBy, stop: _core.Stop | None
@@ -306,11 +285,6 @@ class SceneView:
         _check(stop)
         return drawing.color, drawing.alpha, drawing.depth, drawing.finish().in_frustum
 
-    def _levels(self, cut: Selection) -> npt.NDArray[np.int64]:
-        """(L,) selected gaussians by level."""
-        level, size = cut._per_pair(lambda c: c.level), cut._per_pair(lambda c: np.diff(c.offset))
-        return np.bincount(level, size, self.num_levels).astype(np.int64)
-
 
 class _Drawn(NamedTuple):
     """Planes of what is right of the split, what it is compared with from the left on, and what it cost."""
@@ -319,7 +293,7 @@ class _Drawn(NamedTuple):
     alpha: Any
     depth: Any  # or how many gaussians a pixel is blended of
     whole: Any
-    figures: Figures
+    figures: Stats
 
 
 def _painted(drawn: _Drawn, settings: Settings) -> tuple[Any, tuple[float, float] | None, float | None]:
@@ -328,7 +302,9 @@ def _painted(drawn: _Drawn, settings: Settings) -> tuple[Any, tuple[float, float
     if shows == "count":
         values = np.log2(np.maximum(depth, 1)) / np.log2(MOST_COUNTED)
         return _core.ramp(values) * (depth > 0)[..., None], (1.0, MOST_COUNTED), None
-    distance = _distance(alpha, depth)
+    middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
+    covered = depth[middle][alpha[middle] > 0.5]
+    distance = float(np.median(covered)) if covered.size else None
     if shows == "error":
         mean = np.clip(drawn.color[..., 0] / np.maximum(alpha, 1e-6), 0, 1)
         return _core.ramp(mean) * alpha[..., None], (0.0, drawn.figures.tolerance), distance
@@ -344,13 +320,6 @@ def _painted(drawn: _Drawn, settings: Settings) -> tuple[Any, tuple[float, float
         difference = np.abs(drawn.color - drawn.whole[:, -alpha.shape[1] :])
         return np.minimum(settings.gain * difference, np.float32(1)), None, distance
     return drawn.color, None, distance
-
-
-def _distance(alpha: npt.NDArray[np.float32], depth: npt.NDArray[np.float32]) -> float | None:
-    """How far what is in the middle of a picture mostly is; None where nothing is."""
-    middle = tuple(slice(side * 3 // 8, side * 5 // 8 + 1) for side in alpha.shape)
-    covered = depth[middle][alpha[middle] > 0.5]
-    return float(np.median(covered)) if covered.size else None
 
 
 def _check(stop: _core.Stop | None) -> None:
@@ -373,9 +342,3 @@ def _bounds(scene: Scene) -> tuple[Any, float]:
         corners.append(placed.reshape(-1, 3))
     points = np.concatenate(corners)
     return ball_of_most(points) if len(points) else (np.zeros(3), 1.0)
-
-
-def _resident_bytes() -> int:
-    """Memory that this process holds."""
-    with open("/proc/self/statm", encoding="ascii") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

@@ -161,10 +161,8 @@ class RenderLoop:
         start = time.perf_counter()
         try:
             frame = self._scene_view.frame(request.view, draft.size, settings, stop, self._steps)
-        except Stopped:  # it would have taken so long at least
+        finally:  # where it was stopped, it would have taken so long at least
             self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
-            raise
-        self._pacer.drew(draft, 1e3 * (time.perf_counter() - start))
         sizes = finer_sizes(draft.size, request.size)
         if settings != request.settings and not sizes:
             sizes = [draft.size]
