@@ -194,6 +194,7 @@ def gather(
     weights: Float32 | None = None,
     device: int,
 ) -> Columns: ...
+def transform(rows: Rows, quaternion: Float64, position: Float64, scale: float) -> Columns: ...
 
 # select
 class ClusterTable:

@@ -143,21 +143,9 @@ class Gaussians:
         turn = vector(quaternion, "quaternion", (4,))
         check("quaternion", turn.any(), "a rotation, got a quaternion of zeros")
         turn /= np.abs(turn).max()  # so that squares neither overflow nor vanish
-        rows = _core.gather(
-            bundles=[self.rows],
-            instances=_core.Instances(
-                bundle=np.zeros(1, np.int32),
-                positions=vector(position, "position")[None],
-                quaternions=turn[None] / np.linalg.norm(turn),
-                scales=np.array([positive(scale, "scale")]),
-                importance=np.ones(1, np.float32),
-            ),
-            instance=np.zeros(1, np.int32),
-            first_row=np.zeros(1, np.int64),
-            offset=np.array([0, len(self)]),
-            device=self.means.device.index if getattr(self.means, "is_cuda", False) else -1,
-        )
-        moved = Gaussians(*rows)
+        turn /= np.linalg.norm(turn)
+        where = vector(position, "position"), positive(scale, "scale")
+        moved = Gaussians(*_core.transform(self.rows, turn, *where))
         return moved.torch() if _is_tensor(self.means) else moved
 
     @staticmethod

@@ -26,6 +26,16 @@ void check_clusters(const GatherInput& in) {
     }
 }
 
+py::tuple gathered(const GatherInput& in, Device device, int sh_degree) {
+    const Work work(device);
+    const NewRows out(device, static_cast<size_t>(in.offset[in.instance.size]), sh_degree);
+    {
+        const py::gil_scoped_release unlocked;
+        V3DG_DISPATCH(work, gather, in, out.rows());
+    }
+    return out.arrays();
+}
+
 py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles, const Instances& instances,
                  const py::array& instance, const py::array& first_row, const py::array& offset,
                  const py::object& weights, int device) {
@@ -51,13 +61,23 @@ py::tuple gather(const std::vector<std::reference_wrapper<const Rows>>& bundles,
     in.offset = span_of<const int64_t>(offset, "offset", {num_clusters + 1});
     if (!weights.is_none()) in.weight = span_of<const float>(weights, "weights", {num_clusters});
     check_clusters(in);
-    const Work work(Device{device});
-    const NewRows out(Device{device}, static_cast<size_t>(in.offset[in.instance.size]), sh_degree);
-    {
-        const py::gil_scoped_release unlocked;
-        V3DG_DISPATCH(work, gather, in, out.rows());
-    }
-    return out.arrays();
+    return gathered(in, Device{device}, sh_degree);
+}
+
+// All of a bundle as one cluster of one instance.
+py::tuple transform(const Rows& rows, const py::array& quaternion, const py::array& position, double scale) {
+    const GaussianRows<const float> bundle = rows.read<float>();
+    const int32_t first = 0;
+    const int64_t first_row = 0, offset[] = {0, static_cast<int64_t>(bundle.size)};
+    GatherInput in;
+    in.bundles = {&bundle, 1};
+    in.bundle = in.instance = {&first, 1};
+    in.position = span_of<const double>(position, "position", {3});
+    in.quaternion = span_of<const double>(quaternion, "quaternion", {4});
+    in.scale = {&scale, 1};
+    in.first_row = {&first_row, 1};
+    in.offset = {offset, 2};
+    return gathered(in, rows.device(), rows.sh_degree());
 }
 
 }  // namespace
@@ -66,6 +86,8 @@ void bind_gather(py::module_& m) {
     m.def("gather", &gather, py::kw_only(), "bundles"_a, "instances"_a, "instance"_a, "first_row"_a,
           "offset"_a, "weights"_a = py::none(), "device"_a,
           "Gaussians of clusters of instances in the world: means, quats, scales, opacities, sh.");
+    m.def("transform", &transform, "rows"_a, "quaternion"_a, "position"_a, "scale"_a,
+          "Gaussians in another frame, to which points go by scale * rotation p + position.");
 }
 
 }  // namespace v3dg
