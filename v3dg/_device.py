@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -101,8 +101,7 @@ def place(gaussians: Gaussians, device: Device) -> Gaussians:
     """The gaussians as NumPy arrays (on the CPU) or as tensors on a CUDA device, without gradients."""
     if not device.is_cuda:
         return gaussians.numpy()
-    there = gaussians.torch(str(device))
-    return Gaussians(*(getattr(there, field.name).detach() for field in fields(there)))
+    return Gaussians(*(array.detach() for array in vars(gaussians.torch(str(device))).values()))
 
 
 def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Array:

@@ -43,12 +43,11 @@ class Bar:
     def __enter__(self: T) -> T:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
+    def close(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.close()
+
+    __exit__ = close
 
     def update(self, count: int, text: str = "") -> None:
         """Count what is done since, and say what is at work."""

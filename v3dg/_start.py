@@ -22,12 +22,6 @@ SIGNALS = (signal.SIGINT, signal.SIGALRM)
 """Of Ctrl-C: the second brings one again that could not be heard when it came, in the midst of an import."""
 
 
-def is_command() -> bool:
-    """Whether Python was started as `v3dg` or `python -m v3dg`."""
-    started = sys.orig_argv[-len(sys.argv) :][:1]  # what stands before the arguments
-    return [os.path.basename(name) for name in started] in (["v3dg"], ["-mv3dg"])
-
-
 def begin() -> None:
     """Open streams that are closed, to nothing, and have Ctrl-C end the process."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else whoever started it ignores them
@@ -102,5 +96,6 @@ def _is_importing(frame: types.FrameType | None) -> bool:
     return False
 
 
-if is_command():
+# What stands before the arguments, if anything does.
+if [os.path.basename(name) for name in sys.orig_argv[-len(sys.argv) :][:1]] in (["v3dg"], ["-mv3dg"]):
     begin()

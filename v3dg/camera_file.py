@@ -58,15 +58,14 @@ def read_cameras(
     place = Path(path)
     if place.name in (_RUN, *_MODEL):
         place = place.parent
-    run = place
-    is_run = (run / _RUN).is_file()
+    is_run = (place / _RUN).is_file()
     if is_run:
-        path, applied_transform = _data_of(run), "undo"
+        path, applied_transform = _data_of(place), "undo"
     elif place.is_dir():
         return _read_colmap(place, distortion)
     top = read_json(path).some_fields(("frames",))
     transforms = [_applied(top)] if applied_transform == "undo" else []
-    transforms += [_trained(run)] if is_run else []
+    transforms += [_trained(place)] if is_run else []
     names, cameras = [], []
     for node in top["frames"].items():
         frame = node.some_fields(("transform_matrix",))
@@ -76,8 +75,10 @@ def read_cameras(
         K, width, height = _intrinsics(node, fields, focal, size)
         near = fields["near"].positive() if "near" in fields else 0.01
         viewmat = node.attempt(partial(viewmat_from_blender, _rows(fields["transform_matrix"])))
-        for transform in transforms:
-            viewmat = _undone(viewmat, *transform)
+        for transform, scale in transforms:  # to the world before them
+            with np.errstate(over="ignore", invalid="ignore"):  # the camera refuses what comes of it
+                viewmat = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
+                viewmat[:3] /= scale  # the camera's own unit goes along
         cameras.append(node.attempt(partial(Camera, viewmat, K, width, height, near)))
         names.append(frame["file_path"].text() if "file_path" in frame else "")
     if "" in names or len(set(names)) < len(names):
@@ -174,14 +175,6 @@ def _applied(top: Mapping[str, Node]) -> tuple[Floats, float]:
     if not is_rotation(transform[:3, :3]):
         raise top["applied_transform"].error("a rotation and a translation")
     return transform, scale
-
-
-def _undone(viewmat: Floats, transform: Floats, scale: float) -> Floats:
-    """World to camera for the world before the transform and the scale."""
-    with np.errstate(over="ignore", invalid="ignore"):  # the camera refuses what comes of it
-        before = viewmat @ (np.diag([scale, scale, scale, 1.0]) @ transform)
-        before[:3] /= scale  # the camera's own unit goes along
-    return before
 
 
 def _intrinsics(

@@ -65,7 +65,10 @@ def run_demo(
     columns: list[dict[str, Any]] = []
     rows: tuple[list[tuple[str, Picture]], ...] = ([], [])
     for distance, elevation in counted(views, len(views), "draw", progress):
-        camera = _camera(distance, elevation, *size)
+        # Of the middle of the field: from near a donut, from far the whole hill.
+        across, target = distance * math.cos(elevation), 0.42 / (1 + (distance / 12) ** 2)
+        x, y, z = math.sin(_AZIMUTH) * across, -math.cos(_AZIMUTH) * across, distance * math.sin(elevation)
+        camera = Camera.look_at((x, y, target + z), (0, 0, target), width=size[0], height=size[1])
         truth = draw_truth(scene, camera, where, background=_SKY)
         columns.append({"distance": distance})
         for name, row, px2 in (("full", rows[0], 0.0), ("bundle", rows[1], tolerance)):
@@ -76,13 +79,6 @@ def run_demo(
     result |= {"levels": bundle.num_levels, "bundle_gaussians": bundle.num_gaussians}
     result |= {"tolerance": tolerance, "device": str(where), "build_seconds": build_seconds}
     return result | {"seconds": time.perf_counter() - start, "columns": columns}
-
-
-def _camera(distance: float, elevation: float, width: int, height: int) -> Camera:
-    """Look at the middle of the field: from near at a donut, from far at the whole hill."""
-    across, target = distance * math.cos(elevation), 0.42 / (1 + (distance / 12) ** 2)
-    x, y, z = math.sin(_AZIMUTH) * across, -math.cos(_AZIMUTH) * across, distance * math.sin(elevation)
-    return Camera.look_at((x, y, target + z), (0, 0, target), width=width, height=height)
 
 
 def _drawn(

@@ -4,7 +4,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v3dg import _core
 from v3dg._numbers import check
@@ -38,7 +37,10 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
     rng = np.random.default_rng(seed)
     count = num_gaussians // 5 // _SPRINKLES  # in each sprinkle
     on_tube = num_gaussians - count * _SPRINKLES
-    around, along = rng.uniform(0, 2 * np.pi, on_tube), _angles_along(on_tube, rng)
+    around, angles = rng.uniform(0, 2 * np.pi, on_tube), np.linspace(-np.pi, np.pi, 1000)
+    # Along the tube's section, 0 outside, pi/2 up, spread evenly over its surface.
+    share = (_RING * (angles + np.pi) + _TUBE * np.sin(angles)) / (2 * np.pi * _RING)
+    along = np.interp(rng.random(on_tube), share, angles)
     phase, outside = rng.uniform(0, 2 * np.pi, (2, 4, 1)), np.cos(along) > 0
     drips = (0.07 * np.sin(np.array([[3], [5], [8], [13]]) * around + np.where(outside, *phase))).sum(0)
     icing = np.clip((np.sin(along) - 0.1 - drips) / 0.08, 0, 1)
@@ -63,13 +65,6 @@ def make_donut(num_gaussians: int = 50_000, *, seed: int = 0) -> Gaussians:
     scales = np.stack([longest, middle, thinnest], 1)
     arrays = points, _quats(normals, rng), scales, opacities, _lit(normals, albedo, gloss)
     return Gaussians(*(array[order].astype(np.float32) for array in arrays))
-
-
-def _angles_along(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Angles along the tube's section, 0 outside, pi/2 up, spread evenly over its surface."""
-    angles = np.linspace(-np.pi, np.pi, 1000)
-    share = (_RING * (angles + np.pi) + _TUBE * np.sin(angles)) / (2 * np.pi * _RING)
-    return np.interp(rng.random(count), share, angles)
 
 
 def _on_tube(around: Any, along: Any, radius: Any) -> tuple[Any, Any]:

@@ -20,11 +20,7 @@ class Image:
     """
 
     def __init__(self, color: Any, alpha: Any, depth: Any) -> None:
-        self._own = SimpleNamespace(color=color, alpha=alpha, depth=depth)
-
-    @property
-    def _planes(self) -> Any:
-        return self._own
+        self._planes: Any = SimpleNamespace(color=color, alpha=alpha, depth=depth)
 
     def _repr_png_(self) -> bytes:
         """The picture, for notebooks."""

@@ -26,16 +26,11 @@ MIN_TRANSMITTANCE = 1e-4
 FLIP_MISSING = _extras.missing("flip_evaluator")
 
 
-def _picture(name: str, image: Any) -> NDArray[np.floating[Any]]:
-    """The picture as `pictures.checked` has it, of floats."""
-    picture = checked(name, image)
-    is_float = np.issubdtype(picture.dtype, np.floating)
-    check(name, is_float, f"floats in [0, 1], got {picture.dtype}; divide 8-bit pictures by 255")
-    return picture
-
-
 def _pair(reference: Any, test: Any) -> tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]:
-    a, b = _picture("reference", reference), _picture("test", test)
+    """The pictures as `pictures.checked` has them, of floats and of one size."""
+    a, b = checked("reference", reference), checked("test", test)
+    for name, dtype in (("reference", a.dtype), ("test", b.dtype)):
+        check(name, dtype.kind == "f", f"floats in [0, 1], got {dtype}; divide 8-bit pictures by 255")
     check("test", a.shape == b.shape, f"the reference's shape {a.shape}, got {b.shape}")
     return a, b
 

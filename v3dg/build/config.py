@@ -1,7 +1,7 @@
 """How a bundle is built."""
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from v3dg._numbers import check
@@ -173,32 +173,30 @@ class BuildConfig:
         640 fresh random views of 64 x 64 px at four radii, against the previous level, without a filter;
         0.8 L1 + 0.2 D-SSIM + 0.1 alpha.
         """
-        return replace(
-            BuildConfig(
-                cluster_size=4096,
-                group_size=2,
-                min_clusters=2,
-                init="prune",
-                targets="previous",
-                steps=640,
-                first_steps=640,
-                views_per_step=1,
-                num_views=0,
-                supersample=1,
-                image_size=64,
-                filter_px2=0.0,
-                loss_l1=0.8,
-                loss_dssim=0.2,
-                loss_alpha=0.1,
-                step_position=1.6e-5,
-                position_in_world=True,
-                step_log_scale=5e-3,
-                step_quat=1e-3,
-                step_logit=5e-2,
-                step_sh0=2.5e-3,
-                step_sh_rest=2.5e-3 / 20,
-                final_step=1.0,
-                beta2=0.999,
-            ),
-            **changes,
+        settings: dict[str, Any] = dict(
+            cluster_size=4096,
+            group_size=2,
+            min_clusters=2,
+            init="prune",
+            targets="previous",
+            steps=640,
+            first_steps=640,
+            views_per_step=1,
+            num_views=0,
+            supersample=1,
+            image_size=64,
+            filter_px2=0.0,
+            loss_l1=0.8,
+            loss_dssim=0.2,
+            loss_alpha=0.1,
+            step_position=1.6e-5,
+            position_in_world=True,
+            step_log_scale=5e-3,
+            step_quat=1e-3,
+            step_logit=5e-2,
+            step_sh0=2.5e-3,
+            step_sh_rest=2.5e-3 / 20,
+            final_step=1.0,
+            beta2=0.999,
         )
+        return BuildConfig(**settings | changes)

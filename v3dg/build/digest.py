@@ -16,11 +16,9 @@ PIECE = 1 << 16
 def digest_of(asset: Gaussians) -> str:
     """What tells an asset from others, wherever it was read from."""
     pieces = pieces_of(asset.numpy())
-    if len(pieces) < 4:
-        # Less work than starting threads, which Python does not do safely where memory runs out.
-        return digest_of_hashes(map(hash_of, pieces))
     with new_pool() as pool:
-        return digest_of_hashes(pool.map(hash_of, pieces))
+        # A few are less work than starting threads, which Python does not do safely where memory runs out.
+        return digest_of_hashes(pool.map(hash_of, pieces) if len(pieces) > 3 else map(hash_of, pieces))
 
 
 def pieces_of(gaussians: Gaussians) -> list[Gaussians]:

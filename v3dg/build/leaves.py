@@ -64,16 +64,13 @@ class MemoryLeaves(Leaves):
         """Leaves `first` to `last`, where the asset is."""
         with self._lock:
             if self._order is None:
-                self._order = self._split()
+                means = _device.place_rows(self._asset.means, self._drawable, self._device)
+                depth = _core.num_halvings(self.num_gaussians, self._config.cluster_size)
+                order, _ = _core.median_split(means, np.array([0, self.num_gaussians]), depth)
+                kind: Any = np.int32 if self.asset_gaussians < 1 << 31 else np.int64
+                rows: npt.NDArray[np.integer[Any]] = np.flatnonzero(self._drawable).astype(kind)
+                self._order = np.take(rows, _device.to_host(order))
         return self._asset.subset(self._order[first:last])
-
-    def _split(self) -> npt.NDArray[np.integer[Any]]:
-        means = _device.place_rows(self._asset.means, self._drawable, self._device)
-        depth = _core.num_halvings(self.num_gaussians, self._config.cluster_size)
-        order, _ = _core.median_split(means, np.array([0, self.num_gaussians]), depth)
-        kind: Any = np.int32 if self.asset_gaussians < 1 << 31 else np.int64
-        rows: npt.NDArray[np.integer[Any]] = np.flatnonzero(self._drawable).astype(kind)
-        return np.take(rows, _device.to_host(order))
 
 
 def made_with(leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None) -> dict[str, Any]:

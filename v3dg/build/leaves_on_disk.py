@@ -108,7 +108,11 @@ def leaves_on_disk(
             del buffer
             yield leaves
         else:
-            _check_disk(folder, count, degree)
+            needed, free = scratch_bytes(count, degree), shutil.disk_usage(folder).free
+            if free < needed:
+                found = f"{in_mib(needed)} free for scratch, got {in_mib(free)}"
+                advice = "free some, write to another disk, or give so much memory that none is needed"
+                raise OSError(f"{folder}: expected {found}; {advice}")
             yield _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
 
 
@@ -166,15 +170,6 @@ def _bytes_in_bucket(degree: int) -> int:
 def scratch_bytes(count: int, degree: int) -> int:
     """What the scratch of so many gaussians takes on the disk, at most."""
     return count * (4 + max(gaussian_bytes(degree), 2 * 16))
-
-
-def _check_disk(folder: Path, count: int, degree: int) -> None:
-    needed, free = scratch_bytes(count, degree), shutil.disk_usage(folder).free
-    if free < needed:
-        raise OSError(
-            f"{folder}: expected {in_mib(needed)} free for scratch, got {in_mib(free)}; "
-            "free some, write to another disk, or give so much memory that none is needed"
-        )
 
 
 def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Any) -> _Blocks:

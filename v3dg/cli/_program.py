@@ -84,7 +84,7 @@ class Program:
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """Run one command, by default the one this program was started with, and return its exit code."""
         if arguments is None:
-            warnings.showwarning = _warn
+            warnings.showwarning = lambda message, *_, **__: tell(f"v3dg: warning: {message}")
         code = 0
         try:
             code = self._run(arguments)
@@ -169,7 +169,3 @@ def _flush(code: int) -> int:
 def _fail(message: str, code: int) -> int:
     tell(f"v3dg: error: {message}")
     return code
-
-
-def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
-    tell(f"v3dg: warning: {message}")

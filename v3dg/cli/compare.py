@@ -130,18 +130,13 @@ def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair], int | None]:
         pictures.check_size(f"camera {name}, supersampled", *sides)
 
     finest = _common.level_size(test, 0) if isinstance(test, Bundle) and test.num_levels else None
+    how: Any = {"tolerance": options.tolerance, "budget": options.budget, "device": device}
+    how["min_transmittance"] = MIN_TRANSMITTANCE  # the truth's, so that only the gaussians differ
 
     def pairs() -> Iterator[_Pair]:
         for name, camera in cameras.items():
             truth = draw_truth(reference, camera, device, options.supersample)
-            image = render(
-                test,
-                camera,
-                tolerance=options.tolerance,
-                budget=options.budget,
-                min_transmittance=MIN_TRANSMITTANCE,  # the truth's, so that only the gaussians differ
-                device=device,
-            )
+            image = render(test, camera, **how)
             yield _Pair(name, truth, to_8bit(image.color), image.stats.gaussians_selected)
 
     return list(cameras), pairs(), finest

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -36,15 +36,9 @@ def run(options: Demo) -> None:
         check_range("--size", side, 16, 4096)
     check_range("--seed", options.seed, 0, (1 << 58) - 1)
     rule_of(options.tolerance, None, 0, "solid_angle", True)
-    result = run_demo(
-        options.output,
-        num_gaussians=options.gaussians,
-        instances=options.instances,
-        size=options.size,
-        tolerance=options.tolerance,
-        seed=options.seed,
-        progress=not options.quiet,
-    )
+    names = ("instances", "size", "tolerance", "seed")
+    how: dict[str, Any] = {name: getattr(options, name) for name in names}
+    result = run_demo(options.output, num_gaussians=options.gaussians, progress=not options.quiet, **how)
     columns = (
         "drawn = {name}, distance {distance:g}; gaussians = {gaussians:,}; "
         "select ms = {select_ms:.1f}; draw ms = {draw_ms:.1f}; FLIP = {flip:.4f}; PSNR = {psnr:.2f}"

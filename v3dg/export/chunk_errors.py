@@ -33,19 +33,15 @@ class ChunkErrors:
         """Add the next level of a chunk, which need not have gaussians."""
         errors, error = self.of_chunk[chunk], 0.0
         if len(gaussians) and chunk not in self._finest:
-            cameras = _cameras_around(gaussians)
+            middle, radius = ball_of_most(gaussians.means.astype(np.float64))
+            far = max(radius, 1e-6) / np.sin(_FOV / 2)
+            how = {"fov_x": _FOV, "width": _SIDE_PX, "height": _SIDE_PX, "near": far / 100}
+            cameras = [Camera.look_at(middle + far * side, middle, **how) for side in _DIRECTIONS]
             self._finest[chunk] = cameras, _pictures(gaussians, cameras).astype(np.float16)
         elif len(gaussians):
             cameras, finest = self._finest[chunk]
             error = float(np.square(_pictures(gaussians, cameras) - finest).mean())
         errors.append(max(error, *errors[-1:]) if errors else error)
-
-
-def _cameras_around(gaussians: Gaussians) -> list[Camera]:
-    middle, radius = ball_of_most(gaussians.means.astype(np.float64))
-    far = max(radius, 1e-6) / np.sin(_FOV / 2)
-    options = {"fov_x": _FOV, "width": _SIDE_PX, "height": _SIDE_PX, "near": far / 100}
-    return [Camera.look_at(middle + far * direction, middle, **options) for direction in _DIRECTIONS]
 
 
 def _pictures(gaussians: Gaussians, cameras: list[Camera]) -> Floats:

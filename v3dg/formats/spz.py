@@ -72,7 +72,9 @@ def write(path: Path, gaussians: Gaussians, version: int = 3) -> None:
 def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
     """Parts of a `.spz` file, of NumPy gaussians with values that can be held."""
     reach = float(np.abs(host.means).max(initial=0.0))
-    bits = _fraction_bits(reach)
+    whole = math.ceil(math.log2(reach)) if reach > 0 else 0
+    # After the point: 12, as Niantic's writer has it, but 2^-17 of the largest coordinate at most.
+    bits = max(0, min(max(12, 17 - whole), 22 - whole, 24))
     fits = reach * 2**bits <= _LARGEST_FIXED
     check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
 
@@ -114,12 +116,6 @@ def _zstd_parts(header: bytes, count: int, sections: list[Callable[[slice], byte
 
 def _bytes(values: Floats) -> bytes:
     return _packing.to_integers(values, 255).astype(np.uint8).tobytes()
-
-
-def _fraction_bits(reach: float) -> int:
-    """Bits after the point: 12, as Niantic's writer has it, but 2^-17 of the largest coordinate at most."""
-    whole = math.ceil(math.log2(reach)) if reach > 0 else 0
-    return max(0, min(max(12, 17 - whole), 22 - whole, 24))
 
 
 def _rotation_bytes(quats: Floats) -> bytes:
