@@ -1,19 +1,27 @@
-"""Files at URLs: each is fetched once, by fsspec, into a folder that goes when the process ends."""
+"""Files at URLs, by fsspec: what is needed of one, or all, comes to a folder that goes with the process."""
 
 import atexit
+import contextlib
 import os
 import re
 import shutil
 import tempfile
+import threading
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
+
+import numpy as np
 
 from v3dg import _extras
 from v3dg._numbers import check
 
 # A `Path` of a URL has one slash where there were two.
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+(?=.)")
-_fetched: dict[str, str] = {}
+_BLOCK_BYTES = 1024  # that come together; pages have far more
+_MOST_BLOCKS, _MOST_PIECES = 1 << 12, 8  # of a piece, and that are asked for at once
+_opened: dict[tuple[str, str], "FileAtUrl"] = {}
 
 
 def is_url(path: str | os.PathLike[str]) -> bool:
@@ -26,18 +34,19 @@ def beside(path: str | os.PathLike[str]) -> Path:
     return Path(os.path.basename(unquote(urlsplit(os.fspath(path)).path)) if is_url(path) else path)
 
 
-def is_fetched(path: str) -> bool:
-    """Whether a file goes when the process ends."""
-    return path in _fetched.values()
-
-
 def local(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
-    """A file that is here: the one of that name, or what is fetched from a URL.
+    """A file that is here: the one of that name, or what is fetched from a URL; errors as `in_parts`."""
+    found = in_parts(path)
+    return found.whole() if isinstance(found, FileAtUrl) else found
+
+
+def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUrl":
+    """A file that is here, or one at a URL, as it is there now, of which nothing is fetched yet.
 
     Raises:
         ImportError: The extra `fsspec` is not installed, or what it needs for such URLs.
         ValueError: It is a URL of no file, or of one that names others, which are not fetched.
-        OSError: It cannot be fetched.
+        OSError: It cannot be had.
     """
     if not is_url(path):
         return path
@@ -45,15 +54,87 @@ def local(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
     name = beside(path).name
     expected = "the URL of a bundle, or of an asset in one file"
     check(url, name and not name.endswith(".json"), f"{expected}, got one of a file that names others")
-    if url not in _fetched:
-        fsspec, folder = _extras.load("fsspec"), tempfile.mkdtemp(prefix="v3dg_")
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        target = os.path.join(folder, name)
-        try:
-            fsspec.open(url).fs.get_file(url, target)
-        except (ImportError, ValueError):
-            raise
-        except Exception as error:  # of whichever package knows such URLs
-            raise OSError(f"{url}: expected a file, got {type(error).__name__}: {error}") from error
-        _fetched[url] = target
-    return _fetched[url]
+    fsspec = _extras.load("fsspec")
+    with _naming_errors(url):
+        there, place = fsspec.core.url_to_fs(url)
+        info = there.info(place)
+    key = url, str(info)  # which mostly has a tag or a time, besides the size
+    if key not in _opened:
+        _opened[key] = FileAtUrl(url, there, place, info["size"], name)
+    return _opened[key]
+
+
+@contextlib.contextmanager
+def _naming_errors(url: str) -> Iterator[None]:
+    """Make an OSError of what goes wrong in whichever package knows such URLs."""
+    try:
+        yield
+    except (ImportError, ValueError):
+        raise
+    except Exception as error:
+        raise OSError(f"{url}: expected a file, got {type(error).__name__}: {error}") from error
+
+
+class FileAtUrl(os.PathLike[str]):
+    """A file at a URL, and one of its size here, to which comes what is needed, once.
+
+    Attributes:
+        copy: The name of the file here.
+    """
+
+    def __init__(self, url: str, there: Any, place: str, num_bytes: int | None, name: str) -> None:
+        self._url, self._there, self._place, self._num_bytes = url, there, place, num_bytes
+        self.copy = os.path.join(tempfile.mkdtemp(prefix="v3dg_"), name)
+        atexit.register(shutil.rmtree, os.path.dirname(self.copy), ignore_errors=True)
+        with open(self.copy, "wb") as file:
+            file.truncate(num_bytes or 0)
+        self._is_here = np.zeros(-(-(num_bytes or 0) // _BLOCK_BYTES), bool)  # each block
+        # Only those of the asynchronous kind are for several threads.
+        self._lock: Any = contextlib.nullcontext() if there.async_impl else threading.Lock()
+        if num_bytes is None:  # no parts without it
+            self.whole()
+
+    def __fspath__(self) -> str:
+        return self._url
+
+    def whole(self) -> str:
+        """The name of the file here, all of which is there."""
+        if self._num_bytes is None or not self._is_here.all():
+            with self._lock, _naming_errors(self._url):
+                self._there.get_file(self._place, self.copy)
+            self._num_bytes = os.stat(self.copy).st_size
+            self._is_here = np.ones(-(-self._num_bytes // _BLOCK_BYTES), bool)
+        return self.copy
+
+    def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
+        """Have the bytes from each first to each last here; on any thread.
+
+        Raises:
+            OSError: They cannot be had.
+            ValueError: There are fewer than there were.
+        """
+        wanted = np.zeros_like(self._is_here)
+        for first, last in parts:
+            wanted[first // _BLOCK_BYTES : -(-last // _BLOCK_BYTES)] = True
+        blocks = np.flatnonzero(wanted & ~self._is_here)
+        cuts = np.flatnonzero((np.diff(blocks) > 1) | (blocks[1:] % _MOST_BLOCKS == 0)) + 1
+        pieces = [(piece[0], piece[-1] + 1) for piece in np.split(blocks, cuts) if len(piece)]
+        for k in range(0, len(pieces), _MOST_PIECES):
+            some = np.minimum(
+                _BLOCK_BYTES * np.array(pieces[k : k + _MOST_PIECES]), self._num_bytes or 0
+            ).tolist()
+            with self._lock, _naming_errors(self._url), open(self.copy, "r+b") as file:
+                found = self._there.cat_ranges([self._place] * len(some), *map(list, zip(*some, strict=True)))
+                for (first, last), data in zip(some, found, strict=True):
+                    if isinstance(data, Exception):
+                        raise data
+                    if len(data) == self._num_bytes:  # its server knows no parts
+                        first, last = 0, self._num_bytes
+                    expected = (
+                        f"{last - first} bytes at {first}, got {len(data)}; it has changed, open it again"
+                    )
+                    check(self._url, len(data) == last - first, expected)
+                    file.seek(first)
+                    file.write(data)
+                    file.flush()  # before anybody takes it to be there
+                    self._is_here[first // _BLOCK_BYTES : -(-last // _BLOCK_BYTES)] = True

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from v3dg._numbers import check
-from v3dg._urls import is_url, local
+from v3dg._urls import beside, is_url, local
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
@@ -39,14 +39,15 @@ def opened(subject: Any) -> Any:
 def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
     """A scene with its cameras, or a bundle or an asset, which have none."""
     if is_scene(path):
-        check(
-            path, not is_url(path), "a scene that is here, got a URL; fetch it with the files that it names"
-        )
+        expected = "a scene that is here, got a URL; fetch it with the files that it names"
+        check(path, not is_url(path), expected)
         return read_scene(path)
+    if beside(path).suffix == ".v3dg":
+        return Bundle.open(path), None
     path = Path(local(path))
     if path.suffix.lower() in usd.SUFFIXES and usd.has_instances(path):
         return read_usd_scene(path), None
-    return Bundle.open(path) if path.suffix == ".v3dg" else read_asset(path), None
+    return read_asset(path), None
 
 
 def read_usd_scene(

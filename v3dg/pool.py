@@ -98,5 +98,5 @@ class Pool:
                 last, known = time.monotonic(), status.pages_in
             elif time.monotonic() - last > timeout:
                 missing = f"{status.missing} pages are missing and none came in for {timeout:g} s"
-                raise TimeoutError(f"settle: expected the disk to answer, but {missing}")
+                raise TimeoutError(f"settle: expected the disk or the server to answer, but {missing}")
             core.wait(_WAIT_SECONDS)

@@ -107,8 +107,8 @@ def render(
         RuntimeError: `device` is "cuda" and something is missing for it.
     """
     where, shown = _device.resolve(device), opened(subject)
-    make, key = partial(_Frame, shown, color_by, where, memory), (color_by, where, memory)
-    frame = make() if isinstance(shown, Gaussians) else residency.frame(shown, key, make)
+    make, key = partial(_Frame, shown, color_by, where, memory), ("frame", color_by, where, memory)
+    frame = make() if isinstance(shown, Gaussians) else residency.once(shown, key, make)
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
     shade = shade_of(background, min_transmittance, isinstance(shown, Gaussians), depth)
 

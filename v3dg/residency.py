@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from v3dg import _core
 from v3dg._device import CPU, Device
+from v3dg._urls import is_url
 from v3dg.bundle import Bundle
 from v3dg.bundle.codec import Codec
 from v3dg.false_color import ColorBy, palette_of
@@ -29,6 +30,7 @@ _Kept = TypeVar("_Kept")
 # about what its second-level cache holds. Above, codes are as fast, and take a seventh of the memory.
 MOST_DECODED_BYTES = 48 << 20
 _PACKED_BYTES = 64  # of a gaussian, which frames of a GPU read besides its rows
+_TOO_MANY_BYTES = 1 << 62  # what no memory holds, so that pages come one by one
 
 
 class ResidentScene:
@@ -116,12 +118,12 @@ class Residency:
         groups = bundle.groups
         of_groups = {"ball": groups.ball, "weight": groups.weight, "level": groups.level}
         columns: dict[str, Any] = vars(bundle.clusters) | of_groups  # the level is that of the groups
-        return self._once(bundle, "table", lambda: _core.ClusterTable(**columns))
+        return self.once(bundle, "table", lambda: _core.ClusterTable(**columns))
 
     def scene(self, subject: Scene | Bundle, device: Device) -> ResidentScene:
         """The scene on a device as it is now; a bundle as a scene of one."""
         with self.lock:
-            resident = self._once(subject, ("scene", device), lambda: ResidentScene(device))
+            resident = self.once(subject, ("scene", device), lambda: ResidentScene(device))
             if resident.is_of(subject):
                 return resident
             scene = copy.copy(Scene.of(subject))
@@ -159,13 +161,13 @@ class Residency:
                 return _core.Model(codes, device.number)
             return _core.Model(self.gaussians(bundle, device).rows)
 
-        return self._once(bundle, ("model", device), make)
+        return self.once(bundle, ("model", device), make)
 
     def gaussians(self, bundle: Bundle, device: Device) -> Gaussians:
         """All gaussians of the bundle on a device."""
         if not device.is_cuda:
             return bundle.gaussians
-        return self._once(bundle, ("gaussians", device), lambda: bundle.gaussians.torch(str(device)))
+        return self.once(bundle, ("gaussians", device), lambda: bundle.gaussians.torch(str(device)))
 
     def set_models(
         self, frame: _core.SceneFrame, bundles: Sequence[Bundle], device: Device, color_by: ColorBy
@@ -180,25 +182,24 @@ class Residency:
 
     def palette(self, bundle: Bundle, color_by: ColorBy) -> NDArray[np.float32] | None:
         """As `palette_of`."""
-        return self._once(bundle, ("palette", color_by), lambda: palette_of(bundle, color_by))
+        return self.once(bundle, ("palette", color_by), lambda: palette_of(bundle, color_by))
 
     def bytes_to_add(self, bundles: Sequence[Bundle], device: Device) -> dict[Device, int]:
-        """What it takes, on the device and on the host, to have all gaussians there that are not yet."""
+        """What it takes, on the device and on the host, to have all gaussians there that are not yet.
+
+        Those at URLs take more than there is: their pages are fetched as pictures need them."""
         add = {device: 0, CPU: 0}
         for bundle in bundles:
             if ("model", device) in self._kept.get(bundle, {}):
                 continue
             is_coded = bundle.codec != Codec.name
-            add[CPU] += 0 if bundle.is_in_memory else bundle.page_bytes
+            of_pages = bundle.page_bytes if not is_url(bundle.path or "") else _TOO_MANY_BYTES
+            add[CPU] += 0 if bundle.is_in_memory else of_pages
             if device.is_cuda or not is_coded:  # the CPU draws codes where they are
                 add[device] += bundle.page_bytes
             if device.is_cuda and not is_coded:
                 add[device] += _PACKED_BYTES * bundle.num_gaussians
         return add
-
-    def frame(self, subject: Scene | Bundle, key: Hashable, make: Callable[[], _Kept]) -> _Kept:
-        """The buffers that pictures of a subject are drawn with, of which each key has its own."""
-        return self._once(subject, ("frame", key), make)
 
     def num_bytes(self, device: Device) -> int:
         """Memory that gaussians and tables of all bundles take on a device beside the bundles themselves."""
@@ -223,9 +224,9 @@ class Residency:
             taken = sum(of.get(("decoded", device), 0) for of in self._kept.values())
             return size if size + taken <= MOST_DECODED_BYTES else 0
 
-        return self._once(bundle, ("decoded", device), decoded_bytes) == 0
+        return self.once(bundle, ("decoded", device), decoded_bytes) == 0
 
-    def _once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _Kept]) -> _Kept:
+    def once(self, owner: Scene | Bundle, key: Hashable, make: Callable[[], _Kept]) -> _Kept:
         """What is kept for a bundle or scene, made where it is not there."""
         with self.lock:
             owner = owner if isinstance(owner, Bundle) else Scene.of(owner)  # which refuses others

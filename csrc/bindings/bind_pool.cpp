@@ -26,10 +26,44 @@ struct GivenSource {
     const Rows* rows = nullptr;  // in memory; else a file:
     std::string name;
     int descriptor = -1, sh_degree = 0;
+    Fetch fetch;
     PageCodec codec = PageCodec::float32;
     Span<const int64_t> places;
     Span<const uint8_t> hashes;
 };
+
+// What a function raises that is asked for parts of a file, or nothing. With Python's lock; while the
+// function runs there is nothing here to be undone, for Python may end the thread in it when the process
+// ends.
+std::string told_by(PyObject* function, Span<const int64_t> places) {
+    PyObject* const list = PyList_New(static_cast<py::ssize_t>(places.size / 2));
+    for (size_t k = 0; list != nullptr && k < places.size / 2; ++k)
+        PyList_SET_ITEM(list, static_cast<py::ssize_t>(k),
+                        Py_BuildValue("(LL)", static_cast<long long>(places[2 * k]),
+                                      static_cast<long long>(places[2 * k + 1])));
+    PyObject* const done = list == nullptr ? nullptr : PyObject_CallFunctionObjArgs(function, list, nullptr);
+    Py_XDECREF(list);
+    Py_XDECREF(done);
+    if (done != nullptr) return {};
+    const py::error_already_set error;
+    const std::string problem = py::str(error.value());
+    return problem.empty() ? "the fetch failed" : problem;
+}
+
+// Has a function of Python fetch, for threads that have no part in its lock until then: whoever waits for
+// them has to have given that up. The function is kept for ever, for a pool may leave threads behind that
+// call it.
+Fetch fetch_by(const py::object& function) {
+    if (function.is_none()) return {};
+    PyObject* const kept = function.inc_ref().ptr();
+    return [kept](Span<const int64_t> places) -> std::string {
+        if (Py_IsInitialized() == 0) return "the process ends";
+        const PyGILState_STATE state = PyGILState_Ensure();
+        std::string problem = told_by(kept, places);
+        PyGILState_Release(state);
+        return problem;
+    };
+}
 
 GivenSource given_source(const py::handle& source, const ClusterTable& table) {
     GivenSource given;
@@ -49,13 +83,14 @@ GivenSource given_source(const py::handle& source, const ClusterTable& table) {
     const auto num_pages = static_cast<py::ssize_t>(table.num_clusters() > 0 ? table.num_pages() : 0);
     given.places = span_of<const int64_t>(places, "places", {num_pages + 1});
     given.hashes = span_of<const uint8_t>(hashes, "hashes", {num_pages, 16});
+    given.fetch = fetch_by(file[6]);
     return given;
 }
 
 std::shared_ptr<const PageSource> source_of(const GivenSource& given, const ClusterTable& table) {
     if (given.rows != nullptr) return std::make_shared<MemoryPages>(table, given.rows->read<float>());
     return std::make_shared<FilePages>(table, given.sh_degree, given.codec, given.name, given.descriptor,
-                                       given.places, given.hashes);
+                                       given.places, given.hashes, given.fetch);
 }
 
 py::array_t<bool> resident_pages(BoundPool& pool, size_t bundle) {
@@ -136,6 +171,15 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
 #if V3DG_WITH_CUDA
     if (!device_.is_host()) make_on_device(work);
 #endif
+}
+
+BoundPool::~BoundPool() {
+#if V3DG_WITH_CUDA
+    on_device_.reset();
+#endif
+    host_.reset();
+    const py::gil_scoped_release unlocked;  // threads that end may be on their way to ask Python for a page
+    pool_.reset();
 }
 
 #if V3DG_WITH_CUDA
@@ -227,7 +271,9 @@ void bind_pool(py::module_& m) {
         .def(
             "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); }, "seconds"_a,
             py::call_guard<py::gil_scoped_release>(), "Waits for pages; whether there are any to bring.")
-        .def("read_one", [](BoundPool& p) { return p.pool().read_one(); })
+        .def(
+            "read_one", [](BoundPool& p) { return p.pool().read_one(); },
+            py::call_guard<py::gil_scoped_release>())
         .def("forget_failures", [](BoundPool& p) { p.pool().forget_failures(); });
 }
 

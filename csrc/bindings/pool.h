@@ -23,9 +23,11 @@ enum class PoolFrame { flight, look, aside };
 class BoundPool {
   public:
     // `sources` has for each table either the arrays of gaussians in memory, or the file of the bundle: its
-    // name, descriptor, SH degree, places (P+1,) and hashes (P, 16).
+    // name, descriptor, codec, SH degree, places (P+1,), hashes (P, 16), and what fetches parts of it, or
+    // None.
     BoundPool(const py::list& tables, const py::list& sources, int device, size_t num_bytes,
               unsigned num_threads);
+    ~BoundPool();
 
     Device device() const { return device_; }
     PagePool& pool() { return *pool_; }

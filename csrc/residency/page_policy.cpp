@@ -200,7 +200,7 @@ void PagePolicy::note(Span<const PageRequest> needs, size_t num_left_out, bool h
         const int32_t slot = slot_of_page_[id_of(need.bundle, need.page)];
         if (slot != kNoSlot)
             use(slot, need.priority > 1);
-        else
+        else if (need.priority > 1 || !bundles_[need.bundle].source->is_far())
             missing_ += ask(need, has_failures);
     }
     num_needed_ = needed_.now;

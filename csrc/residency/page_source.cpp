@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cassert>
+#include <cerrno>
 #include <cstring>
 
 #include "io/blake2b.h"
@@ -37,12 +38,13 @@ GaussianRows<const float> PageSource::rows(size_t page, const unsigned char* byt
 }
 
 FilePages::FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, std::string name,
-                     int descriptor, Span<const int64_t> place, Span<const uint8_t> hash)
+                     int descriptor, Span<const int64_t> place, Span<const uint8_t> hash, Fetch fetch)
     : PageSource(table, sh_degree, codec),
       name_(std::move(name)),
       file_(PosixFile::duplicate(descriptor)),
       place_(place.begin(), place.end()),
-      hash_(hash.begin(), hash.end()) {}
+      hash_(hash.begin(), hash.end()),
+      fetch_(std::move(fetch)) {}
 
 static void read_one(const PosixFile& file, Span<const int64_t> places, PageReading& of,
                      const std::function<std::string(size_t)>& name_of) {
@@ -119,6 +121,7 @@ void PageSource::read(size_t page, unsigned char* bytes) const {
 }
 
 void FilePages::expect(Span<const PageReading> pages) const {
+    if (fetch_) return;
     const Span<const int64_t> places{place_.data(), place_.size()};
     for (size_t first = 0, end = 0; first < pages.size; first = end) {
         end = end_of_run(places, pages, first);
@@ -127,9 +130,25 @@ void FilePages::expect(Span<const PageReading> pages) const {
     }
 }
 
+// Whether the pages are there to be read; else none of them is.
+bool FilePages::fetch(Span<PageReading> pages) const {
+    int64_t places[2 * kMostPagesTogether];
+    size_t count = 0;
+    for (const PageReading& of : pages) {
+        places[count++] = place_[of.page];
+        places[count++] = place_[of.page + 1];
+    }
+    std::string problem = fetch_({places, count});
+    if (problem.empty()) return true;
+    if (problem.rfind(name_ + ": ", 0) == 0) problem.erase(0, name_.size() + 2);
+    for (PageReading& of : pages) of.error.emplace(name_of(of.page) + ": " + problem, false, EIO);
+    return false;
+}
+
 void FilePages::read_pages(Span<PageReading> pages) const {
-    const auto name_of = [this](size_t page) { return name_ + ": page " + std::to_string(page); };
-    read_verified(file_, {place_.data(), place_.size()}, hash_.data(), pages, name_of);
+    if (fetch_ && !fetch(pages)) return;
+    read_verified(file_, {place_.data(), place_.size()}, hash_.data(), pages,
+                  [this](size_t page) { return name_of(page); });
     if (codec() == PageCodec::float32) return;
     for (PageReading& of : pages) {
         const PageCodes<const uint32_t> codes{clusters(of.page), reinterpret_cast<const uint32_t*>(of.bytes),

@@ -1,6 +1,7 @@
 #pragma once
 
-// Where the bytes of a bundle's pages come from: a file, or memory. Read on any thread.
+// Where the bytes of a bundle's pages come from: a file, which may have to be fetched first, or memory. Read
+// on any thread.
 
 #include <cstdint>
 #include <functional>
@@ -66,6 +67,8 @@ class PageSource {
     virtual void read_pages(Span<PageReading> pages) const = 0;
     // The same of one page. Throws PageError.
     void read(size_t page, unsigned char* bytes) const;
+    // Whether they come from so far away that none is to be read before it is missed.
+    virtual bool is_far() const { return false; }
     // Such pages will be read soon.
     virtual void expect(Span<const PageReading> pages) const { static_cast<void>(pages); }
 
@@ -80,22 +83,31 @@ class PageSource {
     std::vector<int64_t> offset_;        // [C + 1]
 };
 
+// Brings parts of a file to where they are read, before they are: of each two numbers, the bytes from the
+// first to the second. Returns what went wrong, or nothing. Called on any thread.
+using Fetch = std::function<std::string(Span<const int64_t>)>;
+
 // Pages of a file that stays open as long as this lives; one that is renamed or removed meanwhile stays
 // readable, one that is cut or written to is found out.
 class FilePages : public PageSource {
   public:
-    // `place` is [P + 1], `hash` is [P][16], as docs/format.md has them.
+    // `place` is [P + 1], `hash` is [P][16], as docs/format.md has them. `fetch` is empty where all is there.
     FilePages(const ClusterTable& table, int sh_degree, PageCodec codec, std::string name, int descriptor,
-              Span<const int64_t> place, Span<const uint8_t> hash);
+              Span<const int64_t> place, Span<const uint8_t> hash, Fetch fetch);
     size_t num_bytes(size_t page) const override { return place_[page + 1] - place_[page]; }
     void read_pages(Span<PageReading> pages) const override;
     void expect(Span<const PageReading> pages) const override;
+    bool is_far() const override { return fetch_ != nullptr; }
 
   private:
+    std::string name_of(size_t page) const { return name_ + ": page " + std::to_string(page); }
+    bool fetch(Span<PageReading> pages) const;
+
     const std::string name_;
     const PosixFile file_;
     const std::vector<int64_t> place_;
     const std::vector<uint8_t> hash_;
+    const Fetch fetch_;
 };
 
 // Pages of gaussians in memory, which outlive this.

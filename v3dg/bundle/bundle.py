@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from v3dg import _core, _files
 from v3dg._json import parse_json
 from v3dg._numbers import check, check_all, check_type
-from v3dg._urls import local
+from v3dg._urls import in_parts, is_url
 from v3dg.bundle.codec import Codec, codec_of
 from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES, config_to_json, page_tables
@@ -30,6 +30,7 @@ class Bundle:
     """All clusters of all levels of one asset. In memory, or a file of which pages are read when needed.
 
     Attributes:
+        path: Name or URL of the file that it was opened from, if it was.
         config: How it was built, as JSON values.
         sh_degree: 0 to 3, the same for all gaussians.
         codec: How its file keeps gaussians. "float32": every bit. "quantized": in 16 (SH degree 0) to 40
@@ -40,6 +41,7 @@ class Bundle:
             ``config`` is not JSON, or the codec is unknown or cannot hold a value.
     """
 
+    path: str | None = None
     _file: BundleFile | None = None
 
     def __init__(
@@ -68,8 +70,7 @@ class Bundle:
 
     def _set(self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: _Pages) -> None:
         self.config = config
-        self._clusters = clusters
-        self._groups = groups
+        self._clusters, self._groups = clusters, groups
         self._codec, self.codec = pages.codec, pages.codec.name
         self.sh_degree = pages.codec.sh_degree
         self._layout = pages.layout
@@ -80,14 +81,14 @@ class Bundle:
         """Open a bundle file: read and check its header and tables, leave the gaussians on disk until used.
 
         The file stays open, so a file that is later saved over it does not change this bundle. With the extra
-        `fsspec` it may be at a URL, which is fetched once by a process.
+        `fsspec` it may be at a URL, of which what is used is fetched, once by a process.
 
         Raises:
             FileNotFoundError: There is no such file.
             ValueError: It is not a bundle, is newer than this build can read, or is damaged; the message says
                 which file and field. Damage in the gaussians is found when they are read.
         """
-        return cls.open_all([local(path)])[0]
+        return cls.open_all([in_parts(path)])[0]
 
     @classmethod
     def open_all(cls, paths: Iterable[str | os.PathLike[str]]) -> list[Bundle]:
@@ -125,7 +126,7 @@ class Bundle:
             _check_page_tables(pages, file)
             bundle = cls.__new__(cls)
             bundle._set(clusters, groups, file.config, pages)
-            bundle._file = file
+            bundle._file, bundle.path = file, file.path
         except ValueError as error:
             file.verify()  # for what is wrong with the tables is mostly damage
             raise ValueError(f"{file.path}: {error}") from None
@@ -155,8 +156,8 @@ class Bundle:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what is in memory, and of a file its path: the copy opens it again."""
-        if self._file is not None:
-            return Bundle.open, (os.path.abspath(self._file.path),)
+        if self.path is not None:
+            return Bundle.open, (self.path if is_url(self.path) else os.path.abspath(self.path),)
         return Bundle, (self.clusters, self.groups, self.gaussians, self.config, self.codec)
 
     @property
@@ -168,11 +169,6 @@ class Bundle:
     def groups(self) -> Groups:
         """G groups."""
         return self._groups
-
-    @property
-    def path(self) -> str | None:
-        """File that the bundle was opened from, if it was."""
-        return None if self._file is None else os.fspath(self._file.path)
 
     @property
     def num_levels(self) -> int:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from v3dg import _core, _files
 from v3dg._json import parse_json, shown
 from v3dg._numbers import check
+from v3dg._urls import FileAtUrl
 from v3dg.bundle import format as file_format
 from v3dg.bundle.codec import CODECS, Codec
 from v3dg.bundle.format import DTYPES, HASH_BYTES, entries_of, page_hash, page_tables, schema_of
@@ -97,10 +98,15 @@ class BundleFile:
 
     def __init__(self, path: str | os.PathLike[str], reader: _core.HashedReader) -> None:
         self.path = os.fspath(path)
-        self._fd = _files.open_regular(path)
+        self._at_url = path if isinstance(path, FileAtUrl) else None
+        self._fd = _files.open_regular(self._at_url.copy if self._at_url else path)
         weakref.finalize(self, os.close, self._fd)
         with _files.naming_errors(path):
             self._read_header_and_tables(reader)
+
+    def _fetch(self, first: int, last: int) -> None:
+        if self._at_url:
+            self._at_url.fetch([(first, last)])
 
     def _fail(self, problem: str) -> NoReturn:
         raise ValueError(f"{self.path}: {problem}")
@@ -180,6 +186,7 @@ class BundleFile:
 
     def _read_tables(self, entries: dict[str, Any], text: bytes, reader: _core.HashedReader) -> None:
         place = self._data_start + self.pages_bytes
+        self._fetch(place, self.num_bytes)
         self._reading = reader.read(self.path, self._fd, text, place, self.num_bytes - place)
         data = self._reading.wait()  # with the hash at the end
         self.tables: dict[str, NDArray[Any]] = {}
@@ -194,6 +201,7 @@ class BundleFile:
         del self._reading
 
     def _read(self, num_bytes: int, offset: int) -> bytes:
+        self._fetch(offset, offset + num_bytes)
         out = np.empty(num_bytes, np.uint8)
         if not _files.read_at(self._fd, out, offset):
             self._fail(f"size: expected bytes at {offset}, got the end of the file; it was truncated")
@@ -205,24 +213,13 @@ class BundleFile:
         return self._data_start + np.append(self.tables["pages.offset"], self.pages_bytes)
 
     @property
-    def source(self) -> tuple[str, int, str, int, NDArray[np.int64], NDArray[np.uint8]]:
-        """What the core reads pages with: name, descriptor, codec, SH degree, places and hashes."""
-        return (
-            self.path,
-            self._fd,
-            self.codec.name,
-            self.codec.sh_degree,
-            self.places,
-            self.tables["pages.hash"],
-        )
+    def source(self) -> tuple[Any, ...]:
+        """What the core reads pages with: name, descriptor, codec, SH degree, places, hashes, fetch."""
+        file, codec = (self.path, self._fd), (self.codec.name, self.codec.sh_degree)
+        return *file, *codec, self.places, self.tables["pages.hash"], self._at_url and self._at_url.fetch
 
-    def read_pages(self, run: PageRun) -> Gaussians:
-        """The gaussians of a run of pages, verified."""
-        return read_pages(self.path, self._fd, run, self.codec, self.tables["pages.hash"][run.first_page :])
-
-    def read_codes(self, run: PageRun) -> NDArray[np.int32]:
-        """The words of a run of quantised pages, verified."""
-        words = np.empty((run.places[-1] - run.places[0]) // 4, np.int32)
+    def read(self, run: PageRun, out: _core.Rows | NDArray[np.int32]) -> None:
+        """Fill rows with the gaussians of a run of pages, or words with quantised pages; verified."""
+        self._fetch(*run.places[[0, -1]])
         hashes = self.tables["pages.hash"][run.first_page :][: len(run)]
-        _core.read_pages(self.path, self._fd, words, self.codec.name, hashes, **vars(run))
-        return words
+        _core.read_pages(self.path, self._fd, out, self.codec.name, hashes, **vars(run))

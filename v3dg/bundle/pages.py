@@ -131,30 +131,31 @@ class FilePages:
     def __init__(self, layout: PageLayout, file: "BundleFile") -> None:
         self.layout, self.codec = layout, file.codec
         self._file = file
-        self._last_page: tuple[int, Gaussians] | None = None
+        self._last_page: tuple[int, Gaussians | None] = -1, None
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Gaussians of a run of pages, on the host; verified."""
-        if last_page - first_page != 1:
-            return self._read(first_page, last_page)
-        kept = self._last_page
-        if kept is None or kept[0] != first_page:
-            self._last_page = kept = (first_page, self._read(first_page, last_page))
-        return kept[1]
+        number, kept = self._last_page
+        if first_page == number == last_page - 1 and kept is not None:
+            return kept
+        run = self.layout.run(first_page, last_page, self._file.places)
+        kept = self.codec.empty(run.rows.stop - run.rows.start)
+        self._file.read(run, kept.rows)
+        if last_page - first_page == 1:
+            self._last_page = first_page, kept
+        return kept
 
     def in_memory(self) -> MemoryPages | CodePages:
         """All of them; read and verified."""
-        run = self.layout.run(0, self.layout.num_pages, self._file.places)
         if self.codec.name == Codec.name:
-            return MemoryPages(self.layout, self._file.read_pages(run), self.codec)
-        words = self._file.read_codes(run)
+            return MemoryPages(self.layout, self.read(0, self.layout.num_pages), self.codec)
+        run = self.layout.run(0, self.layout.num_pages, self._file.places)
+        words = np.empty((run.places[-1] - run.places[0]) // 4, np.int32)
+        self._file.read(run, words)
         try:
             return CodePages(self.layout, words, self.codec)
         except ValueError as error:
             raise ValueError(f"{self._file.path}: {error}; {_core.DAMAGED}") from None
-
-    def _read(self, first_page: int, last_page: int) -> Gaussians:
-        return self._file.read_pages(self.layout.run(first_page, last_page, self._file.places))
 
 
 def on_threads(work: Callable[[_Item], _Result], items: Sequence[_Item], most: int = _MOST) -> list[_Result]:

@@ -40,7 +40,7 @@ def run(options: Info) -> None:
     if isinstance(subject, Scene):
         description = _scene_info(options.file, subject, cameras or {})
     elif isinstance(subject, Bundle):
-        description = _bundle_info(options.file, subject)
+        description = _bundle_info(subject)
     else:
         description = _asset_info(options.file, subject)
     _common.print_result(options.json, *description)
@@ -93,8 +93,8 @@ def _point(values: list[float]) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
 
 
-def _bundle_info(path: Path, bundle: Bundle) -> _Description:
-    result = {**bundle.info(), "path": str(path), "kind": "bundle"}
+def _bundle_info(bundle: Bundle) -> _Description:
+    result = {**bundle.info(), "kind": "bundle"}
     columns = (
         "level = {level}; clusters = {clusters:,}; gaussians = {gaussians:,}; size = {size}; "
         "colour error = {error_color:.4f}; alpha error = {error_alpha:.4f}"
@@ -103,7 +103,7 @@ def _bundle_info(path: Path, bundle: Bundle) -> _Description:
     leaves = _common.level_size(bundle, 0) if len(bundle.level_range(0)) else 0
     each = f", {result['bytes'] / leaves:.1f} bytes a gaussian of level 0" if leaves else ""
     lines = [
-        f"{path}: bundle, version {result['version']} ({result['codec']}), "
+        f"{bundle.path}: bundle, version {result['version']} ({result['codec']}), "
         f"{_common.bytes_text(result['bytes'])}{each}",
         f"{bundle.num_gaussians:,} gaussians, SH degree {bundle.sh_degree}, "
         f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, {result['num_pages']:,} pages",

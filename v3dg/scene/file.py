@@ -11,7 +11,7 @@ import numpy as np
 
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check
-from v3dg._urls import is_fetched
+from v3dg._urls import is_url
 from v3dg.bundle import Bundle
 from v3dg.cameras import DEFAULT_FOV_X, Camera, check_cameras
 from v3dg.io import SUFFIXES
@@ -76,7 +76,7 @@ def write_scene(
     if bundle_paths is None:
         found = "one in memory or at a URL; write it and open that"
         for number, bundle in enumerate(scene.bundles):
-            is_here = bundle.path and not is_fetched(bundle.path)
+            is_here = bundle.path and not is_url(bundle.path)
             check(f"scene.bundles[{number}]", is_here, f"one that was opened from a file, got {found}")
         folder = os.path.dirname(os.path.abspath(path))
         bundle_paths = [os.path.relpath(bundle.path or "", folder) for bundle in scene.bundles]
