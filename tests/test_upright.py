@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
+import os
 import pickle
+import pty
+import subprocess
+import termios
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +17,7 @@ import pytest
 
 import scenes_lod
 import v3dg
-from command_line import run
+from command_line import COMMAND, ENVIRONMENT, run
 from v3dg.cameras import AXES
 from v3dg.cli._views import choose_up
 from v3dg.upright import direction_of, up_of
@@ -119,6 +125,71 @@ def test_bundle_keeps_what_is_up_and_commands_say_what_they_took(rng, tmp_path):
     done = run("export", tmp_path / "flat.v3dg", "-o", tmp_path / "web", "--quiet")
     assert done.returncode == 0, done.stderr
     assert "flat.v3dg: x is up, as its file says; --up says otherwise\n" in done.stdout
+
+
+def at_a_terminal(*arguments, answers, cwd):
+    """What a command says on stderr and on stdout to who types these lines, and its exit code."""
+    ours, theirs = pty.openpty()
+    command = [*COMMAND, *map(str, arguments)]
+    process = subprocess.Popen(
+        command,
+        stdin=theirs,
+        stderr=theirs,
+        stdout=subprocess.PIPE,
+        cwd=cwd,
+        env=ENVIRONMENT,
+        preexec_fn=own_terminal,
+    )
+    os.write(ours, answers.encode())
+    said = process.communicate(timeout=120)[0].decode()
+    os.close(theirs)
+    asked = b""
+    with contextlib.suppress(OSError):  # the end
+        while part := os.read(ours, 1 << 16):
+            asked += part
+    os.close(ours)
+    return asked.decode(), said, process.returncode
+
+
+def own_terminal():
+    os.setsid()
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+
+ASKED = "round.ply: which way is up, x, y, z, -x, -y, -z? [-y] "
+
+
+@pytest.mark.parametrize(
+    ("answers", "up", "times"), [("\n", "-y", 1), ("z\n", "z", 1), ("up\n x \n", "x", 2), ("\x04", "-y", 1)]
+)
+def test_a_build_asks_at_a_terminal_what_nothing_tells(rng, tmp_path, answers, up, times):
+    v3dg.write_asset(tmp_path / "round.ply", spread(rng, (1, 1, 1)))
+    how = ("--device", "cpu", "--quiet")
+    asked, _, code = at_a_terminal("build", "round.ply", *how, answers=answers, cwd=tmp_path)
+    assert (code, asked.count(ASKED)) == (0, times), asked
+    assert up_of(v3dg.Bundle.open(tmp_path / "round.v3dg")) == (up, "as its file says")
+    for more in (("--up", "y"), ("--resume",)):
+        asked, _, code = at_a_terminal("build", "round.ply", *how, *more, answers="\n", cwd=tmp_path)
+        assert (code, asked.count("which way")) == (0, 0)
+    for name, scales in (("flat", (3, 2, 0.5)), ("round", (1, 1, 1))):  # what tells, and without a terminal
+        v3dg.write_asset(tmp_path / f"{name}.ply", spread(rng, scales))
+        run_here = at_a_terminal if name == "flat" else run
+        given = {"answers": "\n"} if name == "flat" else {}
+        done = run_here("build", f"{name}.ply", *how, **given, cwd=tmp_path)
+        assert "which way" not in str(done)
+        assert "up" not in v3dg.Bundle.open(tmp_path / f"{name}.v3dg").config
+
+
+def test_commands_that_use_what_is_up_ask_at_a_terminal_once(rng, tmp_path):
+    v3dg.write_asset(tmp_path / "round.ply", spread(rng, (1, 1, 1)))
+    how = ("--size", 32, 32, "--device", "cpu", "--output")
+    asked, said, code = at_a_terminal("render", "round.ply", *how, "a.png", answers="x\n", cwd=tmp_path)
+    assert (code, asked.count(ASKED)) == (0, 1), asked
+    assert said.endswith("round.ply: x is up, as you said; --up says otherwise\n")
+    assert run("render", "round.ply", *how, "b.png", "--up", "x", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    done = run("render", "round.ply", *how, "b.png", cwd=tmp_path)
+    assert done.stdout.endswith("round.ply: -y is up, as most trained assets have it; --up says otherwise\n")
 
 
 def test_what_is_told_is_not_guessed():

@@ -159,6 +159,33 @@ def test_page_of_a_token_reaches_the_viewer(browser, site):
         elsewhere.close()
 
 
+def test_page_asks_what_is_up_where_that_is_assumed(browser, site):
+    asking = Site(site.scene_view, name="blobs", port=0, up=(0, -1, 0), asks_up=True)
+    question = "#question:not([hidden])"
+    try:
+        with Tab(browser, asking.url) as tab:
+            first = tab.settled()
+            group = tab.page.get_by_role("radiogroup", name="Which way is up?")
+            assert group.get_by_role("radio").all_inner_texts() == ["x", "y", "z", "-x", "-y", "-z"]
+            checked = group.locator("[aria-checked=true]")
+            assert checked.all_inner_texts() == ["-y"]
+            group.get_by_role("radio", name="x", exact=True).click()
+            assert differ(first, tab.settled()) > 0.02
+            assert tab.view()["up"] == "x"
+            assert checked.all_inner_texts() == ["x"]
+            group.get_by_role("button").click()
+            tab.page.wait_for_selector(question, state="hidden")
+            link = tab.page.url
+        with Tab(browser, link) as tab:  # which says what is up
+            tab.settled()
+            assert tab.page.locator(question).count() == 0
+    finally:
+        asking.close()
+    with Tab(browser, site.url) as tab:
+        tab.settled()
+        assert tab.page.locator(question).count() == 0
+
+
 def test_drag_is_answered_while_the_mouse_is_still_down(tab):
     """First by the picture that is there, moved; then by drafts, which say what they are."""
     first = tab.settled()

@@ -12,6 +12,9 @@ from v3dg.cameras import AXES, Axis, Camera
 from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene, Subject
 
+ASSUMED = "as most trained assets have it"
+"""What `up_of` says where nothing tells."""
+
 # Fewer cameras may all lie on their sides.
 _FEWEST_CAMERAS = 3
 # Cosine of the angle to an axis, within which a direction is taken to mean it: 26 degrees.
@@ -57,7 +60,7 @@ def up_of(
     flat = _flat_axis(_middles(subject))
     if flat is not None:
         return flat, "guessed from the plane of its gaussians"
-    return "-y", "as most trained assets have it"
+    return "-y", ASSUMED
 
 
 def _middles(subject: Bundle | Gaussians) -> Floats:

@@ -9,7 +9,7 @@ from v3dg._numbers import one_of
 from v3dg.cameras import AXES, Axis, VectorLike
 from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Subject
-from v3dg.upright import direction_of, up_of
+from v3dg.upright import ASSUMED, direction_of, up_of
 
 if TYPE_CHECKING:
     from v3dg.viewer.server import Site
@@ -45,7 +45,9 @@ def view(
     if isinstance(subject, str | os.PathLike):
         subject, cameras = open_with_cameras(path)
         options = {"name": path.stem, "cameras": cameras} | options
-    up = up_of(subject, options.get("cameras"), path)[0] if up is None else up
+    if up is None:
+        up, how = up_of(subject, options.get("cameras"), path)
+        options = {"asks_up": how == ASSUMED} | options
     if isinstance(up, str):
         one_of(up, "up", AXES)
         up = direction_of(up)

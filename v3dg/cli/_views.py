@@ -1,10 +1,12 @@
 """Where commands look from: the cameras of a file, a scene's own, or a turntable around the subject."""
 
 import math
+import os
+import sys
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 import tyro
@@ -12,14 +14,14 @@ import tyro
 from v3dg._numbers import check
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
-from v3dg.cameras import DEFAULT_FOV_X, Axis, Camera, turntable
+from v3dg.cameras import AXES, DEFAULT_FOV_X, Axis, Camera, turntable
 from v3dg.cleaning import ball_of_most, examine
-from v3dg.cli._common import check_range, check_usage, level_size, option, require_subject
+from v3dg.cli._common import check_range, check_usage, level_size, option, printable, require_subject
 from v3dg.gaussians import Gaussians
 from v3dg.pictures import MOST_SIDE, check_size
 from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene
-from v3dg.upright import direction_of, up_of
+from v3dg.upright import ASSUMED, direction_of, up_of
 
 # Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
 _ENOUGH_TO_FRAME = 50_000
@@ -95,20 +97,15 @@ def choose_cameras(
         own = {} if isinstance(subject, Scene) else _around(subject, options, options.views or views, path)
     check(path, own, "cameras, got a file without any; give some with --cameras")
     if options.camera is not None:
-        own = _one_camera(own, options.camera)
+        names, name = list(own), options.camera
+        if name not in own and name.isdecimal() and int(name) < len(names):
+            name = names[int(name)]
+        known = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+        check("--camera", name in own, f"one of {known}, or 0 to {len(names) - 1}, got {name}")
+        own = {name: own[name]}
     for name, camera in own.items():
         check_size(f"camera {name}", camera.width, camera.height)
     return own
-
-
-def _one_camera(cameras: dict[str, Camera], name: str) -> dict[str, Camera]:
-    """The camera of that name or at that place."""
-    names = list(cameras)
-    if name not in cameras and name.isdecimal() and int(name) < len(names):
-        name = names[int(name)]
-    known = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
-    check("--camera", name in cameras, f"one of {known}, or 0 to {len(names) - 1}, got {name}")
-    return {name: cameras[name]}
 
 
 def _around(subject: Bundle | Gaussians, options: ViewOptions, views: int, path: Path) -> dict[str, Camera]:
@@ -139,9 +136,30 @@ def _around(subject: Bundle | Gaussians, options: ViewOptions, views: int, path:
 def choose_up(
     given: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
 ) -> tuple[Axis, list[str]]:
-    """The axis that is up: of --up, or else as `up_of` takes it, with a line that says so."""
+    """The axis that is up: of --up, or else as `up_of` takes it, with a line that says so.
+
+    Where nothing tells, whoever sits at a terminal is asked.
+    """
     axis, how = (given, "") if given else up_of(subject, cameras, path)
+    if how == ASSUMED and is_at_terminal():
+        axis, how = ask_up(path, axis), "as you said"
     return axis, [] if given else [f"{path.name}: {axis} is up, {how}; --up says otherwise"]
+
+
+def is_at_terminal() -> bool:
+    """Whether somebody can answer; a job in the background would be stopped."""
+    is_open = sys.stdin and sys.stdin.isatty() and sys.stderr.isatty()
+    return bool(is_open and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp())
+
+
+def ask_up(path: Path, axis: Axis) -> Axis:
+    """What whoever sits at the terminal says is up; just Enter, or the end of all input, takes the axis."""
+    while True:
+        question = printable(f"{path.name}: which way is up, {', '.join(AXES)}? [{axis}] ")
+        print(question, end="", file=sys.stderr, flush=True)
+        answer: Any = sys.stdin.readline().strip() or axis
+        if answer in AXES:
+            return answer  # type: ignore[no-any-return]
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:

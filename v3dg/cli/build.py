@@ -20,9 +20,13 @@ from v3dg.build import BuildConfig, build_file, levels_path
 from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
-from v3dg.io import SUFFIXES, run_files
+from v3dg.cli._views import ask_up, is_at_terminal
+from v3dg.gaussians import Gaussians
+from v3dg.io import SUFFIXES, open_asset, run_files
+from v3dg.upright import ASSUMED, up_of
 
 _PATIENCE_S = 20  # for a scheduler's answer
+_SAMPLES, _SAMPLE = 64, 256  # of an asset, and gaussians of each, that tell what is up
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
 
@@ -42,7 +46,7 @@ class Build(_common.OnDevice):
     codec: Literal["float32", "quantized"] = "float32"
     """How gaussians are kept: every bit, or rounded to 16 to 40 bytes (docs/format.md has the error)."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """What is up in the asset, which the bundle then says to `view`, `render` and `export`."""
+    """What is up in the asset, which the bundle then says; asked for at a terminal where nothing tells it."""
     seed: int = 0
     """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
     strict: _common.Flag = False
@@ -66,10 +70,23 @@ def run(options: Build) -> None:
         if is_one or list(assets) == list(options.assets[:1]):
             output = options.output or _output_of(options.assets[0], None)
             files = list(dict.fromkeys(file for files in assets.values() for file in files))
+            options.up = options.up or (None if options.resume else _asked_up(files[0]))
             result = _build(options, files, output, executor)
             _common.print_result(options.json, result, _lines(result))
         else:
             _run_many(options, assets, executor)
+
+
+def _asked_up(path: Path) -> Axis | None:
+    """What is up in an asset, of who sits at a terminal, where neither its kind nor its gaussians tell."""
+    _common.require_file(path, *SUFFIXES)
+    if not is_at_terminal():
+        return None
+    asset = open_asset(path)
+    starts = range(0, asset.num_gaussians, max(asset.num_gaussians // _SAMPLES, _SAMPLE))
+    parts = [asset.read(start, min(start + _SAMPLE, asset.num_gaussians)) for start in starts]
+    axis, how = up_of(Gaussians.concatenate(parts), path=path) if parts else ("-y", "")
+    return ask_up(path, axis) if how == ASSUMED else None
 
 
 @contextmanager
@@ -179,7 +196,9 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
     config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
     if options.cluster_size is not None:
         config = replace(config, cluster_size=options.cluster_size)
-    levels = levels_path(output)
+    levels, names = levels_path(output), ("seed", "codec", "up", "device", "resume", "memory")
+    how: dict[str, Any] = {name: getattr(options, name) for name in names}
+    how |= {"progress": not options.quiet, "unusable": "refuse" if options.strict else "drop"}
 
     def to_resume() -> str:
         return f"; `--resume` continues from {levels}" if levels.exists() else ""
@@ -187,20 +206,7 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AssetWarning)  # the result says it
-            bundle, is_built = build_file(
-                paths,
-                output,
-                config=config,
-                seed=options.seed,
-                codec=options.codec,
-                up=options.up,
-                progress=not options.quiet,
-                device=options.device,
-                resume=options.resume,
-                unusable="refuse" if options.strict else "drop",
-                memory=options.memory,
-                executor=executor,
-            )
+            bundle, is_built = build_file(paths, output, config=config, executor=executor, **how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{to_resume()}") from None
     except OSError as error:  # a full disk, say

@@ -44,8 +44,10 @@ def run(options: Render) -> None:
     output = check_picture_path(options.output or Path(options.subject.with_suffix(".png").name))
     device = _device.resolve(options.device)
     subject, own_cameras = open_with_cameras(options.subject)
+    is_turntable, notes = options.view.cameras is None and own_cameras is None, list[str]()
+    if is_turntable:
+        options.view.up, notes = choose_up(options.view.up, subject, None, options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
-    is_turntable = options.view.cameras is None and own_cameras is None
     is_film = is_turntable and len(cameras) > 1
     fade = DEFAULT_FADE if options.fade is None and is_film else options.fade
     pictures: list[dict[str, Any]] = []
@@ -67,5 +69,4 @@ def run(options: Render) -> None:
         "in frustum = {gaussians_in_frustum:,}; select ms = {select_ms:.1f}; draw ms = {draw_ms:.1f}"
     )
     result = {"subject": str(options.subject), "pictures": pictures}
-    notes = choose_up(options.view.up, subject, None, options.subject)[1] if is_turntable else []
     print_result(options.json, result, [*table_lines(columns, pictures), *notes])

@@ -19,9 +19,9 @@ import tyro
 from v3dg._start import SIGNALS
 from v3dg.cameras import Axis
 from v3dg.cli._common import Cut, Flag, OnPool, check_usage, option, print_result, require_subject, tell
-from v3dg.cli._views import CameraFile, choose_up
+from v3dg.cli._views import CameraFile
 from v3dg.opening import open_with_cameras
-from v3dg.upright import direction_of
+from v3dg.upright import ASSUMED, direction_of, up_of
 
 # Between looks for a signal: a wait without an end misses one that comes just before it.
 _SECONDS = 0.1
@@ -60,7 +60,8 @@ def run(options: View) -> None:
     photographs = None if options.cameras is None else _photographs(options.cameras, cameras or {})
     expected = f"a bundle or a scene, got the asset {options.subject}; build a bundle of it"
     check_usage("--budget", options.budget is None or not isinstance(subject, Gaussians), expected)
-    up, lines = choose_up(options.up, subject, cameras, options.subject)
+    up, how = (options.up, "") if options.up else up_of(subject, cameras, options.subject)
+    lines = [f"{options.subject.name}: {up} is up, {how}; --up says otherwise"] if how else []
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
     with contextlib.suppress(ImportError):  # of which the site tells; it takes long
         importlib.import_module("v3dg.viewer.tab")
@@ -75,6 +76,7 @@ def run(options: View) -> None:
             tolerance=tolerance,
             budget=options.budget,
             up=direction_of(up),
+            asks_up=how == ASSUMED,
         )
         try:
             if options.port not in (0, site.port) and not options.quiet:

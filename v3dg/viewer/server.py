@@ -62,6 +62,7 @@ class Site:
         host, port: As of its `Gate`, whose port and URL it has, and whose errors it raises.
         tolerance, budget: What a tab begins with.
         up: (3,) direction in the world.
+        asks_up: Whether that is but assumed, so that the page asks.
 
     Raises:
         ImportError: The extra is not installed.
@@ -80,6 +81,7 @@ class Site:
         tolerance: float = DEFAULT_TOLERANCE,
         budget: int | None = None,
         up: VectorLike = (0.0, 0.0, 1.0),
+        asks_up: bool = False,
     ) -> None:
         for module in ("msgspec", "websockets.asyncio.server"):
             _extras.load(module)
@@ -94,6 +96,7 @@ class Site:
             "type": "hello",
             "version": __version__,
             "up": np.asarray(up, np.float64).tolist(),
+            "asks_up": asks_up,
             "home": asdict(start_view(scene_view, up)),
             "settings": {"tolerance": tolerance, "budget": budget, "fade": DEFAULT_FADE},
             "cameras": [

@@ -109,6 +109,7 @@ class App {
     }
     this.panel.build();
     if (isFirst && location.hash.length > 1) this.openHash(location.hash);
+    element("question").hidden = !(isFirst && this.greeting.asks_up && !/[#&]up=/.test(location.hash));
     this.sync();
   }
 
@@ -269,6 +270,7 @@ class App {
       const isOn = button.dataset.mode === this.camera.mode || button.dataset.tool === this.tool;
       button.setAttribute("aria-checked", String(isOn));
     }
+    for (const button of document.querySelectorAll("[data-up]")) button.setAttribute("aria-checked", String(button.dataset.up === this.upAxis));
     element("tools").hidden = !this.selected;
     this.panel.sync();
     this.redraw();
@@ -280,13 +282,21 @@ class App {
   }
 
   addButtons() {
-    const acts = { undo: () => this.undo(), deselect: () => this.select(null) };
+    const dismiss = () => (element("question").hidden = true);
+    const acts = { undo: () => this.undo(), deselect: () => this.select(null), dismiss };
+    for (const axis of Object.keys(AXES)) {
+      element("question").lastElementChild.before(make("button", { role: "radio", "data-up": axis, title: `${axis} is up` }, axis));
+    }
     document.body.dataset.mode = this.camera.mode;
     for (const button of document.querySelectorAll("#stage button")) {
-      const { mode, tool, act } = button.dataset;
+      const { mode, tool, act, up } = button.dataset;
       button.addEventListener("click", () => {
         if (mode) this.changePage({ mode });
         if (tool) this.tool = tool;
+        if (up) {
+          this.changePage({ up });
+          this.showAll();
+        }
         acts[act]?.();
         this.sync();
       });
