@@ -320,12 +320,16 @@ def test_a_file_here_of_that_name_comes_first(there, asset, tmp_path, monkeypatc
     assert len(v3dg.read_asset("memory://in/a.ply")) == 7
 
 
-def test_commands_take_urls_and_write_into_the_working_folder(there, asset, bundle, tmp_path, monkeypatch):
+def test_commands_take_urls_and_write_into_the_working_folder(
+    there, asset, bundle, tmp_path, monkeypatch, capsys
+):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     assert cli.main(["info", "memory://in/a.ply"]) == 0
+    assert capsys.readouterr().out.startswith("memory://in/a.ply: asset, ")
     assert cli.main(["build", "memory://in/a.ply", "--quiet", "--device", "cpu"]) == 0
-    assert cli.main(["render", "memory://in/a.v3dg", "--device", "cpu", "--size", "16", "16"]) == 0
+    assert cli.main(["render", "memory://in/a.v3dg", "--device", "cpu", "--size", "16", "16", "--json"]) == 0
+    assert '"subject": "memory://in/a.v3dg"' in capsys.readouterr().out
     assert cli.main(["export", "memory://in/a.v3dg", "--quiet"]) == 0
     assert sorted(path.name for path in Path().iterdir()) == ["a.png", "a.v3dg", "a_web"]
 
@@ -337,7 +341,7 @@ def test_commands_take_urls_and_write_into_the_working_folder(there, asset, bund
         ("nowhere://in/a.ply", "Protocol not known: nowhere"),
         ("memory://in/scene.json", "expected a scene that is here, got a URL"),
         ("memory://in/lod-meta.json", "got one of a file that names others"),
-        ("memory://in/a.txt", "expected a file ending in"),
+        ("memory://in/a.txt", "memory://in/a.txt: expected a file ending in"),
     ],
 )
 def test_what_is_not_fetched_is_an_error_of_one_line(there, url, message, capsys):

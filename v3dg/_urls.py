@@ -1,4 +1,4 @@
-"""Files at URLs, by fsspec: what is needed of one, or all, comes to a folder that goes with the process."""
+"""Files at URLs, by fsspec: what is needed of one, or all, comes to files that go with the process."""
 
 import atexit
 import contextlib
@@ -7,14 +7,16 @@ import re
 import shutil
 import tempfile
 import threading
+import weakref
 from collections.abc import Iterable, Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import numpy as np
 
-from v3dg import _extras
+from v3dg import _extras, _files
 from v3dg._numbers import check
 
 # A `Path` of a URL has one slash where there were two.
@@ -29,6 +31,12 @@ def is_url(path: str | os.PathLike[str]) -> bool:
     return bool(_URL.match(os.fspath(path))) and not os.path.lexists(path)
 
 
+def shown(path: str | os.PathLike[str]) -> str:
+    """The name of a file as it was given: a URL has lost a slash as a `Path`."""
+    url = _URL.sub(lambda found: found[1] + ("://" if found[1] != "file" else ":///"), os.fspath(path))
+    return url if is_url(path) else os.fspath(path)
+
+
 def beside(path: str | os.PathLike[str]) -> Path:
     """The file; in place of one at a URL, that of its name in the working folder."""
     return Path(os.path.basename(unquote(urlsplit(os.fspath(path)).path)) if is_url(path) else path)
@@ -37,7 +45,7 @@ def beside(path: str | os.PathLike[str]) -> Path:
 def local(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
     """A file that is here: the one of that name, or what is fetched from a URL; errors as `in_parts`."""
     found = in_parts(path)
-    return found.whole() if isinstance(found, FileAtUrl) else found
+    return found.whole if isinstance(found, FileAtUrl) else found
 
 
 def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUrl":
@@ -50,8 +58,7 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
     """
     if not is_url(path):
         return path
-    url = _URL.sub(lambda found: found[1] + ("://" if found[1] != "file" else ":///"), os.fspath(path))
-    name = beside(path).name
+    url, name = shown(path), beside(path).name
     expected = "the URL of a bundle, or of an asset in one file"
     check(url, name and not name.endswith(".json"), f"{expected}, got one of a file that names others")
     fsspec = _extras.load("fsspec")
@@ -76,35 +83,35 @@ def _naming_errors(url: str) -> Iterator[None]:
 
 
 class FileAtUrl(os.PathLike[str]):
-    """A file at a URL, and one of its size here, to which comes what is needed, once.
+    """A file at a URL, and one of its size here, without a name, to which comes what is needed, once.
 
     Attributes:
-        copy: The name of the file here.
+        file: The file here.
     """
 
     def __init__(self, url: str, there: Any, place: str, num_bytes: int | None, name: str) -> None:
-        self._url, self._there, self._place, self._num_bytes = url, there, place, num_bytes
-        self.copy = os.path.join(tempfile.mkdtemp(prefix="v3dg_"), name)
-        atexit.register(shutil.rmtree, os.path.dirname(self.copy), ignore_errors=True)
-        with open(self.copy, "wb") as file:
-            file.truncate(num_bytes or 0)
-        self._is_here = np.zeros(-(-(num_bytes or 0) // _BLOCK_BYTES), bool)  # each block
+        self._url, self._there, self._place, self._name = url, there, place, name
+        self.file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  # as long as this lives
+        weakref.finalize(self, self.file.close)
+        if num_bytes is None:  # no parts without it
+            shutil.copyfileobj(there.open(place), self.file)
+        self._num_bytes = num_bytes or self.file.tell()
+        self.file.truncate(self._num_bytes)
+        self._is_here = np.full(-(-self._num_bytes // _BLOCK_BYTES), num_bytes is None)  # each block
         # Only those of the asynchronous kind are for several threads.
         self._lock: Any = contextlib.nullcontext() if there.async_impl else threading.Lock()
-        if num_bytes is None:  # no parts without it
-            self.whole()
 
     def __fspath__(self) -> str:
         return self._url
 
+    @cached_property
     def whole(self) -> str:
-        """The name of the file here, all of which is there."""
-        if self._num_bytes is None or not self._is_here.all():
-            with self._lock, _naming_errors(self._url):
-                self._there.get_file(self._place, self.copy)
-            self._num_bytes = os.stat(self.copy).st_size
-            self._is_here = np.ones(-(-self._num_bytes // _BLOCK_BYTES), bool)
-        return self.copy
+        """A file here that has all of it, and its name."""
+        folder = tempfile.mkdtemp(prefix="v3dg_")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        with self._lock, _naming_errors(self._url):
+            self._there.get_file(self._place, os.path.join(folder, self._name))
+        return os.path.join(folder, self._name)
 
     def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
         """Have the bytes from each first to each last here; on any thread.
@@ -120,21 +127,16 @@ class FileAtUrl(os.PathLike[str]):
         cuts = np.flatnonzero((np.diff(blocks) > 1) | (blocks[1:] % _MOST_BLOCKS == 0)) + 1
         pieces = [(piece[0], piece[-1] + 1) for piece in np.split(blocks, cuts) if len(piece)]
         for k in range(0, len(pieces), _MOST_PIECES):
-            some = np.minimum(
-                _BLOCK_BYTES * np.array(pieces[k : k + _MOST_PIECES]), self._num_bytes or 0
-            ).tolist()
-            with self._lock, _naming_errors(self._url), open(self.copy, "r+b") as file:
-                found = self._there.cat_ranges([self._place] * len(some), *map(list, zip(*some, strict=True)))
-                for (first, last), data in zip(some, found, strict=True):
+            ends = _BLOCK_BYTES * np.array(pieces[k : k + _MOST_PIECES])
+            firsts, lasts = np.minimum(ends, self._num_bytes).T.tolist()
+            with self._lock, _naming_errors(self._url):
+                found = self._there.cat_ranges([self._place] * len(firsts), firsts, lasts)
+                for first, last, data in zip(firsts, lasts, found, strict=True):
                     if isinstance(data, Exception):
                         raise data
                     if len(data) == self._num_bytes:  # its server knows no parts
                         first, last = 0, self._num_bytes
-                    expected = (
-                        f"{last - first} bytes at {first}, got {len(data)}; it has changed, open it again"
-                    )
-                    check(self._url, len(data) == last - first, expected)
-                    file.seek(first)
-                    file.write(data)
-                    file.flush()  # before anybody takes it to be there
+                    got = f"{len(data)}; it has changed, open it again"
+                    check(self._url, len(data) == last - first, f"{last - first} bytes at {first}, got {got}")
+                    _files.write_at(self.file.fileno(), data, first)
                     self._is_here[first // _BLOCK_BYTES : -(-last // _BLOCK_BYTES)] = True

@@ -99,7 +99,7 @@ class BundleFile:
     def __init__(self, path: str | os.PathLike[str], reader: _core.HashedReader) -> None:
         self.path = os.fspath(path)
         self._at_url = path if isinstance(path, FileAtUrl) else None
-        self._fd = _files.open_regular(self._at_url.copy if self._at_url else path)
+        self._fd = os.dup(self._at_url.file.fileno()) if self._at_url else _files.open_regular(path)
         weakref.finalize(self, os.close, self._fd)
         with _files.naming_errors(path):
             self._read_header_and_tables(reader)

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import tyro
 
 from v3dg._numbers import check
-from v3dg._urls import beside, is_url
+from v3dg._urls import beside, is_url, shown
 from v3dg.bundle import Bundle
 from v3dg.io import SUFFIXES
 
@@ -106,11 +106,8 @@ def check_range(name: str, value: float, least: float, most: float) -> None:
 def require_file(path: Path, *suffixes: str) -> None:
     check(path, is_url(path) or path.exists(), f"a file, got a path where there is none{_similar(path)}")
     got = "a folder" if path.is_dir() else "another name"
-    check(
-        path,
-        beside(path).name.lower().endswith(suffixes),
-        f"a file ending in {', '.join(suffixes)}, got {got}",
-    )
+    is_known = beside(path).name.lower().endswith(suffixes)
+    check(shown(path), is_known, f"a file ending in {', '.join(suffixes)}, got {got}")
 
 
 def _similar(path: Path) -> str:

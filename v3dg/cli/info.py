@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import tyro
 
+from v3dg._urls import shown
 from v3dg.build import BuildConfig
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
@@ -55,7 +56,7 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
     values = {"longest_scale": drawable.scales.max(axis=1), "opacity": drawable.opacities}
     spread = {name: np.percentile(of, (5, 50, 95)).tolist() for name, of in values.items() if len(of)}
     result = {
-        "path": str(path),
+        "path": shown(path),
         "kind": "asset",
         "gaussians": len(asset),
         "drawable": len(drawable),
@@ -67,7 +68,7 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
         "percentiles_5_50_95": spread,
     }
     lines = [
-        f"{path}: asset, {_common.bytes_text(num_bytes)}",
+        f"{shown(path)}: asset, {_common.bytes_text(num_bytes)}",
         f"{len(asset):,} gaussians, SH degree {asset.sh_degree}",
     ]
     if findings.counts:

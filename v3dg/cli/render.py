@@ -8,6 +8,7 @@ import tyro
 
 from v3dg import _device
 from v3dg._progress import counted
+from v3dg._urls import shown
 from v3dg.cli._common import Cut, OnPool, check_usage, finite, option, print_result, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, choose_up, picture_paths
 from v3dg.false_color import ColorBy
@@ -68,5 +69,5 @@ def run(options: Render) -> None:
         "picture = {picture}; size = {width} x {height}; selected = {gaussians_selected:,}; "
         "in frustum = {gaussians_in_frustum:,}; select ms = {select_ms:.1f}; draw ms = {draw_ms:.1f}"
     )
-    result = {"subject": str(options.subject), "pictures": pictures}
+    result = {"subject": shown(options.subject), "pictures": pictures}
     print_result(options.json, result, [*table_lines(columns, pictures), *notes])

@@ -17,6 +17,7 @@ from typing import Annotated
 import tyro
 
 from v3dg._start import SIGNALS
+from v3dg._urls import shown
 from v3dg.cameras import Axis
 from v3dg.cli._common import Cut, Flag, OnPool, check_usage, option, print_result, require_subject, tell
 from v3dg.cli._views import CameraFile
@@ -81,8 +82,8 @@ def run(options: View) -> None:
         try:
             if options.port not in (0, site.port) and not options.quiet:
                 tell(f"port {options.port} is taken, listening at {site.port}")
-            told = {"url": site.url, "subject": str(options.subject)}
-            print_result(options.json, told, [f"{site.url} shows {options.subject}; Ctrl-C ends it", *lines])
+            told = {"url": site.url, "subject": shown(options.subject)}
+            print_result(options.json, told, [f"{site.url} shows {told['subject']}; Ctrl-C ends it", *lines])
             if not options.no_browser and not site.is_secret and _has_browser():
                 threading.Thread(target=webbrowser.open, args=(site.url,), daemon=True).start()
             while not interrupts:
