@@ -97,11 +97,12 @@ def others_of(config: Config, cameras: Sequence[v3dg.Camera]) -> list[v3dg.Camer
 
 
 def refitted(
-    kept: v3dg.Gaussians, asset: v3dg.Gaussians, cameras: Sequence[v3dg.Camera], steps: int, device: str
+    kept: v3dg.Gaussians, asset: v3dg.Gaussians, cameras: Sequence[v3dg.Camera], config: Config
 ) -> v3dg.Gaussians:
     """What is kept, moved by Adam until pictures of it are those of the asset: a step a picture."""
     import torch
 
+    device, steps = config.device, config.steps
     whole = asset.torch(device)
     truths = [torch.tensor(draw_truth(whole, camera, device, _SAMPLES)) for camera in cameras]
     start = kept.torch(device)
@@ -120,7 +121,7 @@ def refitted(
         sh = torch.cat([values["sh0"], values["rest"]], dim=1)
         return v3dg.Gaussians(values["means"], quats, *shape, sh)
 
-    order = random.Random(0)
+    order = random.Random(config.seed)
     left: list[int] = []
     for _ in range(steps):
         left = left or order.sample(range(len(cameras)), len(cameras))
@@ -173,7 +174,7 @@ def measure(config: Config, subject: Subject) -> list[Row]:
         kept = asset.subset(np.sort(seen[round(len(seen) * (1 - part)) :]))
         add(kept, part, 0)
         if part in config.refit:
-            add(refitted(kept, asset, others, config.steps, config.device), part, config.steps)
+            add(refitted(kept, asset, others, config), part, config.steps)
     return rows
 
 
