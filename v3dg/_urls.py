@@ -61,13 +61,12 @@ def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUr
     url, name = shown(path), beside(path).name
     expected = "the URL of a bundle, or of an asset in one file"
     check(url, name and not name.endswith(".json"), f"{expected}, got one of a file that names others")
-    fsspec = _extras.load("fsspec")
     with _naming_errors(url):
-        there, place = fsspec.core.url_to_fs(url)
+        there, place = _extras.load("fsspec").core.url_to_fs(url)
         info = there.info(place)
-    key = url, str(info)  # which mostly has a tag or a time, besides the size
-    if key not in _opened:
-        _opened[key] = FileAtUrl(url, there, place, info["size"], name)
+        key = url, str(info)  # which mostly has a tag or a time, besides the size
+        if key not in _opened:
+            _opened[key] = FileAtUrl(url, there, place, info["size"], name)
     return _opened[key]
 
 

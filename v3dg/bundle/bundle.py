@@ -30,7 +30,6 @@ class Bundle:
     """All clusters of all levels of one asset. In memory, or a file of which pages are read when needed.
 
     Attributes:
-        path: Name or URL of the file that it was opened from, if it was.
         config: How it was built, as JSON values.
         sh_degree: 0 to 3, the same for all gaussians.
         codec: How its file keeps gaussians. "float32": every bit. "quantized": in 16 (SH degree 0) to 40
@@ -41,7 +40,6 @@ class Bundle:
             ``config`` is not JSON, or the codec is unknown or cannot hold a value.
     """
 
-    path: str | None = None
     _file: BundleFile | None = None
 
     def __init__(
@@ -126,7 +124,7 @@ class Bundle:
             _check_page_tables(pages, file)
             bundle = cls.__new__(cls)
             bundle._set(clusters, groups, file.config, pages)
-            bundle._file, bundle.path = file, file.path
+            bundle._file = file
         except ValueError as error:
             file.verify()  # for what is wrong with the tables is mostly damage
             raise ValueError(f"{file.path}: {error}") from None
@@ -169,6 +167,11 @@ class Bundle:
     def groups(self) -> Groups:
         """G groups."""
         return self._groups
+
+    @property
+    def path(self) -> str | None:
+        """Name or URL of the file that the bundle was opened from, if it was."""
+        return None if self._file is None else self._file.path
 
     @property
     def num_levels(self) -> int:

@@ -143,7 +143,12 @@ def choose_up(
     axis, how = (given, "") if given else up_of(subject, cameras, path)
     if how == ASSUMED and is_at_terminal():
         axis, how = ask_up(path, axis), "as you said"
-    return axis, [] if given else [f"{path.name}: {axis} is up, {how}; --up says otherwise"]
+    return axis, lines_of_up(path, axis, how)
+
+
+def lines_of_up(path: Path, axis: Axis, how: str) -> list[str]:
+    """What a command says of the axis that it took for up, and how; nothing of one that was given."""
+    return [f"{path.name}: {axis} is up, {how}; --up says otherwise"] if how else []
 
 
 def is_at_terminal() -> bool:

@@ -79,9 +79,9 @@ def run(options: Build) -> None:
 
 def _asked_up(path: Path) -> Axis | None:
     """What is up in an asset, of who sits at a terminal, where neither its kind nor its gaussians tell."""
-    _common.require_file(path, *SUFFIXES)
     if not is_at_terminal():
         return None
+    _common.require_file(path, *SUFFIXES)
     asset = open_asset(path)
     starts = range(0, asset.num_gaussians, max(asset.num_gaussians // _SAMPLES, _SAMPLE))
     parts = [asset.read(start, min(start + _SAMPLE, asset.num_gaussians)) for start in starts]

@@ -20,7 +20,7 @@ from v3dg._start import SIGNALS
 from v3dg._urls import shown
 from v3dg.cameras import Axis
 from v3dg.cli._common import Cut, Flag, OnPool, check_usage, option, print_result, require_subject, tell
-from v3dg.cli._views import CameraFile
+from v3dg.cli._views import CameraFile, lines_of_up
 from v3dg.opening import open_with_cameras
 from v3dg.upright import ASSUMED, direction_of, up_of
 
@@ -62,7 +62,7 @@ def run(options: View) -> None:
     expected = f"a bundle or a scene, got the asset {options.subject}; build a bundle of it"
     check_usage("--budget", options.budget is None or not isinstance(subject, Gaussians), expected)
     up, how = (options.up, "") if options.up else up_of(subject, cameras, options.subject)
-    lines = [f"{options.subject.name}: {up} is up, {how}; --up says otherwise"] if how else []
+    lines = lines_of_up(options.subject, up, how)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
     with contextlib.suppress(ImportError):  # of which the site tells; it takes long
         importlib.import_module("v3dg.viewer.tab")
