@@ -18,6 +18,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 import v3dg
+from file_hash import file_hash
 from golden import golden_bundles
 from random_bundle import random_bundle, random_gaussians
 from v3dg import _core
@@ -120,11 +121,11 @@ def split_file(data):
 def join_file(header, tensors):
     """The file of a header, as it is given, and tensors in the header's order, with a hash that fits."""
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
-    is_packed = b'"version": "2"' in text
-    text += b" " * (-(8 + len(text)) % (16 if is_packed else 4096))
+    version = re.search(rb'"version": "([0-9]{1,9})"', text)
+    text += b" " * (-(8 + len(text)) % (16 if b'"codec": "quantized"' in text else 4096))
     head = len(text).to_bytes(8, "little") + text
     tables = b"".join(tensors[name].tobytes() for name in TABLE_NAMES if name in tensors)
-    digest = hashlib.blake2b(head + tables, digest_size=16).digest()
+    digest = file_hash(head + tables, int(version[1]) if version else 3)
     return head + tensors["pages"].tobytes() + tables + digest
 
 
@@ -195,10 +196,10 @@ def test_format_page_lists_the_tables_in_file_order(saved):
     header, _ = split_file(saved[1].read_bytes())
     del header["__metadata__"]
     in_file = sorted(header.items(), key=lambda item: item[1]["data_offsets"])
-    only_in_1 = re.findall(r"^\| `([a-z0-9_.]+)` \| .*; in version 1 only \|$", text, re.MULTILINE)
-    assert len(only_in_1) == 2
-    is_1 = saved[0].codec == "float32"
-    expected = [(name, dtype) for name, dtype in documented if is_1 or name not in only_in_1]
+    only_of_floats = re.findall(r"^\| `([a-z0-9_.]+)` \| .*; only with float32 \|$", text, re.MULTILINE)
+    assert len(only_of_floats) == 2
+    has_floats = saved[0].codec == "float32"
+    expected = [(name, dtype) for name, dtype in documented if has_floats or name not in only_of_floats]
     assert expected == [(name, tensor["dtype"]) for name, tensor in in_file]
 
 
@@ -516,12 +517,12 @@ def test_newer_version_asks_for_an_update(saved, monkeypatch):
     _, path = saved
 
     def newer(header, tensors):
-        header["__metadata__"] = {"format": "v3dg", "version": "3"}
+        header["__metadata__"] = {"format": "v3dg", "version": "4"}
         header["unheard_of"] = None
 
     monkeypatch.chdir(path.parent)
     path.rename("x.v3dg")
-    with pytest.raises(ValueError, match=r"^x\.v3dg: version 3, this build reads up to 2; update v3dg$"):
+    with pytest.raises(ValueError, match=r"^x\.v3dg: version 4, this build reads up to 3; update v3dg$"):
         open_changed(Path("x.v3dg"), newer)
 
 
@@ -547,6 +548,8 @@ def with_metadata(**values):
         (with_metadata(version="١"), "version: expected a number"),
         (with_metadata(version=1), "version: expected a number"),
         (with_metadata(version="9" * 1000), "version: expected a number"),
+        (with_metadata(codec="zip"), 'codec: expected one that this build reads, got "zip"'),
+        (with_metadata(codec=["float32"]), "codec: expected one that this build reads, got"),
         (with_metadata(sh_degree="4"), "sh_degree: expected '0' to '3', got \"4\""),
         (with_metadata(sh_degree="1"), "clusters.offset.* expected at most|pages"),
         (with_metadata(config="[]"), "config: expected a JSON object"),
@@ -638,7 +641,7 @@ BIG = 2**31 - 1
 )
 def test_wrong_table_is_refused(saved, name, row, value, message):
     if name not in split_file(saved[1].read_bytes())[1]:
-        pytest.skip("version 1 alone has it")
+        pytest.skip("files with float32 alone have it")
     with pytest.raises(ValueError, match=rf"small\.v3dg: ({message})") as caught:
         open_changed(saved[1], with_value(name, row, value))
     assert "\n" not in str(caught.value)
@@ -691,13 +694,32 @@ def test_random_headers_open_or_are_refused(tmp_path_factory, data):
 # Quantised pages
 
 
-def test_golden_files_of_both_versions_are_read():
-    """What was written once stays readable, to the same bits."""
-    for version, bundle in enumerate(golden_bundles.bundles(), start=1):
-        opened = Bundle.open(golden_bundles.path_of(version))
-        assert opened.info()["version"] == version
-        assert_same_tables(opened, bundle)
-        assert_same_gaussians(opened.gaussians, bundle.gaussians)
+@pytest.mark.parametrize(
+    ("version", "codec"), [(1, "float32"), (2, "quantized"), (3, "float32"), (3, "quantized")]
+)
+def test_golden_files_of_all_versions_are_read(version, codec, tmp_path):
+    """What was written once stays readable, to the same bits; what is written is of the newest version."""
+    path, bundle = golden_bundles.path_of(version, codec), golden_bundles.bundle_of(codec)
+    opened = Bundle.open(path)
+    info = opened.info()
+    assert (info["version"], info["codec"], info["bytes"]) == (version, codec, path.stat().st_size)
+    assert_same_tables(opened, bundle)
+    assert_same_gaussians(opened.gaussians, bundle.gaussians)
+    opened.write(tmp_path / "again.v3dg")
+    newest = golden_bundles.path_of(3, codec)
+    assert (tmp_path / "again.v3dg").read_bytes() == newest.read_bytes()
+
+
+@pytest.mark.parametrize(("version", "codec"), [(1, "float32"), (2, "quantized"), (3, "float32")])
+def test_damage_of_tables_is_found_in_all_versions(version, codec, tmp_path):
+    data = bytearray(golden_bundles.path_of(version, codec).read_bytes())
+    path = tmp_path / "damaged.v3dg"
+    for place in (len(data) - 1, len(data) - 17):  # of the file's hash, and of a page's
+        data[place] ^= 1
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match="hash: the header and tables do not match it"):
+            Bundle.open(path)
+        data[place] ^= 1
 
 
 def test_a_bundle_is_rounded_when_it_is_made():
@@ -724,7 +746,7 @@ def test_values_that_have_no_code_are_refused():
 
 def test_unknown_codecs_ask_for_an_update(tmp_path):
     random_bundle(3, codec="quantized").write(tmp_path / "a.v3dg")
-    for codec in ("later", "float32", None, 3, ["quantized"]):
+    for codec in ("later", None, 3, ["quantized"]):
         with pytest.raises(ValueError, match=r"a\.v3dg: codec: expected one that this .*, got .*; update"):
             open_changed(tmp_path / "a.v3dg", with_metadata(codec=codec))
 

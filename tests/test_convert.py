@@ -95,7 +95,7 @@ def test_a_bundle_becomes_one_of_another_codec_and_back(folder):
     assert write("back.v3dg", "again.v3dg", "--codec", "quantized") == "quantized"
     assert (folder / "again.v3dg").read_bytes() == (folder / "small.v3dg").read_bytes()
     text = run("info", "small.v3dg", cwd=folder).stdout
-    assert "bundle, version 2 (quantized)" in text
+    assert "bundle, version 3 (quantized)" in text
 
 
 def test_the_cut_of_a_bundle_for_a_turntables_camera(folder):

@@ -1,29 +1,35 @@
 """Opening bundles: tables are read and hashed while they are looked at, and several files at once."""
 
-import hashlib
 import os
 
 import numpy as np
 import pytest
 
 import v3dg
+from support.file_hash import PIECE, file_hash
 from support.random_bundle import random_bundle
 from v3dg import Bundle, Clusters, Gaussians, Groups, _core
 
 LARGE = 5 << 20  # bytes: what is read and hashed on threads of its own
 
 
-@pytest.mark.parametrize("size", [0, 1, 127, 128, 129, 256, 4097, LARGE, LARGE + 1, LARGE + (1 << 20) - 3])
-@pytest.mark.parametrize("num_before", [0, 1, 128, 200])
-def test_what_is_read_is_hashed_behind_what_was_before(tmp_path, size, num_before):
+SIZES = [0, 1, 127, 128, 129, 256, 4097, PIECE - 200, PIECE, PIECE + 1, 10 * PIECE]
+SIZES += [LARGE, LARGE + 1, LARGE + (1 << 20) - 3]
+
+
+@pytest.mark.parametrize("in_pieces", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("num_before", [0, 1, 128, 200, PIECE, 3 * PIECE + 5])
+def test_what_is_read_is_hashed_behind_what_was_before(tmp_path, size, num_before, in_pieces):
     rng = np.random.default_rng(size + num_before)
     data, before = (rng.integers(0, 256, count, np.uint8) for count in (size, num_before))
-    digest = bytearray(hashlib.blake2b(before.tobytes() + data.tobytes(), digest_size=16).digest())
+    digest = bytearray(file_hash(before.tobytes() + data.tobytes(), 3 if in_pieces else 2))
     path = tmp_path / "data"
     for is_sound in (True, False):
         path.write_bytes(b"other" + data.tobytes() + digest + b"more")
         with open(path, "rb") as file:
-            reading = _core.HashedReader().read(str(path), file.fileno(), before.tobytes(), 5, size + 16)
+            place = (file.fileno(), before.tobytes(), 5, size + 16)
+            reading = _core.HashedReader().read(str(path), *place, in_pieces)
         read = reading.wait()
         np.testing.assert_array_equal(read[:size], data)
         assert read[size:].tobytes() == digest
@@ -32,17 +38,18 @@ def test_what_is_read_is_hashed_behind_what_was_before(tmp_path, size, num_befor
         digest[size % 16] ^= 1 << size % 8
 
 
-def test_of_several_that_are_hashed_together_each_is_sound_or_not(tmp_path):
+@pytest.mark.parametrize("in_pieces", [False, True])
+def test_of_several_that_come_together_each_is_sound_or_not(tmp_path, in_pieces):
     reader, before = _core.HashedReader(), bytes(8)
     sizes = [100, 0, 5000, 70_000, LARGE, 1, 128, 120, 300_000, 8, *range(20)]
     readings = []
     for number, size in enumerate(sizes):
         data = np.full(size, number, np.uint8)
-        digest = hashlib.blake2b(before + data.tobytes(), digest_size=16).digest()
+        digest = file_hash(before + data.tobytes(), 3 if in_pieces else 2)
         path = tmp_path / str(number)
         path.write_bytes(data.tobytes() + (digest if number % 3 else digest[::-1]))
         with open(path, "rb") as file:
-            readings.append(reader.read(str(path), file.fileno(), before, 0, size + 16))
+            readings.append(reader.read(str(path), file.fileno(), before, 0, size + 16, in_pieces))
         assert readings[-1].wait().ctypes.data % 8 == 0
     for number, (reading, size) in enumerate(zip(readings, sizes, strict=True)):
         assert reading.is_sound() == (number % 3 > 0)
@@ -54,7 +61,7 @@ def test_a_file_that_ends_before_is_told(tmp_path, size):
     path = tmp_path / "data"
     path.write_bytes(bytes(size - 1))
     with open(path, "rb") as file:
-        reading = _core.HashedReader().read(str(path), file.fileno(), b"", 0, size)
+        reading = _core.HashedReader().read(str(path), file.fileno(), b"", 0, size, True)
     with pytest.raises(ValueError, match=r"data: size: expected bytes at 0, .*truncated"):
         reading.wait()
 
@@ -63,7 +70,7 @@ def test_a_file_that_ends_before_is_told(tmp_path, size):
 def test_what_the_system_cannot_read_is_an_error_with_the_name(tmp_path, size):
     descriptor = os.open(tmp_path, os.O_RDONLY)
     try:
-        reading = _core.HashedReader().read(str(tmp_path), descriptor, b"", 0, size)
+        reading = _core.HashedReader().read(str(tmp_path), descriptor, b"", 0, size, True)
         with pytest.raises(IsADirectoryError, match=tmp_path.name):
             reading.wait()
     finally:

@@ -155,6 +155,7 @@ def decode_page(page: Int32, offset: Int64, out: Rows) -> None: ...
 
 # pages
 DAMAGED: str
+HASH_PIECE_BYTES: int
 
 def read_pages(
     path: str,
@@ -176,7 +177,9 @@ class HashedRead:
 
 class HashedReader:
     def __init__(self) -> None: ...
-    def read(self, path: str, descriptor: int, before: bytes, offset: int, num_bytes: int) -> HashedRead: ...
+    def read(
+        self, path: str, descriptor: int, before: bytes, offset: int, num_bytes: int, in_pieces: bool
+    ) -> HashedRead: ...
 
 class Codes:
     """All pages of a bundle as codes, on the host; borrows the arrays."""

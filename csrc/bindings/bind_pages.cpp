@@ -102,28 +102,20 @@ std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
     return digests;
 }
 
-class BoundReader;
-
 // With the array that it reads to and hashes.
-class BoundHashedRead : public std::enable_shared_from_this<BoundHashedRead> {
+class BoundHashedRead {
   public:
-    BoundHashedRead(std::shared_ptr<BoundReader> reader, const py::object& path, int descriptor,
-                    size_t offset, py::array_t<uint8_t> message, size_t num_before)
-        : reader_(std::move(reader)),
-          path_(path),
-          message_(std::move(message)),
-          offset_(offset),
-          num_before_(num_before) {
+    BoundHashedRead(const py::object& path, int descriptor, size_t offset, py::array_t<uint8_t> message,
+                    size_t num_before, HashOf how)
+        : path_(path), message_(std::move(message)), offset_(offset), num_before_(num_before) {
         const Span<uint8_t> bytes = span_of<uint8_t>(message_, "message", {-1});
         naming_file(path_,
-                    [&] { read_.emplace(PosixFile::duplicate(descriptor), offset, bytes, num_before); });
+                    [&] { read_.emplace(PosixFile::duplicate(descriptor), offset, bytes, num_before, how); });
     }
-    HashedRead& read() { return *read_; }
     py::array wait();
     bool is_sound();
 
   private:
-    const std::shared_ptr<BoundReader> reader_;
     const py::object path_;
     const py::array_t<uint8_t> message_;
     const size_t offset_, num_before_;
@@ -131,33 +123,18 @@ class BoundHashedRead : public std::enable_shared_from_this<BoundHashedRead> {
 };
 
 // Parts of several files. Small ones come to pieces of memory together, for which the system takes large
-// pages, and are hashed together: by the thread that has read the last of a few, and the rest by whoever
-// first asks whether one is sound. With Python's lock, unless a function gives it up.
-class BoundReader : public std::enable_shared_from_this<BoundReader> {
+// pages.
+class BoundReader {
   public:
-    std::shared_ptr<BoundHashedRead> read(const py::object& path, int descriptor, const py::bytes& before,
-                                          size_t offset, size_t num_bytes) {
+    std::unique_ptr<BoundHashedRead> read(const py::object& path, int descriptor, const py::bytes& before,
+                                          size_t offset, size_t num_bytes, bool in_pieces) {
         const auto first = before.cast<std::string_view>();
         if (num_bytes < kPageHashBytes)
             throw py::value_error("num_bytes: expected at least 16, got " + std::to_string(num_bytes));
         py::array_t<uint8_t> message = take(first.size() + num_bytes);
         std::copy(first.begin(), first.end(), message.mutable_data());
-        return std::make_shared<BoundHashedRead>(shared_from_this(), path, descriptor, offset,
-                                                 std::move(message), first.size());
-    }
-    void add_read(const std::shared_ptr<BoundHashedRead>& read) {
-        read_.push_back(read);
-        if (read_.size() >= HashedRead::kHashedTogether) hash_small();
-    }
-    void hash_small() {
-        std::vector<std::shared_ptr<BoundHashedRead>> kept;
-        std::vector<HashedRead*> reads;
-        for (const auto& read : std::exchange(read_, {})) {
-            kept.push_back(read.lock());
-            if (kept.back() != nullptr) reads.push_back(&kept.back()->read());
-        }
-        const py::gil_scoped_release unlocked;
-        HashedRead::hash_small({reads.data(), reads.size()});
+        return std::make_unique<BoundHashedRead>(path, descriptor, offset, std::move(message), first.size(),
+                                                 in_pieces ? HashOf::pieces : HashOf::bytes);
     }
 
   private:
@@ -177,8 +154,7 @@ class BoundReader : public std::enable_shared_from_this<BoundReader> {
 
     static constexpr size_t kFilesOfPiece = 8;
     py::array piece_;
-    size_t left_ = 0;                                   // of it
-    std::vector<std::weak_ptr<BoundHashedRead>> read_;  // and not hashed yet
+    size_t left_ = 0;  // of it
 };
 
 py::array BoundHashedRead::wait() {
@@ -188,14 +164,12 @@ py::array BoundHashedRead::wait() {
                                 ", got the end of the file; it was truncated",
                             true);
     });
-    reader_->add_read(shared_from_this());
     py::array bytes = message_[py::slice(num_before_, message_.size(), 1)];
     bytes.attr("flags").attr("writeable") = false;
     return bytes;
 }
 
 bool BoundHashedRead::is_sound() {
-    reader_->hash_small();
     const py::gil_scoped_release unlocked;
     return read_->is_sound();
 }
@@ -203,19 +177,20 @@ bool BoundHashedRead::is_sound() {
 }  // namespace
 
 void bind_pages(py::module_& m) {
-    py::class_<BoundHashedRead, std::shared_ptr<BoundHashedRead>>(
-        m, "HashedRead", "A part of a file that is read and hashed at the same time.")
+    py::class_<BoundHashedRead>(m, "HashedRead", "A part of a file that is read and hashed at the same time.")
         .def("wait", &BoundHashedRead::wait,
              "The bytes, once all are there; ValueError if the file has fewer.")
         .def("is_sound", &BoundHashedRead::is_sound, "Whether all that was read has the hash at its end.");
-    py::class_<BoundReader, std::shared_ptr<BoundReader>>(
-        m, "HashedReader", "Reads parts of several files, of which small ones are hashed side by side.")
+    py::class_<BoundReader>(m, "HashedReader", "Reads parts of several files, small ones to memory together.")
         .def(py::init<>())
-        .def("read", &BoundReader::read, "path"_a, "descriptor"_a, "before"_a, "offset"_a, "num_bytes"_a,
-             "Bytes at one place of a file that end with their BLAKE2b-128, of `before` and them. They are "
-             "aligned to eight if `before` has a multiple of eight.");
+        .def(
+            "read", &BoundReader::read, "path"_a, "descriptor"_a, "before"_a, "offset"_a, "num_bytes"_a,
+            "in_pieces"_a,
+            "Bytes at one place of a file that end with the BLAKE2b-128 of `before` and them, or of those of "
+            "their pieces. They are aligned to eight if `before` has a multiple of eight.");
     m.def("blake2b", &hash_messages, "messages"_a, "BLAKE2b-128 of several messages, side by side.");
     m.attr("DAMAGED") = kDamaged;
+    m.attr("HASH_PIECE_BYTES") = kHashPieceBytes;
     m.def(
         "read_pages", &read_run, "path"_a, "descriptor"_a, "out"_a, "codec"_a, "hashes"_a, py::kw_only(),
         "first_page"_a, "first_cluster"_a, "offset"_a, "places"_a,

@@ -44,4 +44,23 @@ void blake2b(Span<const Span<const uint8_t>> messages, PageHash* digests) {
     V3DG_DISPATCH_ISA(hash_messages, messages, digests);
 }
 
+void HashOfPieces::add_until(size_t end) {
+    const size_t first = digests_.size();
+    const size_t last =
+        end < message_.size ? end / kHashPieceBytes : (message_.size + kHashPieceBytes - 1) / kHashPieceBytes;
+    std::vector<Span<const uint8_t>> pieces;
+    for (size_t i = first; i < last; ++i) {
+        const size_t begin = i * kHashPieceBytes;
+        pieces.push_back({message_.data + begin, std::min(kHashPieceBytes, message_.size - begin)});
+    }
+    digests_.resize(last);
+    blake2b({pieces.data(), pieces.size()}, digests_.data() + first);
+}
+
+PageHash HashOfPieces::digest() {
+    Blake2b hash;
+    for (const PageHash& digest : digests_) hash.add(digest.data(), digest.size());
+    return hash.digest();
+}
+
 }  // namespace v3dg

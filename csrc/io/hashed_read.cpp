@@ -2,9 +2,6 @@
 
 #include <algorithm>
 #include <utility>
-#include <vector>
-
-#include "base/parallel_for.h"
 
 namespace v3dg {
 
@@ -16,16 +13,17 @@ constexpr size_t kNeededBefore = size_t(64) << 10;  // of the coarsest page, whi
 
 }  // namespace
 
-HashedRead::HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before)
+HashedRead::HashedRead(PosixFile file, size_t offset, Span<uint8_t> message, size_t num_before, HashOf how)
     : file_(std::move(file)),
       offset_(offset),
       bytes_{message.data + num_before, message.size - num_before},
-      message_{message.data, message.size - kPageHashBytes} {
+      message_{message.data, message.size - kPageHashBytes},
+      how_(how) {
     const size_t first = offset - std::min(offset, kNeededBefore);
     file_.expect(first, offset - first + std::min(bytes_.size, kPieceBytes));
-    const auto how = is_large() ? std::launch::async : std::launch::deferred;
-    read_ = std::async(how, [this] { return read(); }).share();
-    hash_ = std::async(how, [this] { return hash(); });
+    const auto when = bytes_.size >= kLargeBytes ? std::launch::async : std::launch::deferred;
+    read_ = std::async(when, [this] { return read(); }).share();
+    is_sound_ = std::async(when, [this] { return hash(); }).share();
 }
 
 bool HashedRead::read() {
@@ -62,50 +60,25 @@ size_t HashedRead::wait_for_more(size_t than) {
     return num_read_;
 }
 
-PageHash HashedRead::hash() {
-    Blake2b hash;
+bool HashedRead::hash() {
+    Blake2b of_bytes;
+    HashOfPieces of_pieces(message_);
     const size_t num_before = static_cast<size_t>(bytes_.data - message_.data);
-    hash.add(message_.data, num_before);
-    for (size_t done = 0; num_before + done < message_.size;) {
-        const size_t end = std::min(wait_for_more(done), message_.size - num_before);
-        if (end == done) break;  // the file ended, of which wait() tells
-        hash.add(bytes_.data + done, end - done);
+    for (size_t done = 0, end = num_before;;) {
+        if (how_ == HashOf::bytes) of_bytes.add(message_.data + done, end - done);
+        if (how_ == HashOf::pieces) of_pieces.add_until(end);
         done = end;
+        if (done == message_.size) break;
+        end = num_before + std::min(wait_for_more(done - num_before), message_.size - num_before);
+        if (end == done) break;  // the file ended, of which wait() tells
     }
-    return hash.digest();
-}
-
-std::optional<PageHash> HashedRead::digest() {
-    const std::lock_guard<std::mutex> lock(busy_);
-    return digest_;
-}
-
-void HashedRead::set_digest(const PageHash& digest) {
-    const std::lock_guard<std::mutex> lock(busy_);
-    digest_ = digest;
-}
-
-bool HashedRead::is_sound() {
-    if (!digest()) {
-        read_.wait();
-        set_digest(hash_.get());
-    }
-    const PageHash found = *digest();
+    const PageHash found = how_ == HashOf::bytes ? of_bytes.digest() : of_pieces.digest();
     return std::equal(found.begin(), found.end(), message_.end());
 }
 
-void HashedRead::hash_small(Span<HashedRead* const> reads) {
-    std::vector<HashedRead*> small;
-    for (HashedRead* read : reads)
-        if (!read->is_large() && !read->digest()) small.push_back(read);
-    parallel_for((small.size() + kHashedTogether - 1) / kHashedTogether, 1, [&](size_t k) {
-        Span<const uint8_t> messages[kHashedTogether];
-        PageHash digests[kHashedTogether];
-        const size_t first = k * kHashedTogether, count = std::min(kHashedTogether, small.size() - first);
-        for (size_t i = 0; i < count; ++i) messages[i] = small[first + i]->message_;
-        blake2b({messages, count}, digests);
-        for (size_t i = 0; i < count; ++i) small[first + i]->set_digest(digests[i]);
-    });
+bool HashedRead::is_sound() {
+    read_.wait();
+    return is_sound_.get();
 }
 
 }  // namespace v3dg

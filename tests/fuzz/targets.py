@@ -1,8 +1,8 @@
 """Readers, and what must hold whatever they read, for inputs that were kept; and zips for all."""
 
 import gzip
-import hashlib
 import io
+import itertools
 import json
 import struct
 import zipfile
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from file_hash import blake2b, file_hash
 from random_bundle import random_bundle, random_gaussians
 from v3dg._json import is_one_line
 from v3dg.bundle import Bundle
@@ -128,20 +129,18 @@ def with_fitting_hashes(data):
     data = bytearray(data)
     try:
         header, start, pages_end, hash_end = parts_of(data)
-        tables = {
-            name: slice(*(start + offset for offset in header[name]["data_offsets"]))
-            for name in ("pages.offset", "pages.bytes", "pages.hash")
-        }
-        offsets, sizes = (
-            struct.unpack(f"<{len(data[tables[name]]) // 8}q", data[tables[name]])
-            for name in ("pages.offset", "pages.bytes")
+        offsets, hashes = (
+            slice(*(start + offset for offset in header[name]["data_offsets"]))
+            for name in ("pages.offset", "pages.hash")
         )
-        pages = [data[start + a : start + a + n + -n % 4096] for a, n in zip(offsets, sizes, strict=True)]
-        hashes = b"".join(hashlib.blake2b(page, digest_size=16).digest() for page in pages)
-        if len(hashes) == len(data[tables["pages.hash"]]):
-            data[tables["pages.hash"]] = hashes
+        ends = [*struct.unpack(f"<{len(data[offsets]) // 8}q", data[offsets]), pages_end]
+        pages = [data[start + first : start + last] for first, last in itertools.pairwise(ends)]
+        fitting = b"".join(map(blake2b, pages))
+        if len(fitting) == len(data[hashes]):
+            data[hashes] = fitting
         covered = data[:start] + data[start + pages_end : start + hash_end - 16]
-        data[start + hash_end - 16 : start + hash_end] = hashlib.blake2b(covered, digest_size=16).digest()
+        version = int(header["__metadata__"]["version"])
+        data[start + hash_end - 16 : start + hash_end] = file_hash(covered, version)
     except Exception:  # the header leads nowhere
         pass
     return bytes(data)

@@ -17,7 +17,7 @@ from v3dg._numbers import check, check_all, check_type
 from v3dg._urls import in_parts, is_url
 from v3dg.bundle.codec import Codec, codec_of
 from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
-from v3dg.bundle.format import HASH_BYTES, config_to_json, page_tables
+from v3dg.bundle.format import HASH_BYTES, VERSION, config_to_json, page_tables
 from v3dg.bundle.pages import CodePages, FilePages, MemoryPages, PageLayout, on_threads, runs_of_pages
 from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
@@ -98,18 +98,14 @@ class Bundle:
         reader, paths = _core.HashedReader(), list(paths)
         try:
             # Also where there are fewer processors: a disk answers several at once.
-            opened = on_threads(lambda path: cls._open(BundleFile(path, reader)), paths, most=8)
-            for _, file in opened:
-                file.verify()  # the first time of all, because they are hashed side by side
+            return on_threads(lambda path: cls._open(BundleFile(path, reader)), paths, most=8)
         except (OSError, ValueError):
             for path in paths[:-1]:
                 cls.open_all([path])  # where one before has a fault as well, that is told
             raise
-        return [bundle for bundle, _ in opened]
 
     @classmethod
-    def _open(cls, file: BundleFile) -> tuple[Bundle, BundleFile]:
-        """Not verified yet."""
+    def _open(cls, file: BundleFile) -> Bundle:
         tables = file.tables
         try:
             clusters = Clusters(**{f.name: tables[f"clusters.{f.name}"] for f in fields(Clusters)})
@@ -128,7 +124,8 @@ class Bundle:
         except ValueError as error:
             file.verify()  # for what is wrong with the tables is mostly damage
             raise ValueError(f"{file.path}: {error}") from None
-        return bundle, file
+        file.verify()  # after the checks, for tables are hashed meanwhile
+        return bundle
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the bundle to a file; the same bundle gives the same bytes.
@@ -291,9 +288,9 @@ class Bundle:
             )
         return {
             "path": self.path,
-            "version": self._codec.version,
+            "version": self._file.version if self._file else VERSION,
             "codec": self.codec,
-            "bytes": BundlePlan(self._layout, self._codec, self.config).num_bytes,
+            "bytes": (self._file or BundlePlan(self._layout, self._codec, self.config)).num_bytes,
             "sh_degree": self.sh_degree,
             "num_gaussians": self.num_gaussians,
             "num_clusters": len(self.clusters),

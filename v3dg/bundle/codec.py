@@ -20,13 +20,11 @@ class Codec:
 
     Attributes:
         name: As users and files have it.
-        version: Of the files that have it.
         alignment: Where a page begins in the file: at a multiple of so many bytes.
         gaussian_bytes, cluster_bytes: What a page holds for each.
     """
 
     name: ClassVar[str] = "float32"
-    version: ClassVar[int] = 1
     alignment: int = 4096  # the memory page, so that a page maps or loads directly
 
     def __init__(self, sh_degree: int) -> None:
@@ -57,7 +55,6 @@ class Quantized(Codec):
     """Codes of 16 bytes and up to 24 for the higher degrees, relative to the ranges of a cluster."""
 
     name = "quantized"
-    version = 2
 
     def __init__(self, sh_degree: int) -> None:
         self.sh_degree = sh_degree

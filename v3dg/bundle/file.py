@@ -4,7 +4,6 @@ docs/format.md says what is in the file and why. This module moves bytes and tru
 tables mean is checked by `v3dg.bundle.tables`.
 """
 
-import hashlib
 import os
 import re
 import weakref
@@ -19,7 +18,7 @@ from v3dg._numbers import check
 from v3dg._urls import FileAtUrl
 from v3dg.bundle import format as file_format
 from v3dg.bundle.codec import CODECS, Codec
-from v3dg.bundle.format import DTYPES, HASH_BYTES, entries_of, page_hash, page_tables, schema_of
+from v3dg.bundle.format import DTYPES, HASH_BYTES, VERSION, entries_of, page_hash, page_tables, schema_of
 from v3dg.bundle.pages import PageLayout, PageRun, on_threads
 from v3dg.bundle.tables import Clusters, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
@@ -35,7 +34,7 @@ class BundlePlan:
         self._page_tables = page_tables(layout, codec)
         pages_bytes = int(layout.page_bytes(codec).sum())
         num_clusters, num_pages = int(layout.first_cluster[-1]), layout.num_pages
-        entries = entries_of(codec.version, num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
+        entries = entries_of(codec, num_clusters, max(num_pages - 1, 0), num_pages, pages_bytes)
         self.header = file_format.header_of(entries, codec, config)
         ends = (entries[name]["data_offsets"][1] for name in ("pages", "hash"))
         self._pages_end, self.num_bytes = (len(self.header) + int(end) for end in ends)
@@ -51,9 +50,9 @@ class BundlePlan:
         """Write the tables, which are checked, behind the pages; those have these hashes, (P, 16)."""
         check_tables(clusters, groups, int(self.layout.first_gaussian[-1]))
         tables = self._page_tables | columns_of(clusters, groups) | {"pages.hash": hashes}
-        schema = schema_of(self.codec.version)
+        schema = schema_of(self.codec)
         end = b"".join(tables[name].astype(DTYPES[kind], copy=False).tobytes() for name, kind, _, _ in schema)
-        end += hashlib.blake2b(self.header + end, digest_size=HASH_BYTES).digest()
+        end += file_format.hash_of_pieces(self.header + end)
         assert self._pages_end + len(end) == self.num_bytes
         _files.write_at(descriptor, end, self._pages_end)
 
@@ -69,13 +68,10 @@ def write_pages(descriptor: int, run: PageRun, codec: Codec, gaussians: Gaussian
     hashes = np.empty((len(run), HASH_BYTES), np.uint8)
 
     def write(page: int) -> None:
-        data = np.zeros(int(sizes[page]), np.uint8)
-        end = 0
-        for piece in codec.encode(host, run.clusters_of(page)):
-            end += piece.nbytes
-            data[end - piece.nbytes : end] = piece.reshape(-1).view(np.uint8)
-        hashes[page] = np.frombuffer(page_hash((data,)), np.uint8)
-        _files.write_at(descriptor, data.data, int(run.places[page]))
+        data = b"".join(piece.tobytes() for piece in codec.encode(host, run.clusters_of(page)))
+        data = data.ljust(int(sizes[page]), b"\0")
+        hashes[page] = np.frombuffer(page_hash([np.frombuffer(data, np.uint8)]), np.uint8)
+        _files.write_at(descriptor, data, int(run.places[page]))
 
     on_threads(write, range(len(run)))
     return hashes
@@ -139,13 +135,14 @@ class BundleFile:
         self._check("format", is_ours, f"'{file_format.FORMAT}', got {shown(kind)}; not a bundle")
         is_number = isinstance(version, str) and re.fullmatch("[1-9][0-9]{0,8}", version)
         self._check("version", is_number, f"a number of 1 or more, got {shown(version)}")
-        if int(version) > file_format.VERSION:
-            self._fail(f"version {int(version)}, this build reads up to {file_format.VERSION}; update v3dg")
+        self.version = int(version)
+        if self.version > VERSION:
+            self._fail(f"version {self.version}, this build reads up to {VERSION}; update v3dg")
         self._check("sh_degree", degree in ("0", "1", "2", "3"), f"'0' to '3', got {shown(degree)}")
-        name = codec if int(version) > 1 else Codec.name
-        known = [kind for kind in CODECS.values() if kind.version == int(version) and kind.name == name]
-        self._check("codec", known, f"one that this build reads, got {shown(name)}; update v3dg")
-        self.codec = known[0](int(degree))
+        name = codec if self.version > 1 else Codec.name
+        is_known = isinstance(name, str) and name in CODECS
+        self._check("codec", is_known, f"one that this build reads, got {shown(name)}; update v3dg")
+        self.codec = CODECS[name](int(degree))
         self._check("config", isinstance(config, str), f"a string of JSON, got {shown(config)}")
         self.config = self._object("config", config)
 
@@ -169,13 +166,13 @@ class BundleFile:
         wanted, given = max(counts), self.num_bytes
         found = f"got {given}; the file is truncated"
         self._check("size", wanted <= given, f"more than {shown(wanted)} bytes for tensors, {found}")
-        expected = entries_of(self.codec.version, *counts)
+        expected = entries_of(self.codec, *counts)
         for name, entry in expected.items():
             if header.get(name) != entry:
                 self._fail(f"{name}: expected {entry}, got {shown(header.get(name))}")
         unknown = sorted(set(header) - set(expected))
         if unknown:
-            self._fail(f"{shown(unknown[0])}: expected only the tensors of version {self.codec.version}")
+            self._fail(f"{shown(unknown[0])}: expected only the tensors of version {self.version}")
         for name, value in (("header", self._data_start), ("pages", counts[3])):
             is_aligned = value % self.codec.alignment == 0
             self._check(name, is_aligned, f"to end at a multiple of {self.codec.alignment}, got {value}")
@@ -187,10 +184,12 @@ class BundleFile:
     def _read_tables(self, entries: dict[str, Any], text: bytes, reader: _core.HashedReader) -> None:
         place = self._data_start + self.pages_bytes
         self._fetch(place, self.num_bytes)
-        self._reading = reader.read(self.path, self._fd, text, place, self.num_bytes - place)
+        self._reading = reader.read(
+            self.path, self._fd, text, place, self.num_bytes - place, self.version > 2
+        )
         data = self._reading.wait()  # with the hash at the end
         self.tables: dict[str, NDArray[Any]] = {}
-        for name, dtype, _, _ in schema_of(self.codec.version):
+        for name, dtype, _, _ in schema_of(self.codec):
             first, last = (offset - self.pages_bytes for offset in entries[name]["data_offsets"])
             self.tables[name] = data[first:last].view(DTYPES[dtype]).reshape(entries[name]["shape"])
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from v3dg import _core
 from v3dg._numbers import check, check_type
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from v3dg.bundle.pages import PageLayout
 
 FORMAT = "v3dg"
-VERSION = 2  # the newest
+VERSION = 3  # the newest, which is written
 HASH_BYTES = 16
 MAX_HEADER_BYTES = 1 << 20  # the header holds 20 entries and the config; more is damage or an attack
 
@@ -44,12 +45,12 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-_ONLY_IN_1 = ("pages.bytes", "pages.num_clusters")  # they follow from the others
+_ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")  # of codes they follow from the others
 
 
-def schema_of(version: int) -> list[tuple[str, str, str, tuple[int, ...]]]:
-    """The tables of a version."""
-    return [table for table in SCHEMA if version == 1 or table[0] not in _ONLY_IN_1]
+def schema_of(codec: "Codec") -> list[tuple[str, str, str, tuple[int, ...]]]:
+    """The tables of a file with pages of this codec."""
+    return [table for table in SCHEMA if codec.name == "float32" or table[0] not in _ONLY_OF_FLOATS]
 
 
 def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[Any]]:
@@ -61,7 +62,7 @@ def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[Any]]
         "pages.first_cluster": layout.first_cluster[:-1].astype(np.int32),
         "pages.num_clusters": np.diff(layout.first_cluster).astype(np.int32),
     }
-    return {name: tables[name] for name, *_ in schema_of(codec.version) if name in tables}
+    return {name: tables[name] for name, *_ in schema_of(codec) if name in tables}
 
 
 def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
@@ -72,12 +73,19 @@ def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
     return digest.digest()
 
 
+def hash_of_pieces(message: bytes) -> bytes:
+    """BLAKE2b-128 of the digests of the message's pieces, which are hashed side by side."""
+    data, size = np.frombuffer(message, np.uint8), _core.HASH_PIECE_BYTES
+    digests = _core.blake2b(np.split(data, range(size, len(data), size)))
+    return hashlib.blake2b(b"".join(digests), digest_size=HASH_BYTES).digest()
+
+
 def entries_of(
-    version: int, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
+    codec: "Codec", num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
 ) -> dict[str, Any]:
     """Every tensor of the file, in file order, as the header describes it."""
     rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
-    tables = ((name, dtype, [rows[count], *rest]) for name, dtype, count, rest in schema_of(version))
+    tables = ((name, dtype, [rows[count], *rest]) for name, dtype, count, rest in schema_of(codec))
     entries: dict[str, Any] = {}
     end = 0
     for name, dtype, shape in (("pages", "U8", [pages_bytes]), *tables, ("hash", "U8", [HASH_BYTES])):
@@ -88,9 +96,8 @@ def entries_of(
 
 def header_of(entries: dict[str, Any], codec: "Codec", config: dict[str, Any]) -> bytes:
     """The length and the JSON, filled up with spaces so that the data starts aligned."""
-    metadata = {"format": FORMAT, "version": str(codec.version), "sh_degree": str(codec.sh_degree)}
-    metadata |= {"codec": codec.name} if codec.version > 1 else {}
-    metadata["config"] = config_to_json(config)
+    metadata = {"format": FORMAT, "version": str(VERSION), "sh_degree": str(codec.sh_degree)}
+    metadata |= {"codec": codec.name, "config": config_to_json(config)}
     text = json.dumps({"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")).encode()
     text += b" " * (-(8 + len(text)) % codec.alignment)
     found = f"{len(metadata['config'])}; shorten it"
