@@ -113,7 +113,7 @@ def frames(
     scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
 ) -> tuple[Row, list[Picture]]:
     """Every camera, near to far, with one renderer: as a flight through the scene finds it."""
-    ms, device_ms, select_ms, counts, pictures = [], [], [], [], []
+    ms, device_ms, select_ms, counts = [], [], [], []
     with gpu.PeakMemory() as peak:
         renderer = Renderer(scene, device=gpu.DEVICE)
         for camera in cameras:
@@ -128,7 +128,8 @@ def frames(
             device_ms.append(statistics.median(s.select_ms + s.draw_ms for s in stats))
             select_ms.append(statistics.median(s.select_ms for s in stats))
             counts.append(stats[-1].gaussians_in_frustum)
-            pictures.append(to_8bit(frame().color))
+    # Not before, for what a picture takes beside its frame is not the renderer's memory.
+    pictures = [to_8bit(renderer.render(camera, **options).color) for camera in cameras]
     row = {
         **options,
         "frame_ms": round(statistics.fmean(ms), 3),

@@ -69,7 +69,7 @@ class BuildConfig:
     group_size: Annotated[int, (2, 1 << 30)] = 2
     # Counts that the core does not see; so many make level 0 the only one.
     min_clusters: Annotated[int, (1, 1 << 62)] = 1
-    min_gaussians: Annotated[int, (1, 1 << 62)] = 4
+    min_gaussians: Annotated[int, (1, 1 << 62)] = 1
     init: Literal["merge", "prune"] = "merge"
     prune_growth: Annotated[float, (0.001, 1000)] = 2 ** (1 / 6)  # once a level
     targets: Literal["finest", "previous"] = "finest"

@@ -109,7 +109,9 @@ def write_levels(plan: "Plan", place: Path, turn: Floats, advance: Callable[[int
         "tree": plan.tree(leaves, turn),
     }
     _common.write_document(place / INDEX, index)
-    shown = plan.bundle.level_gaussians(plan.top).transform(turn)
+    # Of a few gaussians it does not show how far the asset reaches.
+    framed = next((level for level in range(plan.top, 0, -1) if counts[level] >= 1000), 0)
+    shown = plan.bundle.level_gaussians(framed).transform(turn)
     _common.write_document(place / SETTINGS, _viewer_settings(shown))
     return Export(counts, plan.num_chunks, len(names), _common.bytes_below(place))
 
