@@ -187,6 +187,16 @@ def test_each_level_has_half_of_the_one_below(num_gaussians, group_size, device)
     assert sizes[-1] // 2 < SMALL.min_gaussians <= sizes[-1]
 
 
+@pytest.mark.parametrize(("filter_px2", "last"), [(0.0, 0.0), (0.05, 1 / 12), (0.2, 0.2)])
+def test_the_last_level_has_the_filter_of_a_pixel(filter_px2, last):
+    bundle = build(make_asset(num_gaussians=1000, seed=3), replace(SMALL, steps=0, filter_px2=filter_px2))
+    level = bundle.clusters.level
+    expected = np.select([level == 0, level < bundle.num_levels - 1], [0.0, filter_px2], last)
+    np.testing.assert_array_equal(bundle.clusters.filter_px2, expected.astype(np.float32))
+    only = build(make_asset(num_gaussians=1000, seed=3), replace(SMALL, min_gaussians=1001))
+    assert not only.clusters.filter_px2.any()
+
+
 def test_level_zero_is_the_asset(asset, bundle):
     rows = [np.concatenate([getattr(g, n).reshape(len(g), -1) for n in scenes.NAMES], axis=1)
             for g in (asset, bundle.level_gaussians(0))]  # fmt: skip

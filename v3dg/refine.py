@@ -112,7 +112,7 @@ class _Cuts:
     def run(self, name: str, steps: int, operation: Callable[..., _T]) -> _T:
         """Do something by so many pictures; what it returns."""
         sizes: Any = {k: _RATE * v for k, v in vars(BuildConfig()).items() if k.startswith("step_")}
-        filter_px2 = float(self._bundle.clusters.filter_px2[-1])
+        filter_px2 = float(self._bundle.clusters.filter_px2[self._bundle.level_range(1).start])
         config = BuildConfig(steps=steps, first_steps=steps, filter_px2=filter_px2, **sizes)
         given = {"gaussians": self._gaussians.rows, "pictures": self._pictures}
         work = partial(operation, config=fit_config(config, self._seed, 1), **given)

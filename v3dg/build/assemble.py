@@ -16,15 +16,18 @@ def assemble(plan: Plan, tables: Sequence[LevelTables], config: BuildConfig) -> 
     levels = plan.levels
     num_clusters = [level.num_clusters for level in levels]
     num_groups = [0, *(level.num_groups for level in levels[1:])]  # of level 0 there are none in a bundle
-    is_fine = np.arange(sum(num_clusters)) < num_clusters[0]
+    level = np.repeat(np.arange(len(levels), dtype=np.int32), num_clusters)
+    # The last level is drawn at all smaller sizes, too, where a pixel sees its whole square: variance 1/12.
+    last_px2 = max(config.filter_px2, 1 / 12) if config.filter_px2 > 0 else 0.0
+    coarse_px2 = np.where(level < len(levels) - 1, config.filter_px2, last_px2)
     clusters = Clusters(
         offset=np.concatenate([[0], np.cumsum(np.concatenate([np.diff(level.offset) for level in levels]))]),
-        level=np.repeat(np.arange(len(levels), dtype=np.int32), num_clusters),
+        level=level,
         own_group=_groups_from(num_clusters, num_groups, 0),
         parent_group=_groups_from(num_clusters, num_groups, 1),
         box=np.concatenate([table.box for table in tables]),
-        filter_px2=np.where(is_fine, config.asset_filter_px2, config.filter_px2).astype(np.float32),
-        antialiased=np.where(is_fine, config.asset_antialiased, True).astype(np.uint8),
+        filter_px2=np.where(level == 0, config.asset_filter_px2, coarse_px2).astype(np.float32),
+        antialiased=np.where(level == 0, config.asset_antialiased, True).astype(np.uint8),
     )
     none = LevelTables(*(np.zeros((0, *shape), np.float32) for shape in ((2, 3), (4,), (4,), (2,))))
     coarse = [none, *tables[1:]]

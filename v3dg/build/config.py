@@ -49,7 +49,8 @@ class BuildConfig:
         image_size: Side of the views in px; 0 shows a group at the size at which it will be selected.
         px2_per_gaussian: That size: px² of the group's footprint for each gaussian that it is simplified to.
         distance: From the camera to the centre of the group, in radii.
-        filter_px2: Variance of the low-pass that the coarser levels are drawn with, px².
+        filter_px2: Variance of the low-pass that the coarser levels are drawn with, px²; the last one with a
+            pixel's, 1/12, if that is more, unless this is 0.
         asset_filter_px2: The same for level 0: what the asset was trained with (0.3 for the original 3DGS) at
             the size of its photographs; without, it is better seen from farther away. Coarser levels are
             fitted to the asset without a filter.

@@ -28,8 +28,7 @@ def in_bytes(memory: int | str | None) -> int:
 
 def most_units(memory: int, leaves: Leaves) -> int:
     """Units that may be in memory at once, beside the leaves; at least one."""
-    each = unit_bytes(leaves.num_gaussians, leaves.sh_degree)
-    return max(1, (memory - leaves.resident_bytes) // each)
+    return max(1, (memory - leaves.resident_bytes) // unit_bytes(leaves.num_gaussians, leaves.sh_degree))
 
 
 def unit_bytes(num_gaussians: int, sh_degree: int) -> int:

@@ -49,8 +49,7 @@ def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussian
     """Read a `.sog` file, or the `meta.json` of a folder with its pictures."""
     path, claims = Path(path), claims or Claims()
     if path.suffix == ".json":
-        text = claims.read(path)
-        return _read(path, text, lambda name: claims.read(path.with_name(name)), claims)
+        return _read(path, claims.read(path), lambda name: claims.read(path.with_name(name)), claims)
     with claims.open(path) as file:
         archive = Archive(path, file)
         return _read(path, archive.read("meta.json"), archive.read, claims)
