@@ -89,8 +89,8 @@ def make_scene(config: Config) -> tuple[v3dg.Scene, v3dg.Camera]:
         bundle = v3dg.build_bundle(make_donut(), device="auto")
     else:
         bundle = v3dg.Bundle.open(config.bundle)
-    means = bundle.level_gaussians(bundle.num_levels - 1).means
-    step = 1.3 * float(np.ptp(means, axis=0).max())
+    means = bundle.level_gaussians(0).means
+    step = 1.1 * float(np.ptp(means, axis=0).max())
     x, y = np.meshgrid(np.arange(config.rows), np.arange(config.rows))
     positions = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1) * step
     scene = v3dg.Scene()

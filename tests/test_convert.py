@@ -173,7 +173,8 @@ def test_what_cannot_be_meant_is_refused(folder):
     fails(2, "and no level or cut", "convert", "tuft.v3dg", "x.v3dg", "--level", "1", cwd=folder)
     fails(2, "--codec: expected an output", "convert", "tuft.ply", "x.ply", "--codec", "float32", cwd=folder)
     fails(1, "create it first", "convert", "tuft.ply", "no/x.ply", cwd=folder)
-    fails(1, "budget: expected at least", "convert", "tuft.v3dg", "x.ply", "--budget", "1", cwd=folder)
+    options = ("--camera", "far", "--budget", "1")
+    fails(1, "budget: expected at least", "convert", "scene.json", "x.ply", *options, cwd=folder)
 
 
 def test_the_meta_json_of_an_asset_is_no_scene(folder):

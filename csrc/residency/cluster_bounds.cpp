@@ -67,10 +67,16 @@ std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table) {
 
 ClusterRuns runs_of_clusters(const ClusterTable& table) {
     const size_t count = table.num_clusters();
-    constexpr size_t kLeast = kClustersOfBounds * kMostRuns;
     ClusterRuns runs{};
-    runs.size = static_cast<uint32_t>(kClustersOfBounds * std::max<size_t>(1, (count + kLeast - 1) / kLeast));
-    runs.count = static_cast<uint32_t>((count + runs.size - 1) / runs.size);
+    std::vector<size_t> ends;  // the last first
+    size_t left = (count + kClustersOfBounds - 1) / kClustersOfBounds;
+    for (size_t size = 1; left > 0; size *= ends.size() > 1 ? 2 : 1) {
+        ends.push_back(left);
+        left -= ends.size() < kMostRuns ? std::min(size, left) : left;
+    }
+    runs.count = static_cast<uint32_t>(ends.size());
+    for (uint32_t k = 0; k < runs.count; ++k)
+        runs.begin[k + 1] = static_cast<uint32_t>(kClustersOfBounds * ends[runs.count - 1 - k]);
     runs.groups = ball_of_centers(table.ball);
     float most_radius = runs.groups.radius, least_radius = INFINITY;
     for (const Ball& ball : table.ball) {
@@ -83,7 +89,7 @@ ClusterRuns runs_of_clusters(const ClusterTable& table) {
     const auto size_of = [&](int32_t g) { return table.ball[g].radius * std::sqrt(table.weight[g]); };
     for (uint32_t k = 0; k < runs.count; ++k) {
         float most_parent = 0, least_own = INFINITY;
-        for (size_t c = size_t(k) * runs.size; c < std::min(count, size_t(k + 1) * runs.size); ++c) {
+        for (size_t c = runs.begin[k]; c < std::min<size_t>(count, runs.begin[k + 1]); ++c) {
             const int32_t own = table.own_group[c], parent = table.parent_group[c];
             const float above = parent < 0 ? NAN : size_of(parent);
             if (!(above <= most_parent)) most_parent = std::isnan(most_parent) ? NAN : above;

@@ -23,15 +23,17 @@ struct ClusterBounds {
 // [ceil(C / kClustersOfBounds)]
 std::vector<ClusterBounds> bounds_of_clusters(const ClusterTable& table);
 
-constexpr uint32_t kMostRuns = 16;
+constexpr uint32_t kMostRuns = 24;
 
 // The clusters of a table in a few runs, which are told apart by one distance to all of them. Levels follow
 // each other in a table, so of a distant instance most runs are too fine, and of a near one some too coarse.
+// As levels do, runs have twice as many clusters as what follows them, and the last of one lane's.
 struct ClusterRuns {
-    uint32_t count, size;  // of runs; of clusters in each, whole bounds
-    Ball groups;           // contains the centres of the balls of all groups
-    float least_distance;  // of a ball, from which on the tests hold
-    int32_t least_level;   // of all groups
+    uint32_t count;
+    uint32_t begin[kMostRuns + 1];  // first cluster of each, whole bounds, and where the last one ends
+    Ball groups;                    // contains the centres of the balls of all groups
+    float least_distance;           // of a ball, from which on the tests hold
+    int32_t least_level;            // of all groups
     // Radius times root of weight. Of the groups above, NaN where a cluster has none; of their own, 0 where a
     // cluster has none.
     float most_parent[kMostRuns], least_own[kMostRuns];

@@ -1,7 +1,8 @@
 // A cut takes two kernels. place_kernel, a thread an instance: the camera in its frame, and where its cut is
 // found: nowhere, among its tops, or in its table. That is dealt out as parts: 256 of the clusters of a table
-// that its distance leaves to be asked, or the tops of up to 32 neighbouring instances. cut_kernel, a block
-// eight parts and a warp each: which clusters are drawn, and their places in the list by a prefix sum.
+// that its distance leaves to be asked; or, of up to 32 neighbouring instances, the tops or, where that
+// leaves no more than a lane asks, the last of each. cut_kernel, a block eight parts and a warp each: which
+// clusters are drawn, and their places in the list by a prefix sum.
 //
 // For a budget, the kernels of budget_cuda.cu run in between, for two rounds with place_kernel before each.
 
@@ -32,6 +33,7 @@ constexpr unsigned kReportBlocks = 64;
 constexpr unsigned kPlaceBlocks = 12;  // on a multiprocessor
 constexpr unsigned kFewBundles = 8;
 constexpr unsigned kPlaceThreads = 64;  // few, so that a few thousand instances spread over the device
+constexpr unsigned kFewInstances = 8192, kFewLanes = 8;  // and so do their parts
 
 // The sides of the frustum for each bundle, which every instance would take eight divisions of doubles to
 // find out: as an argument where there are few bundles, in memory where there are more.
@@ -84,10 +86,12 @@ struct RecordRow {
     }
 };
 
-// Where the cut of an instance is found, and which clusters are asked where that is a table.
+// Where the cut of an instance is found, and which clusters are asked where that is a table. `is_alone`: a
+// lane has it.
 struct Placed {
     CutSource source;
     ClusterRange asked;
+    bool is_alone;
 };
 
 // Places instance i, if there is one. Writes what the kernels after this one need of it. For whole warps, of
@@ -103,6 +107,7 @@ __device__ Placed place_instance(const PlacedScene& scene, size_t i, const Eyes&
     const Pose pose = i < num_instances ? scene.instances.pose(i) : Pose{nullptr, nullptr, 0.0};
     CutSource source = CutSource::nowhere;
     ClusterRange asked{0, 0};
+    bool is_alone = false;
     int32_t bundle = 0;
     InstanceView view;
     if (i < num_instances && is_placed(pose)) {
@@ -124,10 +129,14 @@ __device__ Placed place_instance(const PlacedScene& scene, size_t i, const Eyes&
             if (drawn == 0) source = CutSource::nowhere;
         }
         // A budget's tolerance is not known yet.
-        if (source == CutSource::table)
+        if (source == CutSource::table) {
             asked =
                 clusters_to_ask(table, scene.bundles[bundle].runs, view, rule,
                                 rule.budget == kNoBudget ? Tolerances::this_one : Tolerances::from_this_on);
+            is_alone = asked.first < asked.end && asked.first >= last_of_table(table);
+            if (is_alone) scene.tops[i] = 0;
+        }
+        is_alone |= source == CutSource::tops;
     }
     const bool is_seen = source != CutSource::nowhere;
     if (placements != nullptr) {
@@ -140,7 +149,7 @@ __device__ Placed place_instance(const PlacedScene& scene, size_t i, const Eyes&
     }
     if (source == CutSource::table) view_row.set(view);
     view_row.write(source == CutSource::table, scene.views + first);
-    return {source, asked};
+    return {source, asked, is_alone};
 }
 
 // A thread a bundle.
@@ -160,17 +169,20 @@ __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kP
     rule.tolerance_px2 = round.least_tolerance(rule);
     const size_t block = take_ticket(scratch.place_ticket), i = block * kPlaceThreads + threadIdx.x;
     if (i < pictures.count) images[i] = pictures.image[i];
-    const auto [source, asked] = place_instance(scene, i, eyes, sides, rule, placements);
+    const auto [source, asked, is_alone] = place_instance(scene, i, eyes, sides, rule, placements);
 
-    // Tops of neighbours with no table in between make one part, which the first of them writes.
+    // Neighbours that a lane has each, and no other table in between, make one part, which the first of them
+    // writes.
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
-    const unsigned tops = __ballot_sync(kAllLanes, source == CutSource::tops);
-    const unsigned tables = __ballot_sync(kAllLanes, source == CutSource::table);
+    const unsigned lanes = __ballot_sync(kAllLanes, is_alone);
+    const unsigned tables = __ballot_sync(kAllLanes, source == CutSource::table && !is_alone);
     const unsigned table_below = tables & below, table_above = tables & ~below;
-    const unsigned from = table_below != 0 ? 32 - __clz(static_cast<int>(table_below)) : 0;
-    const unsigned to = table_above != 0 ? __ffs(table_above) - 1 : 32;
-    const bool begins = source == CutSource::tops && (tops & below) >> from == 0;
-    const unsigned parts = begins ? 1 : blocks_for(asked.end - asked.first, kPartSize);
+    const unsigned width = scene.instances.scale.size <= kFewInstances ? kFewLanes : 32;
+    const unsigned first = lane / width * width;
+    const unsigned from = max(first, table_below != 0 ? 32 - __clz(static_cast<int>(table_below)) : 0);
+    const unsigned to = min(first + width, table_above != 0 ? __ffs(table_above) - 1 : 32);
+    const bool begins = is_alone && (lanes & below) >> from == 0;
+    const unsigned parts = is_alone ? begins : blocks_for(asked.end - asked.first, kPartSize);
 
     unsigned total;
     const unsigned before_in_block = block_prefix(parts, total);
@@ -184,8 +196,8 @@ __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kP
     CutPart* part = scene.parts + before + before_in_block;
     if (begins) {
         const unsigned until = to < 32 ? (1u << to) - 1 : kAllLanes;
-        *part = {static_cast<uint32_t>(i), 0, (tops & until) >> lane};
-    } else {
+        *part = {static_cast<uint32_t>(i), 0, (lanes & until) >> lane};
+    } else if (!is_alone) {
         for (unsigned p = 0; p < parts; ++p)
             part[p] = {static_cast<uint32_t>(i), asked.first + p * kPartSize, 0};
     }
@@ -312,6 +324,7 @@ __global__ void __launch_bounds__(kCutThreads)
         mine = {&scene.bundles[scene.instances.bundle[i]],
                 static_cast<uint32_t>(i),
                 static_cast<uint32_t>(given.cluster[p]),
+                false,
                 false,
                 1,
                 {}};

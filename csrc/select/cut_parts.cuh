@@ -15,18 +15,23 @@ constexpr unsigned kPartSize = 32 * kLaneClusters;
 constexpr unsigned kCutThreads = 256, kCutWarps = kCutThreads / 32;
 static_assert(kLaneClusters == 8, "a byte says which of them are drawn");
 
-// Clusters [first, first + kPartSize) of one instance's table; or where `tops` is not zero, the top clusters
-// of instance + k for its bits k.
+// Clusters [first, first + kPartSize) of one instance's table; or where `lanes` is not zero, for its bits k a
+// lane of instance + k: its top clusters, or the last of its table.
 struct CutPart {
-    uint32_t instance, first, tops;
+    uint32_t instance, first, lanes;
 };
+
+// From where on a single lane has all clusters of a table, which are its coarsest.
+__device__ inline uint32_t last_of_table(const ClusterTable& table) {
+    return static_cast<uint32_t>(table.num_clusters() - 1) / kLaneClusters * kLaneClusters;
+}
 
 // A scene and what place_kernel finds out about its instances.
 struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
     InstanceView* views;  // of instances whose tables are asked
-    uint8_t* tops;        // of those whose tops are the cut: a bit for each that is drawn
+    uint8_t* tops;  // where a lane has an instance: a bit for each top that is drawn; 0: it asks the last
     CutPart* parts;
 };
 
@@ -77,6 +82,7 @@ struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
     uint32_t first;  // of a table
+    bool is_alone;   // with its instance: the lanes of a warp have one each, or all have the same
     bool are_tops;
     unsigned drawn;
     LaneWeights weights;
@@ -95,14 +101,17 @@ struct LaneClusters {
 // Those of a table are not asked yet.
 __device__ inline LaneClusters clusters_of_lane(const PlacedScene& scene, const CutPart& part) {
     const unsigned lane = threadIdx.x % 32;
-    LaneClusters mine{nullptr, part.instance, part.first + kLaneClusters * lane, part.tops != 0, 0, {}};
-    if (mine.are_tops) {
-        if ((part.tops >> lane & 1) == 0) return mine;
+    const bool is_alone = part.lanes != 0;
+    LaneClusters mine{nullptr, part.instance, part.first + kLaneClusters * lane, is_alone, false, 0, {}};
+    if (is_alone) {
+        if ((part.lanes >> lane & 1) == 0) return mine;
         mine.instance += lane;
         mine.drawn = scene.tops[mine.instance];
+        mine.are_tops = mine.drawn != 0;
         mine.weights = LaneWeights::all(kWhole);
     }
     mine.bundle = &scene.bundles[scene.instances.bundle[mine.instance]];
+    if (is_alone && !mine.are_tops) mine.first = last_of_table(mine.bundle->table);
     return mine;
 }
 
@@ -115,8 +124,8 @@ template <bool kKeepsWeights, class Ask>
 __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, Tolerances tolerances,
                              LaneClusters& mine, const Ask& ask) {
     struct Table {
-        const BundleOnDevice* bundle;
-        uint32_t first;  // cluster
+        const BundleOnDevice* bundle;  // null: each lane has an instance
+        uint32_t first;                // cluster; or instance, of the first lane
     };
     __shared__ InstanceView views[kCutWarps];
     __shared__ Table tables[kCutWarps];
@@ -126,15 +135,19 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, T
     static_assert(kCutThreads <= 256, "a byte says which thread");
     const unsigned lane = threadIdx.x % 32, warp = threadIdx.x / 32;
     bool is_owner = false;
-    if (mine.bundle != nullptr && !mine.are_tops) {  // the same in the whole warp
+    if (!mine.is_alone && mine.bundle != nullptr) {  // the same in the whole warp
         const auto* view = reinterpret_cast<const uint32_t*>(scene.views + mine.instance);
         for (unsigned w = lane; w < sizeof(InstanceView) / sizeof *view; w += 32)
             reinterpret_cast<uint32_t*>(views + warp)[w] = view[w];
         if (lane == 0) tables[warp] = {mine.bundle, mine.first};
-        __syncwarp();
+    }
+    if (mine.is_alone && lane == 0) tables[warp] = {nullptr, mine.instance};
+    __syncwarp();
+    if (mine.bundle != nullptr && !mine.are_tops) {
         const ClusterTable& table = mine.bundle->table;
-        is_owner = mine.first < table.num_clusters() &&
-                   may_draw(table, mine.bounds(), views[warp], rule, tolerances);
+        const InstanceView& view = mine.is_alone ? scene.views[mine.instance] : views[warp];
+        is_owner =
+            mine.first < table.num_clusters() && may_draw(table, mine.bounds(), view, rule, tolerances);
     }
     const unsigned in_warp = __ballot_sync(kAllLanes, is_owner);
     if (lane == 0) num_owners[warp] = __popc(in_warp);
@@ -154,9 +167,15 @@ __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, T
         int32_t answer = 0;
         if (is_one) {
             const Table& of = tables[owner / 32];
-            const uint32_t c = of.first + kLaneClusters * (owner % 32) + k;
-            if (c < of.bundle->table.num_clusters())
-                answer = static_cast<int32_t>(ask(*of.bundle, views[owner / 32], static_cast<int32_t>(c)));
+            const bool is_alone = of.bundle == nullptr;
+            const uint32_t instance = of.first + owner % 32;  // where it is
+            const BundleOnDevice* bundle =
+                is_alone ? &scene.bundles[scene.instances.bundle[instance]] : of.bundle;
+            const InstanceView& view = is_alone ? scene.views[instance] : views[owner / 32];
+            const uint32_t c =
+                k + (is_alone ? last_of_table(bundle->table) : of.first + kLaneClusters * (owner % 32));
+            if (c < bundle->table.num_clusters())
+                answer = static_cast<int32_t>(ask(*bundle, view, static_cast<int32_t>(c)));
         }
         const unsigned bits = __ballot_sync(kAllLanes, answer > 0);
         if (is_one && k == 0) drawn[owner] = static_cast<uint8_t>(bits >> lane);

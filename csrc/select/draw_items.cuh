@@ -65,7 +65,7 @@ __device__ inline bool is_worth_sharing(unsigned num_gaussians, unsigned num_ins
 // weights are not drawn together.
 template <bool kFades, class Visit>
 __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
-    if (!mine.are_tops) {
+    if (!mine.is_alone) {
         if (mine.drawn == 0) return;
         const unsigned joins = mine.bundle->joins[mine.first / kLaneClusters];
         for (unsigned k = 0, end; k < kLaneClusters; k = end) {
@@ -79,20 +79,22 @@ __device__ void for_each_drawn(const LaneClusters& mine, const Visit& visit) {
         }
         return;
     }
-    const unsigned same_bundle =
-        __match_any_sync(kAllLanes, reinterpret_cast<unsigned long long>(mine.bundle));
+    static_assert(alignof(BundleOnDevice) > 1, "a bit of its address is free");
+    const auto same_clusters = reinterpret_cast<unsigned long long>(mine.bundle) | mine.are_tops;
+    const unsigned same = __match_any_sync(kAllLanes, same_clusters);
     for (unsigned k = 0; __any_sync(kAllLanes, mine.drawn >> k != 0); ++k) {
         const bool is_drawn = (mine.drawn >> k & 1) != 0;
-        const unsigned sharers = __ballot_sync(kAllLanes, is_drawn) & same_bundle, count = __popc(sharers);
+        const bool is_whole = is_drawn && (!kFades || mine.weights[k] == kWhole);
+        const unsigned sharers = __ballot_sync(kAllLanes, is_whole) & same, count = __popc(sharers);
         if (!is_drawn) continue;
-        if (!is_worth_sharing(mine.size(k), count))
+        if (!is_whole || !is_worth_sharing(mine.size(k), count))
             visit(DrawnRun{k, 1, 0, 1});
         else if (threadIdx.x % 32 + 1 == static_cast<unsigned>(__ffs(sharers)))
             visit(DrawnRun{k, 1, sharers, count});
     }
 }
 
-// Selected clusters as items. Neighbouring clusters are drawn by the same items, and so are the tops that
+// Selected clusters as items. Neighbouring clusters are drawn by the same items, and so are coarse ones that
 // neighbouring instances have in common. Each is written for every picture.
 template <bool kHasFade>
 struct ItemOutput {

@@ -428,8 +428,8 @@ V3DG_HD inline ClusterRange clusters_to_ask(const ClusterTable& table, const Clu
         if (tolerances == Tolerances::this_one && table.pages.is_whole() && runs.least_level > rule.min_level)
             while (first < last && runs.least_own[last - 1] > least) --last;
     }
-    const uint32_t end = min_of(last * runs.size, static_cast<uint32_t>(table.num_clusters()));
-    return {min_of(first * runs.size, end), end};
+    const uint32_t end = min_of(runs.begin[last], static_cast<uint32_t>(table.num_clusters()));
+    return {min_of(runs.begin[first], end), end};
 }
 
 }  // namespace v3dg
