@@ -27,7 +27,7 @@ constexpr uint32_t kMostRuns = 24;
 
 // The clusters of a table in a few runs, which are told apart by one distance to all of them. Levels follow
 // each other in a table, so of a distant instance most runs are too fine, and of a near one some too coarse.
-// As levels do, runs have twice as many clusters as what follows them, and the last of one lane's.
+// As levels do, a run has as many clusters as all that follows it; the last has those of one bounds.
 struct ClusterRuns {
     uint32_t count;
     uint32_t begin[kMostRuns + 1];  // first cluster of each, whole bounds, and where the last one ends

@@ -86,8 +86,8 @@ struct RecordRow {
     }
 };
 
-// Where the cut of an instance is found, and which clusters are asked where that is a table. `is_alone`: a
-// lane has it.
+// Where the cut of an instance is found, and which clusters are asked where that is a table. `is_alone`: by
+// one lane.
 struct Placed {
     CutSource source;
     ClusterRange asked;
@@ -171,8 +171,8 @@ __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kP
     if (i < pictures.count) images[i] = pictures.image[i];
     const auto [source, asked, is_alone] = place_instance(scene, i, eyes, sides, rule, placements);
 
-    // Neighbours that a lane has each, and no other table in between, make one part, which the first of them
-    // writes.
+    // Neighbours with a lane of their own and no other table in between make one part, which the first of
+    // them writes.
     const unsigned lane = threadIdx.x % 32, below = (1u << lane) - 1;
     const unsigned lanes = __ballot_sync(kAllLanes, is_alone);
     const unsigned tables = __ballot_sync(kAllLanes, source == CutSource::table && !is_alone);

@@ -31,7 +31,9 @@ struct PlacedScene {
     const BundleOnDevice* bundles;
     InstanceTable instances;
     InstanceView* views;  // of instances whose tables are asked
-    uint8_t* tops;  // where a lane has an instance: a bit for each top that is drawn; 0: it asks the last
+    // Of instances with a lane of their own: a bit for each top that is drawn, or 0 where the lane asks the
+    // last clusters of the table.
+    uint8_t* tops;
     CutPart* parts;
 };
 
@@ -82,7 +84,7 @@ struct LaneClusters {
     const BundleOnDevice* bundle;
     uint32_t instance;
     uint32_t first;  // of a table
-    bool is_alone;   // with its instance: the lanes of a warp have one each, or all have the same
+    bool is_alone;   // in having its instance; else all lanes of the warp have the same one
     bool are_tops;
     unsigned drawn;
     LaneWeights weights;
@@ -124,8 +126,8 @@ template <bool kKeepsWeights, class Ask>
 __device__ void ask_clusters(const PlacedScene& scene, const SelectRule& rule, Tolerances tolerances,
                              LaneClusters& mine, const Ask& ask) {
     struct Table {
-        const BundleOnDevice* bundle;  // null: each lane has an instance
-        uint32_t first;                // cluster; or instance, of the first lane
+        const BundleOnDevice* bundle;  // null: each lane has an instance of its own
+        uint32_t first;                // cluster; there, the instance of the first lane
     };
     __shared__ InstanceView views[kCutWarps];
     __shared__ Table tables[kCutWarps];
