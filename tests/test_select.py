@@ -20,7 +20,7 @@ from scenes_lod import (
     rotation_matrices,
     turned,
 )
-from v3dg import Bundle, Camera, Gaussians, Scene, _core, select
+from v3dg import BuildConfig, Bundle, Camera, Gaussians, Scene, _core, build_bundle, select
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 seeds = st.integers(0, 2**32 - 1)
@@ -407,6 +407,33 @@ def test_both_devices_choose_the_same():
             )
             same(cpu, cuda)
             assert cpu.num_gaussians == cuda.num_gaussians
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("count", [300, 9000])
+@pytest.mark.parametrize("options", [{}, {"fade": 1.3}, {"min_level": 7}, {"budget": 60_000}])
+def test_both_devices_choose_the_same_of_what_a_lane_asks(count, options):
+    """Neighbours that need a table, its last clusters or their tops alone, in every order."""
+    rng = np.random.default_rng(count)
+    config = BuildConfig(cluster_size=32, steps=0, num_views=1)
+    made = [build_bundle(blob(rng, size), config=config, progress=False) for size in (700, 40, 1)]
+    distance = 10 ** rng.uniform(0.5, 4, count)
+    positions = distance[:, None] * [0, 0, 1] + rng.normal(size=(count, 3))
+    scene = Scene()
+    scene.add([made[k] for k in rng.integers(0, 3, count)], positions=positions)
+    camera = Camera.look_at((0, 0, -1), (0, 0, 1), (0, 1, 0), width=640, height=480)
+    for tolerance in (0.1, 3.0, 100.0):
+        cpu, cuda = (
+            select(scene, camera, tolerance=tolerance, device=device, **options) for device in ("cpu", "cuda")
+        )
+        same(cpu, cuda)
+        assert (cpu.num_gaussians, cpu.tolerance) == (cuda.num_gaussians, cuda.tolerance)
+        if cpu.weights is not None:
+            np.testing.assert_array_equal(cpu.weights, cuda.weights)
+        level = np.concatenate([bundle.clusters.level for bundle in scene.bundles])
+        first = np.cumsum([0, *(len(bundle.clusters) for bundle in scene.bundles)])
+        chosen = level[first[scene.instance_bundle[cpu.instance_ids]] + cpu.cluster_ids]
+        assert options or len(np.unique(chosen)) > 4
 
 
 DIGEST = """
