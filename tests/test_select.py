@@ -409,11 +409,11 @@ def test_both_devices_choose_the_same():
             assert cpu.num_gaussians == cuda.num_gaussians
 
 
-@pytest.mark.gpu
-@pytest.mark.parametrize("count", [300, 9000])
-@pytest.mark.parametrize("options", [{}, {"fade": 1.3}, {"min_level": 7}, {"budget": 60_000}])
-def test_both_devices_choose_the_same_of_what_a_lane_asks(count, options):
-    """Neighbours that need a table, its last clusters or their tops alone, in every order."""
+OPTIONS = [{}, {"fade": 1.3}, {"min_level": 7}, {"footprint": "paper"}]
+
+
+def lane_scene(count):
+    """Instances that need a table, its last clusters or their tops alone, in every order; and a camera."""
     rng = np.random.default_rng(count)
     config = BuildConfig(cluster_size=32, steps=0, num_views=1)
     made = [build_bundle(blob(rng, size), config=config, progress=False) for size in (700, 40, 1)]
@@ -421,7 +421,14 @@ def test_both_devices_choose_the_same_of_what_a_lane_asks(count, options):
     positions = distance[:, None] * [0, 0, 1] + rng.normal(size=(count, 3))
     scene = Scene()
     scene.add([made[k] for k in rng.integers(0, 3, count)], positions=positions)
-    camera = Camera.look_at((0, 0, -1), (0, 0, 1), (0, 1, 0), width=640, height=480)
+    return scene, Camera.look_at((0, 0, -1), (0, 0, 1), (0, 1, 0), width=640, height=480)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("count", [300, 9000])
+@pytest.mark.parametrize("options", [*OPTIONS, {"budget": 60_000}])
+def test_both_devices_choose_the_same_of_what_a_lane_asks(count, options):
+    scene, camera = lane_scene(count)
     for tolerance in (0.1, 3.0, 100.0):
         cpu, cuda = (
             select(scene, camera, tolerance=tolerance, device=device, **options) for device in ("cpu", "cuda")
@@ -430,10 +437,25 @@ def test_both_devices_choose_the_same_of_what_a_lane_asks(count, options):
         assert (cpu.num_gaussians, cpu.tolerance) == (cuda.num_gaussians, cuda.tolerance)
         if cpu.weights is not None:
             np.testing.assert_array_equal(cpu.weights, cuda.weights)
-        level = np.concatenate([bundle.clusters.level for bundle in scene.bundles])
-        first = np.cumsum([0, *(len(bundle.clusters) for bundle in scene.bundles)])
-        chosen = level[first[scene.instance_bundle[cpu.instance_ids]] + cpu.cluster_ids]
-        assert options or len(np.unique(chosen)) > 4
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+def test_many_instances_are_cut_as_each_alone(options):
+    """Of many instances of a bundle those clusters are not asked that a distance rules out."""
+    scene, camera = lane_scene(200)
+    for tolerance in (0.1, 3.0, 100.0):
+        whole = select(scene, camera, tolerance=tolerance, device="cpu", **options)
+        levels = set()
+        for i in range(len(scene)):
+            bundle, alone = scene.bundles[scene.instance_bundle[i]], Scene()
+            alone.add(bundle, positions=scene.positions[i])
+            expected = select(alone, camera, tolerance=tolerance, device="cpu", **options)
+            chosen = whole.instance_ids == i
+            np.testing.assert_array_equal(whole.cluster_ids[chosen], expected.cluster_ids)
+            if whole.weights is not None:
+                np.testing.assert_array_equal(whole.weights[chosen], expected.weights)
+            levels |= set(bundle.clusters.level[expected.cluster_ids].tolist())
+        assert options or len(levels) > 4
 
 
 DIGEST = """

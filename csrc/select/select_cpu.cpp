@@ -16,6 +16,7 @@ namespace {
 
 constexpr size_t kChunk = 16;
 constexpr size_t kBudgetParts = 16;
+constexpr size_t kManyInstances = 16;  // of a bundle, for which its runs pay: those cost about one instance
 
 // Answers for the groups of one instance: how far each is refined, or its bins.
 struct KnownRefinements {
@@ -37,6 +38,7 @@ struct KnownBins {
 struct View {
     const SelectInput& in;
     std::vector<FrustumSides> sides;            // of each bundle
+    std::vector<ClusterRuns> runs;              // likewise; none where it has few instances
     size_t most_groups = 0, most_clusters = 0;  // of any bundle
 
     explicit View(const SelectInput& input) : in(input) {
@@ -45,7 +47,18 @@ struct View {
             most_groups = std::max(most_groups, table.ball.size);
             most_clusters = std::max(most_clusters, table.num_clusters());
         }
+        std::vector<size_t> count(in.bundles.size, 0);
+        for (const int32_t b : in.instances.bundle) ++count[b];
+        runs.resize(in.bundles.size);
+        parallel_for(runs.size(), 1, [&](size_t b) {
+            if (count[b] >= kManyInstances) runs[b] = runs_of_clusters(in.bundles[b]);
+        });
     }
+};
+
+// Clusters of a table, and groups among which are all of theirs.
+struct Asked {
+    ClusterRange clusters, groups;
 };
 
 // An instance in front of the camera. One without a pose is hidden.
@@ -76,6 +89,24 @@ struct SeenInstance {
     }
 
     AskedGroups groups(const SelectRule& rule) const { return {table, view, rule}; }
+
+    // What is asked at these tolerances.
+    Asked asked(const ClusterRuns& runs, const SelectRule& rule, Tolerances tolerances) const {
+        Asked asked{{0, static_cast<uint32_t>(table.num_clusters())},
+                    {0, static_cast<uint32_t>(table.ball.size)}};
+        if (runs.count == 0 || !table.pages.is_whole()) return asked;
+        asked.clusters = clusters_to_ask(table, runs, view, rule, tolerances);
+        // Of most clusters, these are most groups, and to find them out costs more than to ask the rest.
+        if (asked.clusters.end - asked.clusters.first > table.num_clusters() / 2) return asked;
+        int32_t first = static_cast<int32_t>(table.ball.size), last = -1;
+        for (uint32_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
+            const int32_t own = table.own_group[c], parent = table.parent_group[c];
+            first = std::min(first, own >= 0 ? own : parent >= 0 ? parent : first);
+            last = std::max({last, own, parent});
+        }
+        asked.groups = {static_cast<uint32_t>(std::min(first, last + 1)), static_cast<uint32_t>(last + 1)};
+        return asked;
+    }
 };
 
 // What a thread works in.
@@ -94,38 +125,39 @@ struct Scratch {
 // change, so that the compiler works on several groups at once. Those that are absent, which it could not ask
 // for at once, are not refined whatever the answer, and those that fade in no further than they have.
 template <Footprint footprint, bool kFades>
-void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule,
+void ask_groups(ClusterTable table, const InstanceView view, SelectRule rule, const ClusterRange asked,
                 uint16_t* __restrict refinement) {
     rule.footprint = footprint;
     if (!kFades) rule.fade = {};
     const PageTable pages = table.pages;
     table.pages = {};
     const AskedGroups groups{table, view, rule};
-    const int32_t num_groups = static_cast<int32_t>(table.ball.size);
-    for (int32_t g = 0; g < num_groups; ++g) refinement[g] = static_cast<uint16_t>(groups.refinement(g));
-    for (int32_t g = 0; g < num_groups && !pages.is_whole(); ++g) {
+    const auto first = static_cast<int32_t>(asked.first), end = static_cast<int32_t>(asked.end);
+    for (int32_t g = first; g < end; ++g) refinement[g] = static_cast<uint16_t>(groups.refinement(g));
+    for (int32_t g = first; g < end && !pages.is_whole(); ++g) {
         const int32_t most = pages.is_resident(g) ? arrival(pages, g, rule) : 0;
         refinement[g] = static_cast<uint16_t>(min_of<int32_t>(refinement[g], most));
     }
 }
 
-void ask_groups(const SeenInstance& seen, const SelectRule& rule, uint16_t* refinement) {
+void ask_groups(const SeenInstance& seen, const SelectRule& rule, const ClusterRange& asked,
+                uint16_t* refinement) {
     if (rule.footprint == Footprint::paper)
-        ask_groups<Footprint::paper, false>(seen.table, seen.view, rule, refinement);
+        ask_groups<Footprint::paper, false>(seen.table, seen.view, rule, asked, refinement);
     else if (rule.fade.is_on())
-        ask_groups<Footprint::solid_angle, true>(seen.table, seen.view, rule, refinement);
+        ask_groups<Footprint::solid_angle, true>(seen.table, seen.view, rule, asked, refinement);
     else
-        ask_groups<Footprint::solid_angle, false>(seen.table, seen.view, rule, refinement);
+        ask_groups<Footprint::solid_angle, false>(seen.table, seen.view, rule, asked, refinement);
 }
 
-// Returns how many clusters suffice and writes which.
+// Returns how many of the clusters suffice and writes which.
 size_t find_sufficient(const ClusterTable table, const InstanceView view, const SelectRule rule,
-                       const uint16_t* __restrict refinement, int32_t* __restrict cluster) {
+                       const ClusterRange asked, const uint16_t* __restrict refinement,
+                       int32_t* __restrict cluster) {
     const InstanceCut<KnownRefinements> cut{table, view, rule, {refinement}, false};
-    const size_t num_clusters = table.num_clusters();
     size_t num_sufficient = 0;
     // Without a branch, because none could be foretold.
-    for (size_t c = 0; c < num_clusters; ++c) {
+    for (size_t c = asked.first; c < asked.end; ++c) {
         cluster[num_sufficient] = static_cast<int32_t>(c);
         num_sufficient += cut.weight(c) > 0;
     }
@@ -166,8 +198,10 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     if (source == CutSource::tops) {
         end = std::copy(seen.table.top_cluster.begin(), seen.table.top_cluster.end(), chosen);
     } else {
-        ask_groups(seen, rule, refinement);
-        end += find_sufficient(seen.table, seen.view, rule, refinement, chosen);
+        const ClusterRuns& runs = view.runs[view.in.instances.bundle[i]];
+        const Asked asked = seen.asked(runs, rule, Tolerances::this_one);
+        ask_groups(seen, rule, asked.groups, refinement);
+        end += find_sufficient(seen.table, seen.view, rule, asked.clusters, refinement, chosen);
         if (!view.in.needs.empty() && !seen.table.pages.is_whole())
             tell_needs(cut, rule, view.in.needs[view.in.instances.bundle[i]], scratch.priority);
     }
@@ -195,9 +229,13 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins, st
         return;
     }
     const AskedGroups groups = seen.groups(rule);
-    const int32_t num_groups = static_cast<int32_t>(seen.table.ball.size);
-    for (int32_t g = 0; g < num_groups; ++g) bins[g] = {groups.first_fitting(g), groups.first_unrefined(g)};
-    for (size_t c = 0; c < seen.table.num_clusters(); ++c) {
+    const ClusterRuns& runs = view.runs[view.in.instances.bundle[i]];
+    const Asked asked = seen.asked(runs, rule, Tolerances::from_this_on);
+    for (uint32_t g = asked.groups.first; g < asked.groups.end; ++g) {
+        const auto group = static_cast<int32_t>(g);
+        bins[g] = {groups.first_fitting(group), groups.first_unrefined(group)};
+    }
+    for (size_t c = asked.clusters.first; c < asked.clusters.end; ++c) {
         const BinRange range = cut.bins(c);
         if (range.is_empty()) continue;
         change[range.first] += seen.table.num_gaussians(c);
