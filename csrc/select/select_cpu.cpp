@@ -38,7 +38,7 @@ struct KnownBins {
 struct View {
     const SelectInput& in;
     std::vector<FrustumSides> sides;            // of each bundle
-    std::vector<ClusterRuns> runs;              // likewise; none where it has few instances
+    std::vector<ClusterRuns> runs;              // likewise, once found; none where it has few instances
     size_t most_groups = 0, most_clusters = 0;  // of any bundle
 
     explicit View(const SelectInput& input) : in(input) {
@@ -47,6 +47,9 @@ struct View {
             most_groups = std::max(most_groups, table.ball.size);
             most_clusters = std::max(most_clusters, table.num_clusters());
         }
+    }
+
+    void find_runs() {
         std::vector<size_t> count(in.bundles.size, 0);
         for (const int32_t b : in.instances.bundle) ++count[b];
         runs.resize(in.bundles.size);
@@ -91,7 +94,8 @@ struct SeenInstance {
     AskedGroups groups(const SelectRule& rule) const { return {table, view, rule}; }
 
     // What is asked at these tolerances.
-    Asked asked(const ClusterRuns& runs, const SelectRule& rule, Tolerances tolerances) const {
+    Asked asked(const View& of, size_t i, const SelectRule& rule, Tolerances tolerances) const {
+        const ClusterRuns& runs = of.runs[of.in.instances.bundle[i]];
         Asked asked{{0, static_cast<uint32_t>(table.num_clusters())},
                     {0, static_cast<uint32_t>(table.ball.size)}};
         if (runs.count == 0 || !table.pages.is_whole()) return asked;
@@ -198,8 +202,7 @@ void select_instance(const View& view, const SelectRule& rule, size_t i, Scratch
     if (source == CutSource::tops) {
         end = std::copy(seen.table.top_cluster.begin(), seen.table.top_cluster.end(), chosen);
     } else {
-        const ClusterRuns& runs = view.runs[view.in.instances.bundle[i]];
-        const Asked asked = seen.asked(runs, rule, Tolerances::this_one);
+        const Asked asked = seen.asked(view, i, rule, Tolerances::this_one);
         ask_groups(seen, rule, asked.groups, refinement);
         end += find_sufficient(seen.table, seen.view, rule, asked.clusters, refinement, chosen);
         if (!view.in.needs.empty() && !seen.table.pages.is_whole())
@@ -229,8 +232,7 @@ void count_instance(const View& view, size_t i, std::vector<GroupBins>& bins, st
         return;
     }
     const AskedGroups groups = seen.groups(rule);
-    const ClusterRuns& runs = view.runs[view.in.instances.bundle[i]];
-    const Asked asked = seen.asked(runs, rule, Tolerances::from_this_on);
+    const Asked asked = seen.asked(view, i, rule, Tolerances::from_this_on);
     for (uint32_t g = asked.groups.first; g < asked.groups.end; ++g) {
         const auto group = static_cast<int32_t>(g);
         bins[g] = {groups.first_fitting(group), groups.first_unrefined(group)};
@@ -271,7 +273,8 @@ bool meet_budget(const View& view, SelectRule& rule, int64_t& least_count) {
 }  // namespace
 
 void cpu::select(const SelectInput& in, SelectOutput& out) {
-    const View view(in);
+    View view(in);
+    view.find_runs();
     SelectRule rule = in.rule;
     if (rule.budget != kNoBudget) {
         out.num_gaussians = 0;
