@@ -587,6 +587,12 @@ def with_value(name, row, value):
     return change
 
 
+def assert_refuses_table(path, name, row, value, message):
+    with pytest.raises(ValueError, match=rf"small\.v3dg: ({message})") as caught:
+        open_changed(path, with_value(name, row, value))
+    assert "\n" not in str(caught.value)
+
+
 def assert_opens_or_is_refused(path):
     try:
         opened = Bundle.open(path)
@@ -634,17 +640,25 @@ BIG = 2**31 - 1
         ("groups.error", 0, -1, r"groups.error\[0\]: expected 0 or more"),
         ("pages.offset", 1, 0, r"pages.offset\[1\]: expected (4096|96) for its clusters, got 0"),
         ("pages.offset", -1, 2**63 - 1, r"pages.offset\[\d+\]: expected"),
-        ("pages.bytes", 0, 2**62, r"pages|size"),
         ("pages.first_cluster", 1, 0, r"pages.first_cluster\[1\]: expected"),
-        ("pages.num_clusters", 0, -1, r"pages.num_clusters\[0\]: expected"),
     ],
 )
 def test_wrong_table_is_refused(saved, name, row, value, message):
-    if name not in split_file(saved[1].read_bytes())[1]:
-        pytest.skip("files with float32 alone have it")
-    with pytest.raises(ValueError, match=rf"small\.v3dg: ({message})") as caught:
-        open_changed(saved[1], with_value(name, row, value))
-    assert "\n" not in str(caught.value)
+    assert_refuses_table(saved[1], name, row, value, message)
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "value", "message"),
+    [
+        ("pages.bytes", 0, 2**62, r"pages|size"),
+        ("pages.num_clusters", 0, -1, r"pages.num_clusters\[0\]: expected"),
+    ],
+)
+@pytest.mark.parametrize("version", [1, 3])
+def test_wrong_table_that_only_float32_has_is_refused(tmp_path, version, name, row, value, message):
+    path = tmp_path / "small.v3dg"
+    path.write_bytes(golden_bundles.path_of(version, "float32").read_bytes())
+    assert_refuses_table(path, name, row, value, message)
 
 
 @settings(max_examples=80)
@@ -746,9 +760,14 @@ def test_values_that_have_no_code_are_refused():
 
 def test_unknown_codecs_ask_for_an_update(tmp_path):
     random_bundle(3, codec="quantized").write(tmp_path / "a.v3dg")
-    for codec in ("later", None, 3, ["quantized"]):
-        with pytest.raises(ValueError, match=r"a\.v3dg: codec: expected one that this .*, got .*; update"):
-            open_changed(tmp_path / "a.v3dg", with_metadata(codec=codec))
+    (tmp_path / "2.v3dg").write_bytes(golden_bundles.path_of(2, "quantized").read_bytes())
+    for name, codecs in (("a", ("later", None, 3, ["quantized"])), ("2", ("later", "float32", None))):
+        for codec in codecs:
+            message = rf"{name}\.v3dg: codec: expected one that this .*, got .*; update"
+            with pytest.raises(ValueError, match=message):
+                open_changed(tmp_path / f"{name}.v3dg", with_metadata(codec=codec))
+    with pytest.raises(ValueError, match=r"a\.v3dg: pages.bytes: expected .*, got null$"):
+        open_changed(tmp_path / "a.v3dg", with_metadata(codec="float32"))
 
 
 @settings(max_examples=80)

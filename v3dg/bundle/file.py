@@ -140,7 +140,7 @@ class BundleFile:
             self._fail(f"version {self.version}, this build reads up to {VERSION}; update v3dg")
         self._check("sh_degree", degree in ("0", "1", "2", "3"), f"'0' to '3', got {shown(degree)}")
         name = codec if self.version > 1 else Codec.name
-        is_known = isinstance(name, str) and name in CODECS
+        is_known = isinstance(name, str) and name in CODECS and (self.version, name) != (2, Codec.name)
         self._check("codec", is_known, f"one that this build reads, got {shown(name)}; update v3dg")
         self.codec = CODECS[name](int(degree))
         self._check("config", isinstance(config, str), f"a string of JSON, got {shown(config)}")
