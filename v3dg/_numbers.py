@@ -11,13 +11,12 @@ import numpy.typing as npt
 Floats: TypeAlias = npt.NDArray[np.float64]
 
 MOST_INT = (1 << 31) - 1
+BLACK = (0.0, 0.0, 0.0)  # behind most pictures
 LEAST_FLOAT, MOST_FLOAT = 1.4e-45, float(np.finfo(np.float32).max)  # positive float32
 
 
 def floats(values: Any, name: str, expected: str = "numbers") -> Floats:
     """A new array of doubles, also of torch's tensors; ValueError for what is no number, or not finite."""
-    if type(values) is np.ndarray and values.dtype == np.float64 and np.isfinite(values).all():
-        return np.array(values, order="C")  # of every frame, and quickly
     try:
         array = np.asarray(values.numpy(force=True) if hasattr(values, "detach") else values)
         if array.dtype.kind not in "biufO":
@@ -37,6 +36,9 @@ def floats(values: Any, name: str, expected: str = "numbers") -> Floats:
 
 def vector(values: Any, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
     """As `floats`, of this shape."""
+    is_plain = type(values) is np.ndarray and values.shape == shape and values.dtype == np.float64
+    if is_plain and math.isfinite(sum(values.ravel().tolist())):
+        return np.array(values, order="C")  # of every frame, and quickly
     array = floats(values, name, f"numbers of shape {shape}")
     check(name, array.shape == shape, f"shape {shape}, got {array.shape}")
     return array
@@ -44,7 +46,8 @@ def vector(values: Any, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
 
 def color(values: Any, name: str) -> list[float]:
     """Three numbers that the core can hold."""
-    if type(values) is tuple and len(values) == 3 and all(type(v) is float and 0 <= v <= 1 for v in values):
+    is_plain = type(values) is tuple and list(map(type, values)) == [float] * 3
+    if values is BLACK or (is_plain and all(0 <= v <= 1 for v in values)):
         return list(values)  # of every frame, and quickly
     array = vector(values, name)
     largest = np.abs(array).max()

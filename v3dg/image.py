@@ -1,9 +1,8 @@
 """Image: what drawing gives."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 from v3dg import _core
 from v3dg.pictures import encode_png
@@ -42,8 +41,7 @@ class Image:
         return depth
 
 
-@dataclass(frozen=True)
-class Stats:
+class Stats(NamedTuple):
     """What a picture cost.
 
     Attributes:

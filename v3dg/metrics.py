@@ -111,8 +111,7 @@ def box_downsample(image: Any, factor: int) -> Any:
     height, width = image.shape[0], image.shape[1]
     is_divisible = height % factor == 0 == width % factor
     check("image", is_divisible, f"a height and width divisible by {factor}, got {height} x {width}")
-    blocks = image.reshape(height // factor, factor, width // factor, factor, *image.shape[2:])
-    return blocks.mean((1, 3))
+    return image.reshape(height // factor, factor, width // factor, factor, *image.shape[2:]).mean((1, 3))
 
 
 def errors_of(reference: Picture, test: Picture) -> dict[str, float | None]:

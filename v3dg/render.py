@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, TypeAlias, get_args, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check, color, one_of, real
+from v3dg._numbers import BLACK, check, color, one_of, real
 from v3dg.build.memory import in_bytes, in_mib
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, StereoCamera, check_camera, for_each
@@ -68,7 +67,7 @@ def render(
     fade: float | None = None,
     cut: Selection | None = None,
     color_by: ColorBy = "appearance",
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    background: Sequence[float] = BLACK,
     min_transmittance: float | None = None,
     depth: bool = False,
     device: str | Device = "auto",
@@ -187,7 +186,7 @@ class Renderer:
         min_level: int = 0,
         fade: float | None = None,
         cut: Selection | None = None,
-        background: Sequence[float] = (0.0, 0.0, 0.0),
+        background: Sequence[float] = BLACK,
         min_transmittance: float | None = None,
         depth: bool = False,
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
@@ -250,8 +249,8 @@ class _Frame:
             expected = f"'appearance' for a pool on a CUDA device, got {color_by!r}"
             check("color_by", memory is None or not is_whole, expected)
             self._frame = _core.SceneFrame(device.number)
-            with residency.reading(subject, device) as resident:
-                self._take_models(resident)
+            with residency.turn(device):
+                self._take_models(residency.scene(subject, device))
 
     def draw(
         self,
@@ -275,8 +274,8 @@ class _Frame:
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
         is_plain = {float, int, type(None)} >= {*map(type, options.values())}
         rule = (_known_rule if is_plain else rule_of)(**options)
-        with residency.reading(subject, self.device, self._resident) as resident:
-            self._resident = resident
+        with residency.turn(self.device):
+            self._resident = resident = residency.scene(subject, self.device, self._resident)
             pool = self._take_models(resident)
             if pool is not None:
                 check("cut", cut is None, "none for a pool, which has its own, got one; give memory=None")
@@ -302,7 +301,7 @@ class _Frame:
                 raise over_budget(options["budget"], stats.gaussians)
             chosen = stats.tolerance_px2 if options["budget"] is not None else rule.tolerance_px2
             if pool is not None:
-                return replace(_stats(stats, stats.tolerance_px2), memory=self.memory, **came_in)
+                return _stats(stats, stats.tolerance_px2)._replace(memory=self.memory, **came_in)
             return _stats(stats, chosen if cut is None else cut.tolerance)
 
         if not self.device.is_cuda:
@@ -310,8 +309,8 @@ class _Frame:
         elif self._has_settled:
             drawing.finish()  # which may draw again, with pages that other views put in place of its own
         self._has_settled = False
-        eyes = tuple(RenderedImage(drawing, finish, is_right=is_right) for is_right in (False, True))
-        return eyes[0] if isinstance(camera, Camera) else eyes
+        left = RenderedImage(drawing, finish)
+        return left if isinstance(camera, Camera) else (left, RenderedImage(drawing, finish, is_right=True))
 
     def settle(
         self, subject: Subject, camera: Camera | StereoCamera, timeout: float = 30.0, **options: Any
@@ -322,7 +321,8 @@ class _Frame:
         rule = rule_of(**options)
         if isinstance(subject, Gaussians) or (self.memory is None and not self._is_auto):
             return
-        with residency.reading(subject, self.device) as resident:
+        with residency.turn(self.device):
+            resident = residency.scene(subject, self.device)
             pool = self._take_models(resident)
         if pool is not None:
             pool.settle(resident, (camera.core, rule), timeout, seconds)
@@ -350,9 +350,9 @@ class _Frame:
     def pick(self, subject: Any, pixel: _core.Camera, rule: _core.Rule) -> Any:
         """(instance, cluster, weight, depth) of what a pool has there, or None; ValueError without a pool."""
         check("renderer", self.memory and not self.device.is_cuda, "one with a pool on the CPU")
-        with residency.reading(subject, self.device) as resident:
-            pool: Any = self._take_models(resident)
-            return self._frame.pick_resident(resident.core, pool.core, pixel, rule)
+        resident = residency.scene(subject, self.device)
+        pool: Any = self._take_models(resident)
+        return self._frame.pick_resident(resident.core, pool.core, pixel, rule)
 
     def _here(self, ids: Any) -> Any:
         if not self.device.is_cuda:

@@ -8,8 +8,8 @@ import copy
 import os
 import threading
 import weakref
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Hashable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import numpy as np
@@ -120,8 +120,19 @@ class Residency:
         columns: dict[str, Any] = vars(bundle.clusters) | of_groups  # the level is that of the groups
         return self.once(bundle, "table", lambda: _core.ClusterTable(**columns))
 
-    def scene(self, subject: Scene | Bundle, device: Device) -> ResidentScene:
-        """The scene on a device as it is now; a bundle as a scene of one."""
+    def turn(self, device: Device) -> AbstractContextManager[Any]:
+        """Meanwhile a scene that is on the device stays as it is, for which on CUDA other threads wait."""
+        return self.lock if device.is_cuda else nullcontext()
+
+    def scene(
+        self, subject: Scene | Bundle, device: Device, last: ResidentScene | None = None
+    ) -> ResidentScene:
+        """The scene on a device as it is now; a bundle as a scene of one.
+
+        Mostly it is what it was the last time, which is found sooner where that is given.
+        """
+        if last is not None and last.is_of(subject):
+            return last
         with self.lock:
             resident = self.once(subject, ("scene", device), lambda: ResidentScene(device))
             if resident.is_of(subject):
@@ -132,15 +143,6 @@ class Residency:
             resident.update(scene, [self.table(bundle) for bundle in scene.bundles])
             self._kept[subject]["scene", device] = resident
             return resident
-
-    @contextmanager
-    def reading(self, subject: Scene | Bundle, device: Device, last: Any = None) -> Iterator[ResidentScene]:
-        """As `scene`; it stays so meanwhile, for which on CUDA other threads have to wait.
-
-        Mostly it is what it was the last time, which is found sooner where that is given.
-        """
-        with self.lock if device.is_cuda else nullcontext():
-            yield last if last is not None and last.is_of(subject) else self.scene(subject, device)
 
     def rows(
         self, bundle: Bundle, clusters: NDArray[np.int32], device: Device

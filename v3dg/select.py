@@ -243,7 +243,8 @@ def select_by(
     """Select for one view; with `steps`, for the next of views that follow each other."""
     check_camera(camera)
     start = time.perf_counter()
-    with residency.reading(subject, device) as resident:
+    with residency.turn(device):
+        resident = residency.scene(subject, device)
         cut = resident.core.select(camera.core, rule, steps)
     if not cut.fits_budget:
         assert budget is not None

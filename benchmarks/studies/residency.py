@@ -141,7 +141,7 @@ def timed(
             time.sleep(max(0.0, start + number / config.hz - time.perf_counter()))
         begin = time.perf_counter()
         image = renderer.render(camera, tolerance=config.tolerance)
-        stats = dataclasses.asdict(image.stats)
+        stats = image.stats._asdict()
         frames.append({"ms": 1e3 * (time.perf_counter() - begin), **stats})
         if number in kept:
             frames[-1]["picture"] = pixels(image)

@@ -33,8 +33,7 @@ def most_units(memory: int, leaves: Leaves) -> int:
 
 def unit_bytes(num_gaussians: int, sh_degree: int) -> int:
     """What a unit of an asset takes."""
-    leaf = _LEAF_BYTES + _LEAF_COPIES * gaussian_bytes(sh_degree)
-    return int(min(num_gaussians, UNIT_LEAVES) * leaf)
+    return int(min(num_gaussians, UNIT_LEAVES) * (_LEAF_BYTES + _LEAF_COPIES * gaussian_bytes(sh_degree)))
 
 
 def in_mib(num_bytes: int) -> str:

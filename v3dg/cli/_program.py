@@ -110,8 +110,7 @@ class Program:
             if arguments is None:
                 _set_threads(getattr(options, "threads", None))
                 _start.raise_interrupts()
-            run = next(run for kind, run in self.commands.values() if isinstance(options, kind))
-            run(options)
+            next(run for kind, run in self.commands.values() if isinstance(options, kind))(options)
         except SystemExit:  # after the help
             return 0
         except UsageError as error:

@@ -169,8 +169,7 @@ def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
 def _output_of(name: Path, folder: Path | None) -> Path:
     """Where the bundle of an asset goes that is named after that."""
     name = name.resolve() if name.is_dir() else beside(name)
-    stem = name.name if name.is_dir() else name.stem
-    return (folder or name.parent) / f"{stem}.v3dg"
+    return (folder or name.parent) / f"{name.name if name.is_dir() else name.stem}.v3dg"
 
 
 def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:

@@ -1,6 +1,6 @@
 """`v3dg render`."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -63,7 +63,7 @@ def run(options: Render) -> None:
         image = renderer.render(camera, **cut, background=options.background)
         write_picture(path, _device.to_host(image.color))
         view = {"camera": name, "width": camera.width, "height": camera.height}
-        cost = asdict(image.stats) | {"tolerance": finite(image.stats.tolerance)}
+        cost = image.stats._asdict() | {"tolerance": finite(image.stats.tolerance)}
         pictures.append({"picture": str(path), **view, **cost})
     columns = (
         "picture = {picture}; size = {width} x {height}; selected = {gaussians_selected:,}; "

@@ -149,8 +149,7 @@ def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
     means = gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0)
     centre, radius = ball_of_most(means)
     distance = 1.2 * radius / math.sin(math.radians(_FOV_DEGREES) / 2)
-    towards_camera = np.array([0.4, 0.4, 0.8]) / np.linalg.norm([0.4, 0.4, 0.8])
-    position = centre + distance * towards_camera
+    position = centre + distance * np.array([0.4, 0.4, 0.8]) / np.linalg.norm([0.4, 0.4, 0.8])
     pose = {"position": position.tolist(), "target": centre.tolist(), "fov": _FOV_DEGREES}
     settings = json.loads(files("v3dg.export").joinpath(SETTINGS).read_text(encoding="utf-8"))
     return {**settings, "cameras": [{"initial": pose}]}

@@ -135,8 +135,7 @@ class _Writer:
         below = [self.tile_of(child) for child in self._below(g)]
         if self._bundle.groups.level[g] == 1:
             below = [self._tile(f"0_{g}", self._replaced(g), 0.0, [])]
-        name = f"{self._bundle.groups.level[g]}_{g}"
-        return self._tile(name, self._made(g), float(self._error[g]), below)
+        return self._tile(f"{self._bundle.groups.level[g]}_{g}", self._made(g), float(self._error[g]), below)
 
     def _tile(
         self, name: str, clusters: Sequence[int], error: float, children: list[dict[str, Any]]

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import CPU, Device
+from v3dg._numbers import BLACK
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
@@ -39,7 +40,7 @@ _OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
 _OF_CUT = ("level", "cluster", "residency", "error", "count")  # colours of clusters, and what is not colours
 # So many gaussians are drawn whole while the camera moves, too.
 _FEW_GAUSSIANS = 500_000
-_SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
+_SHADE = shade_of(BLACK, None, is_asset=False, depth=True)
 
 
 @dataclass(frozen=True)
@@ -201,7 +202,8 @@ class SceneView:
         if edge > 0:
             picture[:, :edge] = drawn.whole[:, :edge]
             picture[:, max(edge - 1, 0) : edge + 1] = 1.0
-        figures = replace(drawn.figures, draw_ms=1e3 * time.perf_counter() - start - drawn.figures.select_ms)
+        draw_ms = 1e3 * time.perf_counter() - start - drawn.figures.select_ms
+        figures = drawn.figures._replace(draw_ms=draw_ms)
         return Frame(to_8bit(picture), figures, settings.shows, value_range, view, distance)
 
     def pick(self, view: View, size: tuple[int, int], x: int, y: int, settings: Settings) -> Pick | None:
@@ -235,7 +237,7 @@ class SceneView:
         color, alpha, depth = (_device.to_host(plane)[:, first:] for plane in planes)
         levels = image.stats.levels and (*image.stats.levels, *[0] * self.num_levels)[: self.num_levels]
         whole = None if finer is None else finer.color
-        return _Drawn(color, alpha, depth, whole, replace(image.stats, levels=levels))
+        return _Drawn(color, alpha, depth, whole, image.stats._replace(levels=levels))
 
     def _of_all(self, asked: _Asked) -> "_Drawn":
         """What is resident, which is all; compared with all gaussians."""
@@ -337,8 +339,7 @@ def _bounds(scene: Scene) -> tuple[Any, float]:
             continue
         low, high = np.percentile(leaves.astype(np.float64), (2, 98), axis=0)
         box = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
-        turned = np.einsum("iab,kb->ika", scene.rotations[mine], box)
-        placed = scene.scales[mine, None, None] * turned + scene.positions[mine, None]
-        corners.append(placed.reshape(-1, 3))
+        turned = np.einsum("i,iab,kb->ika", scene.scales[mine], scene.rotations[mine], box)
+        corners.append((turned + scene.positions[mine, None]).reshape(-1, 3))
     points = np.concatenate(corners)
     return ball_of_most(points) if len(points) else (np.zeros(3), 1.0)

@@ -126,7 +126,7 @@ class Tab:
     def _show(self, frame: Frame, is_final: bool, number: int) -> None:
         picture, quality = io.BytesIO(), _FINAL_QUALITY if is_final else _DRAFT_QUALITY
         Image.fromarray(frame.pixels).save(picture, "jpeg", quality=quality, subsampling=0 if is_final else 2)
-        figures = asdict(frame.figures) | {"memory_bytes": _resident_bytes()}
+        figures = frame.figures._asdict() | {"memory_bytes": _resident_bytes()}
         message = {"type": "picture", "final": is_final, "number": number, "size": frame.size}
         message |= {"view": asdict(frame.view), "shows": frame.shows, "range": frame.value_range}
         message |= {"distance": frame.distance, "figures": figures}
