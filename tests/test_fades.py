@@ -22,7 +22,7 @@ from frames import (
 from random_bundle import random_bundle
 from reference import select as reference
 from scenes_lod import blob, group_metrics, lod_bundle, random_camera, random_scene, turned
-from v3dg import DEFAULT_FADE, Camera, Gaussians, Scene, Selection, _core, _device, select
+from v3dg import DEFAULT_FADE, Bundle, Camera, Gaussians, Scene, Selection, _core, _device, rasterize, select
 from v3dg.select import rule_of, select_by
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
@@ -333,19 +333,54 @@ def test_gaussians_have_opacities_times_weights(device):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_picture_is_that_of_the_gaussians_with_faded_opacities(device):
-    """Drawn without a filter, the picture is that of an asset: any rasterizer fades."""
+    """Each with its filter: any rasterizer fades."""
     rng = np.random.default_rng(7)
-    bundle = lod_bundle(rng, blob(rng, 900), 32, filter_px2=0.0)
+    bundle = lod_bundle(rng, blob(rng, 900), 32, filter_px2=0.05)
     tolerance = float(np.median(group_metrics(bundle, CAMERA)[0]))
     cut = select(bundle, CAMERA, tolerance=tolerance, fade=1.2, device=device)
     assert 0.2 < (cut.weights < 1).mean() < 1
     options = {"device": device, "min_transmittance": 0.0}
     image = render(bundle, CAMERA, cut=cut, **options)
     assert_same_bytes(image, render(bundle, CAMERA, tolerance=tolerance, fade=1.2, **options))
-    whole = render(cut.gaussians(device=device), CAMERA, **options)
+    assert (cut.filters_px2 == np.float32(0.05)).all()
+    assert cut.antialiased.all()
+    one = lod_bundle(rng, cut.gaussians(device="cpu"), 1 << 20, past_root=0)
+    filters = {"filter_px2": np.full(1, 0.05, np.float32), "antialiased": np.ones(1, np.uint8)}
+    shown = Bundle(replace(one.clusters, **filters), one.groups, one.gaussians)
+    whole = render(shown, CAMERA, tolerance=0.0, **options)
     assert_close(arrays(image)[:2], arrays(whole)[:2])
     hard = render(bundle, CAMERA, tolerance=tolerance, **options)
     assert np.abs(arrays(image)[0] - arrays(hard)[0]).max() > 1e-2
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("filter_px2", "is_antialiased"), [(0.0, 0), (0.3, 0), (0.02, 1)])
+def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased, device):
+    """Also where nothing is on its way, so that a picture does not change as a whole once something is."""
+    rng = np.random.default_rng(3)
+    bundle = lod_bundle(rng, blob(rng, 900, size=0.01), 32)
+    is_fine = bundle.clusters.level == 0
+    filters = np.where(is_fine, np.float32(filter_px2), bundle.clusters.filter_px2)
+    antialiased = np.where(is_fine, np.uint8(is_antialiased), bundle.clusters.antialiased)
+    bundle = Bundle(
+        replace(bundle.clusters, filter_px2=filters, antialiased=antialiased), bundle.groups, bundle.gaussians
+    )
+    soft, hard = (select(bundle, CAMERA, tolerance=0.0, fade=fade, device=device) for fade in (1.05, None))
+    assert (hard.filters_px2 == np.float32(filter_px2)).all()
+    assert (hard.antialiased == bool(is_antialiased)).all()
+    assert (soft.weights == 1).all()
+    expected, compensates = (filter_px2, bool(is_antialiased)) if filter_px2 else (0.05, True)
+    assert (soft.filters_px2 == np.float32(expected)).all()
+    assert (soft.antialiased == compensates).all()
+    shown = rasterize(soft.gaussians(device=device), CAMERA, filter_px2=expected, antialiased=compensates)
+    drawn = render(bundle, CAMERA, cut=soft, min_transmittance=1e-4, device=device)
+    assert_close(arrays(drawn)[:2], arrays(shown)[:2])
+    image = render(bundle, CAMERA, tolerance=0.0, fade=1.05, device=device)
+    assert_same_bytes(image, render(bundle, CAMERA, cut=soft, device=device))
+    still = render(bundle, CAMERA, tolerance=0.0, device=device)
+    assert_same_bytes(still, render(bundle, CAMERA, cut=hard, device=device))
+    is_other = np.abs(arrays(image)[1] - arrays(still)[1]).max() > 0.02
+    assert is_other == (filter_px2 == 0)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -132,7 +132,8 @@ def test_budget_is_kept_and_one_too_small_is_an_error(scene_view, view):
 
 def test_alpha_and_depth_are_shown(scene_view, view, device):
     camera = view.camera(*SIZE, scene_view.near)
-    image = v3dg.render(scene_view.scene, camera, tolerance=0.0, depth=True, device=device)
+    options = {"tolerance": 0.0, "fade": DEFAULT_FADE, "depth": True}
+    image = v3dg.render(scene_view.scene, camera, **options, device=device)
     alpha, depth = (np.asarray(p if device == "cpu" else p.cpu()) for p in (image.alpha, image.depth))
     shown = scene_view.frame(view, SIZE, Settings(shows="alpha", tolerance=0.0))
     np.testing.assert_array_equal(shown.pixels, np.repeat(to_8bit(alpha)[..., None], 3, axis=2))
@@ -204,7 +205,7 @@ def test_error_is_the_share_of_the_tolerance_that_is_used(share, device):
         wanted = to_8bit(_core.ramp(np.array(share * metric / near)) * alpha[:, half])
         assert wanted.max() > 20
         np.testing.assert_allclose(frame.pixels[:, half].astype(int), wanted, atol=2)
-    finest = scene_view.frame(view, size, Settings(shows="error", tolerance=0.0)).pixels
+    finest = scene_view.frame(view, size, Settings(shows="error", tolerance=0.0, fade=None)).pixels
     alpha = v3dg.render(scene, camera, tolerance=0.0, device="cpu").alpha[..., None]
     np.testing.assert_allclose(finest.astype(int), to_8bit(_core.ramp(np.array(0.0)) * alpha), atol=2)
 
@@ -225,7 +226,7 @@ def test_difference_is_to_all_gaussians_and_amplified(scene_view, view):
 def test_split_shows_all_gaussians_on_the_left(scene_view, view, device):
     settings = Settings(tolerance=20.0, split=0.25)
     pixels = scene_view.frame(view, SIZE, settings).pixels
-    fine, _ = drawn(scene_view, view, device, tolerance=0.0)
+    fine, _ = drawn(scene_view, view, device, tolerance=0.0, fade=DEFAULT_FADE)
     coarse, _ = drawn(scene_view, view, device, tolerance=20.0, fade=DEFAULT_FADE)
     np.testing.assert_array_equal(pixels[:, :23], fine[:, :23])
     np.testing.assert_array_equal(pixels[:, 25:], coarse[:, 25:])
@@ -252,10 +253,12 @@ def test_asset_is_drawn_whole_and_has_one_level(view):
     scene_view = SceneView(asset, device="cpu")
     assert scene_view.num_levels == 1
     assert scene_view.num_gaussians == 500
-    frame = scene_view.frame(view, SIZE, Settings())
-    whole = to_8bit(v3dg.render(asset, view.camera(*SIZE, scene_view.near), device="cpu").color)
-    assert abs(frame.pixels.astype(int) - whole).max() <= 1
-    assert whole.any()
+    for fade, filter_px2 in ((None, 0.0), (DEFAULT_FADE, 0.05)):
+        frame = scene_view.frame(view, SIZE, Settings(fade=fade))
+        camera, how = view.camera(*SIZE, scene_view.near), {"filter_px2": filter_px2, "antialiased": True}
+        whole = to_8bit(v3dg.rasterize(asset, camera, **how).color)
+        assert abs(frame.pixels.astype(int) - whole).max() <= 1
+        assert whole.any()
 
 
 def test_scene_of_nothing_is_drawn():

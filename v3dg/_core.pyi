@@ -17,6 +17,7 @@ Int32: TypeAlias = NDArray[np.int32]
 Int64: TypeAlias = NDArray[np.int64]
 Uint8: TypeAlias = NDArray[np.uint8]
 
+fade_filter_px2: float
 has_cuda: bool
 min_alpha: float
 sh_base0: float

@@ -32,6 +32,7 @@ DEFAULT_TOLERANCE = 3.0
 
 # Fade of pictures that follow each other; docs/fades.md has what it costs and what it gains.
 DEFAULT_FADE = 1.02
+_FADE_FILTER_PX2 = np.float32(_core.fade_filter_px2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class Selection:
         tolerance: px² that were used; with a budget, those with which it is met.
         seconds: Wall time of the selection.
         revision: Of the scene, when its instances were looked at; as it is now if None.
-        given_weights: As `weights`, not to be written to; None where all are 1, as they are without a fade.
+        given_weights: As `weights`, not to be written to; None without a fade, where all are 1.
     """
 
     scene: Scene
@@ -65,8 +66,6 @@ class Selection:
         weights, expected = self.weights, f"{len(self)} numbers of 0 to 1"
         check("given_weights", len(weights) == len(self), f"{expected}, got {len(weights)}")
         check("given_weights", ((weights >= 0) & (weights <= 1)).all(), f"{expected}, got others")
-        if (weights == 1).all():
-            object.__setattr__(self, "given_weights", None)
         for values in (self.instance_ids, self.cluster_ids, weights):
             values.flags.writeable = False
 
@@ -131,13 +130,21 @@ class Selection:
 
     @property
     def filters_px2(self) -> npt.NDArray[np.float32]:
-        """(N,) variance of the screen-space filter that each gaussian is drawn with."""
-        return self._per_gaussian(lambda clusters: clusters.filter_px2).astype(np.float32)
+        """(N,) variance of the screen-space filter that each gaussian is drawn with.
+
+        With a fade, a level 0 that has none is drawn with 0.05 px², and with `antialiased`.
+        """
+        return self._per_gaussian(lambda of: np.where(self._bare(of), _FADE_FILTER_PX2, of.filter_px2))
 
     @property
     def antialiased(self) -> npt.NDArray[np.bool_]:
         """(N,) whether each gaussian's opacity is compensated for its filter."""
-        return self._per_gaussian(lambda clusters: clusters.antialiased).astype(np.bool_)
+        return self._per_gaussian(lambda clusters: self._bare(clusters) | (clusters.antialiased > 0))
+
+    def _bare(self, clusters: Clusters) -> npt.NDArray[np.bool_]:
+        """(C,) whether only the fade gives the clusters a filter."""
+        fades = self.given_weights is not None
+        return np.asarray((clusters.level == 0) & (clusters.filter_px2 == 0) & fades)
 
     def _first(self) -> npt.NDArray[np.int64]:
         """(S + 1,) where each selected cluster's gaussians begin."""

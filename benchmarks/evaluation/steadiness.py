@@ -111,10 +111,10 @@ def paths_from(first: Camera, target: Any, frames: int) -> list[Path]:
     return [*paths, Path("moved instances", [first] * frames, True, nearer)]
 
 
-def true_picture(subject: Any, camera: Camera, device: str) -> Any:
-    """(H, W, 3) of all gaussians, floats in [0, 1], of so many samples that it hardly flickers."""
-    color = render(subject, camera.scaled(SUPERSAMPLING), tolerance=0.0, device=device).color
-    return box_downsample(_device.to_host(color).clip(0, 1), SUPERSAMPLING)
+def true_picture(subject: Any, camera: Camera, device: str, samples: int = SUPERSAMPLING) -> Any:
+    """(H, W, 3) of all gaussians, floats in [0, 1], of so many samples a side that it hardly flickers."""
+    color = render(subject, camera.scaled(samples), tolerance=0.0, device=device).color
+    return box_downsample(_device.to_host(color).clip(0, 1), samples)
 
 
 class Warp:
@@ -267,12 +267,19 @@ class _Follower:
 
 
 def compare(
-    subject: Any, path: Path, cuts: dict[str, Cut], device: str, *, along_motion: bool = True
+    subject: Any,
+    path: Path,
+    cuts: dict[str, Cut],
+    device: str,
+    *,
+    along_motion: bool = True,
+    samples: int = SUPERSAMPLING,
 ) -> list[Row]:
     """Draw the frames of a path with several options of `render`: how steady they are, gaussians a frame.
 
     Args:
         along_motion: Whether errors are followed, too, which draws all gaussians once more.
+        samples: Of the true pictures, a pixel's side.
     """
     scene = copy.copy(Scene.of(subject))
     start = scene.positions
@@ -280,7 +287,7 @@ def compare(
     last: Any = None
     for k, camera in enumerate(path.cameras):
         scene.move(positions=start + path.moves[k])
-        truth = true_picture(scene, camera, device)
+        truth = true_picture(scene, camera, device, samples)
         warp, whole = None, None
         if along_motion:
             whole = render(scene, camera, tolerance=0.0, depth=True, device=device)

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.record import write
-from benchmarks.evaluation.steadiness import Cut, Options, compare, paths_from
+from benchmarks.evaluation.steadiness import SUPERSAMPLING, Cut, Options, compare, paths_from
 from benchmarks.evaluation.steadiness import Path as CameraPath
 from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Scene, Selection, select
 from v3dg.cleaning import ball_of_most
@@ -41,6 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--fades", type=float, nargs="+", default=[DEFAULT_FADE])
     parser.add_argument("--tolerance", type=float, default=DEFAULT_TOLERANCE)
     parser.add_argument("--paths", nargs="+", help="only these")
+    parser.add_argument("--samples", type=int, default=SUPERSAMPLING, help="of the true pictures, a side")
     parser.add_argument("--level-0-filter", type=float, default=0.0, help="px2, with compensated opacities")
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--json", type=Path, help="write the result there")
@@ -60,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
                 rows += measure(scene, camera_path, options, {**of, "distance": distance})
                 print(*(line(row) for row in rows[-4 - len(options.fades) :]), sep="\n", flush=True)
     result = {"frames": options.frames, "size": options.size, "tolerance": options.tolerance, "rows": rows}
-    result["level_0_filter"] = options.level_0_filter
+    result |= {"level_0_filter": options.level_0_filter, "samples": options.samples}
     result["verdict"] = [verdict(rows, fade) for fade in options.fades]
     print(*result["verdict"], sep="\n")
     write(options.json, result, options.device)
@@ -114,7 +115,7 @@ def first_camera(bundle: Bundle, up: str, distance: float, size: int) -> tuple[C
 
 
 class Stays:
-    """The hard cut of one camera, whatever the frame."""
+    """The hard cut of one camera, whatever the frame, drawn as a fade draws: with a filter at level 0."""
 
     def __init__(self, camera: Camera, tolerance: float) -> None:
         self.camera, self.tolerance = camera, tolerance
@@ -122,7 +123,8 @@ class Stays:
 
     def __call__(self, scene: Scene, camera: Camera) -> Options:
         if self.cut is None:
-            self.cut = select(scene, self.camera, tolerance=self.tolerance, cull=False, device="cpu")
+            cut = select(scene, self.camera, tolerance=self.tolerance, cull=False, device="cpu")
+            self.cut = replace(cut, given_weights=np.ones(len(cut), np.float32))
         return {"cut": self.cut}
 
 
@@ -135,7 +137,7 @@ def measure(scene: Scene, path: CameraPath, options: Any, of: Row, *, along_moti
     count = _mean_count(scene, cameras, tolerance=tolerance, fade=options.fades[0])
     cuts["hard, equal count"] = {"tolerance": _tolerance_of_count(scene, cameras, count, tolerance)}
     cuts["stays"] = Stays(path.seen_from(len(path.cameras) // 2), tolerance)
-    rows = compare(scene, path, cuts, options.device, along_motion=along_motion)
+    rows = compare(scene, path, cuts, options.device, along_motion=along_motion, samples=options.samples)
     return [{**of, "path": path.name, "is_drift": path.is_drift, **row} for row in rows]
 
 

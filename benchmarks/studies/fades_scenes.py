@@ -25,7 +25,7 @@ import tyro
 from benchmarks.evaluation.evaluation import resized
 from benchmarks.evaluation.measure import Row
 from benchmarks.evaluation.record import write
-from benchmarks.evaluation.steadiness import paths_from
+from benchmarks.evaluation.steadiness import SUPERSAMPLING, paths_from
 from benchmarks.studies.fades import axes, filtered, line, measure, verdict
 from v3dg import DEFAULT_FADE, DEFAULT_TOLERANCE, Bundle, Camera, Scene, read_cameras, read_scene, render
 from v3dg._device import to_host
@@ -49,6 +49,8 @@ class Config:
     fades: tuple[float, ...] = (DEFAULT_FADE,)
     tolerance: float = DEFAULT_TOLERANCE
     paths: tuple[str, ...] = ("drift in", "drift out")
+    samples: int = SUPERSAMPLING
+    """Of the true pictures, a pixel's side."""
     level_0_filter: float = 0.0
     """px², with compensated opacities."""
     device: str = "cpu"

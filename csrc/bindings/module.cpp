@@ -8,6 +8,7 @@
 #include "base/isa.h"
 #include "bindings/operations.h"
 #include "math/gaussian.h"
+#include "residency/cluster_table.h"
 
 #if V3DG_WITH_CUDA
 #include "base/device.h"
@@ -37,6 +38,7 @@ PYBIND11_MODULE(_core, m) {
         throw std::bad_alloc();
     m.doc() = "Compiled operations of v3dg; the public interface is the package v3dg.";
     m.attr("min_alpha") = v3dg::kMinAlpha;
+    m.attr("fade_filter_px2") = v3dg::kFadeFilterPx2;
     m.attr("sh_base0") = v3dg::kShBase0;
     m.attr("has_cuda") = V3DG_WITH_CUDA != 0;
     m.def(

@@ -56,7 +56,7 @@ SceneFrameCounts draw_all(const std::vector<Draw<float>>& draws, const Camera& c
 class CutDraws {
   public:
     CutDraws(const HostScene& scene, const Camera& camera, const GivenCut& given, const float* tint = nullptr)
-        : scene_(scene), camera_(camera) {
+        : scene_(scene), camera_(camera), fades_(given.weight.size > 0) {
         for (size_t s = 0; s < given.instance.size; ++s)
             add(given.instance[s], given.cluster[s], given.weight_of(s), tint ? tint + 3 * s : nullptr);
     }
@@ -89,8 +89,10 @@ class CutDraws {
         end_of_pair_.back() = num_gaussians_ += count;
         if (tint == nullptr && model.cluster_sh != nullptr) tint = model.cluster_sh + 3 * size_t(c);
         const Palette palette = tint == nullptr ? model.palette : Palette{tint, nullptr, 1};
-        const Draw<float> next{model.planes,        first,   count,       view_,
-                               model.appearance[c], palette, model.codes, weight};
+        const Appearance<float> appearance =
+            fades_ ? model.appearance.faded(table, c) : model.appearance[c];
+        const Draw<float> next{model.planes, first,   count,       view_,
+                               appearance,   palette, model.codes, weight};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else
@@ -106,6 +108,7 @@ class CutDraws {
 
     const HostScene& scene_;
     const Camera& camera_;
+    const bool fades_;
     std::vector<Draw<float>> draws_;
     std::vector<uint64_t> end_of_pair_;  // among the gaussians of all draws
     uint64_t num_gaussians_ = 0;

@@ -44,12 +44,20 @@ struct ClusterTable {
     V3DG_HD bool follows(size_t c) const { return pages.is_whole() || page_of(c) == page_of(c - 1); }
 };
 
+// Low-pass of a level 0 that has none of its own, in a cut that fades: that of coarser levels by default.
+constexpr float kFadeFilterPx2 = 0.05f;
+
 // How the clusters of a bundle are drawn.
 struct ClusterAppearance {
     Span<const float> filter_px2;     // [C]
     Span<const uint8_t> antialiased;  // [C]
 
     V3DG_HD Appearance<float> operator[](size_t c) const { return {filter_px2[c], antialiased[c] != 0}; }
+    // In a cut that fades, where the gaussians of level 0, too, are not to come and go between the samples.
+    V3DG_HD Appearance<float> faded(const ClusterTable& table, size_t c) const {
+        if (table.own_group[c] >= 0 || filter_px2[c] > 0.0f) return (*this)[c];
+        return {kFadeFilterPx2, true};
+    }
 };
 
 // The tables of a bundle on the host. Borrows the arrays that it is given and owns what it derives from them.

@@ -119,7 +119,9 @@ struct ItemOutput {
             const uint32_t placement = run.sharers == 0 ? mine.instance : mine.instance - threadIdx.x % 32;
             const uint32_t gaussian = static_cast<uint32_t>(mine.bundle->table.first_row(cluster));
             const uint32_t place = mine.bundle->table.place_of(cluster);
-            const Appearance<float> appearance = mine.bundle->appearance[cluster];
+            const ClusterAppearance& appearances = mine.bundle->appearance;
+            const Appearance<float> appearance =
+                kFades ? appearances.faded(mine.bundle->table, cluster) : appearances[cluster];
             const float weight = kFades ? share_of(mine.weights[run.k]) : 1.0f;
             for (uint32_t picture = 0; picture < num_pictures; ++picture)
                 for (unsigned skip = 0; skip < size; skip += step, ++first) {

@@ -217,7 +217,7 @@ class SceneView:
         """What a pool has; compared with the finest that it has room for, from whose pages both are drawn."""
         settings, stop, edge, chooser = asked.settings, asked.stop, asked.edge, asked.chooser
         wanted: Any = {name: getattr(settings, name) for name in ("tolerance", "budget", "min_level", "fade")}
-        finest: Any = {"tolerance": 0.0, "budget": None, "min_level": 0, "fade": None}
+        finest: Any = {"tolerance": 0.0, "budget": None, "min_level": 0, "fade": settings.fade}
         compares = edge > 0 or settings.shows == "difference"
         if patience:
             how = finest if compares else wanted
@@ -255,7 +255,7 @@ class SceneView:
             planes = self._draw(cut, camera, window, by, stop)
         whole, last = None, camera.width if shows == "difference" else edge
         if last > 0:
-            finest = select(self.scene, camera, tolerance=0.0, device=self.device)
+            finest = select(self.scene, camera, tolerance=0.0, fade=settings.fade, device=self.device)
             whole = self._draw(finest, camera, (0, 0, last, camera.height), "appearance", stop)[0]
         cost = cut.num_gaussians, planes[3], cut.tolerance, 1e3 * cut.seconds, 0.0
         level, size = cut._per_pair(lambda c: c.level), cut._per_pair(lambda c: np.diff(c.offset))
