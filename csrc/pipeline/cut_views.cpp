@@ -107,6 +107,16 @@ Camera resized(Camera camera, double scale) {
     return camera;
 }
 
+// The same picture somewhere among the pixels of a screen, with what is beside it where it is narrow.
+Camera on_screen(Camera camera, Random& random) {
+    const double width = std::max(camera.width, kNarrowestPx), height = std::max(camera.height, kNarrowestPx);
+    camera.cx += (width - camera.width) / 2 + random.uniform() - 0.5;
+    camera.cy += (height - camera.height) / 2 + random.uniform() - 0.5;
+    camera.width = camera.x1 = width;
+    camera.height = camera.y1 = height;
+    return camera;
+}
+
 // A part of the picture around a gaussian. What is twice as large in the asset is seen twice as often.
 Camera window_of(const Camera& camera, double widest_px, const CutPictures& pictures, Random& random) {
     double at[2] = {camera.width / 2, camera.height / 2};
@@ -202,8 +212,9 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
     const double longer = std::max(camera.width, camera.height);
     const double area_px2 = size * size * kHomePx2 * share * all;
     const double scale = std::sqrt(area_px2 / (camera.width * camera.height));
-    const double longer_px = std::clamp(longer * scale, kNarrowestPx, kMostPx);
+    const double longer_px = std::clamp(longer * scale, rule.culls ? kNarrowestPx : 0.0, kMostPx);
     camera = resized(camera, longer_px / longer);
+    if (!rule.culls) camera = on_screen(camera, random);
     rule.budget = static_cast<uint64_t>(std::ceil(share * all));
     const SelectOutput whole = selected(pictures.table, camera, rule);
     rule.budget = kNoBudget;
