@@ -7,7 +7,9 @@ in view at once, whose error is measured on crops, since nothing draws all of th
 from __future__ import annotations
 
 import math
+import multiprocessing
 import statistics
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -81,6 +83,8 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
     runs.append(frames(scene, cameras, {"budget": config.budget}, config.repeats))
     moving = movement(scene, cameras[-1], config)
     flown = [flight(scene, cameras, {"tolerance": t}, config.repeats) for t in config.tolerances]
+    for row, _ in runs[:-1]:
+        row["gigabytes_alone"] = gigabytes_alone(scene.bundles[0], config, row["tolerance"])
     truths = [draw_truth(scene, camera, gpu.DEVICE) for camera in cameras]
     peer_ms, peer_pictures = gsplat(scene, cameras, config) if config.gsplat else ([], [])
     rows = []
@@ -142,6 +146,27 @@ def frames(
         "gaussians_in_frustum_of_each": counts,
     }
     return row, pictures
+
+
+def gigabytes_alone(bundle: v3dg.Bundle, config: Config, tolerance: float) -> float:
+    """What a process takes on the device that draws the layout with these levels, and has built nothing."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "levels.v3dg"
+        bundle.write(path)
+        with multiprocessing.get_context("spawn").Pool(1) as other:
+            return other.apply(_drawing_gigabytes, (path, config, tolerance))
+
+
+def _drawing_gigabytes(path: Path, config: Config, tolerance: float) -> float:
+    torch.zeros(1, device=gpu.DEVICE)
+    with gpu.PeakMemory() as peak:
+        assert config.layout is not None
+        scene, cameras = read_layout(config.layout, v3dg.Bundle.open(path))
+        renderer = Renderer(scene, device=gpu.DEVICE)
+        for camera in list(cameras.values())[slice(*config.cameras)]:
+            for _ in range(config.repeats):
+                renderer.render(camera, tolerance=tolerance).stats  # noqa: B018  waits for the picture
+    return round(peak.gigabytes, 3)
 
 
 def flight(scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int) -> Row:
