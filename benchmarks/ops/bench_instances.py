@@ -175,7 +175,8 @@ def flight(scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], rep
     ms = []
     for camera in cameras:
         step = _STEP * float(np.linalg.norm(camera.position - middle))
-        views = iter(_aside(camera, step * k) for k in range(3 + repeats))
+        # Made before, as all cameras are: a frame goes from the call to the finished picture.
+        views = iter([_aside(camera, step * k) for k in range(3 + repeats)])
 
         def frame(views: Iterator[Camera] = views) -> None:
             renderer.render(next(views), **options).stats  # noqa: B018  waits for the picture
