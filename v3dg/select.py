@@ -222,8 +222,9 @@ def select(
         cull: False keeps what lies outside the frustum.
         fade: What is within this factor of the tolerance is drawn on two levels, or more, with weights that
             add up to exactly 1 on every path and depend on the view alone: a level comes as the other goes,
-            so that nothing pops while the camera moves. `DEFAULT_FADE` is meant for that, and for nothing
-            else; 1 and None choose one cluster on every path. Not with the paper's footprint.
+            so that nothing pops while the camera moves. A level 0 without a filter of its own is drawn with
+            a low-pass of 0.05 px², so that it does not flicker. `DEFAULT_FADE` is meant for that, and for
+            nothing else; 1 and None choose one cluster on every path. Not with the paper's footprint.
         device: Where to choose: ``"cpu"``, ``"cuda"``, or ``"auto"``, which is CUDA where that works; all
             choose the same.
 
