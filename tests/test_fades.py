@@ -358,7 +358,10 @@ def test_picture_is_that_of_the_gaussians_with_faded_opacities(device):
 def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased, device):
     """Also where nothing is on its way, so that a picture does not change as a whole once something is."""
     rng = np.random.default_rng(3)
-    bundle = lod_bundle(rng, blob(rng, 900, size=0.01), 32)
+    asset = blob(rng, 900)
+    px = CAMERA.fx / np.linalg.norm(CAMERA.position)  # of a unit, about; none so narrow that it gets less
+    asset = replace(asset, scales=np.clip(asset.scales, 0.2 / px, 0.5 / px).astype(np.float32))
+    bundle = lod_bundle(rng, asset, 32)
     is_fine = bundle.clusters.level == 0
     filters = np.where(is_fine, np.float32(filter_px2), bundle.clusters.filter_px2)
     antialiased = np.where(is_fine, np.uint8(is_antialiased), bundle.clusters.antialiased)
@@ -381,6 +384,64 @@ def test_a_fade_gives_level_0_a_filter_that_has_none(filter_px2, is_antialiased,
     assert_same_bytes(still, render(bundle, CAMERA, cut=hard, device=device))
     is_other = np.abs(arrays(image)[1] - arrays(still)[1]).max() > 0.02
     assert is_other == (filter_px2 == 0)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("distance", [3, 10, 30, 60])
+def test_a_surface_of_tiny_gaussians_does_not_become_transparent(distance, device):
+    """Far smaller than the low-pass, so that each alone would be less than the least alpha that is drawn."""
+    rng = np.random.default_rng(1)
+    means = rng.normal(size=(50_000, 3))
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    count = len(means)
+    sphere = Gaussians(
+        means.astype(np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        np.full((count, 3), 0.01, np.float32),
+        np.full(count, 0.5, np.float32),
+        np.ones((count, 1, 3), np.float32),
+    )
+    bundle = lod_bundle(rng, sphere, 1 << 20, past_root=0)
+    camera = Camera.look_at((0, -distance, 0), (0, 0, 0), width=160, height=160)
+    options = {"tolerance": 0.0, "device": device}
+    truth = host(render(bundle, camera.scaled(8), **options).alpha).sum() / 64
+    assert host(render(bundle, camera, fade=1.05, **options).alpha).sum() == pytest.approx(truth, rel=0.1)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_levels_that_are_drawn_alike_without_a_fade_are_not_with_one(device):
+    """The last clusters of level 0 and the first of level 1 follow each other, each with its own filter."""
+    rng = np.random.default_rng(5)
+    bundle = lod_bundle(rng, blob(rng, 240, size=0.02), 60, filter_px2=0.0)
+    clusters = replace(bundle.clusters, antialiased=np.ones_like(bundle.clusters.antialiased))
+    bundle = Bundle(clusters, bundle.groups, bundle.gaussians)
+    assert (bundle.clusters.level[:8] == 0).sum() == 4
+    both = 0
+    for tolerance in np.geomspace(1, 1e4, 40):
+        options = {"tolerance": float(tolerance), "fade": 4.0, "device": device}
+        cut = select(bundle, CAMERA, **{**options, "device": "cpu"})
+        both += {0, 1} <= set(bundle.clusters.level[cut.cluster_ids].tolist())
+        image = render(bundle, CAMERA, **options)
+        assert_like_cpu(image, render(bundle, CAMERA, **{**options, "device": "cpu"}))
+        assert_same_bytes(image, render(bundle, CAMERA, cut=cut, device=device))
+    assert both > 3
+
+
+def test_weights_of_a_cut_may_be_any_numbers():
+    bundle = lod_bundle(np.random.default_rng(8), blob(np.random.default_rng(8), 300), 32)
+    cut = select(bundle, CAMERA, tolerance=2.0, device="cpu")
+    for ones in (np.ones(len(cut)), np.ones(len(cut), np.int64), np.ones(2 * len(cut), np.float32)[::2]):
+        faded_cut = replace(cut, given_weights=ones)
+        assert faded_cut.weights.dtype == np.float32
+        assert (faded_cut.filters_px2 > 0).all()
+        render(bundle, CAMERA, cut=faded_cut, device="cpu")
+
+
+@pytest.mark.parametrize("fade", [None, 1.05])
+def test_filters_of_no_gaussians_have_their_types(fade):
+    cut = select(Scene(), CAMERA, fade=fade, device="cpu")
+    assert cut.filters_px2.dtype == np.float32
+    assert cut.antialiased.dtype == np.bool_
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -211,7 +211,7 @@ def test_error_is_the_share_of_the_tolerance_that_is_used(share, device):
 
 
 def test_difference_is_to_all_gaussians_and_amplified(scene_view, view):
-    none = scene_view.frame(view, SIZE, Settings(shows="difference", tolerance=0.0))
+    none = scene_view.frame(view, SIZE, Settings(shows="difference", tolerance=0.0, fade=None))
     assert not none.pixels.any()
     one, ten = (
         scene_view.frame(view, SIZE, Settings(shows="difference", tolerance=20.0, gain=gain)).pixels.astype(
@@ -226,7 +226,7 @@ def test_difference_is_to_all_gaussians_and_amplified(scene_view, view):
 def test_split_shows_all_gaussians_on_the_left(scene_view, view, device):
     settings = Settings(tolerance=20.0, split=0.25)
     pixels = scene_view.frame(view, SIZE, settings).pixels
-    fine, _ = drawn(scene_view, view, device, tolerance=0.0, fade=DEFAULT_FADE)
+    fine, _ = drawn(scene_view, view, device, tolerance=0.0)
     coarse, _ = drawn(scene_view, view, device, tolerance=20.0, fade=DEFAULT_FADE)
     np.testing.assert_array_equal(pixels[:, :23], fine[:, :23])
     np.testing.assert_array_equal(pixels[:, 25:], coarse[:, 25:])

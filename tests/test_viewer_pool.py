@@ -2,6 +2,7 @@
 
 import math
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -215,6 +216,7 @@ def test_pictures_follow_until_nothing_is_missing(scene, loop):
         assert frame.figures.missing == 0
         expected = SceneView(scene, device="cpu", memory=None).frame(view, SIZE, settings)
         np.testing.assert_array_equal(frame.pixels, expected.pixels)
+        time.sleep(0.3)  # in which nothing is left to draw
     assert [final for _, final, _ in loop.sent].count(True) == 2
     assert not loop.errors
 

@@ -32,7 +32,7 @@ DEFAULT_TOLERANCE = 3.0
 
 # Fade of pictures that follow each other; docs/fades.md has what it costs and what it gains.
 DEFAULT_FADE = 1.02
-_FADE_FILTER_PX2 = np.float32(_core.fade_filter_px2)
+_FADE_PX2 = np.float32(_core.fade_filter_px2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +63,8 @@ class Selection:
     def __post_init__(self) -> None:
         if self.revision is None:
             object.__setattr__(self, "revision", self.scene.revision)
+        if self.given_weights is not None:
+            object.__setattr__(self, "given_weights", np.ascontiguousarray(self.given_weights, np.float32))
         weights, expected = self.weights, f"{len(self)} numbers of 0 to 1"
         check("given_weights", len(weights) == len(self), f"{expected}, got {len(weights)}")
         check("given_weights", ((weights >= 0) & (weights <= 1)).all(), f"{expected}, got others")
@@ -132,14 +134,15 @@ class Selection:
     def filters_px2(self) -> npt.NDArray[np.float32]:
         """(N,) variance of the screen-space filter that each gaussian is drawn with.
 
-        With a fade, a level 0 that has none is drawn with 0.05 px², and with `antialiased`.
+        With a fade, a level 0 that has none is drawn with 0.05 px², and with `antialiased`; here with at
+        most four times a gaussian's own variance, without which very many tiny ones become transparent.
         """
-        return self._per_gaussian(lambda of: np.where(self._bare(of), _FADE_FILTER_PX2, of.filter_px2))
+        return self._per_gaussian(lambda of: np.where(self._bare(of), _FADE_PX2, of.filter_px2), np.float32)
 
     @property
     def antialiased(self) -> npt.NDArray[np.bool_]:
         """(N,) whether each gaussian's opacity is compensated for its filter."""
-        return self._per_gaussian(lambda clusters: self._bare(clusters) | (clusters.antialiased > 0))
+        return self._per_gaussian(lambda of: self._bare(of) | (of.antialiased > 0), np.bool_)
 
     def _bare(self, clusters: Clusters) -> npt.NDArray[np.bool_]:
         """(C,) whether only the fade gives the clusters a filter."""
@@ -162,8 +165,8 @@ class Selection:
             values[mine] = table[self.cluster_ids[mine]]
         return values
 
-    def _per_gaussian(self, column: Callable[[Clusters], npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        return np.repeat(self._per_pair(column), np.diff(self._first()))
+    def _per_gaussian(self, column: Callable[[Clusters], npt.NDArray[Any]], dtype: Any) -> npt.NDArray[Any]:
+        return np.repeat(self._per_pair(column).astype(dtype), np.diff(self._first()))
 
 
 class CutOptions(TypedDict, total=False):

@@ -71,12 +71,15 @@ def measure(scene: Scene, cameras: list[Camera], options: argparse.Namespace) ->
         truth = video(renderer, cameras, SUPERSAMPLING, tolerance=0.0)[0]
     rows: list[dict[str, Any]] = []
     for tolerance in [*([] if truth is None else [0.0]), *options.tolerances]:
-        references = {"truth": truth}
+        references, cut = {"truth": truth}, None
         if tolerance > 0 and "frozen" in options.references:
             middle = cameras[len(cameras) // 2]
             cut = select(scene, middle, tolerance=tolerance, cull=False, device=options.device)
-            references["frozen"] = video(renderer, cameras, 1, cut=cut)[0]
         for fade in [None, DEFAULT_FADE] if tolerance > 0 else [None]:
+            if cut is not None:  # drawn alike, so that it differs in what pops alone
+                weights = None if fade is None else np.ones(len(cut), np.float32)
+                still = replace(cut, given_weights=weights)
+                references["frozen"] = video(renderer, cameras, 1, cut=still)[0]
             frames, gaussians = video(renderer, cameras, 1, tolerance=tolerance, fade=fade)
             row = {"tolerance": tolerance, "fade": fade, "gaussians": gaussians}
             for name, reference in references.items():

@@ -95,7 +95,7 @@ class HostTape final : public Tape {
                 0,
                 model_.size(),
                 view_of_world<T>(camera.camera),
-                {T(look.filter_px2), look.antialiased}},
+                {T(look.filter_px2), look.antialiased, false}},
           camera_(pinhole_of<T>(camera.camera)),
           height_(camera.height()),
           width_(camera.width()),

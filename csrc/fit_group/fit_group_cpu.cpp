@@ -60,9 +60,11 @@ static int place_in_tile(int x, int y) {
 void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget& target, const FitView& view,
                 FitScratch& scratch, FitImage& image) {
     const int ss = config.supersample;
-    const Draw<float> draw{target.model,       group.target_first,
-                           group.target_count, view_of_world(config, group.center, group.radius, view),
-                           target.filter_px2,  target.antialiased};
+    const Draw<float> draw{target.model,
+                           group.target_first,
+                           group.target_count,
+                           view_of_world(config, group.center, group.radius, view),
+                           {target.filter_px2, target.antialiased, false}};
     const size_t count = project_sorted(draw, camera_of(view, static_cast<float>(ss)), scratch);
     const int across = tiles_across(view);
     image.assign(static_cast<size_t>(across) * across * kPlanes * kTilePixels, 0.0f);
@@ -137,7 +139,8 @@ class Student {
     }
 
     Draw<float> draw(const FitView& view) const {
-        return {&model_, 0, n_, view_of_group(config_, view), config_.filter_px2, config_.antialiased};
+        return {
+            &model_, 0, n_, view_of_group(config_, view), {config_.filter_px2, config_.antialiased, false}};
     }
 
     void clear_gradient() { std::fill(gradient_.begin(), gradient_.end(), 0.0f); }

@@ -17,9 +17,11 @@ template <class T>
 struct Appearance {
     T filter_px2;      // added to the variances on screen
     bool antialiased;  // the opacity makes up for what the filter adds
+    bool is_limited;   // what a gaussian far narrower than the filter gets of it (project_math.h)
 
     V3DG_HD bool operator==(const Appearance& other) const {
-        return filter_px2 == other.filter_px2 && antialiased == other.antialiased;
+        return filter_px2 == other.filter_px2 && antialiased == other.antialiased &&
+               is_limited == other.is_limited;
     }
 };
 

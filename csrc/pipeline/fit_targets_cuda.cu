@@ -150,7 +150,7 @@ void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob
                             jobs_on_device,
                             views,
                             pictures_on_device.copy_from({pictures.data(), pictures.size()}, stream),
-                            {target.filter_px2, target.antialiased},
+                            {target.filter_px2, target.antialiased, false},
                             color.reserve(3 * pixels, stream),
                             alpha.reserve(pixels, stream),
                             images.reserve(num_images, stream),

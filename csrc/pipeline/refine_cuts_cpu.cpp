@@ -79,7 +79,7 @@ class Views {
 // The gaussians of one view, the picture of them, and the way back.
 class CutFrame {
   public:
-    explicit CutFrame(const FitConfig& config) : appearance_{config.filter_px2, config.antialiased} {}
+    explicit CutFrame(const FitConfig& config) : appearance_{config.filter_px2, config.antialiased, false} {}
 
     // The rows of so many gaussians, which are written before they are drawn.
     const GaussianRows<float>& start(size_t count, int sh_degree) {
@@ -161,7 +161,7 @@ void refine_cuts(const FitConfig& config, const FitTarget& target, uint64_t targ
                         0,
                         target_count,
                         view_of_world<float>(larger),
-                        {target.filter_px2, target.antialiased}}},
+                        {target.filter_px2, target.antialiased, false}}},
                       pinhole_of<float>(larger), wanted.start(larger), false, of_target);
 
         const std::vector<uint32_t> index = gaussians_of(pictures.table, view);

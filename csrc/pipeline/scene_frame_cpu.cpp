@@ -89,10 +89,8 @@ class CutDraws {
         end_of_pair_.back() = num_gaussians_ += count;
         if (tint == nullptr && model.cluster_sh != nullptr) tint = model.cluster_sh + 3 * size_t(c);
         const Palette palette = tint == nullptr ? model.palette : Palette{tint, nullptr, 1};
-        const Appearance<float> appearance =
-            fades_ ? model.appearance.faded(table, c) : model.appearance[c];
-        const Draw<float> next{model.planes, first,   count,       view_,
-                               appearance,   palette, model.codes, weight};
+        const Appearance<float> appearance = fades_ ? model.appearance.faded(table, c) : model.appearance[c];
+        const Draw<float> next{model.planes, first, count, view_, appearance, palette, model.codes, weight};
         if (i == last_instance_ && joins(draws_.back(), next))
             draws_.back().count += count;
         else
@@ -222,8 +220,8 @@ SceneFrameCounts cpu::draw_metrics(const HostScene& scene, const Camera& camera,
 SceneFrameCounts cpu::draw_model(const GaussianPlanes<float>& model, size_t count, const Camera& camera,
                                  const Picture<float>& picture, const std::atomic<bool>* stop) {
     const double start = now();
-    SceneFrameCounts counts =
-        draw_all({{&model, 0, count, view_of_world<float>(camera), 0.0f, false}}, camera, picture, stop);
+    SceneFrameCounts counts = draw_all(
+        {{&model, 0, count, view_of_world<float>(camera), {0.0f, false, false}}}, camera, picture, stop);
     counts.gaussians = static_cast<int64_t>(count);
     counts.draw_seconds = now() - start;
     return counts;

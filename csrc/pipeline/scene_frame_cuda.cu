@@ -224,7 +224,7 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
         batch,
         [=](const ItemList& items, cudaStream_t on) {
             launch("model_kernel", model_kernel, blocks, kModelThreads, 0, on, tables, on_device,
-                   Appearance<float>{filter_px2, antialiased}, items);
+                   Appearance<float>{filter_px2, antialiased, false}, items);
         },
         stream);
 }

@@ -130,7 +130,7 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
         const auto in_front = s.p[2] >= all_lanes<V>(camera.near_depth);
         if ((bits_of(in_front) & lanes) == 0) continue;
         Ellipse<V> e = project_gaussian(g, draw.view, camera, draw.appearance.filter_px2,
-                                        draw.appearance.antialiased, s);
+                                        draw.appearance.antialiased, s, draw.appearance.is_limited);
         if (draw.weight < 1) fade(draw.weight, e);
 
         V half_x, half_y;

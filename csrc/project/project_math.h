@@ -6,6 +6,7 @@
 // covariance is A Aᵀ + filter I with A = J W R S (2x3), so its determinant is |a1 x a2|² plus terms that are
 // positive: nothing cancels, however thin the gaussian is.
 
+#include "frame/draw_list.h"
 #include "math/camera.h"
 #include "math/ellipse.h"
 #include "math/gaussian.h"
@@ -31,18 +32,25 @@ V3DG_HD V3DG_INLINE void set_slopes(const SlopeLimits<T>& limits, V inv_z, Proje
     s.slope_y = min_of(all_lanes<V>(limits.high_y), max_of(all_lanes<V>(limits.low_y), s.p[1] * inv_z));
 }
 
+// Of a filter that is limited a gaussian gets so many times its own variance at most, the square root of its
+// determinant. An opacity that makes up for the filter is then never less than a fifth: far smaller ones
+// would leave nothing of what many tiny gaussians cover, each below the least alpha that is drawn.
+constexpr float kMostFilterOfVariance = 4;
+
 // The ellipse whose covariance is A Aᵀ + filter I, with the rows a1 and a2 of A and p in `s`; all but its
 // opacity.
 template <class V, class T>
-V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const Pinhole<T>& cam, T filter_px2, V inv_z,
-                                               Projection<V>& s) {
+V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const Pinhole<T>& cam, T most_filter_px2, bool is_limited,
+                                               V inv_z, Projection<V>& s) {
     V normal[3];
     cross3(s.a1, s.a2, normal);
     const V n11 = dot3(s.a1, s.a1), n22 = dot3(s.a2, s.a2);
+    s.det0 = dot3(normal, normal);
+    V filter_px2 = all_lanes<V>(most_filter_px2);
+    if (is_limited) filter_px2 = min_of(filter_px2, T(kMostFilterOfVariance) * sqrt_of(s.det0));
     s.c11 = n11 + filter_px2;
     s.c22 = n22 + filter_px2;
     s.c12 = dot3(s.a1, s.a2);
-    s.det0 = dot3(normal, normal);
     s.det = s.det0 + filter_px2 * (n11 + n22) + filter_px2 * filter_px2;
 
     Ellipse<V> e;
@@ -61,7 +69,7 @@ V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const Pinhole<T>& cam, T filter_p
 template <class V, class T>
 V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const ModelView<T>& mv,
                                                 const Pinhole<T>& cam, T filter_px2, bool antialiased,
-                                                Projection<V>& s) {
+                                                Projection<V>& s, bool is_limited = false) {
     V r[9];
     rotation_of_quat(g.quat, r);
     for (int i = 0; i < 3; ++i)
@@ -75,7 +83,7 @@ V3DG_HD V3DG_INLINE Ellipse<V> project_gaussian(const Gaussian3d<V>& g, const Mo
         s.a1[k] = cam.fx * inv_z * (s.linear_rs[k] - s.slope_x * s.linear_rs[6 + k]);
         s.a2[k] = cam.fy * inv_z * (s.linear_rs[3 + k] - s.slope_y * s.linear_rs[6 + k]);
     }
-    Ellipse<V> e = ellipse_of_axes(cam, filter_px2, inv_z, s);
+    Ellipse<V> e = ellipse_of_axes(cam, filter_px2, is_limited, inv_z, s);
     const V opacity = antialiased ? g.opacity * sqrt_of(s.det0 / s.det) : g.opacity;
     e.log2_opacity = log2_of(opacity);
     return e;
@@ -104,7 +112,7 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
 // As project_gaussian(); s.p is set, s.linear_rs is left alone.
 V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g, const ModelView<float>& mv,
                                                   const Pinhole<float>& cam, const SlopeLimits<float>& limits,
-                                                  float filter_px2, bool antialiased, Projection<float>& s) {
+                                                  const Appearance<float>& look, Projection<float>& s) {
     const float inv_z = 1 / s.p[2];
     set_slopes(limits, inv_z, s);
     float row1[3], row2[3];  // of the Jacobian times the view
@@ -118,8 +126,8 @@ V3DG_HD V3DG_INLINE Ellipse<float> project_packed(const PackedGaussian& g, const
     }
     s.a1[2] = row1[1] * g.f[6] + row1[2] * g.f[7];
     s.a2[2] = row2[1] * g.f[6] + row2[2] * g.f[7];
-    Ellipse<float> e = ellipse_of_axes(cam, filter_px2, inv_z, s);
-    e.log2_opacity = antialiased ? g.log2_opacity + 0.5f * log2_of(s.det0 / s.det) : g.log2_opacity;
+    Ellipse<float> e = ellipse_of_axes(cam, look.filter_px2, look.is_limited, inv_z, s);
+    e.log2_opacity = look.antialiased ? g.log2_opacity + 0.5f * log2_of(s.det0 / s.det) : g.log2_opacity;
     return e;
 }
 

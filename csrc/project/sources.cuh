@@ -95,8 +95,9 @@ struct RowSource : OfRows<GaussianRows<const float>> {
             color_of_row<0>(sh, gaussian.mean, view, color);
         else if (m.sh_degree == kPlainColor)
             color_of_row<kPlainColor>(sh, gaussian.mean, view, color);
-        return project_gaussian(gaussian, view, in.image.camera, in.item.appearance.filter_px2,
-                                in.item.appearance.antialiased, s);
+        const Appearance<float>& look = in.item.appearance;
+        return project_gaussian(gaussian, view, in.image.camera, look.filter_px2, look.antialiased, s,
+                                look.is_limited);
     }
     static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&, uint32_t g,
                                  float color[3]) {
@@ -124,8 +125,7 @@ struct PackedSource : OfRows<PackedPlanes> {
         color[1] = c.z;
         color[2] = c.w;
         const PackedGaussian gaussian{{}, 0.0f, {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w}, c.x};
-        return project_packed(gaussian, view, in.image.camera, in.limits, in.item.appearance.filter_px2,
-                              in.item.appearance.antialiased, s);
+        return project_packed(gaussian, view, in.image.camera, in.limits, in.item.appearance, s);
     }
     static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&, uint32_t g,
                                  float color[3]) {
@@ -215,8 +215,7 @@ struct CodeSource {
         color_of_sh(0, gaussian.mean, sh, color);
         PackedGaussian packed = pack_gaussian(gaussian);
         packed.log2_opacity = opacity_table()[record.x >> 24].log2_opacity;
-        return project_packed(packed, view, in.image.camera, in.limits, in.item.appearance.filter_px2,
-                              in.item.appearance.antialiased, s);
+        return project_packed(packed, view, in.image.camera, in.limits, in.item.appearance, s);
     }
     static __device__ void shade(const Model& m, const ModelView<float>& view, const Place& place, uint32_t g,
                                  float color[3]) {

@@ -47,9 +47,12 @@ std::vector<uint8_t> joins_of_clusters(const ClusterTable& table, const ClusterA
     parallel_for(joins.size(), 512, [&](size_t i) {
         const size_t first = i * kClustersOfBounds;
         const size_t count = std::min(kClustersOfBounds, table.num_clusters() - first);
-        for (size_t k = 1; k < count; ++k)
-            if (table.follows(first + k) && appearance[first + k - 1] == appearance[first + k])
+        for (size_t k = 1; k < count; ++k) {
+            const size_t before = first + k - 1, c = first + k;
+            if (table.follows(c) && appearance[before] == appearance[c] &&
+                appearance.faded(table, before) == appearance.faded(table, c))
                 joins[i] |= 1 << k;
+        }
     });
     return joins;
 }

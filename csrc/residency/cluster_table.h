@@ -52,11 +52,13 @@ struct ClusterAppearance {
     Span<const float> filter_px2;     // [C]
     Span<const uint8_t> antialiased;  // [C]
 
-    V3DG_HD Appearance<float> operator[](size_t c) const { return {filter_px2[c], antialiased[c] != 0}; }
+    V3DG_HD Appearance<float> operator[](size_t c) const {
+        return {filter_px2[c], antialiased[c] != 0, false};
+    }
     // In a cut that fades, where the gaussians of level 0, too, are not to come and go between the samples.
     V3DG_HD Appearance<float> faded(const ClusterTable& table, size_t c) const {
         if (table.own_group[c] >= 0 || filter_px2[c] > 0.0f) return (*this)[c];
-        return {kFadeFilterPx2, true};
+        return {kFadeFilterPx2, true, true};
     }
 };
 

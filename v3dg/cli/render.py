@@ -49,8 +49,7 @@ def run(options: Render) -> None:
     if is_turntable:
         options.view.up, notes = choose_up(options.view.up, subject, None, options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
-    is_film = is_turntable and len(cameras) > 1
-    fade = DEFAULT_FADE if options.fade is None and is_film else options.fade
+    fade = DEFAULT_FADE if options.fade is None and is_turntable and len(cameras) > 1 else options.fade
     pictures: list[dict[str, Any]] = []
     views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
     show = len(views) > 1 and not options.quiet

@@ -202,8 +202,7 @@ class SceneView:
         if edge > 0:
             picture[:, :edge] = drawn.whole[:, :edge]
             picture[:, max(edge - 1, 0) : edge + 1] = 1.0
-        draw_ms = 1e3 * time.perf_counter() - start - drawn.figures.select_ms
-        figures = drawn.figures._replace(draw_ms=draw_ms)
+        figures = drawn.figures._replace(draw_ms=1e3 * time.perf_counter() - start - drawn.figures.select_ms)
         return Frame(to_8bit(picture), figures, settings.shows, value_range, view, distance)
 
     def pick(self, view: View, size: tuple[int, int], x: int, y: int, settings: Settings) -> Pick | None:
@@ -217,15 +216,14 @@ class SceneView:
         """What a pool has; compared with the finest that it has room for, from whose pages both are drawn."""
         settings, stop, edge, chooser = asked.settings, asked.stop, asked.edge, asked.chooser
         wanted: Any = {name: getattr(settings, name) for name in ("tolerance", "budget", "min_level", "fade")}
-        finest: Any = {"tolerance": 0.0, "budget": None, "min_level": 0, "fade": settings.fade}
+        finest: Any = {"tolerance": 0.0, "budget": None, "min_level": 0, "fade": None}
         compares = edge > 0 or settings.shows == "difference"
         if patience:
             how = finest if compares else wanted
             pool._frame.settle(self.scene, chooser or asked.camera, seconds=patience, **how)
 
         def draw(steps: _core.BudgetSteps | None, look: PoolLook, options: Any) -> Any:
-            how = _SHADE, None, stop, steps, look
-            image = pool._frame.draw(self.scene, asked.camera, *how, **options)
+            image = pool._frame.draw(self.scene, asked.camera, _SHADE, None, stop, steps, look, **options)
             _check(stop)
             return image
 
@@ -255,7 +253,7 @@ class SceneView:
             planes = self._draw(cut, camera, window, by, stop)
         whole, last = None, camera.width if shows == "difference" else edge
         if last > 0:
-            finest = select(self.scene, camera, tolerance=0.0, fade=settings.fade, device=self.device)
+            finest = select(self.scene, camera, tolerance=0.0, device=self.device)
             whole = self._draw(finest, camera, (0, 0, last, camera.height), "appearance", stop)[0]
         cost = cut.num_gaussians, planes[3], cut.tolerance, 1e3 * cut.seconds, 0.0
         level, size = cut._per_pair(lambda c: c.level), cut._per_pair(lambda c: np.diff(c.offset))

@@ -184,7 +184,8 @@ class RenderLoop:
             frame = self._scene_view.frame(request.view, request.size, *how)
             if self._has_news():
                 return
-            self._send(frame, not frame.figures.missing, request.number)
+            is_whole = not frame.figures.missing
+            self._send(frame, is_whole, request.number)
         is_on_way = has_budget and not is_larger and self._scene_view.pool is None
         while is_on_way:  # for a budget's tolerance goes in steps
             before, stop = frame.figures.tolerance, self._begin(0.0)
