@@ -27,7 +27,8 @@ class Clusters:
         parent_group: (C,) int32. Group that the cluster is simplified in; -1 at the last level.
         box: (C,2,3) float32. Lower and upper corner of what the cluster draws, in the asset's frame, without
             the reach of the filter.
-        filter_px2: (C,) float32. Variance of the low-pass on the screen that the cluster is drawn with.
+        filter_px2: (C,) float32. Variance of the low-pass on the screen that the cluster is drawn with, but
+            that level 0 has one in a fade, too.
         antialiased: (C,) uint8. 1 where opacity is compensated for the filter.
     """
 

@@ -29,8 +29,9 @@ class Render(Cut, OnPool):
     min_level: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Draw no level finer than this, except where an asset has no coarser one."""
     fade: Annotated[float | None, option("FACTOR")] = None
-    """Draw what is within this factor of the tolerance on two levels, one coming as the other goes, so that a
-    film does not pop. Default: 1.02 for several views of a turntable, otherwise 1, which is none."""
+    """Draw what is within this factor of the tolerance on two levels, one coming as the other goes, and level
+    0 with a low-pass, so that a film neither pops nor flickers. Default: 1.02 for several views of a
+    turntable, otherwise 1, which is none."""
     color_by: ColorBy = "appearance"
     """What a gaussian's colour shows."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
