@@ -107,8 +107,7 @@ def write_tiles(
             }
             for b, transform in zip(scene.instance_bundle.tolist(), _transforms(scene), strict=True)
         ]
-        tree = {"transform": root.T.ravel().tolist(), **_above(instances)}
-        _write_tileset(place / TILESET, tree)
+        _write_tileset(place / TILESET, {"transform": root.T.ravel().tolist(), **_above(instances)})
         _common.write_page(place, "tiles.html")
         size, tiles = _common.bytes_below(place), sum(1 for _ in place.rglob("*.glb"))
     return Tiles(len(trees), len(scene), tiles, size)
