@@ -33,8 +33,8 @@ V3DG_HD V3DG_INLINE void set_slopes(const SlopeLimits<T>& limits, V inv_z, Proje
 }
 
 // Of a filter that is limited a gaussian gets so many times its own variance at most, the square root of its
-// determinant. An opacity that makes up for the filter is then never less than a fifth: far smaller ones
-// would leave nothing of what many tiny gaussians cover, each below the least alpha that is drawn.
+// determinant. What is left of the opacity of a round one is then never less than a fifth: without, nothing
+// would be left of what many tiny gaussians cover, each below the least alpha that is drawn.
 constexpr float kMostFilterOfVariance = 4;
 
 // The ellipse whose covariance is A Aᵀ + filter I, with the rows a1 and a2 of A and p in `s`; all but its
