@@ -83,8 +83,8 @@ def layout(scene: Scene, cameras: Sequence[Camera], config: Config, judge: Judge
     runs.append(frames(scene, cameras, {"budget": config.budget}, config.repeats))
     moving = movement(scene, cameras[-1], config)
     flown = [flight(scene, cameras, {"tolerance": t}, config.repeats) for t in config.tolerances]
-    for row, _ in runs[:-1]:
-        row["gigabytes_alone"] = gigabytes_alone(scene.bundles[0], config, row["tolerance"])
+    for (row, _), gigabytes in zip(runs[:-1], gigabytes_alone(scene.bundles[0], config), strict=True):
+        row["gigabytes_alone"] = gigabytes
     truths = [draw_truth(scene, camera, gpu.DEVICE) for camera in cameras]
     peer_ms, peer_pictures = gsplat(scene, cameras, config) if config.gsplat else ([], [])
     rows = []
@@ -118,11 +118,7 @@ def frames(
 ) -> tuple[Row, list[Picture]]:
     """Every camera, near to far, with one renderer: as a flight through the scene finds it."""
     ms, device_ms, select_ms, counts = [], [], [], []
-    with gpu.PeakMemory() as peak:  # whose questions to the driver would be in the way of timed frames
-        renderer = Renderer(scene, device=gpu.DEVICE)
-        for camera in cameras:
-            for _ in range(repeats):
-                renderer.render(camera, **options).stats  # noqa: B018  waits for the picture
+    renderer, gigabytes = drawn_before(scene, cameras, options, repeats)
     for camera in cameras:
 
         def frame(camera: Camera = camera) -> Any:
@@ -143,7 +139,7 @@ def frames(
         "host_ms": round(statistics.fmean(ms) - statistics.fmean(device_ms), 3),
         "select_ms": round(statistics.fmean(select_ms), 4),
         "gaussians_in_frustum": round(statistics.fmean(counts)),
-        "peak_gigabytes": round(peak.gigabytes, 2),
+        "peak_gigabytes": round(gigabytes, 2),
         "frame_ms_of_each": [round(t, 3) for t in ms],
         "select_ms_of_each": [round(t, 4) for t in select_ms],
         "gaussians_in_frustum_of_each": counts,
@@ -151,25 +147,33 @@ def frames(
     return row, pictures
 
 
-def gigabytes_alone(bundle: v3dg.Bundle, config: Config, tolerance: float) -> float:
-    """What a process takes on the device that draws the layout with these levels, and has built nothing."""
+def drawn_before(
+    scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int
+) -> tuple[Renderer, float]:
+    """A renderer that has drawn from every camera, and the most memory that took; no frame is timed then."""
+    with gpu.PeakMemory() as peak:
+        renderer = Renderer(scene, device=gpu.DEVICE)
+        for camera in cameras:
+            for _ in range(repeats):
+                renderer.render(camera, **options).stats  # noqa: B018  waits for the picture
+    return renderer, peak.gigabytes
+
+
+def gigabytes_alone(bundle: v3dg.Bundle, config: Config) -> list[float]:
+    """Of each tolerance, what a process takes on the device that draws the layout and has built nothing."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "levels.v3dg"
         bundle.write(path)
-        with multiprocessing.get_context("spawn").Pool(1) as other:
-            return other.apply(_drawing_gigabytes, (path, config, tolerance))
+        with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as others:
+            return [others.apply(_drawing_gigabytes, (path, config, t)) for t in config.tolerances]
 
 
 def _drawing_gigabytes(path: Path, config: Config, tolerance: float) -> float:
-    torch.zeros(1, device=gpu.DEVICE)
-    with gpu.PeakMemory() as peak:
-        assert config.layout is not None
-        scene, cameras = read_layout(config.layout, v3dg.Bundle.open(path))
-        renderer = Renderer(scene, device=gpu.DEVICE)
-        for camera in list(cameras.values())[slice(*config.cameras)]:
-            for _ in range(config.repeats):
-                renderer.render(camera, tolerance=tolerance).stats  # noqa: B018  waits for the picture
-    return round(peak.gigabytes, 3)
+    torch.zeros(1, device=gpu.DEVICE)  # as an idle process has
+    assert config.layout is not None
+    scene, cameras = read_layout(config.layout, v3dg.Bundle.open(path))
+    chosen = list(cameras.values())[slice(*config.cameras)]
+    return round(drawn_before(scene, chosen, {"tolerance": tolerance}, config.repeats)[1], 3)
 
 
 def flight(scene: Scene, cameras: Sequence[Camera], options: dict[str, Any], repeats: int) -> Row:
