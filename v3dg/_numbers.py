@@ -11,7 +11,6 @@ import numpy.typing as npt
 Floats: TypeAlias = npt.NDArray[np.float64]
 
 MOST_INT = (1 << 31) - 1
-BLACK = (0.0, 0.0, 0.0)  # behind most pictures
 LEAST_FLOAT, MOST_FLOAT = 1.4e-45, float(np.finfo(np.float32).max)  # positive float32
 
 
@@ -46,8 +45,7 @@ def vector(values: Any, name: str, shape: tuple[int, ...] = (3,)) -> Floats:
 
 def color(values: Any, name: str) -> list[float]:
     """Three numbers that the core can hold."""
-    is_plain = type(values) is tuple and list(map(type, values)) == [float] * 3
-    if values is BLACK or (is_plain and all(0 <= v <= 1 for v in values)):
+    if type(values) is tuple and len(values) == 3 and all(type(v) is float and 0 <= v <= 1 for v in values):
         return list(values)  # of every frame, and quickly
     array = vector(values, name)
     largest = np.abs(array).max()

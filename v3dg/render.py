@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, get_args, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import BLACK, check, color, one_of, real
+from v3dg._numbers import check, color, one_of, real
 from v3dg.build.memory import in_bytes, in_mib
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, StereoCamera, check_camera, for_each
@@ -32,6 +32,7 @@ _known_rule = lru_cache(64, typed=True)(rule_of)  # of pictures that follow each
 
 # Of pictures with levels, whose own error is far larger; docs/cuda.md has what it saves.
 DEFAULT_MIN_TRANSMITTANCE = 1e-3
+_BLACK = (0.0, 0.0, 0.0)  # behind most pictures
 
 
 class _FrameOptions(CutOptions, total=False):
@@ -67,7 +68,7 @@ def render(
     fade: float | None = None,
     cut: Selection | None = None,
     color_by: ColorBy = "appearance",
-    background: Sequence[float] = BLACK,
+    background: Sequence[float] = _BLACK,
     min_transmittance: float | None = None,
     depth: bool = False,
     device: str | Device = "auto",
@@ -186,7 +187,7 @@ class Renderer:
         min_level: int = 0,
         fade: float | None = None,
         cut: Selection | None = None,
-        background: Sequence[float] = BLACK,
+        background: Sequence[float] = _BLACK,
         min_transmittance: float | None = None,
         depth: bool = False,
     ) -> RenderedImage | tuple[RenderedImage, RenderedImage]:
@@ -369,7 +370,7 @@ def shade_of(
     stop = -1.0 if is_asset else DEFAULT_MIN_TRANSMITTANCE
     if min_transmittance is not None:
         stop = real(min_transmittance, "min_transmittance", "a share of light, 0 to 0.99", 0, 0.99)
-    behind = color(background, "background")
+    behind = list(_BLACK) if background is _BLACK else color(background, "background")
     return _core.Shade(background=behind, min_transmittance=stop, with_depth=bool(depth))
 
 

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import CPU, Device
-from v3dg._numbers import BLACK
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
@@ -40,7 +39,7 @@ _OF_POOLS_ON_CUDA: tuple[Shows, ...] = ("appearance", "depth", "alpha")
 _OF_CUT = ("level", "cluster", "residency", "error", "count")  # colours of clusters, and what is not colours
 # So many gaussians are drawn whole while the camera moves, too.
 _FEW_GAUSSIANS = 500_000
-_SHADE = shade_of(BLACK, None, is_asset=False, depth=True)
+_SHADE = shade_of((0.0, 0.0, 0.0), None, is_asset=False, depth=True)
 
 
 @dataclass(frozen=True)
