@@ -134,8 +134,8 @@ class Selection:
     def filters_px2(self) -> npt.NDArray[np.float32]:
         """(N,) variance of the screen-space filter that each gaussian is drawn with.
 
-        With a fade, a level 0 that has none is drawn with 0.05 px², and with `antialiased`; here with at
-        most four times a gaussian's own variance, without which very many tiny ones become transparent.
+        With a fade, a level 0 that has none is drawn with 0.05 px², and with `antialiased`. Of that `render`
+        gives a gaussian at most four times its own variance, so that very many tiny ones stay opaque.
         """
         return self._per_gaussian(lambda of: np.where(self._bare(of), _FADE_PX2, of.filter_px2), np.float32)
 
