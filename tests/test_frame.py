@@ -66,16 +66,34 @@ def test_gaussians_of_any_size(scale):
     assert_like_cpu(render(asset, CAMERA, device="cuda"), render(asset, CAMERA, device="cpu"))
 
 
-@pytest.mark.parametrize("depths", ["spread", "one before all", "equal"])
+@pytest.mark.parametrize("size", [(2100, 1500), (6000, 16)])
+def test_gaussians_over_thousands_of_tiles(size):
+    """Of those a few neighbours have more tiles than are listed together."""
+    rng = np.random.default_rng(4)
+    width, height = size
+    camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 0.9, width=width, height=height)
+    blob = scenes_lod.blob(rng, 400)
+    scales = np.exp(rng.uniform(-6, 1, (400, 3))).astype(np.float32)
+    asset = Gaussians(blob.means + np.float32([0, 0, 4]), blob.quats, scales, 0.2 * blob.opacities, blob.sh)
+    expected = render(asset, camera, device="cpu")
+    assert_like_cpu(render(asset, camera, device="cuda"), expected)
+    assert (host(expected.alpha) > 0.1).mean() > 0.5
+
+
+@pytest.mark.parametrize("depths", ["spread", "one before all", "equal", "in one step", "on sheets"])
 @pytest.mark.parametrize("count", [3000, 60_000])
 def test_tiles_blended_in_parts_have_the_same_bytes(depths, count):
     """Where few tiles have most of the entries; a frame that keeps a tape blends tiles whole."""
     rng = np.random.default_rng(count)
     camera = Camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0), 0.9, width=640, height=400)
-    nearest, farthest = {"spread": (2, 3), "one before all": (4, 4.1), "equal": (2, 2)}[depths]
-    depth = rng.uniform(nearest, farthest, count)
+    ranges = {"spread": (2, 3), "one before all": (4, 4.1), "on sheets": (2, 2.0001)}
+    depth = rng.uniform(*ranges.get(depths, (2, 2)), count)
     if depths == "one before all":
         depth[0] = 0.02
+    if depths == "in one step":  # of the depths that lists are sorted by
+        depth = np.where(rng.random(count) < 0.5, depth, np.nextafter(np.float32(2), np.float32(3)))
+    if depths == "on sheets":
+        depth += rng.integers(0, 7, count) ** 2
     asset = scenes.gaussians(
         np.stack([*(rng.uniform(-0.15, 0.15, (2, count)) * depth), depth], axis=1),
         scales=rng.uniform(0.001, 0.01, (count, 3)),

@@ -109,6 +109,7 @@ CROWDS = {
     "spread": lambda rng, num: rng.uniform(1, 4, num),
     "on a plane": lambda rng, num: np.full(num, 2.0),
     "on three planes": lambda rng, num: rng.integers(1, 4, num),
+    "on sheets": lambda rng, num: 1 + rng.integers(0, 7, num) ** 2 + rng.uniform(0, 1e-4, num),
     "behind one": lambda rng, num: np.where(np.arange(num) == num // 2, 0.02, rng.uniform(3, 3.001, num)),
     "before one": lambda rng, num: np.where(np.arange(num) == num // 2, 1e6, rng.uniform(3, 3.001, num)),
 }

@@ -19,8 +19,8 @@ struct CutChoice {
 // drawn.
 struct FrameCounters {
     unsigned long long items, gaussians, in_frustum, records, entries;
-    unsigned long long large;   // records over many tiles, in whole batches
-    unsigned long long spread;  // entries whose lists need scratch
+    unsigned long long large;   // records over many tiles, or parts of them, in whole batches
+    unsigned long long spread;  // places of entries in the scratch that lists need
     unsigned long long slots;   // of gradients, in a frame that keeps a tape
     CutChoice choice;           // where there is a budget
 };

@@ -69,11 +69,12 @@ struct TilePlan {
     uint32_t lowest;       // of the depths that the buckets were made for
     uint16_t last_bucket, shift;
     uint8_t part, log2_parts;
-    bool fits_windows;  // no bucket needs to be spread again, which the parts could not do side by side
-    bool in_scratch;    // is the list that was spread, and not in its own place
+    bool in_windows;                   // is the list, so that parts of the tile can be blended side by side
+    bool in_scratch;                   // is the list that was spread, and not in its own place
     unsigned long long first_scratch;  // where the list has room in the scratch, if it needs any
 };
 constexpr uint32_t kNoTile = ~0u;
+constexpr int kPlanClasses = 64;  // of plans by load
 
 // The pixels of a Record.
 struct RecordBox {
@@ -96,8 +97,10 @@ struct FrameLists {
     const unsigned long long* tile_first;  // [num_tiles + 1] into entries
     TileEntry *entries, *scratch;          // each tile's in any order
     FrameCounters* counters;
-    Capacity capacity;        // at most kMostFrameRecords records
-    TilePlan* plans;          // [num_plans] scratch
+    Capacity capacity;  // at most kMostFrameRecords records
+    TilePlan* plans;    // [num_plans] scratch
+    // [2 * kPlanClasses], cleared before: of each class, and of those that have a place.
+    uint32_t* plan_counts;
     uint32_t num_plans;       // num_tiles, or most_plans() where tiles may be blended in parts
     float min_transmittance;  // of the images
     // Of images that do not say where they are: those of the first and of the second.

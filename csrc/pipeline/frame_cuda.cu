@@ -14,6 +14,7 @@ namespace cuda {
 struct Frame::State {
     FrameCounters counters;
     unsigned long long ticket;
+    alignas(8) uint32_t plan_counts[2 * kPlanClasses];
 };
 
 // What the host keeps of a frame in flight.
@@ -196,6 +197,7 @@ FrameLists Frame::lists(const FrameBatch& batch) const {
             &reinterpret_cast<State*>(cleared_.data())->counters,
             capacity_,
             plans_.data(),
+            reinterpret_cast<State*>(cleared_.data())->plan_counts,
             num_plans_,
             batch.min_transmittance};
 }

@@ -15,6 +15,8 @@ constexpr int kWindow = kEntriesAtOnce * kBlendThreads;  // entries looked at in
 constexpr int kPiece = 3 * kWindow / 2;                  // entries sorted at once, at most
 constexpr int kLog2SpreadAgain = 10;                     // buckets of what did not fit into a window
 constexpr int kLog2Sort = 9;                             // buckets of a piece
+constexpr uint32_t kMostAlike = 12;                      // entries of a bucket that is not crowded
+constexpr uint32_t kMostCrowded = kBlendThreads / 4;     // of an entry a thread, in crowded buckets
 constexpr int kFewEntries = 64;                          // sorted without buckets
 constexpr int kBlendBatch = 128;                         // records blended at once
 // Each takes some bits of depth or record, at least 4, after the first one, whose range is a guess.
@@ -53,7 +55,7 @@ struct BlendShared {
     union {
         SpreadShared<kLog2SpreadAgain> spreading;
         struct {
-            uint32_t bucket[1 << kLog2Sort];
+            uint32_t bucket[1 << kLog2Sort], finer[1 << kLog2Sort];
             uint32_t warp_sum[kBlendWarps];
             uint16_t by_bucket[kPiece];
         };
@@ -69,6 +71,7 @@ struct BlendShared {
     uint32_t subs_taken;    // of those reached
     ListWindow window[3];
     uint32_t lowest, highest;  // depths of the piece
+    uint32_t crowded;          // of some of its entries, those with many in their bucket
     SpreadLevel level[kMostSpreadLevels];
 };
 
@@ -150,6 +153,32 @@ __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPla
     return depth_a != depth_b ? depth_a < depth_b : a < b;
 }
 
+// Sorts the piece by buckets. Their counters are 0, then say where each begins, and in the end where the next
+// one does.
+template <class SomeBuckets>
+__device__ void count_buckets(const SomeBuckets& buckets, uint32_t* bucket, uint32_t count, BlendShared& s) {
+    for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)
+        atomicAdd(&bucket[buckets.of(s.key[i])], 1u);
+    __syncthreads();
+}
+template <class SomeBuckets>
+__device__ void sort_buckets(const SomeBuckets& buckets, uint32_t* bucket, const RecordPlanes& records,
+                             uint32_t count, BlendShared& s) {
+    for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)
+        s.by_bucket[atomicAdd(&bucket[buckets.of(s.key[i])], 1u)] = static_cast<uint16_t>(i);
+    __syncthreads();
+    for (uint32_t p = threadIdx.x; p < count; p += kBlendThreads) {
+        const uint32_t i = s.by_bucket[p];
+        const EntryKey key = s.key[i];
+        const uint32_t own = buckets.of(key), last = bucket[own];
+        const uint32_t first = own > 0 ? bucket[own - 1] : 0;
+        uint32_t rank = first;
+        for (uint32_t j = first; j < last; ++j) rank += precedes(s.key[s.by_bucket[j]], key, records);
+        s.sorted[rank] = static_cast<uint16_t>(i);
+    }
+    __syncthreads();
+}
+
 // Sorts the piece.
 __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, BlendShared& s) {
     const Buckets buckets = buckets_over(s.lowest, s.highest, kLog2Sort, false);
@@ -170,24 +199,22 @@ __device__ inline void sort_piece(const RecordPlanes& records, uint32_t count, B
         s.highest = 0;
     }
     if (few) return;
-    for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)
-        atomicAdd(&s.bucket[buckets.of(s.key[i])], 1u);
-    __syncthreads();
+    count_buckets(buckets, s.bucket, count, s);
+    // Some entries tell whether most have many others in their bucket, each of which costs them a comparison.
+    const bool is_crowded = threadIdx.x < count && s.bucket[buckets.of(s.key[threadIdx.x])] > kMostAlike;
+    if (is_crowded) atomicAdd(&s.crowded, 1u);
     scan_buckets<1 << kLog2Sort, kBlendThreads>(s.bucket, s.warp_sum);
-    for (uint32_t i = threadIdx.x; i < count; i += kBlendThreads)
-        s.by_bucket[atomicAdd(&s.bucket[buckets.of(s.key[i])], 1u)] = static_cast<uint16_t>(i);
-    __syncthreads();
-    // A bucket's counter now stands where the next one begins.
-    for (uint32_t p = threadIdx.x; p < count; p += kBlendThreads) {
-        const uint32_t i = s.by_bucket[p];
-        const EntryKey key = s.key[i];
-        const uint32_t bucket = buckets.of(key), last = s.bucket[bucket];
-        const uint32_t first = bucket > 0 ? s.bucket[bucket - 1] : 0;
-        uint32_t rank = first;
-        for (uint32_t j = first; j < last; ++j) rank += precedes(s.key[s.by_bucket[j]], key, records);
-        s.sorted[rank] = static_cast<uint16_t>(i);
+    if (s.crowded <= kMostCrowded) {
+        sort_buckets(buckets, s.bucket, records, count, s);
+    } else {
+        const FinerBuckets finer = finer_buckets(buckets, s.bucket, count, kLog2Sort);
+        for (int i = threadIdx.x; i < 1 << kLog2Sort; i += kBlendThreads) s.finer[i] = 0;
+        __syncthreads();
+        count_buckets(finer, s.finer, count, s);
+        scan_buckets<1 << kLog2Sort, kBlendThreads>(s.finer, s.warp_sum);
+        sort_buckets(finer, s.finer, records, count, s);
     }
-    __syncthreads();
+    if (threadIdx.x == 0) s.crowded = 0;  // for the next piece
 }
 
 }  // namespace cuda

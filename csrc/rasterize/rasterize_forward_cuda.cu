@@ -21,10 +21,11 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-constexpr int kBlocks = 8;          // on a multiprocessor
-constexpr int kLog2Spread = 11;     // buckets of a list, at most
-constexpr int kPlanThreads = 1024;  // of the kernels before the blend
-constexpr int kMostParts = 4;       // of a tile
+constexpr int kBlocks = 8;         // on a multiprocessor
+constexpr int kLog2Spread = 11;    // buckets of a list, at most
+constexpr int kPlanThreads = 256;  // a thread a tile
+constexpr int kSpreadThreads = 1024;
+constexpr int kMostParts = 4;  // of a tile
 
 static_assert(kSubWidth == 8 && kSubHeight == 4, "the window of reached_pixels");
 static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
@@ -210,13 +211,15 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
     if (threadIdx.x < 2) s.reached[threadIdx.x] = 0;
 }
 
-// Blends the list of a tile. Returns how many of its entries were not dropped.
+// Blends the list of a tile. Returns how many of its entries were not dropped. Of a list in windows, which
+// lies in the scratch, `window_ends` has where those end; it is null for others.
 template <bool kWithDepth, class Stop>
 __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, TileEntry* scratch,
                                uint32_t count, const TilePlan& plan, const Buckets& spread_buckets,
-                               uint32_t* order, int left, int top, Stop stop, BlendShared& s) {
+                               const uint32_t* window_ends, uint32_t* order, int left, int top, Stop stop,
+                               BlendShared& s) {
     int depth = 0;  // of levels
-    if (count > kPiece) {
+    if (count > kPiece && window_ends == nullptr) {
         if (threadIdx.x == 0) s.level[0] = {count, plan.in_scratch, spread_buckets};
         depth = 1;
         __syncthreads();
@@ -226,9 +229,17 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
         uint32_t held = 0;
         while (done < count) {
             while (depth > 0 && s.level[depth - 1].end == done) --depth;
-            const SpreadLevel level = depth > 0 ? s.level[depth - 1] : SpreadLevel{count, false, {}};
+            const SpreadLevel level =
+                depth > 0 ? s.level[depth - 1] : SpreadLevel{count, window_ends != nullptr, {}};
             const TileEntry* from = level.in_scratch ? scratch : entries;
             const uint32_t left_over = level.end - done, room = kPiece - held;
+            if (window_ends != nullptr) {
+                if (room < kWindow) break;
+                const uint32_t end = window_ends[num_windows];
+                held = take_window(from, done, end, level.buckets, kNoBucket, held, num_windows++, s).y;
+                done = end;
+                continue;
+            }
             if (left_over <= room) {
                 const uint32_t end = done + min(left_over, static_cast<uint32_t>(kWindow));
                 const uint2 taken =
@@ -251,7 +262,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
             const uint32_t end = end_of_bucket(from, done, level.end, level.buckets);
             const Buckets buckets = find_buckets<kBlendThreads>(from, done, end, false, false, s.spreading);
             spread<kBlendThreads>(from, level.in_scratch ? entries : scratch, done, end, buckets,
-                                  s.spreading);
+                                  s.spreading.bucket, s.spreading.warp_sum);
             if (threadIdx.x == 0) s.level[depth] = {end, !level.in_scratch, buckets};
             __syncthreads();
             ++depth;
@@ -294,6 +305,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
         s.window[0] = {0, ~0u};
         s.lowest = ~0u;
         s.highest = 0;
+        s.crowded = 0;
         s.reached[0] = s.reached[1] = 0;
     }
     __syncthreads();
@@ -310,6 +322,8 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     const uint32_t count = static_cast<uint32_t>(lists.tile_first[tile + 1] - first);
     const uint32_t blended = blend_list<kWithDepth>(
         lists.records, lists.entries + first, lists.scratch + plan.first_scratch, count, plan, spread_buckets,
+        plan.in_windows ? reinterpret_cast<const uint32_t*>(lists.scratch + plan.first_scratch + count)
+                        : nullptr,
         tape.order == nullptr ? nullptr : tape.order + first, left, top, stop, s);
     if (tape.blended != nullptr && threadIdx.x == 0) tape.blended[tile] = blended;
 
@@ -331,82 +345,162 @@ __device__ uint32_t count_of(const FrameLists& lists, uint32_t tile) {
     return static_cast<uint32_t>(lists.tile_first[tile + 1] - lists.tile_first[tile]);
 }
 
-// Plans the tiles by falling load, so that no block is left with a long list at the end. Loads of one class,
-// half an octave wide, follow in any order. Where few tiles have most of the entries, as of an asset in the
-// middle of a picture, they are blended in parts, each by a block that drops what does not reach it: there
-// are `num_places` for blocks at a time, and no block is to have much more than its share.
-__global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
-    constexpr int kClasses = 64;
-    __shared__ uint32_t place[kClasses], num_planned;
-    if (!lists.capacity.holds(*lists.counters)) return;
-    const auto share = static_cast<uint32_t>(lists.tile_first[lists.num_tiles] / num_places + 1);
-    const auto log2_parts_of = [&](uint32_t count) {
-        if (lists.num_plans == lists.num_tiles || count <= kPiece || count < share) return 0;
+// How tiles are planned, by two kernels with a thread a tile: by falling load, so that no block is left with
+// a long list at the end. Loads of one class, half an octave wide, follow in any order. Where few tiles have
+// most of the entries, as of an asset in the middle of a picture, they are blended in parts, each by a block
+// that drops what does not reach it: there are `num_places` for blocks at a time, and no block is to have
+// much more than its share.
+struct PlanRules {
+    uint32_t share;
+    bool has_parts;
+
+    __device__ PlanRules(const FrameLists& lists, uint32_t num_places)
+        : share(static_cast<uint32_t>(lists.tile_first[lists.num_tiles] / num_places + 1)),
+          has_parts(lists.num_plans != lists.num_tiles) {}
+    __device__ int log2_parts_of(uint32_t count) const {
+        if (!has_parts || count <= kPiece || count < share) return 0;
         return count / 2 < share ? 1 : 2;
-    };
-    const auto class_of = [&](uint32_t count) {
+    }
+    __device__ int class_of(uint32_t count) const {
         const uint32_t load = count >> log2_parts_of(count);
-        if (load < 2) return kClasses - 1 - static_cast<int>(load);
+        if (load < 2) return kPlanClasses - 1 - static_cast<int>(load);
         const int octave = 31 - __clz(static_cast<int>(load));
-        return kClasses - 1 - 2 * octave - static_cast<int>(load >> (octave - 1) & 1);
-    };
-    // Calls visit(tile, its count) for a thread's share of the tiles, some of whose loads are under way
-    // together.
-    const auto for_each_tile = [&](const auto& visit) {
-        constexpr int kTogether = 4;
-        for (uint32_t first = threadIdx.x; first < lists.num_tiles; first += kTogether * kPlanThreads) {
-            uint32_t count[kTogether];
-#pragma unroll
-            for (int k = 0; k < kTogether; ++k)
-                count[k] = count_of(lists, min(first + k * kPlanThreads, lists.num_tiles - 1));
-#pragma unroll
-            for (int k = 0; k < kTogether; ++k)
-                if (first + k * kPlanThreads < lists.num_tiles) visit(first + k * kPlanThreads, count[k]);
-        }
-    };
-    if (threadIdx.x < kClasses) place[threadIdx.x] = 0;
+        return kPlanClasses - 1 - 2 * octave - static_cast<int>(load >> (octave - 1) & 1);
+    }
+};
+
+// Counts the plans of each class.
+__global__ void __launch_bounds__(kPlanThreads) count_plans_kernel(FrameLists lists, uint32_t num_places) {
+    __shared__ uint32_t in_block[kPlanClasses];
+    if (!lists.capacity.holds(*lists.counters)) return;
+    const PlanRules rules(lists, num_places);
+    if (threadIdx.x < kPlanClasses) in_block[threadIdx.x] = 0;
     __syncthreads();
-    for_each_tile(
-        [&](uint32_t, uint32_t count) { atomicAdd(&place[class_of(count)], 1u << log2_parts_of(count)); });
-    __syncthreads();
-    if (threadIdx.x == 0) {
-        uint32_t first = 0;
-        for (uint32_t& p : place) {
-            const uint32_t count = p;
-            p = first;
-            first += count;
-        }
-        num_planned = first;
+    const uint32_t tile = blockIdx.x * kPlanThreads + threadIdx.x;
+    if (tile < lists.num_tiles) {
+        const uint32_t count = count_of(lists, tile);
+        atomicAdd(&in_block[rules.class_of(count)], 1u << rules.log2_parts_of(count));
     }
     __syncthreads();
-    for_each_tile([&](uint32_t tile, uint32_t count) {
-        const int log2_parts = log2_parts_of(count);
-        TilePlan* plan = lists.plans + atomicAdd(&place[class_of(count)], 1u << log2_parts);
+    if (threadIdx.x < kPlanClasses && in_block[threadIdx.x] > 0)
+        atomicAdd(&lists.plan_counts[threadIdx.x], in_block[threadIdx.x]);
+}
+
+// Writes the plans, those of a class where it begins and behind those of other blocks.
+__global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
+    __shared__ uint32_t place[kPlanClasses], in_block[kPlanClasses], num_planned;
+    static_assert(kPlanClasses == 64, "a lane has two");
+    if (!lists.capacity.holds(*lists.counters)) return;
+    const PlanRules rules(lists, num_places);
+    const uint32_t tile = blockIdx.x * kPlanThreads + threadIdx.x;
+    const uint32_t count = tile < lists.num_tiles ? count_of(lists, tile) : 0;
+    const int log2_parts = rules.log2_parts_of(count), own_class = rules.class_of(count);
+    if (threadIdx.x < kPlanClasses) in_block[threadIdx.x] = 0;
+    __syncthreads();
+    uint32_t before = 0;  // of the block's
+    if (tile < lists.num_tiles) before = atomicAdd(&in_block[own_class], 1u << log2_parts);
+    __syncthreads();
+    if (threadIdx.x < 32) {
+        const uint2 counts = reinterpret_cast<const uint2*>(lists.plan_counts)[threadIdx.x];
+        const uint32_t end = warp_prefix(counts.x + counts.y);
+        uint32_t* taken = lists.plan_counts + kPlanClasses;
+        for (int k = 0; k < 2; ++k) {
+            const int c = 2 * threadIdx.x + k;
+            place[c] = end - counts.y - (k == 0 ? counts.x : 0);
+            if (in_block[c] > 0) place[c] += atomicAdd(&taken[c], in_block[c]);
+        }
+        if (threadIdx.x == 31) num_planned = end;
+    }
+    __syncthreads();
+    if (tile < lists.num_tiles) {
+        TilePlan* plan = lists.plans + place[own_class] + before;
         const uint32_t image = lists.image_of_tile[tile];
         for (int part = 0; part < 1 << log2_parts; ++part)
             plan[part] = {tile, image, 0, 0, 0, uint8_t(part), uint8_t(log2_parts), false, false, 0};
-    });
-    for (uint32_t i = num_planned + threadIdx.x; i < lists.num_plans; i += kPlanThreads)
+    }
+    for (uint32_t i = num_planned + tile; i < lists.num_plans; i += gridDim.x * kPlanThreads)
         lists.plans[i].tile = kNoTile;
 }
 
-// Room in the scratch for a list, for the whole block.
-__device__ unsigned long long take_scratch(const FrameLists& lists, uint32_t count) {
+// Room in the scratch for entries, for the whole block.
+__device__ unsigned long long take_scratch(FrameCounters& counters, uint32_t count) {
     __shared__ unsigned long long first;
-    if (threadIdx.x == 0) first = atomicAdd(&lists.counters->spread, static_cast<unsigned long long>(count));
+    if (threadIdx.x == 0) first = atomicAdd(&counters.spread, static_cast<unsigned long long>(count));
     __syncthreads();
     const unsigned long long taken = first;
     __syncthreads();
     return taken;
 }
 
+// Entries of a window of a list in windows; a window has up to a bucket more.
+constexpr uint32_t kWindowEntries = 3 * kWindow / 4;
+
+__device__ uint32_t num_window_ends(uint32_t count) { return (count + kWindowEntries - 1) / kWindowEntries; }
+
+// Room that a list in windows takes, with the ends of its windows behind it.
+__device__ uint32_t room_in_windows(uint32_t count) {
+    static_assert(sizeof(TileEntry) == 2 * sizeof(uint32_t), "two ends in the place of an entry");
+    return count + num_window_ends(count) / 2 + 1;
+}
+
+struct SpreadSpace {
+    SpreadShared<kLog2Spread> even;
+    uint32_t finer[1 << kLog2Spread];
+};
+
+// Whether a bucket has more entries than that; a counter stands where the next one begins.
+__device__ bool has_longer(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t most) {
+    bool is_long = false;
+    for (uint32_t b = threadIdx.x; b < 1 << kLog2Spread; b += kSpreadThreads)
+        is_long = is_long || bucket[b] - (b > 0 ? bucket[b - 1] : 0) > most;
+    return __syncthreads_or(is_long);
+}
+
+// Windows end where the buckets do that reach every kWindowEntries entries.
+__device__ void write_window_ends(const uint32_t (&bucket)[1 << kLog2Spread], uint32_t count,
+                                  uint32_t* window_ends) {
+    for (uint32_t w = threadIdx.x; w < num_window_ends(count); w += kSpreadThreads) {
+        const uint32_t least = min((w + 1) * kWindowEntries, count);
+        uint32_t b = 0;  // the first bucket that ends there or behind it
+#pragma unroll
+        for (uint32_t step = 1u << (kLog2Spread - 1); step > 0; step /= 2)
+            if (bucket[b + step - 1] < least) b += step;
+        window_ends[w] = bucket[b];
+    }
+}
+
+// Spreads a list into windows of whole buckets, to a place that has room_in_windows() of it; for a whole
+// block. Returns whether there are such windows. Where one step of depth is all of a list, there are none:
+// the order within a step depends on where pieces begin, which parts of a tile do not have in common.
+__device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileEntry* to,
+                                    SpreadSpace& space) {
+    SpreadShared<kLog2Spread>& s = space.even;
+    const Buckets buckets = find_buckets<kSpreadThreads>(from, 0, count, false, true, s);
+    if (buckets.by_record) {
+        __syncthreads();  // before the range is found again
+        return false;
+    }
+    for (int i = threadIdx.x; i < 1 << kLog2Spread; i += kSpreadThreads) s.bucket[i] = 0;
+    __syncthreads();
+    for_each_entry<kSpreadThreads>(from, 0, count,
+                                   [&](TileEntry e) { atomicAdd(&s.bucket[buckets.of(e.key)], 1u); });
+    __syncthreads();
+    scan_buckets<1 << kLog2Spread, kSpreadThreads>(s.bucket, s.warp_sum);
+    const FinerBuckets finer = finer_buckets(buckets, s.bucket, count, kLog2Spread);
+    spread<kSpreadThreads>(from, to, 0, count, finer, space.finer, s.warp_sum);
+    const bool has_windows = !has_longer(space.finer, kWindow - kWindowEntries);
+    if (has_windows) write_window_ends(space.finer, count, reinterpret_cast<uint32_t*>(to + count));
+    __syncthreads();  // the next list is held where these counters are
+    return has_windows;
+}
+
 // Spreads the long lists, a block one after another: where they are, if `most_held` entries in shared memory
-// are enough, else into the scratch.
-__global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists lists, uint32_t most_held) {
-    using Shared = SpreadShared<kLog2Spread>;
-    static_assert(sizeof(Shared) % sizeof(TileEntry) == 0, "entries follow it");
-    Shared& s = *reinterpret_cast<Shared*>(shared_memory());
-    auto* held = reinterpret_cast<TileEntry*>(shared_memory() + sizeof(Shared));
+// are enough, else into the scratch. Those of tiles in parts are spread into windows, in the scratch.
+__global__ void __launch_bounds__(kSpreadThreads, 2) spread_kernel(FrameLists lists, uint32_t most_held) {
+    static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0, "entries lie where `finer` does");
+    SpreadSpace& space = *reinterpret_cast<SpreadSpace*>(shared_memory());
+    SpreadShared<kLog2Spread>& s = space.even;
+    auto* held = reinterpret_cast<TileEntry*>(&space.finer);
     if (!lists.capacity.holds_entries(*lists.counters)) return;
     for (uint32_t i = blockIdx.x; i < lists.num_plans; i += gridDim.x) {
         TilePlan& plan = lists.plans[i];
@@ -415,30 +509,36 @@ __global__ void __launch_bounds__(kPlanThreads, 2) spread_kernel(FrameLists list
         if (count >> plan.log2_parts < kPiece / kMostParts) return;  // and so are all that follow
         if (count <= kPiece || plan.part != 0) continue;
         TileEntry* entries = lists.entries + lists.tile_first[plan.tile];
-        const bool is_held = count <= most_held, finely = plan.log2_parts > 0;
+        const bool has_parts = plan.log2_parts > 0, is_held = count <= most_held;
         unsigned long long first_scratch = 0;
+        if (has_parts || !is_held) {
+            const uint32_t room = has_parts ? room_in_windows(count) : count;
+            first_scratch = take_scratch(*lists.counters, room);
+            if (first_scratch + room > lists.capacity.spread) continue;
+        }
+        TileEntry* scratch = lists.scratch + first_scratch;
+        if (has_parts && spread_into_windows(entries, count, scratch, space)) {
+            if (threadIdx.x == 0) {
+                plan.in_windows = plan.in_scratch = true;
+                plan.first_scratch = first_scratch;
+            }
+            continue;
+        }
         Buckets buckets;
         if (is_held) {
-            for (uint32_t k = threadIdx.x; k < count; k += kPlanThreads)
+            for (uint32_t k = threadIdx.x; k < count; k += kSpreadThreads)
                 copy_async(reinterpret_cast<float2*>(held + k), reinterpret_cast<const float2*>(entries + k));
             wait_for_copies();
             __syncthreads();
-            buckets = find_buckets<kPlanThreads>(held, 0, count, true, finely, s);
-            spread<kPlanThreads>(held, entries, 0, count, buckets, s);
+            buckets = find_buckets<kSpreadThreads>(held, 0, count, true, false, s);
+            spread<kSpreadThreads>(held, entries, 0, count, buckets, s.bucket, s.warp_sum);
         } else {
-            first_scratch = take_scratch(lists, count);
-            if (first_scratch + count > lists.capacity.spread) continue;
-            buckets = find_buckets<kPlanThreads>(entries, 0, count, true, finely, s);
-            spread<kPlanThreads>(entries, lists.scratch + first_scratch, 0, count, buckets, s);
+            buckets = find_buckets<kSpreadThreads>(entries, 0, count, true, false, s);
+            spread<kSpreadThreads>(entries, scratch, 0, count, buckets, s.bucket, s.warp_sum);
         }
-        // A bucket's counter now stands where the next one begins.
-        bool is_long = false;
-        for (uint32_t b = threadIdx.x; b <= buckets.last; b += kPlanThreads)
-            is_long = is_long || s.bucket[b] - (b > 0 ? s.bucket[b - 1] : 0) > kWindow;
-        is_long = __syncthreads_or(is_long);
-        if (is_long && is_held) first_scratch = take_scratch(lists, count);
+        if (has_longer(s.bucket, kWindow) && is_held && !has_parts)
+            first_scratch = take_scratch(*lists.counters, count);
         if (threadIdx.x == 0) {
-            plan.fits_windows = !is_long;
             plan.in_scratch = !is_held;
             plan.first_scratch = first_scratch;
             plan.lowest = buckets.lowest;
@@ -457,8 +557,8 @@ __global__ void __launch_bounds__(kBlendThreads, kBlocks)
     if (lists.plans[blockIdx.x].tile == kNoTile) return;
     const int part = lists.plans[blockIdx.x].part;
     const TilePlan& plan = lists.plans[blockIdx.x - part];
-    if (part > 0 && !plan.fits_windows) return;  // the first blends it all
-    const uint32_t own_blocks = blocks_of_part(part, plan.fits_windows ? plan.log2_parts : 0);
+    if (part > 0 && !plan.in_windows) return;  // the first blends it all
+    const uint32_t own_blocks = blocks_of_part(part, plan.in_windows ? plan.log2_parts : 0);
     const Buckets buckets{plan.lowest, plan.last_bucket, plan.shift, false};
     const FrameImage& image = lists.images[plan.image];
     if (planes_of(lists, image).depth != nullptr)
@@ -483,10 +583,13 @@ uint32_t most_plans(uint32_t num_tiles) {
 }
 
 void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t stream) {
-    launch("plan_kernel", plan_kernel, 1, kPlanThreads, 0, stream, lists, num_places());
+    const unsigned plan_blocks = std::max(blocks_for(lists.num_tiles, kPlanThreads), 1u);
+    launch("count_plans_kernel", count_plans_kernel, plan_blocks, kPlanThreads, 0, stream, lists,
+           num_places());
+    launch("plan_kernel", plan_kernel, plan_blocks, kPlanThreads, 0, stream, lists, num_places());
     const uint32_t held = most_held();
-    launch("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles), kPlanThreads,
-           sizeof(SpreadShared<kLog2Spread>) + held * sizeof(TileEntry), stream, lists, held);
+    launch("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles),
+           kSpreadThreads, sizeof(SpreadShared<kLog2Spread>) + held * sizeof(TileEntry), stream, lists, held);
     with_stop<float>(lists.min_transmittance, [&](auto stop) {
         launch("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans, kBlendThreads,
                sizeof(BlendShared), stream, lists, tape == nullptr ? RasterTape{} : *tape, stop);

@@ -40,6 +40,28 @@ __device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int lo
     return {lowest, (1u << log2_buckets) - 1, max(bits - log2_buckets, 0), by_record};
 }
 
+// Buckets for entries most of which lie in few buckets of equal width: by the place that an entry would have
+// if those of its bucket lay evenly in it. The buckets of equal width were made for all of them.
+struct FinerBuckets {
+    Buckets even;
+    const uint32_t* first;  // entry of each of those
+    uint32_t count;         // of entries
+    int shift;              // of places
+
+    __device__ uint32_t of(EntryKey key) const {
+        const uint32_t bucket = even.of(key);
+        const uint32_t begin = first[bucket], end = bucket < even.last ? first[bucket + 1] : count;
+        const uint32_t above = even.part_of(key) - even.lowest - (bucket << even.shift);
+        return (begin + static_cast<uint32_t>(EntryKey(above) * (end - begin) >> even.shift)) >> shift;
+    }
+};
+
+__device__ inline FinerBuckets finer_buckets(const Buckets& even, const uint32_t* first, uint32_t count,
+                                             int log2_buckets) {
+    const int bits = 32 - __clz(static_cast<int>(count - 1));
+    return {even, first, count, max(bits - log2_buckets, 0)};
+}
+
 // Shared memory of a block that spreads a list.
 template <int kLog2Buckets>
 struct SpreadShared {
@@ -128,18 +150,19 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
     return buckets_over(range[0], range[1], log2_buckets, by_record);
 }
 
-// Spreads entries [first, last) into bucket order, from one place to another.
-template <int kBlock, int kLog2Buckets>
+// Spreads entries [first, last) into bucket order, from one place to another. In the end a bucket's counter
+// stands where the next one begins.
+template <int kBlock, int kCount, class SomeBuckets>
 __device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
-                       const Buckets& buckets, SpreadShared<kLog2Buckets>& s) {
-    for (int i = threadIdx.x; i < 1 << kLog2Buckets; i += kBlock) s.bucket[i] = 0;
+                       const SomeBuckets& buckets, uint32_t (&bucket)[kCount], uint32_t* warp_sum) {
+    for (int i = threadIdx.x; i < kCount; i += kBlock) bucket[i] = 0;
     __syncthreads();
     for_each_entry<kBlock>(from, first, last,
-                           [&](TileEntry e) { atomicAdd(&s.bucket[buckets.of(e.key)], 1u); });
+                           [&](TileEntry e) { atomicAdd(&bucket[buckets.of(e.key)], 1u); });
     __syncthreads();
-    scan_buckets<1 << kLog2Buckets, kBlock>(s.bucket, s.warp_sum);
+    scan_buckets<kCount, kBlock>(bucket, warp_sum);
     for_each_entry<kBlock>(from, first, last,
-                           [&](TileEntry e) { to[first + atomicAdd(&s.bucket[buckets.of(e.key)], 1u)] = e; });
+                           [&](TileEntry e) { to[first + atomicAdd(&bucket[buckets.of(e.key)], 1u)] = e; });
     __syncthreads();
 }
 
