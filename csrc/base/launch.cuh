@@ -43,7 +43,6 @@ __device__ inline T warp_min(T x) {
     for (int offset = 16; offset > 0; offset /= 2) x = min(x, __shfl_xor_sync(kAllLanes, x, offset));
     return x;
 }
-__device__ inline int warp_min(int x) { return __reduce_min_sync(kAllLanes, x); }
 
 }  // namespace cuda
 }  // namespace v3dg

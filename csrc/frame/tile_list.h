@@ -147,13 +147,15 @@ V3DG_HD inline EntryBox box_of(FewTiles f) {
     return {x0, x0 + (static_cast<int>(f >> 19) & 31), y0, y0 + (static_cast<int>(f) & 31)};
 }
 
-// A record over more than kFewTiles tiles. They come in batches of kLargeAtOnce of one item, so of neighbours
-// in one picture; what a batch lacks is filled up at its end.
+// A record over more than kFewTiles tiles, or some of its rows of tiles and its pixels in those. They come in
+// batches of kLargeAtOnce of one item, so of neighbours in one picture; what a batch lacks is filled up at
+// its end. A batch has no more than kMostLargeTiles tiles, or a row of them of each record.
 struct alignas(16) LargeRecord {
     uint32_t record, image;  // kNoRecord where there is none
     RecordBox box;
 };
 constexpr unsigned kLargeAtOnce = 16;
+constexpr int kMostLargeTiles = 1024;
 constexpr uint32_t kNoRecord = ~0u;
 
 // The records of an item, and the tiles of their picture.

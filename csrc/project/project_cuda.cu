@@ -103,8 +103,18 @@ __device__ void store_word(T& to, uint32_t word) {
     if (lane < sizeof(T) / sizeof(uint32_t)) reinterpret_cast<uint32_t*>(&to)[lane] = word;
 }
 
+// Of a large record the rows of tiles that one of `count` parts of a batch has; no record if it has none.
+__device__ LargeRecord part_of(LargeRecord large, int part, int count) {
+    const int top = large.box.y0 / kFrameTileHeight, rows = large.box.y1 / kFrameTileHeight - top + 1;
+    const int first = rows * part / count, end = rows * (part + 1) / count;
+    if (first == end) large.record = kNoRecord;
+    if (first > 0) large.box.y0 = static_cast<uint16_t>((top + first) * kFrameTileHeight);
+    if (end < rows) large.box.y1 = static_cast<uint16_t>((top + end) * kFrameTileHeight - 1);
+    return large;
+}
+
 // Writes the item's large records that wait: in whole batches, of which the last is filled up at the end of
-// the item and waits for more before.
+// the item and waits for more before. What lies over very many tiles is written in parts, a batch each.
 template <class Model>
 __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, const ProjectOutput& out,
                             bool is_end) {
@@ -112,16 +122,32 @@ __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, co
     const unsigned num_batches = is_end ? blocks_for(num_large, kLargeAtOnce) : num_large / kLargeAtOnce;
     if (num_batches == 0) return;
     const unsigned count = num_batches * kLargeAtOnce;
-    unsigned long long place = 0;
-    if (lane == 0) place = atomicAdd(&counters.large, static_cast<unsigned long long>(count));
-    place = __shfl_sync(kAllLanes, place, 0);
-    for (unsigned k = lane; k < count; k += 32) {
+    for (unsigned first = 0; first < count; first += 32) {
+        // A half of the warp has a batch.
+        static_assert(kLargeAtOnce == 16, "half a warp");
+        const unsigned k = first + lane;
         LargeRecord large{kNoRecord, space.tables.placement.image, {}};
-        if (k < num_large) {
+        int tiles = 0;
+        if (k < min(num_large, count)) {
             large.record = space.tables.item.record + space.large[k];
             large.box = space.boxes[k];
+            tiles = (large.box.x1 / kFrameTileWidth - large.box.x0 / kFrameTileWidth + 1) *
+                    (large.box.y1 / kFrameTileHeight - large.box.y0 / kFrameTileHeight + 1);
         }
-        if (place + k < out.large_capacity) out.large[place + k] = large;
+#pragma unroll
+        for (unsigned step = 1; step < kLargeAtOnce; step *= 2)
+            tiles += __shfl_xor_sync(kAllLanes, tiles, step);
+        const unsigned parts = k < count ? (tiles + kMostLargeTiles - 1) / kMostLargeTiles : 0;
+        const unsigned of_first = __shfl_sync(kAllLanes, parts, 0), before = lane < 16 ? 0 : of_first;
+        unsigned long long place = 0;
+        if (lane == 31)
+            place =
+                atomicAdd(&counters.large, static_cast<unsigned long long>(kLargeAtOnce * (before + parts)));
+        place = __shfl_sync(kAllLanes, place, 31) + kLargeAtOnce * before + lane % kLargeAtOnce;
+        for (unsigned part = 0; part < parts; ++part, place += kLargeAtOnce)
+            if (place < out.large_capacity)
+                out.large[place] =
+                    parts == 1 || large.record == kNoRecord ? large : part_of(large, part, parts);
     }
     const unsigned left = num_large - min(count, num_large);
     RecordBox box{};

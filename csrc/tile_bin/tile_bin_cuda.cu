@@ -19,69 +19,27 @@ constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
 constexpr unsigned kBlocks = 5;    // on a multiprocessor
 constexpr uint32_t kNoItem = ~0u;  // in place of a number of records
 
-// Large records that a warp takes together; lanes 16 apart have the same one. Neighbours cover the same
-// tiles, so a tile is looked at for all of them at once, in windows of so many tiles, unless they lie so
-// scattered that a tile has fewer than two of them.
+// Large records that a warp takes together; lanes 16 apart have the same one.
 struct LargeBatch {
     uint32_t image;
-    uint32_t record;        // of this lane; the first one where it has none
-    RecordBox box;          // of that
-    int first_row, rows;    // of tiles, of this lane; from `top` on
-    int left, top;          // of the tiles that they all lie in
-    int columns, all_rows;  // of those
-    int window_rows;        // 0 if without windows
-    float columns_inverse;
+    uint32_t record;  // of this lane
+    RecordBox box;    // of that
+    int rows;         // of tiles, of this lane's record; 0 where it has none
+    int rows_after;   // of all records up to this one
 };
-constexpr int kMostTiles = 255, kMostRows = 256;
 
-// For each row of each record in a window `count` of its columns from `first` on: first | count << 8.
-using WindowRuns = uint16_t[kMostRows];
+// A warp's part of the rows of a batch: one of so many.
+struct LargePart {
+    int number, log2_parts;
+};
 
 __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first) {
     const LargeRecord mine = in.large[first + threadIdx.x % kLargeAtOnce];
-    const LargeRecord& first_one = in.large[first];
-    LargeBatch batch{mine.image, first_one.record, first_one.box, 0, 0, 0, 0, 0, 0, 0, 0};
-    int left = 1 << 20, top = left, right = -left, bottom = -left, boxes = 0;
-    if (mine.record != kNoRecord) {
-        batch.record = mine.record;
-        batch.box = mine.box;
-        left = mine.box.x0 / kFrameTileWidth;
-        right = mine.box.x1 / kFrameTileWidth;
-        top = mine.box.y0 / kFrameTileHeight;
-        bottom = mine.box.y1 / kFrameTileHeight;
-        batch.rows = bottom - top + 1;
-        boxes = batch.rows * (right - left + 1);
-    }
-    batch.left = warp_min(left);
-    batch.top = warp_min(top);
-    batch.first_row = top - batch.top;
-    batch.columns = -warp_min(-right) - batch.left + 1;
-    batch.all_rows = -warp_min(-bottom) - batch.top + 1;
-    batch.columns_inverse = 1 / static_cast<float>(batch.columns);
-    const int tiles = batch.columns * batch.all_rows;
-    const bool is_dense = tiles <= warp_sum(boxes) / 4;  // two lanes count each box
-    // Halfway between two quotients of whole numbers.
-    const int fitting = static_cast<int>((kMostTiles + 0.5f) * batch.columns_inverse);
-    if (is_dense) batch.window_rows = min(fitting, kMostRows / static_cast<int>(kLargeAtOnce));
+    LargeBatch batch{mine.image, mine.record, mine.box, 0, 0};
+    if (mine.record != kNoRecord)
+        batch.rows = mine.box.y1 / kFrameTileHeight - mine.box.y0 / kFrameTileHeight + 1;
+    batch.rows_after = warp_prefix<kLargeAtOnce>(batch.rows);
     return batch;
-}
-
-// Some of the rows of tiles that a batch lies in.
-struct LargeRows {
-    int top;              // of the picture's
-    int tiles;            // in the batch's columns
-    int first_row, rows;  // of this lane's record; from `top` on
-    int above;            // of the record's rows
-    int rows_after;       // of all records up to this one
-};
-
-__device__ LargeRows rows_of(const LargeBatch& batch, int first, int count) {
-    const int begin = max(batch.first_row, first), end = min(batch.first_row + batch.rows, first + count);
-    LargeRows rows{batch.top + first,       min(count, batch.all_rows - first) * batch.columns,
-                   begin - first,           max(end - begin, 0),
-                   begin - batch.first_row, 0};
-    rows.rows_after = warp_prefix<kLargeAtOnce>(rows.rows);
-    return rows;
 }
 
 // The box of another lane of the warp.
@@ -92,35 +50,47 @@ __device__ RecordBox box_of_lane(const RecordBox& box, int lane) {
             static_cast<uint16_t>(rows >> 16)};
 }
 
-// Calls visit(row, number, record, run) for those rows of a batch's records, a lane a row.
-template <class Visit>
-__device__ void for_each_run(const TileBinInput& in, const LargeBatch& batch, const LargeRows& rows,
-                             const Visit& visit) {
-    const int lane = threadIdx.x % 32, total = __shfl_sync(kAllLanes, rows.rows_after, kLargeAtOnce - 1);
-    const int before = rows.rows_after - rows.rows - rows.above;
-    for (int first = 0; first < total; first += 32) {
-        // The record that the lane's row is of: the first to end after it.
-        const int row = min(first + lane, total - 1);
-        int owner = 0;
+// The first of `kCount` lanes whose number, which does not fall from lane to lane, is above `at`; the last
+// one if none is.
+template <int kCount>
+__device__ int first_lane_above(int number, int at) {
+    int lane = 0;
 #pragma unroll
-        for (int step = kLargeAtOnce / 2; step > 0; step /= 2)
-            if (__shfl_sync(kAllLanes, rows.rows_after, owner + step - 1) <= row) owner += step;
-        const int row_of_owner = row - __shfl_sync(kAllLanes, before, owner);
+    for (int step = kCount / 2; step > 0; step /= 2)
+        if (__shfl_sync(kAllLanes, number, lane + step - 1) <= at) lane += step;
+    return lane;
+}
+
+// Calls begin_row(number, record) for 32 rows of a batch's records, a lane a row, and then visit(from, row,
+// column) for each 32 tiles of those rows: a lane a tile, in the row of lane `from`; a column below 0 is of
+// no tile.
+template <class BeginRow, class Visit>
+__device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch, const LargePart& part,
+                              const BeginRow& begin_row, const Visit& visit) {
+    const int lane = threadIdx.x % 32, total = __shfl_sync(kAllLanes, batch.rows_after, kLargeAtOnce - 1);
+    const int end = total * (part.number + 1) >> part.log2_parts;
+    for (int first = total * part.number >> part.log2_parts; first < end; first += 32) {
+        const int at = min(first + lane, end - 1);
+        const int owner = first_lane_above<kLargeAtOnce>(batch.rows_after, at);
+        const int row_of_owner = at - __shfl_sync(kAllLanes, batch.rows_after - batch.rows, owner);
         const uint32_t number = __shfl_sync(kAllLanes, batch.record, owner);
         const RecordBox box = box_of_lane(batch.box, owner);
-        if (first + lane >= total) continue;
         const Record<float> record = load_record(in.records, number, box);
-        visit(row, number, record, tile_run(record, row_of_owner));
+        const TileRun run = tile_run(record, row_of_owner);
+        begin_row(number, record);
+        const int count = first + lane < end ? run.count : 0;
+        const int after = warp_prefix(count), tiles = __shfl_sync(kAllLanes, after, 31);
+        for (int tile = lane; tile - lane < tiles; tile += 32) {
+            const int from = first_lane_above<32>(after, tile);
+            const int row = __shfl_sync(kAllLanes, run.row, from);
+            const int column = __shfl_sync(kAllLanes, run.first - (after - count), from) + tile;
+            visit(from, row, tile < tiles ? column : -1);
+        }
     }
 }
 
-// A warp's part of a batch: one window in so many, or so many of the rows.
-struct LargePart {
-    int number, log2_parts;
-};
-
 // Calls visit(batch, part) for all large records, batch by batch; for whole warps of the grid. Where there
-// are few batches, several warps take parts of each: a single one may lie over the whole picture.
+// are few batches, several warps take parts of each.
 template <class Visit>
 __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     constexpr int kLog2MostParts = 2;
@@ -128,98 +98,23 @@ __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     const unsigned num_batches = static_cast<unsigned>(in.counters->large / kLargeAtOnce);
     const unsigned warps_each = num_batches == 0 ? 0 : 8 * num_warps / num_batches;
     const int log2_parts = min(max(31 - __clz(static_cast<int>(warps_each)), 0), kLog2MostParts);
-    for (unsigned at = blockIdx.x * kWarps + threadIdx.x / 32; at < num_batches << log2_parts;
+    // Neighbours are as much work as each other, so they go to different blocks.
+    for (unsigned at = blockIdx.x + threadIdx.x / 32 * gridDim.x; at < num_batches << log2_parts;
          at += num_warps)
         visit(load_batch(in, static_cast<unsigned long long>(at >> log2_parts) * kLargeAtOnce),
               LargePart{static_cast<int>(at & ((1u << log2_parts) - 1)), log2_parts});
 }
 
-// Without windows: the rows of a part of a batch.
-__device__ LargeRows rows_of(const LargeBatch& batch, const LargePart& part) {
-    const int count = (batch.all_rows >> part.log2_parts) + 1;
-    return rows_of(batch, part.number * count, count);
-}
-
-// Calls visit(window) for the windows of a part of a batch, whose runs are written down.
-template <class Visit>
-__device__ void for_each_window(const TileBinInput& in, const LargeBatch& batch, const LargePart& part,
-                                WindowRuns& runs, const Visit& visit) {
-    const int step = batch.window_rows << part.log2_parts;
-    for (int first = part.number * batch.window_rows; first < batch.all_rows; first += step) {
-        const LargeRows window = rows_of(batch, first, batch.window_rows);
-        __syncwarp();  // the window before may still be read
-        for_each_run(in, batch, window, [&](int row, uint32_t, const Record<float>&, const TileRun& run) {
-            runs[row] = run.count == 0 ? 0 : static_cast<uint16_t>(run.first - batch.left | run.count << 8);
-        });
-        __syncwarp();
-        visit(window);
-    }
-}
-
-// Tile t of a window.
-struct WindowTile {
-    int row, column;
-
-    // Halfway between two multiples of 1 / columns, whatever the quotient's last bits.
-    __device__ WindowTile(const LargeBatch& batch, int t)
-        : row(static_cast<int>((static_cast<float>(t) + 0.5f) * batch.columns_inverse)),
-          column(t - row * batch.columns) {}
-    __device__ uint32_t index(const FrameImage& image, const LargeBatch& batch,
-                              const LargeRows& window) const {
-        return image.first_tile + (window.top + row) * image.tile_columns + batch.left + column;
-    }
-};
-
-// Calls visit(k, tile) for the tiles of the window from `first` on, 32 at most: a tile for the lower half of
-// the warp and the next one, which may lie past the window, for the upper half. They are the tiles k and
-// k + 1 of those.
-template <class Visit>
-__device__ void for_each_two_tiles(const LargeBatch& batch, const LargeRows& window, int first,
-                                   const Visit& visit) {
-    const int upper = threadIdx.x % 32 / kLargeAtOnce, end = min(window.tiles - first, 32);
-    for (int k = 0; k < end; k += 2) visit(k, WindowTile(batch, first + k + upper));
-}
-
-// Which records of the batch touch the tile first + lane of a window, a bit each.
-__device__ uint32_t records_of_tile(const LargeBatch& batch, const LargeRows& window, const WindowRuns& runs,
-                                    int first) {
-    const unsigned lane = threadIdx.x % 32;
-    const int before = window.rows_after - window.rows;
-    uint32_t of_tile = 0;
-    for_each_two_tiles(batch, window, first, [&](unsigned k, const WindowTile& tile) {
-        const int row = tile.row - window.first_row;
-        const bool has_row = static_cast<unsigned>(row) < static_cast<unsigned>(window.rows);
-        const int run = runs[has_row ? before + row : 0];
-        const unsigned both = __ballot_sync(
-            kAllLanes, has_row && static_cast<unsigned>(tile.column - (run & 255)) < unsigned(run) >> 8);
-        if ((lane & ~1u) == k) of_tile = both;
-    });
-    return of_tile >> kLargeAtOnce * (lane & 1) & ((1u << kLargeAtOnce) - 1);
-}
-
 __global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinInput in) {
     if (!in.capacity.holds(*in.counters)) return;
-    __shared__ WindowRuns all_runs[kWarps];
-    WindowRuns& runs = all_runs[threadIdx.x / 32];
     for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
         const FrameImage& image = in.images[batch.image];
-        if (batch.window_rows == 0) {
-            for_each_run(in, batch, rows_of(batch, part),
-                         [&](int, uint32_t, const Record<float>&, const TileRun& run) {
-                             uint32_t* to = in.counts.count + image.first_tile +
-                                            run.row * image.tile_columns + run.first;
-                             for (int k = 0; k < run.count; ++k) atomicAdd(to + k, 1u);
-                         });
-            return;
-        }
-        for_each_window(in, batch, part, runs, [&](const LargeRows& window) {
-            for (int first = 0; first < window.tiles; first += 32) {
-                const uint32_t records = records_of_tile(batch, window, runs, first);
-                const WindowTile tile(batch, first + threadIdx.x % 32);
-                if (records != 0)
-                    atomicAdd(in.counts.count + tile.index(image, batch, window), unsigned(__popc(records)));
-            }
-        });
+        for_each_tile(
+            in, batch, part, [](uint32_t, const Record<float>&) {},
+            [&](int, int row, int column) {
+                count_tile(in.counts.count,
+                           column < 0 ? kNoTile : image.first_tile + row * image.tile_columns + column);
+            });
     });
 }
 
@@ -294,49 +189,36 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item, uint32_t r
     }
 }
 
-// A batch without windows.
-__device__ void scatter_runs(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
-                             const LargePart& part) {
+// A part of a batch of records over many tiles.
+__device__ void scatter_large(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
+                              const LargePart& part) {
+    const unsigned lane = threadIdx.x % 32;
     const FrameImage& image = in.images[batch.image];
-    const auto visit = [&](int, uint32_t number, const Record<float>& r, const TileRun& run) {
-        const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
-        const EntryBox box = entry_box(r);
-        for (int k = 0; k < run.count; ++k) {
-            const uint32_t tile = image.first_tile + run.row * image.tile_columns + run.first + k;
-            to.entries[to.tile_first[tile] + (atomicSub(to.left + tile, 1u) - 1)] =
-                tile_entry(depth, number, box, run.first + k, run.row);
-        }
-    };
-    for_each_run(in, batch, rows_of(batch, part), visit);
-}
-
-// A batch with windows: what it has for a tile is written at once.
-__device__ void scatter_windows(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
-                                const LargePart& part, WindowRuns& runs) {
-    const FrameImage& image = in.images[batch.image];
-    const unsigned lane = threadIdx.x % 32, mine = lane % kLargeAtOnce;
-    const Record<float> r = load_record(in.records, batch.record, batch.box);
-    const uint32_t depth = entry_depth(r.depth, image.camera.near_depth);
-    const EntryBox box = entry_box(r);
-    for_each_window(in, batch, part, runs, [&](const LargeRows& window) {
-        for (int first = 0; first < window.tiles; first += 32) {
-            const uint32_t records = records_of_tile(batch, window, runs, first);
-            unsigned long long place = 0;
-            if (records != 0) {
-                const uint32_t tile = WindowTile(batch, first + lane).index(image, batch, window),
-                               count = __popc(records);
-                place = to.tile_first[tile] + (atomicSub(to.left + tile, count) - count);
-            }
-            for_each_two_tiles(batch, window, first, [&](unsigned k, const WindowTile& tile) {
-                const unsigned from = k + lane / kLargeAtOnce;
-                const uint32_t of_tile = __shfl_sync(kAllLanes, records, from);
-                const unsigned long long begin = __shfl_sync(kAllLanes, place, from);
-                if (of_tile >> mine & 1)
-                    to.entries[begin + __popc(of_tile & ((1u << mine) - 1))] =
-                        tile_entry(depth, batch.record, box, batch.left + tile.column, window.top + tile.row);
-            });
-        }
-    });
+    uint32_t record_of_row = 0, depth_of_row = 0;
+    RecordBox blocks_of_row{};
+    for_each_tile(
+        in, batch, part,
+        [&](uint32_t number, const Record<float>& r) {
+            record_of_row = number;
+            depth_of_row = entry_depth(r.depth, image.camera.near_depth);
+            const EntryBox box = entry_box(r);
+            blocks_of_row = {static_cast<uint16_t>(box.x0), static_cast<uint16_t>(box.x1),
+                             static_cast<uint16_t>(box.y0), static_cast<uint16_t>(box.y1)};
+        },
+        [&](int from, int row, int column) {
+            const uint32_t record = __shfl_sync(kAllLanes, record_of_row, from),
+                           depth = __shfl_sync(kAllLanes, depth_of_row, from);
+            const RecordBox box = box_of_lane(blocks_of_row, from);
+            const uint32_t tile = column < 0 ? kNoTile : image.first_tile + row * image.tile_columns + column;
+            const unsigned peers = __match_any_sync(kAllLanes, tile);
+            const unsigned before = __popc(peers & ((1u << lane) - 1));
+            uint32_t left = 0;
+            if (tile != kNoTile && before == 0) left = atomicSub(to.left + tile, unsigned(__popc(peers)));
+            left = __shfl_sync(kAllLanes, left, __ffs(peers) - 1);
+            if (tile == kNoTile) return;
+            to.entries[to.tile_first[tile] + (left - 1 - before)] =
+                tile_entry(depth, record, {box.x0, box.x1, box.y0, box.y1}, column, row);
+        });
 }
 
 // Blocks take items, a thread a record, and then the records over many tiles. An item's table is fetched two
@@ -361,14 +243,8 @@ __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput
         next = later;
         few = next_few;
     }
-    __shared__ WindowRuns all_runs[kWarps];
-    WindowRuns& runs = all_runs[threadIdx.x / 32];
-    for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
-        if (batch.window_rows == 0)
-            scatter_runs(in, to, batch, part);
-        else
-            scatter_windows(in, to, batch, part, runs);
-    });
+    for_each_part(
+        in, [&](const LargeBatch& batch, const LargePart& part) { scatter_large(in, to, batch, part); });
 }
 
 }  // namespace
