@@ -1,0 +1,158 @@
+"""Where a frame's time goes on a GPU: each kernel of it, beside the frame and a digest of its picture.
+
+    python -m benchmarks.studies.frame_kernels --layout donutsea.json --asset donut.ply \\
+        --captured ASSETS --names Fungi -o frame_kernels_h200
+
+ASSETS is a folder as `pairs` has it. A captured asset is drawn whole, and with levels at the default
+tolerance, random gaussians whole, instances of a layout with levels at two tolerances, and whole. A frame is
+counted from an idle device to an idle device, Python included, the median of 25; kernels are the means of a
+dozen frames under torch's profiler. To compare two versions, run it with each in turn on one machine: digests
+tell whether they draw the same bits.
+"""
+
+from __future__ import annotations
+
+import collections
+import hashlib
+import re
+import statistics
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+import v3dg
+from benchmarks.evaluation import record
+from benchmarks.evaluation.assets import read_layout
+from benchmarks.studies import peers_scenes as scenes
+from benchmarks.worlds.procedural import make_asset
+from v3dg.cameras import Camera
+
+Row = dict[str, Any]
+Frame = tuple[str, Any, Camera, float | None]
+"""Its name, what draws it, from where, and a tolerance, or None where there are no levels."""
+
+_WARM_UPS, _FRAMES, _PROFILED = 4, 25, 12
+_TOLERANCES = 9.4, 3.0
+
+
+@dataclass
+class Config:
+    asset: Path | None = None
+    """A .ply file; by default the procedural asset."""
+    layout: Path | None = None
+    """A layout of instances of that asset; without one, that part is left out."""
+    cameras: tuple[int, ...] = (40, 45, 50, 55, 59)
+    """Which cameras of the layout."""
+    captured: Path | None = None
+    """A folder with assets.json; without one, that part is left out."""
+    names: tuple[str, ...] = ()
+    """Assets of that folder."""
+    counts: tuple[int, ...] = (1_000_000, 4_000_000)
+    """How many random gaussians."""
+    widths: tuple[int, ...] = (1920, 3840)
+    """px; pictures of captured assets and random gaussians are 16 : 9."""
+    output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+    """File of the results."""
+
+
+def frames(config: Config) -> Iterator[Frame]:
+    if config.captured is not None:
+        for name in config.names:
+            subject = scenes.captured(config.captured, name, "cuda")
+            yield from _sized(
+                config, f"{name}, whole", v3dg.Renderer(subject.gaussians), subject.cameras, None
+            )
+            bundle = v3dg.build_bundle(subject.gaussians.numpy(), device="cuda", progress=False)
+            yield from _sized(
+                config, f"{name}, levels", v3dg.Renderer(bundle, device="cuda"), subject.cameras, 3.0
+            )
+    for count in config.counts:
+        subject = scenes.random(count, 3, "cuda")
+        yield from _sized(config, subject.name, v3dg.Renderer(subject.gaussians), subject.cameras, None)
+    if config.layout is not None:
+        asset = make_asset() if config.asset is None else v3dg.read_asset(config.asset)
+        scene, views = read_layout(config.layout, v3dg.build_bundle(asset, device="cuda", progress=False))
+        renderer = v3dg.Renderer(scene, device="cuda")
+        for tolerance in (*_TOLERANCES, 0.0):
+            for number in config.cameras:
+                name = list(views)[number]
+                yield (
+                    f"{config.layout.stem}, {name}, tolerance {tolerance:g}",
+                    renderer,
+                    views[name],
+                    tolerance,
+                )
+
+
+def _sized(
+    config: Config, name: str, renderer: Any, cameras: Mapping[str, Camera], tolerance: float | None
+) -> Iterator[Frame]:
+    for view, camera in cameras.items():
+        for width in config.widths:
+            yield (
+                f"{name}, {view}, {width} px",
+                renderer,
+                scenes.at_size(camera, width, width * 9 // 16),
+                tolerance,
+            )
+
+
+def measure(frame: Frame) -> Row:
+    """Milliseconds of the frame and of its kernels, and what it draws."""
+    import torch
+    from torch.profiler import ProfilerActivity, profile
+
+    name, renderer, camera, tolerance = frame
+    options = {} if tolerance is None else {"tolerance": tolerance}
+
+    def draw() -> Any:
+        image = renderer.render(camera, **options)
+        return image, image.stats  # which waits for it
+
+    for _ in range(_WARM_UPS):
+        image, stats = draw()
+    times = []
+    for _ in range(_FRAMES):
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        draw()
+        torch.cuda.synchronize()
+        times.append(1e3 * (time.perf_counter() - start))
+    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
+        for _ in range(_PROFILED):
+            draw()
+        torch.cuda.synchronize()
+    kernels: collections.Counter[str] = collections.Counter()
+    for event in profiled.events():
+        if event.device_type.name == "CUDA":
+            kernels[_short(event.name)] += event.device_time_total / 1e3 / _PROFILED
+    return {
+        "frame": name,
+        "gaussians_in_frustum": stats.gaussians_in_frustum,
+        "milliseconds": round(statistics.median(times), 4),
+        "kernels": {kernel: round(ms, 4) for kernel, ms in kernels.most_common()},
+        "digest": hashlib.blake2b(image.color.cpu().numpy().tobytes(), digest_size=4).hexdigest(),
+    }
+
+
+def _short(name: str) -> str:
+    """A kernel's name without its namespaces and arguments."""
+    found = re.findall(r"(\w+)(?:<|\(|$)", name.replace("(anonymous namespace)::", ""))
+    return found[0].removesuffix("_kernel") if found else name
+
+
+def main(config: Config) -> None:
+    rows: list[Row] = []
+    for frame in frames(config):
+        rows.append(measure(frame))
+        record.write(config.output, {"rows": rows}, "cuda")
+        kernels = " ".join(f"{kernel} {ms:.3f}" for kernel, ms in list(rows[-1]["kernels"].items())[:8])
+        print(f"{rows[-1]['frame']}: {rows[-1]['milliseconds']:.3f} ms; {kernels}", flush=True)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
