@@ -474,6 +474,9 @@ def test_weights_that_are_none_are_refused():
     for weights in ([-0.1], [1.1], [np.nan], [0.5, 0.5]):
         with pytest.raises(ValueError, match="given_weights: expected 1 numbers of 0 to 1, got"):
             Selection(Scene.of(bundle), ids, ids, 1, 0.0, 0.0, given_weights=np.float32(weights))
+    for others in (["much"], [None], "much", [1j]):
+        with pytest.raises(ValueError, match="given_weights: expected 1 numbers of 0 to 1, got"):
+            Selection(Scene.of(bundle), ids, ids, 1, 0.0, 0.0, given_weights=others)
 
 
 def test_the_papers_footprint_has_no_fade():

@@ -64,7 +64,9 @@ class Selection:
         if self.revision is None:
             object.__setattr__(self, "revision", self.scene.revision)
         if self.given_weights is not None:
-            object.__setattr__(self, "given_weights", np.ascontiguousarray(self.given_weights, np.float32))
+            given = np.asarray(self.given_weights)
+            numbers = given if given.dtype.kind in "biuf" else np.full(given.shape, np.nan)
+            object.__setattr__(self, "given_weights", np.ascontiguousarray(numbers, np.float32))
         weights, expected = self.weights, f"{len(self)} numbers of 0 to 1"
         check("given_weights", len(weights) == len(self), f"{expected}, got {len(weights)}")
         check("given_weights", ((weights >= 0) & (weights <= 1)).all(), f"{expected}, got others")
