@@ -5,8 +5,8 @@
 ASSETS is a folder as `benchmarks.studies.pairs` describes it; its scenes are measured from their own
 cameras. What other cameras, which stand beside those and look elsewhere, see least of is dropped, as by
 `examples/drop_unseen.py`. What is left may be refitted to pictures of all gaussians from the same other
-cameras, 3 x 3 samples a pixel. Errors are to all gaussians at 4 x 4 samples a pixel. The table has the share
-of the gaussians in the frustum, and FLIP by that of all gaussians at one sample.
+cameras, 3 x 3 samples a pixel, or be drawn with levels. Errors are to all gaussians at 4 x 4 samples a pixel.
+The table has the share of the gaussians in the frustum, and FLIP by that of all gaussians at one sample.
 """
 
 from __future__ import annotations
@@ -55,6 +55,8 @@ class Config:
     """Of the gaussians that are seen at all: what is kept."""
     refit: tuple[float, ...] = ()
     """Those of them that are refitted."""
+    tolerances: tuple[float, ...] = ()
+    """At which what is kept is also drawn with levels."""
     steps: int = 4000
     """Of a refit, a picture each."""
     width: int = 384
@@ -149,10 +151,12 @@ def measure(config: Config, subject: Subject) -> list[Row]:
     rows: list[Row] = []
     whole: list[Row] = []
 
-    def add(kept: v3dg.Gaussians, part: float, steps: int) -> None:
+    def add(kept: v3dg.Gaussians | v3dg.Bundle, part: float, steps: int, tolerance: float = 0.0) -> None:
         found = []
+        options: Row = {"tolerance": tolerance} if isinstance(kept, v3dg.Bundle) else {}
+        renderer = v3dg.Renderer(kept, device=config.device)
         for (width, camera), truth in zip(shown, truths, strict=True):
-            image = v3dg.render(kept.torch(config.device), camera, device=config.device)
+            image = renderer.render(camera, **options)
             count = image.stats.gaussians_in_frustum
             found.append({"width": width, "count": count, **errors_of(truth, to_8bit(image.color))})
         if part == 0:
@@ -162,7 +166,8 @@ def measure(config: Config, subject: Subject) -> list[Row]:
         for width in config.widths:
             here = [(mine, all_) for mine, all_ in pairs if mine["width"] == width]
             row = {"asset": subject.name, "width": width, "seen": len(seen) / len(asset), "part": part}
-            row |= {"steps": steps, "all": statistics.fmean(all_["flip"] for _, all_ in here)}
+            row |= {"steps": steps, "tolerance": tolerance}
+            row["all"] = statistics.fmean(all_["flip"] for _, all_ in here)
             row["share"] = statistics.fmean(mine["count"] / all_["count"] for mine, all_ in here)
             ratios = [mine["flip"] / all_["flip"] for mine, all_ in here]
             row |= {"flip": statistics.geometric_mean(ratios), "worst": max(ratios)}
@@ -175,6 +180,10 @@ def measure(config: Config, subject: Subject) -> list[Row]:
         add(kept, part, 0)
         if part in config.refit:
             add(refitted(kept, asset, others, config), part, config.steps)
+        if config.tolerances:
+            bundle = v3dg.build_bundle(kept, device=config.device, progress=False)
+            for tolerance in config.tolerances:
+                add(bundle, part, 0, tolerance)
     return rows
 
 
@@ -185,6 +194,7 @@ _COLUMNS = (
     Column("seen", "seen", ".0%"),
     Column("kept of these", "part", ".0%"),
     Column("steps of refit", "steps", "d"),
+    Column("tolerance", "tolerance", "g"),
     Column("in the frustum, of all", "share", ".3f"),
     Column("FLIP, kept / all", "flip", ".3f"),
     Column("worst", "worst", ".3f"),
