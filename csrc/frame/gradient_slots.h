@@ -16,12 +16,6 @@ struct GradientSlots {
     uint8_t* is_touched;      // zeros at the start
 };
 
-V3DG_HD inline uint32_t tile_columns_of(const RecordBox& r) {
-    return r.x1 / kFrameTileWidth - r.x0 / kFrameTileWidth + 1u;
-}
-V3DG_HD inline uint32_t num_slots_of(const RecordBox& r) {
-    return tile_columns_of(r) * (r.y1 / kFrameTileHeight - r.y0 / kFrameTileHeight + 1u);
-}
 V3DG_HD inline uint32_t slot_of_tile(const RecordBox& r, uint32_t column, uint32_t row) {
     return (row - r.y0 / kFrameTileHeight) * tile_columns_of(r) + (column - r.x0 / kFrameTileWidth);
 }

@@ -80,6 +80,13 @@ constexpr int kPlanClasses = 64;  // of plans by load
 struct RecordBox {
     uint16_t x0, x1, y0, y1;
 };
+V3DG_HD inline uint32_t tile_columns_of(const RecordBox& r) {
+    return r.x1 / kFrameTileWidth - r.x0 / kFrameTileWidth + 1u;
+}
+V3DG_HD inline uint32_t tile_rows_of(const RecordBox& r) {
+    return r.y1 / kFrameTileHeight - r.y0 / kFrameTileHeight + 1u;
+}
+V3DG_HD inline uint32_t num_tiles_of(const RecordBox& r) { return tile_columns_of(r) * tile_rows_of(r); }
 
 // The records of a frame in three planes: a Record in the order of its fields.
 struct RecordPlanes {

@@ -187,6 +187,7 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
 }
 
 FrameLists Frame::lists(const FrameBatch& batch) const {
+    State* state = reinterpret_cast<State*>(cleared_.data());
     return {batch.images,
             image_of_tile_.data(),
             batch.num_tiles,
@@ -194,10 +195,10 @@ FrameLists Frame::lists(const FrameBatch& batch) const {
             tile_first_.data(),
             entries_.data(),
             reinterpret_cast<TileEntry*>(scratch_.data()),
-            &reinterpret_cast<State*>(cleared_.data())->counters,
+            &state->counters,
             capacity_,
             plans_.data(),
-            reinterpret_cast<State*>(cleared_.data())->plan_counts,
+            state->plan_counts,
             num_plans_,
             batch.min_transmittance};
 }

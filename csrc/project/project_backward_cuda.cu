@@ -69,7 +69,7 @@ __global__ void place_slots_kernel(ItemList items, const uint32_t* item_records,
     for (unsigned long long i = blockIdx.x; i < num_items; i += gridDim.x) {
         const uint32_t record = items.items[i].record + threadIdx.x;
         const bool is_record = threadIdx.x < item_records[i];
-        const uint32_t num = is_record ? num_slots_of(boxes[record]) : 0;
+        const uint32_t num = is_record ? num_tiles_of(boxes[record]) : 0;
         const uint32_t end = warp_prefix(num);
         if (lane == 31) sum_of_warp[warp] = end;
         __syncthreads();
@@ -139,7 +139,7 @@ __global__ void __launch_bounds__(kThreads, kDegree < 3 ? 4 : 3)
     }
     RecordGradient<float> d{};
     const bool used = sum_of_slots(slots, slots.slot, is_record ? slots.first[record] : 0,
-                                   is_record ? num_slots_of(in.records.box[record]) : 0, d);
+                                   is_record ? num_tiles_of(in.records.box[record]) : 0, d);
     if (used) {
         is_used[i - first] = true;
         const float center[2] = {d.ellipse.u, d.ellipse.v};
@@ -205,7 +205,7 @@ __global__ void __launch_bounds__(kThreads)
     const bool is_record = threadIdx.x < in.item_records[blockIdx.x];
     CenterSize<float> size{};
     if (sum_of_slots(slots, slots.size, is_record ? slots.first[record] : 0,
-                     is_record ? num_slots_of(in.records.box[record]) : 0, size))
+                     is_record ? num_tiles_of(in.records.box[record]) : 0, size))
         sizes[in.source[record]] = size;
 }
 

@@ -105,7 +105,7 @@ __device__ void store_word(T& to, uint32_t word) {
 
 // Of a large record the rows of tiles that one of `count` parts of a batch has; no record if it has none.
 __device__ LargeRecord part_of(LargeRecord large, int part, int count) {
-    const int top = large.box.y0 / kFrameTileHeight, rows = large.box.y1 / kFrameTileHeight - top + 1;
+    const int top = large.box.y0 / kFrameTileHeight, rows = static_cast<int>(tile_rows_of(large.box));
     const int first = rows * part / count, end = rows * (part + 1) / count;
     if (first == end) large.record = kNoRecord;
     if (first > 0) large.box.y0 = static_cast<uint16_t>((top + first) * kFrameTileHeight);
@@ -131,8 +131,7 @@ __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, co
         if (k < min(num_large, count)) {
             large.record = space.tables.item.record + space.large[k];
             large.box = space.boxes[k];
-            tiles = (large.box.x1 / kFrameTileWidth - large.box.x0 / kFrameTileWidth + 1) *
-                    (large.box.y1 / kFrameTileHeight - large.box.y0 / kFrameTileHeight + 1);
+            tiles = static_cast<int>(num_tiles_of(large.box));
         }
 #pragma unroll
         for (unsigned step = 1; step < kLargeAtOnce; step *= 2)

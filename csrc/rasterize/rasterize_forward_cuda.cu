@@ -480,12 +480,7 @@ __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileE
         __syncthreads();  // before the range is found again
         return false;
     }
-    for (int i = threadIdx.x; i < 1 << kLog2Spread; i += kSpreadThreads) s.bucket[i] = 0;
-    __syncthreads();
-    for_each_entry<kSpreadThreads>(from, 0, count,
-                                   [&](TileEntry e) { atomicAdd(&s.bucket[buckets.of(e.key)], 1u); });
-    __syncthreads();
-    scan_buckets<1 << kLog2Spread, kSpreadThreads>(s.bucket, s.warp_sum);
+    place_buckets<kSpreadThreads>(from, 0, count, buckets, s.bucket, s.warp_sum);
     const FinerBuckets finer = finer_buckets(buckets, s.bucket, count, kLog2Spread);
     spread<kSpreadThreads>(from, to, 0, count, finer, space.finer, s.warp_sum);
     const bool has_windows = !has_longer(space.finer, kWindow - kWindowEntries);

@@ -150,17 +150,24 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
     return buckets_over(range[0], range[1], log2_buckets, by_record);
 }
 
+// Counts entries [first, last) into buckets, and turns the counts into the place of each bucket's first.
+template <int kBlock, int kCount, class SomeBuckets>
+__device__ void place_buckets(const TileEntry* entries, uint32_t first, uint32_t last,
+                              const SomeBuckets& buckets, uint32_t (&bucket)[kCount], uint32_t* warp_sum) {
+    for (int i = threadIdx.x; i < kCount; i += kBlock) bucket[i] = 0;
+    __syncthreads();
+    for_each_entry<kBlock>(entries, first, last,
+                           [&](TileEntry e) { atomicAdd(&bucket[buckets.of(e.key)], 1u); });
+    __syncthreads();
+    scan_buckets<kCount, kBlock>(bucket, warp_sum);
+}
+
 // Spreads entries [first, last) into bucket order, from one place to another. In the end a bucket's counter
 // stands where the next one begins.
 template <int kBlock, int kCount, class SomeBuckets>
 __device__ void spread(const TileEntry* from, TileEntry* to, uint32_t first, uint32_t last,
                        const SomeBuckets& buckets, uint32_t (&bucket)[kCount], uint32_t* warp_sum) {
-    for (int i = threadIdx.x; i < kCount; i += kBlock) bucket[i] = 0;
-    __syncthreads();
-    for_each_entry<kBlock>(from, first, last,
-                           [&](TileEntry e) { atomicAdd(&bucket[buckets.of(e.key)], 1u); });
-    __syncthreads();
-    scan_buckets<kCount, kBlock>(bucket, warp_sum);
+    place_buckets<kBlock>(from, first, last, buckets, bucket, warp_sum);
     for_each_entry<kBlock>(from, first, last,
                            [&](TileEntry e) { to[first + atomicAdd(&bucket[buckets.of(e.key)], 1u)] = e; });
     __syncthreads();

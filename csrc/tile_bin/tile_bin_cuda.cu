@@ -36,8 +36,7 @@ struct LargePart {
 __device__ LargeBatch load_batch(const TileBinInput& in, unsigned long long first) {
     const LargeRecord mine = in.large[first + threadIdx.x % kLargeAtOnce];
     LargeBatch batch{mine.image, mine.record, mine.box, 0, 0};
-    if (mine.record != kNoRecord)
-        batch.rows = mine.box.y1 / kFrameTileHeight - mine.box.y0 / kFrameTileHeight + 1;
+    if (mine.record != kNoRecord) batch.rows = static_cast<int>(tile_rows_of(mine.box));
     batch.rows_after = warp_prefix<kLargeAtOnce>(batch.rows);
     return batch;
 }
@@ -158,32 +157,40 @@ struct Scatter {
     TileEntry* entries;
 };
 
+// The places of a warp's lanes in the lists of their tiles: lanes of one tile ask together.
+struct Places {
+    unsigned peers;
+    uint32_t left;  // of the first of the peers
+
+    // For a whole warp; kNoTile has none.
+    __device__ Places(const Scatter& to, uint32_t tile) : peers(__match_any_sync(kAllLanes, tile)), left(0) {
+        if (tile != kNoTile && threadIdx.x % 32 + 1 == unsigned(__ffs(peers)))
+            left = atomicSub(to.left + tile, unsigned(__popc(peers)));
+    }
+    // Of this lane, counted from where its tile's list begins; for a whole warp.
+    __device__ uint32_t own() const {
+        const uint32_t of_peers = __shfl_sync(kAllLanes, left, __ffs(peers) - 1);
+        return of_peers - 1 - __popc(peers & ((1u << threadIdx.x % 32) - 1));
+    }
+};
+
 // The lanes' records over few tiles, by a whole warp. Places are asked for two at a time, as each takes a
 // while to come.
 __device__ void scatter_few(const Scatter& to, const ItemTiles& item, uint32_t record, FewTiles few) {
-    const unsigned lane = threadIdx.x % 32;
     const EntryBox box = box_of(few);
     TileBox tiles = tile_box(box);
     if (few == kManyTiles) tiles.count = 0;
+    const auto tile_of = [&](unsigned k) {
+        return k < tiles.count ? item.first_tile + tiles.row(k) * item.columns + tiles.column(k) : kNoTile;
+    };
     for (unsigned k = 0; __any_sync(kAllLanes, k < tiles.count); k += 2) {
-        uint32_t tile[2], place[2];
-        unsigned peers[2];
+        const uint32_t tile[2] = {tile_of(k), tile_of(k + 1)};
+        const Places places[2] = {{to, tile[0]}, {to, tile[1]}};
 #pragma unroll
         for (unsigned j = 0; j < 2; ++j) {
-            tile[j] = k + j < tiles.count
-                          ? item.first_tile + tiles.row(k + j) * item.columns + tiles.column(k + j)
-                          : kNoTile;
-            peers[j] = __match_any_sync(kAllLanes, tile[j]);
-            place[j] = 0;
-            if (tile[j] != kNoTile && lane + 1 == unsigned(__ffs(peers[j])))
-                place[j] = atomicSub(to.left + tile[j], unsigned(__popc(peers[j])));
-        }
-#pragma unroll
-        for (unsigned j = 0; j < 2; ++j) {
-            const uint32_t left = __shfl_sync(kAllLanes, place[j], __ffs(peers[j]) - 1);
+            const uint32_t place = places[j].own();
             if (tile[j] == kNoTile) continue;
-            const unsigned before = __popc(peers[j] & ((1u << lane) - 1));
-            to.entries[to.tile_first[tile[j]] + (left - 1 - before)] =
+            to.entries[to.tile_first[tile[j]] + place] =
                 tile_entry(depth_of(few), record, box, tiles.column(k + j), tiles.row(k + j));
         }
     }
@@ -192,7 +199,6 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item, uint32_t r
 // A part of a batch of records over many tiles.
 __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const LargeBatch& batch,
                               const LargePart& part) {
-    const unsigned lane = threadIdx.x % 32;
     const FrameImage& image = in.images[batch.image];
     uint32_t record_of_row = 0, depth_of_row = 0;
     RecordBox blocks_of_row{};
@@ -210,13 +216,9 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
                            depth = __shfl_sync(kAllLanes, depth_of_row, from);
             const RecordBox box = box_of_lane(blocks_of_row, from);
             const uint32_t tile = column < 0 ? kNoTile : image.first_tile + row * image.tile_columns + column;
-            const unsigned peers = __match_any_sync(kAllLanes, tile);
-            const unsigned before = __popc(peers & ((1u << lane) - 1));
-            uint32_t left = 0;
-            if (tile != kNoTile && before == 0) left = atomicSub(to.left + tile, unsigned(__popc(peers)));
-            left = __shfl_sync(kAllLanes, left, __ffs(peers) - 1);
+            const uint32_t place = Places(to, tile).own();
             if (tile == kNoTile) return;
-            to.entries[to.tile_first[tile] + (left - 1 - before)] =
+            to.entries[to.tile_first[tile] + place] =
                 tile_entry(depth, record, {box.x0, box.x1, box.y0, box.y1}, column, row);
         });
 }
