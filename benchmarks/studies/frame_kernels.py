@@ -13,10 +13,8 @@ tell whether they draw the same bits.
 from __future__ import annotations
 
 import collections
-import hashlib
 import re
 import statistics
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +25,9 @@ import tyro
 import v3dg
 from benchmarks.evaluation import record
 from benchmarks.evaluation.assets import read_layout
+from benchmarks.evaluation.measure import times_ms
 from benchmarks.studies import peers_scenes as scenes
+from benchmarks.studies.two_versions import digest
 from benchmarks.worlds.procedural import make_asset
 from v3dg.cameras import Camera
 
@@ -115,13 +115,6 @@ def measure(frame: Frame) -> Row:
 
     for _ in range(_WARM_UPS):
         image, stats = draw()
-    times = []
-    for _ in range(_FRAMES):
-        torch.cuda.synchronize()
-        start = time.perf_counter()
-        draw()
-        torch.cuda.synchronize()
-        times.append(1e3 * (time.perf_counter() - start))
     with profile(activities=[ProfilerActivity.CUDA]) as profiled:
         for _ in range(_PROFILED):
             draw()
@@ -133,9 +126,9 @@ def measure(frame: Frame) -> Row:
     return {
         "frame": name,
         "gaussians_in_frustum": stats.gaussians_in_frustum,
-        "milliseconds": round(statistics.median(times), 4),
+        "milliseconds": round(statistics.median(times_ms(draw, "cuda", _FRAMES)), 4),
         "kernels": {kernel: round(ms, 4) for kernel, ms in kernels.most_common()},
-        "digest": hashlib.blake2b(image.color.cpu().numpy().tobytes(), digest_size=4).hexdigest(),
+        "digest": digest(image.color),
     }
 
 
