@@ -78,14 +78,18 @@ V3DG_HD V3DG_INLINE void sh_bases_vjp(int degree, V x, V y, V z, const V g[kMaxS
 }
 
 // Colour in a direction of any length, from the eye to the gaussian in model space; what is not finite is 0,
-// so that it stays off pixels on which the gaussian has no weight. `sh` holds the coefficients of one
-// gaussian (or of one a lane), base by base, three channels each.
-template <class V>
-V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* sh, V color[3]) {
+// so that it stays off pixels on which the gaussian has no weight. `sh(k)` is the k-th coefficient of one
+// gaussian (or of one a lane), base by base, three channels each; it is asked for each once, in this order.
+template <class V, class Coefficient>
+V3DG_HD V3DG_INLINE void color_of_coefficients(int degree, const V direction[3], const Coefficient& sh,
+                                               V color[3]) {
     using L = Lane<V>;
+    const V most = all_lanes<V>(kInfinite<L>);
     if (degree == kPlainColor) {
-        const V most = all_lanes<V>(kInfinite<L>);
-        for (int c = 0; c < 3; ++c) color[c] = (sh[c] < most) & (sh[c] > -most) ? sh[c] : V{};
+        for (int c = 0; c < 3; ++c) {
+            const V x = sh(c);
+            color[c] = (x < most) & (x > -most) ? x : V{};
+        }
         return;
     }
     V basis[kMaxShBases];
@@ -96,12 +100,20 @@ V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* 
         for (int i = 0; i < 3; ++i) dir[i] *= inv;
     }
     sh_bases(degree, dir[0], dir[1], dir[2], basis);
+    const V half = all_lanes<V>(L(0.5));
+    V sum[3] = {half, half, half};
+    for (int b = 0; b < num_sh_bases(degree); ++b)
+        for (int c = 0; c < 3; ++c) sum[c] += basis[b] * sh(3 * b + c);
     for (int c = 0; c < 3; ++c) {
-        V sum = all_lanes<V>(L(0.5));
-        for (int b = 0; b < num_sh_bases(degree); ++b) sum += basis[b] * sh[3 * b + c];
-        sum = max_of(sum, V{});
-        color[c] = sum < all_lanes<V>(kInfinite<L>) ? sum : V{};
+        sum[c] = max_of(sum[c], V{});
+        color[c] = sum[c] < most ? sum[c] : V{};
     }
+}
+
+// The same of coefficients in memory.
+template <class V>
+V3DG_HD V3DG_INLINE void color_of_sh(int degree, const V direction[3], const V* sh, V color[3]) {
+    color_of_coefficients(degree, direction, [&](int k) { return sh[k]; }, color);
 }
 
 // Adds to `d_direction` and sets `d_sh` from the gradient of the colour. `d_sh` may be `sh` itself.

@@ -30,25 +30,20 @@ __device__ void color_of(const float* sh, const float mean[3], const ModelView<f
     color_of_sh(kDegree, direction, sh, color);
 }
 
+// The coefficients are loaded as they are used: all at once are more than there are registers.
 template <int kDegree>
 __device__ void color_of_row(const float* row, const float mean[3], const ModelView<float>& view,
                              float color[3]) {
     constexpr int kSize = 3 * num_sh_bases(kDegree);
-    float sh[kSize];
-    if constexpr (kSize % 4 == 0) {
-#pragma unroll
-        for (int k = 0; k < kSize; k += 4) {
-            const float4 x = load4(row, k / 4);
-            sh[k] = x.x;
-            sh[k + 1] = x.y;
-            sh[k + 2] = x.z;
-            sh[k + 3] = x.w;
-        }
-    } else {
-#pragma unroll
-        for (int k = 0; k < kSize; ++k) sh[k] = __ldg(row + k);
-    }
-    color_of<kDegree>(sh, mean, view, color);
+    float direction[3];
+    from_eye(view, mean, direction);
+    float4 four{};
+    const auto coefficient = [&](int k) {
+        if (kSize % 4 != 0) return __ldg(row + k);
+        if (k % 4 == 0) four = load4(row, k / 4);
+        return k % 4 == 0 ? four.x : k % 4 == 1 ? four.y : k % 4 == 2 ? four.z : four.w;
+    };
+    color_of_coefficients(kDegree, direction, coefficient, color);
 }
 
 // A source tells what a gaussian is, in steps, because most reach no pixel centre: a lane fetch()es what the
