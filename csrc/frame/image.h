@@ -60,7 +60,7 @@ struct PictureGradient {
 
 namespace cuda {
 
-// A block blends one tile, a warp 8 x 4 of its pixels.
+// A block blends one tile, a warp a part of four rows of it.
 constexpr int kFrameTileWidth = 32, kFrameTileHeight = 16;
 // Where a picture is, as Picture<float> has it. It may be asked for after the first stages of a frame are
 // enqueued.

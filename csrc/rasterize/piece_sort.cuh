@@ -23,9 +23,14 @@ constexpr int kBlendBatch = 128;                         // records blended at o
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
 
-// The pixels that a warp blends at a time, and how many of them a tile has.
-constexpr int kSubWidth = 8, kSubHeight = 4, kSubColumns = kFrameTileWidth / kSubWidth;
-constexpr int kSubs = kSubColumns * kFrameTileHeight / kSubHeight;
+// The pixels that a warp blends at a time, kPixels of a row a lane.
+template <int kPixels>
+struct SubTile {
+    static constexpr int kWidth = 8 * kPixels, kHeight = 4, kColumns = kFrameTileWidth / kWidth;
+    static constexpr int kCount = kColumns * kFrameTileHeight / kHeight;  // of a tile
+    static constexpr int kBlocks = kWidth / kEntryBlockSize;              // of a tile's, side by side
+};
+constexpr int kTilePixels = kFrameTileWidth * kFrameTileHeight;
 
 static_assert(2 * kFewEntries <= kBlendThreads, "two threads rank an entry");
 
@@ -43,11 +48,12 @@ struct ListWindow {
     uint32_t end;  // the first entry that is beyond
 };
 
-// State of a tile's pixels, sub-tile by sub-tile.
+// State of a tile's pixels, of 8 x 4 after each other. Of those with odd columns the upper and lower halves
+// are exchanged: the pixels of half a warp lie in different banks then, with one of them a lane and with two.
 struct TilePixels {
-    float transmittance[kSubs][32];
-    float color[3][kSubs][32];
-    float depth[kSubs][32];  // sum of weight * depth
+    alignas(float2) float transmittance[kTilePixels];
+    alignas(float2) float color[3][kTilePixels];
+    alignas(float2) float depth[kTilePixels];  // sum of weight * depth
 };
 
 struct BlendShared {
@@ -63,12 +69,14 @@ struct BlendShared {
     };
     uint16_t sorted[kPiece];       // places in `key`
     uint32_t blocks[kBlendBatch];  // live ones that the batch's records may reach
-    // Of the batch, those that may reach the sub-tile of a warp: where they begin in a vector of `record`.
+    // Of the batch, those that may reach the sub-tile of a warp: where they begin in shared memory, from the
+    // last place on backwards. The first place is read ahead only.
     uint32_t list[kBlendWarps][kBlendBatch + 1];
     TilePixels pixels;
-    uint32_t alive_blocks;  // as blocks_of(TileEntry)
-    uint32_t reached[2];    // by some record of the batch, in turn
-    uint32_t subs_taken;    // of those reached
+    uint32_t alive_blocks;    // as blocks_of(TileEntry)
+    uint32_t reached[2];      // by some record of the batch, in turn
+    uint32_t num_covered[2];  // the same counted once for each record, in turn
+    uint32_t subs_taken;      // of those reached
     ListWindow window[3];
     uint32_t lowest, highest;  // depths of the piece
     uint32_t crowded;          // of some of its entries, those with many in their bucket

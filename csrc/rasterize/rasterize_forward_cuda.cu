@@ -1,4 +1,4 @@
-// A block blends a tile, front to back; its warps take the tile's sub-tiles of 8 x 4 pixels in turn.
+// A block blends a tile, front to back; its warps take the tile's sub-tiles in turn.
 //
 // Lists are sorted piece by piece, nearest first. Entries over pixels that have all stopped by then are
 // dropped unsorted, and their records are never fetched. A list that does not fit into a piece is first
@@ -6,9 +6,11 @@
 // spread again. A list with far more than its share of a frame's entries is blended in parts of the tile,
 // side by side.
 //
-// Most gaussians cover a pixel or two. So a warp takes 32 records that may reach its sub-tile, each lane
-// finds which pixels one of them reaches, and the bits are transposed: a pixel then walks its own records
-// only.
+// Many gaussians cover a few pixels. So a warp takes 32 records that may reach its sub-tile, each lane finds
+// which pixels one of them reaches, and the bits are transposed: a pixel then walks its own records only.
+// Where gaussians cover many pixels, a lane has two neighbours, which share most of their records and what is
+// loaded and computed for a row; a sub-tile has 16 x 4 pixels then, else 8 x 4. Either way a pixel gets the
+// same bits.
 
 #include "rasterize/rasterize_cuda.h"
 
@@ -26,11 +28,14 @@ constexpr int kLog2Spread = 11;    // buckets of a list, at most
 constexpr int kPlanThreads = 256;  // a thread a tile
 constexpr int kSpreadThreads = 1024;
 constexpr int kMostParts = 4;  // of a tile
+// Blocks a record of a batch, on average, from which two pixels a lane are quicker. Measured: 4, 7 and 10
+// differ by a hundredth.
+constexpr int kBlocksForPairs = 5;
 
-static_assert(kSubWidth == 8 && kSubHeight == 4, "the window of reached_pixels");
 static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
               "kPiece / kMostParts begins a class of plan_kernel");
-static_assert(kEntryBlockSize == kSubHeight && 2 * kEntryBlockSize == kSubWidth, "a sub-tile is two blocks");
+static_assert(SubTile<2>::kColumns == 2 && SubTile<2>::kHeight == 4 && kEntryBlockSize == 4,
+              "place_of(), subs_of(), publish_alive() and reached_cells() know this");
 
 // Copies 16 or 8 bytes from device to shared memory; they are there once the thread has waited.
 __device__ void copy_async(float4* shared, const float4* from) {
@@ -59,27 +64,86 @@ __device__ void wait_for_copies() {
 #endif
 }
 
-// Of a sub-tile's two among the tile's blocks.
-__device__ int blocks_place(int sub) { return 8 * (sub / kSubColumns) + 2 * (sub % kSubColumns); }
-
 // A part of a tile: the whole, its left or right half, or a quarter. A bit for each of its blocks.
 __device__ uint32_t blocks_of_part(int part, int log2_parts) {
     if (log2_parts == 0) return ~0u;
     return (log2_parts == 1 ? 0x0f0f0f0fu : 0x0f0fu) << (4 * (part & 1) + 16 * (part >> 1));
 }
 
-struct BlendedPixel {
-    float x, y;  // of the centre
-    float transmittance;
-    float color[3];
-    float depth;
+// What a lane has of a sub-tile.
+template <int kPixels>
+struct BlendedPixels {
+    float x[kPixels], y;  // of the centres
+    float transmittance[kPixels];
+    float color[3][kPixels];
+    float depth[kPixels];
 };
 
+// Where a lane's first pixel is in TilePixels.
+template <int kPixels>
+__device__ int place_of(int sub, int lane) {
+    if (kPixels == 1) return 32 * sub + (lane ^ (16 * (sub % 2)));
+    const int column = lane / 4 % 2;
+    return 64 * sub + 32 * column + ((8 * (lane / 8) + 2 * (lane % 4)) ^ (16 * column));
+}
+__device__ void load(const float* from, float (&to)[1]) { to[0] = *from; }
+__device__ void load(const float* from, float (&to)[2]) {
+    const float2 both = *reinterpret_cast<const float2*>(from);
+    to[0] = both.x, to[1] = both.y;
+}
+__device__ void store(const float (&from)[1], float* to) { *to = from[0]; }
+__device__ void store(const float (&from)[2], float* to) {
+    *reinterpret_cast<float2*>(to) = {from[0], from[1]};
+}
+
+// Vectors of the record that begins at a place in shared memory. No clobber keeps these loads behind plain
+// stores: records are written by copy_async() only, which is waited for.
+template <int kVector>
+__device__ float4 vector_at(uint32_t place) {
+    float4 v{};
+#ifdef __CUDA_ARCH__
+    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4 + %5];"
+                 : "=f"(v.x), "=f"(v.y), "=f"(v.z), "=f"(v.w)
+                 : "r"(place), "n"(kVector * int(sizeof(float4)) * kBlendBatch));
+#endif
+    return v;
+}
+__device__ float2 rest_at(uint32_t place) {
+    float2 v{};
+#ifdef __CUDA_ARCH__
+    asm volatile("ld.shared.v2.f32 {%0, %1}, [%2 + %3];"
+                 : "=f"(v.x), "=f"(v.y)
+                 : "r"(place), "n"(kEllipseVectors * int(sizeof(float4)) * kBlendBatch));
+#endif
+    return v;
+}
+
+// Of a sub-tile's among the tile's blocks, a bit each.
+template <int kPixels>
+__device__ uint32_t blocks_of_sub(int sub) {
+    return ((1u << SubTile<kPixels>::kBlocks) - 1) << SubTile<kPixels>::kBlocks * sub;
+}
+
+// The sub-tiles that have one of the blocks, a bit each, where the first of its blocks is.
+template <int kPixels>
+__device__ uint32_t subs_of(uint32_t blocks) {
+    blocks |= blocks >> 1;
+    return kPixels == 1 ? blocks & 0x55555555u : (blocks | blocks >> 2) & 0x11111111u;
+}
+
 // Tells the block which blocks of a sub-tile have died.
+template <int kPixels>
 __device__ void publish_alive(bool is_alive, int sub, BlendShared& s) {
+    constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes of a block in a row
     const uint32_t alive = __ballot_sync(kAllLanes, is_alive);
-    const uint32_t dead = ((alive & 0x0f0f0f0fu) == 0) | ((alive & 0xf0f0f0f0u) == 0) << 1;
-    if (dead != 0 && threadIdx.x % 32 == 0) atomicAnd(&s.alive_blocks, ~(dead << blocks_place(sub)));
+    uint32_t dead = 0;
+#pragma unroll
+    for (int block = 0; block < SubTile<kPixels>::kBlocks; ++block) {
+        const uint32_t lanes = ((1u << kAcross) - 1) * 0x01010101u << kAcross * block;
+        dead |= ((alive & lanes) == 0) << block;
+    }
+    if (dead != 0 && threadIdx.x % 32 == 0)
+        atomicAnd(&s.alive_blocks, ~(dead << SubTile<kPixels>::kBlocks * sub));
 }
 
 // Bit j of lane i becomes bit i of lane j.
@@ -101,72 +165,108 @@ __device__ uint32_t transpose_bits(uint32_t bits) {
 }
 
 // A warp blends the batch, of `num_groups` times 32 records, over a sub-tile.
-template <bool kWithDepth, class Stop>
+template <int kPixels, bool kWithDepth, class Stop>
 __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop, BlendShared& s) {
-    const int lane = threadIdx.x % 32;
-    uint32_t* list = s.list[threadIdx.x / 32];
-    const uint32_t own_blocks = 3u << blocks_place(sub);
+    int lane = threadIdx.x % 32;
+    // Hidden from the compiler, which would keep what follows from the lane in registers from batch to batch
+    // and spill others.
+    asm volatile("" : "+r"(lane));
+    uint32_t* list = s.list[threadIdx.x / 32] + kBlendBatch;  // from its end to its begin
+    const uint32_t own_blocks = blocks_of_sub<kPixels>(sub);
     int listed = 0;
     for (int g = 0; g < num_groups; ++g) {
         const bool reaches = (s.blocks[32 * g + lane] & own_blocks) != 0;
         const uint32_t reaching = __ballot_sync(kAllLanes, reaches);
         if (reaches)
-            list[listed + __popc(reaching & ((1u << lane) - 1))] =
-                static_cast<uint32_t>(sizeof(float4)) * (32 * g + lane);
+            *(list - listed - __popc(reaching & ((1u << lane) - 1))) =
+                static_cast<uint32_t>(__cvta_generic_to_shared(&s.record[0][32 * g + lane]));
         listed += __popc(reaching);
     }
     __syncwarp();
 
-    const float corner_x = left + sub % kSubColumns * kSubWidth + 0.5f;
-    const float corner_y = top + sub / kSubColumns * kSubHeight + 0.5f;
+    using Sub = SubTile<kPixels>;
+    const float corner_x = left + sub % Sub::kColumns * Sub::kWidth + 0.5f;
+    const float corner_y = top + sub / Sub::kColumns * Sub::kHeight + 0.5f;
     TilePixels& pixels = s.pixels;
-    BlendedPixel p;
-    p.x = corner_x + static_cast<float>(lane % kSubWidth);
-    p.y = corner_y + static_cast<float>(lane / kSubWidth);
-    p.transmittance = pixels.transmittance[sub][lane];
-    for (int c = 0; c < 3; ++c) p.color[c] = pixels.color[c][sub][lane];
-    if (kWithDepth) p.depth = pixels.depth[sub][lane];
-    bool alive = p.transmittance > 0;
+    const int place = place_of<kPixels>(sub, lane);
+    BlendedPixels<kPixels> p;
+    for (int k = 0; k < kPixels; ++k) p.x[k] = corner_x + static_cast<float>(kPixels * (lane % 8) + k);
+    p.y = corner_y + static_cast<float>(lane / 8);
+    load(pixels.transmittance + place, p.transmittance);
+    for (int c = 0; c < 3; ++c) load(pixels.color[c] + place, p.color[c]);
+    if (kWithDepth) load(pixels.depth + place, p.depth);
+    // Of two pixels, all gaussians are infinitely far from the one that has stopped.
+    const float kNowhere = __int_as_float(0x7f800000);
+    bool alive = false;
+    for (int k = 0; k < kPixels; ++k) {
+        if (p.transmittance[k] > 0)
+            alive = true;
+        else
+            p.x[k] = kNowhere;
+    }
     // A record is used as its vectors (frame/record.cuh) here: taken apart first, nvcc rounds the falloff
-    // otherwise, and pictures would change in their last bits.
-    const auto vector = [&](int k, uint32_t offset) -> const float4& {
-        return *reinterpret_cast<const float4*>(reinterpret_cast<const unsigned char*>(s.record[k]) + offset);
-    };
-    for (int first = 0; first < listed; first += 32) {
-        // The last lane takes the first record, which becomes the highest bit of a pixel.
-        const uint32_t* last_of_group = list + first + 31;
+    // otherwise than for the other number of pixels, and in the backward pass.
+    // The last lane takes the first record of a group, which becomes the highest bit of a lane's pixels.
+    const uint32_t* last_of_group = list - 31;
+    for (; listed > 0; listed -= 32, last_of_group -= 32) {
         uint32_t bits = 0;
-        if (first + 31 - lane < listed) {
-            const uint32_t own = last_of_group[-lane];
-            const float4 a = vector(0, own), b = vector(1, own);
-            bits = reached_pixels(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
+        if (31 - lane < listed) {
+            const uint32_t own = last_of_group[lane];
+            const float4 a = vector_at<0>(own), b = vector_at<1>(own);
+            bits = reached_cells<kPixels>(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
         }
         bits = transpose_bits(bits);
         if (!alive) bits = 0;
         // Where the next record begins is looked up ahead; after the last one it means nothing.
         int highest = 31 - __clz(static_cast<int>(bits));
-        uint32_t next = last_of_group[-highest];
+        uint32_t next = last_of_group[highest];
         while (bits != 0) {
-            const float4 a = vector(0, next), b = vector(1, next), c = vector(2, next);
+            const float4 a = vector_at<0>(next), b = vector_at<1>(next);
+            const float2 c = rest_at(next);
             bits ^= __funnelshift_l(0u, 1u, highest);  // 1 << highest, without a register for the 1
             highest = 31 - __clz(static_cast<int>(bits));
-            next = last_of_group[-highest];
-            const Falloff<float> f = falloff_at(p.x, p.y, a.x, a.y, a.z, a.w, b.x, b.y);
-            float weight;
-            alive = blend_live(alpha_of(f), p.transmittance, weight, stop);
-            p.color[0] += weight * b.z;
-            p.color[1] += weight * b.w;
-            p.color[2] += weight * c.x;
-            if (kWithDepth) p.depth += weight * c.y;
+            next = last_of_group[highest];
+            alive = false;
+#pragma unroll
+            for (int k = 0; k < kPixels; ++k) {
+                const Falloff<float> f = falloff_at(p.x[k], p.y, a.x, a.y, a.z, a.w, b.x, b.y);
+                float weight;
+                const bool goes_on = blend_live(alpha_of(f), p.transmittance[k], weight, stop);
+                if (kPixels > 1 && !goes_on) p.x[k] = kNowhere;
+                alive |= goes_on;
+                p.color[0][k] += weight * b.z;
+                p.color[1][k] += weight * b.w;
+                p.color[2][k] += weight * c.x;
+                if (kWithDepth) p.depth[k] += weight * c.y;
+            }
             if (!alive) bits = 0;
         }
+        // With StopsBefore one of two pixels that has stopped seems to go on: it is left with more light than
+        // a pixel stops at. So lanes of which both have stopped may walk up to here.
+        if (kPixels > 1) alive = p.x[0] != kNowhere || p.x[kPixels - 1] != kNowhere;
         __syncwarp();
     }
-    if (!alive) p.transmittance = -fabsf(p.transmittance);
-    pixels.transmittance[sub][lane] = p.transmittance;
-    for (int c = 0; c < 3; ++c) pixels.color[c][sub][lane] = p.color[c];
-    if (kWithDepth) pixels.depth[sub][lane] = p.depth;
-    publish_alive(alive, sub, s);
+    for (int k = 0; k < kPixels; ++k)
+        if (kPixels > 1 ? p.x[k] == kNowhere : !alive) p.transmittance[k] = -fabsf(p.transmittance[k]);
+    store(p.transmittance, pixels.transmittance + place);
+    for (int c = 0; c < 3; ++c) store(p.color[c], pixels.color[c] + place);
+    if (kWithDepth) store(p.depth, pixels.depth + place);
+    publish_alive<kPixels>(alive, sub, s);
+}
+
+// The block blends the batch over the sub-tiles that have one of the blocks `reached`.
+template <int kPixels, bool kWithDepth, class Stop>
+__device__ void blend_batch(uint32_t reached, int num_groups, int left, int top, Stop stop, BlendShared& s) {
+    uint32_t subs = subs_of<kPixels>(reached);
+    uint32_t taken = threadIdx.x / 32;  // the first ones are given, the others to whoever is done
+    for (uint32_t passed = 0;;) {
+        for (; passed < taken; ++passed) subs &= subs - 1;
+        if (subs == 0) break;
+        blend_sub<kPixels, kWithDepth>((__ffs(subs) - 1) / SubTile<kPixels>::kBlocks, num_groups, left, top,
+                                       stop, s);
+        if (threadIdx.x % 32 == 0) taken = kBlendWarps + atomicAdd(&s.subs_taken, 1u);
+        taken = __shfl_sync(kAllLanes, taken, 0);
+    }
 }
 
 // Blends the sorted piece.
@@ -174,7 +274,7 @@ template <bool kWithDepth, class Stop>
 __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int left, int top, Stop stop,
                             BlendShared& s) {
     for (uint32_t first = 0; first < count && s.alive_blocks != 0; first += kBlendBatch) {
-        uint32_t* reached = &s.reached[first / kBlendBatch % 2];
+        const uint32_t turn = first / kBlendBatch % 2;
         for (uint32_t i = threadIdx.x; i < kBlendBatch; i += kBlendThreads) {
             uint32_t blocks = 0;
             if (first + i < count) {
@@ -188,27 +288,29 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
                 }
             }
             s.blocks[i] = blocks;
+            const uint32_t num_covered = __reduce_add_sync(kAllLanes, __popc(blocks));
             blocks = __reduce_or_sync(kAllLanes, blocks);
-            if (threadIdx.x % 32 == 0 && blocks != 0) atomicOr(reached, blocks);
+            if (threadIdx.x % 32 == 0 && blocks != 0) {
+                atomicOr(&s.reached[turn], blocks);
+                atomicAdd(&s.num_covered[turn], num_covered);
+            }
         }
         if (threadIdx.x == 0) s.subs_taken = 0;
         wait_for_copies();
         __syncthreads();
-        if (threadIdx.x == 0) s.reached[(first / kBlendBatch + 1) % 2] = 0;
-        const int num_groups = (min(count - first, static_cast<uint32_t>(kBlendBatch)) + 31) / 32;
-        // A bit for each sub-tile that is reached, where the first of its blocks is.
-        uint32_t subs = (*reached | *reached >> 1) & 0x55555555u;
-        uint32_t taken = threadIdx.x / 32;  // the first ones are given, the others to whoever is done
-        for (uint32_t passed = 0;;) {
-            for (; passed < taken; ++passed) subs &= subs - 1;
-            if (subs == 0) break;
-            blend_sub<kWithDepth>((__ffs(subs) - 1) / 2, num_groups, left, top, stop, s);
-            if (threadIdx.x % 32 == 0) taken = kBlendWarps + atomicAdd(&s.subs_taken, 1u);
-            taken = __shfl_sync(kAllLanes, taken, 0);
-        }
+        if (threadIdx.x == 0) s.reached[turn ^ 1] = s.num_covered[turn ^ 1] = 0;
+        const int num_records = min(count - first, static_cast<uint32_t>(kBlendBatch));
+        const int num_groups = (num_records + 31) / 32;
+        const uint32_t reached = s.reached[turn];
+        // Fewer sub-tiles than warps would leave some without work.
+        if (s.num_covered[turn] >= kBlocksForPairs * num_records &&
+            __popc(subs_of<2>(reached)) >= kBlendWarps)
+            blend_batch<2, kWithDepth>(reached, num_groups, left, top, stop, s);
+        else
+            blend_batch<1, kWithDepth>(reached, num_groups, left, top, stop, s);
         __syncthreads();
     }
-    if (threadIdx.x < 2) s.reached[threadIdx.x] = 0;
+    if (threadIdx.x < 2) s.reached[threadIdx.x] = s.num_covered[threadIdx.x] = 0;
 }
 
 // Blends the list of a tile. Returns how many of its entries were not dropped. Of a list in windows, which
@@ -292,12 +394,13 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     const int left = in_image % image.tile_columns * kFrameTileWidth;
     const int top = in_image / image.tile_columns * kFrameTileHeight;
     const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-    // A thread begins and ends one pixel of each sub-tile that it takes.
-    const auto for_each_pixel = [&](const auto& visit) {
-        for (int sub = warp; sub < kSubs; sub += kBlendWarps)
-            if ((own_blocks >> blocks_place(sub) & 1) != 0)
-                visit(sub, left + sub % kSubColumns * kSubWidth + lane % kSubWidth,
-                      top + sub / kSubColumns * kSubHeight + lane / kSubWidth);
+    // A thread begins and ends one pair of pixels of each sub-tile that it takes.
+    using Sub = SubTile<2>;
+    const auto for_each_pair = [&](const auto& visit) {
+        for (int sub = warp; sub < Sub::kCount; sub += kBlendWarps)
+            if ((own_blocks & blocks_of_sub<2>(sub)) != 0)
+                visit(sub, place_of<2>(sub, lane), left + sub % Sub::kColumns * Sub::kWidth + 2 * (lane % 8),
+                      top + sub / Sub::kColumns * Sub::kHeight + lane / 8);
     };
 
     if (threadIdx.x == 0) {
@@ -306,15 +409,16 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
         s.lowest = ~0u;
         s.highest = 0;
         s.crowded = 0;
-        s.reached[0] = s.reached[1] = 0;
+        s.reached[0] = s.reached[1] = s.num_covered[0] = s.num_covered[1] = 0;
     }
     __syncthreads();
-    for_each_pixel([&](int sub, int x, int y) {
-        const bool inside = x < image.width && y < image.height;
-        s.pixels.transmittance[sub][lane] = inside ? 1.0f : -1.0f;
-        for (int c = 0; c < 3; ++c) s.pixels.color[c][sub][lane] = 0.0f;
-        if (kWithDepth) s.pixels.depth[sub][lane] = 0.0f;
-        publish_alive(inside, sub, s);
+    for_each_pair([&](int sub, int place, int x, int y) {
+        for (int k = 0; k < 2; ++k) {
+            s.pixels.transmittance[place + k] = x + k < image.width && y < image.height ? 1.0f : -1.0f;
+            for (int c = 0; c < 3; ++c) s.pixels.color[c][place + k] = 0.0f;
+            if (kWithDepth) s.pixels.depth[place + k] = 0.0f;
+        }
+        publish_alive<2>(x < image.width && y < image.height, sub, s);
     });
     __syncthreads();
 
@@ -328,16 +432,18 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
     if (tape.blended != nullptr && threadIdx.x == 0) tape.blended[tile] = blended;
 
     const PicturePlanes& planes = planes_of(lists, image);
-    for_each_pixel([&](int sub, int x, int y) {
-        if (x >= image.width || y >= image.height) return;
-        const size_t out = static_cast<size_t>(y) * image.width + x;
-        const Finished<float> of = finished(s.pixels.transmittance[sub][lane], lists.min_transmittance);
-        const float alpha = 1 - of.transmittance;
-        for (int c = 0; c < 3; ++c)
-            planes.color[3 * out + c] =
-                of.gain * s.pixels.color[c][sub][lane] + of.transmittance * image.background[c];
-        planes.alpha[out] = alpha;
-        if (kWithDepth) planes.depth[out] = alpha > 0 ? of.gain * s.pixels.depth[sub][lane] / alpha : 0.0f;
+    for_each_pair([&](int, int place, int x, int y) {
+        for (int k = 0; k < 2 && x + k < image.width && y < image.height; ++k) {
+            const size_t out = static_cast<size_t>(y) * image.width + x + k;
+            const Finished<float> of = finished(s.pixels.transmittance[place + k], lists.min_transmittance);
+            const float alpha = 1 - of.transmittance;
+            for (int c = 0; c < 3; ++c)
+                planes.color[3 * out + c] =
+                    of.gain * s.pixels.color[c][place + k] + of.transmittance * image.background[c];
+            planes.alpha[out] = alpha;
+            if (kWithDepth)
+                planes.depth[out] = alpha > 0 ? of.gain * s.pixels.depth[place + k] / alpha : 0.0f;
+        }
     });
 }
 

@@ -25,7 +25,7 @@ V3DG_HD V3DG_INLINE Falloff<V> falloff_at(V x, V y, V u, V v, V l11, V l12, V l2
     f.dy = y - v;
     f.t1 = l11 * f.dx + l12 * f.dy;
     f.t2 = l22 * f.dy;
-    f.exponent = log2_opacity - (f.t1 * f.t1 + f.t2 * f.t2);
+    f.exponent = log2_opacity - f.t2 * f.t2 - f.t1 * f.t1;  // pixels of a row share all but the last term
     return f;
 }
 
@@ -41,10 +41,19 @@ V3DG_HD V3DG_INLINE V alpha_of(const Falloff<V>& f) {
     return contributes(f) ? alpha : V{};
 }
 
+template <class V>
+V3DG_HD V3DG_INLINE V transmittance_behind(V alpha, V t) {
+#ifdef __CUDA_ARCH__
+    return fma(-alpha, t, t);  // one operation, which is not left to the compiler: t - (alpha t) cancels
+#else
+    return t * (1 - alpha);
+#endif
+}
+
 // Blends over a pixel with transmittance `t`, updates it and returns the gaussian's weight.
 template <class V>
 V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBehind<Lane<V>> stop) {
-    const V next = t * (1 - alpha);
+    const V next = transmittance_behind(alpha, t);
     const auto is_live = t > V{};
     const V weight = is_live ? alpha * t : V{};
     const V behind = next > all_lanes<V>(stop.transmittance) ? next : -next;
@@ -53,7 +62,7 @@ V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBehind<Lane<V>> stop) {
 }
 template <class V>
 V3DG_HD V3DG_INLINE V blend_weight(V alpha, V& t, StopsBefore = {}) {
-    const V next = t * (1 - alpha);
+    const V next = transmittance_behind(alpha, t);
     const auto goes_on = next > all_lanes<V>(Lane<V>(kMinTransmittance));
     const V weight = goes_on ? alpha * t : V{};
     t = goes_on ? next : min_of(t, -t);
@@ -82,7 +91,7 @@ V3DG_HD V3DG_INLINE void blend_weights(const T (&alpha)[kCount], T& t, T (&befor
     for (int i = 0; i < kCount; ++i) {
         before[i] = next;
         weight[i] = alpha[i] * next;
-        next = next * (1 - alpha[i]);
+        next = transmittance_behind(alpha[i], next);
     }
     if (next > T(kMinTransmittance)) {
         t = next;
@@ -162,40 +171,44 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
 // blend_weight() for a single pixel that has not stopped. Returns whether it goes on; `t` stays positive.
 V3DG_HD inline bool blend_live(float alpha, float& t, float& weight, StopsBehind<float> stop) {
     weight = alpha * t;
-    t *= 1 - alpha;
+    t = transmittance_behind(alpha, t);
     return t > stop.transmittance;
 }
 V3DG_HD inline bool blend_live(float alpha, float& t, float& weight, StopsBefore = {}) {
-    const float next = t * (1 - alpha);
+    const float next = transmittance_behind(alpha, t);
     const bool goes_on = next > static_cast<float>(kMinTransmittance);
     weight = goes_on ? alpha * t : 0.0f;
     t = goes_on ? next : t;
     return goes_on;
 }
 
-// The pixels of an 8 x 4 window that a gaussian may reach, a bit each, row by row; (u, v) is its centre from
-// that of the first pixel. It has a margin, so that the blend step alone decides.
-V3DG_HD inline uint32_t reached_pixels(float u, float v, float l11, float l12, float l22,
-                                       float log2_opacity) {
+// A window of 8 x 4 cells, each of kPixels side by side: the cells in which a gaussian may reach a pixel, a
+// bit each, row by row. (u, v) is its centre from that of the first pixel. Both axes have a margin, so that
+// the blend step alone decides.
+template <int kPixels>
+V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, float l22, float log2_opacity) {
     // In x, 1 is the width of the window, so that saturation cuts off what lies outside.
-    constexpr float kEighth = 0.125f, kMargin = 1e-2f;
-    const float reach = log2_opacity - static_cast<float>(kLog2MinAlpha);
-    const float inverse = kEighth * rough_reciprocal(l11), slope = -l12 * inverse,
+    constexpr float kScale = 0.125f / kPixels, kMargin = 1e-2f, kReachMargin = 1e-5f;
+    const float reach = log2_opacity - static_cast<float>(kLog2MinAlpha) + kReachMargin;
+    const float inverse = kScale * rough_reciprocal(l11), slope = -l12 * inverse,
                 wider = inverse * (1 + 2e-3f);
-    // Half a pixel is added, because both are rounded to the nearest integer.
-    const float first_u = kEighth * u + kEighth * (0.5f - kMargin),
-                end_u = kEighth * u + kEighth * (0.5f + kMargin);
-    uint32_t pixels = 0;
+    // The first cell is the first of which the last pixel is not before the ellipse, and the end is behind
+    // the last of which the first pixel is not behind it. Half a cell is added, as both are rounded to
+    // integers.
+    const float first_u = kScale * u + kScale * (1 - 0.5f * kPixels - kMargin),
+                end_u = kScale * u + kScale * (0.5f * kPixels + kMargin);
+    uint32_t cells = 0;
     for (int row = 0; row < 4; ++row) {
         const float y = static_cast<float>(row) - v, t = l22 * y;
-        const float half = rough_sqrt(max_of(reach - t * t, 0.0f)) * wider;
+        // Where the row is missed it is not a number, which saturates to 0.
+        const float half = rough_sqrt(reach - t * t) * wider;
         const float first = saturated_fma(slope, y, first_u - half);
         const float end = max_of(saturated_fma(slope, y, end_u + half), first);
         // In the last row an end of 1 shifts the bit out, which leaves the 0 that the subtraction needs.
         const uint32_t row_begin = 1u << (8 * row);
-        pixels += shifted_by_eighths(row_begin, end) - shifted_by_eighths(row_begin, first);
+        cells += shifted_by_eighths(row_begin, end) - shifted_by_eighths(row_begin, first);
     }
-    return pixels;
+    return cells;
 }
 
 }  // namespace v3dg
