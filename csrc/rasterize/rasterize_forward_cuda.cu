@@ -5,17 +5,12 @@
 // spread over buckets of depth, through shared memory or into scratch; a bucket too long for a window is
 // spread again. A list with far more than its share of a frame's entries is blended in parts of the tile,
 // side by side.
-//
-// Many gaussians cover a few pixels. So a warp takes 32 records that may reach its sub-tile, each lane finds
-// which pixels one of them reaches, and the bits are transposed: a pixel then walks its own records only.
-// Where gaussians cover many pixels, a lane has two neighbours, which share most of their records and what is
-// loaded and computed for a row; a sub-tile has 16 x 4 pixels then, else 8 x 4. Either way a pixel gets the
-// same bits.
 
 #include "rasterize/rasterize_cuda.h"
 
 #include <algorithm>
 
+#include "rasterize/blend_batch.cuh"
 #include "rasterize/piece_sort.cuh"
 #include "rasterize/rasterize_math.h"
 
@@ -34,8 +29,6 @@ constexpr int kBlocksForPairs = 5;
 
 static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
               "kPiece / kMostParts begins a class of plan_kernel");
-static_assert(SubTile<2>::kColumns == 2 && SubTile<2>::kHeight == 4 && kEntryBlockSize == 4,
-              "place_of(), subs_of(), publish_alive() and reached_cells() know this");
 
 // Copies 16 or 8 bytes from device to shared memory; they are there once the thread has waited.
 __device__ void copy_async(float4* shared, const float4* from) {
@@ -68,205 +61,6 @@ __device__ void wait_for_copies() {
 __device__ uint32_t blocks_of_part(int part, int log2_parts) {
     if (log2_parts == 0) return ~0u;
     return (log2_parts == 1 ? 0x0f0f0f0fu : 0x0f0fu) << (4 * (part & 1) + 16 * (part >> 1));
-}
-
-// What a lane has of a sub-tile.
-template <int kPixels>
-struct BlendedPixels {
-    float x[kPixels], y;  // of the centres
-    float transmittance[kPixels];
-    float color[3][kPixels];
-    float depth[kPixels];
-};
-
-// Where a lane's first pixel is in TilePixels.
-template <int kPixels>
-__device__ int place_of(int sub, int lane) {
-    if (kPixels == 1) return 32 * sub + (lane ^ (16 * (sub % 2)));
-    const int column = lane / 4 % 2;
-    return 64 * sub + 32 * column + ((8 * (lane / 8) + 2 * (lane % 4)) ^ (16 * column));
-}
-__device__ void load(const float* from, float (&to)[1]) { to[0] = *from; }
-__device__ void load(const float* from, float (&to)[2]) {
-    const float2 both = *reinterpret_cast<const float2*>(from);
-    to[0] = both.x, to[1] = both.y;
-}
-__device__ void store(const float (&from)[1], float* to) { *to = from[0]; }
-__device__ void store(const float (&from)[2], float* to) {
-    *reinterpret_cast<float2*>(to) = {from[0], from[1]};
-}
-
-// Vectors of the record that begins at a place in shared memory. No clobber keeps these loads behind plain
-// stores: records are written by copy_async() only, which is waited for.
-template <int kVector>
-__device__ float4 vector_at(uint32_t place) {
-    float4 v{};
-#ifdef __CUDA_ARCH__
-    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4 + %5];"
-                 : "=f"(v.x), "=f"(v.y), "=f"(v.z), "=f"(v.w)
-                 : "r"(place), "n"(kVector * int(sizeof(float4)) * kBlendBatch));
-#endif
-    return v;
-}
-__device__ float2 rest_at(uint32_t place) {
-    float2 v{};
-#ifdef __CUDA_ARCH__
-    asm volatile("ld.shared.v2.f32 {%0, %1}, [%2 + %3];"
-                 : "=f"(v.x), "=f"(v.y)
-                 : "r"(place), "n"(kEllipseVectors * int(sizeof(float4)) * kBlendBatch));
-#endif
-    return v;
-}
-
-// Of a sub-tile's among the tile's blocks, a bit each.
-template <int kPixels>
-__device__ uint32_t blocks_of_sub(int sub) {
-    return ((1u << SubTile<kPixels>::kBlocks) - 1) << SubTile<kPixels>::kBlocks * sub;
-}
-
-// The sub-tiles that have one of the blocks, a bit each, where the first of its blocks is.
-template <int kPixels>
-__device__ uint32_t subs_of(uint32_t blocks) {
-    blocks |= blocks >> 1;
-    return kPixels == 1 ? blocks & 0x55555555u : (blocks | blocks >> 2) & 0x11111111u;
-}
-
-// Tells the block which blocks of a sub-tile have died.
-template <int kPixels>
-__device__ void publish_alive(bool is_alive, int sub, BlendShared& s) {
-    constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes of a block in a row
-    const uint32_t alive = __ballot_sync(kAllLanes, is_alive);
-    uint32_t dead = 0;
-#pragma unroll
-    for (int block = 0; block < SubTile<kPixels>::kBlocks; ++block) {
-        const uint32_t lanes = ((1u << kAcross) - 1) * 0x01010101u << kAcross * block;
-        dead |= ((alive & lanes) == 0) << block;
-    }
-    if (dead != 0 && threadIdx.x % 32 == 0)
-        atomicAnd(&s.alive_blocks, ~(dead << SubTile<kPixels>::kBlocks * sub));
-}
-
-// Bit j of lane i becomes bit i of lane j.
-__device__ uint32_t transpose_bits(uint32_t bits) {
-    const unsigned lane = threadIdx.x % 32;
-    // Halves and bytes are put together whole: lanes 16, then 8 apart exchange what belongs to the other.
-    bits = __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 16), (lane & 16) != 0 ? 0x3276 : 0x5410);
-    bits = __byte_perm(bits, __shfl_xor_sync(kAllLanes, bits, 8), (lane & 8) != 0 ? 0x3715 : 0x6240);
-    uint32_t low_half = 0x0f0f0f0f;
-#pragma unroll
-    for (unsigned width = 4; width > 0; width /= 2) {
-        const bool upper = (lane & width) != 0;
-        const uint32_t kept = upper ? ~low_half : low_half;
-        const uint32_t other = __shfl_xor_sync(kAllLanes, bits, width);
-        bits = (bits & kept) | (__funnelshift_l(other, other, upper ? 32 - width : width) & ~kept);
-        low_half ^= low_half << (width / 2);
-    }
-    return bits;
-}
-
-// A warp blends the batch, of `num_groups` times 32 records, over a sub-tile.
-template <int kPixels, bool kWithDepth, class Stop>
-__device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop, BlendShared& s) {
-    int lane = threadIdx.x % 32;
-    // Hidden from the compiler, which would keep what follows from the lane in registers from batch to batch
-    // and spill others.
-    asm volatile("" : "+r"(lane));
-    uint32_t* list = s.list[threadIdx.x / 32] + kBlendBatch;  // from its end to its begin
-    const uint32_t own_blocks = blocks_of_sub<kPixels>(sub);
-    int listed = 0;
-    for (int g = 0; g < num_groups; ++g) {
-        const bool reaches = (s.blocks[32 * g + lane] & own_blocks) != 0;
-        const uint32_t reaching = __ballot_sync(kAllLanes, reaches);
-        if (reaches)
-            *(list - listed - __popc(reaching & ((1u << lane) - 1))) =
-                static_cast<uint32_t>(__cvta_generic_to_shared(&s.record[0][32 * g + lane]));
-        listed += __popc(reaching);
-    }
-    __syncwarp();
-
-    using Sub = SubTile<kPixels>;
-    const float corner_x = left + sub % Sub::kColumns * Sub::kWidth + 0.5f;
-    const float corner_y = top + sub / Sub::kColumns * Sub::kHeight + 0.5f;
-    TilePixels& pixels = s.pixels;
-    const int place = place_of<kPixels>(sub, lane);
-    BlendedPixels<kPixels> p;
-    for (int k = 0; k < kPixels; ++k) p.x[k] = corner_x + static_cast<float>(kPixels * (lane % 8) + k);
-    p.y = corner_y + static_cast<float>(lane / 8);
-    load(pixels.transmittance + place, p.transmittance);
-    for (int c = 0; c < 3; ++c) load(pixels.color[c] + place, p.color[c]);
-    if (kWithDepth) load(pixels.depth + place, p.depth);
-    // Of two pixels, all gaussians are infinitely far from the one that has stopped.
-    const float kNowhere = __int_as_float(0x7f800000);
-    bool alive = false;
-    for (int k = 0; k < kPixels; ++k) {
-        if (p.transmittance[k] > 0)
-            alive = true;
-        else
-            p.x[k] = kNowhere;
-    }
-    // A record is used as its vectors (frame/record.cuh) here: taken apart first, nvcc rounds the falloff
-    // otherwise than for the other number of pixels, and in the backward pass.
-    // The last lane takes the first record of a group, which becomes the highest bit of a lane's pixels.
-    const uint32_t* last_of_group = list - 31;
-    for (; listed > 0; listed -= 32, last_of_group -= 32) {
-        uint32_t bits = 0;
-        if (31 - lane < listed) {
-            const uint32_t own = last_of_group[lane];
-            const float4 a = vector_at<0>(own), b = vector_at<1>(own);
-            bits = reached_cells<kPixels>(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
-        }
-        bits = transpose_bits(bits);
-        if (!alive) bits = 0;
-        // Where the next record begins is looked up ahead; after the last one it means nothing.
-        int highest = 31 - __clz(static_cast<int>(bits));
-        uint32_t next = last_of_group[highest];
-        while (bits != 0) {
-            const float4 a = vector_at<0>(next), b = vector_at<1>(next);
-            const float2 c = rest_at(next);
-            bits ^= __funnelshift_l(0u, 1u, highest);  // 1 << highest, without a register for the 1
-            highest = 31 - __clz(static_cast<int>(bits));
-            next = last_of_group[highest];
-            alive = false;
-#pragma unroll
-            for (int k = 0; k < kPixels; ++k) {
-                const Falloff<float> f = falloff_at(p.x[k], p.y, a.x, a.y, a.z, a.w, b.x, b.y);
-                float weight;
-                const bool goes_on = blend_live(alpha_of(f), p.transmittance[k], weight, stop);
-                if (kPixels > 1 && !goes_on) p.x[k] = kNowhere;
-                alive |= goes_on;
-                p.color[0][k] += weight * b.z;
-                p.color[1][k] += weight * b.w;
-                p.color[2][k] += weight * c.x;
-                if (kWithDepth) p.depth[k] += weight * c.y;
-            }
-            if (!alive) bits = 0;
-        }
-        // With StopsBefore one of two pixels that has stopped seems to go on: it is left with more light than
-        // a pixel stops at. So lanes of which both have stopped may walk up to here.
-        if (kPixels > 1) alive = p.x[0] != kNowhere || p.x[kPixels - 1] != kNowhere;
-        __syncwarp();
-    }
-    for (int k = 0; k < kPixels; ++k)
-        if (kPixels > 1 ? p.x[k] == kNowhere : !alive) p.transmittance[k] = -fabsf(p.transmittance[k]);
-    store(p.transmittance, pixels.transmittance + place);
-    for (int c = 0; c < 3; ++c) store(p.color[c], pixels.color[c] + place);
-    if (kWithDepth) store(p.depth, pixels.depth + place);
-    publish_alive<kPixels>(alive, sub, s);
-}
-
-// The block blends the batch over the sub-tiles that have one of the blocks `reached`.
-template <int kPixels, bool kWithDepth, class Stop>
-__device__ void blend_batch(uint32_t reached, int num_groups, int left, int top, Stop stop, BlendShared& s) {
-    uint32_t subs = subs_of<kPixels>(reached);
-    uint32_t taken = threadIdx.x / 32;  // the first ones are given, the others to whoever is done
-    for (uint32_t passed = 0;;) {
-        for (; passed < taken; ++passed) subs &= subs - 1;
-        if (subs == 0) break;
-        blend_sub<kPixels, kWithDepth>((__ffs(subs) - 1) / SubTile<kPixels>::kBlocks, num_groups, left, top,
-                                       stop, s);
-        if (threadIdx.x % 32 == 0) taken = kBlendWarps + atomicAdd(&s.subs_taken, 1u);
-        taken = __shfl_sync(kAllLanes, taken, 0);
-    }
 }
 
 // Blends the sorted piece.
