@@ -7,6 +7,7 @@
 #include "base/buffer.h"
 #include "base/isa.h"
 #include "fit_group/dssim.h"
+#include "frame/entry.h"
 #include "frame/record.h"
 #include "math/gaussian.h"
 
@@ -67,6 +68,7 @@ using FitImage = std::vector<float>;
 struct FitScratch {
     Buffer<Record<float>> records;
     Buffer<uint32_t> source;
+    EntryFormat format;  // of the order, which leaves boxes out
     Buffer<uint64_t> order, order_scratch, row;
 };
 

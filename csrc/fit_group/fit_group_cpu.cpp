@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstring>
 
 #include "fit_group/fit_group_math.h"
 #include "project/project.h"
@@ -29,12 +28,9 @@ static size_t project_sorted(const Draw<float>& draw, const Pinhole<float>& came
     Reach unused;
     const size_t count = project<float>(draw, 0, draw.count, camera, all, records, source, 0, unused);
     uint64_t* order = scratch.order.reserve(count);
-    for (size_t i = 0; i < count; ++i) {
-        uint32_t bits;
-        std::memcpy(&bits, &records[i].depth, sizeof bits);
-        order[i] = uint64_t(bits) << 32 | i;
-    }
-    sort_tile(records, order, count, scratch.order_scratch.reserve(count));
+    scratch.format = EntryFormat::of(count, 0, INT32_MAX);
+    for (size_t i = 0; i < count; ++i) order[i] = scratch.format.entry(depth_bits_of(records[i].depth), i, 0);
+    sort_tile(records, scratch.format, order, count, scratch.order_scratch.reserve(count));
     return count;
 }
 
@@ -45,11 +41,10 @@ static bool misses_tile(const Record<float>& g, int left, int top) {
 // Blends records in this order.
 static void blend_sorted(const FitScratch& scratch, const uint64_t* order, size_t count, int left, int top,
                          int size, TilePlanes<float>& tile) {
-    blend_tile<float, Extra::kNothing>(
-        count, left, top, square(size), StopsBefore{}, tile, [&](size_t i) -> const Record<float>* {
-            const Record<float>& g = scratch.records.data()[record_of(order[i])];
-            return misses_tile(g, left, top) ? nullptr : &g;
-        });
+    blend_tile<float, Extra::kNothing>(count, left, top, square(size), StopsBefore{}, tile, [&](size_t i) {
+        const Record<float>& g = scratch.records.data()[scratch.format.record_of(order[i])];
+        return Listed<float>{&g, misses_tile(g, left, top) ? 0 : blocks_of(g, left, top)};
+    });
 }
 
 static int place_in_tile(int x, int y) {
@@ -75,7 +70,7 @@ void fit_target(const FitConfig& config, const FitGroup& group, const FitTarget&
         size_t num_in_row = 0;
         for (size_t i = 0; i < count; ++i) {
             const uint64_t entry = scratch.order.data()[i];
-            const Record<float>& g = scratch.records.data()[record_of(entry)];
+            const Record<float>& g = scratch.records.data()[scratch.format.record_of(entry)];
             if (g.y1 >= top && g.y0 < top + kTileSize) in_row[num_in_row++] = entry;
         }
         for (int left = 0; left < ss * view.size; left += kTileSize) {
@@ -290,7 +285,7 @@ class Comparison {
             }
             uint64_t alive = clear_tile(tile, left, top, square(view.size), Extra::kNothing);
             for (size_t i = 0; i < count && alive != 0; ++i) {
-                const uint32_t r = record_of(scratch_.order.data()[i]);
+                const uint64_t r = scratch_.format.record_of(scratch_.order.data()[i]);
                 const Record<float>& g = scratch_.records.data()[r];
                 if (misses_tile(g, left, top)) continue;
                 const uint64_t blocks = live_blocks(g, left, top, alive);

@@ -34,10 +34,6 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
     r.y1 = static_cast<uint16_t>(box.y1);
 }
 
-// An entry of a tile's list on the CPU holds a record's place in its low half and the bits of its float32
-// depth, which order the list, in its high half.
-inline uint32_t record_of(uint64_t entry) { return static_cast<uint32_t>(entry); }
-
 // Sum over pixels of the size of the gradient by a record's centre, along both axes: how much pixels pull at
 // it, also where they pull apart.
 template <class V>

@@ -54,7 +54,8 @@ static std::vector<Piece> pieces_of(const std::vector<Draw<T>>& draws) {
 // Enough chunks to spread over threads, few enough that a chunk's counters stay small beside it.
 static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num_tiles) {
     const uint64_t total = pieces.empty() ? 0 : pieces.back().first + pieces.back().count;
-    const uint64_t size = std::max({kPieceSize, uint64_t(num_tiles), (total + 1023) / 1024});
+    const uint64_t size =
+        std::min(std::max({kPieceSize, uint64_t(num_tiles), (total + 1023) / 1024}), kMostChunkRecords);
     std::vector<Chunk> chunks;
     for (size_t p = 0; p < pieces.size(); ++p) {
         if (chunks.empty() || pieces[p].first + pieces[p].count - pieces[chunks.back().first].first > size)
@@ -223,9 +224,9 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
         const uint32_t t = order[i];
         uint64_t* entry = ws.lists.entry.data() + offset[t];
         const size_t count = offset[t + 1] - offset[t];
-        sort_tile(records, entry, count, scratch[omp_get_thread_num()].reserve(count));
-        V3DG_DISPATCH_ISA(rasterize_tile<T>, records, entry, count, kTileSize * grid.column(t),
-                          kTileSize * grid.row(t), picture);
+        sort_tile(records, ws.lists.format, entry, count, scratch[omp_get_thread_num()].reserve(count));
+        V3DG_DISPATCH_ISA(rasterize_tile<T>, records, ws.lists.format, entry, count,
+                          kTileSize * grid.column(t), kTileSize * grid.row(t), picture);
     });
     counts.entries += ws.lists.num_entries;
     counts.project_seconds += projected - start;
@@ -301,11 +302,11 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
         d_entry.assign(count, RecordGradient<T>{});
         std::vector<CenterSize<T>>& size = sizes[omp_get_thread_num()];
         size.assign(with_size ? count : 0, CenterSize<T>{});
-        V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, entry + offset[t], count, kTileSize * column,
-                          kTileSize * row, picture, d_picture, d_entry.data(),
+        V3DG_DISPATCH_ISA(rasterize_tile_backward<T>, records, ws.lists.format, entry + offset[t], count,
+                          kTileSize * column, kTileSize * row, picture, d_picture, d_entry.data(),
                           with_size ? size.data() : nullptr, &d_background_of_tile[3 * t]);
         for (size_t e = 0; e < count; ++e) {
-            const uint32_t r = record_of(entry[offset[t] + e]);
+            const uint64_t r = ws.lists.format.record_of(entry[offset[t] + e]);
             const int x0 = records[r].x0 / kTileSize, x1 = records[r].x1 / kTileSize,
                       y0 = records[r].y0 / kTileSize;
             const uint64_t slot =
@@ -349,7 +350,7 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
     picked.weight = 0.0f;
     float transmittance = 1.0f;
     for (uint64_t e = ws.lists.offset.data()[0]; e < ws.lists.offset.data()[1]; ++e) {
-        const uint32_t place = record_of(ws.lists.entry.data()[e]);
+        const uint64_t place = ws.lists.format.record_of(ws.lists.entry.data()[e]);
         const Record<float>& r = ws.records.data()[place];
         const Falloff<float> f = falloff_at(static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f, r.u,
                                             r.v, r.l11, r.l12, r.l22, r.log2_opacity);

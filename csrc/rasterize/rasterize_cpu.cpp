@@ -5,23 +5,11 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-// Far enough ahead that a record arrives from memory before it is its turn.
-constexpr size_t kPrefetch = 48;
-
-template <class T>
-static V3DG_INLINE void prefetch(const Record<T>* records, const uint64_t* entry, size_t i, size_t count) {
-    if (i + kPrefetch >= count) return;
-    const char* at = reinterpret_cast<const char*>(records + record_of(entry[i + kPrefetch]));
-    __builtin_prefetch(at);
-    __builtin_prefetch(at + sizeof(Record<T>) - 1);
-}
-
 template <class T, Extra kExtra, class Stop>
-static void blend_entries(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
-                          const Window& window, Stop stop, TilePlanes<T>& tile) {
+static void blend_entries(const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count,
+                          int left, int top, const Window& window, Stop stop, TilePlanes<T>& tile) {
     blend_tile<T, kExtra>(count, left, top, window, stop, tile, [&](size_t i) {
-        prefetch(records, entry, i, count);
-        return records + record_of(entry[i]);
+        return Listed<T>{records + format.record_of(entry[i]), EntryFormat::blocks_of(entry[i])};
     });
 }
 
@@ -38,16 +26,19 @@ static V3DG_INLINE void for_each_pixel(int left, int top, const Window& window, 
 }
 
 template <class T>
-void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
-                    const Picture<T>& picture) {
+void rasterize_tile(const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count,
+                    int left, int top, const Picture<T>& picture) {
     TilePlanes<T> tile;
     with_stop<T>(picture.min_transmittance, [&](auto stop) {
         if (picture.count != nullptr)
-            blend_entries<T, Extra::kCount>(records, entry, count, left, top, picture.window, stop, tile);
+            blend_entries<T, Extra::kCount>(records, format, entry, count, left, top, picture.window, stop,
+                                            tile);
         else if (picture.depth != nullptr)
-            blend_entries<T, Extra::kDepth>(records, entry, count, left, top, picture.window, stop, tile);
+            blend_entries<T, Extra::kDepth>(records, format, entry, count, left, top, picture.window, stop,
+                                            tile);
         else
-            blend_entries<T, Extra::kNothing>(records, entry, count, left, top, picture.window, stop, tile);
+            blend_entries<T, Extra::kNothing>(records, format, entry, count, left, top, picture.window, stop,
+                                              tile);
     });
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const Finished<T> of = finished(tile.transmittance[p], picture.min_transmittance);
@@ -64,12 +55,12 @@ void rasterize_tile(const Record<T>* records, const uint64_t* entry, size_t coun
 }
 
 template <class T, bool kWithDepth, bool kWithSize>
-static void backward(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
-                     const Picture<T>& picture, const PictureGradient<T>& d_picture,
+static void backward(const Record<T>* records, EntryFormat format, const uint64_t* entry, size_t count,
+                     int left, int top, const Picture<T>& picture, const PictureGradient<T>& d_picture,
                      RecordGradient<T>* d_entry, CenterSize<T>* size, T* d_background) {
     TilePlanes<T> tile;
     constexpr Extra kExtra = kWithDepth ? Extra::kDepth : Extra::kNothing;
-    blend_entries<T, kExtra>(records, entry, count, left, top, picture.window, StopsBefore{}, tile);
+    blend_entries<T, kExtra>(records, format, entry, count, left, top, picture.window, StopsBefore{}, tile);
     TileGradient<T> grad = {};
     for_each_pixel(left, top, picture.window, [&](int p, size_t out) {
         const T t = tile.transmittance[p] < 0 ? -tile.transmittance[p] : tile.transmittance[p];
@@ -90,12 +81,13 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
         grad.d_weight[p] = d_weight;
         grad.total[p] = total + d_weight * (1 - t);
     });
+    constexpr size_t kPrefetch = 48;  // so far ahead that a record arrives before it is its turn
     const BlockPixels<T> pixels;
     uint64_t alive = clear_tile(tile, left, top, picture.window, Extra::kNothing);
     for (size_t i = 0; i < count && alive != 0; ++i) {
-        prefetch(records, entry, i, count);
-        const Record<T>& g = records[record_of(entry[i])];
-        const uint64_t blocks = live_blocks(g, left, top, alive);
+        if (i + kPrefetch < count) prefetch_record(records + format.record_of(entry[i + kPrefetch]));
+        const Record<T>& g = records[format.record_of(entry[i])];
+        const uint64_t blocks = blocks_of_ellipse(g, left, top, EntryFormat::blocks_of(entry[i]) & alive);
         if (blocks != 0)
             blend_record_vjp<T, kWithDepth, kWithSize>(g, blocks, left, top, pixels, grad, tile, alive,
                                                        d_entry[i], kWithSize ? size + i : nullptr);
@@ -103,20 +95,22 @@ static void backward(const Record<T>* records, const uint64_t* entry, size_t cou
 }
 
 template <class T>
-void rasterize_tile_backward(const Record<T>* records, const uint64_t* entry, size_t count, int left, int top,
-                             const Picture<T>& picture, const PictureGradient<T>& d_picture,
-                             RecordGradient<T>* d_entry, CenterSize<T>* size, T* d_background) {
+void rasterize_tile_backward(const Record<T>* records, EntryFormat format, const uint64_t* entry,
+                             size_t count, int left, int top, const Picture<T>& picture,
+                             const PictureGradient<T>& d_picture, RecordGradient<T>* d_entry,
+                             CenterSize<T>* size, T* d_background) {
     const bool with_depth = d_picture.depth != nullptr;
     const auto run = size != nullptr ? with_depth ? &backward<T, true, true> : &backward<T, false, true>
                      : with_depth    ? &backward<T, true, false>
                                      : &backward<T, false, false>;
-    run(records, entry, count, left, top, picture, d_picture, d_entry, size, d_background);
+    run(records, format, entry, count, left, top, picture, d_picture, d_entry, size, d_background);
 }
 
-#define V3DG_INSTANTIATE(T)                                                                                  \
-    template void rasterize_tile<T>(const Record<T>*, const uint64_t*, size_t, int, int, const Picture<T>&); \
-    template void rasterize_tile_backward<T>(const Record<T>*, const uint64_t*, size_t, int, int,            \
-                                             const Picture<T>&, const PictureGradient<T>&,                   \
+#define V3DG_INSTANTIATE(T)                                                                               \
+    template void rasterize_tile<T>(const Record<T>*, EntryFormat, const uint64_t*, size_t, int, int,     \
+                                    const Picture<T>&);                                                   \
+    template void rasterize_tile_backward<T>(const Record<T>*, EntryFormat, const uint64_t*, size_t, int, \
+                                             int, const Picture<T>&, const PictureGradient<T>&,           \
                                              RecordGradient<T>*, CenterSize<T>*, T*);
 V3DG_INSTANTIATE(float)
 V3DG_INSTANTIATE(double)

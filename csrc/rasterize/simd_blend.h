@@ -33,31 +33,47 @@ struct BatchRecord {
     }
 };
 
+// Into the second-level cache, which waits for more lines at once than the first. A record may lie on two.
+template <class T>
+V3DG_INLINE void prefetch_record(const Record<T>* record) {
+    constexpr int kRead = 0, kSecondLevel = 2;
+    __builtin_prefetch(record, kRead, kSecondLevel);
+    __builtin_prefetch(reinterpret_cast<const char*>(record + 1) - 1, kRead, kSecondLevel);
+}
+
 // Records of a tile, front to back, and places among them by block.
 template <class T>
 struct Batch {
     int size;
-    const Record<T>* source[kBatchSize];
-    uint64_t blocks[kBatchSize];  // that a record may change
+    const Record<T>* source[1 + kBatchSize];  // from 1 on
+    uint64_t blocks[kBatchSize];              // that a record may change
     BatchRecord<T> record[kBatchSize];
     uint16_t count[kTileBlocks * kTileBlocks];
     uint8_t place[kTileBlocks * kTileBlocks][kBatchSize];
 };
 
-// Takes records from the i-th on until the batch is full: those whose boxes meet live blocks. Whether one
-// does is as good as random, so there is no branch on it.
-template <class T, class RecordAt>
-V3DG_INLINE size_t take_live(size_t i, size_t count, int left, int top, uint64_t alive,
-                             const RecordAt& record_at, Batch<T>& batch) {
+// A record of a tile's list, and the blocks that its box meets.
+template <class T>
+struct Listed {
+    const Record<T>* record;
+    uint64_t blocks;
+};
+
+// Takes records from the i-th on until the batch is full: those whose boxes meet live blocks, and only those
+// are fetched from memory. Whether one does is as good as random, so there is no branch on it.
+template <class T, class ListedAt>
+V3DG_INLINE size_t take_live(size_t i, size_t count, uint64_t alive, const ListedAt& listed_at,
+                             Batch<T>& batch) {
     int size = 0, num_blocks = 0;
+    batch.source[0] = listed_at(i).record;  // to be fetched while there is none
     for (; i < count && size < kBatchSize && num_blocks < kBatchBlocks; ++i) {
-        const Record<T>* g = record_at(i);
-        if (g == nullptr) continue;
-        const uint64_t blocks = blocks_of(*g, left, top) & alive;
-        batch.source[size] = g;
+        const Listed<T> g = listed_at(i);
+        const uint64_t blocks = g.blocks & alive;
+        batch.source[1 + size] = g.record;
         batch.blocks[size] = blocks;
         size += blocks != 0;
         num_blocks += __builtin_popcountll(blocks);
+        prefetch_record(batch.source[size]);
     }
     batch.size = size;
     return i;
@@ -74,11 +90,11 @@ V3DG_INLINE void sort_into_blocks(int left, int top, Batch<T>& batch) {
     }
     for (int k = 0; k < num_many; ++k) {
         uint64_t& blocks = batch.blocks[many[k]];
-        blocks = blocks_of_ellipse(*batch.source[many[k]], left, top, blocks);
+        blocks = blocks_of_ellipse(*batch.source[1 + many[k]], left, top, blocks);
     }
     for (uint16_t& n : batch.count) n = 0;
     for (int i = 0; i < batch.size; ++i) {
-        batch.record[i].take(*batch.source[i], left, top);
+        batch.record[i].take(*batch.source[1 + i], left, top);
         for (uint64_t blocks = batch.blocks[i]; blocks != 0; blocks &= blocks - 1) {
             const int block = __builtin_ctzll(blocks);
             batch.place[block][batch.count[block]++] = static_cast<uint8_t>(i);
@@ -128,16 +144,15 @@ V3DG_INLINE bool blend_block(const Batch<T>& batch, int block, const BlockPixels
     return goes_on;
 }
 
-// Blends `count` records front to back over a tile, which starts empty. record_at(i) points to one, or is
-// null where its box does not meet the tile.
-template <class T, Extra kExtra, class Stop, class RecordAt>
+// Blends `count` records front to back over a tile, which starts empty. listed_at(i) is one of them.
+template <class T, Extra kExtra, class Stop, class ListedAt>
 V3DG_INLINE void blend_tile(size_t count, int left, int top, const Window& window, Stop stop,
-                            TilePlanes<T>& tile, const RecordAt& record_at) {
+                            TilePlanes<T>& tile, const ListedAt& listed_at) {
     const BlockPixels<T> pixels;
     uint64_t alive = clear_tile(tile, left, top, window, kExtra);
     Batch<T> batch;
     for (size_t i = 0; i < count && alive != 0;) {
-        i = take_live(i, count, left, top, alive, record_at, batch);
+        i = take_live(i, count, alive, listed_at, batch);
         sort_into_blocks(left, top, batch);
         for (uint64_t blocks = alive; blocks != 0; blocks &= blocks - 1) {
             const int block = __builtin_ctzll(blocks);

@@ -8,6 +8,7 @@
 
 #include <cstdint>
 
+#include "frame/entry.h"
 #include "frame/image.h"
 #include "frame/record.h"
 #include "rasterize/rasterize_math.h"
@@ -15,9 +16,7 @@
 namespace v3dg {
 namespace V3DG_ISA {
 
-constexpr int kBlockSize = 4;
 constexpr int kBlockPixels = kBlockSize * kBlockSize;
-constexpr int kTileBlocks = kTileSize / kBlockSize;
 constexpr int kTilePixels = kTileSize * kTileSize;
 
 // What a tile has beside colour and transmittance.

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "base/buffer.h"
+#include "frame/entry.h"
 #include "frame/image.h"
 #include "frame/record.h"
 
@@ -26,20 +27,29 @@ struct TileGrid {
 };
 
 // The records that touch each tile t, in the order of the chunks that they came in: entries offset[t] to
-// offset[t + 1]. Entries are those of frame/record.h.
+// offset[t + 1].
 struct TileLists {
+    EntryFormat format;
     Buffer<uint64_t> offset;
     Buffer<uint64_t> entry;
     uint64_t num_entries = 0;
-    // The same of each chunk alone.
+    // The same of each chunk alone, whose records are [first, first + count) with depths of these bits.
+    struct Chunk {
+        uint64_t first, count;
+        uint32_t least_depth, most_depth;
+        Buffer<uint64_t> entry;  // with places in the chunk and all of a depth
+    };
     Buffer<uint32_t> chunk_offset;  // (chunk, tile + 1)
-    std::vector<Buffer<uint64_t>> chunk_entry;
+    std::vector<Chunk> chunk;
 
     void start(size_t num_chunks, const TileGrid& grid) {
         chunk_offset.reserve(num_chunks * (grid.size() + 1));
-        if (chunk_entry.size() < num_chunks) chunk_entry.resize(num_chunks);
+        if (chunk.size() < num_chunks) chunk.resize(num_chunks);
     }
 };
+
+// A chunk has at most so many records.
+constexpr uint64_t kMostChunkRecords = uint64_t(1) << 21;
 
 // Bins the records of one chunk, which are records[first .. first + count). Best done while they are in the
 // cache. Chunks may be binned at the same time.
@@ -51,9 +61,10 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
 void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out,
                  const std::atomic<bool>* stop = nullptr);
 
-// Sorts one tile's entries by depth; equal depths stay in their order. `scratch` has room for as many.
-// Double-precision records are ordered by their own depth, which float32 bits do not hold.
+// Sorts one tile's entries by the depths of their records; equal depths stay in their order. `scratch` has
+// room for as many.
 template <class T>
-void sort_tile(const Record<T>* records, uint64_t* entry, size_t count, uint64_t* scratch);
+void sort_tile(const Record<T>* records, EntryFormat format, uint64_t* entry, size_t count,
+               uint64_t* scratch);
 
 }  // namespace v3dg

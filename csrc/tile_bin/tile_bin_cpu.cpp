@@ -11,12 +11,23 @@
 
 namespace v3dg {
 
+// All of a depth's bits, and the place in the chunk.
+static constexpr EntryFormat kChunkFormat = EntryFormat::of(kMostChunkRecords, 0, INT32_MAX);
+
+// Calls visit(tile, box in it) for the tiles that a record's box meets; most meet one.
 template <class T, class Visit>
-static void for_each_tile(const Record<T>& r, const TileGrid& grid, const Visit& visit) {
+static V3DG_INLINE void for_each_tile(const Record<T>& r, const TileGrid& grid, const Visit& visit) {
     const int x0 = r.x0 / kTileSize, x1 = r.x1 / kTileSize, y0 = r.y0 / kTileSize, y1 = r.y1 / kTileSize;
-    for (int y = y0; y <= y1; ++y)
+    const uint32_t left = r.x0 / kBlockSize % kTileBlocks, right = r.x1 / kBlockSize % kTileBlocks << 3;
+    const uint32_t top = r.y0 / kBlockSize % kTileBlocks << 6, bottom = r.y1 / kBlockSize % kTileBlocks << 9;
+    size_t row = static_cast<size_t>(y0 - grid.first_row) * grid.columns - grid.first_column;
+    if (x0 == x1 && y0 == y1) return visit(row + x0, left | right | top | bottom);
+    constexpr uint32_t kLast = kTileBlocks - 1;
+    for (int y = y0; y <= y1; ++y, row += grid.columns) {
+        const uint32_t rows = (y == y0 ? top : 0) | (y == y1 ? bottom : kLast << 9);
         for (int x = x0; x <= x1; ++x)
-            visit(static_cast<size_t>(y - grid.first_row) * grid.columns + (x - grid.first_column));
+            visit(row + x, rows | (x == x0 ? left : 0) | (x == x1 ? right : kLast << 3));
+    }
 }
 
 template <class T>
@@ -28,21 +39,41 @@ void bin_chunk(const Record<T>* records, uint64_t first, uint32_t count, const T
     uint32_t* offset = out.chunk_offset.data() + chunk * (num_tiles + 1);
     std::memset(offset, 0, (num_tiles + 1) * sizeof *offset);
     const Record<T>* record = records + first;
-    for (uint32_t i = 0; i < count; ++i) for_each_tile(record[i], grid, [&](size_t t) { ++offset[t + 1]; });
+    for (uint32_t i = 0; i < count; ++i)
+        for_each_tile(record[i], grid, [&](size_t t, uint32_t) { ++offset[t + 1]; });
     uint32_t sum = 0;
     for (size_t t = 1; t <= num_tiles; ++t) {
         const uint32_t here = offset[t];
         offset[t] = sum;
         sum += here;
     }
-    uint64_t* entry = out.chunk_entry[chunk].reserve(sum);
+    uint64_t* entry = out.chunk[chunk].entry.reserve(sum);
+    uint32_t least = UINT32_MAX, most = 0;
     for (uint32_t i = 0; i < count; ++i) {
-        const float depth = static_cast<float>(record[i].depth);
-        uint32_t bits;  // positive floats order as their bits do
-        std::memcpy(&bits, &depth, sizeof bits);
-        for_each_tile(record[i], grid,
-                      [&](size_t t) { entry[offset[t + 1]++] = uint64_t(bits) << 32 | (first + i); });
+        const Record<T>& r = record[i];
+        const uint32_t depth = depth_bits_of(static_cast<float>(r.depth));
+        least = std::min(least, depth);
+        most = std::max(most, depth);
+        const uint64_t whole = kChunkFormat.entry(depth, i, 0);
+        for_each_tile(r, grid, [&](size_t t, uint32_t box) { entry[offset[t + 1]++] = whole | box; });
     }
+    out.chunk[chunk].first = first;
+    out.chunk[chunk].count = count;
+    out.chunk[chunk].least_depth = least;
+    out.chunk[chunk].most_depth = most;
+}
+
+// Of the entries of these chunks, together.
+static EntryFormat format_of(const TileLists::Chunk* chunk, size_t num_chunks) {
+    uint64_t end = 0;
+    uint32_t least = UINT32_MAX, most = 0;
+    for (size_t c = 0; c < num_chunks; ++c) {
+        if (chunk[c].count == 0) continue;
+        end = std::max(end, chunk[c].first + chunk[c].count);
+        least = std::min(least, chunk[c].least_depth);
+        most = std::max(most, chunk[c].most_depth);
+    }
+    return EntryFormat::of(end, std::min(least, most), most);
 }
 
 void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out, const std::atomic<bool>* stop) {
@@ -55,6 +86,7 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out, const 
             offset[t + 1] += from[c * stride + t + 1] - from[c * stride + t];
     for (size_t t = 0; t < num_tiles; ++t) offset[t + 1] += offset[t];
     out.num_entries = offset[num_tiles];
+    const EntryFormat format = out.format = format_of(out.chunk.data(), num_chunks);
     uint64_t* entry = out.entry.reserve(out.num_entries);
     constexpr size_t kTogether = 16;  // tiles whose offsets in a chunk share a cache line
     parallel_for((num_tiles + kTogether - 1) / kTogether, 1, [&](size_t group) {
@@ -65,26 +97,33 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out, const 
             const uint32_t* here = from + c * stride;
             if (here[first] == here[last]) continue;
             if (is_stopped(stop)) return;
-            const uint64_t* source = out.chunk_entry[c].data();
+            const uint64_t* source = out.chunk[c].entry.data();
+            constexpr uint64_t kLow = (uint64_t(1) << kChunkFormat.depth_shift) - 1;
+            const uint64_t first_record = out.chunk[c].first;
             for (size_t t = first; t < last; ++t) {
-                std::copy(source + here[t], source + here[t + 1], entry + next[t - first]);
+                uint64_t* to = entry + next[t - first];
+                for (uint32_t i = here[t]; i < here[t + 1]; ++i)
+                    *to++ = format.entry(static_cast<uint32_t>(source[i] >> kChunkFormat.depth_shift),
+                                         first_record, 0) +
+                            (source[i] & kLow);
                 next[t - first] += here[t + 1] - here[t];
             }
         }
     });
 }
 
-template <>
-void sort_tile<float>(const Record<float>*, uint64_t* entry, size_t count, uint64_t* scratch) {
+// Sorts entries by what they hold of depths; equal ones stay in their order.
+static void sort_by_bits(EntryFormat format, uint64_t* entry, size_t count, uint64_t* scratch) {
+    const int depth_shift = format.depth_shift;
     constexpr size_t kSmall = 256;
     if (count <= kSmall) {
-        constexpr uint64_t kLow = UINT32_MAX;
+        const uint64_t low = (uint64_t(1) << depth_shift) - 1;
         for (size_t i = 0; i < count; ++i) {
-            scratch[i] = entry[i] & kLow;
-            entry[i] = (entry[i] & ~kLow) | i;
+            scratch[i] = entry[i] & low;
+            entry[i] = (entry[i] & ~low) | i;
         }
         std::sort(entry, entry + count);
-        for (size_t i = 0; i < count; ++i) entry[i] = (entry[i] & ~kLow) | scratch[entry[i] & kLow];
+        for (size_t i = 0; i < count; ++i) entry[i] = (entry[i] & ~low) | scratch[entry[i] & low];
         return;
     }
     // Least significant digit first over the bits in which depths differ once the least is taken away;
@@ -96,14 +135,14 @@ void sort_tile<float>(const Record<float>*, uint64_t* entry, size_t count, uint6
         least = std::min(least, entry[i]);
         most = std::max(most, entry[i]);
     }
-    least = least >> 32 << 32;
+    least = least >> depth_shift << depth_shift;
     int bits = 0;
-    while (bits < 32 && (most - least) >> (32 + bits) != 0) ++bits;
+    while ((most - least) >> depth_shift >> bits != 0) ++bits;
     const int passes = (bits + most_bits - 1) / most_bits;
     uint64_t* from = entry;
     uint64_t* to = scratch;
     for (int pass = 0; pass < passes; ++pass) {
-        const int digit = (bits + passes - 1) / passes, shift = 32 + pass * digit;
+        const int digit = (bits + passes - 1) / passes, shift = depth_shift + pass * digit;
         const uint64_t mask = (uint64_t(1) << digit) - 1;
         uint32_t start[1u << kMostBits];
         std::fill_n(start, mask + 1, 0);
@@ -120,11 +159,33 @@ void sort_tile<float>(const Record<float>*, uint64_t* entry, size_t count, uint6
     if (from != entry) std::memcpy(entry, from, count * sizeof *entry);
 }
 
-template <>
-void sort_tile<double>(const Record<double>* records, uint64_t* entry, size_t count, uint64_t*) {
-    std::stable_sort(entry, entry + count, [&](uint64_t a, uint64_t b) {
-        return records[record_of(a)].depth < records[record_of(b)].depth;
+// Sorts entries by their records' depths; equal ones stay in their order.
+template <class T>
+static void sort_by_records(const Record<T>* records, EntryFormat format, uint64_t* first, uint64_t* last) {
+    std::stable_sort(first, last, [&](uint64_t a, uint64_t b) {
+        return records[format.record_of(a)].depth < records[format.record_of(b)].depth;
     });
+}
+
+template <>
+void sort_tile<float>(const Record<float>* records, EntryFormat format, uint64_t* entry, size_t count,
+                      uint64_t* scratch) {
+    sort_by_bits(format, entry, count, scratch);
+    if (format.dropped_bits == 0) return;
+    const int depth_shift = format.depth_shift;
+    for (size_t i = 0; i < count;) {
+        const uint64_t depth = entry[i] >> depth_shift;
+        const size_t first = i++;
+        while (i < count && entry[i] >> depth_shift == depth) ++i;
+        if (i - first > 1) sort_by_records(records, format, entry + first, entry + i);
+    }
+}
+
+// What entries hold of depths is less than a double.
+template <>
+void sort_tile<double>(const Record<double>* records, EntryFormat format, uint64_t* entry, size_t count,
+                       uint64_t*) {
+    sort_by_records(records, format, entry, entry + count);
 }
 
 template void bin_chunk<float>(const Record<float>*, uint64_t, uint32_t, const TileGrid&, size_t, TileLists&);
