@@ -289,6 +289,25 @@ def test_equal_depths_are_drawn_in_the_order_of_their_index(device):
         np.testing.assert_allclose(center, expected, atol=2e-6)
 
 
+def test_depths_too_far_apart_for_an_entry_keep_their_order(torch):
+    # 30 bits of depth and 23 of places are one more than an entry has, so that neighbours in depth tie.
+    count = 4_300_000
+    generator = np.random.default_rng(1)
+    depths = (np.float32(0.02).view(np.uint32) + generator.integers(0, 64, count)).astype(np.uint32)
+    means = np.c_[0.02 * generator.uniform(-0.5, 0.5, (count, 2)), depths.view(np.float32)]
+    near = scenes.gaussians(
+        means, scales=1.6e-4, opacities=0.1, color=generator.uniform(size=(count, 3)).astype(np.float32)
+    )
+    far = scenes.gaussians([[0, 0, 1e18]], scales=3e16, opacities=0.1)
+    camera = v3dg.Camera(np.eye(4), [[64, 0, 32], [0, 64, 32], [0, 0, 1]], 64, 64)
+    pictures = []
+    for gaussians in (near, v3dg.Gaussians.concatenate([near, far])):
+        leaf = gaussians.torch("cpu")
+        leaf.opacities.requires_grad_(True)  # so that the picture is drawn in one go
+        pictures.append(v3dg.rasterize(leaf, camera).color.detach().numpy())
+    np.testing.assert_array_equal(*pictures)  # all stops in front of what is far
+
+
 def test_order_of_the_arrays_does_not_matter(device):
     camera = scenes.CAMERAS["off_centre"]
     gaussians = scenes.trained_like(6, camera, 300)
