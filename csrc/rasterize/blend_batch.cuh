@@ -151,8 +151,6 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
         else
             p.x[k] = kNowhere;
     }
-    // A record is used as its vectors (frame/record.cuh) here: taken apart first, nvcc rounds the falloff
-    // otherwise than for the other number of pixels, and in the backward pass.
     // The last lane takes the first record of a group, which becomes the highest bit of a lane's pixels.
     const uint32_t* last_of_group = list - 31;
     for (; listed > 0; listed -= 32, last_of_group -= 32) {
@@ -168,6 +166,8 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
         int highest = 31 - __clz(static_cast<int>(bits));
         uint32_t next = last_of_group[highest];
         while (bits != 0) {
+            // A record is used as its vectors (frame/record.cuh): taken apart first, nvcc rounds the falloff
+            // otherwise than for the other number of pixels, and in the backward pass.
             const float4 a = vector_at<0>(next), b = vector_at<1>(next);
             const float2 c = rest_at(next);
             bits ^= __funnelshift_l(0u, 1u, highest);  // 1 << highest, without a register for the 1
