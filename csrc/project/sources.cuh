@@ -23,11 +23,13 @@ __device__ inline float4 load4(const float* rows, uint32_t row) {
     return __ldg(reinterpret_cast<const float4*>(rows) + row);
 }
 
-template <int kDegree>
-__device__ void color_of(const float* sh, const float mean[3], const ModelView<float>& view, float color[3]) {
+// `sh(k)` is the k-th coefficient, as color_of_coefficients() has it.
+template <int kDegree, class Coefficient>
+__device__ void color_of(const Coefficient& sh, const float mean[3], const ModelView<float>& view,
+                         float color[3]) {
     float direction[3];
     from_eye(view, mean, direction);
-    color_of_sh(kDegree, direction, sh, color);
+    color_of_coefficients(kDegree, direction, sh, color);
 }
 
 // The coefficients are loaded as they are used: all at once are more than there are registers.
@@ -35,15 +37,13 @@ template <int kDegree>
 __device__ void color_of_row(const float* row, const float mean[3], const ModelView<float>& view,
                              float color[3]) {
     constexpr int kSize = 3 * num_sh_bases(kDegree);
-    float direction[3];
-    from_eye(view, mean, direction);
     float4 four{};
     const auto coefficient = [&](int k) {
         if (kSize % 4 != 0) return __ldg(row + k);
         if (k % 4 == 0) four = load4(row, k / 4);
         return k % 4 == 0 ? four.x : k % 4 == 1 ? four.y : k % 4 == 2 ? four.z : four.w;
     };
-    color_of_coefficients(kDegree, direction, coefficient, color);
+    color_of<kDegree>(coefficient, mean, view, color);
 }
 
 // A source tells what a gaussian is, in steps, because most reach no pixel centre: a lane fetch()es what the
@@ -242,7 +242,7 @@ struct CodeSource {
 #pragma unroll
         for (int k = 0; k < 3 * kDegree; ++k) step[k] = __ldg(m.codes.ranges_of(place.cluster).sh_step + k);
         decode_sh<float>(words, step, kDegree, sh + 3);
-        color_of<kDegree>(sh, gaussian.mean, view, color);
+        color_of<kDegree>([&](int k) { return sh[k]; }, gaussian.mean, view, color);
     }
 };
 

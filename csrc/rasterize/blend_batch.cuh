@@ -143,7 +143,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
     for (int c = 0; c < 3; ++c) load(pixels.color[c] + place, p.color[c]);
     if (kWithDepth) load(pixels.depth + place, p.depth);
     // Of two pixels, all gaussians are infinitely far from the one that has stopped.
-    const float kNowhere = __int_as_float(0x7f800000);
+    constexpr float kNowhere = INFINITY;
     bool alive = false;
     for (int k = 0; k < kPixels; ++k) {
         if (p.transmittance[k] > 0)

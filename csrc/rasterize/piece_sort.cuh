@@ -30,7 +30,7 @@ struct SubTile {
     static constexpr int kCount = kColumns * kFrameTileHeight / kHeight;  // of a tile
     static constexpr int kBlocks = kWidth / kEntryBlockSize;              // of a tile's, side by side
 };
-constexpr int kTilePixels = kFrameTileWidth * kFrameTileHeight;
+constexpr int kFrameTilePixels = kFrameTileWidth * kFrameTileHeight;
 
 static_assert(2 * kFewEntries <= kBlendThreads, "two threads rank an entry");
 
@@ -51,9 +51,9 @@ struct ListWindow {
 // State of a tile's pixels, of 8 x 4 after each other. Of those with odd columns the upper and lower halves
 // are exchanged: the pixels of half a warp lie in different banks then, with one of them a lane and with two.
 struct TilePixels {
-    alignas(float2) float transmittance[kTilePixels];
-    alignas(float2) float color[3][kTilePixels];
-    alignas(float2) float depth[kTilePixels];  // sum of weight * depth
+    alignas(float2) float transmittance[kFrameTilePixels];
+    alignas(float2) float color[3][kFrameTilePixels];
+    alignas(float2) float depth[kFrameTilePixels];  // sum of weight * depth
 };
 
 struct BlendShared {

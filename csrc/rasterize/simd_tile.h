@@ -46,9 +46,7 @@ V3DG_INLINE uint64_t blocks_of(const Record<T>& g, int left, int top) {
     const int y0 = (g.y0 > top ? g.y0 - top : 0) >> 2;
     const int x1 = (g.x1 - left < kTileSize ? g.x1 - left : kTileSize - 1) >> 2;
     const int y1 = (g.y1 - top < kTileSize ? g.y1 - top : kTileSize - 1) >> 2;
-    const uint64_t row = (0xffu >> (7 - x1)) & (0xffu << x0);
-    const uint64_t rows = (~uint64_t(0) >> (8 * (7 - y1))) & (~uint64_t(0) << (8 * y0));
-    return (row * 0x0101010101010101u) & rows;
+    return EntryFormat::blocks_of(static_cast<uint64_t>(x0 | x1 << 3 | y0 << 6 | y1 << 9));
 }
 
 // Fewer touched blocks than this are not worth a closer look.

@@ -113,8 +113,7 @@ void join_chunks(size_t num_chunks, const TileGrid& grid, TileLists& out, const 
 }
 
 // Sorts entries by what they hold of depths; equal ones stay in their order.
-static void sort_by_bits(EntryFormat format, uint64_t* entry, size_t count, uint64_t* scratch) {
-    const int depth_shift = format.depth_shift;
+static void sort_by_bits(int depth_shift, uint64_t* entry, size_t count, uint64_t* scratch) {
     constexpr size_t kSmall = 256;
     if (count <= kSmall) {
         const uint64_t low = (uint64_t(1) << depth_shift) - 1;
@@ -170,9 +169,9 @@ static void sort_by_records(const Record<T>* records, EntryFormat format, uint64
 template <>
 void sort_tile<float>(const Record<float>* records, EntryFormat format, uint64_t* entry, size_t count,
                       uint64_t* scratch) {
-    sort_by_bits(format, entry, count, scratch);
-    if (format.dropped_bits == 0) return;
     const int depth_shift = format.depth_shift;
+    sort_by_bits(depth_shift, entry, count, scratch);
+    if (format.dropped_bits == 0) return;
     for (size_t i = 0; i < count;) {
         const uint64_t depth = entry[i] >> depth_shift;
         const size_t first = i++;
