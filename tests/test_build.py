@@ -197,6 +197,54 @@ def test_the_last_level_has_the_filter_of_a_pixel(filter_px2, last):
     assert not only.clusters.filter_px2.any()
 
 
+def shell(width, height, seed=0):
+    """A ball of flat gaussians: their width and height, in distances to the next one."""
+    rng, num = np.random.default_rng(seed), 1500
+    quats = rng.normal(size=(num, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    w, x, y, z = quats.T
+    normals = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    scales = np.tile(math.sqrt(4 * math.pi / num) * np.array([width, height, 0.1]), (num, 1))
+    arrays = normals, quats, scales, np.full(num, 0.9), np.sin(3 * normals)[:, None]
+    return Gaussians(*(array.astype(np.float32) for array in arrays))
+
+
+SMOOTH = BuildConfig(cluster_size=64, steps=40, num_views=16)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "is_smooth"), [(1.1, 1.1, True), (0.4, 0.4, False), (1.1, 0.1, False)]
+)
+def test_smooth_assets_have_no_filter_and_a_level_1_for_later(width, height, is_smooth, device, tmp_path):
+    asset = shell(width, height)
+    found = build(asset, SMOOTH, device=device)
+    first = found.level_range(1)
+    assert (found.clusters.filter_px2[first] == (0 if is_smooth else np.float32(0.05))).all()
+    assert found.clusters.filter_px2[-1] == np.float32(1 / 12)
+    assert found.config["build"]["smooth"] == "measured"
+    assert same(found, build(asset, replace(SMOOTH, smooth="yes" if is_smooth else "no"), device=device))
+    assert same(found, build(asset, SMOOTH, device=device, resume_path=tmp_path / "parts.v3dg"))
+    if is_smooth:
+        plain = build(asset, replace(SMOOTH, smooth="no", filter_px2=0.0), device=device)
+        arrays, others = (vars(bundle.gaussians).values() for bundle in (found, plain))
+        assert all(map(np.array_equal, arrays, others))
+        is_first, ball, other = found.groups.level == 1, found.groups.ball, plain.groups.ball
+        np.testing.assert_array_equal(ball[is_first], other[is_first] * [1, 1, 1, 2])
+        assert (ball[~is_first, 3] > other[~is_first, 3]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_smooth"),
+    [({"filter_px2": 0.0}, False), ({"min_gaussians": 1501}, False), ({"min_clusters": 16}, True)],
+)
+def test_smoothness_is_measured_where_levels_have_a_filter(changes, is_smooth, device):
+    config = replace(SMOOTH, **changes)
+    bundle = build(shell(1.1, 1.1), config, device=device)
+    assert same(
+        bundle, build(shell(1.1, 1.1), replace(config, smooth="yes" if is_smooth else "no"), device=device)
+    )
+
+
 def test_level_zero_is_the_asset(asset, bundle):
     rows = [np.concatenate([getattr(g, n).reshape(len(g), -1) for n in scenes.NAMES], axis=1)
             for g in (asset, bundle.level_gaussians(0))]  # fmt: skip

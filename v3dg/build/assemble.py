@@ -18,7 +18,7 @@ def assemble(plan: Plan, tables: Sequence[LevelTables], config: BuildConfig) -> 
     num_groups = [0, *(level.num_groups for level in levels[1:])]  # of level 0 there are none in a bundle
     level = np.repeat(np.arange(len(levels), dtype=np.int32), num_clusters)
     # The last level is drawn at all smaller sizes, too, where a pixel sees its whole square: variance 1/12.
-    last_px2 = max(config.filter_px2, 1 / 12) if config.filter_px2 > 0 else 0.0
+    last_px2 = max(config.filter_px2, 1 / 12) if config.filter_px2 > 0 or config.smooth == "yes" else 0.0
     coarse_px2 = np.where(level < len(levels) - 1, config.filter_px2, last_px2)
     clusters = Clusters(
         offset=np.concatenate([[0], np.cumsum(np.concatenate([np.diff(level.offset) for level in levels]))]),

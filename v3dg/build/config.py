@@ -51,6 +51,10 @@ class BuildConfig:
         distance: From the camera to the centre of the group, in radii.
         filter_px2: Variance of the low-pass that the coarser levels are drawn with, px²; the last one with a
             pixel's, 1/12, if that is more, unless this is 0.
+        smooth: Whether the asset's gaussians are about as wide as they are far apart, so that one sample a
+            pixel shows it well from near. Its coarser levels have no filter, but the last one a pixel's, and
+            level 1 is selected at half the size. To measure it, some groups of level 1 are fitted with
+            `filter_px2` and without; an asset that hardly gains by it is smooth.
         asset_filter_px2: The same for level 0: what the asset was trained with (0.3 for the original 3DGS) at
             the size of its photographs; without, it is better seen from farther away. Coarser levels are
             fitted to the asset without a filter.
@@ -84,6 +88,7 @@ class BuildConfig:
     # Outside the ball; from farther, float32 depths are coarser than gaussians.
     distance: Annotated[float, (1.1, 1000)] = 4.0
     filter_px2: _Weight = 0.05
+    smooth: Literal["measured", "yes", "no"] = "measured"
     asset_filter_px2: _Weight = 0.0
     asset_antialiased: bool = False
     loss_l1: _Weight = 1.0
@@ -174,30 +179,10 @@ class BuildConfig:
         640 fresh random views of 64 x 64 px at four radii, against the previous level, without a filter;
         0.8 L1 + 0.2 D-SSIM + 0.1 alpha.
         """
-        settings: dict[str, Any] = dict(
-            cluster_size=4096,
-            group_size=2,
-            min_clusters=2,
-            init="prune",
-            targets="previous",
-            steps=640,
-            first_steps=640,
-            views_per_step=1,
-            num_views=0,
-            supersample=1,
-            image_size=64,
-            filter_px2=0.0,
-            loss_l1=0.8,
-            loss_dssim=0.2,
-            loss_alpha=0.1,
-            step_position=1.6e-5,
-            position_in_world=True,
-            step_log_scale=5e-3,
-            step_quat=1e-3,
-            step_logit=5e-2,
-            step_sh0=2.5e-3,
-            step_sh_rest=2.5e-3 / 20,
-            final_step=1.0,
-            beta2=0.999,
-        )
+        settings: dict[str, Any] = {"cluster_size": 4096, "group_size": 2, "min_clusters": 2, "init": "prune"}
+        settings |= {"targets": "previous", "steps": 640, "first_steps": 640, "views_per_step": 1}
+        settings |= {"num_views": 0, "supersample": 1, "image_size": 64, "filter_px2": 0.0, "smooth": "no"}
+        settings |= {"loss_l1": 0.8, "loss_dssim": 0.2, "loss_alpha": 0.1, "position_in_world": True}
+        settings |= {"step_position": 1.6e-5, "step_log_scale": 5e-3, "step_quat": 1e-3, "step_logit": 5e-2}
+        settings |= {"step_sh0": 2.5e-3, "step_sh_rest": 2.5e-3 / 20, "final_step": 1.0, "beta2": 0.999}
         return BuildConfig(**settings | changes)

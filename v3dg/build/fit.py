@@ -18,7 +18,7 @@ _T = TypeVar("_T")
 # What of a config shapes the levels; all else is the fit's.
 _OF_LEVELS = {
     *("cluster_size", "group_size", "min_clusters", "min_gaussians", "init", "prune_growth", "targets"),
-    *("first_steps", "asset_filter_px2", "asset_antialiased"),
+    *("first_steps", "smooth", "asset_filter_px2", "asset_antialiased"),
 }
 
 

@@ -1,7 +1,7 @@
 """The unit of work: from the leaves of an asset or of a subtree of it to the levels above them."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -12,10 +12,13 @@ from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
 from v3dg.build.plan import LevelPlan, Offsets, Plan
 from v3dg.bundle.codec import Codec
-from v3dg.gaussians import Array, Gaussians, empty
+from v3dg.gaussians import Array, Gaussians
 
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
 _GROUPS_AT_ONCE = 256
+
+# Of the balls of level 1 where the asset is smooth: selected at half the size (docs/levels.md).
+_SMOOTH_GROWTH = 2.0
 
 Show = Callable[[range, int, int, _core.FitProgress], None]
 """Is told now and then of a fit: its levels, groups and gaussians, and how far it has come."""
@@ -128,6 +131,8 @@ class LevelBuilder:
         ball = below[levels[0] - 1].tables.ball
         for i, number in enumerate(levels):
             ball = _core.bound_spheres(ball, _children(plan, number - 1, number))
+            if number == 1 and config.smooth == "yes":
+                ball[:, 3] *= _SMOOTH_GROWTH
             part = gaussians.subset(slice(int(rows[i]), int(rows[i + 1])))
             made.append(_level(part, plans[i], self.codec, ball, balls[i], error[groups[i] : groups[i + 1]]))
         return made
@@ -191,14 +196,12 @@ def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: B
     """What groups start from: their gaussians halved, from `offset` to `out_offset`."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
-    result = empty(int(out_offset[-1]), gaussians.sh_degree)
+    parts = []
     for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
         cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
         part = gaussians.subset(slice(cuts[0], cuts[-1]))
-        part = _halved(part, cuts - cuts[0], out_cuts - out_cuts[0], config)
-        for field in fields(Gaussians):
-            getattr(result, field.name)[out_cuts[0] : out_cuts[-1]] = getattr(part, field.name)
-    return result
+        parts.append(_halved(part, cuts - cuts[0], out_cuts - out_cuts[0], config))
+    return Gaussians.concatenate(parts)
 
 
 def _halved(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig) -> Gaussians:

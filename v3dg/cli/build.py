@@ -211,11 +211,8 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
     except OSError as error:  # a full disk, say
         raise OSError(error.errno, f"{error.strerror}{to_resume()}", error.filename) from None
     asset = str(paths[0]) if len(paths) == 1 else [str(path) for path in paths]
-    result: dict[str, Any] = {
-        "asset": asset,
-        "output": str(output),
-        "status": "built" if is_built else "kept",
-    }
+    result: dict[str, Any] = {"asset": asset, "output": str(output)}
+    result |= {"status": "built" if is_built else "kept"}
     result |= {name: bundle.config[name] for name in ("asset_gaussians", "dropped")}
     result |= {"gaussians": bundle.num_gaussians, "clusters": len(bundle.clusters)}
     result |= {"levels": bundle.num_levels, "bytes": output.stat().st_size}

@@ -55,18 +55,9 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
     boxes = {"box": _box(drawable.means), "box_without_outliers": _box(drawable.means[~far])}
     values = {"longest_scale": drawable.scales.max(axis=1), "opacity": drawable.opacities}
     spread = {name: np.percentile(of, (5, 50, 95)).tolist() for name, of in values.items() if len(of)}
-    result = {
-        "path": shown(path),
-        "kind": "asset",
-        "gaussians": len(asset),
-        "drawable": len(drawable),
-        "not_drawable": findings.counts,
-        "outliers": int(far.sum()),
-        "sh_degree": asset.sh_degree,
-        "bytes": num_bytes,
-        **boxes,
-        "percentiles_5_50_95": spread,
-    }
+    result: dict[str, Any] = {"path": shown(path), "kind": "asset", "gaussians": len(asset)}
+    result |= {"drawable": len(drawable), "not_drawable": findings.counts, "outliers": int(far.sum())}
+    result |= {"sh_degree": asset.sh_degree, "bytes": num_bytes, **boxes, "percentiles_5_50_95": spread}
     lines = [
         f"{shown(path)}: asset, {_common.bytes_text(num_bytes)}",
         f"{len(asset):,} gaussians, SH degree {asset.sh_degree}",
@@ -101,7 +92,7 @@ def _bundle_info(bundle: Bundle) -> _Description:
         "colour error = {error_color:.4f}; alpha error = {error_alpha:.4f}"
     )
     levels = [{**level, "size": _common.bytes_text(level["bytes"])} for level in result["levels"]]
-    leaves = _common.level_size(bundle, 0) if len(bundle.level_range(0)) else 0
+    leaves = _leaves(bundle)
     each = f", {result['bytes'] / leaves:.1f} bytes a gaussian of level 0" if leaves else ""
     lines = [
         f"{bundle.path}: bundle, version {result['version']} ({result['codec']}), "
@@ -125,14 +116,16 @@ def _bundle_info(bundle: Bundle) -> _Description:
     return result, lines
 
 
+def _leaves(bundle: Bundle) -> int:
+    """Gaussians of level 0."""
+    return _common.level_size(bundle, 0) if len(bundle.level_range(0)) else 0
+
+
 def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Description:
+    counts = np.bincount(scene.instance_bundle, minlength=len(scene.bundles)).tolist()
     bundles: list[dict[str, Any]] = [
-        {
-            "path": bundle.path,
-            "instances": int((scene.instance_bundle == number).sum()),
-            "asset_gaussians": _common.level_size(bundle, 0) if len(bundle.level_range(0)) else 0,
-        }
-        for number, bundle in enumerate(scene.bundles)
+        {"path": bundle.path, "instances": count, "asset_gaussians": _leaves(bundle)}
+        for bundle, count in zip(scene.bundles, counts, strict=True)
     ]
     total = sum(bundle["instances"] * bundle["asset_gaussians"] for bundle in bundles)
     sizes = [{"name": name, "width": at.width, "height": at.height} for name, at in cameras.items()]
