@@ -235,9 +235,14 @@ def test_smooth_assets_have_no_filter_and_a_level_1_for_later(width, height, is_
 
 @pytest.mark.parametrize(
     ("changes", "is_smooth"),
-    [({"filter_px2": 0.0}, False), ({"min_gaussians": 1501}, False), ({"min_clusters": 16}, True)],
+    [
+        ({"filter_px2": 0.2}, True),
+        ({"min_clusters": 16}, True),
+        ({"min_gaussians": 1501}, False),
+        ({"steps": 0}, False),
+    ],
 )
-def test_smoothness_is_measured_where_levels_have_a_filter(changes, is_smooth, device):
+def test_smoothness_is_measured_where_levels_are_fitted(changes, is_smooth, device):
     config = replace(SMOOTH, **changes)
     bundle = build(shell(1.1, 1.1), config, device=device)
     assert same(

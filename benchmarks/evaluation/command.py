@@ -21,6 +21,8 @@ class Evaluate:
     """small takes minutes on two cores, full needs a GPU."""
     parts: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
     """Which parts of the evaluation; all if not given."""
+    scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = ()
+    """Which composed scenes; all if not given."""
     asset: Annotated[Path | None, option("PATH")] = None
     """Trained asset, a .ply file, in place of the one that is made here."""
     layout: Annotated[Path | None, option("PATH")] = None
@@ -54,6 +56,7 @@ def run(options: Evaluate) -> None:
             "cuda" if _device.resolve(options.device).is_cuda else "cpu",
             options.output,
             seed=options.seed,
+            scenes=options.scenes,
             asset_path=options.asset,
             layout_path=options.layout,
             peers=options.peers,

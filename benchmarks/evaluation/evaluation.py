@@ -132,6 +132,8 @@ class Evaluation:
     device: str
     folder: Path
     seed: int = 0
+    scenes: tuple[str, ...] = ()
+    """Names of the composed scenes that are drawn; all by default."""
     asset_path: Path | None = None
     layout_path: Path | None = None
     peers: Path | None = None
@@ -284,9 +286,12 @@ class Evaluation:
     def composed_scenes(self) -> Iterator[tuple[str, Scene, list[View]]]:
         """The composed scenes and their views, one after another."""
         name = self._main_world.name if self.layout_path is None else self.layout_path.stem
-        yield name, self.full_scene, self.all_views
+        if not self.scenes or name in self.scenes:
+            yield name, self.full_scene, self.all_views
         width, height = self.settings.size
         for world in self._other_worlds:
+            if self.scenes and world.name not in self.scenes:
+                continue
             bundles = {name: self._world_bundle(world, name) for name in world.assets}
             views = views_of(world.cameras(width=width, height=height).values())
             yield world.name, worlds.scene_of(world, bundles), self._some_of(views)

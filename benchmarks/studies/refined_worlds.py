@@ -19,7 +19,7 @@ import os
 import statistics
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -49,6 +49,8 @@ class Config:
     refined: tuple[float, ...] = (3.0, 4.5, 6.0, 9.4, 13.0, 18.0)
     """Tolerances of cuts of the refined ones."""
     steps: int = 30_000
+    build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
+    """How the levels are built."""
     device: Literal["cpu", "cuda"] = "cpu"
     report: Path | None = None
     """Recorded results; nothing is measured then."""
@@ -73,7 +75,7 @@ def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture
         world, start = world_of(config, name), time.perf_counter()
         with multiprocessing.get_context("spawn").Pool(min(len(world.assets), os.cpu_count() or 1)) as pool:
             assets = dict(zip(world.assets, pool.map(make_asset, world.assets.values(), 1), strict=True))
-        built = {key: v3dg.build_bundle(asset, **how) for key, asset in assets.items()}
+        built = {key: v3dg.build_bundle(asset, config=config.build, **how) for key, asset in assets.items()}
         refined = {key: v3dg.refine_bundle(b, steps=config.steps, **how) for key, b in built.items()}
         seconds = round(time.perf_counter() - start, 1)
         about[name] = {"assets": len(assets), "instances": world.num_instances, "seconds": seconds}
