@@ -19,6 +19,12 @@ import v3dg
 from benchmarks.worlds.procedural import make_asset
 from reference import project as reference_project
 from v3dg import BuildConfig, Camera, Gaussians, build_bundle, metrics, rasterize, render, select
+from v3dg._device import CPU
+from v3dg.build.leaves import MemoryLeaves
+from v3dg.build.plan import Plan
+from v3dg.build.simplify import Level, LevelTables
+from v3dg.build.smooth import settled
+from v3dg.bundle.codec import codec_of
 
 SMALL = BuildConfig(cluster_size=32, steps=10)
 TABLES = {"clusters": v3dg.Clusters, "groups": v3dg.Groups}
@@ -238,16 +244,57 @@ def test_smooth_assets_have_no_filter_and_a_level_1_for_later(width, height, is_
     [
         ({"filter_px2": 0.2}, True),
         ({"min_clusters": 16}, True),
-        ({"min_gaussians": 1501}, False),
+        ({"group_size": 4, "init": "prune"}, True),
+        ({"filter_px2": 0.0}, False),
         ({"steps": 0}, False),
+        ({"first_steps": 0}, False),
     ],
 )
-def test_smoothness_is_measured_where_levels_are_fitted(changes, is_smooth, device):
+def test_smoothness_is_measured_where_levels_are_fitted_with_a_filter(changes, is_smooth, device):
     config = replace(SMOOTH, **changes)
     bundle = build(shell(1.1, 1.1), config, device=device)
-    assert same(
-        bundle, build(shell(1.1, 1.1), replace(config, smooth="yes" if is_smooth else "no"), device=device)
+    told = replace(config, smooth="yes" if is_smooth else "no")
+    assert same(bundle, build(shell(1.1, 1.1), told, device=device))
+    untold = replace(config, smooth="no" if is_smooth else "yes")
+    assert not same(bundle, build(shell(1.1, 1.1), untold, device=device))
+
+
+@pytest.mark.parametrize("num_gaussians", [8192, 8193, 8200, 9000, 700])
+@pytest.mark.parametrize(("missed", "is_smooth"), [(1.47, True), (1.48, False)])
+def test_smoothness_is_measured_all_over_the_asset(num_gaussians, missed, is_smooth, monkeypatch):
+    """Also where groups have a gaussian more than a round number: a sample's clusters could be larger."""
+    asset = make_asset(num_gaussians=1000, seed=0).subset(np.arange(num_gaussians) % 1000)
+    config = BuildConfig(cluster_size=64, group_size=4, steps=7, loss_l1=2.0, loss_alpha=0.25)
+    leaves = MemoryLeaves(asset, config)
+    plan = Plan.of(leaves.num_gaussians, config)
+    num_groups, reads, builders = plan.levels[1].num_groups, [], []
+    read = leaves.read
+    monkeypatch.setattr(leaves, "read", lambda first, last: reads.append((first, last)) or read(first, last))
+
+    def levels(builder, asset):
+        builders.append(builder)
+        assert (
+            len(asset) == sum(last - first for first, last in reads) == builder.plan.levels[0].num_gaussians
+        )
+        error = np.array([[0.2, 0.4], [0.6, 0.8]])  # a loss of 2 * 0.4 + 0.25 * 0.6
+        error[:, 0] *= missed if builder.config.filter_px2 == 0 else 1
+        yield from [Level(asset, LevelTables(None, None, None, error))] * len(builder.plan.levels)
+
+    monkeypatch.setattr("v3dg.build.simplify.LevelBuilder.levels", levels)
+    found = settled(config, plan, leaves, 5, codec_of("float32", 1), CPU)
+    assert found == (replace(config, smooth="yes", filter_px2=0.0) if is_smooth else config)
+    count = min(32, num_groups)
+    offset = plan.levels[1].leaf_offset
+    own = [np.searchsorted(offset, first, side="right") - 1 for first, _ in reads]
+    assert np.diff(own).tolist() == [num_groups // count] * (count - 1)
+    assert all(
+        offset[g] == first and last <= offset[g + 1] for g, (first, last) in zip(own, reads, strict=True)
     )
+    assert [builder.config.filter_px2 for builder in builders] == [0.05, 0.0]
+    for builder in builders:
+        assert [level.num_groups for level in builder.plan.levels] == [2 * count, count]
+        assert builder.config.steps_at(1) == 3
+        assert builder.seed == 5
 
 
 def test_level_zero_is_the_asset(asset, bundle):

@@ -12,12 +12,13 @@ from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
 from v3dg.build.plan import LevelPlan, Offsets, Plan
 from v3dg.bundle.codec import Codec
-from v3dg.gaussians import Array, Gaussians
+from v3dg.gaussians import Array, Gaussians, empty
 
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
 _GROUPS_AT_ONCE = 256
 
-# Of the balls of level 1 where the asset is smooth: selected at half the size (docs/levels.md).
+# Of the balls of level 1 where the asset is smooth, which is then selected at half the size; those above,
+# which contain them, grow less (docs/levels.md).
 _SMOOTH_GROWTH = 2.0
 
 Show = Callable[[range, int, int, _core.FitProgress], None]
@@ -196,12 +197,14 @@ def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: B
     """What groups start from: their gaussians halved, from `offset` to `out_offset`."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
-    parts = []
+    result = empty(int(out_offset[-1]), gaussians.sh_degree)
     for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
         cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
         part = gaussians.subset(slice(cuts[0], cuts[-1]))
-        parts.append(_halved(part, cuts - cuts[0], out_cuts - out_cuts[0], config))
-    return Gaussians.concatenate(parts)
+        part = _halved(part, cuts - cuts[0], out_cuts - out_cuts[0], config)
+        for array, values in zip(vars(result).values(), vars(part).values(), strict=True):
+            array[out_cuts[0] : out_cuts[-1]] = values
+    return result
 
 
 def _halved(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig) -> Gaussians:

@@ -58,10 +58,8 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
     result: dict[str, Any] = {"path": shown(path), "kind": "asset", "gaussians": len(asset)}
     result |= {"drawable": len(drawable), "not_drawable": findings.counts, "outliers": int(far.sum())}
     result |= {"sh_degree": asset.sh_degree, "bytes": num_bytes, **boxes, "percentiles_5_50_95": spread}
-    lines = [
-        f"{shown(path)}: asset, {_common.bytes_text(num_bytes)}",
-        f"{len(asset):,} gaussians, SH degree {asset.sh_degree}",
-    ]
+    lines = [f"{shown(path)}: asset, {_common.bytes_text(num_bytes)}"]
+    lines += [f"{len(asset):,} gaussians, SH degree {asset.sh_degree}"]
     if findings.counts:
         lines.append(f"{findings.num_dropped:,} cannot be drawn: {describe(findings.counts)}")
     if len(drawable):

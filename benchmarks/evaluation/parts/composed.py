@@ -35,6 +35,8 @@ def run(evaluation: Evaluation) -> Iterator[dict[str, Any]]:
         )
         scenes.append({"scene": name, "instances": len(scene), "gaussians": gaussians, "views": rows})
         yield {"tolerance": DEFAULT_TOLERANCE, "scenes": scenes}
+    if not scenes:
+        raise ValueError(f"--scenes: expected names of composed scenes, got {' '.join(evaluation.scenes)}")
 
 
 def measure(evaluation: Evaluation, scene: Scene, views: list[View]) -> tuple[list[Row], Picture]:
