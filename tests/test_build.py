@@ -23,7 +23,7 @@ from v3dg._device import CPU
 from v3dg.build.leaves import MemoryLeaves
 from v3dg.build.plan import Plan
 from v3dg.build.simplify import Level, LevelTables
-from v3dg.build.smooth import settled
+from v3dg.build.smooth import measured_config
 from v3dg.bundle.codec import codec_of
 
 SMALL = BuildConfig(cluster_size=32, steps=10)
@@ -281,7 +281,7 @@ def test_smoothness_is_measured_all_over_the_asset(num_gaussians, missed, is_smo
         yield from [Level(asset, LevelTables(None, None, None, error))] * len(builder.plan.levels)
 
     monkeypatch.setattr("v3dg.build.simplify.LevelBuilder.levels", levels)
-    found = settled(config, plan, leaves, 5, codec_of("float32", 1), CPU)
+    found = measured_config(config, plan, leaves, 5, codec_of("float32", 1), CPU)
     assert found == (replace(config, smooth="yes", filter_px2=0.0) if is_smooth else config)
     count = min(32, num_groups)
     offset = plan.levels[1].leaf_offset

@@ -16,7 +16,7 @@ from v3dg.gaussians import Gaussians
 _GROUPS, _FILTER_PX2, _MOST_LEAVES, _NEEDED = 32, 0.05, 1 << 15, 1.4
 
 
-def settled(
+def measured_config(
     config: BuildConfig, plan: Plan, leaves: Leaves, seed: int, codec: Codec, where: Device
 ) -> BuildConfig:
     """The config with which levels are built: what it leaves to a measurement is measured."""

@@ -22,7 +22,7 @@ from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.build.plan import Plan
 from v3dg.build.progress import Bar
 from v3dg.build.simplify import Level, LevelBuilder, LevelTables, Show
-from v3dg.build.smooth import settled
+from v3dg.build.smooth import measured_config
 from v3dg.build.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
 from v3dg.bundle import Bundle
 from v3dg.bundle.codec import codec_of
@@ -77,7 +77,7 @@ def build_into(
         else nullcontext(MemoryStore(file)) as store,
     ):
         if not store.is_whole:
-            config = settled(config, plan, leaves, seed, kept, devices[0])
+            config = measured_config(config, plan, leaves, seed, kept, devices[0])
             done = sum(parts[part][number][0].num_gaussians for part, number in store.levels if number > 0)
             with Bar(plan, done, progress) as bar:
                 build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
