@@ -17,9 +17,6 @@ from v3dg.donut import make_donut
 from v3dg.metrics import psnr
 from v3dg.pictures import write_picture
 
-# What the coarser levels were fitted with: gsplat has one filter for all gaussians, and that is nearest.
-FILTER_PX2 = v3dg.BuildConfig.filter_px2
-
 
 @dataclass
 class Config:
@@ -78,9 +75,15 @@ def gsplat_arguments(selection: v3dg.Selection, camera: v3dg.Camera, device: str
         "width": camera.width,
         "height": camera.height,
         "near_plane": camera.near,
-        "eps2d": FILTER_PX2,
+        "eps2d": filter_of(selection.scene),
         "rasterize_mode": "antialiased",
     }
+
+
+def filter_of(scene: v3dg.Scene) -> float:
+    """What level 1 of the first bundle is drawn with: gsplat has one filter for all gaussians."""
+    clusters = scene.bundles[0].clusters
+    return float(clusters.filter_px2[clusters.level == 1].max(initial=0.0))
 
 
 def make_scene(config: Config) -> tuple[v3dg.Scene, v3dg.Camera]:
