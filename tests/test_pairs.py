@@ -136,19 +136,30 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
     for row in best:
         others = rows["thing", row["best"], row["level"], row["factor"]]
         assert row["ratio"] == row["ours_flip"] / others["flip"]
-    # A second run measures one method again, and takes the others from the first.
+    # A second run measures one method again and a new one, and takes the others from the first.
     known = (tmp_path / "all" / "pairs.json",)
-    again = pairs.Measure(folder, tmp_path / "again", methods=("merged",), known=known, only=("thing",))
+    methods = ("refined", "merged")
+    again = pairs.Measure(folder, tmp_path / "again", methods=methods, known=known, only=("thing",), refine=2)
     with pytest.raises(SystemExit, match="expected results of"):
         pairs.measure(again)
     for name in ("percents", "factors", "widest", "views", "device"):
         setattr(again, name, getattr(config, name))
     pairs.measure(again)
     second = json.loads((tmp_path / "again" / "pairs.json").read_text())
-    assert sorted(map(str, second["rows"])) == sorted(map(str, result["rows"]))
+    refined = [row for row in second["rows"] if row["method"] == "refined"]
+    assert {(row["level"], row["factor"]) for row in refined} == {
+        (row["level"], row["factor"]) for row in result["rows"] if row["asset"] == "thing"
+    }
+    others = [row for row in second["rows"] if row["method"] != "refined"]
+    assert sorted(map(str, others)) == sorted(map(str, result["rows"]))
+    assert second["builds"]["thing"].keys() == {"ours_seconds", "merged_seconds", "refined_seconds"}
     pairs_report.report(pairs_report.Report(tmp_path / "again" / "pairs.json", tmp_path / "pairs.md"))
     text = (tmp_path / "pairs.md").read_text()
-    assert f"{best[0]['ours_flip']:.4f} / {best[0]['best_flip']:.4f} = {best[0]['ratio']:.2f}" in text
+    of_refined = pairs_report.best_others(second["rows"], "refined")
+    assert len(of_refined) == len(best)
+    for row in (best[0], of_refined[0]):
+        assert f"{row['ours_flip']:.4f} / {row['best_flip']:.4f} = {row['ratio']:.2f}" in text
+    assert "Refined in 2 steps" in text
 
 
 @pytest.mark.skipif(not has_flip(), reason="FLIP is not installed")

@@ -14,16 +14,16 @@ ASSETS/peers/NAME/TOOL_PERCENT.npz, which `pairs_subject.pack_level` makes of wh
 
 wrote, or of any format that v3dg reads.
 
-A pair is a count and a size. The size at which a level is at home is 2 px² for each of its gaussians: of
-the footprint of the object's ball, or of a scene's picture for those of the level that are in it. Every
-level is drawn at `factors` times that, measured along a side. Ours and merging alone are the cut with a
-budget of as many gaussians (of a scene, of the same share of those in the frustum), drawn with the filter
-that the bundle asks for; others are drawn whole and plain. Cuts are of whole groups: where the one within
-the budget has fewer than 97 % of it, its error and that of the next finer one are interpolated in the
-logarithm of the count. Where the eye is inside of groups, those are refined at any tolerance; a budget
-below what is left is met with the least `min_level` that does. The truth is every gaussian at four by four
-samples a pixel. Of a picture wider than `widest` a window is compared, around a gaussian drawn at random
-from those that are large and opaque.
+A pair is a count and a size. The size at which a level is at home is 2 px² for each of its gaussians: of the
+footprint of the object's ball, or of a scene's picture for those of the level that are in it. Every level is
+drawn at `factors` times that, measured along a side. Ours and merging alone are the cut with a budget of as
+many gaussians (of a scene, of the same share of those in the frustum), drawn with the filter that the bundle
+asks for, and so are ours refined, with `--refine` and as many steps; others are drawn whole and plain. Cuts
+are of whole groups: where the one within the budget has fewer than 97 % of it, its error and that of the
+next finer one are interpolated in the logarithm of the count. Where the eye is inside of groups, those are
+refined at any tolerance; a budget below what is left is met with the least `min_level` that does. The truth
+is every gaussian at four by four samples a pixel. Of a picture wider than `widest` a window is compared,
+around a gaussian drawn at random from those that are large and opaque.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from v3dg.refine import refine_bundle
 Row = dict[str, Any]
 
 PERCENTS = (50.0, 25.0, 12.5, 6.25, 3.0, 1.5, 0.7)
-_OURS = ("ours", "merged")
+_OURS = ("ours", "refined", "merged")
 _SAMPLES = 4
 _FULL_ENOUGH = 0.97  # of a budget
 _COARSEST_PX2 = 1e30
@@ -69,7 +69,13 @@ class Measure:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("pairs")
     only: tuple[str, ...] = ()
     """Names of assets; all by default."""
-    methods: tuple[Literal["all", "ours", "merged", "peers"], ...] = ("all", "ours", "merged", "peers")
+    methods: tuple[Literal["all", "ours", "refined", "merged", "peers"], ...] = (
+        "all",
+        "ours",
+        "refined",
+        "merged",
+        "peers",
+    )
     """What is measured; "all" is every gaussian at one sample a pixel."""
     known: tuple[Path, ...] = ()
     """Recorded results, from which rows are taken that are not measured here."""
@@ -84,7 +90,7 @@ class Measure:
     build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
     """How ours are built; merging alone is the same without a step."""
     refine: int = 0
-    """Steps by which ours are refined, too."""
+    """Steps of "refined": ours, refined; without any it is left out."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +137,8 @@ class Study:
 
     def _drawn(self, subject: Subject) -> Iterator[tuple[Row, Picture, Picture]]:
         """What is to be compared: what it is, the truth, the picture."""
-        bundles = {
-            name: self._built(subject, name) for name in _OURS if name in set[str](self._config.methods)
-        }
+        wanted_of_ours = set[str](self._config.methods) - ({"refined"} if self._config.refine == 0 else set())
+        bundles = {name: self._built(subject, name) for name in _OURS if name in wanted_of_ours}
         self._asset = self._placed(subject.asset)
         targets: dict[float | str, tuple[int, list[Level]]] = {
             percent: (round(len(subject.asset) * percent / 100), []) for percent in self._config.percents
@@ -150,10 +155,10 @@ class Study:
         return gaussians.torch("cuda") if self.device == "cuda" else gaussians
 
     def _built(self, subject: Subject, name: str) -> v3dg.Bundle:
-        config = self._config.build if name == "ours" else replace(self._config.build, steps=0)
+        config = replace(self._config.build, steps=0) if name == "merged" else self._config.build
         start = time.perf_counter()
         bundle = v3dg.build_bundle(subject.asset, config=config, device=self.device, progress=False)
-        if name == "ours" and self._config.refine > 0:
+        if name == "refined":
             bundle = refine_bundle(bundle, steps=self._config.refine, device=self.device, progress=False)
         seconds = round(time.perf_counter() - start, 2)
         self.builds.setdefault(subject.name, {})[f"{name}_seconds"] = seconds
@@ -244,9 +249,9 @@ def measure(config: Measure) -> None:
     settings = {"factors": list(config.factors), "widest": config.widest, "views": config.views}
     changes = dict(asdict(config.build).items() - asdict(v3dg.BuildConfig()).items())
     changes |= {"refine": config.refine} if config.refine > 0 else {}
-    rows = known_rows(config.known, settings)
     config.output.mkdir(parents=True, exist_ok=True)
     study, judges = Study(config), Judges()
+    rows, study.builds = known_results(config.known, settings)
     try:
         for name in config.only or about:
             start = time.perf_counter()
@@ -265,15 +270,19 @@ def by_key(rows: list[Row]) -> dict[tuple[Any, ...], Row]:
     return {(row["asset"], row["method"], row["level"], row["factor"]): row for row in rows}
 
 
-def known_rows(paths: tuple[Path, ...], settings: Row) -> dict[tuple[Any, ...], Row]:
-    """Rows of recorded results, which must have been measured alike."""
+def known_results(
+    paths: tuple[Path, ...], settings: Row
+) -> tuple[dict[tuple[Any, ...], Row], dict[str, Row]]:
+    """Rows and builds of recorded results, which must have been measured alike."""
     rows: dict[tuple[Any, ...], Row] = {}
+    builds: dict[str, Row] = {}
     for path in paths:
         recorded = json.loads(path.read_text(encoding="utf-8"))
         if recorded["settings"] != settings:
             raise SystemExit(f"{path}: expected results of {settings}, got {recorded['settings']}")
         rows |= by_key(recorded["rows"])
-    return rows
+        builds |= recorded["builds"]
+    return rows, builds
 
 
 if __name__ == "__main__":

@@ -16,10 +16,11 @@ from benchmarks.evaluation.markdown import Column, count_text, markdown
 
 Row = dict[str, Any]
 
-_OURS = ("ours", "merged")
+_OURS = ("ours", "refined", "merged")
 _COLUMNS = 3
 _STYLES = {
     "ours": ("o-", "tab:blue", "ours"),
+    "refined": ("o-", "navy", "ours, refined"),
     "merged": ("s--", "tab:cyan", "ours, merged only"),
     "d": ("^-", "tab:orange", "splat-transform -d"),
     "adaptive": ("v-", "tab:red", "splat-transform --decimate-adaptive"),
@@ -38,9 +39,9 @@ Each level is drawn at several times that size, along a side, by the same render
 gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views} views,
 windows of at most {widest} px. *Ours* is the cut with a budget of as many gaussians as the other level has
 (of a scene, of the same share of those in the frustum), interpolated between two cuts where groups are too
-large to meet it; *merged* the same without the fit. Others are splat-transform 3.7.0 (`-d`,
-`--decimate-adaptive`) and the levels that an asset's makers published, drawn plain; the best of them
-counts, for each count and size anew.
+large to meet it; *refined* the same after `v3dg refine`, *merged* without the fit. Others are
+splat-transform 3.7.0 (`-d`, `--decimate-adaptive`) and the levels that an asset's makers published, drawn
+plain; the best of them counts, for each count and size anew.
 """
 
 
@@ -55,17 +56,17 @@ class Report:
     """Folder for the plots; without it there are none."""
 
 
-def best_others(rows: Sequence[Row]) -> list[Row]:
-    """One row for each pair of a count and a size that others have, too: ours, merged, the best other."""
+def best_others(rows: Sequence[Row], which: str = "ours") -> list[Row]:
+    """One row for each pair of a count and a size that others have, too: which of ours, the best other."""
     pairs: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
         pairs.setdefault((row["asset"], row["level"], row["factor"]), {})[row["method"]] = row
     out = []
     for (asset, level, factor), by_method in pairs.items():
         others = [row for name, row in by_method.items() if name not in (*_OURS, "all")]
-        if not others or "ours" not in by_method:
+        if not others or which not in by_method:
             continue
-        best, ours = min(others, key=lambda row: row["flip"]), by_method["ours"]
+        best, ours = min(others, key=lambda row: row["flip"]), by_method[which]
         row = {
             "asset": asset,
             "level": level,
@@ -87,13 +88,16 @@ def _ratio(ours: float, theirs: float) -> float:
     return ours / theirs if theirs > 0 else float(ours > 0) + 1
 
 
-def overview(rows: Sequence[Row]) -> str:
-    """A line for each asset, and one for all of them."""
-    pairs = best_others(rows)
+def overview(rows: Sequence[Row], which: str = "ours") -> str:
+    """A line for each asset, and of all of them one, one from half the size on, and one for each size."""
+    pairs = best_others(rows, which)
     names = list(dict.fromkeys(row["asset"] for row in pairs))
     lines = [_line(name, [row for row in pairs if row["asset"] == name]) for name in names]
     if len(names) > 1:
         lines.append(_line("all", pairs))
+        lines.append(_line("all, from x0.5 on", [row for row in pairs if row["factor"] >= 0.5]))
+        for factor in sorted({row["factor"] for row in pairs}):
+            lines.append(_line(f"all, x{factor:g}", [row for row in pairs if row["factor"] == factor]))
     return markdown(_OVERVIEW, lines)
 
 
@@ -152,16 +156,24 @@ def table(pairs: Sequence[Row]) -> str:
 
 def report(options: Report) -> None:
     recorded = json.loads(options.results.read_text(encoding="utf-8"))
-    rows, pairs = recorded["rows"], best_others(recorded["rows"])
+    rows = recorded["rows"]
+    parts = {"As they are built": "ours"}
+    if any(row["method"] == "refined" for row in rows):
+        parts[f"Refined in {recorded['changes']['refine']:,} steps"] = "refined"
+    pairs = {which: best_others(rows, which) for which in parts.values()}
     machine = ", ".join(str(recorded[key]) for key in ("gpu", "processor") if key in recorded)
     sections = [
         _ABOUT.format(**recorded["settings"]),
         f"Measured on {machine}, commit {recorded['commit']}, by `{recorded['command']}`.",
-        "",
-        overview(rows),
     ]
-    for name in dict.fromkeys(row["asset"] for row in pairs):
-        sections += ["", f"## {name}", "", table([row for row in pairs if row["asset"] == name])]
+    for title, which in parts.items():
+        sections += ["", f"## {title}", "", overview(rows, which)]
+    for name in dict.fromkeys(row["asset"] for of_part in pairs.values() for row in of_part):
+        sections += ["", f"## {name}"]
+        for title, which in parts.items():
+            of_asset = [row for row in pairs[which] if row["asset"] == name]
+            if of_asset:
+                sections += ["", f"{title}, FLIP, ours / best other:", "", table(of_asset)]
         if options.plots is not None:
             options.plots.mkdir(parents=True, exist_ok=True)
             path = options.plots / f"pairs_{name}.png"
