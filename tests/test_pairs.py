@@ -73,7 +73,7 @@ def test_scene_is_drawn_at_two_px2_of_the_picture_a_gaussian(folder):
     place = subject(folder, "place")
     (size,) = place.sizes(400, 2, widest=1 << 20)
     camera = v3dg.read_cameras(folder / "cameras.json")["near"]
-    in_picture = 400 * place._places(camera)[1].mean()
+    in_picture = 400 * pairs_subject.places(place.asset.means, camera)[1].mean()
     assert 0 < in_picture <= 400
     assert size.camera.width * size.camera.height == pytest.approx(2 * in_picture * 4, rel=0.1)
 

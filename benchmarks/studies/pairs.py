@@ -4,9 +4,9 @@
     python -m benchmarks.studies.pairs report pairs/pairs.json -o docs/notes/pairs.md --plots docs/images
 
 ASSETS is a folder with assets.json: for each asset by its name a `file` that v3dg reads; `up` for an object,
-which is drawn from four sides, or `cameras`, a transforms.json, and `views`, names of some of them, for a
-scene; and `published`, by their names the `file` and number of `gaussians` of the levels that its makers gave
-it. Levels of other tools are
+which is drawn from four sides, or for a scene `cameras`, a transforms.json, `views`, names of some of them,
+and `refined_from`, cameras of another file by which it is refined; and `published`, by their names the
+`file` and number of `gaussians` of the levels that its makers gave it. Levels of other tools are
 ASSETS/peers/NAME/TOOL_PERCENT.npz, which `pairs_subject.pack_level` makes of what
 
     splat-transform -g cpu -w NAME.ply -d 50% d_50.ply
@@ -16,14 +16,16 @@ wrote, or of any format that v3dg reads.
 
 A pair is a count and a size. The size at which a level is at home is 2 px² for each of its gaussians: of the
 footprint of the object's ball, or of a scene's picture for those of the level that are in it. Every level is
-drawn at `factors` times that, measured along a side. Ours and merging alone are the cut with a budget of as
-many gaussians (of a scene, of the same share of those in the frustum), drawn with the filter that the bundle
-asks for, and so are ours refined, with `--refine` and as many steps; others are drawn whole and plain. Cuts
-are of whole groups: where the one within the budget has fewer than 97 % of it, its error and that of the
-next finer one are interpolated in the logarithm of the count. Where the eye is inside of groups, those are
-refined at any tolerance; a budget below what is left is met with the least `min_level` that does. The truth
-is every gaussian at four by four samples a pixel. Of a picture wider than `widest` a window is compared,
-around a gaussian drawn at random from those that are large and opaque.
+drawn at `factors` times that, measured along a side. Ours and merging alone are the finest cut with at most
+as many gaussians as the other level has, drawn with the filter that the bundle asks for, and so are ours
+refined, with `--refine` and as many steps; others are drawn whole and plain. Of a scene those gaussians
+count whose means are in the picture, in each picture anew: others' levels have more of them in one place
+than in another, so there each of them is a pair alone. Cuts are of whole groups: where one has fewer than 97
+% of the count, its error and that of the next finer one are interpolated in the logarithm of the count.
+Where the eye is inside of groups, those are refined at any tolerance; a count below what is left is met with
+the least `min_level` that does. The truth is every gaussian at four by four samples a pixel. Of a picture
+wider than `widest` a window is compared, around a gaussian drawn at random from those that are large and
+opaque.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ import tyro
 
 import v3dg
 from benchmarks.evaluation import record
-from benchmarks.studies import pairs_report
+from benchmarks.studies import pairs_report, pairs_subject
 from benchmarks.studies.pairs_subject import Subject
 from v3dg import _device
 from v3dg._judges import Judges
@@ -55,8 +57,8 @@ PERCENTS = (50.0, 25.0, 12.5, 6.25, 3.0, 1.5, 0.7)
 _OURS = ("ours", "refined", "merged")
 _SAMPLES = 4
 _FULL_ENOUGH = 0.97  # of a budget
-_COARSEST_PX2 = 1e30
-_STEP_OF_BUDGETS = 2 ** (-1.5 / 2048)  # the tolerances that a budget chooses from lie closer than that
+_FINEST_PX2, _COARSEST_PX2 = 1e-9, 1e30
+_STEP = 2 ** (-1.5 / 2048)  # cuts of tolerances that lie closer count as neighbours
 _LEAST_PX = 8  # of a side: SSIM needs 6, and below that there is nothing to see
 
 
@@ -110,12 +112,24 @@ class Level:
 
     method: str
     gaussians: v3dg.Gaussians
-    count: int
+    counts: list[int]
+    """Of gaussians that count, in each view."""
 
 
 def errors(item: tuple[Row, Picture, Picture]) -> Row:
     """FLIP, PSNR and SSIM of (what it is, truth, picture)."""
     return errors_of(item[1], item[2])
+
+
+@dataclass(frozen=True)
+class Target:
+    """A count that ours are to meet, and others' levels of it."""
+
+    label: float | str
+    count: int
+    counts: list[int]
+    """Of gaussians that count, in each view."""
+    levels: list[Level]
 
 
 class Study:
@@ -139,17 +153,34 @@ class Study:
         """What is to be compared: what it is, the truth, the picture."""
         wanted_of_ours = set[str](self._config.methods) - ({"refined"} if self._config.refine == 0 else set())
         bundles = {name: self._built(subject, name) for name in _OURS if name in wanted_of_ours}
-        self._asset = self._placed(subject.asset)
-        targets: dict[float | str, tuple[int, list[Level]]] = {
-            percent: (round(len(subject.asset) * percent / 100), []) for percent in self._config.percents
-        }
-        targets |= {f"published {label}": (count, []) for label, count in subject.published_counts.items()}
-        if "peers" in self._config.methods:
-            for wanted, method, level in subject.peers(self._config.percents):
-                targets[wanted][1].append(Level(method, self._placed(level), len(level)))
-        for wanted, (count, levels) in targets.items():
+        self._asset = Level("all", self._placed(subject.asset), subject.counts(subject.asset))
+        for target in self._targets(subject):
             for factor in self._config.factors:
-                yield from self._compared(subject, wanted, count, factor, levels, bundles)
+                yield from self._compared(subject, target, factor, bundles)
+
+    def _targets(self, subject: Subject) -> list[Target]:
+        """Objects at each percent; of a scene each other level, which have different counts in a picture."""
+        targets: dict[float | str, Target] = {}
+        for percent in self._config.percents:
+            counts = [round(count * percent / 100) for count in self._asset.counts]
+            targets[percent] = Target(percent, round(len(subject.asset) * percent / 100), counts, [])
+        if not subject.is_scene:
+            for label, count in subject.published_counts.items():
+                targets[f"published {label}"] = Target(
+                    f"published {label}", count, [count] * len(subject.cameras), []
+                )
+        is_drawn = "peers" in self._config.methods
+        if not is_drawn and not subject.is_scene:
+            return list(targets.values())
+        of_scene: list[Target] = []
+        for wanted, method, gaussians in subject.peers(self._config.percents):
+            level = Level(method, self._placed(gaussians), subject.counts(gaussians))
+            if subject.is_scene:
+                label = wanted if isinstance(wanted, str) else f"{wanted:g} %, {method}"
+                of_scene.append(Target(label, len(gaussians), level.counts, [level] if is_drawn else []))
+            else:
+                targets[wanted].levels.append(level)
+        return of_scene or list(targets.values())
 
     def _placed(self, gaussians: v3dg.Gaussians) -> v3dg.Gaussians:
         return gaussians.torch("cuda") if self.device == "cuda" else gaussians
@@ -159,72 +190,82 @@ class Study:
         start = time.perf_counter()
         bundle = v3dg.build_bundle(subject.asset, config=config, device=self.device, progress=False)
         if name == "refined":
-            bundle = refine_bundle(bundle, steps=self._config.refine, device=self.device, progress=False)
+            options: Row = {"steps": self._config.refine, "device": self.device, "progress": False}
+            bundle = refine_bundle(bundle, cameras=subject.refined_from, **options)
         seconds = round(time.perf_counter() - start, 2)
         self.builds.setdefault(subject.name, {})[f"{name}_seconds"] = seconds
         return bundle
 
     def _compared(
-        self,
-        subject: Subject,
-        wanted: float | str,
-        count: int,
-        factor: float,
-        levels: list[Level],
-        bundles: dict[str, v3dg.Bundle],
+        self, subject: Subject, target: Target, factor: float, bundles: dict[str, v3dg.Bundle]
     ) -> Iterator[tuple[Row, Picture, Picture]]:
-        about: Row = {"asset": subject.name, "level": wanted, "count": count, "factor": factor}
-        sizes = subject.sizes(count, factor, self._config.widest)
+        about: Row = {
+            "asset": subject.name,
+            "level": target.label,
+            "count": target.count,
+            "factor": factor,
+        }
+        sizes = subject.sizes(target.count, factor, self._config.widest)
         if min(min(size.window.width, size.window.height) for size in sizes) < _LEAST_PX:
             return
-        for size in sizes:
-            truth = draw_truth(self._asset, size.window, self.device, _SAMPLES)
+        levels = [*([self._asset] if "all" in self._config.methods else []), *target.levels]
+        for view, size in enumerate(sizes):
+            truth = draw_truth(self._asset.gaussians, size.window, self.device, _SAMPLES)
             about["width"] = size.camera.width
-            for shown in self._shown(levels, bundles, size.camera, count):
-                image = v3dg.render(shown.subject, size.window, device=self.device, **shown.cut)
-                row = {**about, "method": shown.method, "gaussians": shown.gaussians, "weight": shown.weight}
-                tolerance = shown.cut.get("tolerance", _COARSEST_PX2)
+            shown = [Shown(level.method, level.gaussians, level.counts[view], {}) for level in levels]
+            for name, bundle in bundles.items():
+                shown += cuts_of(
+                    name, bundle, size.camera, max(target.counts[view], 1), of_picture=subject.is_scene
+                )
+            for one in shown:
+                image = v3dg.render(one.subject, size.window, device=self.device, **one.cut)
+                row = {**about, "method": one.method, "gaussians": one.gaussians, "weight": one.weight}
+                tolerance = one.cut.get("tolerance", _COARSEST_PX2)
                 row["tolerance"] = tolerance if tolerance < _COARSEST_PX2 else None
                 yield row, truth, to_8bit(image.color)
 
-    def _shown(
-        self, levels: list[Level], bundles: dict[str, v3dg.Bundle], camera: v3dg.Camera, count: int
-    ) -> Iterator[Shown]:
-        if "all" in self._config.methods:
-            yield Shown("all", self._asset, len(self._asset), {})
-        for level in levels:
-            yield Shown(level.method, level.gaussians, level.count, {})
-        for name, bundle in bundles.items():
-            yield from cuts_of(name, bundle, camera, count)
 
+def cuts_of(
+    name: str, bundle: v3dg.Bundle, camera: v3dg.Camera, count: int, *, of_picture: bool = False
+) -> list[Shown]:
+    """The finest cut with at most so many gaussians, and the next finer one if it has far fewer.
 
-def cuts_of(name: str, bundle: v3dg.Bundle, camera: v3dg.Camera, count: int) -> list[Shown]:
-    """The cut with at most so many of the finest gaussians, and the next finer one if it is far below."""
-    scene = v3dg.Scene.of(bundle)
+    `of_picture`: those count whose means are in the picture.
+    """
+    scene, offset = v3dg.Scene.of(bundle), bundle.clusters.offset
+    sizes = np.diff(offset)
+    if of_picture:
+        sizes = np.add.reduceat(
+            pairs_subject.places(bundle.gaussians.means, camera)[1], offset[:-1], dtype=int
+        )
 
-    def cut(min_level: int, **options: Any) -> Shown:
-        chosen = v3dg.select(scene, camera, min_level=min_level, device="cpu", **options)
-        tolerance = min(chosen.tolerance, _COARSEST_PX2)
-        return Shown(name, bundle, chosen.num_gaussians, {"tolerance": tolerance, "min_level": min_level})
+    def cut(min_level: int, tolerance: float) -> Shown:
+        chosen = v3dg.select(scene, camera, min_level=min_level, tolerance=tolerance, device="cpu")
+        options = {"tolerance": tolerance, "min_level": min_level}
+        return Shown(name, bundle, int(sizes[chosen.cluster_ids].sum()), options)
 
-    everything = cut(0, tolerance=0.0).gaussians
-    finest = bundle.clusters.offset[bundle.level_range(0).stop] - bundle.clusters.offset[0]
-    budget = round(count * everything / finest)
     finer = None
     for min_level in range(bundle.num_levels):
-        coarsest = cut(min_level, tolerance=_COARSEST_PX2)
-        if coarsest.gaussians <= budget:
+        within = cut(min_level, _COARSEST_PX2)
+        if within.gaussians <= count:
             break
-        finer = coarsest
+        finer = within
     else:
-        return [coarsest]
-    within = cut(min_level, budget=budget)
-    tolerance = within.cut["tolerance"]
-    if tolerance > 0:
-        finer = cut(min_level, tolerance=tolerance * _STEP_OF_BUDGETS)
-    if within.gaussians >= _FULL_ENOUGH * budget or finer is None or finer.gaussians <= budget:
         return [within]
-    share = math.log(budget / within.gaussians) / math.log(finer.gaussians / within.gaussians)
+    finest = cut(min_level, 0.0)
+    if finest.gaussians <= count:
+        within = finest
+    else:
+        finer = cut(min_level, _FINEST_PX2)
+        while finer.cut["tolerance"] < within.cut["tolerance"] * _STEP:
+            between = cut(min_level, math.sqrt(finer.cut["tolerance"] * within.cut["tolerance"]))
+            if between.gaussians <= count:
+                within = between
+            else:
+                finer = between
+    if within.gaussians >= _FULL_ENOUGH * count or within.gaussians == 0 or finer is None:
+        return [within]
+    share = math.log(count / within.gaussians) / math.log(finer.gaussians / within.gaussians)
     return [replace(within, weight=1 - share), replace(finer, weight=share)]
 
 
@@ -235,7 +276,7 @@ def weighted(rows: list[Row]) -> Row:
         known = [row for row in rows if row[name] is not None]
         values, weights = [row[name] for row in known], [row["weight"] for row in known]
         if name == "gaussians":  # errors are interpolated in its logarithm
-            means[name] = round(math.exp(np.average(np.log(values), weights=weights)))
+            means[name] = round(math.exp(np.average(np.log(np.maximum(values, 1)), weights=weights)))
         else:
             means[name] = float(f"{np.average(values, weights=weights):.6g}") if known else None
     return means

@@ -37,11 +37,12 @@ those of its gaussians that are in it. (Groups of a bundle are fitted at 2 px² 
 overlap and lie behind each other: they are at home at a quarter to half the size that is called 1 here.)
 Each level is drawn at several times that size, along a side, by the same renderer, and compared with every
 gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views} views,
-windows of at most {widest} px. *Ours* is the cut with a budget of as many gaussians as the other level has
-(of a scene, of the same share of those in the frustum), interpolated between two cuts where groups are too
-large to meet it; *refined* the same after `v3dg refine`, *merged* without the fit. Others are
-splat-transform 3.7.0 (`-d`, `--decimate-adaptive`) and the levels that an asset's makers published, drawn
-plain; the best of them counts, for each count and size anew.
+windows of at most {widest} px. *Ours* is the finest cut with at most as many gaussians as the other level
+has (of a scene, as many as it has in each picture), interpolated between two cuts where groups are too large
+to meet that; *refined* the same after `v3dg refine` (a scene by other cameras in it), *merged* without the
+fit. Others are splat-transform 3.7.0 (`-d`, `--decimate-adaptive`) and the levels that an asset's makers
+published, drawn plain; the best of them counts, for each count and size anew. Of a scene each counts alone,
+because levels of one share of a scene have different numbers of gaussians in a picture.
 """
 
 
@@ -72,6 +73,7 @@ def best_others(rows: Sequence[Row], which: str = "ours") -> list[Row]:
             "level": level,
             "factor": factor,
             "count": ours["count"],
+            "others": best["gaussians"],
             "best": best["method"],
         }
         row |= {"gaussians": ours["gaussians"], "width": ours["width"]}
@@ -143,12 +145,12 @@ def table(pairs: Sequence[Row]) -> str:
     factors = sorted({row["factor"] for row in pairs})
     lines: dict[Any, Row] = {}
     for row in sorted(pairs, key=lambda row: -row["count"]):
-        line = lines.setdefault(row["level"], {"level": _level(row), "count": row["count"]})
+        line = lines.setdefault(row["level"], {"level": _level(row), "others": row["others"]})
         line["gaussians"] = row["gaussians"]
         line[f"{row['factor']:g}"] = f"{row['ours_flip']:.4f} / {row['best_flip']:.4f} = {row['ratio']:.2f}"
     columns = [
         Column("kept", "level"),
-        Column("theirs", "count", "count"),
+        Column("theirs", "others", "count"),
         Column("ours", "gaussians", "count"),
     ]
     return markdown([*columns, *(Column(f"x{f:g}", f"{f:g}") for f in factors)], list(lines.values()))

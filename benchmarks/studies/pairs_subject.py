@@ -33,7 +33,7 @@ class Subject:
     def __init__(self, folder: Path, name: str, about: dict[str, Any], views: int) -> None:
         self.name, self._folder, self._about = name, folder, about
         self.asset = v3dg.read_asset(folder / about["file"])
-        self.cameras = self._scene_views(views) if "cameras" in about else self._object_views(views)
+        self.cameras = self._scene_views(views) if self.is_scene else self._object_views(views)
 
     def _scene_views(self, views: int) -> list[v3dg.Camera]:
         cameras = v3dg.read_cameras(self._folder / self._about["cameras"])
@@ -47,25 +47,31 @@ class Subject:
         fov, up = 2 * math.asin(1 / _DISTANCE), self._about["up"]
         return v3dg.turntable(center, _DISTANCE * radius, views, up=up, fov_x=fov, width=1024, height=1024)
 
-    @cached_property
-    def _is_seen(self) -> list[Any]:
-        """(N,) for each view, whether a gaussian's mean is in the picture."""
-        return [self._places(camera)[1] for camera in self.cameras]
+    @property
+    def is_scene(self) -> bool:
+        return "cameras" in self._about
 
-    def _places(self, camera: v3dg.Camera) -> tuple[Any, Any]:
-        """(N, 2) px and (N,) whether they are in the picture."""
-        seen = self.asset.means.astype(np.float64) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        is_before = seen[:, 2] > camera.near
-        depth = np.where(is_before, seen[:, 2], 1)
-        px = np.stack(
-            [camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy], 1
-        )
-        return px, is_before & ((px >= 0) & (px < [camera.width, camera.height])).all(axis=1)
+    @property
+    def refined_from(self) -> list[v3dg.Camera]:
+        """Cameras by which a scene is refined; none of an object, which is seen from all around."""
+        name = self._about.get("refined_from")
+        return [] if name is None else list(v3dg.read_cameras(self._folder / name).values())
+
+    def counts(self, gaussians: v3dg.Gaussians) -> list[int]:
+        """Of gaussians that count, in each view: all of an object, of a scene those in the picture."""
+        if not self.is_scene:
+            return [len(gaussians)] * len(self.cameras)
+        return [int(places(gaussians.means, camera)[1].sum()) for camera in self.cameras]
+
+    @cached_property
+    def _share_seen(self) -> float:
+        """Of the asset's gaussians in the pictures, a mean."""
+        return float(np.mean(self.counts(self.asset))) / len(self.asset)
 
     def sizes(self, count: int, factor: float, widest: int) -> list[Size]:
         """Each view, at a factor times the size at which a level of so many gaussians is at home."""
-        if "cameras" in self._about:
-            wanted = HOME_PX2 * count * float(np.mean([seen.mean() for seen in self._is_seen]))
+        if self.is_scene:
+            wanted = HOME_PX2 * count * self._share_seen
             scales = [math.sqrt(wanted / (c.width * c.height)) for c in self.cameras]
         else:
             solid_angle = 2 * math.pi * (1 - math.sqrt(1 - _DISTANCE**-2))
@@ -78,7 +84,7 @@ class Subject:
     def _size(self, camera: v3dg.Camera, widest: int, rng: np.random.Generator) -> Size:
         if max(camera.width, camera.height) <= widest:
             return Size(camera, camera)
-        px, is_seen = self._places(camera)
+        px, is_seen = places(self.asset.means, camera)
         ids = np.flatnonzero(is_seen)
         largest = np.sort(self.asset.scales[ids].astype(np.float64), axis=1)[:, 1:].prod(axis=1)
         # Of a scene the sky would always be taken: what is twice as large counts twice, whatever the rest.
@@ -102,7 +108,16 @@ class Subject:
             if float(percent) in percents:
                 yield float(percent), tool, read_level(path)
         for label, level in self._about.get("published", {}).items():
-            yield f"published {label}", "published", v3dg.read_asset(self._folder / level["file"])
+            yield f"published {label}", "published", read_level(self._folder / level["file"])
+
+
+def places(means: Any, camera: v3dg.Camera) -> tuple[Any, Any]:
+    """(N, 2) px of (N, 3) means, and (N,) whether they are in the picture."""
+    seen = means.astype(np.float64) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    is_before = seen[:, 2] > camera.near
+    depth = np.where(is_before, seen[:, 2], 1)
+    px = np.stack([camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy], 1)
+    return px, is_before & ((px >= 0) & (px < [camera.width, camera.height])).all(axis=1)
 
 
 def scaled(camera: v3dg.Camera, scale: float) -> v3dg.Camera:
