@@ -30,6 +30,12 @@ __device__ inline unsigned char* shared_memory() {
     return bytes;
 }
 
+// What a warp is to do next, in lane 0: the first `dealt` things have been dealt out, and `taken` counts the
+// others, from 0. Ask early, for it takes a while to come.
+__device__ inline unsigned take_next(unsigned* taken, unsigned dealt) {
+    return threadIdx.x % 32 == 0 ? dealt + atomicAdd(taken, 1u) : 0;
+}
+
 // Over the lanes of a whole warp, in every lane. The order of the additions is fixed.
 template <class T>
 __device__ inline T warp_sum(T x) {

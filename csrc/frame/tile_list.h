@@ -108,6 +108,7 @@ struct FrameLists {
     TilePlan* plans;    // [num_plans] scratch
     // [2 * kPlanClasses], cleared before: of each class, and of those that have a place.
     uint32_t* plan_counts;
+    unsigned* taken;          // long lists beyond the first of each block; 0 before
     uint32_t num_plans;       // num_tiles, or most_plans() where tiles may be blended in parts
     float min_transmittance;  // of the images
     // Of images that do not say where they are: those of the first and of the second.
@@ -173,8 +174,8 @@ struct ItemTiles {
 // What project() has found out of the tiles, and scratch of tile_bin(). Cleared before project().
 struct TileCounts {
     uint32_t* count;  // [num_tiles] of the records over at most kFewTiles; zero after tile_bin()
-    unsigned* ticket;
-    unsigned long long* state;  // [tile_bin_parts(num_tiles)]
+    unsigned *scan_ticket, *taken;  // of parts of the scan; of items whose records are scattered
+    unsigned long long* state;      // [tile_bin_parts(num_tiles)]
 };
 
 }  // namespace cuda

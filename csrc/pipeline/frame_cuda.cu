@@ -13,7 +13,7 @@ namespace cuda {
 // What a frame counts, cleared before it.
 struct Frame::State {
     FrameCounters counters;
-    unsigned long long ticket;
+    unsigned projected[2], scan_ticket, scattered, spread;  // what blocks and warps have taken of their work
     alignas(8) uint32_t plan_counts[2 * kPlanClasses];
 };
 
@@ -134,8 +134,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     State* state = reinterpret_cast<State*>(cleared);
     auto* scan_state = reinterpret_cast<unsigned long long*>(cleared + sizeof(State));
     unsigned long long* zeros = scan_state + parts;
-    const TileCounts tiles{reinterpret_cast<uint32_t*>(zeros + batch.num_zeros),
-                           reinterpret_cast<unsigned*>(&state->ticket), scan_state};
+    const TileCounts tiles{reinterpret_cast<uint32_t*>(zeros + batch.num_zeros), &state->scan_ticket,
+                           &state->scattered, scan_state};
     const ItemList items{room(items_, capacity.items, drawing), &state->counters, capacity.items,
                          capacity.records, zeros};
     room(records_, kRecordFloats * capacity.records, drawing);
@@ -158,7 +158,8 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
     project({batch.models, batch.packed, batch.coded, batch.placements, batch.images, items,
              batch.has_shared_items, batch.has_faded_items},
-            {planes, few, item_records, item_tiles, source, tiles, large, capacity.large}, stream);
+            {planes, few, item_records, item_tiles, source, tiles, large, capacity.large, state->projected},
+            stream);
     tile_bin({item_tiles, few, planes, batch.images, batch.num_images, batch.num_tiles, capacity, large,
               tiles, &state->counters},
              bins, stream);
@@ -199,6 +200,7 @@ FrameLists Frame::lists(const FrameBatch& batch) const {
             capacity_,
             plans_.data(),
             state->plan_counts,
+            &state->spread,
             num_plans_,
             batch.min_transmittance};
 }

@@ -330,36 +330,29 @@ __device__ void report_counts(FrameCounters& counters, unsigned num_in_frustum, 
 
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
-    project_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out) {
+    project_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out,
+                   unsigned* taken) {
     if (!in.items.is_complete()) return;
     __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
     WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
-    const unsigned num_items = static_cast<unsigned>(in.items.counters->items), stride = gridDim.x * kWarps;
+    const unsigned num_items = static_cast<unsigned>(in.items.counters->items);
     unsigned num_in_frustum = 0, num_records = 0;
     Loaded loaded;
     Source::prepare();
-    // The item after this one and its placement are fetched while this one is projected.
-    unsigned i = blockIdx.x * kWarps + threadIdx.x / 32;
-    uint32_t item_word = 0, placement_word = 0, next_item_word = 0;
-    if (i < num_items) {
-        item_word = load_word(in.items.items[i]);
-        placement_word = load_word(in.placements[__shfl_sync(kAllLanes, item_word, 0)]);
-        if (i + stride < num_items) next_item_word = load_word(in.items.items[i + stride]);
-    }
-    for (; i < num_items; i += stride) {
-        const uint32_t this_item_word = item_word, this_placement_word = placement_word;
-        if (i + stride < num_items) {
-            item_word = next_item_word;
-            placement_word = load_word(in.placements[__shfl_sync(kAllLanes, item_word, 0)]);
-            if (i + 2 * stride < num_items) next_item_word = load_word(in.items.items[i + 2 * stride]);
-        }
+    // Items differ much in what is seen of them, so each warp takes the next one when it is done with one.
+    for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
+        const uint32_t item_word = load_word(in.items.items[i]);
+        const unsigned next = take_next(taken, gridDim.x * kWarps);
+        const uint32_t placement_word = load_word(in.placements[__shfl_sync(kAllLanes, item_word, 0)]);
         __syncwarp();
-        store_tables(space.tables, this_item_word, this_placement_word, in, models, loaded);
-        if (space.tables.item.sharers != 0 || !Source::has(space.tables.model)) continue;
-        const unsigned written =
-            project_item<Source, false>(space, nullptr, *in.items.counters, out, num_in_frustum);
-        num_records += written;
-        report_item(space.tables, i, written, out);
+        store_tables(space.tables, item_word, placement_word, in, models, loaded);
+        if (space.tables.item.sharers == 0 && Source::has(space.tables.model)) {
+            const unsigned written =
+                project_item<Source, false>(space, nullptr, *in.items.counters, out, num_in_frustum);
+            num_records += written;
+            report_item(space.tables, i, written, out);
+        }
+        i = __shfl_sync(kAllLanes, next, 0);
     }
     report_counts(*in.items.counters, num_in_frustum, num_records);
 }
@@ -481,9 +474,10 @@ void pack_pages(const PageRows* pages, size_t num_pages, float* planes, size_t n
 // Shared items have no weights below 1.
 template <class Source, class SharedSource>
 static void project_from(const typename Source::Model* models, const ProjectInput& in,
-                         const ProjectOutput& out, cudaStream_t stream) {
+                         const ProjectOutput& out, int taken, cudaStream_t stream) {
     const unsigned blocks = kBlocks * num_multiprocessors();
-    launch("project_kernel", project_kernel<Source>, blocks, 32 * kWarps, 0, stream, in, models, out);
+    launch("project_kernel", project_kernel<Source>, blocks, 32 * kWarps, 0, stream, in, models, out,
+           out.taken + taken);
     if (in.has_shared_items)
         launch("project_shared_kernel", project_shared_kernel<SharedSource>, blocks, 32 * kWarps, 0, stream,
                in, models, out);
@@ -491,18 +485,18 @@ static void project_from(const typename Source::Model* models, const ProjectInpu
 
 template <class Source>
 static void project_scene(const typename Source::Model* models, const ProjectInput& in,
-                          const ProjectOutput& out, cudaStream_t stream) {
+                          const ProjectOutput& out, int taken, cudaStream_t stream) {
     if (in.has_faded_items)
-        project_from<Faded<Source>, Source>(models, in, out, stream);
+        project_from<Faded<Source>, Source>(models, in, out, taken, stream);
     else
-        project_from<Source, Source>(models, in, out, stream);
+        project_from<Source, Source>(models, in, out, taken, stream);
 }
 
 void project(const ProjectInput& in, const ProjectOutput& out, cudaStream_t stream) {
-    if (in.packed != nullptr) project_scene<PackedSource>(in.packed, in, out, stream);
-    if (in.coded != nullptr) project_scene<CodeSource>(in.coded, in, out, stream);
+    if (in.packed != nullptr) project_scene<PackedSource>(in.packed, in, out, 0, stream);
+    if (in.coded != nullptr) project_scene<CodeSource>(in.coded, in, out, 1, stream);
     if (in.packed == nullptr && in.coded == nullptr)
-        project_from<RowSource, RowSource>(in.models, in, out, stream);
+        project_from<RowSource, RowSource>(in.models, in, out, 0, stream);
 }
 
 }  // namespace cuda

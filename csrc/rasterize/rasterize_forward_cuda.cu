@@ -389,57 +389,77 @@ __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileE
     return has_windows;
 }
 
-// Spreads the long lists, a block one after another: where they are, if `most_held` entries in shared memory
-// are enough, else into the scratch. Those of tiles in parts are spread into windows, in the scratch.
-__global__ void __launch_bounds__(kSpreadThreads, 2) spread_kernel(FrameLists lists, uint32_t most_held) {
+// Spreads the list of a plan's tile if it is long; by a whole block. Where it is, if `most_held` entries in
+// shared memory are enough, else into the scratch. That of a tile in parts is spread into windows, in the
+// scratch, by the block that has the first part.
+__device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t count, uint32_t most_held,
+                            SpreadSpace& space) {
     static_assert(offsetof(SpreadSpace, finer) % sizeof(TileEntry) == 0, "entries lie where `finer` does");
-    SpreadSpace& space = *reinterpret_cast<SpreadSpace*>(shared_memory());
     SpreadShared<kLog2Spread>& s = space.even;
     auto* held = reinterpret_cast<TileEntry*>(&space.finer);
+    if (count <= kPiece || plan.part != 0) return;
+    TileEntry* entries = lists.entries + lists.tile_first[plan.tile];
+    const bool has_parts = plan.log2_parts > 0, is_held = count <= most_held;
+    unsigned long long first_scratch = 0;
+    if (has_parts || !is_held) {
+        const uint32_t room = has_parts ? room_in_windows(count) : count;
+        first_scratch = take_scratch(*lists.counters, room);
+        if (first_scratch + room > lists.capacity.spread) return;
+    }
+    TileEntry* scratch = lists.scratch + first_scratch;
+    if (has_parts && spread_into_windows(entries, count, scratch, space)) {
+        if (threadIdx.x == 0) {
+            plan.in_windows = plan.in_scratch = true;
+            plan.first_scratch = first_scratch;
+        }
+        return;
+    }
+    Buckets buckets;
+    if (is_held) {
+        for (uint32_t k = threadIdx.x; k < count; k += kSpreadThreads)
+            copy_async(reinterpret_cast<float2*>(held + k), reinterpret_cast<const float2*>(entries + k));
+        wait_for_copies();
+        __syncthreads();
+        buckets = find_buckets<kSpreadThreads>(held, 0, count, true, false, s);
+        spread<kSpreadThreads>(held, entries, 0, count, buckets, s.bucket, s.warp_sum);
+    } else {
+        buckets = find_buckets<kSpreadThreads>(entries, 0, count, true, false, s);
+        spread<kSpreadThreads>(entries, scratch, 0, count, buckets, s.bucket, s.warp_sum);
+    }
+    if (has_longer(s.bucket, kWindow) && is_held && !has_parts)
+        first_scratch = take_scratch(*lists.counters, count);
+    if (threadIdx.x == 0) {
+        plan.in_scratch = !is_held;
+        plan.first_scratch = first_scratch;
+        plan.lowest = buckets.lowest;
+        plan.last_bucket = static_cast<uint16_t>(buckets.last);
+        plan.shift = static_cast<uint16_t>(buckets.shift);
+    }
+}
+
+// Spreads the long lists. A block takes the next one when it is done with one; of those that turn out to be
+// short it takes several at once.
+__global__ void __launch_bounds__(kSpreadThreads, 2) spread_kernel(FrameLists lists, uint32_t most_held) {
+    constexpr uint32_t kShortAtOnce = 16;
+    __shared__ uint32_t next_of_block;
+    SpreadSpace& space = *reinterpret_cast<SpreadSpace*>(shared_memory());
     if (!lists.capacity.holds_entries(*lists.counters)) return;
-    for (uint32_t i = blockIdx.x; i < lists.num_plans; i += gridDim.x) {
+    for (uint32_t i = blockIdx.x, end = i + 1; i < lists.num_plans;) {
         TilePlan& plan = lists.plans[i];
         if (plan.tile == kNoTile) return;
-        const uint32_t count = count_of(lists, plan.tile);
-        if (count >> plan.log2_parts < kPiece / kMostParts) return;  // and so are all that follow
-        if (count <= kPiece || plan.part != 0) continue;
-        TileEntry* entries = lists.entries + lists.tile_first[plan.tile];
-        const bool has_parts = plan.log2_parts > 0, is_held = count <= most_held;
-        unsigned long long first_scratch = 0;
-        if (has_parts || !is_held) {
-            const uint32_t room = has_parts ? room_in_windows(count) : count;
-            first_scratch = take_scratch(*lists.counters, room);
-            if (first_scratch + room > lists.capacity.spread) continue;
-        }
-        TileEntry* scratch = lists.scratch + first_scratch;
-        if (has_parts && spread_into_windows(entries, count, scratch, space)) {
-            if (threadIdx.x == 0) {
-                plan.in_windows = plan.in_scratch = true;
-                plan.first_scratch = first_scratch;
-            }
-            continue;
-        }
-        Buckets buckets;
-        if (is_held) {
-            for (uint32_t k = threadIdx.x; k < count; k += kSpreadThreads)
-                copy_async(reinterpret_cast<float2*>(held + k), reinterpret_cast<const float2*>(entries + k));
-            wait_for_copies();
-            __syncthreads();
-            buckets = find_buckets<kSpreadThreads>(held, 0, count, true, false, s);
-            spread<kSpreadThreads>(held, entries, 0, count, buckets, s.bucket, s.warp_sum);
-        } else {
-            buckets = find_buckets<kSpreadThreads>(entries, 0, count, true, false, s);
-            spread<kSpreadThreads>(entries, scratch, 0, count, buckets, s.bucket, s.warp_sum);
-        }
-        if (has_longer(s.bucket, kWindow) && is_held && !has_parts)
-            first_scratch = take_scratch(*lists.counters, count);
-        if (threadIdx.x == 0) {
-            plan.in_scratch = !is_held;
-            plan.first_scratch = first_scratch;
-            plan.lowest = buckets.lowest;
-            plan.last_bucket = static_cast<uint16_t>(buckets.last);
-            plan.shift = static_cast<uint16_t>(buckets.shift);
-        }
+        const uint32_t count = count_of(lists, plan.tile), load = count >> plan.log2_parts;
+        if (load < kPiece / kMostParts) return;  // and so are all that follow
+        const uint32_t taken = load > kPiece ? 1 : kShortAtOnce;
+        const bool is_last = i + 1 == end;
+        const uint32_t next = is_last && threadIdx.x == 0 ? gridDim.x + atomicAdd(lists.taken, taken) : 0;
+        spread_list(lists, plan, count, most_held, space);
+        ++i;
+        if (!is_last) continue;
+        if (threadIdx.x == 0) next_of_block = next;
+        __syncthreads();
+        i = next_of_block;
+        end = i + taken;
+        __syncthreads();  // before the next round writes it
     }
 }
 

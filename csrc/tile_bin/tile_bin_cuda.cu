@@ -16,8 +16,11 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
-constexpr unsigned kBlocks = 5;    // on a multiprocessor
-constexpr uint32_t kNoItem = ~0u;  // in place of a number of records
+constexpr unsigned kBlocks = 5;  // on a multiprocessor
+
+// Of the kernel that counts large records.
+constexpr unsigned kCountThreads = 512, kCountBlocks = 3;
+constexpr unsigned kLeastLarge = 16;  // large records for each tile, for blocks to count on their own
 
 // Large records that a warp takes together; lanes 16 apart have the same one.
 struct LargeBatch {
@@ -93,7 +96,7 @@ __device__ void for_each_tile(const TileBinInput& in, const LargeBatch& batch, c
 template <class Visit>
 __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
     constexpr int kLog2MostParts = 2;
-    const unsigned num_warps = gridDim.x * kWarps;
+    const unsigned num_warps = gridDim.x * (blockDim.x / 32);
     const unsigned num_batches = static_cast<unsigned>(in.counters->large / kLargeAtOnce);
     const unsigned warps_each = num_batches == 0 ? 0 : 8 * num_warps / num_batches;
     const int log2_parts = min(max(31 - __clz(static_cast<int>(warps_each)), 0), kLog2MostParts);
@@ -104,17 +107,40 @@ __device__ void for_each_part(const TileBinInput& in, const Visit& visit) {
               LargePart{static_cast<int>(at & ((1u << log2_parts) - 1)), log2_parts});
 }
 
-__global__ void __launch_bounds__(kThreads, kBlocks) count_large_kernel(TileBinInput in) {
-    if (!in.capacity.holds(*in.counters)) return;
+// Calls visit(tile) for the tiles of all large records, a lane a tile, kNoTile for none.
+template <class Visit>
+__device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) {
     for_each_part(in, [&](const LargeBatch& batch, const LargePart& part) {
         const FrameImage& image = in.images[batch.image];
         for_each_tile(
             in, batch, part, [](uint32_t, const Record<float>&) {},
             [&](int, int row, int column) {
-                count_tile(in.counts.count,
-                           column < 0 ? kNoTile : image.first_tile + row * image.tile_columns + column);
+                visit(column < 0 ? kNoTile : image.first_tile + row * image.tile_columns + column);
             });
     });
+}
+
+// Where there are many large records, a block counts in its shared memory first, if the tiles fit into it.
+__global__ void __launch_bounds__(kCountThreads, kCountBlocks)
+    count_large_kernel(TileBinInput in, bool has_room) {
+    if (!in.capacity.holds(*in.counters)) return;
+    if (!has_room || in.counters->large < kLeastLarge * in.num_tiles) {
+        for_each_large_tile(in, [&](uint32_t tile) { count_tile(in.counts.count, tile); });
+        return;
+    }
+    uint32_t* counts = reinterpret_cast<uint32_t*>(shared_memory());
+    for (uint32_t tile = threadIdx.x; tile < in.num_tiles; tile += kCountThreads) counts[tile] = 0;
+    __syncthreads();
+    for_each_large_tile(in, [&](uint32_t tile) {
+        if (tile != kNoTile) atomicAdd(counts + tile, 1u);
+    });
+    __syncthreads();
+    // Each block begins with another tile, so that they do not all ask for the same at once.
+    const uint32_t first = static_cast<uint32_t>(size_t(in.num_tiles) * blockIdx.x / gridDim.x);
+    for (uint32_t i = threadIdx.x; i < in.num_tiles; i += kCountThreads) {
+        const uint32_t tile = first + i < in.num_tiles ? first + i : first + i - in.num_tiles;
+        if (counts[tile] > 0) atomicAdd(in.counts.count + tile, counts[tile]);
+    }
 }
 
 __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
@@ -131,7 +157,7 @@ __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
 // A thread a tile.
 __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
     __shared__ unsigned long long before_block;
-    const size_t block = take_ticket(in.counts.ticket);
+    const size_t block = take_ticket(in.counts.scan_ticket);
     const size_t tile = block * kThreads + threadIdx.x;
     unsigned long long total;
     const unsigned long long count = tile < in.num_tiles ? in.counts.count[tile] : 0;
@@ -223,27 +249,24 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
         });
 }
 
-// Blocks take items, a thread a record, and then the records over many tiles. An item's table is fetched two
-// items before its turn, its records one.
+// A warp takes an item, and another one when it is done with it; then come the records over many tiles.
 __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput in, TileBinOutput out) {
     if (!in.capacity.holds(*in.counters)) return;
     const Scatter to{out.tile_first, in.counts.count, out.entries};
-    const unsigned num_items = static_cast<unsigned>(in.counters->items);
-    ItemTiles now{0, 0, 0, 0}, next = now;
-    FewTiles few = kManyTiles;
-    if (blockIdx.x < num_items) next = in.items[blockIdx.x];
-    // The first turn is of no item.
-    for (unsigned after = blockIdx.x + gridDim.x, turn = 0; turn == 0 || now.num_records != kNoItem; ++turn) {
-        ItemTiles later{kNoItem, 0, 0, 0};
-        if (after < num_items) later = in.items[after];
-        after += gridDim.x;
-        FewTiles next_few = kManyTiles;
-        if (next.num_records != kNoItem && threadIdx.x < next.num_records)
-            next_few = in.few[next.record + threadIdx.x];
-        scatter_few(to, now, now.record + threadIdx.x, few);
-        now = next;
-        next = later;
-        few = next_few;
+    const unsigned num_items = static_cast<unsigned>(in.counters->items), lane = threadIdx.x % 32;
+    for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
+        const unsigned next = take_next(in.counts.taken, gridDim.x * kWarps);
+        const ItemTiles item = in.items[i];
+        const auto few_of = [&](unsigned k) {
+            return k < item.num_records ? in.few[item.record + k] : kManyTiles;
+        };
+        FewTiles few = few_of(lane);
+        for (unsigned k = lane; k - lane < item.num_records; k += 32) {
+            const FewTiles next_few = few_of(k + 32);
+            scatter_few(to, item, item.record + k, few);
+            few = next_few;
+        }
+        i = __shfl_sync(kAllLanes, next, 0);
     }
     for_each_part(
         in, [&](const LargeBatch& batch, const LargePart& part) { scatter_large(in, to, batch, part); });
@@ -254,9 +277,11 @@ __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput
 size_t tile_bin_parts(size_t num_tiles) { return blocks_for(num_tiles, kThreads); }
 
 void tile_bin(const TileBinInput& in, const TileBinOutput& out, cudaStream_t stream) {
-    static_assert(kThreads == kItemSize, "a thread a record of an item");
     const unsigned resident = kBlocks * num_multiprocessors();
-    launch("count_large_kernel", count_large_kernel, resident, kThreads, 0, stream, in);
+    const size_t counts_bytes = in.num_tiles * sizeof(uint32_t);
+    const bool has_room = kCountBlocks * (counts_bytes + 1024) <= shared_memory_of_multiprocessor();
+    launch("count_large_kernel", count_large_kernel, kCountBlocks * num_multiprocessors(), kCountThreads,
+           has_room ? counts_bytes : 0, stream, in, has_room);
     launch("scan_kernel", scan_kernel, blocks_for(in.num_tiles, kThreads), kThreads, 0, stream, in, out);
     launch("scatter_kernel", scatter_kernel, resident, kThreads, 0, stream, in, out);
 }
