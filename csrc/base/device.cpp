@@ -37,6 +37,14 @@ unsigned num_multiprocessors() {
     return static_cast<unsigned>(count);
 }
 
+int compute_capability() {
+    int major = 0, minor = 0;
+    for (const auto& [number, which] : {std::pair{&major, cudaDevAttrComputeCapabilityMajor},
+                                        std::pair{&minor, cudaDevAttrComputeCapabilityMinor}})
+        check(cudaDeviceGetAttribute(number, which, current_device()), "cudaDeviceGetAttribute");
+    return 100 * major + 10 * minor;
+}
+
 size_t shared_memory_of_multiprocessor() {
     int bytes = 0;
     check(cudaDeviceGetAttribute(&bytes, cudaDevAttrMaxSharedMemoryPerMultiprocessor, current_device()),

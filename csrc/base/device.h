@@ -37,6 +37,9 @@ int current_device();
 // How many multiprocessors the current device has.
 unsigned num_multiprocessors();
 
+// Of the current device, 900 for 9.0.
+int compute_capability();
+
 // Bytes of shared memory that one of them has.
 size_t shared_memory_of_multiprocessor();
 

@@ -332,6 +332,7 @@ template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out,
                    unsigned* taken) {
+    await_kernel_before();
     if (!in.items.is_complete()) return;
     __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
     WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
@@ -361,6 +362,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
 template <class Source>
 __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     project_shared_kernel(ProjectInput in, const typename Source::Model* models, ProjectOutput out) {
+    await_kernel_before();
     if (!in.items.is_complete()) return;
     __shared__ WarpSpace<typename Source::Model> spaces[kWarps];
     WarpSpace<typename Source::Model>& space = spaces[threadIdx.x / 32];
@@ -476,11 +478,11 @@ template <class Source, class SharedSource>
 static void project_from(const typename Source::Model* models, const ProjectInput& in,
                          const ProjectOutput& out, int taken, cudaStream_t stream) {
     const unsigned blocks = kBlocks * num_multiprocessors();
-    launch("project_kernel", project_kernel<Source>, blocks, 32 * kWarps, 0, stream, in, models, out,
-           out.taken + taken);
+    launch_early("project_kernel", project_kernel<Source>, blocks, 32 * kWarps, 0, stream, in, models, out,
+                 out.taken + taken);
     if (in.has_shared_items)
-        launch("project_shared_kernel", project_shared_kernel<SharedSource>, blocks, 32 * kWarps, 0, stream,
-               in, models, out);
+        launch_early("project_shared_kernel", project_shared_kernel<SharedSource>, blocks, 32 * kWarps, 0,
+                     stream, in, models, out);
 }
 
 template <class Source>

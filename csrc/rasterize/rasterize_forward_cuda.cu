@@ -271,6 +271,7 @@ struct PlanRules {
 
 // Counts the plans of each class.
 __global__ void __launch_bounds__(kPlanThreads) count_plans_kernel(FrameLists lists, uint32_t num_places) {
+    await_kernel_before();
     __shared__ uint32_t in_block[kPlanClasses];
     if (!lists.capacity.holds(*lists.counters)) return;
     const PlanRules rules(lists, num_places);
@@ -288,6 +289,7 @@ __global__ void __launch_bounds__(kPlanThreads) count_plans_kernel(FrameLists li
 
 // Writes the plans, those of a class where it begins and behind those of other blocks.
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(FrameLists lists, uint32_t num_places) {
+    await_kernel_before();
     __shared__ uint32_t place[kPlanClasses], in_block[kPlanClasses], num_planned;
     static_assert(kPlanClasses == 64, "a lane has two");
     if (!lists.capacity.holds(*lists.counters)) return;
@@ -442,6 +444,7 @@ __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t co
 __global__ void __launch_bounds__(kSpreadThreads, 2) spread_kernel(FrameLists lists, uint32_t most_held) {
     constexpr uint32_t kShortAtOnce = 16;
     __shared__ uint32_t next_of_block;
+    await_kernel_before();
     SpreadSpace& space = *reinterpret_cast<SpreadSpace*>(shared_memory());
     if (!lists.capacity.holds_entries(*lists.counters)) return;
     for (uint32_t i = blockIdx.x, end = i + 1; i < lists.num_plans;) {
@@ -466,6 +469,7 @@ __global__ void __launch_bounds__(kSpreadThreads, 2) spread_kernel(FrameLists li
 template <class Stop>
 __global__ void __launch_bounds__(kBlendThreads, kBlocks)
     rasterize_kernel(FrameLists lists, RasterTape tape, Stop stop) {
+    await_kernel_before();
     if (blockIdx.x == 0 && threadIdx.x == 0 && lists.report != nullptr) *lists.report = *lists.counters;
     if (!lists.capacity.holds(*lists.counters)) return;
     BlendShared& s = *reinterpret_cast<BlendShared*>(shared_memory());
@@ -499,15 +503,16 @@ uint32_t most_plans(uint32_t num_tiles) {
 
 void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t stream) {
     const unsigned plan_blocks = std::max(blocks_for(lists.num_tiles, kPlanThreads), 1u);
-    launch("count_plans_kernel", count_plans_kernel, plan_blocks, kPlanThreads, 0, stream, lists,
-           num_places());
-    launch("plan_kernel", plan_kernel, plan_blocks, kPlanThreads, 0, stream, lists, num_places());
+    launch_early("count_plans_kernel", count_plans_kernel, plan_blocks, kPlanThreads, 0, stream, lists,
+                 num_places());
+    launch_early("plan_kernel", plan_kernel, plan_blocks, kPlanThreads, 0, stream, lists, num_places());
     const uint32_t held = most_held();
-    launch("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles),
-           kSpreadThreads, sizeof(SpreadShared<kLog2Spread>) + held * sizeof(TileEntry), stream, lists, held);
+    launch_early("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles),
+                 kSpreadThreads, sizeof(SpreadShared<kLog2Spread>) + held * sizeof(TileEntry), stream, lists,
+                 held);
     with_stop<float>(lists.min_transmittance, [&](auto stop) {
-        launch("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans, kBlendThreads,
-               sizeof(BlendShared), stream, lists, tape == nullptr ? RasterTape{} : *tape, stop);
+        launch_early("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans, kBlendThreads,
+                     sizeof(BlendShared), stream, lists, tape == nullptr ? RasterTape{} : *tape, stop);
     });
 }
 

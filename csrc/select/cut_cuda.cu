@@ -277,6 +277,7 @@ template <class Output, bool kTells>
 __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     cut_kernel(PlacedScene scene, SelectRule rule, const CutChoice* choice, const BudgetState* state,
                Scratch scratch, Scratch second_scratch, NeedList needs, Output output) {
+    await_kernel_before();
     if (state != nullptr && state->again != 0) scratch = second_scratch;
     const unsigned num_parts = *scratch.num_parts, num_tickets = blocks_for(num_parts, kCutWarps);
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
@@ -416,13 +417,13 @@ void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule
     }
     const NeedList needs = resident == nullptr ? NeedList{} : resident->needs;
     if (needs.report == nullptr) {
-        launch("cut_kernel", cut_kernel<Output, false>, blocks, kCutThreads, 0, stream, placed, rule,
-               target.choice, state, scratches[0], scratches[1], needs, output);
+        launch_early("cut_kernel", cut_kernel<Output, false>, blocks, kCutThreads, 0, stream, placed, rule,
+                     target.choice, state, scratches[0], scratches[1], needs, output);
         return;
     }
     check(cudaMemsetAsync(needs.words, 0, needs.num_words * sizeof(uint32_t), stream), "cudaMemsetAsync");
-    launch("cut_kernel", cut_kernel<Output, true>, blocks, kCutThreads, 0, stream, placed, rule,
-           target.choice, state, scratches[0], scratches[1], needs, output);
+    launch_early("cut_kernel", cut_kernel<Output, true>, blocks, kCutThreads, 0, stream, placed, rule,
+                 target.choice, state, scratches[0], scratches[1], needs, output);
     launch("report_kernel", report_kernel, kReportBlocks, kCutThreads, 0, stream, needs, rule, target.choice);
 }
 

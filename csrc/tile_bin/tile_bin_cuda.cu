@@ -123,6 +123,7 @@ __device__ void for_each_large_tile(const TileBinInput& in, const Visit& visit) 
 // Where there are many large records, a block counts in its shared memory first, if the tiles fit into it.
 __global__ void __launch_bounds__(kCountThreads, kCountBlocks)
     count_large_kernel(TileBinInput in, bool has_room) {
+    await_kernel_before();
     if (!in.capacity.holds(*in.counters)) return;
     if (!has_room || in.counters->large < kLeastLarge * in.num_tiles) {
         for_each_large_tile(in, [&](uint32_t tile) { count_tile(in.counts.count, tile); });
@@ -156,6 +157,7 @@ __device__ uint32_t image_of(const TileBinInput& in, uint32_t tile) {
 
 // A thread a tile.
 __global__ void scan_kernel(TileBinInput in, TileBinOutput out) {
+    await_kernel_before();
     __shared__ unsigned long long before_block;
     const size_t block = take_ticket(in.counts.scan_ticket);
     const size_t tile = block * kThreads + threadIdx.x;
@@ -251,6 +253,7 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
 
 // A warp takes an item, and another one when it is done with it; then come the records over many tiles.
 __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput in, TileBinOutput out) {
+    await_kernel_before();
     if (!in.capacity.holds(*in.counters)) return;
     const Scatter to{out.tile_first, in.counts.count, out.entries};
     const unsigned num_items = static_cast<unsigned>(in.counters->items), lane = threadIdx.x % 32;
@@ -280,10 +283,11 @@ void tile_bin(const TileBinInput& in, const TileBinOutput& out, cudaStream_t str
     const unsigned resident = kBlocks * num_multiprocessors();
     const size_t counts_bytes = in.num_tiles * sizeof(uint32_t);
     const bool has_room = kCountBlocks * (counts_bytes + 1024) <= shared_memory_of_multiprocessor();
-    launch("count_large_kernel", count_large_kernel, kCountBlocks * num_multiprocessors(), kCountThreads,
-           has_room ? counts_bytes : 0, stream, in, has_room);
-    launch("scan_kernel", scan_kernel, blocks_for(in.num_tiles, kThreads), kThreads, 0, stream, in, out);
-    launch("scatter_kernel", scatter_kernel, resident, kThreads, 0, stream, in, out);
+    launch_early("count_large_kernel", count_large_kernel, kCountBlocks * num_multiprocessors(),
+                 kCountThreads, has_room ? counts_bytes : 0, stream, in, has_room);
+    launch_early("scan_kernel", scan_kernel, blocks_for(in.num_tiles, kThreads), kThreads, 0, stream, in,
+                 out);
+    launch_early("scatter_kernel", scatter_kernel, resident, kThreads, 0, stream, in, out);
 }
 
 }  // namespace cuda
