@@ -175,7 +175,9 @@ Comparison comparison_of(double size, double longer_px) {
 
 CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const float>& asset,
                              Span<const Camera> cameras, uint64_t seed) {
-    CutPictures pictures{table, {asset.means, 3 * asset.size}, cameras, seed, 0, 0, {}, {}, 0};
+    CutPictures pictures{table, {asset.means, 3 * asset.size}, cameras, seed, 0, 0, 0, {}, {}, 0};
+    for (size_t g = 0; g < table.level.size; ++g)
+        pictures.coarsest = std::max(pictures.coarsest, table.level[g]);
     for (const int32_t c : table.top_cluster)
         pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
     pictures.least = std::max(pictures.least, 1.0);
@@ -216,7 +218,14 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
     camera = resized(camera, longer_px / longer);
     if (!rule.culls) camera = on_screen(camera, random);
     rule.budget = static_cast<uint64_t>(std::ceil(share * all));
-    const SelectOutput whole = selected(pictures.table, camera, rule);
+    SelectOutput whole = selected(pictures.table, camera, rule);
+    // From inside of groups these are refined at any tolerance, and a budget below what is left of them is
+    // met by nothing but the coarsest clusters: then by coarser levels alone.
+    while (std::isinf(whole.tolerance_px2) && 2 * whole.num_gaussians < static_cast<int64_t>(rule.budget) &&
+           rule.min_level < pictures.coarsest) {
+        ++rule.min_level;
+        whole = selected(pictures.table, camera, rule);
+    }
     rule.budget = kNoBudget;
     rule.tolerance_px2 = whole.fits_budget ? whole.tolerance_px2 : FLT_MAX;
     rule.culls = true;
