@@ -192,6 +192,21 @@ def test_pictures_from_cameras_are_taken_there(bundle):
         assert abs(camera.height - camera.width * 9 / 16) <= 1
 
 
+def test_cuts_from_inside_are_of_coarse_levels_where_no_other_is_small_enough(bundle):
+    """Groups around the eye are refined at any tolerance, so the least that one leaves is the coarsest level."""
+    center = np.median(bundle.level_gaussians(0).means, axis=0)
+    camera = v3dg.Camera.look_at(center, center + [0, 0, 1], (0, 1, 0), fov_x=1.5, width=96, height=96)
+    left = v3dg.select(bundle, camera, tolerance=1e30, device="cpu").num_gaussians
+    views = [pictures_of(bundle, [camera]).view(number) for number in range(100)]
+    sizes, level = np.diff(bundle.clusters.offset), bundle.clusters.level
+    finest = np.array([level[clusters].min(initial=99) for _, clusters, _ in views])
+    counts = np.array([sizes[clusters].sum() for _, clusters, _ in views])
+    assert (finest == 0).any()
+    coarse = (finest > 0) & (counts > sizes[-1])
+    assert coarse.sum() > 20
+    assert counts[coarse].max() < left
+
+
 def test_cameras_come_by_name_too_and_one_by_one(bundle):
     cameras = v3dg.turntable((0, 0, 0), 3.0, 2, width=64, height=64)
 
