@@ -193,9 +193,11 @@ def test_pictures_from_cameras_are_taken_there(bundle):
 
 
 def test_cuts_from_inside_are_of_coarse_levels_where_no_other_is_small_enough(bundle):
-    """Groups around the eye are refined at any tolerance, so the least that one leaves is the coarsest level."""
+    """Groups around the eye are refined at any tolerance: below what that leaves there are whole levels."""
     center = np.median(bundle.level_gaussians(0).means, axis=0)
-    camera = v3dg.Camera.look_at(center, center + [0, 0, 1], (0, 1, 0), fov_x=1.5, width=96, height=96)
+    camera = v3dg.Camera.look_at(
+        center, center + np.array([0, 0, 1]), (0, 1, 0), fov_x=1.5, width=96, height=96
+    )
     left = v3dg.select(bundle, camera, tolerance=1e30, device="cpu").num_gaussians
     views = [pictures_of(bundle, [camera]).view(number) for number in range(100)]
     sizes, level = np.diff(bundle.clusters.offset), bundle.clusters.level

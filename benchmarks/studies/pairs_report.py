@@ -40,9 +40,10 @@ gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, m
 windows of at most {widest} px. *Ours* is the finest cut with at most as many gaussians as the other level
 has (of a scene, as many as it has in each picture), interpolated between two cuts where groups are too large
 to meet that; *refined* the same after `v3dg refine` (a scene by other cameras in it), *merged* without the
-fit. Others are splat-transform 3.7.0 (`-d`, `--decimate-adaptive`) and the levels that an asset's makers
-published, drawn plain; the best of them counts, for each count and size anew. Of a scene each counts alone,
-because levels of one share of a scene have different numbers of gaussians in a picture.
+fit. Others are splat-transform 3.7.0 (`-d`, `--decimate-adaptive`), Spark 2.2.0 for assets of SH degree 0,
+and the levels that an asset's makers published, drawn plain; the best of them counts, for each count and
+size anew. Of a scene each counts alone, because levels of one share of a scene have different numbers of
+gaussians in a picture.
 """
 
 
@@ -167,6 +168,7 @@ def report(options: Report) -> None:
     sections = [
         _ABOUT.format(**recorded["settings"]),
         f"Measured on {machine}, commit {recorded['commit']}, by `{recorded['command']}`.",
+        *(["", recorded["note"]] if "note" in recorded else []),
     ]
     for title, which in parts.items():
         sections += ["", f"## {title}", "", overview(rows, which)]
@@ -222,21 +224,23 @@ def plot(rows: Sequence[Row], path: Path) -> None:
         for panel in panels[::_COLUMNS]:
             panel.set_ylabel(label)
     for panel in axes[-1]:
-        panel.set_xlabel("gaussians")
+        panel.set_xlabel("gaussians of the level in the picture")
         panel.xaxis.set_major_formatter(lambda x, _: count_text(int(x)))
     total = max((row["gaussians"] for row in rows if row["method"] == "all"), default=0)
-    of = f" of {count_text(total)} gaussians" if total else ""
-    figure.suptitle(f"{rows[0]['asset']}{of}", fontsize=12)
+    figure.suptitle(f"{rows[0]['asset']}, {count_text(total)} gaussians in a picture", fontsize=12)
     figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=10)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
 
 def _draw(panel: Any, rows: Sequence[Row], key: str) -> None:
-    """The points of each method, at one size."""
+    """The points of each method, at one size, where others' levels of as many gaussians are."""
+    counts = {row["level"]: row["gaussians"] for row in rows if row["method"] not in (*_OURS, "all")}
     for method, (style, color, label) in _STYLES.items():
         points = sorted(
-            (row["count"], row[key]) for row in rows if row["method"] == method and row[key] is not None
+            (counts[row["level"]], row[key])
+            for row in rows
+            if row["method"] == method and row["level"] in counts and row[key] is not None
         )
         if points:
             panel.plot(*zip(*points, strict=True), style, color=color, label=label, markersize=4, lw=1.3)
