@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ def folder(tmp_path_factory):
     v3dg.write_asset(folder / "half.ply", asset.subset(np.arange(0, 2000, 2)))
     (folder / "peers" / "thing").mkdir(parents=True)
     pairs_subject.pack_level(folder / "peers" / "thing" / "d_12.5.npz", asset.subset(np.arange(0, 2000, 8)))
+    (folder / "peers" / "place").mkdir()
+    pairs_subject.pack_level(folder / "peers" / "place" / "d_12.5.npz", asset.subset(np.arange(3, 2000, 8)))
     camera = v3dg.Camera.look_at((3, 0, 1), asset.means.mean(axis=0), fov_x=0.5, width=120, height=60)
     v3dg.write_cameras(folder / "cameras.json", {"near": camera, "other": camera})
     about = {
@@ -123,8 +126,8 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
     pairs.measure(config)
     result = json.loads((tmp_path / "all" / "pairs.json").read_text())
     rows = {(r["asset"], r["method"], r["level"], r["factor"]): r for r in result["rows"]}
-    # An object's two counts and a scene's one, two sizes each; others have levels of the object alone.
-    assert len(rows) == 2 * (2 * 4 + 3)
+    # An object's two counts and a scene's one level of others, two sizes each.
+    assert len(rows) == 2 * (2 * 4 + 4)
     for (asset, method, level, factor), row in rows.items():
         assert 0 < row["flip"] < 1
         assert 0 < row["ssim"] <= 1
@@ -132,10 +135,20 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
         if method == "ours":
             assert row["psnr"] >= rows[asset, "merged", level, factor]["psnr"] - 1
     best = pairs_report.best_others(result["rows"])
-    assert {(r["level"], r["best"]) for r in best} == {(12.5, "d"), ("published 1", "published")}
+    expected = {(12.5, "d"), ("published 1", "published"), ("12.5 %, d", "d")}
+    assert {(r["level"], r["best"]) for r in best} == expected
     for row in best:
-        others = rows["thing", row["best"], row["level"], row["factor"]]
+        others = rows[row["asset"], row["best"], row["level"], row["factor"]]
         assert row["ratio"] == row["ours_flip"] / others["flip"]
+    # Of the scene's level those count that are in the picture.
+    place = subject(folder, "place")
+    for _, _, level in place.peers((12.5,)):
+        in_picture = place.counts(level)[0]
+        assert 0 < in_picture < len(level)
+        for factor in (1, 2):
+            assert rows["place", "d", "12.5 %, d", factor]["gaussians"] == in_picture
+            assert rows["place", "ours", "12.5 %, d", factor]["gaussians"] <= in_picture
+    best = [row for row in best if row["asset"] == "thing"]
     # A second run measures one method again and a new one, and takes the others from the first.
     known = (tmp_path / "all" / "pairs.json",)
     methods = ("refined", "merged")
@@ -151,12 +164,19 @@ def test_study_compares_at_equal_counts(folder, tmp_path):
         (row["level"], row["factor"]) for row in result["rows"] if row["asset"] == "thing"
     }
     others = [row for row in second["rows"] if row["method"] != "refined"]
+    assert second["changes"] == {"refine": 2}
     assert sorted(map(str, others)) == sorted(map(str, result["rows"]))
     assert second["builds"]["thing"].keys() == {"ours_seconds", "merged_seconds", "refined_seconds"}
     pairs_report.report(pairs_report.Report(tmp_path / "again" / "pairs.json", tmp_path / "pairs.md"))
     text = (tmp_path / "pairs.md").read_text()
     of_refined = pairs_report.best_others(second["rows"], "refined")
     assert len(of_refined) == len(best)
+    third = replace(again, output=tmp_path / "third", methods=("merged",), refine=0)
+    third.known = (tmp_path / "again" / "pairs.json",)
+    pairs.measure(third)
+    assert json.loads((tmp_path / "third" / "pairs.json").read_text())["changes"] == {"refine": 2}
+    with pytest.raises(SystemExit, match="expected levels of"):
+        pairs.measure(replace(third, refine=3))
     for row in (best[0], of_refined[0]):
         assert f"{row['ours_flip']:.4f} / {row['best_flip']:.4f} = {row['ratio']:.2f}" in text
     assert "Refined in 2 steps" in text

@@ -15,17 +15,17 @@ ASSETS/peers/NAME/TOOL_PERCENT.npz, which `pairs_subject.pack_level` makes of wh
 wrote, or of any format that v3dg reads.
 
 A pair is a count and a size. The size at which a level is at home is 2 px² for each of its gaussians: of the
-footprint of the object's ball, or of a scene's picture for those of the level that are in it. Every level is
-drawn at `factors` times that, measured along a side. Ours and merging alone are the finest cut with at most
-as many gaussians as the other level has, drawn with the filter that the bundle asks for, and so are ours
-refined, with `--refine` and as many steps; others are drawn whole and plain. Of a scene those gaussians
-count whose means are in the picture, in each picture anew: others' levels have more of them in one place
-than in another, so there each of them is a pair alone. Cuts are of whole groups: where one has fewer than 97
-% of the count, its error and that of the next finer one are interpolated in the logarithm of the count.
-Where the eye is inside of groups, those are refined at any tolerance; a count below what is left is met with
-the least `min_level` that does. The truth is every gaussian at four by four samples a pixel. Of a picture
-wider than `widest` a window is compared, around a gaussian drawn at random from those that are large and
-opaque.
+footprint of the object's ball, or of a scene's picture, for as large a share of the level as is in it of the
+asset. Every level is drawn at `factors` times that, measured along a side. Ours and merging alone are the
+finest cut with at most as many gaussians as the other level has, drawn with the filter that the bundle asks
+for, and so are ours refined, with `--refine` and as many steps; others are drawn whole and plain. Of a scene
+those gaussians count whose means are in the picture, in each picture anew: others' levels have more of them
+in one place than in another, so there each of them is a pair alone. Cuts are of whole groups: where one has
+fewer than 97 % of the count, its error and that of the next finer one are interpolated in the logarithm of
+the count. Where the eye is inside of groups, those are refined at any tolerance; a count below what is left
+is met with the least `min_level` that does. The truth is every gaussian at four by four samples a pixel. Of
+a picture wider than `widest` a window is compared, around a gaussian drawn at random from those that are
+large and opaque.
 """
 
 from __future__ import annotations
@@ -152,7 +152,10 @@ class Study:
     def _drawn(self, subject: Subject) -> Iterator[tuple[Row, Picture, Picture]]:
         """What is to be compared: what it is, the truth, the picture."""
         wanted_of_ours = set[str](self._config.methods) - ({"refined"} if self._config.refine == 0 else set())
-        bundles = {name: self._built(subject, name) for name in _OURS if name in wanted_of_ours}
+        bundles: dict[str, v3dg.Bundle] = {}
+        for name in _OURS:
+            if name in wanted_of_ours:
+                bundles[name] = self._built(subject, name, bundles.get("ours"))
         self._asset = Level("all", self._placed(subject.asset), subject.counts(subject.asset))
         for target in self._targets(subject):
             for factor in self._config.factors:
@@ -185,10 +188,14 @@ class Study:
     def _placed(self, gaussians: v3dg.Gaussians) -> v3dg.Gaussians:
         return gaussians.torch("cuda") if self.device == "cuda" else gaussians
 
-    def _built(self, subject: Subject, name: str) -> v3dg.Bundle:
+    def _built(self, subject: Subject, name: str, ours: v3dg.Bundle | None) -> v3dg.Bundle:
+        """What is refined is `ours`, or built for it."""
         config = replace(self._config.build, steps=0) if name == "merged" else self._config.build
         start = time.perf_counter()
-        bundle = v3dg.build_bundle(subject.asset, config=config, device=self.device, progress=False)
+        if name == "refined" and ours is not None:
+            bundle = ours
+        else:
+            bundle = v3dg.build_bundle(subject.asset, config=config, device=self.device, progress=False)
         if name == "refined":
             options: Row = {"steps": self._config.refine, "device": self.device, "progress": False}
             bundle = refine_bundle(bundle, cameras=subject.refined_from, **options)
@@ -214,9 +221,8 @@ class Study:
             about["width"] = size.camera.width
             shown = [Shown(level.method, level.gaussians, level.counts[view], {}) for level in levels]
             for name, bundle in bundles.items():
-                shown += cuts_of(
-                    name, bundle, size.camera, max(target.counts[view], 1), of_picture=subject.is_scene
-                )
+                counted = subject.cameras[view] if subject.is_scene else None
+                shown += cuts_of(name, bundle, size.camera, max(target.counts[view], 1), counted)
             for one in shown:
                 image = v3dg.render(one.subject, size.window, device=self.device, **one.cut)
                 row = {**about, "method": one.method, "gaussians": one.gaussians, "weight": one.weight}
@@ -226,18 +232,17 @@ class Study:
 
 
 def cuts_of(
-    name: str, bundle: v3dg.Bundle, camera: v3dg.Camera, count: int, *, of_picture: bool = False
+    name: str, bundle: v3dg.Bundle, camera: v3dg.Camera, count: int, counted: v3dg.Camera | None = None
 ) -> list[Shown]:
     """The finest cut with at most so many gaussians, and the next finer one if it has far fewer.
 
-    `of_picture`: those count whose means are in the picture.
+    With a camera as `counted` those count whose means are in its picture.
     """
     scene, offset = v3dg.Scene.of(bundle), bundle.clusters.offset
     sizes = np.diff(offset)
-    if of_picture:
-        sizes = np.add.reduceat(
-            pairs_subject.places(bundle.gaussians.means, camera)[1], offset[:-1], dtype=int
-        )
+    if counted is not None:
+        is_in = pairs_subject.places(bundle.gaussians.means, counted)[1]
+        sizes = np.add.reduceat(is_in, offset[:-1], dtype=int)
 
     def cut(min_level: int, tolerance: float) -> Shown:
         chosen = v3dg.select(scene, camera, min_level=min_level, tolerance=tolerance, device="cpu")
@@ -257,7 +262,9 @@ def cuts_of(
         within = finest
     else:
         finer = cut(min_level, _FINEST_PX2)
-        while finer.cut["tolerance"] < within.cut["tolerance"] * _STEP:
+        if finer.gaussians <= count:
+            within, finer = finer, finest
+        while 0 < finer.cut["tolerance"] < within.cut["tolerance"] * _STEP:
             between = cut(min_level, math.sqrt(finer.cut["tolerance"] * within.cut["tolerance"]))
             if between.gaussians <= count:
                 within = between
@@ -290,9 +297,10 @@ def measure(config: Measure) -> None:
     settings = {"factors": list(config.factors), "widest": config.widest, "views": config.views}
     changes = dict(asdict(config.build).items() - asdict(v3dg.BuildConfig()).items())
     changes |= {"refine": config.refine} if config.refine > 0 else {}
+    known = known_results(config.known, settings, changes)
     config.output.mkdir(parents=True, exist_ok=True)
     study, judges = Study(config), Judges()
-    rows, study.builds = known_results(config.known, settings)
+    rows, study.builds, changes = known
     try:
         for name in config.only or about:
             start = time.perf_counter()
@@ -312,18 +320,23 @@ def by_key(rows: list[Row]) -> dict[tuple[Any, ...], Row]:
 
 
 def known_results(
-    paths: tuple[Path, ...], settings: Row
-) -> tuple[dict[tuple[Any, ...], Row], dict[str, Row]]:
-    """Rows and builds of recorded results, which must have been measured alike."""
+    paths: tuple[Path, ...], settings: Row, changes: Row
+) -> tuple[dict[tuple[Any, ...], Row], dict[str, Row], Row]:
+    """Rows and builds of recorded results, which must have been made alike, and all changes."""
     rows: dict[tuple[Any, ...], Row] = {}
     builds: dict[str, Row] = {}
     for path in paths:
         recorded = json.loads(path.read_text(encoding="utf-8"))
         if recorded["settings"] != settings:
             raise SystemExit(f"{path}: expected results of {settings}, got {recorded['settings']}")
+        expected = {"refine": recorded["changes"].get("refine"), **changes}
+        if {"refine": expected["refine"], **recorded["changes"]} != expected:
+            raise SystemExit(f"{path}: expected levels of {changes}, got {recorded['changes']}")
+        changes = {name: value for name, value in expected.items() if value is not None}
         rows |= by_key(recorded["rows"])
-        builds |= recorded["builds"]
-    return rows, builds
+        for name, seconds in recorded["builds"].items():
+            builds.setdefault(name, {}).update(seconds)
+    return rows, builds, changes
 
 
 if __name__ == "__main__":

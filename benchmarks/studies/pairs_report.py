@@ -32,16 +32,16 @@ _ABOUT = """# Levels at equal counts and several sizes
 
 Written by `python -m benchmarks.studies.pairs report` from recorded JSON, never by hand.
 
-A level is at home at 2 px² a gaussian: of the footprint of the object's ball, or of a scene's picture for
-those of its gaussians that are in it. (Groups of a bundle are fitted at 2 px² of their own balls, which
-overlap and lie behind each other: they are at home at a quarter to half the size that is called 1 here.)
-Each level is drawn at several times that size, along a side, by the same renderer, and compared with every
-gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views} views,
-windows of at most {widest} px. *Ours* is the finest cut with at most as many gaussians as the other level
-has (of a scene, as many as it has in each picture), interpolated between two cuts where groups are too large
-to meet that; *refined* the same after `v3dg refine` (a scene by other cameras in it), *merged* without the
-fit. Others are splat-transform 3.7.0 (`-d`, `--decimate-adaptive`), Spark 2.2.0 for assets of SH degree 0,
-and the levels that an asset's makers published, drawn plain; the best of them counts, for each count and
+A level is at home at 2 px² a gaussian: of the footprint of the object's ball, or of a scene's picture, for
+as large a share of them as is in it of the asset. (Groups of a bundle are fitted at 2 px² of their own
+balls, which overlap and lie behind each other: they are at home at a quarter to half the size that is called
+1 here.) Each level is drawn at several times that size, along a side, by the same renderer, and compared
+with every gaussian at 4 x 4 samples a pixel: FLIP (67 pixels per degree), PSNR and SSIM, means of {views}
+views, windows of at most {widest} px. *Ours* is the finest cut with at most as many gaussians as the other
+level has (of a scene, as many as it has in each picture), interpolated between two cuts where groups are too
+large to meet that; *refined* the same after `v3dg refine` (a scene by other cameras in it), *merged* without
+the fit. Others are splat-transform 3.7.0 (`-d`, `--decimate-adaptive`), Spark 2.2.0 for assets of SH degree
+0, and the levels that an asset's makers published, drawn plain; the best of them counts, for each count and
 size anew. Of a scene each counts alone, because levels of one share of a scene have different numbers of
 gaussians in a picture.
 """
@@ -98,7 +98,8 @@ def overview(rows: Sequence[Row], which: str = "ours") -> str:
     lines = [_line(name, [row for row in pairs if row["asset"] == name]) for name in names]
     if len(names) > 1:
         lines.append(_line("all", pairs))
-        lines.append(_line("all, from x0.5 on", [row for row in pairs if row["factor"] >= 0.5]))
+        larger = [row for row in pairs if row["factor"] >= 0.5]
+        lines += [_line("all, from x0.5 on", larger)] if larger else []
         for factor in sorted({row["factor"] for row in pairs}):
             lines.append(_line(f"all, x{factor:g}", [row for row in pairs if row["factor"] == factor]))
     return markdown(_OVERVIEW, lines)
