@@ -37,14 +37,6 @@ unsigned num_multiprocessors() {
     return static_cast<unsigned>(count);
 }
 
-int compute_capability() {
-    int major = 0, minor = 0;
-    for (const auto& [number, which] : {std::pair{&major, cudaDevAttrComputeCapabilityMajor},
-                                        std::pair{&minor, cudaDevAttrComputeCapabilityMinor}})
-        check(cudaDeviceGetAttribute(number, which, current_device()), "cudaDeviceGetAttribute");
-    return 100 * major + 10 * minor;
-}
-
 size_t shared_memory_of_multiprocessor() {
     int bytes = 0;
     check(cudaDeviceGetAttribute(&bytes, cudaDevAttrMaxSharedMemoryPerMultiprocessor, current_device()),
@@ -63,6 +55,22 @@ void allow_shared_memory(const void* kernel, size_t bytes, const char* name) {
     check(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes)),
           name);
     allowed = bytes;
+}
+
+bool can_start_early(const void* kernel) {
+    constexpr int kFirst = 90;  // of the architectures whose kernels can wait for the one before them
+    static std::mutex mutex;
+    static std::map<std::pair<int, const void*>, bool> known;
+    const int device = current_device();
+    const std::lock_guard<std::mutex> lock(mutex);
+    const auto [found, is_new] = known.try_emplace({device, kernel}, false);
+    if (is_new) {
+        cudaFuncAttributes attributes{};
+        found->second =
+            cudaFuncGetAttributes(&attributes, kernel) == cudaSuccess && attributes.ptxVersion >= kFirst;
+        cudaGetLastError();
+    }
+    return found->second;
 }
 
 // A pool of our own, so that how long we keep memory is nobody else's affair.

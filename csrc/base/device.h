@@ -37,9 +37,6 @@ int current_device();
 // How many multiprocessors the current device has.
 unsigned num_multiprocessors();
 
-// Of the current device, 900 for 9.0.
-int compute_capability();
-
 // Bytes of shared memory that one of them has.
 size_t shared_memory_of_multiprocessor();
 
@@ -48,6 +45,9 @@ size_t shared_memory_of_multiprocessor();
 // it is only ever raised: a lower one could come between another thread's asking and its launch. `name` goes
 // into errors.
 void allow_shared_memory(const void* kernel, size_t bytes, const char* name);
+
+// Whether what the current device runs of the kernel is code that waits for the kernel before it.
+bool can_start_early(const void* kernel);
 
 // Stream-ordered memory of the current device, from a pool that keeps what is given back for the next caller.
 // Throws OutOfMemory.

@@ -19,18 +19,8 @@ void launch(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_
     check(cudaGetLastError(), name);
 }
 
-// Whether kernels can be made ready before the one before them is over: the device runs the code of one of
-// the architectures that this was compiled for, the newest that is no newer than itself.
-inline bool can_start_early() {
-    constexpr int kFirst = 900, kCompiled[] = {__CUDA_ARCH_LIST__};
-    const int capability = compute_capability();
-    for (const int architecture : kCompiled)
-        if (architecture >= kFirst && architecture <= capability) return true;
-    return false;
-}
-
-// As launch(), for a kernel that begins with await_kernel_before(): it is made ready while the kernel before
-// it is still at work, where that can be.
+// As launch(), for a kernel that begins with await_kernel_before() in every block: where the device can do
+// that, it is launched before the memory of the kernel before it can be seen, and waits for that itself.
 template <class... P, class... A>
 void launch_early(const char* name, void (*kernel)(P...), dim3 grid, dim3 block, size_t shared_bytes,
                   cudaStream_t stream, A&&... arguments) {
@@ -45,11 +35,11 @@ void launch_early(const char* name, void (*kernel)(P...), dim3 grid, dim3 block,
     config.dynamicSmemBytes = shared_bytes;
     config.stream = stream;
     config.attrs = &early;
-    config.numAttrs = can_start_early() ? 1 : 0;
+    config.numAttrs = can_start_early(reinterpret_cast<const void*>(kernel)) ? 1 : 0;
     check(cudaLaunchKernelEx(&config, kernel, static_cast<P>(arguments)...), name);
 }
 
-// Waits for all that the kernel before this one has written.
+// Waits for all that the kernel before this one has written, and so for all before that.
 __device__ inline void await_kernel_before() {
 #if __CUDA_ARCH__ >= 900
     cudaGridDependencySynchronize();

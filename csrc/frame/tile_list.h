@@ -108,7 +108,7 @@ struct FrameLists {
     TilePlan* plans;    // [num_plans] scratch
     // [2 * kPlanClasses], cleared before: of each class, and of those that have a place.
     uint32_t* plan_counts;
-    unsigned* taken;          // long lists beyond the first of each block; 0 before
+    unsigned* taken;          // plans beyond the first of each block of spread_kernel; 0 before
     uint32_t num_plans;       // num_tiles, or most_plans() where tiles may be blended in parts
     float min_transmittance;  // of the images
     // Of images that do not say where they are: those of the first and of the second.

@@ -200,7 +200,7 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
     const double part = random.uniform();
     double all = static_cast<double>(pictures.weight.size());  // that a picture has without levels
     const double share = pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
-    const double size = kLeastSize * std::exp2(kOctavesOfSize * std::pow(random.uniform(), 1.1));
+    const double size = kLeastSize * std::exp2(kOctavesOfSize * std::pow(random.uniform(), kPowerOfSize));
     Camera camera;
     SelectRule rule{};
     rule.culls = pictures.cameras.size > 0;

@@ -340,7 +340,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     unsigned num_in_frustum = 0, num_records = 0;
     Loaded loaded;
     Source::prepare();
-    // Items differ much in what is seen of them, so each warp takes the next one when it is done with one.
+    // Items differ much in what is seen of them, so a warp asks for another one as it begins with one.
     for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
         const uint32_t item_word = load_word(in.items.items[i]);
         const unsigned next = take_next(taken, gridDim.x * kWarps);

@@ -36,7 +36,7 @@ struct ProjectOutput {
     TileCounts tiles;
     LargeRecord* large;
     unsigned long long large_capacity;
-    unsigned* taken;  // [2] items beyond the first of each warp, by kernels; 0 before
+    unsigned* taken;  // [2] items beyond the first of each warp, of coded models in the second; 0 before
 };
 
 // As v3dg::project, for all items of a frame: writes a record, in the items' order, for each gaussian that

@@ -439,8 +439,8 @@ __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t co
     }
 }
 
-// Spreads the long lists. A block takes the next one when it is done with one; of those that turn out to be
-// short it takes several at once.
+// Spreads the long lists. A block asks for the next plan as it begins with one; behind the longest it takes
+// several at once, most of which have short lists.
 __global__ void __launch_bounds__(kSpreadThreads, 2) spread_kernel(FrameLists lists, uint32_t most_held) {
     constexpr uint32_t kShortAtOnce = 16;
     __shared__ uint32_t next_of_block;

@@ -251,7 +251,7 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
         });
 }
 
-// A warp takes an item, and another one when it is done with it; then come the records over many tiles.
+// A warp asks for another item as it begins with one; then come the records over many tiles.
 __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();
     if (!in.capacity.holds(*in.counters)) return;
