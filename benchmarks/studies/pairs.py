@@ -157,9 +157,11 @@ class Study:
             if name in wanted_of_ours:
                 bundles[name] = self._built(subject, name, bundles.get("ours"))
         self._asset = Level("all", self._placed(subject.asset), subject.counts(subject.asset))
+        places = subject.cameras if subject.is_scene else [None] * len(subject.cameras)
+        sizes = {name: [cluster_sizes(bundle, place) for place in places] for name, bundle in bundles.items()}
         for target in self._targets(subject):
             for factor in self._config.factors:
-                yield from self._compared(subject, target, factor, bundles)
+                yield from self._compared(subject, target, factor, bundles, sizes)
 
     def _targets(self, subject: Subject) -> list[Target]:
         """Objects at each percent; of a scene each other level, which have different counts in a picture."""
@@ -204,7 +206,12 @@ class Study:
         return bundle
 
     def _compared(
-        self, subject: Subject, target: Target, factor: float, bundles: dict[str, v3dg.Bundle]
+        self,
+        subject: Subject,
+        target: Target,
+        factor: float,
+        bundles: dict[str, v3dg.Bundle],
+        cluster_sizes_of: dict[str, list[Any]],
     ) -> Iterator[tuple[Row, Picture, Picture]]:
         about: Row = {
             "asset": subject.name,
@@ -221,8 +228,8 @@ class Study:
             about["width"] = size.camera.width
             shown = [Shown(level.method, level.gaussians, level.counts[view], {}) for level in levels]
             for name, bundle in bundles.items():
-                counted = subject.cameras[view] if subject.is_scene else None
-                shown += cuts_of(name, bundle, size.camera, max(target.counts[view], 1), counted)
+                count = max(target.counts[view], 1)
+                shown += cuts_of(name, bundle, size.camera, count, cluster_sizes_of[name][view])
             for one in shown:
                 image = v3dg.render(one.subject, size.window, device=self.device, **one.cut)
                 row = {**about, "method": one.method, "gaussians": one.gaussians, "weight": one.weight}
@@ -231,18 +238,24 @@ class Study:
                 yield row, truth, to_8bit(image.color)
 
 
+def cluster_sizes(bundle: v3dg.Bundle, camera: v3dg.Camera | None = None) -> Any:
+    """(C,) gaussians of each cluster; with a camera, those whose means are in its picture."""
+    offset = bundle.clusters.offset
+    if camera is None:
+        return np.diff(offset)
+    is_in = pairs_subject.places(bundle.gaussians.means, camera)[1]
+    return np.add.reduceat(is_in, offset[:-1], dtype=int)
+
+
 def cuts_of(
-    name: str, bundle: v3dg.Bundle, camera: v3dg.Camera, count: int, counted: v3dg.Camera | None = None
+    name: str, bundle: v3dg.Bundle, camera: v3dg.Camera, count: int, sizes: Any = None
 ) -> list[Shown]:
     """The finest cut with at most so many gaussians, and the next finer one if it has far fewer.
 
-    With a camera as `counted` those count whose means are in its picture.
+    `sizes`: how many gaussians of each cluster count; all by default.
     """
-    scene, offset = v3dg.Scene.of(bundle), bundle.clusters.offset
-    sizes = np.diff(offset)
-    if counted is not None:
-        is_in = pairs_subject.places(bundle.gaussians.means, counted)[1]
-        sizes = np.add.reduceat(is_in, offset[:-1], dtype=int)
+    scene = v3dg.Scene.of(bundle)
+    sizes = cluster_sizes(bundle) if sizes is None else sizes
 
     def cut(min_level: int, tolerance: float) -> Shown:
         chosen = v3dg.select(scene, camera, min_level=min_level, tolerance=tolerance, device="cpu")
