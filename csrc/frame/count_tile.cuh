@@ -16,5 +16,34 @@ __device__ inline void count_tile(uint32_t* count, uint32_t tile) {
         atomicAdd(count + tile, unsigned(__popc(peers)));
 }
 
+// Tiles of a warp's records beyond the first of each, which wait until there are 32.
+struct WaitingTiles {
+    uint32_t tile[31 + 32 * (kFewTiles - 1)];
+    unsigned count;
+};
+
+// Adds one to the count of each of a lane's tiles, or sees to it that they wait; for a whole warp.
+template <class TileOf>
+__device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& tile_of,
+                            WaitingTiles& waiting) {
+    const unsigned lane = threadIdx.x % 32;
+    count_tile(count, num_tiles > 0 ? tile_of(0) : kNoTile);
+    unsigned num_waiting = waiting.count;
+    for (unsigned k = 1; k < kFewTiles; ++k) {
+        const unsigned lanes = __ballot_sync(kAllLanes, num_tiles > k);
+        if (lanes == 0) break;
+        if (num_tiles > k) waiting.tile[num_waiting + __popc(lanes & ((1u << lane) - 1))] = tile_of(k);
+        num_waiting += __popc(lanes);
+    }
+    __syncwarp();
+    for (; num_waiting >= 32; num_waiting -= 32) count_tile(count, waiting.tile[num_waiting - 32 + lane]);
+    if (lane == 0) waiting.count = num_waiting;
+    __syncwarp();
+}
+__device__ inline void count_waiting(uint32_t* count, const WaitingTiles& waiting) {
+    const unsigned lane = threadIdx.x % 32;
+    count_tile(count, lane < waiting.count ? waiting.tile[lane] : kNoTile);
+}
+
 }  // namespace cuda
 }  // namespace v3dg

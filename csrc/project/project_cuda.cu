@@ -39,6 +39,7 @@ struct WarpSpace {
     RecordBox boxes[kMostWaiting];          // of the item's large records that wait,
     uint8_t large[kMostWaiting];            // which they are,
     unsigned num_large;                     // and how many
+    WaitingTiles tiles;
 };
 
 // What is known of a gaussian from the sphere around it.
@@ -219,11 +220,12 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
 #pragma unroll
     for (unsigned w = lane; w < kEllipseVectors * 32; w += 32)
         if (w < kEllipseVectors * num_records) ellipses[w] = space.ellipses[w];
-    for (unsigned k = 0; __any_sync(kAllLanes, k < tiles.count); ++k)
-        count_tile(out.tiles.count,
-                   k < tiles.count
-                       ? in.image.first_tile + tiles.row(k) * in.image.tile_columns + tiles.column(k)
-                       : kNoTile);
+    count_tiles(
+        out.tiles.count, tiles.count,
+        [&](unsigned k) {
+            return in.image.first_tile + tiles.row(k) * in.image.tile_columns + tiles.column(k);
+        },
+        space.tiles);
     return num_records;
 }
 
@@ -340,6 +342,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     unsigned num_in_frustum = 0, num_records = 0;
     Loaded loaded;
     Source::prepare();
+    space.tiles.count = 0;
     // Items differ much in what is seen of them, so a warp asks for another one as it begins with one.
     for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
         const uint32_t item_word = load_word(in.items.items[i]);
@@ -355,6 +358,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
         }
         i = __shfl_sync(kAllLanes, next, 0);
     }
+    count_waiting(out.tiles.count, space.tiles);
     report_counts(*in.items.counters, num_in_frustum, num_records);
 }
 
@@ -370,6 +374,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     unsigned num_in_frustum = 0, num_records = 0;
     Loaded loaded;
     Source::prepare();
+    space.tiles.count = 0;
     for (unsigned first = blockIdx.x * kWarps + threadIdx.x / 32; first < num_items; first += 32 * stride) {
         const unsigned mine = first + threadIdx.x % 32 * stride;
         unsigned todo = __ballot_sync(kAllLanes, mine < num_items && in.items.items[mine].sharers != 0);
@@ -387,6 +392,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
             report_item(space.tables, i, written, out);
         }
     }
+    count_waiting(out.tiles.count, space.tiles);
     report_counts(*in.items.counters, num_in_frustum, num_records);
 }
 

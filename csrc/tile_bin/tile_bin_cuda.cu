@@ -202,26 +202,99 @@ struct Places {
     }
 };
 
-// The lanes' records over few tiles, by a whole warp. Places are asked for two at a time, as each takes a
-// while to come.
-__device__ void scatter_few(const Scatter& to, const ItemTiles& item, uint32_t record, FewTiles few) {
-    const EntryBox box = box_of(few);
-    TileBox tiles = tile_box(box);
-    if (few == kManyTiles) tiles.count = 0;
-    const auto tile_of = [&](unsigned k) {
-        return k < tiles.count ? item.first_tile + tiles.row(k) * item.columns + tiles.column(k) : kNoTile;
-    };
-    for (unsigned k = 0; __any_sync(kAllLanes, k < tiles.count); k += 2) {
-        const uint32_t tile[2] = {tile_of(k), tile_of(k + 1)};
-        const Places places[2] = {{to, tile[0]}, {to, tile[1]}};
+// Entries of records over few tiles that a warp scatters at once: each lane two, as a place takes a while to
+// come.
+constexpr unsigned kAtOnce = 2, kFewAtOnce = 32 * kAtOnce;
+
+// A record over few tiles, and which of them.
+struct FewPlace {
+    FewTiles few;  // kManyTiles where there is none
+    uint32_t record;
+    unsigned tile;
+};
+
+// Those beyond the first tile of each record, which wait until there are kFewAtOnce.
+struct WaitingPlaces {
+    static constexpr unsigned kMost = kFewAtOnce - 1 + kFewAtOnce * (kFewTiles - 1);
+    FewTiles few[kMost];
+    uint32_t record[kMost];  // and the tile in the highest bits
+};
+static_assert(kFewTiles <= 1u << (32 - kEntryRecordBits), "a tile fits above a record");
+
+// For a whole warp.
+__device__ void scatter_few(const Scatter& to, const ItemTiles& item, const FewPlace (&places)[kAtOnce]) {
+    EntryBox box[kAtOnce];
+    int column[kAtOnce], row[kAtOnce];
+    uint32_t tile[kAtOnce];
 #pragma unroll
-        for (unsigned j = 0; j < 2; ++j) {
-            const uint32_t place = places[j].own();
-            if (tile[j] == kNoTile) continue;
-            to.entries[to.tile_first[tile[j]] + place] =
-                tile_entry(depth_of(few), record, box, tiles.column(k + j), tiles.row(k + j));
-        }
+    for (unsigned j = 0; j < kAtOnce; ++j) {
+        box[j] = box_of(places[j].few);
+        const TileBox tiles = tile_box(box[j]);
+        column[j] = tiles.column(places[j].tile);
+        row[j] = tiles.row(places[j].tile);
+        tile[j] = places[j].few == kManyTiles ? kNoTile : item.first_tile + row[j] * item.columns + column[j];
     }
+    static_assert(kAtOnce == 2, "");
+    const Places found[kAtOnce] = {{to, tile[0]}, {to, tile[1]}};
+#pragma unroll
+    for (unsigned j = 0; j < kAtOnce; ++j) {
+        const uint32_t place = found[j].own();
+        if (tile[j] == kNoTile) continue;
+        to.entries[to.tile_first[tile[j]] + place] =
+            tile_entry(depth_of(places[j].few), places[j].record, box[j], column[j], row[j]);
+    }
+}
+
+// An item's records over few tiles, by a whole warp.
+__device__ void scatter_item(const TileBinInput& in, const Scatter& to, const ItemTiles& item,
+                             WaitingPlaces& waiting) {
+    const unsigned lane = threadIdx.x % 32;
+    unsigned num_waiting = 0;
+    const auto scatter_waiting = [&](unsigned first) {
+        FewPlace places[kAtOnce];
+#pragma unroll
+        for (unsigned j = 0; j < kAtOnce; ++j) {
+            const unsigned at = first + 32 * j + lane;
+            const bool is_there = at < num_waiting;
+            const uint32_t record = is_there ? waiting.record[at] : 0;
+            places[j] = {is_there ? waiting.few[at] : kManyTiles, record & uint32_t(kMostFrameRecords - 1),
+                         record >> kEntryRecordBits};
+        }
+        scatter_few(to, item, places);
+    };
+    const auto few_of = [&](unsigned k) {
+        return k < item.num_records ? in.few[item.record + k] : kManyTiles;
+    };
+    FewTiles next[kAtOnce] = {few_of(lane), few_of(lane + 32)};
+    for (unsigned first = 0; first < item.num_records; first += kFewAtOnce) {
+        FewPlace places[kAtOnce];
+#pragma unroll
+        for (unsigned j = 0; j < kAtOnce; ++j) {
+            places[j] = {next[j], item.record + first + 32 * j + lane, 0};
+            next[j] = few_of(first + kFewAtOnce + 32 * j + lane);
+        }
+        scatter_few(to, item, places);
+#pragma unroll
+        for (unsigned j = 0; j < kAtOnce; ++j) {
+            const unsigned count = places[j].few == kManyTiles ? 0 : tile_box(box_of(places[j].few)).count;
+            for (unsigned k = 1; k < kFewTiles; ++k) {
+                const unsigned lanes = __ballot_sync(kAllLanes, count > k);
+                if (lanes == 0) break;
+                const unsigned at = num_waiting + __popc(lanes & ((1u << lane) - 1));
+                if (count > k) {
+                    waiting.few[at] = places[j].few;
+                    waiting.record[at] = places[j].record | k << kEntryRecordBits;
+                }
+                num_waiting += __popc(lanes);
+            }
+        }
+        __syncwarp();
+        for (; num_waiting >= kFewAtOnce; num_waiting -= kFewAtOnce)
+            scatter_waiting(num_waiting - kFewAtOnce);
+        __syncwarp();
+    }
+    if (num_waiting > 0) scatter_waiting(0);
+    __syncwarp();
 }
 
 // A part of a batch of records over many tiles.
@@ -255,20 +328,13 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
 __global__ void __launch_bounds__(kThreads, kBlocks) scatter_kernel(TileBinInput in, TileBinOutput out) {
     await_kernel_before();
     if (!in.capacity.holds(*in.counters)) return;
+    __shared__ WaitingPlaces waiting[kWarps];
     const Scatter to{out.tile_first, in.counts.count, out.entries};
-    const unsigned num_items = static_cast<unsigned>(in.counters->items), lane = threadIdx.x % 32;
+    const unsigned num_items = static_cast<unsigned>(in.counters->items);
     for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
         const unsigned next = take_next(in.counts.taken, gridDim.x * kWarps);
         const ItemTiles item = in.items[i];
-        const auto few_of = [&](unsigned k) {
-            return k < item.num_records ? in.few[item.record + k] : kManyTiles;
-        };
-        FewTiles few = few_of(lane);
-        for (unsigned k = lane; k - lane < item.num_records; k += 32) {
-            const FewTiles next_few = few_of(k + 32);
-            scatter_few(to, item, item.record + k, few);
-            few = next_few;
-        }
+        scatter_item(in, to, item, waiting[threadIdx.x / 32]);
         i = __shfl_sync(kAllLanes, next, 0);
     }
     for_each_part(
