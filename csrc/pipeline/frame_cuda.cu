@@ -180,7 +180,11 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
         of_frame.report = slot.counters;
     }
     if (place) place(drawing.planes_);
-    for (int k = 0; k < 2; ++k) of_frame.planes[k] = drawing.planes_[k];
+    of_frame.has_depth = batch.has_depth;
+    for (int k = 0; k < 2; ++k) {
+        of_frame.planes[k] = drawing.planes_[k];
+        of_frame.has_depth = of_frame.has_depth || drawing.planes_[k].depth != nullptr;
+    }
     rasterize(of_frame, keeps_tape ? &tape : nullptr, stream);
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;

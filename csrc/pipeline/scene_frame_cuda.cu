@@ -122,7 +122,8 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             pictures.min_transmittance,
             rule.fade.is_on(),
             nullptr,
-            Cut::num_zeros(scene, rule)};
+            Cut::num_zeros(scene, rule),
+            pictures.image[0].planes.depth != nullptr};
 }
 
 // What a frame that was drawn once is drawn again with.
@@ -214,11 +215,12 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
     const ModelTables tables{rows, packed == nullptr ? PackedPlanes{} : *packed, {view, 0, 0}, image};
-    const FrameBatch batch{&on_device->rows,  &on_device->placement,
-                           &on_device->image, 1,
-                           num_tiles(image),  packed == nullptr ? nullptr : &on_device->packed,
-                           nullptr,           false,
-                           min_transmittance};
+    FrameBatch batch{&on_device->rows,  &on_device->placement,
+                     &on_device->image, 1,
+                     num_tiles(image),  packed == nullptr ? nullptr : &on_device->packed,
+                     nullptr,           false,
+                     min_transmittance};
+    batch.has_depth = image.planes.depth != nullptr;
     const unsigned blocks = std::max(1u, blocks_for(blocks_for(rows.size, kItemSize), kModelThreads));
     return frame_.draw(
         batch,

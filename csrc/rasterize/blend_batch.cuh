@@ -65,6 +65,15 @@ __device__ inline float2 rest_at(uint32_t place) {
     return v;
 }
 
+// An element of BlendShared::list. The load extends it; of a plain one, nvcc does that once more.
+__device__ inline uint32_t listed_at(uint32_t place) {
+    uint32_t listed = 0;
+#ifdef __CUDA_ARCH__
+    asm volatile("ld.shared.u16 %0, [%1];" : "=r"(listed) : "r"(place));
+#endif
+    return listed;
+}
+
 // Of a sub-tile's among the tile's blocks, a bit each.
 template <int kPixels>
 __device__ uint32_t blocks_of_sub(int sub) {
@@ -118,7 +127,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
     // Hidden from the compiler, which would keep what follows from the lane in registers from batch to batch
     // and spill others.
     asm volatile("" : "+r"(lane));
-    uint32_t* list = s.list[threadIdx.x / 32] + kBlendBatch;  // from its end to its begin
+    uint16_t* list = s.list[threadIdx.x / 32] + kBlendBatch;  // from its end to its begin
     const uint32_t own_blocks = blocks_of_sub<kPixels>(sub);
     int listed = 0;
     for (int g = 0; g < num_groups; ++g) {
@@ -126,7 +135,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
         const uint32_t reaching = __ballot_sync(kAllLanes, reaches);
         if (reaches)
             *(list - listed - __popc(reaching & ((1u << lane) - 1))) =
-                static_cast<uint32_t>(__cvta_generic_to_shared(&s.record[0][32 * g + lane]));
+                static_cast<uint16_t>(__cvta_generic_to_shared(&s.record[0][32 * g + lane]));
         listed += __popc(reaching);
     }
     __syncwarp();
@@ -141,7 +150,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
     p.y = corner_y + static_cast<float>(lane / 8);
     load(pixels.transmittance + place, p.transmittance);
     for (int c = 0; c < 3; ++c) load(pixels.color[c] + place, p.color[c]);
-    if (kWithDepth) load(pixels.depth + place, p.depth);
+    if (kWithDepth) load(s.depth + place, p.depth);
     // Of two pixels, all gaussians are infinitely far from the one that has stopped.
     constexpr float kNowhere = INFINITY;
     bool alive = false;
@@ -152,11 +161,12 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
             p.x[k] = kNowhere;
     }
     // The last lane takes the first record of a group, which becomes the highest bit of a lane's pixels.
-    const uint32_t* last_of_group = list - 31;
-    for (; listed > 0; listed -= 32, last_of_group -= 32) {
+    constexpr uint32_t kEach = sizeof(*list);
+    uint32_t last_of_group = static_cast<uint32_t>(__cvta_generic_to_shared(list - 31));
+    for (; listed > 0; listed -= 32, last_of_group -= 32 * kEach) {
         uint32_t bits = 0;
         if (31 - lane < listed) {
-            const uint32_t own = last_of_group[lane];
+            const uint32_t own = listed_at(last_of_group + kEach * lane);
             const float4 a = vector_at<0>(own), b = vector_at<1>(own);
             bits = reached_cells<kPixels>(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
         }
@@ -164,7 +174,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
         if (!alive) bits = 0;
         // Where the next record begins is looked up ahead; after the last one it means nothing.
         int highest = 31 - __clz(static_cast<int>(bits));
-        uint32_t next = last_of_group[highest];
+        uint32_t next = listed_at(last_of_group + kEach * highest);
         while (bits != 0) {
             // A record is used as its vectors (frame/record.cuh): taken apart first, nvcc rounds the falloff
             // otherwise than for the other number of pixels, and in the backward pass.
@@ -172,7 +182,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
             const float2 c = rest_at(next);
             bits ^= __funnelshift_l(0u, 1u, highest);  // 1 << highest, without a register for the 1
             highest = 31 - __clz(static_cast<int>(bits));
-            next = last_of_group[highest];
+            next = listed_at(last_of_group + kEach * highest);
             alive = false;
 #pragma unroll
             for (int k = 0; k < kPixels; ++k) {
@@ -197,7 +207,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
         if (kPixels > 1 ? p.x[k] == kNowhere : !alive) p.transmittance[k] = -fabsf(p.transmittance[k]);
     store(p.transmittance, pixels.transmittance + place);
     for (int c = 0; c < 3; ++c) store(p.color[c], pixels.color[c] + place);
-    if (kWithDepth) store(p.depth, pixels.depth + place);
+    if (kWithDepth) store(p.depth, s.depth + place);
     publish_alive<kPixels>(alive, sub, s);
 }
 

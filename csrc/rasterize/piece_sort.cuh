@@ -18,7 +18,7 @@ constexpr int kLog2Sort = 9;                             // buckets of a piece
 constexpr uint32_t kMostAlike = 12;                      // entries of a bucket that is not crowded
 constexpr uint32_t kMostCrowded = kBlendThreads / 4;     // of an entry a thread, in crowded buckets
 constexpr int kFewEntries = 64;                          // sorted without buckets
-constexpr int kBlendBatch = 128;                         // records blended at once
+constexpr int kBlendBatch = 192;                         // records blended at once
 // Each takes some bits of depth or record, at least 4, after the first one, whose range is a guess.
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
@@ -53,7 +53,6 @@ struct ListWindow {
 struct TilePixels {
     alignas(float2) float transmittance[kFrameTilePixels];
     alignas(float2) float color[3][kFrameTilePixels];
-    alignas(float2) float depth[kFrameTilePixels];  // sum of weight * depth
 };
 
 struct BlendShared {
@@ -69,9 +68,9 @@ struct BlendShared {
     };
     uint16_t sorted[kPiece];       // places in `key`
     uint32_t blocks[kBlendBatch];  // live ones that the batch's records may reach
-    // Of the batch, those that may reach the sub-tile of a warp: where they begin in shared memory, from the
-    // last place on backwards. The first place is read ahead only.
-    uint32_t list[kBlendWarps][kBlendBatch + 1];
+    // Of the batch, those that may reach the sub-tile of a warp: where they begin in shared memory, of which
+    // a block's begins at 0, from the last place on backwards. The first place is read ahead only.
+    uint16_t list[kBlendWarps][kBlendBatch + 1];
     TilePixels pixels;
     uint32_t alive_blocks;    // as blocks_of(TileEntry)
     uint32_t reached[2];      // by some record of the batch, in turn
@@ -81,7 +80,11 @@ struct BlendShared {
     uint32_t lowest, highest;  // depths of the piece
     uint32_t crowded;          // of some of its entries, those with many in their bucket
     SpreadLevel level[kMostSpreadLevels];
+    // Sums of weight * depth, in the order of TilePixels. Frames without depth leave out this memory, so that
+    // kBlocks of them share a multiprocessor.
+    alignas(float2) float depth[kFrameTilePixels];
 };
+static_assert(sizeof(BlendShared) < 1 << 15, "addresses are 16 bits in `list`");
 
 // The end of the bucket that entry `first` is in; the entries up to `last` are in bucket order.
 __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint32_t last,

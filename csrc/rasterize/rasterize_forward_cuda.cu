@@ -210,7 +210,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
         for (int k = 0; k < 2; ++k) {
             s.pixels.transmittance[place + k] = x + k < image.width && y < image.height ? 1.0f : -1.0f;
             for (int c = 0; c < 3; ++c) s.pixels.color[c][place + k] = 0.0f;
-            if (kWithDepth) s.pixels.depth[place + k] = 0.0f;
+            if (kWithDepth) s.depth[place + k] = 0.0f;
         }
         publish_alive<2>(x < image.width && y < image.height, sub, s);
     });
@@ -235,8 +235,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
                 planes.color[3 * out + c] =
                     of.gain * s.pixels.color[c][place + k] + of.transmittance * image.background[c];
             planes.alpha[out] = alpha;
-            if (kWithDepth)
-                planes.depth[out] = alpha > 0 ? of.gain * s.pixels.depth[place + k] / alpha : 0.0f;
+            if (kWithDepth) planes.depth[out] = alpha > 0 ? of.gain * s.depth[place + k] / alpha : 0.0f;
         }
     });
 }
@@ -348,6 +347,7 @@ __device__ uint32_t room_in_windows(uint32_t count) {
 struct SpreadSpace {
     SpreadShared<kLog2Spread> even;
     uint32_t finer[1 << kLog2Spread];
+    TileEntry chunk[1];  // as many as there is room for
 };
 
 // Whether a bucket has more entries than that; a counter stands where the next one begins.
@@ -391,6 +391,35 @@ __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileE
     return has_windows;
 }
 
+// As spread(), for a list that does not fit into shared memory: `most` entries at a time go through it, so
+// that those of a bucket are written side by side.
+__device__ void spread_by_chunks(const TileEntry* from, TileEntry* to, uint32_t count, uint32_t most,
+                                 const Buckets& buckets, SpreadSpace& space) {
+    SpreadShared<kLog2Spread>& s = space.even;
+    uint32_t (&of_chunk)[1 << kLog2Spread] = space.finer;
+    // Where a bucket begins in the chunk, once its counter stands where the next one does.
+    const auto begin_of = [&](uint32_t b) { return b > 0 ? of_chunk[b - 1] : 0; };
+    place_buckets<kSpreadThreads>(from, 0, count, buckets, s.bucket, s.warp_sum);
+    const uint32_t num_chunks = (count + most - 1) / most, size = (count + num_chunks - 1) / num_chunks;
+    for (uint32_t first = 0; first < count; first += size) {
+        const uint32_t last = min(first + size, count);
+        place_buckets<kSpreadThreads>(from, first, last, buckets, of_chunk, s.warp_sum);
+        for_each_entry<kSpreadThreads>(from, first, last, [&](TileEntry e) {
+            space.chunk[atomicAdd(&of_chunk[buckets.of(e.key)], 1u)] = e;
+        });
+        __syncthreads();
+        for (uint32_t i = threadIdx.x; i < last - first; i += kSpreadThreads) {
+            const TileEntry e = space.chunk[i];
+            const uint32_t b = buckets.of(e.key);
+            to[s.bucket[b] + i - begin_of(b)] = e;
+        }
+        __syncthreads();
+        for (uint32_t b = threadIdx.x; b < 1 << kLog2Spread; b += kSpreadThreads)
+            s.bucket[b] += of_chunk[b] - begin_of(b);
+        __syncthreads();
+    }
+}
+
 // Spreads the list of a plan's tile if it is long; by a whole block. Where it is, if `most_held` entries in
 // shared memory are enough, else into the scratch. That of a tile in parts is spread into windows, in the
 // scratch, by the block that has the first part.
@@ -426,7 +455,8 @@ __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t co
         spread<kSpreadThreads>(held, entries, 0, count, buckets, s.bucket, s.warp_sum);
     } else {
         buckets = find_buckets<kSpreadThreads>(entries, 0, count, true, false, s);
-        spread<kSpreadThreads>(entries, scratch, 0, count, buckets, s.bucket, s.warp_sum);
+        const uint32_t in_chunk = most_held - sizeof space.finer / sizeof(TileEntry);
+        spread_by_chunks(entries, scratch, count, in_chunk, buckets, space);
     }
     if (has_longer(s.bucket, kWindow) && is_held && !has_parts)
         first_scratch = take_scratch(*lists.counters, count);
@@ -510,9 +540,10 @@ void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t str
     launch_early("spread_kernel", spread_kernel, std::min(2 * num_multiprocessors(), lists.num_tiles),
                  kSpreadThreads, sizeof(SpreadShared<kLog2Spread>) + held * sizeof(TileEntry), stream, lists,
                  held);
+    const size_t shared_bytes = lists.has_depth ? sizeof(BlendShared) : offsetof(BlendShared, depth);
     with_stop<float>(lists.min_transmittance, [&](auto stop) {
         launch_early("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans, kBlendThreads,
-                     sizeof(BlendShared), stream, lists, tape == nullptr ? RasterTape{} : *tape, stop);
+                     shared_bytes, stream, lists, tape == nullptr ? RasterTape{} : *tape, stop);
     });
 }
 
