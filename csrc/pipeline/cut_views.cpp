@@ -15,9 +15,8 @@ namespace {
 
 constexpr double kNarrowestPx = 8, kMostPx = 1 << 15;  // of a side of a picture
 constexpr double kHomePx2 = 2;  // a gaussian: the size at which a cut is selected at the default tolerance
-// A side of a picture, in the size at which its cut is at home. Cuts of the default tolerance are seen at a
-// quarter to half of that, so smaller pictures are a little more frequent: a uniform number to this power.
-constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75, kPowerOfSize = 1.1;
+// A side of a picture, in the size at which its cut is at home.
+constexpr double kLeastSize = 0.18, kOctavesOfSize = 5.75;
 constexpr double kDistance = 2.5;     // from the centre, in radii
 constexpr double kNear = 0.01;        // in radii
 constexpr int kMostTries = 16;        // to find a gaussian that a picture shows
@@ -200,7 +199,7 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
     const double part = random.uniform();
     double all = static_cast<double>(pictures.weight.size());  // that a picture has without levels
     const double share = pictures.most * std::pow(pictures.least / pictures.most, part * part) / all;
-    const double size = kLeastSize * std::exp2(kOctavesOfSize * std::pow(random.uniform(), kPowerOfSize));
+    const double size = kLeastSize * std::exp2(kOctavesOfSize * random.uniform());
     Camera camera;
     SelectRule rule{};
     rule.culls = pictures.cameras.size > 0;
