@@ -40,6 +40,8 @@ __device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& t
     if (lane == 0) waiting.count = num_waiting;
     __syncwarp();
 }
+
+// Counts what still waits: once, at the end, for a whole warp.
 __device__ inline void count_waiting(uint32_t* count, const WaitingTiles& waiting) {
     const unsigned lane = threadIdx.x % 32;
     count_tile(count, lane < waiting.count ? waiting.tile[lane] : kNoTile);

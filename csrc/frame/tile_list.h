@@ -113,7 +113,7 @@ struct FrameLists {
     float min_transmittance;  // of the images
     // Of images that do not say where they are: those of the first and of the second.
     PicturePlanes planes[2] = {};
-    bool has_depth = true;            // whether an image may be drawn with depth
+    bool has_depth = true;            // whether an image may be drawn with depth: true if one is
     FrameCounters* report = nullptr;  // where the counters go, on the host; may be null
 };
 

@@ -155,8 +155,9 @@ void draw_targets(const FitConfig& config, Span<const FitJob> jobs, const FitJob
                             alpha.reserve(pixels, stream),
                             images.reserve(num_images, stream),
                             placements.reserve(num_images, stream)};
-        const FrameBatch batch{model.data(), tables.placements, tables.images, num_images,
-                               static_cast<uint32_t>(tiles)};
+        FrameBatch batch{model.data(), tables.placements, tables.images, num_images,
+                         static_cast<uint32_t>(tiles)};
+        batch.has_depth = false;
         frame
             .draw(
                 batch,

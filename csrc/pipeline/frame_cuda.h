@@ -29,8 +29,9 @@ struct FrameBatch {
     bool has_faded_items = false;            // the same as of shared ones; these are of scenes and not shared
     // Where the models change from frame to frame: what guards them. Whoever draws has it locked.
     StreamMutex* guards_models = nullptr;
-    size_t num_zeros = 0;    // that ItemList is to have
-    bool has_depth = false;  // whether one of the images that say where they are is drawn with depth
+    size_t num_zeros = 0;  // that ItemList is to have
+    // Whether an image that says where it is may be drawn with depth: true if one is.
+    bool has_depth = true;
 };
 
 // What a frame leaves for its backward pass, valid until the next frame is drawn.

@@ -123,7 +123,7 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             rule.fade.is_on(),
             nullptr,
             Cut::num_zeros(scene, rule),
-            pictures.image[0].planes.depth != nullptr};
+            pictures.image[0].planes.depth != nullptr || pictures.image[1].planes.depth != nullptr};
 }
 
 // What a frame that was drawn once is drawn again with.

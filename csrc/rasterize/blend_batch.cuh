@@ -65,7 +65,8 @@ __device__ inline float2 rest_at(uint32_t place) {
     return v;
 }
 
-// An element of BlendShared::list. The load extends it; of a plain one, nvcc does that once more.
+// An element of BlendShared::list, whose writing ends with a clobber. This load fills 32 bits; after a plain
+// one nvcc extends the number again.
 __device__ inline uint32_t listed_at(uint32_t place) {
     uint32_t listed = 0;
 #ifdef __CUDA_ARCH__
@@ -139,6 +140,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
         listed += __popc(reaching);
     }
     __syncwarp();
+    asm volatile("" ::: "memory");  // for listed_at()
 
     using Sub = SubTile<kPixels>;
     const float corner_x = left + sub % Sub::kColumns * Sub::kWidth + 0.5f;

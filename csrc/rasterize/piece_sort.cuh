@@ -68,8 +68,8 @@ struct BlendShared {
     };
     uint16_t sorted[kPiece];       // places in `key`
     uint32_t blocks[kBlendBatch];  // live ones that the batch's records may reach
-    // Of the batch, those that may reach the sub-tile of a warp: where they begin in shared memory, of which
-    // a block's begins at 0, from the last place on backwards. The first place is read ahead only.
+    // Of the batch, those that may reach the sub-tile of a warp, as addresses in shared memory. They stand
+    // from the last place on backwards; the first place is read ahead only.
     uint16_t list[kBlendWarps][kBlendBatch + 1];
     TilePixels pixels;
     uint32_t alive_blocks;    // as blocks_of(TileEntry)
@@ -80,11 +80,12 @@ struct BlendShared {
     uint32_t lowest, highest;  // depths of the piece
     uint32_t crowded;          // of some of its entries, those with many in their bucket
     SpreadLevel level[kMostSpreadLevels];
-    // Sums of weight * depth, in the order of TilePixels. Frames without depth leave out this memory, so that
-    // kBlocks of them share a multiprocessor.
+    // Sums of weight * depth, in the order of TilePixels. Frames without depth do not ask for this memory.
     alignas(float2) float depth[kFrameTilePixels];
 };
-static_assert(sizeof(BlendShared) < 1 << 15, "addresses are 16 bits in `list`");
+static_assert(sizeof(BlendShared) < 1 << 15,
+              "`list` has 16 bits; a block's memory begins within the lower half");
+static_assert(kBlendBatch % 32 == 0, "a warp takes 32 records");
 
 // The end of the bucket that entry `first` is in; the entries up to `last` are in bucket order.
 __device__ inline uint32_t end_of_bucket(const TileEntry* entries, uint32_t first, uint32_t last,

@@ -2,9 +2,9 @@
 //
 // Lists are sorted piece by piece, nearest first. Entries over pixels that have all stopped by then are
 // dropped unsorted, and their records are never fetched. A list that does not fit into a piece is first
-// spread over buckets of depth, through shared memory or into scratch; a bucket too long for a window is
-// spread again. A list with far more than its share of a frame's entries is blended in parts of the tile,
-// side by side.
+// spread over buckets of depth: in its own place if shared memory holds it, else into scratch, so many
+// entries at a time as it holds. A bucket too long for a window is spread again. A list with far more than
+// its share of a frame's entries is blended in parts of the tile, side by side.
 
 #include "rasterize/rasterize_cuda.h"
 
@@ -18,7 +18,7 @@ namespace v3dg {
 namespace cuda {
 namespace {
 
-constexpr int kBlocks = 8;         // on a multiprocessor
+constexpr int kBlocks = 8;         // on a multiprocessor with 228 KiB, of frames without depth
 constexpr int kLog2Spread = 11;    // buckets of a list, at most
 constexpr int kPlanThreads = 256;  // a thread a tile
 constexpr int kSpreadThreads = 1024;
@@ -27,6 +27,7 @@ constexpr int kMostParts = 4;  // of a tile
 // differ by a hundredth.
 constexpr int kBlocksForPairs = 5;
 
+static_assert(kBlocks * (offsetof(BlendShared, depth) + 1024) <= 228 << 10, "the driver keeps 1024 of each");
 static_assert(kPiece % (3 * kMostParts) == 0 && (kPiece / 3 & (kPiece / 3 - 1)) == 0,
               "kPiece / kMostParts begins a class of plan_kernel");
 
@@ -455,7 +456,8 @@ __device__ void spread_list(const FrameLists& lists, TilePlan& plan, uint32_t co
         spread<kSpreadThreads>(held, entries, 0, count, buckets, s.bucket, s.warp_sum);
     } else {
         buckets = find_buckets<kSpreadThreads>(entries, 0, count, true, false, s);
-        const uint32_t in_chunk = most_held - sizeof space.finer / sizeof(TileEntry);
+        constexpr size_t kBefore = offsetof(SpreadSpace, chunk) - offsetof(SpreadSpace, finer);
+        const uint32_t in_chunk = most_held - kBefore / sizeof(TileEntry);
         spread_by_chunks(entries, scratch, count, in_chunk, buckets, space);
     }
     if (has_longer(s.bucket, kWindow) && is_held && !has_parts)

@@ -16,7 +16,7 @@ namespace cuda {
 namespace {
 
 constexpr unsigned kThreads = 256, kWarps = kThreads / 32;
-constexpr unsigned kBlocks = 5;  // on a multiprocessor
+constexpr unsigned kBlocks = 5;  // on a multiprocessor with 164 KiB of shared memory
 
 // Of the kernel that counts large records.
 constexpr unsigned kCountThreads = 512, kCountBlocks = 3;
@@ -234,7 +234,7 @@ __device__ void scatter_few(const Scatter& to, const ItemTiles& item, const FewP
         row[j] = tiles.row(places[j].tile);
         tile[j] = places[j].few == kManyTiles ? kNoTile : item.first_tile + row[j] * item.columns + column[j];
     }
-    static_assert(kAtOnce == 2, "");
+    static_assert(kAtOnce == 2, "`found` has two");
     const Places found[kAtOnce] = {{to, tile[0]}, {to, tile[1]}};
 #pragma unroll
     for (unsigned j = 0; j < kAtOnce; ++j) {
