@@ -22,6 +22,19 @@ struct WaitingTiles {
     unsigned count;
 };
 
+// Calls add(k, at) for each tile k of a lane's beyond the first, with where it is to wait behind the
+// `num_waiting`, and counts it to these; for a whole warp.
+template <class Add>
+__device__ void let_wait(unsigned num_tiles, unsigned& num_waiting, const Add& add) {
+    const unsigned lane = threadIdx.x % 32;
+    for (unsigned k = 1; k < kFewTiles; ++k) {
+        const unsigned lanes = __ballot_sync(kAllLanes, num_tiles > k);
+        if (lanes == 0) break;
+        if (num_tiles > k) add(k, num_waiting + __popc(lanes & ((1u << lane) - 1)));
+        num_waiting += __popc(lanes);
+    }
+}
+
 // Adds one to the count of each of a lane's tiles, or sees to it that they wait; for a whole warp.
 template <class TileOf>
 __device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& tile_of,
@@ -29,12 +42,7 @@ __device__ void count_tiles(uint32_t* count, unsigned num_tiles, const TileOf& t
     const unsigned lane = threadIdx.x % 32;
     count_tile(count, num_tiles > 0 ? tile_of(0) : kNoTile);
     unsigned num_waiting = waiting.count;
-    for (unsigned k = 1; k < kFewTiles; ++k) {
-        const unsigned lanes = __ballot_sync(kAllLanes, num_tiles > k);
-        if (lanes == 0) break;
-        if (num_tiles > k) waiting.tile[num_waiting + __popc(lanes & ((1u << lane) - 1))] = tile_of(k);
-        num_waiting += __popc(lanes);
-    }
+    let_wait(num_tiles, num_waiting, [&](unsigned k, unsigned at) { waiting.tile[at] = tile_of(k); });
     __syncwarp();
     for (; num_waiting >= 32; num_waiting -= 32) count_tile(count, waiting.tile[num_waiting - 32 + lane]);
     if (lane == 0) waiting.count = num_waiting;

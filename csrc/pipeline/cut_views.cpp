@@ -174,9 +174,7 @@ Comparison comparison_of(double size, double longer_px) {
 
 CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const float>& asset,
                              Span<const Camera> cameras, uint64_t seed) {
-    CutPictures pictures{table, {asset.means, 3 * asset.size}, cameras, seed, 0, 0, 0, {}, {}, 0};
-    for (size_t g = 0; g < table.level.size; ++g)
-        pictures.coarsest = std::max(pictures.coarsest, table.level[g]);
+    CutPictures pictures{table, {asset.means, 3 * asset.size}, cameras, seed, 0, 0, {}, {}, 0};
     for (const int32_t c : table.top_cluster)
         pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
     pictures.least = std::max(pictures.least, 1.0);
@@ -220,8 +218,10 @@ CutView cut_view(const CutPictures& pictures, uint64_t number) {
     SelectOutput whole = selected(pictures.table, camera, rule);
     // From inside of groups these are refined at any tolerance, and a budget below what is left of them is
     // met by nothing but the coarsest clusters: then by coarser levels alone.
+    const Span<const int32_t>& levels = pictures.table.level;
+    const int32_t coarsest = levels.size > 0 ? levels[levels.size - 1] : 0;
     while (std::isinf(whole.tolerance_px2) && 2 * whole.num_gaussians < static_cast<int64_t>(rule.budget) &&
-           rule.min_level < pictures.coarsest) {
+           rule.min_level < coarsest) {
         ++rule.min_level;
         whole = selected(pictures.table, camera, rule);
     }

@@ -25,7 +25,6 @@ struct CutPictures {
     Span<const Camera> cameras;
     uint64_t seed;
     double most, least;          // gaussians of a cut
-    int32_t coarsest;            // level
     std::vector<double> weight;  // [N] how often each of the asset is looked at, as the sum up to it
     double center[3], radius;    // that is looked at
 };

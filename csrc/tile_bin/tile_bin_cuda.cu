@@ -277,16 +277,10 @@ __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const It
 #pragma unroll
         for (unsigned j = 0; j < kAtOnce; ++j) {
             const unsigned count = places[j].few == kManyTiles ? 0 : tile_box(box_of(places[j].few)).count;
-            for (unsigned k = 1; k < kFewTiles; ++k) {
-                const unsigned lanes = __ballot_sync(kAllLanes, count > k);
-                if (lanes == 0) break;
-                const unsigned at = num_waiting + __popc(lanes & ((1u << lane) - 1));
-                if (count > k) {
-                    waiting.few[at] = places[j].few;
-                    waiting.record[at] = places[j].record | k << kEntryRecordBits;
-                }
-                num_waiting += __popc(lanes);
-            }
+            let_wait(count, num_waiting, [&](unsigned k, unsigned at) {
+                waiting.few[at] = places[j].few;
+                waiting.record[at] = places[j].record | k << kEntryRecordBits;
+            });
         }
         __syncwarp();
         for (; num_waiting >= kFewAtOnce; num_waiting -= kFewAtOnce)
