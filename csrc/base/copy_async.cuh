@@ -1,0 +1,38 @@
+#pragma once
+
+// Copies from device to shared memory that pass through no register.
+
+#include <cuda_runtime.h>
+
+namespace v3dg {
+namespace cuda {
+
+// Copies 16 or 8 bytes from device to shared memory; they are there once the thread has waited.
+__device__ inline void copy_async(float4* shared, const float4* from) {
+#ifdef __CUDA_ARCH__
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(
+                     static_cast<unsigned>(__cvta_generic_to_shared(shared))),
+                 "l"(from)
+                 : "memory");
+#else
+    *shared = *from;
+#endif
+}
+__device__ inline void copy_async(float2* shared, const float2* from) {
+#ifdef __CUDA_ARCH__
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 8;" ::"r"(
+                     static_cast<unsigned>(__cvta_generic_to_shared(shared))),
+                 "l"(from)
+                 : "memory");
+#else
+    *shared = *from;
+#endif
+}
+__device__ inline void wait_for_copies() {
+#ifdef __CUDA_ARCH__
+    asm volatile("cp.async.commit_group;\n cp.async.wait_group 0;" ::: "memory");
+#endif
+}
+
+}  // namespace cuda
+}  // namespace v3dg
