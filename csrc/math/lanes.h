@@ -340,4 +340,17 @@ V3DG_HD V3DG_INLINE V all_lanes(Lane<V> x) {
     return x - V{};
 }
 
+// x cut to [low, high], which are numbers; what is not a number stays so.
+template <class V>
+V3DG_HD V3DG_INLINE V cut_to(Lane<V> low, Lane<V> high, V x) {
+#ifdef __CUDA_ARCH__
+    if constexpr (std::is_same<V, float>::value) {
+        asm("max.NaN.f32 %0, %0, %1;" : "+f"(x) : "f"(low));
+        asm("min.NaN.f32 %0, %0, %1;" : "+f"(x) : "f"(high));
+        return x;
+    }
+#endif
+    return min_of(all_lanes<V>(high), max_of(all_lanes<V>(low), x));
+}
+
 }  // namespace v3dg

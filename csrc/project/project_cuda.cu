@@ -23,6 +23,9 @@ constexpr unsigned kWarps = 8;
 constexpr unsigned kBlocks = 4;        // on a multiprocessor
 constexpr unsigned kQueue = 64;        // fewer than 32 wait when 32 come
 constexpr unsigned kMostWaiting = 64;  // large records, of which fewer than 32 wait when 32 come
+// Where so many of an item's first 32 gaussians reach so few px at most, they are tested by rows.
+constexpr float kSmall = 3;
+constexpr unsigned kManySmall = 4;
 
 // A gaussian in front of the camera.
 struct Queued {
@@ -46,6 +49,7 @@ struct WarpSpace {
 struct SphereTest {
     bool may_reach;       // a pixel centre; also where something is not a number
     bool misses_centers;  // but is in the frustum
+    float half;           // px that it reaches from its centre
 };
 
 // Of a gaussian at p in view space. Without branches, because some lane of the warp would take each of them.
@@ -66,14 +70,35 @@ __device__ SphereTest test_sphere(const ItemTables<typename Source::Model>& in, 
     const bool is_inside =
         (from_x < middle_x) & (from_y < middle_y) & !in.item.appearance.antialiased & !is_faded;
     const bool misses = is_inside & (misses_centers(u, half) | misses_centers(v, half));
-    return {!(is_outside | misses), misses && !is_outside};
+    return {!(is_outside | misses), misses && !is_outside, half};
 }
 
-// The record of gaussian g at p in view space. Returns whether it reaches a pixel centre.
+// Leaves out the first and the last row of a box where the ellipse misses all of their pixel centres, with a
+// margin, so that the blend step alone decides.
+__device__ void drop_missed_rows(const Ellipse<float>& e, const Projection<float>& s, float image_width,
+                                 PixelBox<int>& box) {
+    const float slope = quotient_of(s.c12, s.c22), u = e.u - 0.5f;
+    const float margin = 2e-3f + 4e-7f * (2 * fabsf(e.u) + image_width);
+    const float reach = e.log2_opacity - static_cast<float>(kLog2MinAlpha) + 1e-4f;
+    const auto misses = [&](int row) {
+        const float dy = static_cast<float>(row) + 0.5f - e.v;
+        // In this row alpha is largest here. No pixel centre, whether in the image or not, is nearer than
+        // the one that this rounds to.
+        const float middle = slope * dy + u;
+        const float t1 = e.l11 * fmaxf(fabsf(middle - round_of(middle)) - margin, 0.0f), t2 = e.l22 * dy;
+        return t1 * t1 + t2 * t2 > reach;
+    };
+    const bool misses_first = misses(box.y0), misses_last = misses(box.y1);
+    box.y0 += misses_first;
+    box.y1 -= misses_last;
+}
+
+// The record of gaussian g at p in view space. Returns whether it reaches a pixel centre; where gaussians are
+// not small those few that miss all centres in their box count, too.
 template <class Source>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in, const ModelView<float>& view,
-                            typename Source::Place place, uint32_t g, const float p[3], Record<float>& r,
-                            unsigned& num_in_frustum) {
+                            typename Source::Place place, uint32_t g, const float p[3], bool are_small,
+                            Record<float>& r, unsigned& num_in_frustum) {
     Projection<float> s;
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
     const Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
@@ -83,7 +108,8 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in, const 
     if (!extent_of(1.0f, e, s, half_x, half_y)) return false;
     if (!(meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height))) return false;
     ++num_in_frustum;
-    const PixelBox<int> box = pixel_box(e, half_x, half_y, cam, in.image.width, in.image.height);
+    PixelBox<int> box = pixel_box(e, half_x, half_y, cam, in.image.width, in.image.height);
+    if (are_small) drop_missed_rows(e, s, cam.width, box);
     if (!box.holds_pixels()) return false;
 
     set_ellipse(e, box, r);
@@ -169,9 +195,9 @@ __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, co
 // many there are. `sharers` are the placements of a shared item.
 template <class Source, bool kIsShared>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, const Placement* sharers,
-                                  const typename Source::Place& start, unsigned head, unsigned count,
-                                  uint32_t first, FrameCounters& counters, const ProjectOutput& out,
-                                  unsigned& num_in_frustum) {
+                                  const typename Source::Place& start, bool are_small, unsigned head,
+                                  unsigned count, uint32_t first, FrameCounters& counters,
+                                  const ProjectOutput& out, unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
     Record<float> r;
@@ -181,7 +207,7 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
         const Queued queued = space.queue[(head + lane) % kQueue];
         g = in.item.first + (kIsShared ? queued.place / 32 : queued.place);
         const ModelView<float>& view = kIsShared ? sharers[queued.place % 32].view : in.placement.view;
-        reaches_pixel = project_one<Source>(in, view, start, g, queued.p, r, num_in_frustum);
+        reaches_pixel = project_one<Source>(in, view, start, g, queued.p, are_small, r, num_in_frustum);
     }
     const unsigned kept = __ballot_sync(kAllLanes, reaches_pixel);
     if (kept == 0) return 0;
@@ -275,6 +301,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     };
     const float reach_scale = sees ? reach_scale_of() : 0;
     unsigned head = 0, waiting = 0, written = 0;
+    bool are_small = false;  // as the first of them tell
     const typename Source::Place start = Source::start(tables);
     typename Source::Place here = start;
     typename Source::Fetched next_fetched{};
@@ -285,7 +312,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         const unsigned place = kIsShared ? first : first + lane;
         if (place + kRound < count)
             next_fetched = Source::fetch(tables.model, tables.item.first + place + kRound);
-        bool may_reach = false;
+        bool may_reach = false, is_small = false;
         float p[3];
         if (place < count && sees) {
             const float4 sphere = Source::sphere(tables.model, here, tables.item.first + place, fetched);
@@ -293,8 +320,10 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             to_view(view, mean, p);
             const SphereTest told = test_sphere<Source>(tables, p, sphere.w, reach_scale);
             may_reach = told.may_reach;
+            is_small = may_reach && told.half < kSmall;
             num_in_frustum += told.misses_centers;
         }
+        if (first == 0) are_small = __popc(__ballot_sync(kAllLanes, is_small)) >= kManySmall;
         const unsigned come = __ballot_sync(kAllLanes, may_reach);
         if (may_reach)
             space.queue[(head + waiting + __popc(come & ((1u << lane) - 1))) % kQueue] = {
@@ -304,8 +333,9 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         if (waiting < 32 && first + kRound < count) continue;
         // After the last there may be two rounds left.
         const unsigned taken = min(waiting, 32u);
-        written += write_records<Source, kIsShared>(
-            space, sharers, start, head, taken, tables.item.record + written, counters, out, num_in_frustum);
+        written +=
+            write_records<Source, kIsShared>(space, sharers, start, are_small, head, taken,
+                                             tables.item.record + written, counters, out, num_in_frustum);
         head += taken;
         waiting -= taken;
         __syncwarp();  // before the queue and the records are written again

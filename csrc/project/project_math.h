@@ -28,8 +28,8 @@ struct Projection {
 // Sets the slopes of s.p.
 template <class V, class T>
 V3DG_HD V3DG_INLINE void set_slopes(const SlopeLimits<T>& limits, V inv_z, Projection<V>& s) {
-    s.slope_x = min_of(all_lanes<V>(limits.high_x), max_of(all_lanes<V>(limits.low_x), s.p[0] * inv_z));
-    s.slope_y = min_of(all_lanes<V>(limits.high_y), max_of(all_lanes<V>(limits.low_y), s.p[1] * inv_z));
+    s.slope_x = cut_to(limits.low_x, limits.high_x, s.p[0] * inv_z);
+    s.slope_y = cut_to(limits.low_y, limits.high_y, s.p[1] * inv_z);
 }
 
 // Of a filter that is limited a gaussian gets so many times its own variance at most, the square root of its
@@ -56,9 +56,9 @@ V3DG_HD V3DG_INLINE Ellipse<V> ellipse_of_axes(const Pinhole<T>& cam, T most_fil
     Ellipse<V> e;
     e.u = cam.fx * s.p[0] * inv_z + cam.cx;
     e.v = cam.fy * s.p[1] * inv_z + cam.cy;
-    e.l11 = T(kFalloffScale) * sqrt_of(s.c22 / s.det);
-    e.l12 = -(s.c12 / s.c22) * e.l11;
-    e.l22 = T(kFalloffScale) / sqrt_of(s.c22);
+    e.l11 = T(kFalloffScale) * sqrt_of(quotient_of(s.c22, s.det));
+    e.l12 = -quotient_of(s.c12, s.c22) * e.l11;
+    e.l22 = quotient_of(all_lanes<V>(T(kFalloffScale)), sqrt_of(s.c22));
     e.depth = s.p[2];
     return e;
 }
