@@ -17,10 +17,6 @@ from v3dg.gaussians import Array, Gaussians, empty
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
 _GROUPS_AT_ONCE = 256
 
-# Of the balls of level 1 where the asset is smooth, which is then selected at half the size; those above,
-# which contain them, grow less (docs/levels.md).
-_SMOOTH_GROWTH = 2.0
-
 Show = Callable[[range, int, int, _core.FitProgress], None]
 """Is told now and then of a fit: its levels, groups and gaussians, and how far it has come."""
 
@@ -131,9 +127,7 @@ class LevelBuilder:
         made: list[Level] = []
         ball = below[levels[0] - 1].tables.ball
         for i, number in enumerate(levels):
-            ball = _core.bound_spheres(ball, _children(plan, number - 1, number))
-            if number == 1 and config.smooth == "yes":
-                ball[:, 3] *= _SMOOTH_GROWTH
+            ball = _core.bound_spheres(ball, children(plan, number - 1, number))
             part = gaussians.subset(slice(int(rows[i]), int(rows[i + 1])))
             made.append(_level(part, plans[i], self.codec, ball, balls[i], error[groups[i] : groups[i + 1]]))
         return made
@@ -164,11 +158,11 @@ def _view(
     if source == 0:
         ball = _core.bound_spheres(_spheres(target.gaussians), here.leaf_offset)
         return here.leaf_offset, _device.to_host(ball)
-    children = _children(plan, source, number)
-    return plan.levels[source].group_offset[children], _core.bound_spheres(target.tables.fit_ball, children)
+    under = children(plan, source, number)
+    return plan.levels[source].group_offset[under], _core.bound_spheres(target.tables.fit_ball, under)
 
 
-def _children(plan: Plan, below: int, number: int) -> Offsets:
+def children(plan: Plan, below: int, number: int) -> Offsets:
     """(G + 1,) groups of a level below that are under each of a level."""
     num_groups = plan.levels[number].num_groups
     return np.arange(num_groups + 1, dtype=np.int64) * (plan.levels[below].num_groups // num_groups)

@@ -18,6 +18,7 @@ from v3dg._device import Device
 from v3dg._progress import Progress
 from v3dg.build.assemble import assemble
 from v3dg.build.config import BuildConfig
+from v3dg.build.first_selected import UNMEASURED, grown, measured_growth
 from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.build.plan import Plan
 from v3dg.build.progress import Bar
@@ -82,6 +83,8 @@ def build_into(
             with Bar(plan, done, progress) as bar:
                 build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
                 tables, hashes = build.all_levels(leaves, devices, most_units, executor)
+                if config.smooth == "yes" and len(tables) > 1:
+                    tables = grown(plan, tables, build.growth(tables[1].ball, devices[0]))
             store.finish(*assemble(plan, tables, config), hashes)
         return store.bundle()
 
@@ -136,7 +139,7 @@ class _Build:
         below: dict[int, Level] = {}
         first = self.config.target_of(self.num_low) if runs else self.num_low - 1
         for n in range(first, self.num_low):  # what the levels above begin with
-            level = finished[n].read(pages, self.file.run(*self.plan.first_page[n : n + 2]))
+            level = finished[n].read(pages, self._run(n))
             below[n] = Level(_device.place(level.gaussians, devices[0]), level.tables)
         builder = LevelBuilder(self.plan, self.config, self.seed, self.file.codec)
         above = builder.levels_above(below, saved, self.bar.show_of(top))
@@ -146,6 +149,16 @@ class _Build:
                 self.store.save(top, number, FinishedLevel(level.tables, hashes))
             finished.append(levels[top, number])
         return [level.tables for level in finished], np.concatenate([level.hashes for level in finished])
+
+    def growth(self, ball: npt.NDArray[np.float32], device: Device) -> npt.NDArray[np.float64]:
+        """(G,) times that balls of level 1 are to grow; measured where the asset is one unit."""
+        if len(self.units) > 1:
+            return np.full(len(ball), UNMEASURED)
+        both = [self._joined(n).read(self.store.pages, self._run(n)).gaussians for n in (0, 1)]
+        return measured_growth(self.plan, both, ball, self.config, device)
+
+    def _run(self, number: int) -> PageRun:
+        return self.file.run(*self.plan.first_page[number : number + 2])
 
     def _build_here(self, leaves: Leaves, devices: Sequence[Device], most_units: int | None) -> None:
         workers = [device for _ in range(_UNITS_ON_GPU) for device in devices if device.is_cuda]
