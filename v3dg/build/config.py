@@ -53,9 +53,10 @@ class BuildConfig:
             pixel's, 1/12, if that is more, unless this is 0.
         smooth: Whether the asset's gaussians are about as wide as they are far apart, so that one sample a
             pixel shows it well from near. Its coarser levels have no filter, but the last one a pixel's, and
-            level 1 is selected at half the size. Where levels are fitted, and with a filter, it is measured:
-            some groups of level 1 are fitted with 0.05 px² and without, and an asset that hardly gains by the
-            filter is smooth.
+            a group of level 1 is selected where pictures of the asset tell that it is no worse than its
+            leaves, or at half the size if there are more than a million leaves. Where levels are fitted, and
+            with a filter, it is measured: some groups of level 1 are fitted with 0.05 px² and without, and an
+            asset that hardly gains by the filter is smooth.
         asset_filter_px2: The filter of level 0: what the asset was trained with (0.3 for the original 3DGS)
             at the size of its photographs; without, it is better seen from farther away. Coarser levels are
             fitted to the asset without a filter.

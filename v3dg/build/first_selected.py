@@ -18,9 +18,9 @@ from v3dg.rasterize import rasterize
 
 _Floats: TypeAlias = npt.NDArray[Any]
 
-# By how much the radii of balls of level 1 may grow: a group is then selected at 3 down to 0.19 px² a
-# gaussian at the default tolerance. And by how much they grow where it is not measured.
-_LEAST, _MOST, UNMEASURED = 1.0, 4.0, 2.0
+# By how much the radii of balls of level 1 grow at least and at most: a group is selected at 1.5 to 0.19 px²
+# a gaussian at the default tolerance. And by how much they grow where it is not measured.
+_LEAST, _MOST, UNMEASURED = 1.4, 4.0, 2.0
 # Pictures are taken from so many sides, at so many px² for a gaussian of half of the groups.
 _SIDES, _PX2, _WIDEST_PX, _SAMPLES = 8, (0.2, 0.5, 1.2, 3.0), 2048, 2
 _DISTANCE, _SHARE = 8.0, 0.999  # from the centre, in radii; of the gaussians that the radius holds
