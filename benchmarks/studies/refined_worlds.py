@@ -49,6 +49,7 @@ class Config:
     refined: tuple[float, ...] = (3.0, 4.5, 6.0, 9.4, 13.0, 18.0)
     """Tolerances of cuts of the refined ones."""
     steps: int = 30_000
+    """Of the refinement; with 0 only levels as they are built are drawn."""
     build: v3dg.BuildConfig = field(default_factory=v3dg.BuildConfig)
     """How the levels are built."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -76,14 +77,13 @@ def pictures(config: Config, about: Row) -> Iterator[tuple[Row, Picture, Picture
         with multiprocessing.get_context("spawn").Pool(min(len(world.assets), os.cpu_count() or 1)) as pool:
             assets = dict(zip(world.assets, pool.map(make_asset, world.assets.values(), 1), strict=True))
         built = {key: v3dg.build_bundle(asset, config=config.build, **how) for key, asset in assets.items()}
-        refined = {key: v3dg.refine_bundle(b, steps=config.steps, **how) for key, b in built.items()}
+        scenes = {"built": (worlds.scene_of(world, built), (0.0, *config.built))}
+        if config.steps > 0:
+            refined = {key: v3dg.refine_bundle(b, steps=config.steps, **how) for key, b in built.items()}
+            scenes["refined"] = worlds.scene_of(world, refined), config.refined
         seconds = round(time.perf_counter() - start, 1)
         about[name] = {"assets": len(assets), "instances": world.num_instances, "seconds": seconds}
         about[name]["gaussians"] = world.num_gaussians
-        scenes = {
-            "built": (worlds.scene_of(world, built), (0.0, *config.built)),
-            "refined": (worlds.scene_of(world, refined), config.refined),
-        }
         cameras = list(world.cameras().items())
         for label, camera in (cameras[number] for number in config.cameras):
             truth = draw_truth(scenes["built"][0], camera, config.device)
@@ -131,12 +131,13 @@ def report(rows: Sequence[Row]) -> None:
         cameras = dict.fromkeys(row["camera"] for row in rows if row["world"] == world)
         sets = [(of(world, camera, "built"), of(world, camera, "refined")) for camera in cameras]
         print(world, *cameras)
-        for tolerance in sorted({row["tolerance"] for row in sets[0][0]} - {0.0}):
+        kinds = range(1 + any(cuts[1] for cuts in sets))  # without refined ones there is nothing to share
+        for tolerance in sorted({row["tolerance"] for row in sets[0][0]} - {0.0} if len(kinds) > 1 else ()):
             shares = [share_at(tolerance, *cuts) for cuts in sets]
             known = [share for share in shares if share is not None]
             text = " ".join("  -  " if share is None else f"{share:.3f}" for share in shares)
             print(f"  {tolerance}: {text} mean {statistics.fmean(known):.3f}")
-        for levels in (0, 1):
+        for levels in kinds:
             at_default = [
                 next(row["flip"] for row in found[levels] if row["tolerance"] == v3dg.DEFAULT_TOLERANCE)
                 / next(row["flip"] for row in found[0] if row["tolerance"] == 0)
