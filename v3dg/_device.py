@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -33,8 +33,7 @@ class Device:
             return nullcontext()
         import torch
 
-        context: AbstractContextManager[Any] = torch.cuda.device(self.number)
-        return context
+        return cast(AbstractContextManager[Any], torch.cuda.device(self.number))
 
 
 CPU = Device()
@@ -76,8 +75,9 @@ def missing_for_cuda() -> str | None:
     except ImportError:
         return _extras.missing("torch")
     if not torch.cuda.is_available():
-        found = f"{torch.__version__}; install one with CUDA"
-        return f"expected a torch that can use the CUDA device, got {found}"
+        return (
+            f"expected a torch that can use the CUDA device, got {torch.__version__}; install one with CUDA"
+        )
     return None
 
 
@@ -134,8 +134,7 @@ def library_of(array: Array) -> Any:
 
 def to_host(array: Array) -> npt.NDArray[Any]:
     """The array as one of NumPy's."""
-    host: npt.NDArray[Any] = array if isinstance(array, np.ndarray) else array.cpu().numpy()
-    return host
+    return cast(npt.NDArray[Any], array if isinstance(array, np.ndarray) else array.cpu().numpy())
 
 
 @contextmanager

@@ -51,8 +51,8 @@ def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) 
     """Bring a file that only its owner may read to the disk and to `path`, with what is permitted there."""
     replaced = status_of_replaced(path)
     with naming_errors(path, os.fspath(private)):
-        descriptor = os.open(private, os.O_RDONLY | os.O_CLOEXEC)
-        try:
+        with open(private, "rb") as file:
+            descriptor = file.fileno()
             if replaced is None:
                 status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
                 found = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
@@ -63,8 +63,6 @@ def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) 
                         os.fchown(descriptor, owner, group)
                 os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
             os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
         os.replace(private, os.path.realpath(path))
 
 

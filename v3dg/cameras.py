@@ -92,8 +92,7 @@ class Camera:
         Raises:
             ValueError: The target is at the eye, or ``up`` lies along the view direction.
         """
-        position, goal = vector(eye, "eye"), vector(target, "target")
-        up_vector = vector(up, "up")
+        position, goal, up_vector = vector(eye, "eye"), vector(target, "target"), vector(up, "up")
         with np.errstate(over="ignore"):
             distance = np.linalg.norm(goal - position)
         check("target", distance > 0, f"a point away from the eye, got {_text(goal)} for both")

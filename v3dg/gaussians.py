@@ -88,14 +88,12 @@ class Gaussians:
 
         Tensors on a CUDA device that do not begin where it can be read in words of 16 bytes are copied.
         """
-        arrays = list(vars(self).values())
-        if _is_tensor(self.means):
-            arrays = [tensor.detach() for tensor in arrays]
-            if self.means.is_cuda:
-                arrays = [tensor if tensor.data_ptr() % 16 == 0 else tensor.clone() for tensor in arrays]
-            else:
-                arrays = [tensor.numpy() for tensor in arrays]
-        return _core.Rows(*arrays)
+        if not _is_tensor(self.means):
+            return _core.Rows(*vars(self).values())
+        tensors = [tensor.detach() for tensor in vars(self).values()]
+        if not self.means.is_cuda:
+            return _core.Rows(*(tensor.numpy() for tensor in tensors))
+        return _core.Rows(*(tensor if tensor.data_ptr() % 16 == 0 else tensor.clone() for tensor in tensors))
 
     def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
         """Take the gaussians that a slice, an array of M indices or a mask of N booleans names, in its order.
@@ -218,6 +216,16 @@ def empty(count: int, sh_degree: int) -> Gaussians:
 def gaussian_bytes(sh_degree: int) -> int:
     """Of one gaussian in memory."""
     return 4 * sum(map(math.prod, shapes_of(1, sh_degree)))
+
+
+def put(part: Gaussians, out: Gaussians, at: int) -> None:
+    """Put gaussians on the host into others of the same SH degree or a higher one, from row `at` on."""
+    for name, values in vars(part).items():
+        target = getattr(out, name)[at : at + len(part)]
+        if name == "sh":
+            target[:, values.shape[1] :] = 0
+            target = target[:, : values.shape[1]]
+        target[:] = values
 
 
 def _check_kind(name: str, array: Any, like: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, TypeAlias, get_args, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, cast, get_args, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
@@ -194,10 +194,8 @@ class Renderer:
         """Draw as `v3dg.render` does, of what is resident."""
         shade = shade_of(background, min_transmittance, isinstance(self._subject, Gaussians), depth)
         options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
-        drawn: RenderedImage | tuple[RenderedImage, RenderedImage] = self._frame.draw(
-            self._subject, camera, shade, cut, None, self._steps, **options
-        )
-        return drawn
+        drawn = self._frame.draw(self._subject, camera, shade, cut, None, self._steps, **options)
+        return cast(RenderedImage | tuple[RenderedImage, RenderedImage], drawn)
 
     def settle(
         self,

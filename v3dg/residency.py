@@ -10,7 +10,7 @@ import threading
 import weakref
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -235,8 +235,7 @@ class Residency:
             kept = self._kept.setdefault(owner, {})
             if key not in kept:
                 kept[key] = make()
-            found: _Kept = kept[key]
-            return found
+            return cast(_Kept, kept[key])
 
     def _renew_lock(self) -> None:
         # Another thread of the parent may have held it when the child was made.

@@ -263,10 +263,9 @@ def select_by(
         assert budget is not None
         raise over_budget(budget, cut.num_gaussians)
     seconds = time.perf_counter() - start
-    pairs = cut.instance_ids, cut.cluster_ids
-    scene, revision = Scene.of(subject), resident.revision
+    chosen = cut.instance_ids, cut.cluster_ids, cut.num_gaussians, cut.tolerance_px2
     weights = cut.weights if len(cut.weights) else None
-    return Selection(scene, *pairs, cut.num_gaussians, cut.tolerance_px2, seconds, revision, weights)
+    return Selection(Scene.of(subject), *chosen, seconds, resident.revision, weights)
 
 
 def rule_of(
@@ -286,8 +285,9 @@ def rule_of(
     one_of(footprint, "footprint", get_args(Footprint))
     factor = 1.0 if fade is None else real(fade, "fade", "None or a factor of 1 to 1000", 1, 1000)
     if factor != 1 and footprint == "paper":
-        expected = "None with the paper's footprint, which can decrease towards the root"
-        refuse("fade", f"{expected}, got {factor:g}")
+        refuse(
+            "fade", f"None with the paper's footprint, which can decrease towards the root, got {factor:g}"
+        )
     return _core.Rule(
         tolerance_px2=tolerance if tolerance == np.inf else min(tolerance, MOST_FLOAT),
         budget=budget,

@@ -68,8 +68,7 @@ class MemoryLeaves(Leaves):
                 depth = _core.num_halvings(self.num_gaussians, self._config.cluster_size)
                 order, _ = _core.median_split(means, np.array([0, self.num_gaussians]), depth)
                 kind: Any = np.int32 if self.asset_gaussians < 1 << 31 else np.int64
-                rows: npt.NDArray[np.integer[Any]] = np.flatnonzero(self._drawable).astype(kind)
-                self._order = np.take(rows, _device.to_host(order))
+                self._order = np.take(np.flatnonzero(self._drawable).astype(kind), _device.to_host(order))
         return self._asset.subset(self._order[first:last])
 
 

@@ -31,7 +31,7 @@ from v3dg.build.plan import halved
 from v3dg.build.scratch import RowFile, scratch_folder
 from v3dg.bundle.codec import Codec
 from v3dg.formats._reading import AssetFile
-from v3dg.gaussians import Gaussians, gaussian_bytes
+from v3dg.gaussians import Gaussians, gaussian_bytes, put
 from v3dg.io import open_asset
 
 _MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few are read in vain
@@ -147,8 +147,7 @@ class _Sizes(NamedTuple):
         overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
         largest = max(tiles, key=lambda tile: tile.whole_bytes)
         least = reserved + overhead + largest.whole_bytes + PIECE * gaussian
-        name = os.fspath(largest.path)
-        why = f" for {name}, whose format can only be read whole (or convert it to .ply)"
+        why = f" for {os.fspath(largest.path)}, whose format can only be read whole (or convert it to .ply)"
         expected = f"at least {in_mib(least)}{why if largest.whole_bytes else ''}"
         check("memory", memory >= least, f"{expected}, got {memory / (1 << 20):,.1f} MiB")
         memory -= reserved
@@ -180,7 +179,7 @@ def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Any) -> _Blocks:
         row = 0
         while row < tile.num_gaussians:
             last = min(row + PIECE, tile.num_gaussians, row + len(buffer) - filled)
-            _put(file.read(row, last), buffer, filled)
+            put(file.read(row, last), buffer, filled)
             bar.update(last - row)
             filled += last - row
             row = last
@@ -190,16 +189,6 @@ def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Any) -> _Blocks:
         del file  # what was read whole is gone before the next is opened
     if filled:
         yield first, buffer.subset(slice(0, filled))
-
-
-def _put(part: Gaussians, out: Gaussians, at: int) -> None:
-    """Put gaussians into others of the same SH degree or a higher one."""
-    for name, values in vars(part).items():
-        target = getattr(out, name)[at : at + len(part)]
-        if name == "sh":
-            target[:, values.shape[1] :] = 0
-            target = target[:, : values.shape[1]]
-        target[:] = values
 
 
 def _put_rows(rows: npt.NDArray[np.float32], out: Gaussians, at: int) -> None:
@@ -254,8 +243,7 @@ def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
             for number, piece in enumerate(pieces):
                 end = tally.num_drawable
                 row = np.flatnonzero(tally.add(piece))
-                index = first + number * PIECE + row
-                points.write(end, external_split.points_of(piece.means[row], index))
+                points.write(end, external_split.points_of(piece.means[row], first + number * PIECE + row))
     return digest_of_hashes(hashes)
 
 
@@ -271,8 +259,7 @@ def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], ro
                 for start in range(begin, end, _SENT_AT_ONCE):
                     index = order.read(start, min(start + _SENT_AT_ONCE, end)).astype(np.int64) - first
                     # `take`, other than an index in brackets, lets other threads go on.
-                    columns = [array.take(index, axis=0) for array in arrays]
-                    rows.write(start, np.concatenate(columns, axis=1))
+                    rows.write(start, np.concatenate([array.take(index, axis=0) for array in arrays], axis=1))
 
             deque(pool.map(send, ends[:, number].tolist(), ends[:, number + 1].tolist()), maxlen=0)
     return digest_of_hashes(hashes)

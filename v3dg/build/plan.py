@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from v3dg import _core
 from v3dg.build.config import BuildConfig
+from v3dg.bundle.format import offset_of
 from v3dg.bundle.pages import PageLayout
 
 Offsets = npt.NDArray[np.int64]
@@ -100,7 +101,7 @@ class Plan:
         num_pages = np.array(self._num_pages, np.int64)
         clusters = np.repeat([level.num_clusters for level in self.levels] // num_pages, num_pages)
         gaussians = np.concatenate([np.diff(level.offset) for level in self.levels])
-        return PageLayout(_offset_of(clusters), _offset_of(gaussians))
+        return PageLayout(offset_of(clusters), offset_of(gaussians))
 
 
 def _next_shape(below: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:
@@ -114,7 +115,7 @@ def _next_shape(below: LevelPlan, config: BuildConfig) -> tuple[int, int] | None
 
 def _level_above(below: LevelPlan, num_groups: int, clusters_made: int) -> LevelPlan:
     sizes = (np.diff(below.offset[:: below.num_clusters // num_groups]) + 1) // 2
-    group_offset = _offset_of(sizes)
+    group_offset = offset_of(sizes)
     weight = np.maximum((1 / sizes).astype(np.float32), below.weight.reshape(num_groups, -1).max(axis=1))
     leaf_offset = np.ascontiguousarray(below.leaf_offset[:: below.num_groups // num_groups])
     return LevelPlan(0, halved(sizes, clusters_made.bit_length() - 1), group_offset, leaf_offset, weight)
@@ -124,8 +125,4 @@ def halved(sizes: npt.NDArray[np.int64], depth: int) -> Offsets:
     """Where parts begin when nodes are split in two so many times, as the median split does it; the end."""
     for _ in range(depth):
         sizes = np.stack([(sizes + 1) // 2, sizes // 2], axis=1).ravel()
-    return _offset_of(sizes)
-
-
-def _offset_of(sizes: npt.NDArray[np.int64]) -> Offsets:
-    return np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
+    return offset_of(sizes)

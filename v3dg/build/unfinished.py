@@ -31,7 +31,7 @@ from v3dg.bundle.codec import Codec
 from v3dg.bundle.file import BundlePlan, read_pages, write_pages
 from v3dg.bundle.format import HASH_BYTES, page_hash
 from v3dg.bundle.pages import PageRun
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Gaussians, put
 
 _RECORD = struct.Struct("<II16s")  # in front of a level: its part, its number, the hash of what follows
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"
@@ -156,8 +156,7 @@ class Unfinished:
             if not (part < len(self._parts) and number in self._parts[part]):
                 raise ValueError("a level is damaged")
             plan, run = self._parts[part][number]
-            clusters, groups = plan.num_clusters, plan.num_groups
-            shapes = (clusters, 2, 3), (groups, 4), (groups, 4), (groups, 2)
+            shapes = (plan.num_clusters, 2, 3), *((plan.num_groups, width) for width in (4, 4, 2))
             floats = [np.empty(shape, np.float32) for shape in shapes]
             arrays = [*floats, np.empty((len(run), HASH_BYTES), np.uint8)]
             place = self._end + _RECORD.size
@@ -216,9 +215,7 @@ class MemoryStore:
         self.levels: dict[tuple[int, int], FinishedLevel] = {}
 
     def write(self, run: PageRun, gaussians: Gaussians) -> npt.NDArray[np.uint8]:
-        place = vars(self._gaussians.subset(run.rows)).values()
-        for array, out in zip(vars(gaussians).values(), place, strict=True):
-            out[...] = _device.to_host(array)
+        put(gaussians.numpy(), self._gaussians, run.rows.start)
         return np.empty((0, HASH_BYTES), np.uint8)
 
     def read(self, run: PageRun, hashes: npt.NDArray[np.uint8]) -> Gaussians:

@@ -62,9 +62,8 @@ class Bundle:
             clusters = clusters.around(gaussians)
         layout = PageLayout.of(clusters)
         in_memory = MemoryPages if codec == Codec.name else CodePages.of
-        self._set(
-            clusters, groups, parse_json(config_to_json(config or {})), in_memory(layout, gaussians, kept)
-        )
+        told = parse_json(config_to_json(config or {}))
+        self._set(clusters, groups, told, in_memory(layout, gaussians, kept))
 
     def _set(self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: _Pages) -> None:
         self.config = config
@@ -269,23 +268,6 @@ class Bundle:
 
     def info(self) -> dict[str, Any]:
         """Describe the bundle in JSON values, without reading gaussians; sizes are those of its file."""
-        page_sizes = self._layout.page_bytes(self._codec)
-        page_level = self.clusters.level[self._layout.first_cluster[:-1]]
-        offset = self.clusters.offset
-        levels = []
-        for level in range(self.num_levels):
-            clusters = self.level_range(level)
-            error = self.groups.error[self.groups.level == level]
-            levels.append(
-                {
-                    "level": level,
-                    "clusters": len(clusters),
-                    "gaussians": int(offset[clusters.stop] - offset[clusters.start]),
-                    "error_color": _mean(error[:, 0]) if level else 0.0,
-                    "error_alpha": _mean(error[:, 1]) if level else 0.0,
-                    "bytes": int(page_sizes[page_level == level].sum()),
-                }
-            )
         return {
             "path": self.path,
             "version": self._file.version if self._file else VERSION,
@@ -297,8 +279,21 @@ class Bundle:
             "num_groups": len(self.groups),
             "num_pages": self.num_pages,
             "num_levels": self.num_levels,
-            "levels": levels,
+            "levels": [self._level_info(level) for level in range(self.num_levels)],
             "config": self.config,
+        }
+
+    def _level_info(self, level: int) -> dict[str, Any]:
+        clusters, error = self.level_range(level), self.groups.error[self.groups.level == level]
+        first, last = self.clusters.offset[[clusters.start, clusters.stop]].tolist()
+        page_level = self.clusters.level[self._layout.first_cluster[:-1]]
+        return {
+            "level": level,
+            "clusters": len(clusters),
+            "gaussians": last - first,
+            "error_color": _mean(error[:, 0]) if level else 0.0,
+            "error_alpha": _mean(error[:, 1]) if level else 0.0,
+            "bytes": int(self._layout.page_bytes(self._codec)[page_level == level].sum()),
         }
 
 

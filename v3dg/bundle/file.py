@@ -184,9 +184,8 @@ class BundleFile:
     def _read_tables(self, entries: dict[str, Any], text: bytes, reader: _core.HashedReader) -> None:
         place = self._data_start + self.pages_bytes
         self._fetch(place, self.num_bytes)
-        self._reading = reader.read(
-            self.path, self._fd, text, place, self.num_bytes - place, self.version > 2
-        )
+        num_bytes = self.num_bytes - place
+        self._reading = reader.read(self.path, self._fd, text, place, num_bytes, self.version > 2)
         data = self._reading.wait()  # with the hash at the end
         self.tables: dict[str, NDArray[Any]] = {}
         for name, dtype, _, _ in schema_of(self.codec):

@@ -55,14 +55,18 @@ def schema_of(codec: "Codec") -> list[tuple[str, str, str, tuple[int, ...]]]:
 
 def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[Any]]:
     """The tables of the pages except the hashes; all follow from what is in each page."""
-    ends = np.cumsum(layout.page_bytes(codec))
     tables = {
-        "pages.offset": np.concatenate([np.zeros(1, np.int64), ends])[:-1],
+        "pages.offset": offset_of(layout.page_bytes(codec))[:-1],
         "pages.bytes": np.diff(layout.first_gaussian) * codec.gaussian_bytes,
         "pages.first_cluster": layout.first_cluster[:-1].astype(np.int32),
         "pages.num_clusters": np.diff(layout.first_cluster).astype(np.int32),
     }
     return {name: tables[name] for name, *_ in schema_of(codec) if name in tables}
+
+
+def offset_of(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N + 1,) where each of N parts that lie one after another begins, and the end of the last."""
+    return np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
 
 
 def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:

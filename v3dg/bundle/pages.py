@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from v3dg import _core
 from v3dg._device import CPU
 from v3dg.bundle.codec import Codec
+from v3dg.bundle.format import offset_of
 from v3dg.bundle.tables import Clusters
 from v3dg.gaussians import Gaussians
 
@@ -109,8 +110,7 @@ class CodePages:
     @staticmethod
     def of(layout: PageLayout, gaussians: Gaussians, codec: Codec) -> "CodePages":
         """The pages of gaussians on the host."""
-        ends = np.cumsum(layout.page_bytes(codec) // 4)  # of the words of each page
-        places = np.concatenate([np.zeros(1, np.int64), ends])
+        places = offset_of(layout.page_bytes(codec) // 4)  # of the words of each page
         words = np.empty(int(places[-1]), np.int32)
 
         def encode(page: int) -> None:

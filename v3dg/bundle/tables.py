@@ -85,10 +85,9 @@ def check_index(name: str, index: int, count: int) -> None:
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
     """Check kinds and shapes, and take copies of arrays that could be changed after all checks."""
-    columns = [column for column in SCHEMA if column[0].startswith(prefix)]
-    arrays = [getattr(part, name.removeprefix(prefix)) for name, _, _, _ in columns]
     count = np.size(part.level)
-    for (name, kind, rows, rest), array in zip(columns, arrays, strict=True):
+    for name, kind, rows, rest in [column for column in SCHEMA if column[0].startswith(prefix)]:
+        array = getattr(part, name.removeprefix(prefix))
         check_type(name, array, np.ndarray, "a NumPy array")
         dtype, shape = np.dtype(DTYPES[kind]), (count + (rows == "C+1"), *rest)
         if array.dtype != dtype or array.shape != shape:

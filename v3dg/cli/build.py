@@ -144,8 +144,7 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
     last = ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
     result = {**summary, "seconds": seconds, "assets": results}
     _common.print_result(options.json, result, [*_common.table_lines(columns, shown), "", last])
-    failed = [result for result in results if result["status"] == "failed"]
-    if failed:
+    if failed := [result for result in results if result["status"] == "failed"]:
         others = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
         raise RuntimeError(f"{len(failed)} of {len(results)} assets failed: {failed[0]['error']}{others}")
 
@@ -211,8 +210,8 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
     except OSError as error:  # a full disk, say
         raise OSError(error.errno, f"{error.strerror}{to_resume()}", error.filename) from None
     asset = str(paths[0]) if len(paths) == 1 else [str(path) for path in paths]
-    result: dict[str, Any] = {"asset": asset, "output": str(output)}
-    result |= {"status": "built" if is_built else "kept"}
+    status = "built" if is_built else "kept"
+    result: dict[str, Any] = {"asset": asset, "output": str(output), "status": status}
     result |= {name: bundle.config[name] for name in ("asset_gaussians", "dropped")}
     result |= {"gaussians": bundle.num_gaussians, "clusters": len(bundle.clusters)}
     result |= {"levels": bundle.num_levels, "bytes": output.stat().st_size}

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg._numbers import check, one_of
@@ -58,6 +59,12 @@ def names_of(scene: Scene) -> list[str]:
     return names
 
 
+def rows_by(numbers: NDArray[Any], count: int) -> list[NDArray[np.intp]]:
+    """The rows that have each of the numbers 0 to `count` - 1, in ascending order."""
+    order = np.argsort(numbers, kind="stable")
+    return np.split(order, np.searchsorted(numbers[order], np.arange(count + 1)))[1:-1]
+
+
 def detail_of(bundle: Bundle) -> dict[str, float]:
     """How far levels reach: `reach` times focal length in px over √tolerance is where level 1 is enough.
 
@@ -65,8 +72,7 @@ def detail_of(bundle: Bundle) -> dict[str, float]:
     """
     groups = bundle.groups
     radius = groups.ball[:, 3].astype(np.float64) * np.sqrt(math.pi * groups.weight.astype(np.float64))
-    levels = range(1, bundle.num_levels)
-    reach = [float(np.median(radius[groups.level == level])) for level in levels]
+    reach = [float(np.median(radius[groups.level == level])) for level in range(1, bundle.num_levels)]
     if not reach:
         return {"reach": 0.0, "ratio": math.sqrt(2)}
     ratio = (reach[-1] / reach[0]) ** (1 / max(1, len(reach) - 1))

@@ -90,8 +90,7 @@ def write_streamed_sog(
     """
     found = opened(bundle)
     plan, turn = Plan.of(found, chunk), _common.turn_upright(up or up_of(found)[0])
-    total = found.num_gaussians
-    with _common.replacing_folder(Path(folder)) as place, Bar(total, "export", progress) as bar:
+    with _common.replacing_folder(Path(folder)) as place, Bar(found.num_gaussians, "export", progress) as bar:
         return write_levels(plan, place, turn, bar.update)
 
 
@@ -146,8 +145,7 @@ def _write_folders(
 def _viewer_settings(gaussians: Gaussians) -> dict[str, Any]:
     """What SuperSplat's viewer reads beside an asset: a camera that shows most of it, and no effects."""
     # Viewers have y up and turn an asset, whose y is taken to be down, by half a turn about z.
-    means = gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0)
-    centre, radius = ball_of_most(means)
+    centre, radius = ball_of_most(gaussians.means.astype(np.float64) * (-1.0, -1.0, 1.0))
     distance = 1.2 * radius / math.sin(math.radians(_FOV_DEGREES) / 2)
     position = centre + distance * np.array([0.4, 0.4, 0.8]) / np.linalg.norm([0.4, 0.4, 0.8])
     pose = {"position": position.tolist(), "target": centre.tolist(), "fov": _FOV_DEGREES}
@@ -221,9 +219,8 @@ class Plan:
 
     def by_chunk(self, clusters: NDArray[np.int64]) -> list[NDArray[np.int64]]:
         """Ids of clusters, by the chunk that they are in."""
-        chunks = self.chunk_of_cluster[clusters]
-        ends = np.cumsum(np.bincount(chunks, minlength=self.num_chunks))[:-1]
-        return np.split(clusters[np.argsort(chunks, kind="stable")], ends)
+        chunks = _common.rows_by(self.chunk_of_cluster[clusters], self.num_chunks)
+        return [clusters[rows] for rows in chunks]
 
     def tree(self, leaves: list[dict[str, Any]], turn: Floats) -> dict[str, Any]:
         """The spatial index: the groups above the chunks, with bounds, in boxes that stay along the axes."""
@@ -238,13 +235,15 @@ class Plan:
             children: dict[int, list[dict[str, Any]]] = {}
             for group, node in of_group.items():
                 children.setdefault(int(parent[group]), []).append(node)
-            of_group = {
-                group: nodes[0]
-                if len(nodes) == 1
-                else _node([corner for node in nodes for corner in node["bound"].values()], children=nodes)
-                for group, nodes in children.items()
-            }
+            of_group = {group: _above(below) for group, below in children.items()}
         return of_group[-1]
+
+
+def _above(nodes: list[dict[str, Any]]) -> dict[str, Any]:
+    """One node, or a node that bounds several."""
+    if len(nodes) == 1:
+        return nodes[0]
+    return _node([corner for node in nodes for corner in node["bound"].values()], children=nodes)
 
 
 def _node(points: Any, **content: Any) -> dict[str, Any]:

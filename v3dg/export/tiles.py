@@ -6,11 +6,10 @@ which a renderer's screen-space error of 16 px, the usual limit, is v3dg's toler
 """
 
 import math
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from v3dg.cameras import Axis, Floats
 from v3dg.export import _common
 from v3dg.formats import gltf
 from v3dg.formats._packing import check_writable
+from v3dg.formats._reading import Path as AnyPath
 from v3dg.gaussians import Gaussians
 from v3dg.opening import File, opened
 from v3dg.scene import Scene
@@ -35,6 +35,7 @@ CESIUM = "cesium"
 TILES_NEED = "npm install cesium@1.145.0", f"cp -r node_modules/cesium/Build/Cesium {{}}/{CESIUM}"
 """Commands that bring CesiumJS, in the version that the page is tested with, to a folder."""
 
+_Tile: TypeAlias = dict[str, Any]
 _SCREEN_SPACE_ERROR = 16.0  # px, CesiumJS's limit where none is given
 # The content's y is up, the tiles' z.
 _TO_Y_UP = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
@@ -60,11 +61,7 @@ class Tiles:
 
 
 def write_tiles(
-    subject: Scene | Bundle | File,
-    folder: str | os.PathLike[str],
-    *,
-    up: Axis | None = None,
-    progress: Progress = False,
+    subject: Scene | Bundle | File, folder: AnyPath, *, up: Axis | None = None, progress: Progress = False
 ) -> Tiles:
     """Write a scene or a bundle as 3D Tiles, replacing an earlier export once all is written.
 
@@ -91,8 +88,7 @@ def write_tiles(
         check("bundle", bundle.num_gaussians, "gaussians to export, got none")
     names, trees = _common.names_of(scene), []
     with _common.replacing_folder(Path(folder), keep=CESIUM) as place:
-        total = sum(bundle.num_gaussians for bundle in scene.bundles)
-        with Bar(total, "export", progress) as bar:
+        with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
             for name, bundle in zip(names, scene.bundles, strict=True):
                 (place / name).mkdir()
                 writer = _Writer(bundle, place / name, bar.update)
@@ -124,25 +120,23 @@ class _Writer:
         self._error = limit * ball[:, 3] * np.sqrt(math.pi * weight)
         # Of each group: the groups below, the clusters that it made, and those that it replaces.
         columns = groups.parent, clusters.own_group, clusters.parent_group
-        self._below, self._made, self._replaced = (_rows_by(links, len(groups)) for links in columns)
+        self._below, self._made, self._replaced = (_common.rows_by(links, len(groups)) for links in columns)
         self.tops = np.flatnonzero(groups.parent < 0).tolist() or [-1]
 
-    def tile_of(self, g: int) -> dict[str, Any]:
+    def tile_of(self, g: int) -> _Tile:
         """The tile of a group with all below; of -1, that of a bundle without groups."""
         if g < 0:
-            return self._tile("asset", range(len(self._bundle.clusters)), 0.0, [])
-        below = [self.tile_of(child) for child in self._below(g)]
+            return self._tile("asset", np.arange(len(self._bundle.clusters)), 0.0, [])
+        below = [self.tile_of(child) for child in self._below[g].tolist()]
         if self._bundle.groups.level[g] == 1:
-            below = [self._tile(f"0_{g}", self._replaced(g), 0.0, [])]
-        return self._tile(f"{self._bundle.groups.level[g]}_{g}", self._made(g), float(self._error[g]), below)
+            below = [self._tile(f"0_{g}", self._replaced[g], 0.0, [])]
+        return self._tile(f"{self._bundle.groups.level[g]}_{g}", self._made[g], float(self._error[g]), below)
 
-    def _tile(
-        self, name: str, clusters: Sequence[int], error: float, children: list[dict[str, Any]]
-    ) -> dict[str, Any]:
-        boxes = self._bundle.clusters.box[np.asarray(clusters)].astype(np.float64)
+    def _tile(self, name: str, clusters: NDArray[Any], error: float, children: list[_Tile]) -> _Tile:
+        boxes = self._bundle.clusters.box[clusters].astype(np.float64)
         bounds = [np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])]
         volume = _box(bounds + [_bounds(child) for child in children])
-        tile: dict[str, Any] = {"boundingVolume": volume, "geometricError": error}
+        tile: _Tile = {"boundingVolume": volume, "geometricError": error}
         gaussians = Gaussians.concatenate([self._bundle.cluster_gaussians(int(c)) for c in clusters])
         self._advance(len(gaussians))
         if len(gaussians):
@@ -152,14 +146,7 @@ class _Writer:
         return tile | ({"children": children} if children else {})
 
 
-def _rows_by(links: NDArray[Any], count: int) -> Callable[[int], list[int]]:
-    """What gives the rows that link to one of `count`."""
-    order = np.argsort(links, kind="stable")
-    first = np.searchsorted(links[order], np.arange(count + 1))
-    return lambda to: order[first[to] : first[to + 1]].tolist()
-
-
-def _above(tiles: list[dict[str, Any]]) -> dict[str, Any]:
+def _above(tiles: list[_Tile]) -> _Tile:
     """One tile, or a tile without content that is always refined to all of several."""
     if len(tiles) == 1 and "transform" not in tiles[0]:
         return tiles[0]
@@ -176,7 +163,7 @@ def _box(bounds: list[Floats]) -> dict[str, list[float]]:
     return {"box": [*((low + high) / 2).tolist(), *np.diag(half).ravel().tolist()]}
 
 
-def _bounds(tile: dict[str, Any]) -> Floats:
+def _bounds(tile: _Tile) -> Floats:
     """Lower and upper corner of a tile's box, after its transform."""
     box = np.array(tile["boundingVolume"]["box"])
     matrix = np.reshape(tile.get("transform", np.eye(4).ravel()), (4, 4)).T
@@ -193,7 +180,7 @@ def _transforms(scene: Scene) -> Floats:
     return matrices
 
 
-def _write_tileset(path: Path, root: dict[str, Any]) -> None:
+def _write_tileset(path: Path, root: _Tile) -> None:
     extensions = {"extensionsUsed": _EXTENSIONS, "extensionsRequired": _EXTENSIONS}
     document = {
         "asset": {"version": "1.1", "generator": f"v3dg {__version__}"},

@@ -79,8 +79,7 @@ def _fields_of(path: Path, archive: Archive) -> tuple[dict[str, _Tensor], str]:
     """Where the tensors of the gaussians are, and in which folder of the zip."""
     root = next((name[:-8] for name in archive.names if name.endswith("data.pkl")), "")
     pickle = archive.read(f"{root}data.pkl")
-    size = len(pickle)
-    check(path, size <= _MAX_PICKLE, f"a pickle of at most {_MAX_PICKLE} bytes, got {size}")
+    check(path, len(pickle) <= _MAX_PICKLE, f"a pickle of at most {_MAX_PICKLE} bytes, got {len(pickle)}")
     is_little = f"{root}byteorder" not in archive.names or archive.read(f"{root}byteorder") == b"little"
     check(path, is_little, "little-endian numbers, got a checkpoint of another byte order")
     with telling(path, "a checkpoint of tensors and plain values"):

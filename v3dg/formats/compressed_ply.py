@@ -8,7 +8,7 @@ coefficient, channel by channel, for -4 to 4. See docs/formats.md.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,11 @@ _CHUNK = 256
 _PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _RANGES = {"": "xyz", "scale_": "xyz", "color": "rgb"}
-# Where the fields of a word begin, and the largest value of each.
-_XYZ_SHIFT, _XYZ_MAX = (21, 11, 0), (2047, 1023, 2047)
-_THREE_SHIFT, _THREE_MAX = (20, 10, 0), (1023, 1023, 1023)
-_RGBA_SHIFT, _RGBA_MAX = (24, 16, 8, 0), (255, 255, 255, 255)
+# Where each field of a word begins, and its largest value.
+_Fields: TypeAlias = tuple[tuple[int, int], ...]
+_XYZ: _Fields = ((21, 2047), (11, 1023), (0, 2047))
+_THREE: _Fields = ((20, 1023), (10, 1023), (0, 1023))
+_RGBA: _Fields = ((24, 255), (16, 255), (8, 255), (0, 255))
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,7 @@ def open_file(path: Path) -> AssetFile:
     file = File(path)
     elements = _elements(file)
     for name in ("chunk", "vertex"):
-        is_there = name in elements
-        check(path, is_there, f"the elements chunk and vertex of a compressed .ply, got no {name}")
+        check(path, name in elements, f"the elements chunk and vertex of a compressed .ply, got no {name}")
     chunk, vertex, sh = elements["chunk"], elements["vertex"], elements.get("sh")
     count = vertex.count
     kinds = [kind for kind in _RANGES if kind != "color" or chunk.kinds.keys() & _range_names(kind)]
@@ -66,38 +66,29 @@ def open_file(path: Path) -> AssetFile:
         if sh is not None:
             columns = sh.rows(file, first, last)
             rest = np.stack([columns[f"f_rest_{i}"] for i in range(len(sh.kinds))], axis=1)
+        packed = vertex.rows(file, first, last)
         chunk_from_row = np.arange(first, last) // _CHUNK - first_chunk
-        return _decoded(vertex.rows(file, first, last), rest, degree, ranges, chunk_from_row)
+
+        def decode(rows: slice) -> tuple[Floats, ...]:
+            block, chunks = packed[rows], chunk_from_row[rows]
+
+            def within(kind: str, fractions: Floats) -> Floats:
+                low, high = ranges[kind][0][chunks], ranges[kind][1][chunks]
+                return np.asarray(low * (1.0 - fractions) + high * fractions)
+
+            rotation = block["packed_rotation"]
+            three = (_fractions(rotation, _THREE) - 0.5) * SQRT2
+            rgba = _fractions(block["packed_color"], _RGBA)
+            color = (within("color", rgba[:, :3]) - 0.5) / SH_C0
+            means = within("", _fractions(block["packed_position"], _XYZ))
+            scales = np.exp(within("scale_", _fractions(block["packed_scale"], _XYZ)))
+            quats = _packing.quats_from_three(three, rotation >> 30)
+            higher = _REST_VALUE[rest[rows]].reshape(len(block), 3, -1).transpose(0, 2, 1)
+            return means, quats, scales, rgba[:, 3], np.concatenate([color[:, None], higher], axis=1)
+
+        return assemble(last - first, degree, decode)
 
     return AssetFile(path, count, degree, read_rows)
-
-
-def _decoded(
-    vertex: NDArray[Any],
-    rest: NDArray[np.uint8],
-    degree: int,
-    ranges: dict[str, tuple[Floats, Floats]],
-    chunk_from_row: NDArray[np.int64],
-) -> Gaussians:
-    def decode(rows: slice) -> tuple[Floats, ...]:
-        block = vertex[rows]
-        chunks = chunk_from_row[rows]
-
-        def within(kind: str, fractions: Floats) -> Floats:
-            low, high = ranges[kind][0][chunks], ranges[kind][1][chunks]
-            return np.asarray(low * (1.0 - fractions) + high * fractions)
-
-        rotation = block["packed_rotation"]
-        three = (_fractions(rotation, _THREE_SHIFT, _THREE_MAX) - 0.5) * SQRT2
-        rgba = _fractions(block["packed_color"], _RGBA_SHIFT, _RGBA_MAX)
-        color = (within("color", rgba[:, :3]) - 0.5) / SH_C0
-        means = within("", _fractions(block["packed_position"], _XYZ_SHIFT, _XYZ_MAX))
-        scales = np.exp(within("scale_", _fractions(block["packed_scale"], _XYZ_SHIFT, _XYZ_MAX)))
-        quats = _packing.quats_from_three(three, rotation >> 30)
-        higher = _REST_VALUE[rest[rows]].reshape(len(block), 3, -1).transpose(0, 2, 1)
-        return means, quats, scales, rgba[:, 3], np.concatenate([color[:, None], higher], axis=1)
-
-    return assemble(len(vertex), degree, decode)
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
@@ -133,10 +124,10 @@ def write(path: Path, gaussians: Gaussians) -> None:
             rows = order[block]
             three, largest = _packing.three_of_quats(host.quats[rows])
             words = np.empty((len(rows), 4), "<u4")
-            words[:, 0] = _word(fractions[""][block], _XYZ_SHIFT, _XYZ_MAX)
-            words[:, 1] = _word(three / SQRT2 + 0.5, _THREE_SHIFT, _THREE_MAX) | (largest.astype("u4") << 30)
-            words[:, 2] = _word(fractions["scale_"][block], _XYZ_SHIFT, _XYZ_MAX)
-            rgb = _word(fractions["color"][block], _RGBA_SHIFT[:3], _RGBA_MAX[:3])
+            words[:, 0] = _word(fractions[""][block], _XYZ)
+            words[:, 1] = _word(three / SQRT2 + 0.5, _THREE) | (largest.astype("u4") << 30)
+            words[:, 2] = _word(fractions["scale_"][block], _XYZ)
+            rgb = _word(fractions["color"][block], _RGBA[:3])
             words[:, 3] = rgb | _packing.opacity_bytes(host.opacities[rows])
             file.write(words.tobytes())
         for block in _packing.blocks(count if num_rest else 0):
@@ -149,14 +140,13 @@ _REST_VALUE = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
 _REST_VALUE[[0, 255]] = -4.0, 4.0
 
 
-def _fractions(words: NDArray[Any], shifts: tuple[int, ...], largest: tuple[int, ...]) -> Floats:
-    fields = zip(shifts, largest, strict=True)
+def _fractions(words: NDArray[Any], fields: _Fields) -> Floats:
     return np.stack([((words >> shift) & most) / float(most) for shift, most in fields], axis=1)
 
 
-def _word(fractions: Floats, shifts: tuple[int, ...], largest: tuple[int, ...]) -> NDArray[np.uint32]:
+def _word(fractions: Floats, fields: _Fields) -> NDArray[np.uint32]:
     word = np.zeros(len(fractions), np.uint32)
-    for column, shift, most in zip(fractions.T, shifts, largest, strict=True):
+    for column, (shift, most) in zip(fractions.T, fields, strict=True):
         word |= _packing.to_integers(column * most, most) << np.uint32(shift)
     return word
 
@@ -190,8 +180,7 @@ def _degree(path: Path, sh: _Element | None, count: int) -> int:
 
 def _require(path: Path, shown: str, element: _Element, names: Sequence[str], kind: str) -> None:
     for name in names:
-        is_there = element.kinds.get(name) == kind
-        check(path, is_there, f"'property {kind} {name}' in element {shown}, got none")
+        check(path, element.kinds.get(name) == kind, f"'property {kind} {name}' in element {shown}, got none")
 
 
 def _elements(file: File) -> dict[str, _Element]:

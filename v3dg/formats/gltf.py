@@ -96,14 +96,15 @@ def encode(host: Gaussians, *, compressed: bool = False) -> bytes:
         ],
         "buffers": [{"byteLength": ends[-1]}],
     }
-    chunks = b"".join(
-        struct.pack("<II", len(content) + -len(content) % 4, kind) + content + padding * (-len(content) % 4)
-        for kind, content, padding in (
-            (_JSON, json.dumps(document, separators=(",", ":")).encode(), b" "),
-            (_BINARY, b"".join(packed), b"\0"),
-        )
-    )
+    text = json.dumps(document, separators=(",", ":")).encode()
+    chunks = _chunk(_JSON, text, b" ") + _chunk(_BINARY, b"".join(packed), b"\0")
     return struct.pack("<III", _MAGIC, 2, 12 + len(chunks)) + chunks
+
+
+def _chunk(kind: int, content: bytes, padding: bytes) -> bytes:
+    """A chunk of the file, filled up to a multiple of four bytes."""
+    content += padding * (-len(content) % 4)
+    return struct.pack("<II", len(content), kind) + content
 
 
 def _coefficients(degree: int) -> list[str]:

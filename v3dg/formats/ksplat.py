@@ -119,12 +119,10 @@ def _decoded(
             higher = sh_range[0] + higher / 255.0 * (sh_range[1] - sh_range[0])
         sh = np.zeros((len(rows), (degree + 1) ** 2, 3))
         sh[:, 0] = (rgba[:, :3] - 0.5) / SH_C0
-        first, last = 1, 1 + higher.shape[1] // 3
-        while first < last:  # band by band, and there channel by channel
-            size = 2 * math.isqrt(first) + 1
-            of_band = higher[:, 3 * (first - 1) : 3 * (first - 1 + size)]
-            sh[:, first : first + size] = of_band.reshape(-1, 3, size).transpose(0, 2, 1)
-            first += size
+        for band in range(1, math.isqrt(1 + higher.shape[1] // 3)):
+            first, last = band**2, (band + 1) ** 2
+            of_band = higher[:, 3 * (first - 1) : 3 * (last - 1)]  # channel by channel
+            sh[:, first:last] = of_band.reshape(-1, 3, last - first).transpose(0, 2, 1)
         return means, normalised(rows["quat"]), rows["scale"], rgba[:, 3], sh
 
     return assemble(len(records), degree, decode)

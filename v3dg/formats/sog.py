@@ -12,7 +12,7 @@ import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,10 @@ from v3dg.formats._packing import SQRT2, Floats, assemble, opacity_bytes
 from v3dg.formats._reading import Archive, AssetFile, Claims, check, least_bytes, telling, whole, whole_file
 from v3dg.gaussians import Gaussians
 
+_Pixels: TypeAlias = NDArray[np.uint8]
 _MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
 # A picture may have this many times the pixels that are needed, and some: writers round up differently.
 _SPARE, _FREE_PIXELS = 4, 1 << 16
-_COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 _PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
 _MAX_LOG = 88.0  # of a float32
 
@@ -70,12 +70,11 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     pictures = {name: load(name) for part in names.values() for name in part}
     claims.add(path, count)  # all that it has on disk is known now
 
-    def pixels(name: str) -> NDArray[np.uint8]:
+    def pixels(name: str) -> _Pixels:
         """(N, 4) red, green, blue and alpha of the gaussians."""
         return _decoded(path, name, pictures[name], count).reshape(-1, 4)[:count]
 
-    limits = meta["means"].some_fields(("mins", "maxs"))
-    low, high = (np.array(limits[name].vector(3)) for name in ("mins", "maxs"))
+    low, high = (np.array(meta["means"].field(name).vector(3)) for name in ("mins", "maxs"))
     lower, upper = map(pixels, names["means"])
     scales, quats, color = (pixels(names[part][0]) for part in ("scales", "quats", "sh0"))
     scale_table, color_table = _codebook(meta["scales"]), _codebook(meta["sh0"])
@@ -86,12 +85,11 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     palette: NDArray[Any] = np.zeros((1, 0, 3), np.uint8)
     labels: NDArray[Any] = np.zeros(count, np.uint8)
     if "shN" in meta:
-        entries = meta["shN"].some_fields(("count",))["count"]
-        num_entries = whole(entries, "1 to 65536 entries", 1, 65536)
+        num_entries = whole(meta["shN"].field("count"), "1 to 65536 entries", 1, 65536)
         table = _codebook(meta["shN"])
-        num_rows, width = -(-num_entries // _PALETTE_COLUMNS), _PALETTE_COLUMNS * _COEFFICIENTS[degree]
+        num_rows, width = -(-num_entries // _PALETTE_COLUMNS), _PALETTE_COLUMNS * ((degree + 1) ** 2 - 1)
         centroids = _decoded(path, names["shN"][0], pictures[names["shN"][0]], num_rows * width, width)
-        palette = centroids[:num_rows, :, :3].reshape(-1, _COEFFICIENTS[degree], 3)
+        palette = centroids[:num_rows, :, :3].reshape(num_rows * _PALETTE_COLUMNS, -1, 3)
         places = pixels(names["shN"][1])
         labels = places[:, 0] | (places[:, 1].astype(np.uint16) << 8)
         largest = labels.max(initial=0)
@@ -125,7 +123,7 @@ def _size(meta: dict[str, Node]) -> tuple[int, int]:
     count = whole(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
     if "shN" not in meta:
         return count, 0
-    return count, whole(meta["shN"].some_fields(("bands",))["bands"], "1 to 3", 1, 3)
+    return count, whole(meta["shN"].field("bands"), "1 to 3", 1, 3)
 
 
 def _names(meta: dict[str, Node]) -> dict[str, list[str]]:
@@ -156,9 +154,7 @@ def _codebook(part: Node) -> Floats:
     return np.pad(values, (0, 256 - len(values)))
 
 
-def _decoded(
-    path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None
-) -> NDArray[np.uint8]:
+def _decoded(path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None) -> _Pixels:
     """(H, W, 4) of a picture that has the pixels that are needed, and not many more."""
     from PIL.WebPImagePlugin import WebPImageFile  # Image.open would ask what other format it is
 
@@ -209,9 +205,7 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
     height = 4 * max(1, math.ceil(count / width / 4))
 
     def picture(*columns: NDArray[Any]) -> bytes:
-        pixels = np.full((width * height, 4), 255, np.uint8)
-        pixels[:count, : len(columns)] = np.stack(columns, axis=1)
-        return _webp(pixels.reshape(height, width, 4))
+        return _webp(np.stack(columns, axis=1), width, height)
 
     means = gaussians.means.astype(np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
@@ -237,16 +231,15 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
     }
     if gaussians.sh_degree:
-        coefficients = _COEFFICIENTS[gaussians.sh_degree]
+        coefficients = (gaussians.sh_degree + 1) ** 2 - 1
         # A quarter of the gaussians, but enough for a small asset to keep all its coefficients, and 16 bits.
         size = min(max(1024, count // 4), 65536)
         vectors = np.ascontiguousarray(gaussians.sh[:, 1:]).reshape(count, 3 * coefficients)
         palette, labels = _core.palette_of(vectors, size)
         table = _table_of(palette)
         rows = -(-len(palette) // _PALETTE_COLUMNS)
-        pixels = np.full((rows * _PALETTE_COLUMNS, coefficients, 4), 255, np.uint8)
-        pixels[: len(palette), :, :3] = _nearest(table, palette).reshape(-1, coefficients, 3)
-        contents["shN_centroids.webp"] = _webp(pixels.reshape(rows, _PALETTE_COLUMNS * coefficients, 4))
+        colors = _nearest(table, palette).reshape(-1, 3)
+        contents["shN_centroids.webp"] = _webp(colors, _PALETTE_COLUMNS * coefficients, rows)
         contents["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
         meta["shN"] = {
             "count": len(palette),
@@ -267,9 +260,12 @@ def _nearest(table: Floats, values: Floats) -> NDArray[np.uint8]:
     return np.searchsorted((table[1:] + table[:-1]) / 2, values).astype(np.uint8)
 
 
-def _webp(pixels: NDArray[np.uint8]) -> bytes:
+def _webp(values: NDArray[Any], width: int, height: int) -> bytes:
+    """A picture that begins with pixels of these values (N, C), and is 255 elsewhere."""
     from PIL import Image
 
+    pixels = np.full((height, width, 4), 255, np.uint8)
+    pixels.reshape(-1, 4)[: len(values), : values.shape[1]] = values
     stream = io.BytesIO()
     # exact: without it, colours of pixels whose alpha is 0 are lost.
     Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True, quality=50, method=4)

@@ -128,10 +128,8 @@ def _rotation_words(quats: Floats) -> bytes:
     # Components are numbered x y z w here.
     three, largest = _packing.three_of_quats(np.roll(quats, -1, axis=1))
     magnitude = _packing.to_integers(np.abs(three) * SQRT2 * 511.0, 511)
-    words = largest.astype("<u4")
-    for column in range(3):
-        field = magnitude[:, column] | ((three[:, column] < 0).astype(np.uint32) << 9)
-        words = (words << 10) | field
+    fields = magnitude | ((three < 0).astype(np.uint32) << 9)
+    words = (largest << 30) | (fields[:, 0] << 20) | (fields[:, 1] << 10) | fields[:, 2]
     return words.astype("<u4").tobytes()
 
 
@@ -163,8 +161,7 @@ def _quats(rotations: NDArray[Any]) -> Floats:
     """w x y z of the words of version 3 and later, or of x y z as bytes."""
     if rotations.shape[1] == 3:
         xyz = rotations / 127.5 - 1.0
-        w = np.sqrt(np.maximum(0.0, 1.0 - np.square(xyz).sum(axis=1, keepdims=True)))
-        return _packing.normalised(np.concatenate([w, xyz], axis=1))
+        return _packing.normalised(_packing.quats_from_three(xyz, np.zeros(len(xyz), np.intp)))
     words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
     three = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511.0 * SQRT2)
@@ -214,8 +211,7 @@ def _sections_of_zstd(path: Path, content: bytes, claims: Claims) -> tuple[int, 
     wanted = sizes if degree else sizes[:-1]
     first = table + num_streams * _STREAM_SIZES.size
     is_there = num_streams == len(wanted) and table >= _ZSTD_HEADER_BYTES and first <= given
-    found = f"{num_streams} at {table}"
-    check(path, is_there, f"a table of {len(wanted)} streams after the header, got {found}")
+    check(path, is_there, f"a table of {len(wanted)} streams after the header, got {num_streams} at {table}")
     sections = []
     for i, size in enumerate(wanted):
         packed, expanded = _STREAM_SIZES.unpack_from(content, table + i * _STREAM_SIZES.size)

@@ -233,8 +233,7 @@ def _read_blender_cameras(nodes: Iterable[Node], keys: tuple[str, ...]) -> dict[
         name, width, height, fov_x, fov_y = (fields[key] for key in keys)
         names.append(name.text())
         matrix, angle = fields["transform_matrix"].matrix(4, 4), fov_x.field_of_view()
-        size = width.size(), height.size()
-        make = partial(Camera.from_blender, matrix, angle, *size, fov_y.field_of_view())
+        make = partial(Camera.from_blender, matrix, angle, width.size(), height.size(), fov_y.field_of_view())
         cameras.append(node.attempt(make))
     if len(set(names)) < len(names):
         names = [f"{i:03}_{name}" for i, name in enumerate(names)]

@@ -16,10 +16,8 @@ from v3dg.gaussians import Gaussians
 from v3dg.rotations import rotation_from_quaternion
 
 # Held by whoever changes a scene, and by fork(), so that a child finds it free.
-_changing = threading.RLock()
-os.register_at_fork(
-    before=_changing.acquire, after_in_parent=_changing.release, after_in_child=_changing.release
-)
+_lock = threading.RLock()
+os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
 class _State(NamedTuple):
@@ -116,14 +114,11 @@ class Scene:
         count = shape[0]
         fits = len(given) == count or given is not bundle
         check("bundle", fits, f"one for all or {count}, got {len(given)}")
-        columns = {
-            "positions": positions,
-            "quaternions": (1.0, 0.0, 0.0, 0.0) if quaternions is None else quaternions,
-            "scales": 1.0 if scales is None else scales,
-            "importance": importance,
-        }
-        new = {name: _rows(values, name, count) for name, values in columns.items()}
-        with _changing:
+        quaternions = (1.0, 0.0, 0.0, 0.0) if quaternions is None else quaternions
+        scales = 1.0 if scales is None else scales
+        values = positions, quaternions, scales, importance
+        new = {name: _rows(of, name, count) for name, of in zip(_ROW, values, strict=True)}
+        with _lock:
             place = {known: b for b, known in enumerate(dict.fromkeys((*self.bundles, *given)))}
             new["bundle"] = np.broadcast_to(np.array([place[one] for one in given], np.int32), count)
             first = len(self)
@@ -133,7 +128,7 @@ class Scene:
 
     def remove(self, ids: Any) -> None:
         """Take instances away; those that follow move down, as `numpy.delete` does it."""
-        with _changing:
+        with _lock:
             keep = np.ones(len(self), bool)
             keep[self._ids(ids)] = False
             columns = {name: getattr(self._state, name) for name in ("bundle", *_ROW)}
@@ -156,7 +151,7 @@ class Scene:
             ValueError: A shape or a value is not as in `add`.
         """
         given = {"positions": positions, "quaternions": quaternions, "scales": scales}
-        with _changing:
+        with _lock:
             rows = self._ids(ids)
             moved = {name: _rows(of, name, len(rows)) for name, of in given.items() if of is not None}
             if ids is not None:
@@ -165,7 +160,7 @@ class Scene:
 
     def set_importance(self, importance: npt.ArrayLike, ids: Any = None) -> None:
         """Give instances another importance, as in `add`; all of them if ``ids`` is None."""
-        with _changing:
+        with _lock:
             rows = self._ids(ids)
             new = _rows(importance, "importance", len(rows))
             self._publish(importance=_replaced(self.importance, rows, new), changes=1)
