@@ -18,9 +18,8 @@ import scenes
 import v3dg
 from benchmarks.worlds.procedural import make_asset
 from reference import project as reference_project
-from v3dg import BuildConfig, Camera, Gaussians, build_bundle, metrics, rasterize, render, select
-from v3dg._device import CPU, resolve
-from v3dg.build.first_selected import measured_growth
+from v3dg import BuildConfig, Camera, Gaussians, _core, build_bundle, metrics, rasterize, render, select
+from v3dg._device import CPU, place, resolve
 from v3dg.build.leaves import MemoryLeaves
 from v3dg.build.plan import Plan
 from v3dg.build.simplify import Level, LevelTables
@@ -231,16 +230,19 @@ def growth_of_level_1(smooth, plain):
 
 
 def test_level_1_is_selected_later_where_it_is_worse_than_its_leaves(device):
-    config = replace(SMOOTH, smooth="yes", filter_px2=0.0)
-    bundle, plan = build(shell(1.1, 1.1), config, device=device), Plan.of(1500, config)
+    config = replace(SMOOTH, smooth="no", filter_px2=0.0)
+    bundle, here = build(shell(1.1, 1.1), config, device=device), Plan.of(1500, config).levels[1]
     leaves, ball = bundle.level_gaussians(0), bundle.groups.ball[bundle.groups.level == 1]
-    offset = plan.levels[1].leaf_offset
-    is_worse = np.add.reduceat(leaves.means[:, 2], offset[:-1]) > 0
-    shift = np.where(np.repeat(is_worse, np.diff(offset)), 0.5, 0)[:, None, None]
-    level = replace(leaves, sh=leaves.sh + shift.astype(np.float32))
-    growth = measured_growth(plan, (leaves, level), ball, config, resolve(device))
-    assert np.median(growth[is_worse]) > 1.5 * np.median(growth[~is_worse])
-    np.testing.assert_allclose(measured_growth(plan, (leaves, leaves), ball, config, CPU), 1.4)
+
+    def growth(level):
+        rows = [place(gaussians, resolve(device)).rows for gaussians in (leaves, level)]
+        return _core.first_selected(*rows, here.leaf_offset, here.leaf_offset, ball, 0.0, False, 0.0)
+
+    is_worse = np.add.reduceat(leaves.means[:, 2], here.leaf_offset[:-1]) > 0
+    shift = np.where(np.repeat(is_worse, np.diff(here.leaf_offset)), 0.05, 0)[:, None, None]
+    found = growth(replace(leaves, sh=leaves.sh + shift.astype(np.float32)))
+    assert np.median(found[is_worse]) > 1.5 * np.median(found[~is_worse])
+    np.testing.assert_allclose(growth(leaves), 1.4, rtol=1e-6)
 
 
 def test_level_1_of_what_is_built_in_parts_is_selected_at_half_the_size(device, monkeypatch):

@@ -272,6 +272,19 @@ def rasterize_backward(
     with_sizes: bool = ...,
 ) -> tuple[Array, Array, Array, Array, Array, Array, Array | None, Array | None]: ...
 
+# How many times larger balls of level 1 are to be, (G, 4); and balls of each level after they have grown.
+def first_selected(
+    leaves: Rows,
+    level: Rows,
+    leaf_offset: Int64,
+    group_offset: Int64,
+    ball: Float32,
+    leaf_filter_px2: float,
+    leaf_antialiased: bool,
+    level_filter_px2: float,
+) -> Float32: ...
+def grown_balls(balls: list[Float32], growth: Float32) -> list[Float32]: ...
+
 # Centres, depths, conics, opacities and radii; zeros for gaussians that are not in sight.
 def ellipses(
     gaussians: Rows,

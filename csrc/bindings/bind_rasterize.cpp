@@ -2,6 +2,7 @@
 
 #include "bindings/operations.h"
 #include "bindings/picture.h"
+#include "bindings/tape.h"
 #include "pipeline/model.h"
 #include "pipeline/render.h"
 #include "project/ellipses.h"
@@ -13,26 +14,6 @@
 namespace v3dg {
 
 namespace {
-
-// What one picture is drawn with, beside gaussians and camera.
-struct Look {
-    double filter_px2;
-    bool antialiased;
-    std::array<double, 3> background;
-    bool plain_colors;  // the coefficients, of degree 0, are colours as they are
-
-    template <class T>
-    GaussianRows<const T> read(const Rows& gaussians) const {
-        GaussianRows<const T> rows = gaussians.read<T>();
-        if (plain_colors) rows.sh_degree = kPlainColor;
-        return rows;
-    }
-};
-
-// What is wanted of the gradients by the gaussians' centres on the image.
-struct Centers {
-    bool sum, size;
-};
 
 // It, or nothing where it is not wanted.
 template <class T>
@@ -52,15 +33,6 @@ struct NewCenters {
         if (device.is_host()) std::fill(array.span.begin(), array.span.end(), T(0));
         return array.span.data;
     }
-};
-
-// What rasterize leaves for rasterize_backward.
-class Tape {
-  public:
-    virtual ~Tape() = default;
-    // Gradients of means, quats, scales, opacities, sh and background; sum and size of those by the centres.
-    virtual py::tuple backward(const py::object& d_color, const py::object& d_alpha,
-                               const py::object& d_depth, Centers wanted) = 0;
 };
 
 // The gradient of a plane of the picture; where none is given, zeros.
@@ -229,21 +201,6 @@ py::tuple rasterize_on_device(const Rows& gaussians, const BoundCamera& camera, 
 
 #endif
 
-py::tuple rasterize(const Rows& gaussians, const BoundCamera& camera, double filter_px2, bool antialiased,
-                    const std::array<double, 3>& background, bool with_depth, bool keep_tape,
-                    bool plain_colors) {
-    if (plain_colors && gaussians.sh_degree() != 0)
-        throw py::value_error("sh: expected shape (N, 1, 3) for plain colours, got degree " +
-                              std::to_string(gaussians.sh_degree()));
-    const Look look{filter_px2, antialiased, background, plain_colors};
-#if V3DG_WITH_CUDA
-    if (!gaussians.device().is_host())
-        return rasterize_on_device(gaussians, camera, look, with_depth, keep_tape);
-#endif
-    return gaussians.is_double() ? rasterize_on_host<double>(gaussians, camera, look, with_depth, keep_tape)
-                                 : rasterize_on_host<float>(gaussians, camera, look, with_depth, keep_tape);
-}
-
 template <class T>
 py::tuple ellipses_of(const Rows& gaussians, const Camera& camera, double filter_px2, bool antialiased,
                       double far_depth, double min_radius_px) {
@@ -277,13 +234,33 @@ py::tuple ellipses(const Rows& gaussians, const BoundCamera& camera, double filt
 
 }  // namespace
 
+py::tuple rasterize(const Rows& gaussians, const BoundCamera& camera, const Look& look, bool with_depth,
+                    bool keep_tape) {
+    if (look.plain_colors && gaussians.sh_degree() != 0)
+        throw py::value_error("sh: expected shape (N, 1, 3) for plain colours, got degree " +
+                              std::to_string(gaussians.sh_degree()));
+#if V3DG_WITH_CUDA
+    if (!gaussians.device().is_host())
+        return rasterize_on_device(gaussians, camera, look, with_depth, keep_tape);
+#endif
+    return gaussians.is_double() ? rasterize_on_host<double>(gaussians, camera, look, with_depth, keep_tape)
+                                 : rasterize_on_host<float>(gaussians, camera, look, with_depth, keep_tape);
+}
+
 void bind_rasterize(py::module_& m) {
     py::class_<Tape>(m, "Tape", "What rasterize leaves for rasterize_backward; it keeps the gaussians.");
-    m.def("rasterize", &rasterize, "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a, "antialiased"_a,
-          "background"_a, "with_depth"_a, "keep_tape"_a, "plain_colors"_a = false,
-          "Draws gaussians where they are and in the precision that they have: (color, alpha, depth or None, "
-          "on "
-          "the host counts and times, the tape or None).");
+    m.def(
+        "rasterize",
+        [](const Rows& gaussians, const BoundCamera& camera, double filter_px2, bool antialiased,
+           const std::array<double, 3>& background, bool with_depth, bool keep_tape, bool plain_colors) {
+            const Look look{filter_px2, antialiased, background, plain_colors};
+            return rasterize(gaussians, camera, look, with_depth, keep_tape);
+        },
+        "gaussians"_a, "camera"_a, py::kw_only(), "filter_px2"_a, "antialiased"_a, "background"_a,
+        "with_depth"_a, "keep_tape"_a, "plain_colors"_a = false,
+        "Draws gaussians where they are and in the precision that they have: (color, alpha, depth or None, "
+        "on "
+        "the host counts and times, the tape or None).");
     m.def(
         "rasterize_backward",
         [](Tape& tape, const py::object& d_color, const py::object& d_alpha, const py::object& d_depth,

@@ -58,4 +58,5 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_pool(m);
     v3dg::bind_frame(m);
     v3dg::bind_fit_level(m);
+    v3dg::bind_first_selected(m);
 }

@@ -19,5 +19,6 @@ void bind_scene(pybind11::module_& m);
 void bind_pool(pybind11::module_& m);
 void bind_frame(pybind11::module_& m);
 void bind_fit_level(pybind11::module_& m);
+void bind_first_selected(pybind11::module_& m);
 
 }  // namespace v3dg

@@ -23,32 +23,6 @@ constexpr int kMostTries = 16;        // to find a gaussian that a picture shows
 constexpr double kMostOfAsset = 0.7;  // of its gaussians, in a cut
 constexpr double kShare = 0.99;       // of the gaussians that the radius holds; the rest may float far away
 
-double median(std::vector<double> values) {
-    const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
-    std::nth_element(values.begin(), middle, values.end());
-    if (values.size() % 2 > 0) return *middle;
-    return (*std::max_element(values.begin(), middle) + *middle) / 2;
-}
-
-// The ball that is looked at.
-void find_ball(CutPictures& pictures) {
-    const Span<const float>& means = pictures.means;
-    std::vector<double> values(means.size / 3);
-    for (size_t k = 0; k < 3; ++k) {
-        for (size_t i = 0; i < values.size(); ++i) values[i] = static_cast<double>(means[3 * i + k]);
-        pictures.center[k] = median(values);
-    }
-    for (size_t i = 0; i < values.size(); ++i) {
-        double d[3];
-        for (size_t k = 0; k < 3; ++k) d[k] = static_cast<double>(means[3 * i + k]) - pictures.center[k];
-        values[i] = std::sqrt(dot3(d, d));
-    }
-    const auto farthest = static_cast<std::ptrdiff_t>(kShare * static_cast<double>(values.size() - 1));
-    std::nth_element(values.begin(), values.begin() + farthest, values.end());
-    pictures.radius = values[static_cast<size_t>(farthest)];
-    if (!(pictures.radius > 0)) pictures.radius = 1;
-}
-
 // Numbers of one view.
 class Random {
   public:
@@ -82,14 +56,14 @@ Camera camera_around(const CutPictures& pictures, Random& random) {
         camera.rotation[k] = right[k];
         camera.rotation[3 + k] = down[k];
         camera.rotation[6 + k] = -outwards[k];
-        camera.eye[k] = pictures.center[k] + kDistance * pictures.radius * outwards[k];
+        camera.eye[k] = pictures.ball.center[k] + kDistance * pictures.ball.radius * outwards[k];
     }
     for (int row = 0; row < 3; ++row) camera.translation[row] = -dot3(camera.rotation + 3 * row, camera.eye);
     // The ball fills the picture.
     camera.fx = camera.fy = std::sqrt(kDistance * kDistance - 1) / 2;
     camera.cx = camera.cy = 0.5;
     camera.width = camera.height = 1;
-    camera.near = kNear * pictures.radius;
+    camera.near = kNear * pictures.ball.radius;
     return camera;
 }
 
@@ -172,14 +146,40 @@ Comparison comparison_of(double size, double longer_px) {
 
 }  // namespace
 
+double median(std::vector<double> values) {
+    const auto middle = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+    std::nth_element(values.begin(), middle, values.end());
+    if (values.size() % 2 > 0) return *middle;
+    return (*std::max_element(values.begin(), middle) + *middle) / 2;
+}
+
+Surroundings surroundings_of(Span<const float> means, double share) {
+    Surroundings found{};
+    std::vector<double> values(means.size / 3);
+    for (size_t k = 0; k < 3; ++k) {
+        for (size_t i = 0; i < values.size(); ++i) values[i] = static_cast<double>(means[3 * i + k]);
+        found.center[k] = median(values);
+    }
+    for (size_t i = 0; i < values.size(); ++i) {
+        double d[3];
+        for (size_t k = 0; k < 3; ++k) d[k] = static_cast<double>(means[3 * i + k]) - found.center[k];
+        values[i] = std::sqrt(dot3(d, d));
+    }
+    const auto farthest = static_cast<std::ptrdiff_t>(share * static_cast<double>(values.size() - 1));
+    std::nth_element(values.begin(), values.begin() + farthest, values.end());
+    found.radius = values[static_cast<size_t>(farthest)];
+    if (!(found.radius > 0)) found.radius = 1;
+    return found;
+}
+
 CutPictures pictures_of_cuts(const ClusterTable& table, const GaussianRows<const float>& asset,
                              Span<const Camera> cameras, uint64_t seed) {
-    CutPictures pictures{table, {asset.means, 3 * asset.size}, cameras, seed, 0, 0, {}, {}, 0};
+    const Span<const float> means{asset.means, 3 * asset.size};
+    CutPictures pictures{table, means, cameras, seed, 0, 0, {}, surroundings_of(means, kShare)};
     for (const int32_t c : table.top_cluster)
         pictures.least += static_cast<double>(table.num_gaussians(static_cast<size_t>(c)));
     pictures.least = std::max(pictures.least, 1.0);
     pictures.most = std::max(kMostOfAsset * static_cast<double>(asset.size), pictures.least);
-    find_ball(pictures);
     // What is twice as large is looked at twice as often.
     double sum = 0;
     for (size_t i = 0; i < asset.size; ++i) {

@@ -9,6 +9,14 @@
 
 namespace v3dg {
 
+double median(std::vector<double> values);
+
+// The ball around the median of means that holds this share of them; the rest may float far away.
+struct Surroundings {
+    double center[3], radius;
+};
+Surroundings surroundings_of(Span<const float> means, double share);
+
 // A window of a picture of a cut, and the clusters that it shows. The asset is drawn `samples` times as
 // large.
 struct CutView {
@@ -26,7 +34,7 @@ struct CutPictures {
     uint64_t seed;
     double most, least;          // gaussians of a cut
     std::vector<double> weight;  // [N] how often each of the asset is looked at, as the sum up to it
-    double center[3], radius;    // that is looked at
+    Surroundings ball;           // that is looked at
 };
 
 // Those of a bundle and its asset, which has gaussians: of cuts of 0.7 of these down to the coarsest one.

@@ -12,7 +12,7 @@ from v3dg.build.config import BuildConfig
 from v3dg.build.fit import fit_config, run_fit
 from v3dg.build.plan import LevelPlan, Offsets, Plan
 from v3dg.bundle.codec import Codec
-from v3dg.gaussians import Array, Gaussians, empty
+from v3dg.gaussians import Array, Gaussians, empty, put
 
 # Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
 _GROUPS_AT_ONCE = 256
@@ -65,11 +65,9 @@ class LevelBuilder:
         leaves = self.codec.rounded(leaves, here.offset)
         ball = _device.to_host(_core.bound_spheres(_spheres(leaves), here.leaf_offset))
         box = _device.to_host(_core.bound_by_boxes(leaves.rows, here.offset))
-        level = Level(leaves, LevelTables(box, ball, ball, np.zeros((here.num_groups, 2), np.float32)))
+        below = {0: Level(leaves, LevelTables(box, ball, ball, np.zeros((here.num_groups, 2), np.float32)))}
         del leaves
-        yield level
-        below = {0: level}
-        del level
+        yield below[0]
         yield from self.levels_above(below, finished, show)
 
     def levels_above(self, below: dict[int, Level], finished: Iterable[Level], show: Show) -> Iterator[Level]:
@@ -127,7 +125,7 @@ class LevelBuilder:
         made: list[Level] = []
         ball = below[levels[0] - 1].tables.ball
         for i, number in enumerate(levels):
-            ball = _core.bound_spheres(ball, children(plan, number - 1, number))
+            ball = _core.bound_spheres(ball, _children(plan, number - 1, number))
             part = gaussians.subset(slice(int(rows[i]), int(rows[i + 1])))
             made.append(_level(part, plans[i], self.codec, ball, balls[i], error[groups[i] : groups[i + 1]]))
         return made
@@ -142,8 +140,7 @@ def _level(gaussians: Gaussians, plan: LevelPlan, codec: Codec, *tables: npt.NDA
     """A level of fitted groups, each split into its clusters."""
     clusters_made = plan.num_clusters // plan.num_groups
     if clusters_made > 1:
-        depth = clusters_made.bit_length() - 1
-        order, _ = _core.median_split(gaussians.means, plan.group_offset, depth)
+        order, _ = _core.median_split(gaussians.means, plan.group_offset, clusters_made.bit_length() - 1)
         gaussians = gaussians.subset(order)
     gaussians = codec.rounded(gaussians, plan.offset)
     box = _device.to_host(_core.bound_by_boxes(gaussians.rows, plan.offset))
@@ -158,11 +155,11 @@ def _view(
     if source == 0:
         ball = _core.bound_spheres(_spheres(target.gaussians), here.leaf_offset)
         return here.leaf_offset, _device.to_host(ball)
-    under = children(plan, source, number)
+    under = _children(plan, source, number)
     return plan.levels[source].group_offset[under], _core.bound_spheres(target.tables.fit_ball, under)
 
 
-def children(plan: Plan, below: int, number: int) -> Offsets:
+def _children(plan: Plan, below: int, number: int) -> Offsets:
     """(G + 1,) groups of a level below that are under each of a level."""
     num_groups = plan.levels[number].num_groups
     return np.arange(num_groups + 1, dtype=np.int64) * (plan.levels[below].num_groups // num_groups)
@@ -195,9 +192,7 @@ def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: B
     for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
         cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
         part = gaussians.subset(slice(cuts[0], cuts[-1]))
-        part = _halved(part, cuts - cuts[0], out_cuts - out_cuts[0], config)
-        for array, values in zip(vars(result).values(), vars(part).values(), strict=True):
-            array[out_cuts[0] : out_cuts[-1]] = values
+        put(_halved(part, cuts - cuts[0], out_cuts - out_cuts[0], config), result, out_cuts[0])
     return result
 
 

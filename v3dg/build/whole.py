@@ -13,12 +13,11 @@ from queue import SimpleQueue
 import numpy as np
 import numpy.typing as npt
 
-from v3dg import _device
+from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._progress import Progress
 from v3dg.build.assemble import assemble
 from v3dg.build.config import BuildConfig
-from v3dg.build.first_selected import UNMEASURED, grown, measured_growth
 from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.build.plan import Plan
 from v3dg.build.progress import Bar
@@ -34,6 +33,9 @@ from v3dg.gaussians import Gaussians
 
 # Leaves of a unit: enough to keep a GPU busy, and little memory. The last bits of a bundle depend on it.
 UNIT_LEAVES = 1 << 20
+# By how much balls of level 1 of a smooth asset grow that is too large to be measured: it is then selected at
+# half the size (docs/levels.md).
+_UNMEASURED = 2.0
 # Units that a GPU works on at once, so that others fill what the smallest levels of one leave idle.
 _UNITS_ON_GPU = 4
 
@@ -84,7 +86,7 @@ def build_into(
                 build = _Build(config, file.config["seed"], plan, units, parts, file, store, bar)
                 tables, hashes = build.all_levels(leaves, devices, most_units, executor)
                 if config.smooth == "yes" and len(tables) > 1:
-                    tables = grown(plan, tables, build.growth(tables[1].ball, devices[0]))
+                    tables = build.grown(tables, devices[0])
             store.finish(*assemble(plan, tables, config), hashes)
         return store.bundle()
 
@@ -139,8 +141,7 @@ class _Build:
         below: dict[int, Level] = {}
         first = self.config.target_of(self.num_low) if runs else self.num_low - 1
         for n in range(first, self.num_low):  # what the levels above begin with
-            level = finished[n].read(pages, self._run(n))
-            below[n] = Level(_device.place(level.gaussians, devices[0]), level.tables)
+            below[n] = Level(_device.place(self._level(n).gaussians, devices[0]), finished[n].tables)
         builder = LevelBuilder(self.plan, self.config, self.seed, self.file.codec)
         above = builder.levels_above(below, saved, self.bar.show_of(top))
         for number, level in enumerate(above, self.num_low):
@@ -150,15 +151,19 @@ class _Build:
             finished.append(levels[top, number])
         return [level.tables for level in finished], np.concatenate([level.hashes for level in finished])
 
-    def growth(self, ball: npt.NDArray[np.float32], device: Device) -> npt.NDArray[np.float64]:
-        """(G,) times that balls of level 1 are to grow; measured where the asset is one unit."""
-        if len(self.units) > 1:
-            return np.full(len(ball), UNMEASURED)
-        both = [self._joined(n).read(self.store.pages, self._run(n)).gaussians for n in (0, 1)]
-        return measured_growth(self.plan, both, ball, self.config, device)
+    def grown(self, tables: Sequence[LevelTables], device: Device) -> list[LevelTables]:
+        """The tables with larger balls: of level 1 by what is measured, if the asset is one unit."""
+        ball, here, config = tables[1].ball, self.plan.levels[1], self.config
+        growth = np.full(len(ball), _UNMEASURED, np.float32)
+        if len(self.units) == 1:
+            leaves, level = (_device.place(self._level(n).gaussians, device).rows for n in (0, 1))
+            filters = config.asset_filter_px2, config.asset_antialiased, config.filter_px2
+            growth = _core.first_selected(leaves, level, here.leaf_offset, here.group_offset, ball, *filters)
+        balls = _core.grown_balls([table.ball for table in tables], growth)
+        return [replace(table, ball=ball) for table, ball in zip(tables, balls, strict=True)]
 
-    def _run(self, number: int) -> PageRun:
-        return self.file.run(*self.plan.first_page[number : number + 2])
+    def _level(self, n: int) -> Level:
+        return self._joined(n).read(self.store.pages, self.file.run(*self.plan.first_page[n : n + 2]))
 
     def _build_here(self, leaves: Leaves, devices: Sequence[Device], most_units: int | None) -> None:
         workers = [device for _ in range(_UNITS_ON_GPU) for device in devices if device.is_cuda]

@@ -1,0 +1,151 @@
+#include "pipeline/first_selected.h"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+#include "base/random.h"
+#include "math/solid_angle.h"
+#include "math/vec.h"
+
+namespace v3dg {
+
+namespace {
+
+// By how much balls grow: a group is selected at 1.5 to 0.19 px² a gaussian at the default tolerance.
+constexpr double kLeast = 1.4, kMost = 4, kDefaultPx2 = 3;
+constexpr double kPx2[FirstSelected::kSizes] = {0.2, 0.5, 1.2, 3};  // a gaussian of half of the groups
+constexpr double kWidestPx = 2048, kBorderPx = 4;                   // of a picture, and around the ball
+constexpr double kDistance = 8, kShare = 0.999;  // from the centre, in radii; of the gaussians in the ball
+// A pixel counts by this power of how far it is off, as people see it. By this measure a level is as good as
+// the leaves, by FLIP, where it has so many times their loss.
+constexpr float kPower = 0.7f;
+constexpr double kAsGood = 1.15;
+// Groups that few pixels show are taken to be like all: so many times the mean loss of a group is added, in
+// the proportion that all groups have. And it counts little what they look like: so much more for leaves.
+constexpr double kLikeAll = 0.2, kOutOfSight = 0.05;
+constexpr double kNothing = 1e-9;  // a loss, or a footprint in the ball, below which there is none
+constexpr int kSteps = 64;         // of sizes that are looked at
+
+double mean_of(const std::vector<double>& values) {
+    return std::accumulate(values.begin(), values.end(), 0.0) / static_cast<double>(values.size());
+}
+
+}  // namespace
+
+FirstSelected::FirstSelected(Span<const float> means, Span<const Ball> balls,
+                             Span<const int64_t> group_offset)
+    : around_(surroundings_of(means, kShare)) {
+    for (size_t g = 0; g < balls.size; ++g) {
+        const double part = static_cast<double>(balls[g].radius) / around_.radius;
+        const auto count = static_cast<double>(group_offset[g + 1] - group_offset[g]);
+        footprint_.push_back(std::max(kPi * part * part / count, kNothing) / (kDistance * kDistance));
+    }
+    const double most = kWidestPx / 2 * std::sqrt(kDistance * kDistance - 1);
+    for (size_t size = 0; size < kSizes; ++size) {
+        focal_[size] = std::min(std::sqrt(kPx2[size] / median(footprint_)), most);
+        of_leaves_[size].assign(balls.size, 0);
+        of_level_[size].assign(balls.size, 0);
+    }
+}
+
+// Looks at the ball from afar, from evenly all around; pixels lie elsewhere by a part of one each time.
+Camera FirstSelected::camera(size_t picture) const {
+    const size_t side = picture % kSides;
+    const double z = 1 - (2 * static_cast<double>(side) + 1) / kSides;
+    const double angle = kPi * (1 + std::sqrt(5.0)) * (static_cast<double>(side) + 0.5);
+    const double flat = std::sqrt(1 - z * z);
+    const double outwards[3] = {flat * std::cos(angle), flat * std::sin(angle), z};
+    double up[3] = {0, 0, 1}, right[3], down[3];
+    cross3(up, outwards, right);  // no side is straight above
+    for (double& x : right) x /= flat;
+    cross3(right, outwards, down);
+    Camera camera{};
+    for (int k = 0; k < 3; ++k) {
+        camera.rotation[k] = right[k];
+        camera.rotation[3 + k] = down[k];
+        camera.rotation[6 + k] = -outwards[k];
+        camera.eye[k] = around_.center[k] + kDistance * around_.radius * outwards[k];
+    }
+    for (int row = 0; row < 3; ++row) camera.translation[row] = -dot3(camera.rotation + 3 * row, camera.eye);
+    camera.fx = camera.fy = focal_[picture / kSides];
+    camera.width = std::floor(2 * camera.fx / std::sqrt(kDistance * kDistance - 1)) + 2 * kBorderPx;
+    camera.height = camera.x1 = camera.y1 = camera.width;
+    camera.cx = camera.width / 2 + random_uniform(0, picture, 0) - 0.5;
+    camera.cy = camera.height / 2 + random_uniform(0, picture, 1) - 0.5;
+    camera.near = around_.radius;
+    return camera;
+}
+
+void FirstSelected::add(size_t picture, Span<const float> shares, Span<const int64_t> leaf_offset) {
+    std::vector<double>&of_leaves = of_leaves_[picture / kSides], &of_level = of_level_[picture / kSides];
+    for (size_t g = 0; g < of_leaves.size(); ++g)
+        for (auto i = static_cast<size_t>(leaf_offset[g]); i < static_cast<size_t>(leaf_offset[g + 1]); ++i) {
+            of_leaves[g] += static_cast<double>(shares[3 * i]);
+            of_level[g] += static_cast<double>(shares[3 * i + 1]);
+        }
+}
+
+std::vector<float> FirstSelected::growth() const {
+    double mean_of_leaves[kSizes], mean_of_level[kSizes];
+    for (size_t size = 0; size < kSizes; ++size) {
+        mean_of_leaves[size] = mean_of(of_leaves_[size]);
+        mean_of_level[size] = mean_of(of_level_[size]);
+    }
+    std::vector<float> growth;
+    for (size_t g = 0; g < footprint_.size(); ++g) {
+        double px2[kSizes], worse[kSizes];  // logarithms; how much worse the level is than the leaves
+        for (size_t size = 0; size < kSizes; ++size) {
+            px2[size] = std::log(footprint_[g] * focal_[size] * focal_[size]);
+            const double of_level = of_level_[size][g] + kLikeAll * mean_of_level[size] + kNothing;
+            const double of_leaves =
+                of_leaves_[size][g] + (kLikeAll + kOutOfSight) * mean_of_leaves[size] + kNothing;
+            worse[size] = std::log(of_level / of_leaves / kAsGood);
+        }
+        // From the smallest size on, as long as the sum over sizes says that the level is better.
+        double sum = 0, least = INFINITY, first = kMost;
+        for (int step = 0; step < kSteps; ++step) {
+            const double times = kMost * std::pow(kLeast / kMost, step / (kSteps - 1.0));
+            const double at = std::log(kDefaultPx2 / (times * times));
+            const auto above = static_cast<size_t>(std::upper_bound(px2, px2 + kSizes, at) - px2);
+            const size_t next = std::clamp<size_t>(above, 1, kSizes - 1), last = next - 1;
+            const double width = px2[next] - px2[last];
+            const double part = width > 0 ? std::clamp((at - px2[last]) / width, 0.0, 1.0) : 0.0;
+            sum += worse[last] + part * (worse[next] - worse[last]);
+            if (sum < least) {
+                least = sum;
+                first = times;
+            }
+        }
+        growth.push_back(static_cast<float>(first));
+    }
+    return growth;
+}
+
+void losses_of_pixels(const PictureColors& colors, size_t width, size_t height, Span<float> losses) {
+    constexpr size_t kSamples = FirstSelected::kSamples;
+    std::vector<float> truth(3 * width * height), off(truth.size()), across(truth.size());
+    for (size_t y = 0; y < kSamples * height; ++y)
+        for (size_t i = 0; i < 3 * kSamples * width; ++i)
+            truth[3 * (y / kSamples * width + i / (3 * kSamples)) + i % 3] +=
+                std::min(colors.truth[3 * kSamples * width * y + i], 1.0f) / (kSamples * kSamples);
+    // As little is seen of what is off in a single pixel, its neighbours share it. The border is empty.
+    const auto shared = [](const std::vector<float>& from, size_t i, size_t step) {
+        const float before = i < step ? 0.0f : from[i - step];
+        return 0.25f * (before + 2 * from[i] + (i + step < from.size() ? from[i + step] : 0.0f));
+    };
+    std::fill(losses.begin(), losses.end(), 0.0f);
+    size_t which = 0;
+    for (const Span<const float>& drawn : {colors.of_leaves, colors.of_level}) {
+        for (size_t i = 0; i < off.size(); ++i) off[i] = std::min(drawn[i], 1.0f) - truth[i];
+        for (size_t i = 0; i < off.size(); ++i) across[i] = shared(off, i, 3);
+        for (size_t i = 0; i < width * height; ++i) {
+            float sum = 0;
+            for (size_t c = 0; c < 3; ++c) sum += std::fabs(shared(across, 3 * i + c, 3 * width));
+            losses[3 * i + which] = std::pow(sum / 3, kPower);
+        }
+        ++which;
+    }
+}
+
+}  // namespace v3dg

@@ -1,0 +1,50 @@
+#pragma once
+
+// At which size each group of level 1 of a smooth asset is no worse than its leaves.
+
+#include <cstdint>
+#include <vector>
+
+#include "base/span.h"
+#include "math/bounds.h"
+#include "math/camera.h"
+#include "pipeline/cut_views.h"
+
+namespace v3dg {
+
+// Pictures of the whole asset are compared, because alone groups show edges that others hide. Who has them
+// drawn adds their losses, and asks for the result.
+class FirstSelected {
+  public:
+    static constexpr size_t kSides = 8, kSizes = 4;
+    static constexpr int kSamples = 2;  // a side of a pixel of the truth
+
+    // Of the leaves' means, (N, 3), and the groups' balls; level 1 has the gaussians of `group_offset`.
+    FirstSelected(Span<const float> means, Span<const Ball> balls, Span<const int64_t> group_offset);
+
+    static constexpr size_t num_pictures() { return kSides * kSizes; }
+    Camera camera(size_t picture) const;
+
+    // Adds what the leaves share of a picture's losses, rows of three of which the third is none.
+    void add(size_t picture, Span<const float> shares, Span<const int64_t> leaf_offset);
+
+    // How many times larger each ball is to be.
+    std::vector<float> growth() const;
+
+  private:
+    Surroundings around_;
+    std::vector<double> footprint_;  // px² of a group's gaussian at a focal length of 1
+    double focal_[kSizes];           // px
+    std::vector<double> of_leaves_[kSizes], of_level_[kSizes];  // losses of groups
+};
+
+// A picture's colours, (height, width, 3), over white.
+struct PictureColors {
+    Span<const float> of_leaves, of_level;
+    Span<const float> truth;  // of FirstSelected::kSamples times the width and height
+};
+
+// How far off each pixel is, (height, width, 3): of the leaves, of the level, and 0.
+void losses_of_pixels(const PictureColors& colors, size_t width, size_t height, Span<float> losses);
+
+}  // namespace v3dg
