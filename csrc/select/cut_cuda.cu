@@ -1,8 +1,8 @@
 // A cut takes two kernels. place_kernel, a thread an instance: the camera in its frame, and where its cut is
 // found: nowhere, among its tops, or in its table. That is dealt out as parts: 256 of the clusters of a table
 // that its distance leaves to be asked; or, of up to 32 neighbouring instances, the tops or, where that
-// leaves no more than a lane asks, the last of each. cut_kernel, a block eight parts and a warp each: which
-// clusters are drawn, and their places in the list by a prefix sum.
+// leaves no more than a lane asks, the last of each. cut_kernel, a block up to eight parts, of which a warp
+// has one: which clusters are drawn, and their places in the list by a prefix sum.
 //
 // For a budget, the kernels of budget_cuda.cu run in between, for two rounds with place_kernel before each.
 
@@ -53,6 +53,13 @@ struct Scratch {
     unsigned* num_parts;
     Count* place_state;               // a word a block of place_kernel
     Count *unit_state, *count_state;  // a word a ticket of cut_kernel
+    unsigned num_places;              // blocks of cut_kernel that there is room for at once
+
+    // Parts that a block takes together: as many as it has warps, or fewer where that spreads them over all
+    // places, because warps without a part help the others to ask.
+    __device__ unsigned parts_at_once(unsigned parts) const {
+        return min(max(blocks_for(parts, num_places), 1u), kCutWarps);
+    }
 };
 
 // Of an instance's model in front of an eye; of n instances, that of instance i is placement eye * n + i.
@@ -201,10 +208,13 @@ __global__ void __launch_bounds__(kPlaceThreads, kAreTwo ? kPlaceBlocks / 2 : kP
         for (unsigned p = 0; p < parts; ++p)
             part[p] = {static_cast<uint32_t>(i), asked.first + p * kPartSize, 0};
     }
-    // The block clears the tickets whose first part is one of its own.
-    for (unsigned t = blocks_for(before, kCutWarps) + threadIdx.x; t < blocks_for(before + total, kCutWarps);
-         t += kPlaceThreads)
-        scratch.unit_state[t] = scratch.count_state[t] = 0;
+    // Cleared are as many tickets as there are places, and those whose first part is one of the block's own
+    // where tickets have kCutWarps parts.
+    const auto clear = [&](unsigned first, unsigned end, unsigned step) {
+        for (unsigned t = first; t < end; t += step) scratch.unit_state[t] = scratch.count_state[t] = 0;
+    };
+    clear(static_cast<unsigned>(i), scratch.num_places, gridDim.x * kPlaceThreads);
+    clear(blocks_for(before, kCutWarps) + threadIdx.x, blocks_for(before + total, kCutWarps), kPlaceThreads);
     if (block + 1 == gridDim.x && threadIdx.x == 0) *scratch.num_parts = before + total;
 }
 
@@ -279,7 +289,8 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
                Scratch scratch, Scratch second_scratch, NeedList needs, Output output) {
     await_kernel_before();
     if (state != nullptr && state->again != 0) scratch = second_scratch;
-    const unsigned num_parts = *scratch.num_parts, num_tickets = blocks_for(num_parts, kCutWarps);
+    const unsigned num_parts = *scratch.num_parts, at_once = scratch.parts_at_once(num_parts);
+    const unsigned num_tickets = blocks_for(num_parts, at_once);
     if (num_tickets == 0 && blockIdx.x == 0 && threadIdx.x == 0) output.finish(0, 0);
     if (rule.budget != kNoBudget) rule.tolerance_px2 = choice->tolerance_px2;
     if (!Output::kFades) rule.fade = {};
@@ -288,9 +299,9 @@ __global__ void __launch_bounds__(kCutThreads, kCutBlocks)
     if (is_enough && blockIdx.x >= num_tickets) return;
     for (unsigned ticket = take_ticket(scratch.cut_ticket); ticket < num_tickets;
          ticket = is_enough ? num_tickets : take_ticket(scratch.cut_ticket)) {
-        const unsigned p = ticket * kCutWarps + threadIdx.x / 32;
+        const unsigned warp = threadIdx.x / 32, p = ticket * at_once + warp;
         LaneClusters mine{};
-        if (p < num_parts) mine = clusters_of_lane(scene, scene.parts[p]);
+        if (warp < at_once && p < num_parts) mine = clusters_of_lane(scene, scene.parts[p]);
         const auto weigh = [&](const BundleOnDevice& bundle, const InstanceView& view, int32_t c) {
             const ClusterTable& table = bundle.table;
             const InstanceCut<AskedGroups> cut{table, view, rule, {table, view, rule}, rule.culls};
@@ -342,9 +353,9 @@ unsigned place_blocks(size_t num_instances) { return std::max(1u, blocks_for(num
 size_t zeros_of_round(size_t num_instances) { return 2 + place_blocks(num_instances); }
 
 // `states`: two words a ticket.
-Scratch scratch_in(Count* zeros, Count* states, size_t num_tickets) {
+Scratch scratch_in(Count* zeros, Count* states, size_t num_tickets, unsigned num_places) {
     auto* counters = reinterpret_cast<unsigned*>(zeros);
-    return {counters, counters + 1, counters + 2, zeros + 2, states, states + num_tickets};
+    return {counters, counters + 1, counters + 2, zeros + 2, states, states + num_tickets, num_places};
 }
 
 // Parts of all tables together, if every one is asked.
@@ -380,17 +391,17 @@ template <class Output>
 void Cut::cut(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, const Target& target,
               const Output& output, Count* zeros, cudaStream_t stream, const PartlyResident* resident) {
     const size_t count = scene.num_instances(), parts = most_parts(scene);
-    const size_t num_tickets = blocks_for(parts, kCutWarps);
+    const unsigned num_places = kCutBlocks * num_multiprocessors();
+    const size_t num_tickets = std::max<size_t>(blocks_for(parts, kCutWarps), num_places);
     Count* states = states_.reserve(4 * num_tickets, stream);
     const Scratch scratches[2] = {
-        scratch_in(zeros, states, num_tickets),
-        scratch_in(zeros + zeros_of_round(count), states + 2 * num_tickets, num_tickets)};
+        scratch_in(zeros, states, num_tickets, num_places),
+        scratch_in(zeros + zeros_of_round(count), states + 2 * num_tickets, num_tickets, num_places)};
     const SceneOnDevice on_device = scene.on_device();
     const PlacedScene placed{resident == nullptr ? on_device.bundles : resident->bundles, on_device.instances,
                              views_.reserve(count, stream), tops_.reserve(count, stream),
                              parts_.reserve(parts, stream)};
-    const unsigned blocks = static_cast<unsigned>(
-        std::clamp<size_t>(num_tickets, 1, (2048 / kCutThreads) * num_multiprocessors()));
+    const auto blocks = static_cast<unsigned>(std::clamp<size_t>(parts, 1, 2 * num_places));
     const bool has_budget = rule.budget != kNoBudget;
     Count* change = zeros + 2 * zeros_of_round(count);  // with a budget
     BudgetState* state = has_budget ? budget_state(stream) : nullptr;
@@ -452,7 +463,7 @@ void Cut::given_items(const SceneTables& scene, const Camera& camera, const Give
     const unsigned blocks = std::max(1u, blocks_for(given.instance.size, kCutThreads));
     const size_t num_zeros = zeros_of_round(0), words = num_zeros + 2 * size_t(blocks);
     Count* zeros = states_.reserve(words, stream);
-    const Scratch scratch = scratch_in(zeros, zeros + num_zeros, blocks);
+    const Scratch scratch = scratch_in(zeros, zeros + num_zeros, blocks, blocks);
     check(cudaMemsetAsync(zeros, 0, words * sizeof(Count), stream), "cudaMemsetAsync");
     launch("place_all_kernel", place_all_kernel, place_blocks(scene.num_instances()), kPlaceThreads, 0,
            stream, placed, camera, image, images, placements);
