@@ -41,6 +41,29 @@ PoolLook pool_look(const std::string& shows, const py::list& cluster_colors, con
     return look;
 }
 
+#if V3DG_WITH_CUDA
+// Pictures of the eyes on the device, which have no memory yet.
+cuda::EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures) {
+    cuda::FrameImage image[2]{};
+    for (int k = 0; k < eyes.count(); ++k) {
+        const Camera& eye = eyes.camera[k];
+        const Window whole{0, 0, static_cast<int>(eye.width), static_cast<int>(eye.height)};
+        pictures.push_back(picture_of(whole, shade.with_depth));
+        image[k] = pictures.back().frame_image(eye, shade);
+    }
+    const float stop = shade.min_transmittance;
+    return eyes.are_two ? cuda::images_of_eyes(image[0], image[1], stop)
+                        : cuda::EyeImages{{image[0], {}}, 1, stop};
+}
+
+// Gives them their memory, for which torch takes a while.
+cuda::Frame::Place place_of(NewPictures& pictures, Device device) {
+    return [&pictures, device](cuda::PicturePlanes planes[2]) {
+        for (size_t k = 0; k < pictures.size(); ++k) planes[k] = pictures[k].on_device(device);
+    };
+}
+#endif
+
 // Draws scenes of the same bundles, or of the first of them, on one device.
 class BoundSceneFrame {
   public:
@@ -97,10 +120,8 @@ class BoundSceneFrame {
             const Work work(device_);
             NewPictures pictures;
             const cuda::EyeImages images = new_images(eyes, shade, pictures);
-            const auto place = [&](cuda::PicturePlanes planes[2]) {
-                for (size_t k = 0; k < pictures.size(); ++k) planes[k] = pictures[k].on_device(device_);
-            };
-            auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream(), place);
+            auto drawing = frame_->draw(scene.on_device(), eyes, paced, images, work.stream(),
+                                        place_of(pictures, device_));
             return std::make_unique<BoundDrawing>(std::move(pictures),
                                                   py::make_tuple(py::cast(this), scene_object), device_,
                                                   turns_, std::move(drawing), rule);
@@ -134,12 +155,10 @@ class BoundSceneFrame {
 #if V3DG_WITH_CUDA
             const Work work(device_);
             NewPictures pictures;
-            cuda::EyeImages images = new_images(eyes, shade, pictures);
-            for (size_t k = 0; k < pictures.size(); ++k)
-                images.image[k].planes = pictures[k].on_device(device_);
+            const cuda::EyeImages images = new_images(eyes, shade, pictures);
             SelectRule used = paced;
-            auto drawing =
-                frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images, work.stream());
+            auto drawing = frame_->draw_resident(scene.on_device(), pool.on_device(), eyes, used, images,
+                                                 work.stream(), place_of(pictures, device_));
             return std::make_unique<BoundDrawing>(
                 std::move(pictures), py::make_tuple(py::cast(this), scene_object, pool_object), device_,
                 turns_, std::move(drawing), used, &pool.on_device());
@@ -192,12 +211,12 @@ class BoundSceneFrame {
 #if V3DG_WITH_CUDA
         const Turn turn(turns_.get());
         const Work work(device_);
-        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, shade.with_depth);
-        const cuda::FrameImage image = picture.frame_image(camera.camera, shade, picture.on_device(device_));
-        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, image,
-                                        shade.min_transmittance, work.stream());
+        NewPictures pictures;
+        const cuda::EyeImages images = new_images(camera.camera, shade, pictures);
+        auto drawing = frame_->draw_cut(scene.on_device(), camera.camera, given, images, work.stream(),
+                                        place_of(pictures, device_));
         return std::make_unique<BoundDrawing>(
-            NewPictures{std::move(picture)},
+            std::move(pictures),
             py::make_tuple(py::cast(this), scene_object, instance_ids, cluster_ids, weights), device_, turns_,
             std::move(drawing), SelectRule{});
 #else
@@ -341,20 +360,6 @@ class BoundSceneFrame {
     }
 
 #if V3DG_WITH_CUDA
-    // Pictures of the eyes on the device, which have no memory yet.
-    static cuda::EyeImages new_images(const Eyes& eyes, const Shade& shade, NewPictures& pictures) {
-        cuda::FrameImage image[2]{};
-        for (int k = 0; k < eyes.count(); ++k) {
-            const Camera& eye = eyes.camera[k];
-            const Window whole{0, 0, static_cast<int>(eye.width), static_cast<int>(eye.height)};
-            pictures.push_back(picture_of(whole, shade.with_depth));
-            image[k] = pictures.back().frame_image(eye, shade);
-        }
-        const float stop = shade.min_transmittance;
-        return eyes.are_two ? cuda::images_of_eyes(image[0], image[1], stop)
-                            : cuda::EyeImages{{image[0], {}}, 1, stop};
-    }
-
     void set_models_on_device(const py::list& models, const py::list& palettes) {
         std::vector<cuda::DeviceModel> on_device;
         for (const py::handle& model : models)
@@ -427,13 +432,14 @@ class BoundAssetFrame {
 #if V3DG_WITH_CUDA
         const Device device = model.device();
         const Work work(device);
-        NewPicture picture = picture_of({0, 0, camera.width(), camera.height()}, shade.with_depth);
-        const cuda::FrameImage image = picture.frame_image(camera.camera, shade, picture.on_device(device));
+        NewPictures pictures;
+        const cuda::EyeImages images = new_images(camera.camera, shade, pictures);
         const cuda::PackedModel& packed = *model.on_device().packed;
-        auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false, image,
-                                    work.stream(), &packed.packed(), shade.min_transmittance);
-        return std::make_unique<BoundDrawing>(NewPictures{std::move(picture)}, py::cast(this), device,
-                                              nullptr, std::move(drawing), SelectRule{});
+        auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false,
+                                    images.image[0], work.stream(), &packed.packed(),
+                                    images.min_transmittance, place_of(pictures, device));
+        return std::make_unique<BoundDrawing>(std::move(pictures), py::cast(this), device, nullptr,
+                                              std::move(drawing), SelectRule{});
 #else
         return nullptr;
 #endif

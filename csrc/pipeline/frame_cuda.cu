@@ -130,6 +130,7 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     const size_t parts = tile_bin_parts(batch.num_tiles);
     const size_t cleared_bytes = sizeof(State) + (parts + batch.num_zeros) * sizeof(unsigned long long) +
                                  batch.num_tiles * sizeof(uint32_t);
+    if (cleared_bytes > cleared_.capacity()) num_zero_bytes_ = 0;
     unsigned char* cleared = room(cleared_, cleared_bytes, drawing);
     State* state = reinterpret_cast<State*>(cleared);
     auto* scan_state = reinterpret_cast<unsigned long long*>(cleared + sizeof(State));
@@ -153,7 +154,9 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
                              room(image_of_tile_, batch.num_tiles, drawing), entries};
 
     if (!capturing) check(cudaEventRecord(slot.begun, stream), "cudaEventRecord");
-    check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
+    if (capturing || num_zero_bytes_ < cleared_bytes)
+        check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
+    const size_t num_zero_bytes = std::max(std::exchange(num_zero_bytes_, 0), cleared_bytes);
     drawing.prepare_(items, stream);
     if (!capturing) check(cudaEventRecord(slot.prepared, stream), "cudaEventRecord");
     project({batch.models, batch.packed, batch.coded, batch.placements, batch.images, items,
@@ -189,6 +192,11 @@ void Frame::enqueue(Drawing& drawing, const Place& place) {
     if (!capturing) check(cudaEventRecord(slot.done, stream), "cudaEventRecord");
     last_stream_ = stream;
     last_batch_ = batch;
+    // The next frame begins sooner if it finds what it counts cleared. A graph is replayed at any time, and a
+    // backward pass reads what was counted.
+    if (was_captured_ || keeps_tape) return;
+    check(cudaMemsetAsync(cleared, 0, cleared_bytes, stream), "cudaMemsetAsync");
+    num_zero_bytes_ = num_zero_bytes;
 }
 
 FrameLists Frame::lists(const FrameBatch& batch) const {

@@ -112,6 +112,7 @@ class Frame {
     DeviceBuffer<TilePlan> plans_;
     uint32_t num_plans_ = 0;
     DeviceBuffer<unsigned char> cleared_;  // State, states of the scan, zeros of items, counts of the tiles
+    size_t num_zero_bytes_ = 0;            // of these, that are zero when the next frame begins
 
     std::vector<std::unique_ptr<Slot>> slots_;
     std::deque<Slot*> free_slots_;                // their frames may not be over yet

@@ -123,7 +123,7 @@ FrameBatch SceneFrame::batch(const SceneTables& scene, const EyeImages& pictures
             rule.fade.is_on(),
             nullptr,
             Cut::num_zeros(scene, rule),
-            pictures.image[0].planes.depth != nullptr || pictures.image[1].planes.depth != nullptr};
+            false};
 }
 
 // What a frame that was drawn once is drawn again with.
@@ -146,7 +146,8 @@ std::unique_ptr<Drawing> SceneFrame::draw(const SceneTables& scene, const Eyes& 
 
 std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, DevicePages& pages,
                                                    const Eyes& eyes, SelectRule& rule,
-                                                   const EyeImages& pictures, cudaStream_t stream) {
+                                                   const EyeImages& pictures, cudaStream_t stream,
+                                                   const Frame::Place& place) {
     const StreamLock lock(pages.mutex(), stream);
     const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
     PartlyResident resident = pages.begin_frame(true, arrive, stream);
@@ -165,20 +166,21 @@ std::unique_ptr<Drawing> SceneFrame::draw_resident(const SceneTables& scene, Dev
             if (resident.needs.report != nullptr) pages.end_frame(on);
             resident.needs = {};
         },
-        stream);
+        stream, place);
 }
 
 std::unique_ptr<Drawing> SceneFrame::draw_cut(const SceneTables& scene, const Camera& camera,
-                                              const GivenCut& given, const FrameImage& image,
-                                              float min_transmittance, cudaStream_t stream) {
-    FrameBatch of_cut = batch(scene, {{image, {}}, 1, min_transmittance}, SelectRule{}, stream);
+                                              const GivenCut& given, const EyeImages& pictures,
+                                              cudaStream_t stream, const Frame::Place& place) {
+    FrameBatch of_cut = batch(scene, pictures, SelectRule{}, stream);
     of_cut.has_faded_items = given.weight.size > 0;
     return frame_.draw(
         of_cut,
         [=, &scene](const ItemList& items, cudaStream_t on) {
-            cut_.given_items(scene, camera, given, image, images_.data(), placements_.data(), items, on);
+            cut_.given_items(scene, camera, given, pictures.image[0], images_.data(), placements_.data(),
+                             items, on);
         },
-        stream);
+        stream, place);
 }
 
 std::vector<std::pair<const char*, size_t>> SceneFrame::bytes() const {
@@ -211,7 +213,7 @@ static __global__ void model_kernel(ModelTables tables, ModelTables* on_device, 
 std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
                                           float filter_px2, bool antialiased, const FrameImage& image,
                                           cudaStream_t stream, const PackedPlanes* packed,
-                                          float min_transmittance) {
+                                          float min_transmittance, const Frame::Place& place) {
     if (tables_.data() == nullptr) tables_.reserve(1, stream);
     ModelTables* on_device = tables_.data();
     const ModelTables tables{rows, packed == nullptr ? PackedPlanes{} : *packed, {view, 0, 0}, image};
@@ -228,7 +230,7 @@ std::unique_ptr<Drawing> ModelFrame::draw(const GaussianRows<const float>& rows,
             launch("model_kernel", model_kernel, blocks, kModelThreads, 0, on, tables, on_device,
                    Appearance<float>{filter_px2, antialiased, false}, items);
         },
-        stream);
+        stream, place);
 }
 
 }  // namespace cuda

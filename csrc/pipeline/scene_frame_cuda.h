@@ -71,17 +71,18 @@ class SceneFrame {
     void set_models(std::vector<DeviceModel> models,
                     std::vector<std::shared_ptr<const DevicePalette>> palettes, cudaStream_t stream);
 
-    // The scene stays as it is until the drawing is finished. `place` is of pictures that have none.
+    // The scene stays as it is until the drawing is finished. `place` says where the pictures are.
     std::unique_ptr<Drawing> draw(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
-                                  const EyeImages& pictures, cudaStream_t stream,
-                                  const Frame::Place& place = {});
+                                  const EyeImages& pictures, cudaStream_t stream, const Frame::Place& place);
     // Draws what is resident of the bundles of a pool, with what comes in before; the pool stays, too. The
     // rule becomes the one that is used. A frame that is drawn again has the pages that are there by then.
     std::unique_ptr<Drawing> draw_resident(const SceneTables& scene, DevicePages& pages, const Eyes& eyes,
-                                           SelectRule& rule, const EyeImages& pictures, cudaStream_t stream);
-    // Draws pairs that were selected before; they are on the device and stay, too.
+                                           SelectRule& rule, const EyeImages& pictures, cudaStream_t stream,
+                                           const Frame::Place& place);
+    // Draws pairs that were selected before; they are on the device and stay, too. There is one picture.
     std::unique_ptr<Drawing> draw_cut(const SceneTables& scene, const Camera& camera, const GivenCut& given,
-                                      const FrameImage& image, float min_transmittance, cudaStream_t stream);
+                                      const EyeImages& pictures, cudaStream_t stream,
+                                      const Frame::Place& place);
 
     // Bytes of what it keeps on the device, by part, without the models.
     std::vector<std::pair<const char*, size_t>> bytes() const;
@@ -120,7 +121,7 @@ class ModelFrame {
     std::unique_ptr<Drawing> draw(const GaussianRows<const float>& rows, const ModelView<float>& view,
                                   float filter_px2, bool antialiased, const FrameImage& image,
                                   cudaStream_t stream, const PackedPlanes* packed = nullptr,
-                                  float min_transmittance = kStopsBefore);
+                                  float min_transmittance = kStopsBefore, const Frame::Place& place = {});
     FrameTape tape() const { return frame_.tape(); }
 
   private:
