@@ -18,9 +18,9 @@ struct Record {
     uint16_t x0, x1, y0, y1;
 };
 
-// Sets all of a record but its colour.
+// Sets all of a record but its colour and its pixels.
 template <class T>
-V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& box, Record<T>& r) {
+V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, Record<T>& r) {
     r.u = e.u;
     r.v = e.v;
     r.l11 = e.l11;
@@ -28,6 +28,12 @@ V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& b
     r.l22 = e.l22;
     r.log2_opacity = e.log2_opacity;
     r.depth = e.depth;
+}
+
+// Sets all of a record but its colour.
+template <class T>
+V3DG_HD V3DG_INLINE void set_ellipse(const Ellipse<T>& e, const PixelBox<int>& box, Record<T>& r) {
+    set_ellipse(e, r);
     r.x0 = static_cast<uint16_t>(box.x0);
     r.x1 = static_cast<uint16_t>(box.x1);
     r.y0 = static_cast<uint16_t>(box.y0);

@@ -13,46 +13,68 @@
 namespace v3dg {
 namespace cuda {
 
-// A gaussian in the list of a tile, in one word: 26 bits of depth, the 28 bits of the record, and 10 of where
-// in the tile it is. Lists are blended by ascending depth, ties by record; entries in one step of the key's
-// depth by the depths of their records, unless a tile has more than a thousand of them.
+// A gaussian in the list of a tile, in one word: 54 bits of depth and record, and 10 of where in the tile it
+// is. A record has 26 bits and depth 28, which make it exact; or up to two more and fewer, in frames with
+// room for more records. Lists are blended by ascending depth, ties by record; where depths are not exact,
+// entries of one depth by those of their records, unless a tile has more than a thousand that share 26 bits.
 struct TileEntry {
     unsigned long long key;
 };
-constexpr int kEntryRecordBits = 28, kEntryBoxBits = 10;
-constexpr unsigned long long kMostFrameRecords = 1ull << kEntryRecordBits;
-constexpr int kEntryBlockSize = 4;  // px; the box counts in blocks
+constexpr int kLeastRecordBits = 26, kMostRecordBits = 28, kEntryBoxBits = 10;
+constexpr unsigned long long kMostFrameRecords = 1ull << kMostRecordBits;
+constexpr int kEntryBlockSize = 4;                    // px; the box counts in blocks
+constexpr uint32_t kLastEntryDepth = (1u << 28) - 1;  // 32 octaves behind near, and whatever is farther
 
-// Depth as entries hold it; it is at least the camera's near depth. A step of the key is 5e-7 of the depth;
-// the last one is 32 octaves behind near.
-V3DG_HD inline uint32_t entry_depth(float depth, float near_depth) {
+// Which bits of the upper half of an entry are depth, in a frame with room for so many records.
+constexpr uint32_t kExactDepths = ~0u << 4;
+inline uint32_t depth_bits_of_entries(unsigned long long most_records) {
+    uint32_t bits = kExactDepths;
+    for (auto held = 1ull << kLeastRecordBits; held < most_records; held *= 2) bits <<= 1;
+    return bits;
+}
+
+// Depth as entries are made of it, in steps of a float's last bit, or of up to four of them where records
+// need more bits; it is at least the camera's near depth.
+V3DG_HD inline uint32_t entry_depth(float depth, float near_depth, uint32_t bits_of_entries) {
     uint32_t depth_bits, near_bits;  // of positive floats, so they order as they do
     std::memcpy(&depth_bits, &depth, sizeof depth_bits);
     std::memcpy(&near_bits, &near_depth, sizeof near_bits);
-    return min_of((depth_bits - near_bits) >> 2, (1u << 26) - 1);
+    return min_of(depth_bits - near_bits, kLastEntryDepth) & bits_of_entries >> 4;
 }
+constexpr uint32_t kTileBlockColumns = kFrameTileWidth / kEntryBlockSize;
+constexpr uint32_t kTileBlockRows = kFrameTileHeight / kEntryBlockSize;
 
-// First and last block, in the picture, that a record's pixels lie in.
+// First and last block that a record's pixels lie in, counted from the corner of the picture or of a tile.
 struct EntryBox {
-    int x0, x1, y0, y1;
+    uint32_t x0, x1, y0, y1;
 };
-V3DG_HD inline EntryBox entry_box(const Record<float>& r) {
-    return {r.x0 / kEntryBlockSize, r.x1 / kEntryBlockSize, r.y0 / kEntryBlockSize, r.y1 / kEntryBlockSize};
+
+// In the picture, of a box of pixels.
+template <class Box>
+V3DG_HD inline EntryBox entry_box(const Box& pixels) {
+    const auto block_of = [](auto pixel) { return static_cast<uint32_t>(pixel) / kEntryBlockSize; };
+    return {block_of(pixels.x0), block_of(pixels.x1), block_of(pixels.y0), block_of(pixels.y1)};
 }
 
-// In the tile of this column and row of the picture, which the box meets.
-V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const EntryBox& box, int column,
-                                    int row) {
-    constexpr int kColumns = kFrameTileWidth / kEntryBlockSize, kRows = kFrameTileHeight / kEntryBlockSize;
-    const uint32_t x0 = max_of(box.x0 - kColumns * column, 0), y0 = max_of(box.y0 - kRows * row, 0);
-    const uint32_t x1 = min_of(box.x1 - kColumns * column, kColumns - 1);
-    const uint32_t y1 = min_of(box.y1 - kRows * row, kRows - 1);
+// In the tile of this column and row, counted from where the box is, which the box meets.
+V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const EntryBox& box, uint32_t column,
+                                    uint32_t row) {
+    const int left = static_cast<int>(kTileBlockColumns * column);
+    const int top = static_cast<int>(kTileBlockRows * row);
+    const uint32_t x0 = max_of(static_cast<int>(box.x0) - left, 0);
+    const uint32_t y0 = max_of(static_cast<int>(box.y0) - top, 0);
+    const uint32_t x1 = min_of(box.x1 - left, kTileBlockColumns - 1);
+    const uint32_t y1 = min_of(box.y1 - top, kTileBlockRows - 1);
     const unsigned long long depth_and_record =
-        static_cast<unsigned long long>(depth) << kEntryRecordBits | record;
+        static_cast<unsigned long long>(depth) << kLeastRecordBits | record;
     return {depth_and_record << kEntryBoxBits | (x0 | x1 << 3 | y0 << 6 | y1 << 8)};
 }
-V3DG_HD inline uint32_t record_of(TileEntry e) {
-    return static_cast<uint32_t>(e.key >> kEntryBoxBits) & static_cast<uint32_t>(kMostFrameRecords - 1);
+// The first 26 bits of depth, and the 28 that follow.
+V3DG_HD inline uint32_t key_depth(TileEntry e) {
+    return static_cast<uint32_t>(e.key >> (kEntryBoxBits + kMostRecordBits));
+}
+V3DG_HD inline uint32_t key_order(TileEntry e) {
+    return static_cast<uint32_t>(e.key >> kEntryBoxBits) & ((1u << kMostRecordBits) - 1);
 }
 // A bit for each 4 x 4 pixels of the tile, row by row, that the record's box meets.
 V3DG_HD inline uint32_t blocks_of(TileEntry e) {
@@ -90,9 +112,19 @@ V3DG_HD inline uint32_t num_tiles_of(const RecordBox& r) { return tile_columns_o
 
 // The records of a frame in three planes: a Record in the order of its fields.
 struct RecordPlanes {
-    float* ellipse;  // (N, 8) u, v, l11, l12, l22, log2_opacity, and two channels
-    float* rest;     // (N, 2) the third channel and the depth
-    RecordBox* box;  // null unless the frame keeps a tape: few records are asked for it later
+    float* ellipse;       // (N, 8) u, v, l11, l12, l22, log2_opacity, and two channels
+    float* rest;          // (N, 2) the third channel and the depth
+    RecordBox* box;       // null unless the frame keeps a tape: few records are asked for it later
+    uint32_t depth_bits;  // of the upper half of entries
+
+    V3DG_HD uint32_t record_of(TileEntry e) const {
+        return static_cast<uint32_t>(e.key >> kEntryBoxBits) & ~(depth_bits << (32 - kEntryBoxBits));
+    }
+    // Orders as depth does, and whether it is alike only where depth is.
+    V3DG_HD uint32_t depth_of(TileEntry e) const { return static_cast<uint32_t>(e.key >> 32) & depth_bits; }
+    V3DG_HD bool is_exact(TileEntry e) const {
+        return depth_bits == kExactDepths && depth_of(e) != kExactDepths;  // the last one is not
+    }
 };
 
 // Input of the blend stage.
@@ -120,40 +152,40 @@ struct FrameLists {
 // A record over more tiles than this is looked at row by row of tiles.
 constexpr unsigned kFewTiles = 4;
 
-// The tiles that a record's blocks lie in.
+// The tiles that a record's blocks lie in: the first one, and how many.
 struct TileBox {
-    int left, top;
-    uint32_t columns, count;
+    uint32_t left, top, columns, count;
 
-    // Column and row of tile k of at most kFewTiles: with more than two columns there is one row.
-    V3DG_HD int column(uint32_t k) const {
-        return left + static_cast<int>(columns > 2 ? k : columns == 2 ? k & 1 : 0);
-    }
-    V3DG_HD int row(uint32_t k) const {
-        return top + static_cast<int>(columns > 2 ? 0 : columns == 2 ? k >> 1 : k);
-    }
+    // How far tile k of at most kFewTiles is from the first: with more than two columns there is one row.
+    V3DG_HD uint32_t columns_to(uint32_t k) const { return columns > 2 ? k : columns == 2 ? k & 1 : 0; }
+    V3DG_HD uint32_t rows_to(uint32_t k) const { return columns > 2 ? 0 : columns == 2 ? k >> 1 : k; }
 };
 
 V3DG_HD inline TileBox tile_box(const EntryBox& b) {
-    constexpr int kColumns = kFrameTileWidth / kEntryBlockSize, kRows = kFrameTileHeight / kEntryBlockSize;
-    const int left = b.x0 / kColumns, top = b.y0 / kRows;
-    const uint32_t columns = b.x1 / kColumns - left + 1, rows = b.y1 / kRows - top + 1;
+    const uint32_t left = b.x0 / kTileBlockColumns, top = b.y0 / kTileBlockRows;
+    const uint32_t columns = b.x1 / kTileBlockColumns - left + 1, rows = b.y1 / kTileBlockRows - top + 1;
     return {left, top, columns, columns * rows};
 }
 
-// A record over few tiles as the scattering kernel reads it: depth, and the blocks' first and how many
-// follow.
+// A record over few tiles as the scattering kernel reads it: its depth, the number of its first tile in the
+// picture, and its blocks, counted from that tile: the first, and how many follow.
 using FewTiles = unsigned long long;
-constexpr FewTiles kManyTiles = ~FewTiles(0);
+constexpr FewTiles kManyTiles = ~FewTiles(0);  // which has five columns
+constexpr int kFewBoxBits = 14, kFewTileBits = 22;
+constexpr uint32_t kMostFewTile = (1u << kFewTileBits) - 1;  // what lies in later tiles counts as large
 
-V3DG_HD inline FewTiles few_tiles(uint32_t depth, const EntryBox& b) {
-    return FewTiles(depth) << 38 | FewTiles(b.x0) << 24 | FewTiles(b.x1 - b.x0) << 19 | FewTiles(b.y0) << 5 |
-           FewTiles(b.y1 - b.y0);
+V3DG_HD inline FewTiles few_tiles(uint32_t depth, uint32_t tile, const EntryBox& b) {
+    const uint32_t box =
+        b.x0 % kTileBlockColumns << 11 | b.y0 % kTileBlockRows << 9 | (b.x1 - b.x0) << 4 | (b.y1 - b.y0);
+    return FewTiles(depth) << (kFewBoxBits + kFewTileBits) | FewTiles(tile) << kFewBoxBits | box;
 }
-V3DG_HD inline uint32_t depth_of(FewTiles f) { return static_cast<uint32_t>(f >> 38); }
+V3DG_HD inline uint32_t depth_of(FewTiles f) {
+    return static_cast<uint32_t>(f >> (kFewBoxBits + kFewTileBits));
+}
+V3DG_HD inline uint32_t tile_of(FewTiles f) { return static_cast<uint32_t>(f >> kFewBoxBits) & kMostFewTile; }
 V3DG_HD inline EntryBox box_of(FewTiles f) {
-    const int x0 = static_cast<int>(f >> 24) & 0x3fff, y0 = static_cast<int>(f >> 5) & 0x3fff;
-    return {x0, x0 + (static_cast<int>(f >> 19) & 31), y0, y0 + (static_cast<int>(f) & 31)};
+    const uint32_t box = static_cast<uint32_t>(f), x0 = box >> 11 & 7, y0 = box >> 9 & 3;
+    return {x0, x0 + (box >> 4 & 31), y0, y0 + (box & 15)};
 }
 
 // A record over more than kFewTiles tiles, or some of its rows of tiles and its pixels in those. They come in

@@ -1,6 +1,8 @@
 // A warp takes an item, and every so many items another. It looks at the spheres of 32 gaussians at a time;
 // those that may reach a pixel centre queue up, and are projected as soon as there are 32 of them. So no lane
-// waits for a gaussian that is not drawn, and records come out in order without asking another warp.
+// waits for a gaussian that is not drawn, and records come out in order without asking another warp. Where
+// nearly all of 32 may reach one, the next ones are projected without a test, which would take longer than
+// what it spares.
 //
 // Of a shared item it looks at one gaussian at a time, in front of up to 32 placements: many far instances of
 // a cluster of few gaussians are then a few items with full warps, and read those gaussians once. A kernel of
@@ -26,6 +28,8 @@ constexpr unsigned kMostWaiting = 64;  // large records, of which fewer than 32 
 // Where so many of an item's first 32 gaussians reach so few px at most, they are tested by rows.
 constexpr float kSmall = 3;
 constexpr unsigned kManySmall = 4;
+// Where so many of 32 gaussians pass the test, the next are not tested, while so many of them become records.
+constexpr unsigned kNearlyAll = 22, kMany = 12;
 
 // A gaussian in front of the camera.
 struct Queued {
@@ -93,26 +97,27 @@ __device__ void drop_missed_rows(const Ellipse<float>& e, const Projection<float
     box.y1 -= misses_last;
 }
 
-// The record of gaussian g at p in view space. Returns whether it reaches a pixel centre; where gaussians are
-// not small those few that miss all centres in their box count, too.
+// The record of gaussian g at p in view space, but for its pixels, which are `box`. Returns whether it
+// reaches a pixel centre; where gaussians are not small those few that miss all centres in their box count,
+// too. What does not is known at the end only, for it is rare.
 template <class Source>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in, const ModelView<float>& view,
                             typename Source::Place place, uint32_t g, const float p[3], bool are_small,
-                            Record<float>& r, unsigned& num_in_frustum) {
+                            Record<float>& r, PixelBox<int>& box, unsigned& num_in_frustum) {
     Projection<float> s;
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
     const Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
     float half_x, half_y;
     const Pinhole<float>& cam = in.image.camera;
     // The sphere has told that it is not too faint.
-    if (!extent_of(1.0f, e, s, half_x, half_y)) return false;
-    if (!(meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height))) return false;
-    ++num_in_frustum;
-    PixelBox<int> box = pixel_box(e, half_x, half_y, cam, in.image.width, in.image.height);
+    bool is_in_frustum = extent_of(1.0f, e, s, half_x, half_y);
+    is_in_frustum &= meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height);
+    num_in_frustum += is_in_frustum;
+    box = pixel_box(e, half_x, half_y, cam, in.image.width, in.image.height);
     if (are_small) drop_missed_rows(e, s, cam.width, box);
-    if (!box.holds_pixels()) return false;
+    if (!(is_in_frustum & box.holds_pixels())) return false;
 
-    set_ellipse(e, box, r);
+    set_ellipse(e, r);
     Source::shade(in.model, view, place, g, r.color);
     return true;
 }
@@ -191,50 +196,53 @@ __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, co
     __syncwarp();
 }
 
-// Writes the records of up to 32 queued gaussians, in their order, and counts them into tiles. Returns how
-// many there are. `sharers` are the placements of a shared item.
+// Writes the records of the lanes' gaussians, in their order, and counts them into tiles. Returns how many
+// there are. `sharers` are the placements of a shared item.
 template <class Source, bool kIsShared>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, const Placement* sharers,
-                                  const typename Source::Place& start, bool are_small, unsigned head,
-                                  unsigned count, uint32_t first, FrameCounters& counters,
+                                  const typename Source::Place& start, bool are_small, bool has_one,
+                                  const Queued& mine, uint32_t first, FrameCounters& counters,
                                   const ProjectOutput& out, unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
     Record<float> r;
+    PixelBox<int> box{};
     bool reaches_pixel = false;
     uint32_t g = 0;
-    if (lane < count) {
-        const Queued queued = space.queue[(head + lane) % kQueue];
-        g = in.item.first + (kIsShared ? queued.place / 32 : queued.place);
-        const ModelView<float>& view = kIsShared ? sharers[queued.place % 32].view : in.placement.view;
-        reaches_pixel = project_one<Source>(in, view, start, g, queued.p, are_small, r, num_in_frustum);
+    if (has_one) {
+        g = in.item.first + (kIsShared ? mine.place / 32 : mine.place);
+        const ModelView<float>& view = kIsShared ? sharers[mine.place % 32].view : in.placement.view;
+        reaches_pixel = project_one<Source>(in, view, start, g, mine.p, are_small, r, box, num_in_frustum);
     }
     const unsigned kept = __ballot_sync(kAllLanes, reaches_pixel);
     if (kept == 0) return 0;
     const unsigned rank = __popc(kept & ((1u << lane) - 1));
-    TileBox tiles{0, 0, 1, 0};
-    RecordBox pixels{};
-    bool is_large = false;
+    const EntryBox blocks = entry_box(box);
+    TileBox tiles = tile_box(blocks);
+    const uint32_t tile = tiles.top * static_cast<uint32_t>(in.image.tile_columns) + tiles.left;
+    const bool is_large = reaches_pixel && (tiles.count > kFewTiles || tile > kMostFewTile);
+    const auto pixels = [&] {
+        return RecordBox{static_cast<uint16_t>(box.x0), static_cast<uint16_t>(box.x1),
+                         static_cast<uint16_t>(box.y0), static_cast<uint16_t>(box.y1)};
+    };
     if (reaches_pixel) {
         space.ellipses[kEllipseVectors * rank] = {r.u, r.v, r.l11, r.l12};
         space.ellipses[kEllipseVectors * rank + 1] = {r.l22, r.log2_opacity, r.color[0], r.color[1]};
         reinterpret_cast<float2*>(out.records.rest)[first + rank] = {r.color[2], r.depth};
-        pixels = {r.x0, r.x1, r.y0, r.y1};
-        const EntryBox box = entry_box(r);
-        tiles = tile_box(box);
-        is_large = tiles.count > kFewTiles;
-        out.few[first + rank] =
-            is_large ? kManyTiles : few_tiles(entry_depth(r.depth, in.image.camera.near_depth), box);
-        if (out.records.box != nullptr) out.records.box[first + rank] = pixels;
-        if (is_large) tiles.count = 0;
-        if (out.source != nullptr) out.source[first + rank] = g;
+        const uint32_t depth = entry_depth(r.depth, in.image.camera.near_depth, out.records.depth_bits);
+        out.few[first + rank] = is_large ? kManyTiles : few_tiles(depth, tile, blocks);
+        if (out.source != nullptr) {  // a tape is kept
+            out.source[first + rank] = g;
+            out.records.box[first + rank] = pixels();
+        }
     }
+    if (!reaches_pixel || is_large) tiles.count = 0;
     const unsigned large = __ballot_sync(kAllLanes, is_large);
     if (large != 0) {
         const unsigned before = space.num_large, place = before + __popc(large & ((1u << lane) - 1));
         if (is_large) {
             space.large[place] = static_cast<uint8_t>(first + rank - in.item.record);
-            space.boxes[place] = pixels;
+            space.boxes[place] = pixels();
         }
         __syncwarp();
         if (lane == 0) space.num_large = before + __popc(large);
@@ -249,7 +257,8 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
     count_tiles(
         out.tiles.count, tiles.count,
         [&](unsigned k) {
-            return in.image.first_tile + tiles.row(k) * in.image.tile_columns + tiles.column(k);
+            return in.image.first_tile + tile + tiles.rows_to(k) * in.image.tile_columns +
+                   tiles.columns_to(k);
         },
         space.tiles);
     return num_records;
@@ -300,8 +309,10 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
                                             : NAN;
     };
     const float reach_scale = sees ? reach_scale_of() : 0;
-    unsigned head = 0, waiting = 0, written = 0;
-    bool are_small = false;  // as the first of them tell
+    unsigned head = 0, waiting = 0;
+    uint32_t record = tables.item.record;  // the next one
+    bool are_small = false;                // as the first of them tell
+    bool are_tested = true;
     const typename Source::Place start = Source::start(tables);
     typename Source::Place here = start;
     typename Source::Fetched next_fetched{};
@@ -313,35 +324,44 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
         if (place + kRound < count)
             next_fetched = Source::fetch(tables.model, tables.item.first + place + kRound);
         bool may_reach = false, is_small = false;
-        float p[3];
+        Queued mine{{}, kIsShared ? 32 * place + lane : place};
         if (place < count && sees) {
             const float4 sphere = Source::sphere(tables.model, here, tables.item.first + place, fetched);
             const float mean[3] = {sphere.x, sphere.y, sphere.z};
-            to_view(view, mean, p);
-            const SphereTest told = test_sphere<Source>(tables, p, sphere.w, reach_scale);
-            may_reach = told.may_reach;
-            is_small = may_reach && told.half < kSmall;
-            num_in_frustum += told.misses_centers;
+            to_view(view, mean, mine.p);
+            if (are_tested) {
+                const SphereTest told = test_sphere<Source>(tables, mine.p, sphere.w, reach_scale);
+                may_reach = told.may_reach;
+                is_small = may_reach && told.half < kSmall;
+                num_in_frustum += told.misses_centers;
+            } else {
+                may_reach = mine.p[2] >= tables.image.camera.near_depth && !(sphere.w < 0);
+            }
         }
-        if (first == 0) are_small = __popc(__ballot_sync(kAllLanes, is_small)) >= kManySmall;
-        const unsigned come = __ballot_sync(kAllLanes, may_reach);
-        if (may_reach)
-            space.queue[(head + waiting + __popc(come & ((1u << lane) - 1))) % kQueue] = {
-                {p[0], p[1], p[2]}, kIsShared ? 32 * place + lane : place};
-        waiting += __popc(come);
-        __syncwarp();
-        if (waiting < 32 && first + kRound < count) continue;
-        // After the last there may be two rounds left.
-        const unsigned taken = min(waiting, 32u);
-        written +=
-            write_records<Source, kIsShared>(space, sharers, start, are_small, head, taken,
-                                             tables.item.record + written, counters, out, num_in_frustum);
-        head += taken;
-        waiting -= taken;
+        if (are_tested) {
+            if (first == 0) are_small = __popc(__ballot_sync(kAllLanes, is_small)) >= kManySmall;
+            const unsigned come = __ballot_sync(kAllLanes, may_reach);
+            if (may_reach) space.queue[(head + waiting + __popc(come & ((1u << lane) - 1))) % kQueue] = mine;
+            waiting += __popc(come);
+            __syncwarp();
+            const bool are_nearly_all = !kIsShared && __popc(come) >= kNearlyAll;
+            if (waiting < 32 && first + kRound < count && !are_nearly_all) continue;
+            // After the last there may be two rounds left.
+            const unsigned taken = min(waiting, 32u);
+            may_reach = lane < taken;
+            if (may_reach) mine = space.queue[(head + lane) % kQueue];
+            head += taken;
+            waiting -= taken;
+            are_tested = !are_nearly_all || waiting > 0;
+        }
+        const unsigned num_records = write_records<Source, kIsShared>(
+            space, sharers, start, are_small, may_reach, mine, record, counters, out, num_in_frustum);
+        record += num_records;
+        are_tested = are_tested || num_records < kMany;
         __syncwarp();  // before the queue and the records are written again
     }
     write_large(space, counters, out, true);
-    return written;
+    return record - tables.item.record;
 }
 
 template <class Model>

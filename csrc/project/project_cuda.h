@@ -32,7 +32,7 @@ struct ProjectOutput {
     FewTiles* few;           // of each record, as TileBinInput has it
     uint32_t* item_records;  // [items] how many of an item's gaussians became records
     ItemTiles* item_tiles;   // [items]
-    uint32_t* source;        // of each record, its gaussian's place in the model; may be null
+    uint32_t* source;        // of each record, its gaussian's place in the model; null without records.box
     TileCounts tiles;
     LargeRecord* large;
     unsigned long long large_capacity;

@@ -131,12 +131,11 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
     uint16_t* list = s.list[threadIdx.x / 32] + kBlendBatch;  // from its end to its begin
     const uint32_t own_blocks = blocks_of_sub<kPixels>(sub);
     int listed = 0;
-    for (int g = 0; g < num_groups; ++g) {
+    auto record = static_cast<uint32_t>(__cvta_generic_to_shared(&s.record[0][lane]));
+    for (int g = 0; g < num_groups; ++g, record += 32 * sizeof(float4)) {
         const bool reaches = (s.blocks[32 * g + lane] & own_blocks) != 0;
         const uint32_t reaching = __ballot_sync(kAllLanes, reaches);
-        if (reaches)
-            *(list - listed - __popc(reaching & ((1u << lane) - 1))) =
-                static_cast<uint16_t>(__cvta_generic_to_shared(&s.record[0][32 * g + lane]));
+        if (reaches) *(list - listed - __popc(reaching & ((1u << lane) - 1))) = static_cast<uint16_t>(record);
         listed += __popc(reaching);
     }
     __syncwarp();
@@ -216,12 +215,14 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
 // The block blends the batch over the sub-tiles that have one of the blocks `reached`.
 template <int kPixels, bool kWithDepth, class Stop>
 __device__ void blend_batch(uint32_t reached, int num_groups, int left, int top, Stop stop, BlendShared& s) {
-    uint32_t subs = subs_of<kPixels>(reached);
+    const uint32_t subs = subs_of<kPixels>(reached), lane = threadIdx.x % 32;
+    // Of the sub-tile whose bit is the lane's: how many come before it.
+    const uint32_t before = subs >> lane & 1 ? __popc(subs & ((1u << lane) - 1)) : ~0u;
     uint32_t taken = threadIdx.x / 32;  // the first ones are given, the others to whoever is done
-    for (uint32_t passed = 0;;) {
-        for (; passed < taken; ++passed) subs &= subs - 1;
-        if (subs == 0) break;
-        blend_sub<kPixels, kWithDepth>((__ffs(subs) - 1) / SubTile<kPixels>::kBlocks, num_groups, left, top,
+    for (;;) {
+        const uint32_t bit = __ballot_sync(kAllLanes, before == taken);
+        if (bit == 0) break;
+        blend_sub<kPixels, kWithDepth>((__ffs(bit) - 1) / SubTile<kPixels>::kBlocks, num_groups, left, top,
                                        stop, s);
         if (threadIdx.x % 32 == 0) taken = kBlendWarps + atomicAdd(&s.subs_taken, 1u);
         taken = __shfl_sync(kAllLanes, taken, 0);

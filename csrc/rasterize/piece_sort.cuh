@@ -19,7 +19,7 @@ constexpr uint32_t kMostAlike = 12;                      // entries of a bucket 
 constexpr uint32_t kMostCrowded = kBlendThreads / 4;     // of an entry a thread, in crowded buckets
 constexpr int kFewEntries = 64;                          // sorted without buckets
 constexpr int kBlendBatch = 192;                         // records blended at once
-// Each takes some bits of depth or record, at least 4, after the first one, whose range is a guess.
+// Each takes some bits of depth or order, at least 4, after the first one, whose range is a guess.
 constexpr int kMostSpreadLevels = 1 + 26 / 4 + 28 / 4 + 2;
 constexpr uint32_t kNoBucket = ~0u;
 
@@ -116,7 +116,7 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
     const uint32_t alive_blocks = s.alive_blocks;
     const bool bounded = beyond != kNoBucket;
     const uint32_t beyond_begin = buckets.begin_of(beyond);
-    const bool by_record = buckets.by_record;
+    const bool by_order = buckets.by_order;
     uint32_t live[kEntriesAtOnce], total = 0, lowest = ~0u, highest = 0;
 #pragma unroll
     for (int k = 0; k < kEntriesAtOnce; ++k) {
@@ -124,7 +124,7 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
         bool inside = i < end;
         const uint32_t depth = depth_of_key(entry[k].key);
         if (bounded) {
-            const bool is_beyond = inside && (by_record ? record_of(entry[k]) : depth) >= beyond_begin;
+            const bool is_beyond = inside && (by_order ? key_order(entry[k]) : depth) >= beyond_begin;
             const uint32_t outside = __ballot_sync(kAllLanes, is_beyond);
             if (outside != 0 && lane == __ffs(outside) - 1) atomicMin(&window.end, i);
             inside = inside && !is_beyond;
@@ -155,14 +155,44 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
     return {min(end, window.end), held + window.taken};
 }
 
-// Whether the first entry is blended before the second: where the depths of the keys are equal, the records'
-// own decide.
+// Whether the first entry is blended before the second: where their depths are alike and not exact, the
+// records' own decide.
 __device__ inline bool precedes(EntryKey first, EntryKey second, const RecordPlanes& records) {
-    if ((first ^ second) >> kDepthShift != 0) return first < second;
-    const uint32_t a = record_of(TileEntry{first}), b = record_of(TileEntry{second});
+    const TileEntry one{first}, other{second};
+    if (records.depth_of(one) != records.depth_of(other) || records.is_exact(other)) return first < second;
+    const uint32_t a = records.record_of(one), b = records.record_of(other);
     if (a == b) return false;
     const float depth_a = rest_of(records, a)->y, depth_b = rest_of(records, b)->y;
     return depth_a != depth_b ? depth_a < depth_b : a < b;
+}
+
+// How many of the entries at places [first, last) of by_bucket come before the one at place p.
+__device__ inline uint32_t count_before(uint32_t p, uint32_t first, uint32_t last,
+                                        const RecordPlanes& records, const BlendShared& s) {
+    const auto entry_at = [&](uint32_t j) { return TileEntry{s.key[s.by_bucket[j]]}; };
+    const TileEntry own = entry_at(p);
+    uint32_t before = 0;
+    if (records.is_exact(own)) {
+        for (uint32_t j = first; j < last; ++j) before += entry_at(j).key < own.key;
+        return before;
+    }
+    const uint32_t depth = records.depth_of(own);
+    uint32_t num_alike = 0, last_alike = 0;  // others
+    for (uint32_t j = first; j < last; ++j) {
+        const uint32_t other = records.depth_of(entry_at(j));
+        before += other < depth;
+        if (other == depth && j != p) {
+            ++num_alike;
+            last_alike = j;
+        }
+    }
+    // The lanes that have to look records up do it together; most of them have one other.
+    for (uint32_t j = last_alike; num_alike > 0; --j) {
+        if (records.depth_of(entry_at(j)) != depth || j == p) continue;
+        before += precedes(entry_at(j).key, own.key, records);
+        --num_alike;
+    }
+    return before;
 }
 
 // Sorts the piece by buckets. Their counters are 0, then say where each begins, and in the end where the next
@@ -180,13 +210,9 @@ __device__ void sort_buckets(const SomeBuckets& buckets, uint32_t* bucket, const
         s.by_bucket[atomicAdd(&bucket[buckets.of(s.key[i])], 1u)] = static_cast<uint16_t>(i);
     __syncthreads();
     for (uint32_t p = threadIdx.x; p < count; p += kBlendThreads) {
-        const uint32_t i = s.by_bucket[p];
-        const EntryKey key = s.key[i];
-        const uint32_t own = buckets.of(key), last = bucket[own];
+        const uint32_t i = s.by_bucket[p], own = buckets.of(s.key[i]);
         const uint32_t first = own > 0 ? bucket[own - 1] : 0;
-        uint32_t rank = first;
-        for (uint32_t j = first; j < last; ++j) rank += precedes(s.key[s.by_bucket[j]], key, records);
-        s.sorted[rank] = static_cast<uint16_t>(i);
+        s.sorted[first + count_before(p, first, bucket[own], records, s)] = static_cast<uint16_t>(i);
     }
     __syncthreads();
 }

@@ -43,10 +43,10 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
                 const TileEntry entry{s.key[s.sorted[first + i]]};
                 blocks = blocks_of(entry) & s.alive_blocks;
                 if (blocks != 0) {
-                    const float4* from = ellipse_of(records, record_of(entry));
+                    const float4* from = ellipse_of(records, records.record_of(entry));
                     for (int k = 0; k < kEllipseVectors; ++k) copy_async(&s.record[k][i], from + k);
                     copy_async(reinterpret_cast<float2*>(&s.record[kEllipseVectors][i]),
-                               rest_of(records, record_of(entry)));
+                               rest_of(records, records.record_of(entry)));
                 }
             }
             s.blocks[i] = blocks;
@@ -135,7 +135,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
         sort_piece(records, held, s);
         if (order != nullptr)
             for (uint32_t i = threadIdx.x; i < held; i += kBlendThreads)
-                order[blended + i] = record_of(TileEntry{s.key[s.sorted[i]]});
+                order[blended + i] = records.record_of(TileEntry{s.key[s.sorted[i]]});
         blended += held;
         blend_piece<kWithDepth>(records, held, left, top, stop, s);
     }

@@ -166,7 +166,7 @@ __device__ bool spread_into_windows(const TileEntry* from, uint32_t count, TileE
                                     SpreadSpace& space) {
     SpreadShared<kLog2Spread>& s = space.even;
     const Buckets buckets = find_buckets<kSpreadThreads>(from, 0, count, false, true, s);
-    if (buckets.by_record) {
+    if (buckets.by_order) {
         __syncthreads();  // before the range is found again
         return false;
     }

@@ -12,18 +12,17 @@ using EntryKey = unsigned long long;  // of a TileEntry
 
 constexpr int kEntriesAtOnce = 4;  // that a thread has in flight
 
-constexpr int kDepthShift = kEntryRecordBits + kEntryBoxBits;
-__device__ inline uint32_t depth_of_key(EntryKey key) { return static_cast<uint32_t>(key >> kDepthShift); }
+__device__ inline uint32_t depth_of_key(EntryKey key) { return key_depth(TileEntry{key}); }
 
 // Buckets of entries, of equal width in the bits of their depths, which are logarithmic over octaves and
-// linear within one; or, where all depths are equal, of equal width in the record.
+// linear within one; or, where all depths are equal, of equal width in what orders those.
 struct Buckets {
     uint32_t lowest, last;  // `last` is the number of the last bucket
     int shift;
-    bool by_record;
+    bool by_order;
 
     __device__ uint32_t part_of(EntryKey key) const {
-        return by_record ? record_of(TileEntry{key}) : depth_of_key(key);
+        return by_order ? key_order(TileEntry{key}) : depth_of_key(key);
     }
     // Keys outside the range that the buckets were made for belong to the first or the last.
     __device__ uint32_t of(EntryKey key) const {
@@ -35,9 +34,9 @@ struct Buckets {
     }
 };
 
-__device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int log2_buckets, bool by_record) {
+__device__ inline Buckets buckets_over(uint32_t lowest, uint32_t highest, int log2_buckets, bool by_order) {
     const int bits = 32 - __clz(static_cast<int>(highest - lowest));
-    return {lowest, (1u << log2_buckets) - 1, max(bits - log2_buckets, 0), by_record};
+    return {lowest, (1u << log2_buckets) - 1, max(bits - log2_buckets, 0), by_order};
 }
 
 // Buckets for entries most of which lie in few buckets of equal width: by the place that an entry would have
@@ -117,9 +116,9 @@ template <int kBlock, int kLog2Buckets>
 __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32_t last, bool roughly,
                                 bool finely, SpreadShared<kLog2Buckets>& s) {
     if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
-    uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // of depths and records
+    uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // of depths and orders
     const auto widen = [&](TileEntry e) {
-        const uint32_t part[2] = {depth_of_key(e.key), record_of(e)};
+        const uint32_t part[2] = {depth_of_key(e.key), key_order(e)};
         for (int i = 0; i < 2; ++i) {
             low[i] = min(low[i], part[i]);
             high[i] = max(high[i], part[i]);
@@ -145,9 +144,9 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
     // Some 64 entries a bucket; the fewer, the more of what is written together stays together in the cache.
     const int log2_buckets =
         finely ? kLog2Buckets : min(max(31 - __clz(static_cast<int>(last - first)) - 6, 4), kLog2Buckets);
-    const bool by_record = !roughly && s.range[0] == s.range[1];
-    const uint32_t* range = s.range + (by_record ? 2 : 0);
-    return buckets_over(range[0], range[1], log2_buckets, by_record);
+    const bool by_order = !roughly && s.range[0] == s.range[1];
+    const uint32_t* range = s.range + (by_order ? 2 : 0);
+    return buckets_over(range[0], range[1], log2_buckets, by_order);
 }
 
 // Counts entries [first, last) into buckets, and turns the counts into the place of each bucket's first.

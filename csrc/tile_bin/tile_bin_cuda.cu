@@ -219,20 +219,21 @@ struct WaitingPlaces {
     FewTiles few[kMost];
     uint32_t record[kMost];  // and the tile in the highest bits
 };
-static_assert(kFewTiles <= 1u << (32 - kEntryRecordBits), "a tile fits above a record");
+static_assert(kFewTiles <= 1u << (32 - kMostRecordBits), "a tile fits above a record");
 
 // For a whole warp.
 __device__ void scatter_few(const Scatter& to, const ItemTiles& item, const FewPlace (&places)[kAtOnce]) {
     EntryBox box[kAtOnce];
-    int column[kAtOnce], row[kAtOnce];
-    uint32_t tile[kAtOnce];
+    uint32_t column[kAtOnce], row[kAtOnce], tile[kAtOnce];
 #pragma unroll
     for (unsigned j = 0; j < kAtOnce; ++j) {
-        box[j] = box_of(places[j].few);
+        const FewTiles few = places[j].few;
+        box[j] = box_of(few);
         const TileBox tiles = tile_box(box[j]);
-        column[j] = tiles.column(places[j].tile);
-        row[j] = tiles.row(places[j].tile);
-        tile[j] = places[j].few == kManyTiles ? kNoTile : item.first_tile + row[j] * item.columns + column[j];
+        column[j] = tiles.columns_to(places[j].tile);
+        row[j] = tiles.rows_to(places[j].tile);
+        tile[j] =
+            few == kManyTiles ? kNoTile : item.first_tile + tile_of(few) + row[j] * item.columns + column[j];
     }
     static_assert(kAtOnce == 2, "`found` has two");
     const Places found[kAtOnce] = {{to, tile[0]}, {to, tile[1]}};
@@ -258,7 +259,7 @@ __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const It
             const bool is_there = at < num_waiting;
             const uint32_t record = is_there ? waiting.record[at] : 0;
             places[j] = {is_there ? waiting.few[at] : kManyTiles, record & uint32_t(kMostFrameRecords - 1),
-                         record >> kEntryRecordBits};
+                         record >> kMostRecordBits};
         }
         scatter_few(to, item, places);
     };
@@ -279,7 +280,7 @@ __device__ void scatter_item(const TileBinInput& in, const Scatter& to, const It
             const unsigned count = places[j].few == kManyTiles ? 0 : tile_box(box_of(places[j].few)).count;
             let_wait(count, num_waiting, [&](unsigned k, unsigned at) {
                 waiting.few[at] = places[j].few;
-                waiting.record[at] = places[j].record | k << kEntryRecordBits;
+                waiting.record[at] = places[j].record | k << kMostRecordBits;
             });
         }
         __syncwarp();
@@ -301,7 +302,7 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
         in, batch, part,
         [&](uint32_t number, const Record<float>& r) {
             record_of_row = number;
-            depth_of_row = entry_depth(r.depth, image.camera.near_depth);
+            depth_of_row = entry_depth(r.depth, image.camera.near_depth, in.records.depth_bits);
             const EntryBox box = entry_box(r);
             blocks_of_row = {static_cast<uint16_t>(box.x0), static_cast<uint16_t>(box.x1),
                              static_cast<uint16_t>(box.y0), static_cast<uint16_t>(box.y1)};
