@@ -67,7 +67,7 @@ V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const Entry
     const uint32_t y1 = min_of(box.y1 - top, kTileBlockRows - 1);
     const unsigned long long depth_and_record =
         static_cast<unsigned long long>(depth) << kLeastRecordBits | record;
-    return {depth_and_record << kEntryBoxBits | (x0 | x1 << 3 | y0 << 6 | y1 << 8)};
+    return {depth_and_record << kEntryBoxBits | ((3 - (y1 - y0)) << 8 | (7 - (x1 - x0)) << 5 | y0 << 3 | x0)};
 }
 // The first 26 bits of depth, and the 28 that follow.
 V3DG_HD inline uint32_t key_depth(TileEntry e) {
@@ -78,10 +78,10 @@ V3DG_HD inline uint32_t key_order(TileEntry e) {
 }
 // A bit for each 4 x 4 pixels of the tile, row by row, that the record's box meets.
 V3DG_HD inline uint32_t blocks_of(TileEntry e) {
-    const uint32_t box = static_cast<uint32_t>(e.key);
-    const uint32_t columns = (2u << (box >> 3 & 7)) - (1u << (box & 7));
-    const uint32_t below = box >> 6 & 3, last = box >> 8 & 3;
-    return columns * (0x01010101u >> (8 * (3 - last)) & 0x01010101u << (8 * below));
+    // The first block, and how many columns and rows fewer than all there are.
+    static_assert(kTileBlockColumns == 8 && kTileBlockRows == 4, "a row of blocks is a byte");
+    const uint32_t box = static_cast<uint32_t>(e.key), fewer = box >> 5;
+    return (0xffu >> (fewer & 7)) * (0x01010101u >> (fewer & 24)) << (box & 31);
 }
 
 // A tile, or one of its parts, in the order in which they are blended; the parts of a tile stand side by

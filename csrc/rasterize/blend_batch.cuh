@@ -28,9 +28,9 @@ struct BlendedPixels {
 
 // Where a lane's first pixel is in TilePixels.
 template <int kPixels>
-__device__ int place_of(int sub, int lane) {
+__device__ unsigned place_of(unsigned sub, unsigned lane) {
     if (kPixels == 1) return 32 * sub + (lane ^ (16 * (sub % 2)));
-    const int column = lane / 4 % 2;
+    const unsigned column = lane / 4 % 2;
     return 64 * sub + 32 * column + ((8 * (lane / 8) + 2 * (lane % 4)) ^ (16 * column));
 }
 __device__ inline void load(const float* from, float (&to)[1]) { to[0] = *from; }
@@ -65,6 +65,13 @@ __device__ inline float2 rest_at(uint32_t place) {
     return v;
 }
 
+// Writes an element of BlendShared::list to a place in shared memory.
+__device__ inline void list_at(uint32_t place, uint32_t record) {
+#ifdef __CUDA_ARCH__
+    asm volatile("st.shared.u16 [%0], %1;" ::"r"(place), "h"(static_cast<uint16_t>(record)));
+#endif
+}
+
 // An element of BlendShared::list, whose writing ends with a clobber. This load fills 32 bits; after a plain
 // one nvcc extends the number again.
 __device__ inline uint32_t listed_at(uint32_t place) {
@@ -77,7 +84,7 @@ __device__ inline uint32_t listed_at(uint32_t place) {
 
 // Of a sub-tile's among the tile's blocks, a bit each.
 template <int kPixels>
-__device__ uint32_t blocks_of_sub(int sub) {
+__device__ uint32_t blocks_of_sub(unsigned sub) {
     return ((1u << SubTile<kPixels>::kBlocks) - 1) << SubTile<kPixels>::kBlocks * sub;
 }
 
@@ -90,7 +97,7 @@ __device__ uint32_t subs_of(uint32_t blocks) {
 
 // Tells the block which blocks of a sub-tile have died.
 template <int kPixels>
-__device__ void publish_alive(bool is_alive, int sub, BlendShared& s) {
+__device__ void publish_alive(bool is_alive, unsigned sub, BlendShared& s) {
     constexpr int kAcross = kEntryBlockSize / kPixels;  // lanes of a block in a row
     const uint32_t alive = __ballot_sync(kAllLanes, is_alive);
     uint32_t dead = 0;
@@ -121,31 +128,35 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
     return bits;
 }
 
-// A warp blends the batch, of `num_groups` times 32 records, over a sub-tile.
+// A warp blends the batch over a sub-tile.
 template <int kPixels, bool kWithDepth, class Stop>
-__device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop, BlendShared& s) {
-    int lane = threadIdx.x % 32;
+__device__ void blend_sub(unsigned sub, int left, int top, Stop stop, BlendShared& s) {
+    unsigned lane = threadIdx.x % 32;
     // Hidden from the compiler, which would keep what follows from the lane in registers from batch to batch
     // and spill others.
     asm volatile("" : "+r"(lane));
-    uint16_t* list = s.list[threadIdx.x / 32] + kBlendBatch;  // from its end to its begin
+    // The list stands from its end to its begin.
+    constexpr uint32_t kEach = sizeof(s.list[0][0]);
+    const auto list = static_cast<uint32_t>(__cvta_generic_to_shared(s.list[threadIdx.x / 32] + kBlendBatch));
+    const auto record = static_cast<uint32_t>(__cvta_generic_to_shared(&s.record[0][lane]));
     const uint32_t own_blocks = blocks_of_sub<kPixels>(sub);
     int listed = 0;
-    auto record = static_cast<uint32_t>(__cvta_generic_to_shared(&s.record[0][lane]));
-    for (int g = 0; g < num_groups; ++g, record += 32 * sizeof(float4)) {
+#pragma unroll
+    for (int g = 0; g < kBlendBatch / 32; ++g) {
         const bool reaches = (s.blocks[32 * g + lane] & own_blocks) != 0;
         const uint32_t reaching = __ballot_sync(kAllLanes, reaches);
-        if (reaches) *(list - listed - __popc(reaching & ((1u << lane) - 1))) = static_cast<uint16_t>(record);
+        const int place = listed + __popc(reaching & ((1u << lane) - 1));
+        if (reaches) list_at(list - kEach * place, record + g * 32 * sizeof(float4));
         listed += __popc(reaching);
     }
     __syncwarp();
     asm volatile("" ::: "memory");  // for listed_at()
 
     using Sub = SubTile<kPixels>;
-    const float corner_x = left + sub % Sub::kColumns * Sub::kWidth + 0.5f;
-    const float corner_y = top + sub / Sub::kColumns * Sub::kHeight + 0.5f;
+    const float corner_x = static_cast<float>(left + sub % Sub::kColumns * Sub::kWidth) + 0.5f;
+    const float corner_y = static_cast<float>(top + sub / Sub::kColumns * Sub::kHeight) + 0.5f;
     TilePixels& pixels = s.pixels;
-    const int place = place_of<kPixels>(sub, lane);
+    const unsigned place = place_of<kPixels>(sub, lane);
     BlendedPixels<kPixels> p;
     for (int k = 0; k < kPixels; ++k) p.x[k] = corner_x + static_cast<float>(kPixels * (lane % 8) + k);
     p.y = corner_y + static_cast<float>(lane / 8);
@@ -162,11 +173,10 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
             p.x[k] = kNowhere;
     }
     // The last lane takes the first record of a group, which becomes the highest bit of a lane's pixels.
-    constexpr uint32_t kEach = sizeof(*list);
-    uint32_t last_of_group = static_cast<uint32_t>(__cvta_generic_to_shared(list - 31));
+    uint32_t last_of_group = list - 31 * kEach;
     for (; listed > 0; listed -= 32, last_of_group -= 32 * kEach) {
         uint32_t bits = 0;
-        if (31 - lane < listed) {
+        if (static_cast<int>(31 - lane) < listed) {
             const uint32_t own = listed_at(last_of_group + kEach * lane);
             const float4 a = vector_at<0>(own), b = vector_at<1>(own);
             bits = reached_cells<kPixels>(a.x - corner_x, a.y - corner_y, a.z, a.w, b.x, b.y);
@@ -214,7 +224,7 @@ __device__ void blend_sub(int sub, int num_groups, int left, int top, Stop stop,
 
 // The block blends the batch over the sub-tiles that have one of the blocks `reached`.
 template <int kPixels, bool kWithDepth, class Stop>
-__device__ void blend_batch(uint32_t reached, int num_groups, int left, int top, Stop stop, BlendShared& s) {
+__device__ void blend_batch(uint32_t reached, int left, int top, Stop stop, BlendShared& s) {
     const uint32_t subs = subs_of<kPixels>(reached), lane = threadIdx.x % 32;
     // Of the sub-tile whose bit is the lane's: how many come before it.
     const uint32_t before = subs >> lane & 1 ? __popc(subs & ((1u << lane) - 1)) : ~0u;
@@ -222,8 +232,8 @@ __device__ void blend_batch(uint32_t reached, int num_groups, int left, int top,
     for (;;) {
         const uint32_t bit = __ballot_sync(kAllLanes, before == taken);
         if (bit == 0) break;
-        blend_sub<kPixels, kWithDepth>((__ffs(bit) - 1) / SubTile<kPixels>::kBlocks, num_groups, left, top,
-                                       stop, s);
+        const unsigned block = __ffs(bit) - 1;
+        blend_sub<kPixels, kWithDepth>(block / SubTile<kPixels>::kBlocks, left, top, stop, s);
         if (threadIdx.x % 32 == 0) taken = kBlendWarps + atomicAdd(&s.subs_taken, 1u);
         taken = __shfl_sync(kAllLanes, taken, 0);
     }

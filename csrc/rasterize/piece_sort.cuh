@@ -106,7 +106,7 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
                                     uint32_t window_number, BlendShared& s) {
     const int lane = threadIdx.x % 32;
     ListWindow& window = s.window[window_number % 3];
-    TileEntry entry[kEntriesAtOnce];
+    TileEntry entry[kEntriesAtOnce]{};
 #pragma unroll
     for (int k = 0; k < kEntriesAtOnce; ++k) {
         const uint32_t i = first + k * kBlendThreads + threadIdx.x;
@@ -129,7 +129,7 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
             if (outside != 0 && lane == __ffs(outside) - 1) atomicMin(&window.end, i);
             inside = inside && !is_beyond;
         }
-        const bool is_live = inside && (blocks_of(entry[k]) & alive_blocks) != 0;
+        const bool is_live = inside & ((blocks_of(entry[k]) & alive_blocks) != 0);
         lowest = min(lowest, is_live ? depth : ~0u);
         highest = max(highest, is_live ? depth : 0u);
         live[k] = __ballot_sync(kAllLanes, is_live);

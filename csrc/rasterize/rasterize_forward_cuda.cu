@@ -62,14 +62,13 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
         __syncthreads();
         if (threadIdx.x == 0) s.reached[turn ^ 1] = s.num_covered[turn ^ 1] = 0;
         const int num_records = min(count - first, static_cast<uint32_t>(kBlendBatch));
-        const int num_groups = (num_records + 31) / 32;
         const uint32_t reached = s.reached[turn];
         // Fewer sub-tiles than warps would leave some without work.
         if (s.num_covered[turn] >= kBlocksForPairs * num_records &&
             __popc(subs_of<2>(reached)) >= kBlendWarps)
-            blend_batch<2, kWithDepth>(reached, num_groups, left, top, stop, s);
+            blend_batch<2, kWithDepth>(reached, left, top, stop, s);
         else
-            blend_batch<1, kWithDepth>(reached, num_groups, left, top, stop, s);
+            blend_batch<1, kWithDepth>(reached, left, top, stop, s);
         __syncthreads();
     }
     if (threadIdx.x < 2) s.reached[threadIdx.x] = s.num_covered[threadIdx.x] = 0;

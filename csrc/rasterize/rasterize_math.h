@@ -203,7 +203,7 @@ V3DG_HD inline uint32_t reached_cells(float u, float v, float l11, float l12, fl
         // Where the row is missed it is not a number, which saturates to 0.
         const float half = rough_sqrt(reach - t * t) * wider;
         const float first = saturated_fma(slope, y, first_u - half);
-        const float end = max_of(saturated_fma(slope, y, end_u + half), first);
+        const float end = fmaxf(saturated_fma(slope, y, end_u + half), first);
         // In the last row an end of 1 shifts the bit out, which leaves the 0 that the subtraction needs.
         const uint32_t row_begin = 1u << (8 * row);
         cells += shifted_by_eighths(row_begin, end) - shifted_by_eighths(row_begin, first);
