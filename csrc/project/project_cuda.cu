@@ -97,29 +97,36 @@ __device__ void drop_missed_rows(const Ellipse<float>& e, const Projection<float
     box.y1 -= misses_last;
 }
 
+// What an item's gaussians are like.
+struct ItemTraits {
+    bool are_small;   // as the first of them tell
+    bool have_shade;  // beyond the colour that project() finds
+};
+
 // The record of gaussian g at p in view space, but for its pixels, which are `box`. Returns whether it
 // reaches a pixel centre; where gaussians are not small those few that miss all centres in their box count,
-// too. What does not is known at the end only, for it is rare.
+// too. Goes through all of it for those that do not, and for lanes without one, because others of the warp
+// do.
 template <class Source>
 __device__ bool project_one(const ItemTables<typename Source::Model>& in, const ModelView<float>& view,
-                            typename Source::Place place, uint32_t g, const float p[3], bool are_small,
-                            Record<float>& r, PixelBox<int>& box, unsigned& num_in_frustum) {
+                            typename Source::Place place, uint32_t g, const float p[3], bool is_one,
+                            const ItemTraits& traits, Record<float>& r, PixelBox<int>& box,
+                            unsigned& num_in_frustum) {
     Projection<float> s;
     for (int i = 0; i < 3; ++i) s.p[i] = p[i];
     const Ellipse<float> e = Source::project(in, view, place, g, s, r.color);
     float half_x, half_y;
     const Pinhole<float>& cam = in.image.camera;
     // The sphere has told that it is not too faint.
-    bool is_in_frustum = extent_of(1.0f, e, s, half_x, half_y);
+    bool is_in_frustum = is_one & extent_of(1.0f, e, s, half_x, half_y);
     is_in_frustum &= meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height);
     num_in_frustum += is_in_frustum;
     box = pixel_box(e, half_x, half_y, cam, in.image.width, in.image.height);
-    if (are_small) drop_missed_rows(e, s, cam.width, box);
-    if (!(is_in_frustum & box.holds_pixels())) return false;
-
+    if (traits.are_small) drop_missed_rows(e, s, cam.width, box);
     set_ellipse(e, r);
-    Source::shade(in.model, view, place, g, r.color);
-    return true;
+    const bool reaches_pixel = is_in_frustum & box.holds_pixels();
+    if (reaches_pixel && traits.have_shade) Source::shade(in.model, view, place, g, r.color);
+    return reaches_pixel;
 }
 
 // A table is copied by a warp, a word a lane.
@@ -200,20 +207,19 @@ __device__ void write_large(WarpSpace<Model>& space, FrameCounters& counters, co
 // there are. `sharers` are the placements of a shared item.
 template <class Source, bool kIsShared>
 __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, const Placement* sharers,
-                                  const typename Source::Place& start, bool are_small, bool has_one,
+                                  const typename Source::Place& start, const ItemTraits& traits, bool has_one,
                                   const Queued& mine, uint32_t first, FrameCounters& counters,
                                   const ProjectOutput& out, unsigned& num_in_frustum) {
     const auto& in = space.tables;
     const unsigned lane = threadIdx.x % 32;
+    // A lane without one takes what is there.
+    const uint32_t place = has_one ? mine.place : kIsShared ? __ffs(in.item.sharers) - 1 : 0;
+    const uint32_t g = in.item.first + (kIsShared ? place / 32 : place);
+    const ModelView<float>& view = kIsShared ? sharers[place % 32].view : in.placement.view;
     Record<float> r;
-    PixelBox<int> box{};
-    bool reaches_pixel = false;
-    uint32_t g = 0;
-    if (has_one) {
-        g = in.item.first + (kIsShared ? mine.place / 32 : mine.place);
-        const ModelView<float>& view = kIsShared ? sharers[mine.place % 32].view : in.placement.view;
-        reaches_pixel = project_one<Source>(in, view, start, g, mine.p, are_small, r, box, num_in_frustum);
-    }
+    PixelBox<int> box;
+    const bool reaches_pixel =
+        project_one<Source>(in, view, start, g, mine.p, has_one, traits, r, box, num_in_frustum);
     const unsigned kept = __ballot_sync(kAllLanes, reaches_pixel);
     if (kept == 0) return 0;
     const unsigned rank = __popc(kept & ((1u << lane) - 1));
@@ -311,7 +317,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
     const float reach_scale = sees ? reach_scale_of() : 0;
     unsigned head = 0, waiting = 0;
     uint32_t record = tables.item.record;  // the next one
-    bool are_small = false;                // as the first of them tell
+    ItemTraits traits{false, Source::has_shade(tables.model)};
     bool are_tested = true;
     const typename Source::Place start = Source::start(tables);
     typename Source::Place here = start;
@@ -339,7 +345,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             }
         }
         if (are_tested) {
-            if (first == 0) are_small = __popc(__ballot_sync(kAllLanes, is_small)) >= kManySmall;
+            if (first == 0) traits.are_small = __popc(__ballot_sync(kAllLanes, is_small)) >= kManySmall;
             const unsigned come = __ballot_sync(kAllLanes, may_reach);
             if (may_reach) space.queue[(head + waiting + __popc(come & ((1u << lane) - 1))) % kQueue] = mine;
             waiting += __popc(come);
@@ -355,7 +361,7 @@ __device__ unsigned project_item(WarpSpace<typename Source::Model>& space, const
             are_tested = !are_nearly_all || waiting > 0;
         }
         const unsigned num_records = write_records<Source, kIsShared>(
-            space, sharers, start, are_small, may_reach, mine, record, counters, out, num_in_frustum);
+            space, sharers, start, traits, may_reach, mine, record, counters, out, num_in_frustum);
         record += num_records;
         are_tested = are_tested || num_records < kMany;
         __syncwarp();  // before the queue and the records are written again

@@ -48,7 +48,7 @@ __device__ void color_of_row(const float* row, const float mean[3], const ModelV
 
 // A source tells what a gaussian is, in steps, because most reach no pixel centre: a lane fetch()es what the
 // sphere around it follows from, early; sphere() is its mean and its reach; project() its ellipse, where s.p
-// is set; shade() its colour.
+// is set, and its colour; shade() another colour, of models that has_shade() tells.
 
 // Gaussians as rows.
 template <class RowModel>
@@ -66,6 +66,7 @@ struct OfRows {
 // As users hold them.
 struct RowSource : OfRows<GaussianRows<const float>> {
     static __device__ bool has(const Model&) { return true; }
+    static __device__ bool has_shade(const Model& m) { return m.sh_degree > 0; }
     static __device__ float4 fetch(const Model& m, uint32_t g) {
         Gaussian3d<float> gaussian{{__ldg(m.means + 3 * size_t(g)), __ldg(m.means + 3 * size_t(g) + 1),
                                     __ldg(m.means + 3 * size_t(g) + 2)},
@@ -96,7 +97,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
     }
     static __device__ void shade(const Model& m, const ModelView<float>& view, const Place&, uint32_t g,
                                  float color[3]) {
-        if (m.sh_degree > 0) shade_row(m.sh + size_t(g) * m.num_sh(), m.sh_degree, fetch(m, g), view, color);
+        shade_row(m.sh + size_t(g) * m.num_sh(), m.sh_degree, fetch(m, g), view, color);
     }
     static __device__ void shade_row(const float* row, int sh_degree, const float4& sphere,
                                      const ModelView<float>& view, float color[3]) {
@@ -111,6 +112,7 @@ struct RowSource : OfRows<GaussianRows<const float>> {
 
 struct PackedSource : OfRows<PackedPlanes> {
     static __device__ bool has(const Model& m) { return m.plane[0] != nullptr; }
+    static __device__ bool has_shade(const Model& m) { return m.palette.sh != nullptr || m.sh_degree > 0; }
     static __device__ float4 fetch(const Model& m, uint32_t g) { return load4(m.plane[0], g); }
     static __device__ Ellipse<float> project(const ItemTables<Model>& in, const ModelView<float>& view,
                                              Place&, uint32_t g, Projection<float>& s, float color[3]) {
@@ -127,7 +129,7 @@ struct PackedSource : OfRows<PackedPlanes> {
         const float anywhere[3] = {0, 0, 0};
         if (m.palette.sh != nullptr)
             color_of_row<0>(m.palette.sh + 3 * size_t(m.palette.cluster_of(g)), anywhere, view, color);
-        else if (m.sh_degree > 0)
+        else
             RowSource::shade_row(m.sh + size_t(g) * m.sh_stride, m.sh_degree, fetch(m, g), view, color);
     }
 };
@@ -146,6 +148,9 @@ struct CodeSource {
     };
 
     static __device__ bool has(const Model& m) { return m.codes.records != nullptr; }
+    static __device__ bool has_shade(const Model& m) {
+        return m.palette.sh != nullptr || m.codes.sh_degree > 0;
+    }
     static __device__ OpacityEntry* opacity_table() {
         __shared__ OpacityEntry entries[kMostOpacity + 1];
         return entries;
@@ -220,7 +225,6 @@ struct CodeSource {
             return;
         }
         switch (m.codes.sh_degree) {
-            case 0: break;
             case 1: shade_codes<1>(m, view, place, g, color); break;
             case 2: shade_codes<2>(m, view, place, g, color); break;
             default: shade_codes<3>(m, view, place, g, color);
