@@ -266,12 +266,12 @@ class _Frame:
         check_camera(camera)
         if isinstance(camera, StereoCamera) and (cut is not None or isinstance(subject, Gaussians)):
             return tuple(self.draw(subject, eye, shade, cut, **options) for eye in camera.eyes)
+        is_plain = {float, int, type(None)} >= {type(cut), *map(type, options.values())}
         if isinstance(subject, Gaussians):
-            _check_asset(self.color_by, cut=cut, **options)
+            (_check_known_asset if is_plain else _check_asset)(self.color_by, cut=cut, **options)
             assert isinstance(camera, Camera)
             drawing = self._asset.draw(camera.core, shade)
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
-        is_plain = {float, int, type(None)} >= {*map(type, options.values())}
         rule = (_known_rule if is_plain else rule_of)(**options)
         with residency.turn(self.device):
             self._resident = resident = residency.scene(subject, self.device, self._resident)
@@ -384,6 +384,9 @@ def _check_asset(color_by: ColorBy, **options: Any) -> None:
     expected = f"'appearance' for an asset, which has no levels, got {color_by!r}"
     check("color_by", color_by == "appearance", expected)
     rule_of(options.get("tolerance"), None, 0, fade=options.get("fade"))
+
+
+_check_known_asset = lru_cache(64, typed=True)(_check_asset)  # as _known_rule
 
 
 def _check_cut(cut: Selection, subject: Scene | Bundle, resident: ResidentScene, **options: Any) -> None:
