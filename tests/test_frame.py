@@ -114,7 +114,7 @@ def test_frames_with_room_for_many_records_have_the_same_bytes(millions):
     rng = np.random.default_rng(millions)
     bundle = scenes_lod.lod_bundle(rng, scenes_lod.blob(rng, 20_000, size=0.5), 512)
     scene = Scene()
-    count = 50 * millions  # behind the camera that looks at the others
+    count = 51 * millions  # behind the camera that looks at the others
     around = np.array([0.0, -9.0, 0.0])
     scene.add(bundle, positions=around + rng.uniform(-0.7, 0.7, (count, 3)), scales=np.full(count, 1e-4))
     scene.add(bundle, positions=rng.integers(-2, 3, (40, 3)) * 2e-7)
