@@ -25,22 +25,24 @@ constexpr unsigned long long kMostFrameRecords = 1ull << kMostRecordBits;
 constexpr int kEntryBlockSize = 4;                    // px; the box counts in blocks
 constexpr uint32_t kLastEntryDepth = (1u << 28) - 1;  // 32 octaves behind near, and whatever is farther
 
-// Which bits of the upper half of an entry are depth, in a frame with room for so many records.
 constexpr uint32_t kExactDepths = ~0u << 4;
-inline uint32_t depth_bits_of_entries(unsigned long long most_records) {
-    uint32_t bits = kExactDepths;
-    for (auto held = 1ull << kLeastRecordBits; held < most_records; held *= 2) bits <<= 1;
-    return bits;
+
+// Which bits of the upper half of an entry are depth, in a frame with room for so many records.
+inline uint32_t depth_mask_of_entries(unsigned long long most_records) {
+    uint32_t mask = kExactDepths;
+    for (auto held = 1ull << kLeastRecordBits; held < most_records; held *= 2) mask <<= 1;
+    return mask;
 }
 
 // Depth as entries are made of it, in steps of a float's last bit, or of up to four of them where records
 // need more bits; it is at least the camera's near depth.
-V3DG_HD inline uint32_t entry_depth(float depth, float near_depth, uint32_t bits_of_entries) {
+V3DG_HD inline uint32_t entry_depth(float depth, float near_depth, uint32_t depth_mask) {
     uint32_t depth_bits, near_bits;  // of positive floats, so they order as they do
     std::memcpy(&depth_bits, &depth, sizeof depth_bits);
     std::memcpy(&near_bits, &near_depth, sizeof near_bits);
-    return min_of(depth_bits - near_bits, kLastEntryDepth) & bits_of_entries >> 4;
+    return min_of(depth_bits - near_bits, kLastEntryDepth) & depth_mask >> 4;
 }
+
 constexpr uint32_t kTileBlockColumns = kFrameTileWidth / kEntryBlockSize;
 constexpr uint32_t kTileBlockRows = kFrameTileHeight / kEntryBlockSize;
 
@@ -69,6 +71,7 @@ V3DG_HD inline TileEntry tile_entry(uint32_t depth, uint32_t record, const Entry
         static_cast<unsigned long long>(depth) << kLeastRecordBits | record;
     return {depth_and_record << kEntryBoxBits | ((3 - (y1 - y0)) << 8 | (7 - (x1 - x0)) << 5 | y0 << 3 | x0)};
 }
+
 // The first 26 bits of depth, and the 28 that follow.
 V3DG_HD inline uint32_t key_depth(TileEntry e) {
     return static_cast<uint32_t>(e.key >> (kEntryBoxBits + kMostRecordBits));
@@ -76,6 +79,7 @@ V3DG_HD inline uint32_t key_depth(TileEntry e) {
 V3DG_HD inline uint32_t key_order(TileEntry e) {
     return static_cast<uint32_t>(e.key >> kEntryBoxBits) & ((1u << kMostRecordBits) - 1);
 }
+
 // A bit for each 4 x 4 pixels of the tile, row by row, that the record's box meets.
 V3DG_HD inline uint32_t blocks_of(TileEntry e) {
     // The first block, and how many columns and rows fewer than all there are.
@@ -115,15 +119,15 @@ struct RecordPlanes {
     float* ellipse;       // (N, 8) u, v, l11, l12, l22, log2_opacity, and two channels
     float* rest;          // (N, 2) the third channel and the depth
     RecordBox* box;       // null unless the frame keeps a tape: few records are asked for it later
-    uint32_t depth_bits;  // of the upper half of entries
+    uint32_t depth_mask;  // of the upper half of entries
 
     V3DG_HD uint32_t record_of(TileEntry e) const {
-        return static_cast<uint32_t>(e.key >> kEntryBoxBits) & ~(depth_bits << (32 - kEntryBoxBits));
+        return static_cast<uint32_t>(e.key >> kEntryBoxBits) & ~(depth_mask << (32 - kEntryBoxBits));
     }
     // Orders as depth does, and whether it is alike only where depth is.
-    V3DG_HD uint32_t depth_of(TileEntry e) const { return static_cast<uint32_t>(e.key >> 32) & depth_bits; }
+    V3DG_HD uint32_t depth_of(TileEntry e) const { return static_cast<uint32_t>(e.key >> 32) & depth_mask; }
     V3DG_HD bool is_exact(TileEntry e) const {
-        return depth_bits == kExactDepths && depth_of(e) != kExactDepths;  // the last one is not
+        return depth_mask == kExactDepths && depth_of(e) != kExactDepths;  // the last one is not
     }
 };
 

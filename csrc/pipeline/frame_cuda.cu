@@ -231,7 +231,7 @@ std::vector<std::pair<const char*, size_t>> Frame::bytes() const {
 
 RecordPlanes Frame::records() const {
     return {records_.data(), records_.data() + kEllipseFloats * capacity_.records, boxes_.data(),
-            depth_bits_of_entries(capacity_.records)};
+            depth_mask_of_entries(capacity_.records)};
 }
 
 FrameTape Frame::tape() const {

@@ -235,7 +235,7 @@ __device__ unsigned write_records(WarpSpace<typename Source::Model>& space, cons
         space.ellipses[kEllipseVectors * rank] = {r.u, r.v, r.l11, r.l12};
         space.ellipses[kEllipseVectors * rank + 1] = {r.l22, r.log2_opacity, r.color[0], r.color[1]};
         reinterpret_cast<float2*>(out.records.rest)[first + rank] = {r.color[2], r.depth};
-        const uint32_t depth = entry_depth(r.depth, in.image.camera.near_depth, out.records.depth_bits);
+        const uint32_t depth = entry_depth(r.depth, in.image.camera.near_depth, out.records.depth_mask);
         out.few[first + rank] = is_large ? kManyTiles : few_tiles(depth, tile, blocks);
         if (out.source != nullptr) {  // a tape is kept
             out.source[first + rank] = g;

@@ -302,7 +302,7 @@ __device__ void scatter_large(const TileBinInput& in, const Scatter& to, const L
         in, batch, part,
         [&](uint32_t number, const Record<float>& r) {
             record_of_row = number;
-            depth_of_row = entry_depth(r.depth, image.camera.near_depth, in.records.depth_bits);
+            depth_of_row = entry_depth(r.depth, image.camera.near_depth, in.records.depth_mask);
             const EntryBox box = entry_box(r);
             blocks_of_row = {static_cast<uint16_t>(box.x0), static_cast<uint16_t>(box.x1),
                              static_cast<uint16_t>(box.y0), static_cast<uint16_t>(box.y1)};
