@@ -361,7 +361,7 @@ def jobs() -> tuple[Job, ...]:
         Peer(name, gsplat_rasterization(packed), lambda frame: frame[0], gsplat_training(packed))
         for name, packed in (("gsplat packed", True), ("gsplat", False))
     )
-    half = "half floats, of the picture too"
+    half = "half floats, of the picture too; " + no_clamp + "; pixels do not stop one by one"
     inference = (
         Peer("HiGS", higs("none"), higs_picture, None, keeps(), differs=half),
         Peer("HiGS, 32 bytes", higs("32b"), higs_picture, None, keeps(), (3,), half + "; SH compressed"),
