@@ -119,6 +119,22 @@ def test_streams_of_several_threads_get_what_one_gets_alone():
             assert found == 10 * [expected]
 
 
+def test_threads_may_share_a_renderer_of_an_asset(device, hasty):
+    """Pictures of many sizes, for which memory is asked for while others draw."""
+    subject = asset() if device == "cpu" else asset().torch(device)
+    cameras = [CAMERA.scaled(1 + k % 4) for k in range(8)]
+
+    def pictures(renderer):
+        images = [renderer.render(camera) for camera in cameras]
+        return [digest(image.color, image.alpha) for image in images]
+
+    expected = pictures(v3dg.Renderer(subject, device=device))
+    renderer = v3dg.Renderer(subject, device=device)
+    with ThreadPoolExecutor(8) as pool:
+        jobs = [pool.submit(pictures, renderer) for _ in range(8)]
+        assert all(job.result(SECONDS) == expected for job in jobs)
+
+
 # ---- scenes that change
 
 

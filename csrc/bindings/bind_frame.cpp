@@ -422,7 +422,9 @@ class BoundAssetFrame {
             throw py::value_error("model: expected one of rows, got one of codes");
         const Work work(held<BoundModel>(model, "model").device());
 #if V3DG_WITH_CUDA
-        if (!work.device().is_host()) frame_ = std::make_unique<cuda::ModelFrame>();
+        if (work.device().is_host()) return;
+        frame_ = std::make_unique<cuda::ModelFrame>();
+        turns_ = std::make_shared<std::mutex>();
 #endif
     }
 
@@ -431,6 +433,7 @@ class BoundAssetFrame {
         if (model.device().is_host()) return on_host(model, camera, shade, stop);
 #if V3DG_WITH_CUDA
         const Device device = model.device();
+        const Turn turn(turns_.get());
         const Work work(device);
         NewPictures pictures;
         const cuda::EyeImages images = new_images(camera.camera, shade, pictures);
@@ -438,7 +441,7 @@ class BoundAssetFrame {
         auto drawing = frame_->draw(packed.rows(), view_of_world<float>(camera.camera), 0.0f, false,
                                     images.image[0], work.stream(), &packed.packed(),
                                     images.min_transmittance, place_of(pictures, device));
-        return std::make_unique<BoundDrawing>(std::move(pictures), py::cast(this), device, nullptr,
+        return std::make_unique<BoundDrawing>(std::move(pictures), py::cast(this), device, turns_,
                                               std::move(drawing), SelectRule{});
 #else
         return nullptr;
@@ -459,6 +462,7 @@ class BoundAssetFrame {
     }
 
     py::object model_;
+    std::shared_ptr<std::mutex> turns_;  // on a device
 #if V3DG_WITH_CUDA
     std::unique_ptr<cuda::ModelFrame> frame_;  // on a device
 #endif
