@@ -266,9 +266,10 @@ class _Frame:
         check_camera(camera)
         if isinstance(camera, StereoCamera) and (cut is not None or isinstance(subject, Gaussians)):
             return tuple(self.draw(subject, eye, shade, cut, **options) for eye in camera.eyes)
-        is_plain = {float, int, type(None)} >= {type(cut), *map(type, options.values())}
+        is_plain = {float, int, type(None)} >= {*map(type, options.values())}
         if isinstance(subject, Gaussians):
-            (_check_known_asset if is_plain else _check_asset)(self.color_by, cut=cut, **options)
+            check_asset = _check_known_asset if is_plain and cut is None else _check_asset
+            check_asset(self.color_by, cut=cut, **options)
             assert isinstance(camera, Camera)
             drawing = self._asset.draw(camera.core, shade)
             return RenderedImage(drawing, lambda: _stats(drawing.finish(), 0.0))
