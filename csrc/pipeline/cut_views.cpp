@@ -41,7 +41,7 @@ class Random {
 
 // Looks at the centre from anywhere around it, one px wide.
 Camera camera_around(const CutPictures& pictures, Random& random) {
-    double outwards[3], up[3], right[3], down[3];
+    double outwards[3], up[3], right[3];
     random.direction(outwards);
     double length = 0;
     while (length < 1e-3) {
@@ -50,15 +50,7 @@ Camera camera_around(const CutPictures& pictures, Random& random) {
         length = std::sqrt(dot3(right, right));
     }
     for (double& x : right) x /= length;
-    cross3(right, outwards, down);
-    Camera camera{};
-    for (int k = 0; k < 3; ++k) {
-        camera.rotation[k] = right[k];
-        camera.rotation[3 + k] = down[k];
-        camera.rotation[6 + k] = -outwards[k];
-        camera.eye[k] = pictures.ball.center[k] + kDistance * pictures.ball.radius * outwards[k];
-    }
-    for (int row = 0; row < 3; ++row) camera.translation[row] = -dot3(camera.rotation + 3 * row, camera.eye);
+    Camera camera = camera_at(pictures.ball, kDistance, outwards, right);
     // The ball fills the picture.
     camera.fx = camera.fy = std::sqrt(kDistance * kDistance - 1) / 2;
     camera.cx = camera.cy = 0.5;
@@ -151,6 +143,20 @@ double median(std::vector<double> values) {
     std::nth_element(values.begin(), middle, values.end());
     if (values.size() % 2 > 0) return *middle;
     return (*std::max_element(values.begin(), middle) + *middle) / 2;
+}
+
+Camera camera_at(const Surroundings& ball, double distance, const double outwards[3], const double right[3]) {
+    double down[3];
+    cross3(right, outwards, down);
+    Camera camera{};
+    for (int k = 0; k < 3; ++k) {
+        camera.rotation[k] = right[k];
+        camera.rotation[3 + k] = down[k];
+        camera.rotation[6 + k] = -outwards[k];
+        camera.eye[k] = ball.center[k] + distance * ball.radius * outwards[k];
+    }
+    for (int row = 0; row < 3; ++row) camera.translation[row] = -dot3(camera.rotation + 3 * row, camera.eye);
+    return camera;
 }
 
 Surroundings surroundings_of(Span<const float> means, double share) {

@@ -17,6 +17,10 @@ struct Surroundings {
 };
 Surroundings surroundings_of(Span<const float> means, double share);
 
+// Looks at the centre of the ball from so many radii away, outwards; what is right in its picture is a unit
+// vector, too. Its pixels are left to the caller.
+Camera camera_at(const Surroundings& ball, double distance, const double outwards[3], const double right[3]);
+
 // A window of a picture of a cut, and the clusters that it shows. The asset is drawn `samples` times as
 // large.
 struct CutView {

@@ -56,18 +56,10 @@ Camera FirstSelected::camera(size_t picture) const {
     const double angle = kPi * (1 + std::sqrt(5.0)) * (static_cast<double>(side) + 0.5);
     const double flat = std::sqrt(1 - z * z);
     const double outwards[3] = {flat * std::cos(angle), flat * std::sin(angle), z};
-    double up[3] = {0, 0, 1}, right[3], down[3];
+    double up[3] = {0, 0, 1}, right[3];
     cross3(up, outwards, right);  // no side is straight above
     for (double& x : right) x /= flat;
-    cross3(right, outwards, down);
-    Camera camera{};
-    for (int k = 0; k < 3; ++k) {
-        camera.rotation[k] = right[k];
-        camera.rotation[3 + k] = down[k];
-        camera.rotation[6 + k] = -outwards[k];
-        camera.eye[k] = around_.center[k] + kDistance * around_.radius * outwards[k];
-    }
-    for (int row = 0; row < 3; ++row) camera.translation[row] = -dot3(camera.rotation + 3 * row, camera.eye);
+    Camera camera = camera_at(around_, kDistance, outwards, right);
     camera.fx = camera.fy = focal_[picture / kSides];
     camera.width = std::floor(2 * camera.fx / std::sqrt(kDistance * kDistance - 1)) + 2 * kBorderPx;
     camera.height = camera.x1 = camera.y1 = camera.width;

@@ -66,7 +66,7 @@ __device__ inline float2 rest_at(uint32_t place) {
 }
 
 // Writes an element of BlendShared::list to a place in shared memory.
-__device__ inline void list_at(uint32_t place, uint32_t record) {
+__device__ inline void list_record(uint32_t place, uint32_t record) {
 #ifdef __CUDA_ARCH__
     asm volatile("st.shared.u16 [%0], %1;" ::"r"(place), "h"(static_cast<uint16_t>(record)));
 #endif
@@ -146,7 +146,7 @@ __device__ void blend_sub(unsigned sub, int left, int top, Stop stop, BlendShare
         const bool reaches = (s.blocks[32 * g + lane] & own_blocks) != 0;
         const uint32_t reaching = __ballot_sync(kAllLanes, reaches);
         const int place = listed + __popc(reaching & ((1u << lane) - 1));
-        if (reaches) list_at(list - kEach * place, record + g * 32 * sizeof(float4));
+        if (reaches) list_record(list - kEach * place, record + g * 32 * sizeof(float4));
         listed += __popc(reaching);
     }
     __syncwarp();

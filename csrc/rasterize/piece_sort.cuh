@@ -122,7 +122,7 @@ __device__ inline uint2 take_window(const TileEntry* entries, uint32_t first, ui
     for (int k = 0; k < kEntriesAtOnce; ++k) {
         const uint32_t i = first + k * kBlendThreads + threadIdx.x;
         bool inside = i < end;
-        const uint32_t depth = depth_of_key(entry[k].key);
+        const uint32_t depth = key_depth(entry[k]);
         if (bounded) {
             const bool is_beyond = inside && (by_order ? key_order(entry[k]) : depth) >= beyond_begin;
             const uint32_t outside = __ballot_sync(kAllLanes, is_beyond);

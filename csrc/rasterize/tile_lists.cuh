@@ -12,8 +12,6 @@ using EntryKey = unsigned long long;  // of a TileEntry
 
 constexpr int kEntriesAtOnce = 4;  // that a thread has in flight
 
-__device__ inline uint32_t depth_of_key(EntryKey key) { return key_depth(TileEntry{key}); }
-
 // Buckets of entries, of equal width in the bits of their depths, which are logarithmic over octaves and
 // linear within one; or, where all depths are equal, of equal width in what orders those.
 struct Buckets {
@@ -21,9 +19,7 @@ struct Buckets {
     int shift;
     bool by_order;
 
-    __device__ uint32_t part_of(EntryKey key) const {
-        return by_order ? key_order(TileEntry{key}) : depth_of_key(key);
-    }
+    __device__ uint32_t part_of(EntryKey key) const { return by_order ? key_order({key}) : key_depth({key}); }
     // Keys outside the range that the buckets were made for belong to the first or the last.
     __device__ uint32_t of(EntryKey key) const {
         return min((max(part_of(key), lowest) - lowest) >> shift, last);
@@ -118,7 +114,7 @@ __device__ Buckets find_buckets(const TileEntry* entries, uint32_t first, uint32
     if (threadIdx.x < 4) s.range[threadIdx.x] = threadIdx.x % 2 == 0 ? ~0u : 0u;
     uint32_t low[2] = {~0u, ~0u}, high[2] = {0, 0};  // of depths and orders
     const auto widen = [&](TileEntry e) {
-        const uint32_t part[2] = {depth_of_key(e.key), key_order(e)};
+        const uint32_t part[2] = {key_depth(e), key_order(e)};
         for (int i = 0; i < 2; ++i) {
             low[i] = min(low[i], part[i]);
             high[i] = max(high[i], part[i]);
