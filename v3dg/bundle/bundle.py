@@ -268,6 +268,9 @@ class Bundle:
 
     def info(self) -> dict[str, Any]:
         """Describe the bundle in JSON values, without reading gaussians; sizes are those of its file."""
+        page_level = self.clusters.level[self._layout.first_cluster[:-1]]
+        page_sizes = self._layout.page_bytes(self._codec)
+        sizes = [int(page_sizes[page_level == level].sum()) for level in range(self.num_levels)]
         return {
             "path": self.path,
             "version": self._file.version if self._file else VERSION,
@@ -279,21 +282,20 @@ class Bundle:
             "num_groups": len(self.groups),
             "num_pages": self.num_pages,
             "num_levels": self.num_levels,
-            "levels": [self._level_info(level) for level in range(self.num_levels)],
+            "levels": [self._level_info(level, size) for level, size in enumerate(sizes)],
             "config": self.config,
         }
 
-    def _level_info(self, level: int) -> dict[str, Any]:
+    def _level_info(self, level: int, size: int) -> dict[str, Any]:
         clusters, error = self.level_range(level), self.groups.error[self.groups.level == level]
         first, last = self.clusters.offset[[clusters.start, clusters.stop]].tolist()
-        page_level = self.clusters.level[self._layout.first_cluster[:-1]]
         return {
             "level": level,
             "clusters": len(clusters),
             "gaussians": last - first,
             "error_color": _mean(error[:, 0]) if level else 0.0,
             "error_alpha": _mean(error[:, 1]) if level else 0.0,
-            "bytes": int(self._layout.page_bytes(self._codec)[page_level == level].sum()),
+            "bytes": size,
         }
 
 
