@@ -354,10 +354,10 @@ bool pick(const std::vector<Draw<float>>& draws, const Pinhole<float>& camera, i
         const Record<float>& r = ws.records.data()[place];
         const Falloff<float> f = falloff_at(static_cast<float>(x) + 0.5f, static_cast<float>(y) + 0.5f, r.u,
                                             r.v, r.l11, r.l12, r.l22, r.log2_opacity);
-        if (!contributes(f)) continue;
-        float weight;
-        if (!blend_live(alpha_of(f), transmittance, weight)) break;
-        if (weight > picked.weight) picked = {ws.source.data()[place], weight, r.depth};
+        const bool goes_on = blend_live(f, transmittance, StopsBefore{}, [&](float weight) {
+            if (weight > picked.weight) picked = {ws.source.data()[place], weight, r.depth};
+        });
+        if (!goes_on) break;
     }
     return picked.weight > 0.0f;
 }

@@ -82,6 +82,15 @@ __device__ inline uint32_t listed_at(uint32_t place) {
     return listed;
 }
 
+// The lowest `count` bits, less than 32.
+__device__ inline uint32_t low_bits(uint32_t bits, uint32_t count) {
+    uint32_t low = 0;
+#ifdef __CUDA_ARCH__
+    asm("szext.clamp.u32 %0, %1, %2;" : "=r"(low) : "r"(bits), "r"(count));
+#endif
+    return low;
+}
+
 // Of a sub-tile's among the tile's blocks, a bit each.
 template <int kPixels>
 __device__ uint32_t blocks_of_sub(unsigned sub) {
@@ -128,9 +137,16 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
     return bits;
 }
 
+// Where pixels stop, in a register: nvcc loads the kernel's argument again for each gaussian.
+__device__ inline StopsBefore in_register(StopsBefore, const BlendShared&) { return {}; }
+__device__ inline StopsBehind<float> in_register(StopsBehind<float>, const BlendShared& s) {
+    return {s.stops_behind};
+}
+
 // A warp blends the batch over a sub-tile.
 template <int kPixels, bool kWithDepth, class Stop>
-__device__ void blend_sub(unsigned sub, int left, int top, Stop stop, BlendShared& s) {
+__device__ void blend_sub(unsigned sub, int left, int top, Stop argument, BlendShared& s) {
+    const Stop stop = in_register(argument, s);
     unsigned lane = threadIdx.x % 32;
     // Hidden from the compiler, which would keep what follows from the lane in registers from batch to batch
     // and spill others.
@@ -191,21 +207,21 @@ __device__ void blend_sub(unsigned sub, int left, int top, Stop stop, BlendShare
             // otherwise than for the other number of pixels, and in the backward pass.
             const float4 a = vector_at<0>(next), b = vector_at<1>(next);
             const float2 c = rest_at(next);
-            bits ^= __funnelshift_l(0u, 1u, highest);  // 1 << highest, without a register for the 1
+            bits = low_bits(bits, highest);
             highest = 31 - __clz(static_cast<int>(bits));
             next = listed_at(last_of_group + kEach * highest);
             alive = false;
 #pragma unroll
             for (int k = 0; k < kPixels; ++k) {
                 const Falloff<float> f = falloff_at(p.x[k], p.y, a.x, a.y, a.z, a.w, b.x, b.y);
-                float weight;
-                const bool goes_on = blend_live(alpha_of(f), p.transmittance[k], weight, stop);
+                const bool goes_on = blend_live(f, p.transmittance[k], stop, [&](float weight) {
+                    p.color[0][k] += weight * b.z;
+                    p.color[1][k] += weight * b.w;
+                    p.color[2][k] += weight * c.x;
+                    if (kWithDepth) p.depth[k] += weight * c.y;
+                });
                 if (kPixels > 1 && !goes_on) p.x[k] = kNowhere;
                 alive |= goes_on;
-                p.color[0][k] += weight * b.z;
-                p.color[1][k] += weight * b.w;
-                p.color[2][k] += weight * c.x;
-                if (kWithDepth) p.depth[k] += weight * c.y;
             }
             if (!alive) bits = 0;
         }

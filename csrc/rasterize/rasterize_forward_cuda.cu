@@ -170,6 +170,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
         s.lowest = ~0u;
         s.highest = 0;
         s.crowded = 0;
+        s.stops_behind = lists.min_transmittance;
         s.reached[0] = s.reached[1] = s.num_covered[0] = s.num_covered[1] = 0;
     }
     __syncthreads();

@@ -35,10 +35,15 @@ V3DG_HD V3DG_INLINE auto contributes(const Falloff<V>& f) {
     return f.exponent >= all_lanes<V>(Lane<V>(kLog2MinAlpha));
 }
 
+// Of a gaussian that contributes.
+template <class V>
+V3DG_HD V3DG_INLINE V capped_alpha_of(const Falloff<V>& f) {
+    return min_of(exp2_in_range(f.exponent), all_lanes<V>(Lane<V>(kMaxAlpha)));
+}
+
 template <class V>
 V3DG_HD V3DG_INLINE V alpha_of(const Falloff<V>& f) {
-    const V alpha = min_of(exp2_in_range(f.exponent), all_lanes<V>(Lane<V>(kMaxAlpha)));
-    return contributes(f) ? alpha : V{};
+    return contributes(f) ? capped_alpha_of(f) : V{};
 }
 
 template <class V>
@@ -168,18 +173,29 @@ V3DG_HD V3DG_INLINE Ellipse<T> falloff_vjp(T l11, T l12, T l22, const FalloffSum
     return out;
 }
 
-// blend_weight() for a single pixel that has not stopped. Returns whether it goes on; `t` stays positive.
-V3DG_HD inline bool blend_live(float alpha, float& t, float& weight, StopsBehind<float> stop) {
-    weight = alpha * t;
-    t = transmittance_behind(alpha, t);
+// blend_weight() for a single pixel that has not stopped: calls add(weight) if there is one. Returns whether
+// the pixel goes on; `t` stays positive. As predicates these conditions cost next to nothing on a GPU, where
+// selecting between numbers is an operation each.
+template <class Add>
+V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBehind<float> stop,
+                                    const Add& add) {
+    const float alpha = capped_alpha_of(f);
+    if (contributes(f)) {
+        add(alpha * t);
+        t = transmittance_behind(alpha, t);  // the last use of `t`, so that it is not copied
+    }
     return t > stop.transmittance;
 }
-V3DG_HD inline bool blend_live(float alpha, float& t, float& weight, StopsBefore = {}) {
-    const float next = transmittance_behind(alpha, t);
-    const bool goes_on = next > static_cast<float>(kMinTransmittance);
-    weight = goes_on ? alpha * t : 0.0f;
-    t = goes_on ? next : t;
-    return goes_on;
+template <class Add>
+V3DG_HD V3DG_INLINE bool blend_live(const Falloff<float>& f, float& t, StopsBefore, const Add& add) {
+    const float alpha = capped_alpha_of(f);
+    const bool is_last =
+        contributes(f) & !(transmittance_behind(alpha, t) > static_cast<float>(kMinTransmittance));
+    if (contributes(f) & !is_last) {
+        add(alpha * t);
+        t = transmittance_behind(alpha, t);
+    }
+    return !is_last;
 }
 
 // A window of 8 x 4 cells, each of kPixels side by side: the cells in which a gaussian may reach a pixel, a
