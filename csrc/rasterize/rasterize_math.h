@@ -43,7 +43,8 @@ V3DG_HD V3DG_INLINE V capped_alpha_of(const Falloff<V>& f) {
 
 template <class V>
 V3DG_HD V3DG_INLINE V alpha_of(const Falloff<V>& f) {
-    return contributes(f) ? capped_alpha_of(f) : V{};
+    const V alpha = capped_alpha_of(f);
+    return contributes(f) ? alpha : V{};
 }
 
 template <class V>
