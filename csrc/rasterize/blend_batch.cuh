@@ -8,6 +8,8 @@
 // loaded and computed for a row; a sub-tile has 16 x 4 pixels then, else 8 x 4. Either way a pixel gets the
 // same bits.
 
+#include <type_traits>
+
 #include "rasterize/piece_sort.cuh"
 #include "rasterize/rasterize_math.h"
 
@@ -82,7 +84,7 @@ __device__ inline uint32_t listed_at(uint32_t place) {
     return listed;
 }
 
-// The lowest `count` bits, less than 32.
+// The lowest `count` bits, less than 32, in one operation.
 __device__ inline uint32_t low_bits(uint32_t bits, uint32_t count) {
     uint32_t low = 0;
 #ifdef __CUDA_ARCH__
@@ -137,16 +139,19 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
     return bits;
 }
 
-// Where pixels stop, in a register: nvcc loads the kernel's argument again for each gaussian.
-__device__ inline StopsBefore in_register(StopsBefore, const BlendShared&) { return {}; }
-__device__ inline StopsBehind<float> in_register(StopsBehind<float>, const BlendShared& s) {
-    return {s.stops_behind};
+// Where pixels stop, kept in a register. Of an argument of the kernel, nvcc loads it for each gaussian anew.
+template <class Stop>
+__device__ Stop stop_of(const BlendShared& s) {
+    if constexpr (std::is_same_v<Stop, StopsBefore>)
+        return {};
+    else
+        return {s.stops_behind};
 }
 
 // A warp blends the batch over a sub-tile.
 template <int kPixels, bool kWithDepth, class Stop>
-__device__ void blend_sub(unsigned sub, int left, int top, Stop argument, BlendShared& s) {
-    const Stop stop = in_register(argument, s);
+__device__ void blend_sub(unsigned sub, int left, int top, BlendShared& s) {
+    const Stop stop = stop_of<Stop>(s);
     unsigned lane = threadIdx.x % 32;
     // Hidden from the compiler, which would keep what follows from the lane in registers from batch to batch
     // and spill others.
@@ -240,7 +245,7 @@ __device__ void blend_sub(unsigned sub, int left, int top, Stop argument, BlendS
 
 // The block blends the batch over the sub-tiles that have one of the blocks `reached`.
 template <int kPixels, bool kWithDepth, class Stop>
-__device__ void blend_batch(uint32_t reached, int left, int top, Stop stop, BlendShared& s) {
+__device__ void blend_batch(uint32_t reached, int left, int top, BlendShared& s) {
     const uint32_t subs = subs_of<kPixels>(reached), lane = threadIdx.x % 32;
     // Of the sub-tile whose bit is the lane's: how many come before it.
     const uint32_t before = subs >> lane & 1 ? __popc(subs & ((1u << lane) - 1)) : ~0u;
@@ -249,7 +254,7 @@ __device__ void blend_batch(uint32_t reached, int left, int top, Stop stop, Blen
         const uint32_t bit = __ballot_sync(kAllLanes, before == taken);
         if (bit == 0) break;
         const unsigned block = __ffs(bit) - 1;
-        blend_sub<kPixels, kWithDepth>(block / SubTile<kPixels>::kBlocks, left, top, stop, s);
+        blend_sub<kPixels, kWithDepth, Stop>(block / SubTile<kPixels>::kBlocks, left, top, s);
         if (threadIdx.x % 32 == 0) taken = kBlendWarps + atomicAdd(&s.subs_taken, 1u);
         taken = __shfl_sync(kAllLanes, taken, 0);
     }

@@ -79,7 +79,7 @@ struct BlendShared {
     ListWindow window[3];
     uint32_t lowest, highest;  // depths of the piece
     uint32_t crowded;          // of some of its entries, those with many in their bucket
-    float stops_behind;        // the kernel's StopsBehind::transmittance
+    float stops_behind;        // StopsBehind::transmittance
     SpreadLevel level[kMostSpreadLevels];
     // Sums of weight * depth, in the order of TilePixels. Frames without depth do not ask for this memory.
     alignas(float2) float depth[kFrameTilePixels];

@@ -33,8 +33,7 @@ __device__ uint32_t blocks_of_part(int part, int log2_parts) {
 
 // Blends the sorted piece.
 template <bool kWithDepth, class Stop>
-__device__ void blend_piece(const RecordPlanes& records, uint32_t count, int left, int top, Stop stop,
-                            BlendShared& s) {
+__device__ void blend_piece(const RecordPlanes& records, uint32_t count, int left, int top, BlendShared& s) {
     for (uint32_t first = 0; first < count && s.alive_blocks != 0; first += kBlendBatch) {
         const uint32_t turn = first / kBlendBatch % 2;
         for (uint32_t i = threadIdx.x; i < kBlendBatch; i += kBlendThreads) {
@@ -66,9 +65,9 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
         // Fewer sub-tiles than warps would leave some without work.
         if (s.num_covered[turn] >= kBlocksForPairs * num_records &&
             __popc(subs_of<2>(reached)) >= kBlendWarps)
-            blend_batch<2, kWithDepth>(reached, left, top, stop, s);
+            blend_batch<2, kWithDepth, Stop>(reached, left, top, s);
         else
-            blend_batch<1, kWithDepth>(reached, left, top, stop, s);
+            blend_batch<1, kWithDepth, Stop>(reached, left, top, s);
         __syncthreads();
     }
     if (threadIdx.x < 2) s.reached[threadIdx.x] = s.num_covered[threadIdx.x] = 0;
@@ -79,7 +78,7 @@ __device__ void blend_piece(const RecordPlanes& records, uint32_t count, int lef
 template <bool kWithDepth, class Stop>
 __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, TileEntry* scratch,
                                uint32_t count, const TilePlan& plan, const Buckets& spread_buckets,
-                               const uint32_t* window_ends, uint32_t* order, int left, int top, Stop stop,
+                               const uint32_t* window_ends, uint32_t* order, int left, int top,
                                BlendShared& s) {
     int depth = 0;  // of levels
     if (count > kPiece && window_ends == nullptr) {
@@ -136,7 +135,7 @@ __device__ uint32_t blend_list(const RecordPlanes& records, TileEntry* entries, 
             for (uint32_t i = threadIdx.x; i < held; i += kBlendThreads)
                 order[blended + i] = records.record_of(TileEntry{s.key[s.sorted[i]]});
         blended += held;
-        blend_piece<kWithDepth>(records, held, left, top, stop, s);
+        blend_piece<kWithDepth, Stop>(records, held, left, top, s);
     }
     return blended;
 }
@@ -149,7 +148,7 @@ __device__ const PicturePlanes& planes_of(const FrameLists& lists, const FrameIm
 template <bool kWithDepth, class Stop>
 __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, const TilePlan& plan,
                            const Buckets& spread_buckets, uint32_t own_blocks, const FrameImage& image,
-                           Stop stop, BlendShared& s) {
+                           BlendShared& s) {
     const uint32_t tile = plan.tile;
     const int in_image = static_cast<int>(tile - image.first_tile);
     const int left = in_image % image.tile_columns * kFrameTileWidth;
@@ -186,11 +185,11 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
 
     const unsigned long long first = lists.tile_first[tile];
     const uint32_t count = static_cast<uint32_t>(lists.tile_first[tile + 1] - first);
-    const uint32_t blended = blend_list<kWithDepth>(
+    const uint32_t blended = blend_list<kWithDepth, Stop>(
         lists.records, lists.entries + first, lists.scratch + plan.first_scratch, count, plan, spread_buckets,
         plan.in_windows ? reinterpret_cast<const uint32_t*>(lists.scratch + plan.first_scratch + count)
                         : nullptr,
-        tape.order == nullptr ? nullptr : tape.order + first, left, top, stop, s);
+        tape.order == nullptr ? nullptr : tape.order + first, left, top, s);
     if (tape.blended != nullptr && threadIdx.x == 0) tape.blended[tile] = blended;
 
     const PicturePlanes& planes = planes_of(lists, image);
@@ -210,7 +209,7 @@ __device__ void blend_tile(const FrameLists& lists, const RasterTape& tape, cons
 
 template <class Stop>
 __global__ void __launch_bounds__(kBlendThreads, kBlocks)
-    rasterize_kernel(FrameLists lists, RasterTape tape, Stop stop) {
+    rasterize_kernel(FrameLists lists, RasterTape tape) {
     await_kernel_before();
     if (blockIdx.x == 0 && threadIdx.x == 0 && lists.report != nullptr) *lists.report = *lists.counters;
     if (!lists.capacity.holds(*lists.counters)) return;
@@ -223,9 +222,9 @@ __global__ void __launch_bounds__(kBlendThreads, kBlocks)
     const Buckets buckets{plan.lowest, plan.last_bucket, plan.shift, false};
     const FrameImage& image = lists.images[plan.image];
     if (planes_of(lists, image).depth != nullptr)
-        blend_tile<true>(lists, tape, plan, buckets, own_blocks, image, stop, s);
+        blend_tile<true, Stop>(lists, tape, plan, buckets, own_blocks, image, s);
     else
-        blend_tile<false>(lists, tape, plan, buckets, own_blocks, image, stop, s);
+        blend_tile<false, Stop>(lists, tape, plan, buckets, own_blocks, image, s);
 }
 
 uint32_t num_places() { return static_cast<uint32_t>(kBlocks) * num_multiprocessors(); }
@@ -239,7 +238,7 @@ void rasterize(const FrameLists& lists, const RasterTape* tape, cudaStream_t str
     const size_t shared_bytes = lists.has_depth ? sizeof(BlendShared) : offsetof(BlendShared, depth);
     with_stop<float>(lists.min_transmittance, [&](auto stop) {
         launch_early("rasterize_kernel", rasterize_kernel<decltype(stop)>, lists.num_plans, kBlendThreads,
-                     shared_bytes, stream, lists, tape == nullptr ? RasterTape{} : *tape, stop);
+                     shared_bytes, stream, lists, tape == nullptr ? RasterTape{} : *tape);
     });
 }
 
