@@ -160,7 +160,7 @@ def test_buffers_that_were_too_small_leave_no_trace():
 def test_memory_of_a_frame_is_told_by_part():
     renderer = Renderer(composed_scene(np.random.default_rng(4)), device="cuda")
     count = renderer.render(CAMERA, tolerance=0.0).stats.gaussians_selected
-    parts = renderer._frame._frame.memory()
+    parts = renderer._frame.chosen(renderer.subject).core.memory()
     reserved, used = parts.pop("pool, reserved"), parts.pop("pool, used")
     assert parts["records"] >= 40 * count > 0
     assert sum(parts.values()) <= used <= reserved

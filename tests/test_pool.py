@@ -16,6 +16,7 @@ from random_bundle import random_bundle
 from scenes_lod import blob, lod_bundle
 from v3dg import Bundle, Camera, Scene
 from v3dg._device import CPU
+from v3dg.render import CutRequest
 from v3dg.residency import residency
 
 CAMERA = Camera.look_at((0, -9, 1), (0, 0, 0), (0, 0, 1), 0.9, width=93, height=61)
@@ -64,7 +65,7 @@ def scaled(scene, memory):
 
 
 def status(renderer):
-    return renderer._frame._pool.core.status()
+    return renderer.pool_frame.core.status()
 
 
 def assert_same(image, expected):
@@ -213,7 +214,7 @@ def test_few_pictures_miss_pages_after_a_teleport(device, monkeypatch, memory, m
         renderer.render(NEAR, tolerance=1.0).stats  # noqa: B018
         missing = status(renderer).missing
         num_missed += missing > 0
-        while renderer._frame._pool.core.read_one():
+        while renderer.pool_frame.core.read_one():
             pass
     assert 0 < num_missed <= most
     assert status(renderer).needed > 900
@@ -242,7 +243,7 @@ def test_pages_are_there_together_with_those_above_them(scene, device, seed, mon
         camera = Camera.look_at(eye, rng.normal(size=3), (0, 0, 1), 0.9, width=61, height=43)
         for _ in range(int(rng.integers(1, 4))):
             renderer.render(camera, tolerance=float(rng.choice([0.5, 5.0, 50.0]))).stats  # noqa: B018
-            core = renderer._frame._pool.core
+            core = renderer.pool_frame.core
             for _ in range(int(rng.integers(0, 40))):
                 core.read_one()
         there = [core.resident(b) for b in range(len(scene.bundles))]
@@ -261,7 +262,7 @@ def order_of_reading(scene, monkeypatch):
     monkeypatch.setattr(v3dg.pool, "NUM_THREADS", 0)
     renderer = Renderer(scene, device="cpu", memory="64MB")
     renderer.render(CAMERA, **FINE)
-    core, order = renderer._frame._pool.core, []
+    core, order = renderer.pool_frame.core, []
     missing, before = core.status().missing, [core.resident(b) for b in range(len(scene.bundles))]
     for _ in range(missing):
         assert core.read_one()
@@ -298,7 +299,7 @@ def film_of_arriving_pages(scene, device, options, num_frames=150):
     for _ in range(num_frames):
         image = renderer.render(CAMERA, **options)
         pictures.append(arrays(image)[0])
-        core = renderer._frame._pool.core
+        core = renderer.pool_frame.core
         arrived.append([core.arrived(b) for b in range(len(scene.bundles))])
         while core.read_one():
             pass
@@ -344,9 +345,9 @@ def test_settling_ends_what_fades_in(scene, device):
 def test_what_is_read_since_settling_does_not_fade_in(scene, device):
     """It comes with the next picture, and with that it is all there."""
     renderer = Renderer(scene, device=device, memory="64MB")
-    pool = renderer._frame._pool.core
+    pool = renderer.pool_frame.core
     options = {"budget": None, "min_level": 0, "fade": 1.05, **FINE}
-    renderer._frame.settle(scene, CAMERA, seconds=0.0, **options)
+    renderer.pool_frame.settle(scene, CAMERA, CutRequest(**options), seconds=0.0)
     while not pool.wait(1.0):
         pass
     assert renderer.render(CAMERA, **options).stats.bytes_in > 0
@@ -378,7 +379,7 @@ def test_pages_that_come_again_fade_in_again(device, monkeypatch):
         camera = Camera.look_at((x, -4, 1), (x, 0, 0), (0, 0, 1), 0.9, width=61, height=43)
         fade = 1.05 if rng.random() < 0.95 else None
         tolerance = renderer.render(camera, tolerance=5.0, fade=fade).stats.tolerance
-        core, now = renderer._frame._pool.core, []
+        core, now = renderer.pool_frame.core, []
         for b, bundle in enumerate(scene.bundles):
             there, arrived = core.resident(b), core.arrived(b)
             assert (arrived[bundle.groups.parent][arrived[:-1] > 0] == 8).all()
@@ -486,7 +487,7 @@ def test_of_pages_that_are_read_together_only_the_damaged_ones_fail(path, device
         assert time.monotonic() < deadline
     renderer.render(CAMERA, tolerance=0.0).stats  # noqa: B018  brings what was read since
     assert status(renderer).failed == 3
-    assert np.flatnonzero(~renderer._frame._pool.core.resident(0)).tolist() == damaged
+    assert np.flatnonzero(~renderer.pool_frame.core.resident(0)).tolist() == damaged
 
 
 def test_truncated_file_is_an_error_and_not_a_crash(path, device):
@@ -552,7 +553,7 @@ def test_disk_that_does_not_answer_ends_the_wait(path, device, monkeypatch):
     for _ in range(3):
         image = renderer.render(CAMERA, **FINE)  # waits for nothing
     assert image.stats.missing > 0
-    core = renderer._frame._pool.core
+    core = renderer.pool_frame.core
     while core.read_one():  # page by page, the most urgent first
         before = image.stats.missing
         image = renderer.render(CAMERA, **FINE)

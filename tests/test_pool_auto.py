@@ -195,7 +195,7 @@ def test_residency_tells_what_waits_for_pages_from_what_is_wanted(scene, monkeyp
     coarse = renderer.render(far, tolerance=1e9)
     assert share_missing(coarse).mean() == 0  # which is what is wanted here
     shares = [share_missing(first).mean()]
-    pool = renderer._frame._pool.core
+    pool = renderer.pool_frame.core
     while renderer.render(CAMERA, **options).stats.missing:
         for _ in range(20):
             pool.read_one()

@@ -135,10 +135,10 @@ def test_a_click_finds_what_is_resident(scene):
     early = [pooled.pick(VIEW, SIZE, *place, settings) for place in places]  # of the coarsest pages
     assert {pick.level for pick in early if pick is not None} == {pooled.num_levels - 1}
     pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
-    bytes_in = pooled.pool._frame._pool.core.status().bytes_in
+    bytes_in = pooled.pool.pool_frame.core.status().bytes_in
     found = [pooled.pick(VIEW, SIZE, *place, settings) for place in places]
     expected = [whole.pick(VIEW, SIZE, *place, settings) for place in places]
-    assert pooled.pool._frame._pool.core.status().bytes_in == bytes_in
+    assert pooled.pool.pool_frame.core.status().bytes_in == bytes_in
     assert len([pick for pick in found if pick is not None]) > 5
     for one, other in zip(found, expected, strict=True):
         assert (one is None) == (other is None)
@@ -157,12 +157,12 @@ def test_a_still_is_cut_once_and_a_settled_one_twice(scene, monkeypatch):
     """Once to see that nothing is missing, and once to draw."""
     pooled, settings = SceneView(scene, device="cpu", memory="64MB"), Settings(tolerance=0.5)
     pooled.frame(VIEW, SIZE, settings, None, None, math.inf)
-    core, asks, selects = pooled.pool._frame._pool, [], []
+    core, asks, selects = pooled.pool.pool_frame._pool, [], []
     asked = core.core
 
     class Counting:
         def __getattr__(self, name):
-            if name == "ask":
+            if name == "settle_step":
                 asks.append(name)
             return getattr(asked, name)
 
@@ -223,7 +223,7 @@ def test_pictures_follow_until_nothing_is_missing(scene, loop):
 
 def test_pictures_are_sent_while_pages_come_in(loop, monkeypatch):
     """One page at a time, on a disk that is slow."""
-    pool = loop._scene_view.pool._frame
+    pool = loop._scene_view.pool.pool_frame
     real, calls = pool.settle, []
 
     def settle(*given, seconds, **options):

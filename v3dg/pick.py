@@ -7,7 +7,7 @@ import numpy as np
 
 from v3dg import _core
 from v3dg._device import CPU
-from v3dg._numbers import check, check_type, whole
+from v3dg._numbers import check, check_type, refuse, whole
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
 from v3dg.opening import File, opened
@@ -74,7 +74,10 @@ def pick(
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
     pixel = camera.core.window(x, y, x + 1, y + 1)
     if renderer is not None:
-        found = renderer._frame.pick(renderer._subject, pixel, rule)
+        pool = renderer.pool_frame
+        if pool is None or pool.device.is_cuda:
+            refuse("renderer", f"one with a pool on the CPU, got {renderer}")
+        found = pool.pick(renderer.subject, pixel, rule)
     else:
         resident = residency.scene(scene, CPU)
         pairs = resident.core.select(pixel, rule)

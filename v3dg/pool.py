@@ -1,8 +1,8 @@
 """Pools: the part of a scene's bundles that is resident, in memory of a fixed size."""
 
+import threading
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -63,12 +63,21 @@ class PoolLook:
 
 
 class Pool:
-    """Pages of bundles in a fixed amount of memory of one device, which come and go as views need them."""
+    """Pages of bundles in a fixed amount of memory of one device, which come and go as views need them.
+
+    Attributes:
+        tables: Those of its bundles.
+        num_bytes: The memory that it was given.
+        lease: Held by a thread from `settle` until its picture is drawn, so that no other thread's view takes
+            the place of what it has settled.
+    """
 
     def __init__(
         self, bundles: tuple[Bundle, ...], tables: list[_core.ClusterTable], device: Device, num_bytes: int
     ) -> None:
         self.tables = tables
+        self.num_bytes = num_bytes
+        self.lease = threading.RLock()
         sources = [bundle.page_source for bundle in bundles]
         self.core = _core.PagePool(tables, sources, device.number, num_bytes, NUM_THREADS)
 
@@ -80,23 +89,61 @@ class Pool:
             OSError: A page cannot be read; TimeoutError when none came in for `timeout` seconds.
         """
         core = self.core
-        core.forget_failures()
-        core.reset_tolerance()
-        last, known, end = time.monotonic(), -1, time.monotonic() + seconds
-
+        camera, rule = view
+        start = time.monotonic()
+        last_arrival = start
+        pages_in = -1
+        begins = True
         while True:
-            with residency.lock if resident.device.is_cuda else nullcontext():  # it stays as it is
-                tolerance = core.ask(resident.core, *view)
+            with residency.turn(resident.device):
+                step = core.settle_step(resident.core, camera, rule, begins)
+            begins = False
             status = core.status()
+            now = time.monotonic()
             if status.failed:
                 raise (ValueError if status.is_damage else OSError)(status.error)
-            if core.raise_tolerance(tolerance):
+            if step.is_decided and core.raise_tolerance(step.tolerance_px2):
                 continue
-            if not status.missing or time.monotonic() > end:
+            is_settled = step.is_decided and step.num_absent == 0
+            if is_settled or now - start > seconds:
                 return
-            if status.pages_in != known:
-                last, known = time.monotonic(), status.pages_in
-            elif time.monotonic() - last > timeout:
-                missing = f"{status.missing} pages are missing and none came in for {timeout:g} s"
-                raise TimeoutError(f"settle: expected the disk or the server to answer, but {missing}")
+            if status.pages_in != pages_in:
+                pages_in = status.pages_in
+                last_arrival = now
+            elif now - last_arrival > timeout:
+                raise TimeoutError(
+                    f"settle: {step.num_absent} pages are missing and none came in for {timeout:g} s; "
+                    "is the disk or the server at work?"
+                )
             core.wait(_WAIT_SECONDS)
+
+
+class PoolSlot:
+    """The pool that stills of one subject share on one device: the last one that was asked for."""
+
+    def __init__(self) -> None:
+        self._pool: Pool | None = None
+
+    @property
+    def num_bytes(self) -> int | None:
+        """The size of the pool that is there; None without one."""
+        return None if self._pool is None else self._pool.num_bytes
+
+    def pool(
+        self,
+        bundles: tuple[Bundle, ...],
+        tables: list[_core.ClusterTable],
+        device: Device,
+        num_bytes: int,
+    ) -> Pool:
+        """A pool of these bundles and of this size. Another one is given up first, for its memory is needed.
+
+        Requires the lock of `residency`.
+        """
+        pool = self._pool
+        if pool is not None and pool.tables == tables and pool.num_bytes == num_bytes:
+            return pool
+        self._pool = pool = None
+        pool = Pool(bundles, tables, device, num_bytes)
+        self._pool = pool
+        return pool

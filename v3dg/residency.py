@@ -22,7 +22,7 @@ from v3dg.bundle import Bundle
 from v3dg.bundle.codec import Codec
 from v3dg.false_color import ColorBy, palette_of
 from v3dg.gaussians import Gaussians, gaussian_bytes
-from v3dg.scene import Scene
+from v3dg.scene import Scene, Subject
 
 _Kept = TypeVar("_Kept")
 
@@ -31,6 +31,21 @@ _Kept = TypeVar("_Kept")
 MOST_DECODED_BYTES = 48 << 20
 _PACKED_BYTES = 64  # of a gaussian, which frames of a GPU read besides its rows
 _TOO_MANY_BYTES = 1 << 62  # what no memory holds, so that pages come one by one
+
+
+# What a child of a fork makes anew, because threads that it does not have may have been at work on it.
+_NOT_INHERITED = ("frame", "pool", "scene")
+
+
+_NOTHING = object()
+
+
+class _LastOne:
+    """What is kept of the last value that was asked for."""
+
+    def __init__(self) -> None:
+        self.value: Hashable = _NOTHING
+        self.kept: object = None
 
 
 class ResidentScene:
@@ -56,7 +71,7 @@ class ResidentScene:
         """The bundles whose tables are there."""
         return tuple(bundle for reference in self.references if (bundle := reference()) is not None)
 
-    def is_of(self, subject: Scene | Bundle) -> bool:
+    def is_of(self, subject: Subject) -> bool:
         """Whether the subject is there as it is now; a bundle stays as it is."""
         return self.revision == subject.revision if isinstance(subject, Scene) else self.revision[0] >= 0
 
@@ -111,7 +126,8 @@ class Residency:
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self._kept = weakref.WeakKeyDictionary[Scene | Bundle, dict[Hashable, Any]]()
-        os.register_at_fork(after_in_child=self._renew_lock)
+        self._abandoned: list[Any] = []
+        os.register_at_fork(after_in_child=self._after_fork)
 
     def table(self, bundle: Bundle) -> _core.ClusterTable:
         """What selection and drawing read of the bundle's clusters, on the host."""
@@ -124,15 +140,14 @@ class Residency:
         """Meanwhile a scene that is on the device stays as it is, for which on CUDA other threads wait."""
         return self.lock if device.is_cuda else nullcontext()
 
-    def scene(
-        self, subject: Scene | Bundle, device: Device, last: ResidentScene | None = None
-    ) -> ResidentScene:
+    def scene(self, subject: Subject, device: Device, last: ResidentScene | None = None) -> ResidentScene:
         """The scene on a device as it is now; a bundle as a scene of one.
 
         Mostly it is what it was the last time, which is found sooner where that is given.
         """
         if last is not None and last.is_of(subject):
             return last
+        assert not isinstance(subject, Gaussians), "an asset has no clusters"
         with self.lock:
             resident = self.once(subject, ("scene", device), lambda: ResidentScene(device))
             if resident.is_of(subject):
@@ -237,9 +252,24 @@ class Residency:
                 kept[key] = make()
             return cast(_Kept, kept[key])
 
-    def _renew_lock(self) -> None:
-        # Another thread of the parent may have held it when the child was made.
+    def last(self, owner: Scene | Bundle, key: Hashable, value: Hashable, make: Callable[[], _Kept]) -> _Kept:
+        """What was made for this value; what was made for another value is given up first."""
+        with self.lock:
+            value_and_kept = self.once(owner, key, _LastOne)
+            if value_and_kept.value != value:
+                value_and_kept.kept = None
+                value_and_kept.value = _NOTHING
+                value_and_kept.kept = make()
+                value_and_kept.value = value
+            return cast(_Kept, value_and_kept.kept)
+
+    def _after_fork(self) -> None:
+        """In the child of a fork: another thread of the parent may have held a lock, or been at work."""
         self.lock = threading.RLock()
+        for kept in self._kept.values():
+            for key in [key for key in kept if isinstance(key, tuple) and key[0] in _NOT_INHERITED]:
+                # Not destroyed: that would wait for threads that the child does not have.
+                self._abandoned.append(kept.pop(key))
 
 
 residency = Residency()

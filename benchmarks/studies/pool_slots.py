@@ -51,7 +51,7 @@ def main(config: Config) -> None:
                     frames = timed(config, renderer, cameras)
                     renderer.settle(cameras[-1], tolerance=config.tolerance)
                     settled.append(renderer.render(cameras[-1], tolerance=config.tolerance))
-                    slots = renderer._frame._pool.core.status().num_slots
+                    slots = renderer.pool_frame.core.status().num_slots
                     row = {"kind": kind, "memory": memory, "round": number, "slots": slots}
                     result.append(row | summary(frames))
                     print(result[-1], flush=True)

@@ -201,8 +201,9 @@ class ArrivesInPool(Arrives):
 
     def arrived(self, scene: Scene, camera: Camera) -> Any:
         self.renderer.render(camera, **self.options)
-        pool: Any = self.renderer._frame._pool
-        shares = [pool.core.arrived(b)[:-1] / _ARRIVAL_FRAMES for b in range(len(scene.bundles))]
+        frame = self.renderer.pool_frame
+        assert frame is not None
+        shares = [frame.core.arrived(b)[:-1] / _ARRIVAL_FRAMES for b in range(len(scene.bundles))]
         return np.concatenate([shares[b] for b in scene.instance_bundle])
 
 

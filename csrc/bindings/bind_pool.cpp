@@ -204,7 +204,7 @@ void BoundPool::check_scene(const SceneState& scene) const {
     if (!fits) throw py::value_error("scene: expected one of the bundles that the pool is of");
 }
 
-void BoundPool::note_needs(float tolerance_px2, bool is_bounded) {
+NotedView BoundPool::note_needs(float tolerance_px2, bool is_bounded) {
     FrameNeeds* needs = pool_->lend_needs();
     size_t count = 0;
     for (uint32_t b = 0; b < needs_.size(); ++b)
@@ -217,29 +217,32 @@ void BoundPool::note_needs(float tolerance_px2, bool is_bounded) {
     needs->num_left_out = count - needs->count;
     needs->tolerance_px2 = tolerance_px2;
     needs->adapts = is_bounded;
-    pool_->note_needs(needs, !is_bounded);
+    return pool_->note_needs(needs, !is_bounded);
 }
 
-float BoundPool::ask(const py::object& scene_object, const BoundEyes& camera, const SelectRule& rule) {
+SettlingStep BoundPool::settle_step(const py::object& scene_object, const BoundEyes& camera,
+                                    const SelectRule& rule, bool begins) {
     const Eyes& eyes = camera.eyes;
     const auto& held_scene = held<BoundScene>(scene_object, "scene");
     const std::shared_ptr<const SceneState> state = held_scene.state();
     check_scene(*state);
-    float tolerance = 0;
+    SettlingStep step;
 #if V3DG_WITH_CUDA
     if (!device_.is_host()) {
         const Work work(device_);
         const py::gil_scoped_release unlocked;
-        return on_device_->ask(held_scene.on_device(), eyes, rule, work.stream());
+        return on_device_->settle_step(held_scene.on_device(), eyes, rule, begins, work.stream());
     }
 #endif
     const py::gil_scoped_release unlocked;
-    frame_on_host(*state, rule, PoolFrame::look, [&](auto tables, const SelectRule& raised, auto needs) {
+    const PoolFrame kind = begins ? PoolFrame::first_look : PoolFrame::look;
+    step.noted = frame_on_host(*state, rule, kind, [&](auto tables, const SelectRule& raised, auto needs) {
         SelectOutput out;
         cpu::select({tables, state->instances, eyes, raised, needs}, out);
-        return tolerance = out.fits_budget ? out.tolerance_px2 : raised.tolerance_px2;
+        step.tolerance_px2 = out.fits_budget ? out.tolerance_px2 : raised.tolerance_px2;
+        return step.tolerance_px2;
     });
-    return tolerance;
+    return step;
 }
 
 void bind_pool(py::module_& m) {
@@ -254,11 +257,15 @@ void bind_pool(py::module_& m) {
         .def_readonly("least_tolerance_px2", &PoolStatus::least_tolerance_px2)
         .def_readonly("error", &PoolStatus::error)
         .def_readonly("is_damage", &PoolStatus::is_damage);
+    py::class_<SettlingStep>(m, "SettlingStep", "What a step towards a settled view found out.")
+        .def_readonly("tolerance_px2", &SettlingStep::tolerance_px2)
+        .def_property_readonly("is_decided", [](const SettlingStep& step) { return step.noted.is_decided; })
+        .def_property_readonly("num_absent", [](const SettlingStep& step) { return step.noted.num_absent; });
     py::class_<BoundPool>(m, "PagePool", "Pages of bundles in a fixed amount of memory of one device.")
         .def(py::init<py::list, py::list, int, size_t, unsigned>(), "tables"_a, "sources"_a, "device"_a,
              "num_bytes"_a, "num_threads"_a)
-        .def("ask", &BoundPool::ask, "scene"_a, "camera"_a, "rule"_a,
-             "Brings pages and finds out what a view needs; the tolerance that was used.")
+        .def("settle_step", &BoundPool::settle_step, "scene"_a, "camera"_a, "rule"_a, "begins"_a,
+             "Brings all pages that were read and finds out what a view needs.")
         .def("status", &BoundPool::status)
         .def("resident", &resident_pages, "bundle"_a, "(P,) which pages of a bundle are there.")
         .def("arrived", &arrived_pages, "bundle"_a,
@@ -267,14 +274,12 @@ void bind_pool(py::module_& m) {
             "raise_tolerance",
             [](BoundPool& p, float from) { return p.pool().raise_tolerance_at_once(from); }, "from_px2"_a,
             "Raises it, unless there is room for what the last view needs; whether it did.")
-        .def("reset_tolerance", [](BoundPool& p) { p.pool().reset_tolerance(); })
         .def(
             "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); }, "seconds"_a,
             py::call_guard<py::gil_scoped_release>(), "Waits for pages; whether there are any to bring.")
         .def(
             "read_one", [](BoundPool& p) { return p.pool().read_one(); },
-            py::call_guard<py::gil_scoped_release>())
-        .def("forget_failures", [](BoundPool& p) { p.pool().forget_failures(); });
+            py::call_guard<py::gil_scoped_release>());
 }
 
 }  // namespace v3dg

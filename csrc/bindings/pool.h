@@ -16,9 +16,10 @@
 
 namespace v3dg {
 
-// Frames of a pool: one of a flight, a look at what a view needs, and one aside, for which pages neither come
-// nor are asked for: of what was there for the last one, as that was.
-enum class PoolFrame { flight, look, aside };
+// Frames of a pool: one of a flight; a look at what a view needs, the first or a later one while it settles;
+// and one aside, for which pages neither come nor are asked for: of what was there for the last one, as that
+// was.
+enum class PoolFrame { flight, first_look, look, aside };
 
 class BoundPool {
   public:
@@ -37,10 +38,12 @@ class BoundPool {
     // A frame on the host: brings pages, calls cut(tables, rule, needs), which returns the tolerance that was
     // used, and takes note of what that needed. Without Python's lock.
     template <class Cut>
-    void frame_on_host(const SceneState& scene, SelectRule rule, PoolFrame kind, const Cut& cut) {
+    NotedView frame_on_host(const SceneState& scene, SelectRule rule, PoolFrame kind, const Cut& cut) {
+        pool_->check_process();  // In a child of fork() the lock may be held for ever.
         const std::lock_guard<std::mutex> lock(busy_);
+        if (kind == PoolFrame::first_look) pool_->begin_settling();
         const bool is_aside = kind == PoolFrame::aside && has_begun_;
-        const bool is_bounded = kind != PoolFrame::look;
+        const bool is_bounded = kind == PoolFrame::flight || kind == PoolFrame::aside;
         if (!is_aside) {
             const Arrive arrive = rule.fade.is_on() ? Arrive::fading : Arrive::at_once;
             host_->apply(*pool_, pool_->begin_frame(is_bounded, arrive));
@@ -60,21 +63,24 @@ class BoundPool {
         rule.frame = pool_->arrivals().frame();
         const float used = cut(Span<const ClusterTable>{tables.data(), tables.size()}, rule,
                                Span<const Span<uint32_t>>{needs.data(), needs.size()});
-        if (!is_aside) note_needs(used, is_bounded);
+        return is_aside ? NotedView{} : note_needs(used, is_bounded);
     }
     const HostPages& on_host() const { return *host_; }
 #if V3DG_WITH_CUDA
     cuda::DevicePages& on_device() { return *on_device_; }
 #endif
 
-    // Cuts the scene for a view, without drawing, and returns the tolerance that was used.
-    float ask(const py::object& scene_object, const BoundEyes& camera, const SelectRule& rule);
+    // Takes a step towards settling a view: brings all pages that were read, cuts the scene without drawing
+    // it, and waits until the pool has decided about what the cut needs. `begins`: the first step, which
+    // forgets earlier frames (PagePool::begin_settling).
+    SettlingStep settle_step(const py::object& scene_object, const BoundEyes& camera, const SelectRule& rule,
+                             bool begins);
 
   private:
 #if V3DG_WITH_CUDA
     void make_on_device(const Work& work);
 #endif
-    void note_needs(float tolerance_px2, bool is_bounded);
+    NotedView note_needs(float tolerance_px2, bool is_bounded);
 
     const Device device_;
     const py::list tables_, sources_;

@@ -193,14 +193,16 @@ void DevicePages::make_tables(const std::vector<ClusterTable>& host,
 // Memory goes back in the order of the stream that it was had on, and frames may be on others.
 DevicePages::~DevicePages() { busy_.wait(); }
 
-void DevicePages::note_flights(bool waits) {
+// Returns what became of the last of them.
+NotedView DevicePages::note_flights(bool waits) {
+    NotedView noted;
     while (!under_way_.empty()) {
         Flight& flight = *under_way_.front();
         if (waits) check(cudaEventSynchronize(flight.done), "a frame");
         const cudaError_t over = cudaEventQuery(flight.done);
         if (over == cudaErrorNotReady) {
             cudaGetLastError();
-            return;
+            return noted;
         }
         check(over, "a frame");
         measure(flight);
@@ -212,9 +214,10 @@ void DevicePages::note_flights(bool waits) {
         needs->tolerance_px2 = flight.report[0].tolerance_px2;
         // Who waits asks for a tolerance that does not depend on the frames before.
         needs->adapts = flight.is_bounded && !waits;
-        pool_.note_needs(needs, waits);
+        noted = pool_.note_needs(needs, waits);
         under_way_.pop_front();
     }
+    return noted;
 }
 
 void DevicePages::note_frames(cudaStream_t stream) {
@@ -346,17 +349,18 @@ SelectRule DevicePages::raised(SelectRule rule) const {
     return rule;
 }
 
-float DevicePages::ask(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
-                       cudaStream_t stream) {
+SettlingStep DevicePages::settle_step(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule,
+                                      bool begins, cudaStream_t stream) {
     const StreamLock lock(busy_, stream);
     note_flights(true);
+    if (begins) pool_.begin_settling();
     const PartlyResident resident = begin_frame(false, Arrive::at_once, stream);
     const SelectRule used = raised(rule);
     SelectOutput out;
     cut_.select(scene, eyes, used, out, stream, &resident);
     end_frame(stream);
-    note_flights(true);
-    return out.fits_budget ? out.tolerance_px2 : used.tolerance_px2;
+    const NotedView noted = note_flights(true);
+    return {out.fits_budget ? out.tolerance_px2 : used.tolerance_px2, noted};
 }
 
 }  // namespace cuda

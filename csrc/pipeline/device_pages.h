@@ -60,8 +60,10 @@ class DevicePages {
     // What the pool says that the frame which began last is drawn with.
     SelectRule raised(SelectRule rule) const;
 
-    // Cuts the scene without drawing, and waits for what that needs; the tolerance that was used.
-    float ask(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, cudaStream_t stream);
+    // Cuts the scene without drawing, and waits until the pool has decided about what that needs. `begins`: it
+    // forgets earlier frames before (PagePool::begin_settling).
+    SettlingStep settle_step(const SceneTables& scene, const Eyes& eyes, const SelectRule& rule, bool begins,
+                             cudaStream_t stream);
 
   private:
     struct Flight;
@@ -69,7 +71,7 @@ class DevicePages {
     void make_coded(cudaStream_t stream);
     void make_tables(const std::vector<ClusterTable>& host, const std::vector<ClusterAppearance>& appearance,
                      cudaStream_t stream);
-    void note_flights(bool waits);
+    NotedView note_flights(bool waits);
     void measure(const Flight& flight);
     Flight& free_flight();
     const int64_t* offset_on_device(const PageChange& change) const;

@@ -65,6 +65,7 @@ struct PagePool::State {
     std::vector<PageChange> ready;  // for the next frame
     size_t ready_bytes = 0, num_left = 0, num_loading = 0, num_threads = 0;
     FrameNeeds* noted = nullptr;  // not decided about
+    uint64_t decided_view = 0;    // the last view that was decided about
     std::vector<FrameNeeds*> free_needs;
     uint64_t rounds_begun = 0, rounds_over = 0;  // of deciding
     bool wants_round = false, takes_all = false, lacks_blocks = false, is_over = false;
@@ -86,6 +87,7 @@ struct PagePool::State {
     PageArrivals arrivals;
     std::vector<FrameNeeds*> idle_needs;
     FrameNeeds* to_note = nullptr;
+    uint64_t views = 0;  // that were noted
 
     void read_roots(size_t num_bundles);
     void allocate(size_t num_bundles);
@@ -107,6 +109,9 @@ struct PagePool::State {
     void read_always();
 
     void exchange();
+    void forget_noted();
+    void forget_failures();
+    size_t count_absent(const FrameNeeds& needs) const;
     void take_changes(bool is_bounded);
     void take_ready();
 
@@ -244,6 +249,7 @@ void PagePool::State::decide(std::unique_lock<std::mutex>& lock) {
     lock.lock();
     if (is_known) {
         todo.swap(chosen);
+        decided_view = needs->view;
         needed = policy.needed();
         missing = policy.missing();
         if (needs->adapts) adapt_tolerance(*needs);
@@ -410,6 +416,28 @@ void PagePool::State::exchange() {
     if (has_to_decide()) to_decide.notify_one();
 }
 
+// Requires the lock. A view that was noted and not decided about is decided about no more.
+void PagePool::State::forget_noted() {
+    if (noted != nullptr) idle_needs.push_back(std::exchange(noted, nullptr));
+}
+
+// Requires the lock.
+void PagePool::State::forget_failures() {
+    if (failed.exchange(0) == 0) return;
+    policy.forget_failures();
+    error.clear();
+}
+
+// The pages that the cut of the frame that began last missed.
+size_t PagePool::State::count_absent(const FrameNeeds& needs) const {
+    size_t count = needs.num_left_out;
+    for (size_t k = 0; k < needs.count; ++k) {
+        const PageRequest& need = needs.list[k];
+        count += need.priority > 1 && shift[need.bundle][need.page] == kAbsentPage;
+    }
+    return count;
+}
+
 // Without the lock: takes note of the changes.
 void PagePool::State::take_ready() {
     for (const PageChange& change : changes) {
@@ -440,6 +468,9 @@ void PagePool::State::take_changes(bool is_bounded) {
     changes.swap(ready);
     ready_bytes = 0;
     has_noted = false;
+    // A look waits until the pool has decided about its own view. An earlier one that was decided about in
+    // between would bring pages to `ready`, and then no other view may be noted before the next frame.
+    if (!is_bounded) forget_noted();
     if (has_to_decide()) to_decide.notify_one();
     lock.unlock();
     take_ready();
@@ -517,14 +548,19 @@ FrameNeeds* PagePool::lend_needs() {
     return needs;
 }
 
-void PagePool::note_needs(FrameNeeds* needs, bool waits) {
+NotedView PagePool::note_needs(FrameNeeds* needs, bool waits) {
     State& state = *state_;
     if (state.to_note != nullptr) state.idle_needs.push_back(state.to_note);
     state.to_note = needs;
+    const uint64_t view = needs->view = ++state.views;
+    NotedView noted;
+    if (waits) noted.num_absent = state.count_absent(*needs);
     std::unique_lock<std::mutex> lock = waits ? state.locked() : state.locked_at_once();
-    if (!lock.owns_lock()) return;
+    if (!lock.owns_lock()) return noted;
     state.exchange();
     if (waits || state.decides_itself) state.decide_next_round(lock);
+    noted.is_decided = waits && state.decided_view == view;
+    return noted;
 }
 
 void PagePool::give_up(FrameNeeds* needs) { state_->idle_needs.push_back(needs); }
@@ -538,10 +574,18 @@ bool PagePool::raise_tolerance_at_once(float tolerance_px2) {
     return true;
 }
 
-void PagePool::reset_tolerance() {
-    const auto lock = state_->locked();
-    state_->least_tolerance = 0;
+void PagePool::begin_settling() {
+    State& state = *state_;
+    auto lock = state.locked();
+    state.exchange();
+    state.forget_noted();
+    // A round that is under way may adapt the tolerance at its end.
+    state.has_changed.wait(lock, [&] { return !state.is_deciding(); });
+    state.forget_failures();
+    state.least_tolerance = 0;
 }
+
+void PagePool::check_process() const { state_->check_process(); }
 
 bool PagePool::wait(double seconds) {
     State& state = *state_;
@@ -556,13 +600,6 @@ bool PagePool::wait(double seconds) {
 bool PagePool::read_one() {
     auto lock = state_->locked();
     return state_->read_some(lock, 1);
-}
-
-void PagePool::forget_failures() {
-    const auto lock = state_->locked();
-    if (state_->failed.exchange(0) == 0) return;
-    state_->policy.forget_failures();
-    state_->error.clear();
 }
 
 PoolStatus PagePool::status() const {

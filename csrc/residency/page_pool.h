@@ -36,6 +36,19 @@ struct FrameNeeds {
     bool adapts;          // the tolerance follows, from frame to frame
     uint32_t frame;       // which lend_needs() tells
     float least_px2;      // its least tolerance, likewise
+    uint64_t view;        // the number of the view, which note_needs() sets
+};
+
+// What became of the needs of a view that was waited for.
+struct NotedView {
+    bool is_decided = false;  // the pool knows what this view needs, and status() is about it
+    size_t num_absent = 0;    // pages that its cut missed
+};
+
+// A step towards a settled view: its cut was found without drawing it.
+struct SettlingStep {
+    float tolerance_px2 = 0;  // that the cut was found with
+    NotedView noted;
 };
 
 struct PoolStatus {
@@ -90,9 +103,11 @@ class PagePool {
 
     // Memory for what the frame needs that began last, which note_needs() returns.
     FrameNeeds* lend_needs();
-    // Of several frames that are noted before one is decided about, the last one counts. Waits for that to be
-    // over if so told.
-    void note_needs(FrameNeeds* needs, bool waits);
+    // Of several frames that are noted before one is decided about, the last one counts. If `waits`, returns
+    // after the pool has decided about this view, with what its cut missed; else at once, with an empty
+    // result. Only the caller knows what its cut missed: a page that arrives between the cut and this call is
+    // resident for the pool, but the pages below it were not asked for.
+    NotedView note_needs(FrameNeeds* needs, bool waits);
     void give_up(FrameNeeds* needs);  // of a frame without a cut
     // What the tolerance of the frame that began last is raised to; 0: it is not.
     float least_tolerance_px2() const;
@@ -100,15 +115,16 @@ class PagePool {
     // shall not depend on the frames before, from one to the next of which it changes little. Returns whether
     // it did.
     bool raise_tolerance_at_once(float tolerance_px2);
-    void reset_tolerance();
+    // Begins to settle: forgets what earlier frames needed, which would otherwise change the tolerance later,
+    // which pages failed, and what the tolerance was raised to. Not between begin_frame() and note_needs().
+    void begin_settling();
+    void check_process() const;  // Throws std::runtime_error in a child of fork().
 
     // Waits until there is something to bring, nothing is left to be read, or time is up. Returns whether
     // there is something to bring.
     bool wait(double seconds);
     // Reads the most urgent page in this thread. Returns whether there was one.
     bool read_one();
-    // Forgets which pages failed, so that they are tried again.
-    void forget_failures();
     // Of the last view that was decided about. Waits for nothing, unless pages failed.
     PoolStatus status() const;
 

@@ -16,11 +16,11 @@ from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
-from v3dg.image import Stats
+from v3dg.image import RenderedImage, Stats
 from v3dg.pick import Pick, pick
 from v3dg.pictures import to_8bit
 from v3dg.pool import PoolLook, chosen_bytes
-from v3dg.render import Renderer, render, shade_of
+from v3dg.render import CutRequest, Renderer, render, shade_of
 from v3dg.residency import residency
 from v3dg.scene import Scene, Subject
 from v3dg.select import DEFAULT_FADE, DEFAULT_TOLERANCE, Selection, rule_of, select, select_by
@@ -213,16 +213,22 @@ class SceneView:
 
     def _of_pool(self, asked: _Asked, pool: Renderer, patience: float) -> "_Drawn":
         """What a pool has; compared with the finest that it has room for, from whose pages both are drawn."""
-        settings, stop, edge, chooser = asked.settings, asked.stop, asked.edge, asked.chooser
-        wanted: Any = {name: getattr(settings, name) for name in ("tolerance", "budget", "min_level", "fade")}
-        finest: Any = {"tolerance": 0.0, "budget": None, "min_level": 0, "fade": None}
+        settings = asked.settings
+        stop = asked.stop
+        edge = asked.edge
+        chooser = asked.chooser
+        frame = pool.pool_frame
+        assert frame is not None
+        wanted = CutRequest(settings.tolerance, settings.budget, settings.min_level, settings.fade)
+        finest = CutRequest(tolerance=0.0)
         compares = edge > 0 or settings.shows == "difference"
         if patience:
-            how = finest if compares else wanted
-            pool._frame.settle(self.scene, chooser or asked.camera, seconds=patience, **how)
+            settled = finest if compares else wanted
+            frame.settle(self.scene, chooser or asked.camera, settled, seconds=patience)
 
-        def draw(steps: _core.BudgetSteps | None, look: PoolLook, options: Any) -> Any:
-            image = pool._frame.draw(self.scene, asked.camera, _SHADE, None, stop, steps, look, **options)
+        def draw(steps: _core.BudgetSteps | None, look: PoolLook, request: CutRequest) -> RenderedImage:
+            image = frame.draw(self.scene, asked.camera, request, _SHADE, steps=steps, stop=stop, look=look)
+            assert isinstance(image, RenderedImage)
             _check(stop)
             return image
 

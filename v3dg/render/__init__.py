@@ -1,0 +1,23 @@
+"""Draw scenes, bundles and assets: select a cut, then project, bin and blend it.
+
+`api.py` has `v3dg.render`, `renderer.py` has `v3dg.Renderer`. Both draw with a frame: of an asset
+(`asset_frame.py`), of a scene whose gaussians are all resident (`scene_frame.py`), or of a pool
+(`pool_frame.py`); `frame.py` says what a frame can do and chooses one. `request.py` has what is asked for.
+"""
+
+from v3dg.render.api import render
+from v3dg.render.frame import Frame, frame_of
+from v3dg.render.pool_frame import PoolFrame
+from v3dg.render.renderer import Renderer
+from v3dg.render.request import DEFAULT_MIN_TRANSMITTANCE, CutRequest, shade_of
+
+__all__ = [
+    "DEFAULT_MIN_TRANSMITTANCE",
+    "CutRequest",
+    "Frame",
+    "PoolFrame",
+    "Renderer",
+    "frame_of",
+    "render",
+    "shade_of",
+]

@@ -1,0 +1,87 @@
+"""The frame of an asset, which is drawn whole: it has no levels to choose from, and no pages."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from v3dg import _core, _device
+from v3dg._device import Device
+from v3dg._numbers import check
+from v3dg.cameras import Camera, StereoCamera
+from v3dg.false_color import ColorBy
+from v3dg.image import RenderedImage, Stats
+from v3dg.render.picture import Picture, stats_of
+from v3dg.render.request import CutRequest
+
+if TYPE_CHECKING:
+    from v3dg.gaussians import Gaussians
+    from v3dg.scene import Subject
+    from v3dg.select import Selection
+
+
+class AssetFrame:
+    """Draws one asset on one device. It keeps the asset's arrays there.
+
+    Attributes:
+        device: Where it draws.
+        memory: None, for it draws from no pool.
+    """
+
+    def __init__(self, asset: Gaussians, color_by: ColorBy, device: Device) -> None:
+        expected = f"'appearance' for an asset, which has no levels, got {color_by!r}"
+        check("color_by", color_by == "appearance", expected)
+        self.device = device
+        self.memory: int | None = None
+        self._core = _core.AssetFrame(_core.Model(_device.place(asset, device).rows))
+
+    def draw(
+        self,
+        subject: Subject,
+        camera: Camera | StereoCamera,
+        request: CutRequest,
+        shade: _core.Shade,
+        cut: Selection | None = None,
+        steps: _core.BudgetSteps | None = None,
+    ) -> Picture:
+        """Draw the asset; ValueError where something is asked for that only levels have."""
+        check("cut", cut is None, "a scene or a bundle to choose from, got an asset")
+        check_request(request)
+        if isinstance(camera, StereoCamera):
+            left, right = (self._draw_eye(eye, shade) for eye in camera.eyes)
+            return left, right
+        return self._draw_eye(camera, shade)
+
+    draw_settled = draw
+
+    def settle(
+        self, subject: Subject, camera: Camera | StereoCamera, request: CutRequest, timeout: float
+    ) -> None:
+        """Return at once, for all of an asset is resident."""
+
+    def _draw_eye(self, camera: Camera, shade: _core.Shade) -> RenderedImage:
+        drawing = self._core.draw(camera.core, shade)
+
+        def finish() -> Stats:
+            return stats_of(drawing.finish(), 0.0)
+
+        if not self.device.is_cuda:
+            finish()
+        return RenderedImage(drawing, finish)
+
+
+def check_request(request: CutRequest) -> None:
+    """Refuse what an asset cannot have; a tolerance and a fade are accepted and change nothing."""
+    if request.is_plain:
+        _check_known(*request)
+    else:
+        _check(*request)
+
+
+def _check(tolerance: float | None, budget: int | None, min_level: int, fade: float | None) -> None:
+    for name, value in (("budget", budget), ("min_level", min_level)):
+        check(name, not value, "a scene or a bundle to choose from, got an asset")
+    CutRequest(tolerance=tolerance, fade=fade).rule  # noqa: B018 - which checks them
+
+
+_check_known = lru_cache(64, typed=True)(_check)

@@ -1,0 +1,166 @@
+"""Frames: what pictures of one subject are drawn with on one device, and which of them a subject gets."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol, get_args
+
+from v3dg import _core
+from v3dg._device import Device
+from v3dg._numbers import check, one_of
+from v3dg.build.memory import in_bytes
+from v3dg.cameras import Camera, StereoCamera
+from v3dg.false_color import ColorBy
+from v3dg.gaussians import Gaussians
+from v3dg.pool import PoolSlot, chosen_bytes
+from v3dg.render.asset_frame import AssetFrame
+from v3dg.render.picture import Picture
+from v3dg.render.pool_frame import PoolFrame
+from v3dg.render.request import CutRequest
+from v3dg.render.scene_frame import SceneFrame
+from v3dg.residency import ResidentScene, residency
+
+if TYPE_CHECKING:
+    import weakref
+
+    from v3dg.bundle import Bundle
+    from v3dg.scene import Subject
+    from v3dg.select import Selection
+
+
+class Frame(Protocol):
+    """Buffers that pictures of one subject are drawn with; it does not keep a scene or a bundle alive."""
+
+    device: Device
+
+    @property
+    def memory(self) -> int | None:
+        """Bytes of the pool that it draws from; None where all is resident."""
+
+    def draw(
+        self,
+        subject: Subject,
+        camera: Camera | StereoCamera,
+        request: CutRequest,
+        shade: _core.Shade,
+        cut: Selection | None = None,
+        steps: _core.BudgetSteps | None = None,
+    ) -> Picture:
+        """Draw what is resident; of a stereo camera, a picture for each eye."""
+
+    def draw_settled(
+        self,
+        subject: Subject,
+        camera: Camera | StereoCamera,
+        request: CutRequest,
+        shade: _core.Shade,
+        cut: Selection | None = None,
+    ) -> Picture:
+        """Draw a picture that misses nothing, whatever other threads draw."""
+
+    def settle(
+        self, subject: Subject, camera: Camera | StereoCamera, request: CutRequest, timeout: float
+    ) -> None:
+        """Wait until what a view needs is resident."""
+
+
+class AutoFrame:
+    """Draws with all gaussians resident where they fit, else from a pool.
+
+    Which of the two is decided when it is made, and again when bundles are added; once it has a pool it
+    keeps that.
+
+    Attributes:
+        device: Where it draws.
+    """
+
+    def __init__(self, color_by: ColorBy, device: Device, slot: PoolSlot) -> None:
+        self.device = device
+        self._color_by = color_by
+        self._slot = slot
+        self._frame: SceneFrame | PoolFrame = SceneFrame(color_by, device)
+        self._references: tuple[weakref.ref[Bundle], ...] | None = None
+        self._resident: ResidentScene | None = None
+
+    @property
+    def memory(self) -> int | None:
+        return self._frame.memory
+
+    def chosen(self, subject: Subject) -> SceneFrame | PoolFrame:
+        """The frame that the subject is drawn with now."""
+        with residency.turn(self.device):
+            self._resident = resident = residency.scene(subject, self.device, self._resident)
+            if self._references is not resident.references:
+                self._choose(resident)
+            return self._frame
+
+    def _choose(self, resident: ResidentScene) -> None:
+        with residency.lock:
+            frame = self._frame
+            bundles = resident.bundles
+            if isinstance(frame, SceneFrame) and frame.num_bundles < len(bundles):
+                num_bytes = self._slot.num_bytes or chosen_bytes(bundles, self.device)
+                if num_bytes is not None:
+                    self._frame = PoolFrame(self._color_by, self.device, num_bytes, self._slot)
+            self._frame.take(resident)
+            self._references = resident.references
+
+    def draw(
+        self,
+        subject: Subject,
+        camera: Camera | StereoCamera,
+        request: CutRequest,
+        shade: _core.Shade,
+        cut: Selection | None = None,
+        steps: _core.BudgetSteps | None = None,
+    ) -> Picture:
+        return self.chosen(subject).draw(subject, camera, request, shade, cut, steps)
+
+    def draw_settled(
+        self,
+        subject: Subject,
+        camera: Camera | StereoCamera,
+        request: CutRequest,
+        shade: _core.Shade,
+        cut: Selection | None = None,
+    ) -> Picture:
+        return self.chosen(subject).draw_settled(subject, camera, request, shade, cut)
+
+    def settle(
+        self, subject: Subject, camera: Camera | StereoCamera, request: CutRequest, timeout: float
+    ) -> None:
+        self.chosen(subject).settle(subject, camera, request, timeout)
+
+
+def frame_of(
+    subject: Subject, color_by: ColorBy, device: Device, memory: int | str | None, slot: PoolSlot
+) -> Frame:
+    """A new frame for pictures of a subject.
+
+    Args:
+        memory: As in `v3dg.Renderer`.
+        slot: Where its pool is kept, if it gets one.
+
+    Raises:
+        ValueError: `color_by` or `memory` is not as in `v3dg.Renderer`.
+    """
+    one_of(color_by, "color_by", get_args(ColorBy))
+    if isinstance(subject, Gaussians):
+        is_without = memory is None or memory == "auto"
+        check("memory", is_without, f"None for an asset, without pages, got {memory}; leave it out")
+        return AssetFrame(subject, color_by, device)
+    frame: SceneFrame | PoolFrame | AutoFrame
+    if memory is None:
+        frame = SceneFrame(color_by, device)
+    elif memory != "auto":
+        frame = PoolFrame(color_by, device, in_bytes(memory), slot)
+    elif device.is_cuda and color_by != "appearance":  # A pool on a GPU has no other colours.
+        frame = SceneFrame(color_by, device)
+    else:
+        frame = AutoFrame(color_by, device, slot)
+    with residency.turn(device):
+        resident = residency.scene(subject, device)
+        if isinstance(frame, AutoFrame):
+            frame.chosen(subject)
+        else:
+            frame.take(resident)
+    return frame

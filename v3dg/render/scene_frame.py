@@ -1,0 +1,144 @@
+"""The frame of a scene whose gaussians are all resident."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from v3dg import _core
+from v3dg._device import Device
+from v3dg._numbers import check
+from v3dg.bundle import Bundle
+from v3dg.cameras import Camera, StereoCamera
+from v3dg.false_color import ColorBy
+from v3dg.image import RenderedImage, Stats
+from v3dg.render.picture import Picture, picture_of, stats_of
+from v3dg.render.request import CutRequest
+from v3dg.residency import ResidentScene, residency
+from v3dg.scene import Scene
+from v3dg.select import Selection, over_budget
+
+if TYPE_CHECKING:
+    import weakref
+
+    from v3dg.scene import Subject
+
+
+class SceneFrame:
+    """Draws a scene or a bundle on one device, all of whose gaussians it has there.
+
+    It does not keep the subject alive.
+
+    Attributes:
+        device: Where it draws.
+        memory: None, for it draws from no pool.
+        num_bundles: How many of the scene's bundles have their gaussians there. A scene only adds bundles.
+    """
+
+    def __init__(self, color_by: ColorBy, device: Device) -> None:
+        self.device = device
+        self.memory: int | None = None
+        self.num_bundles = 0
+        self.core = _core.SceneFrame(device.number)
+        self._color_by = color_by
+        self._references: tuple[weakref.ref[Bundle], ...] | None = None
+        self._resident: ResidentScene | None = None  # as it was last drawn
+
+    def take(self, resident: ResidentScene) -> None:
+        """Have the gaussians of the scene's bundles on the device."""
+        if self._references is resident.references:  # as in most pictures
+            return
+        with residency.lock:
+            bundles = resident.bundles
+            if self.num_bundles < len(bundles):
+                residency.set_models(self.core, bundles, self.device, self._color_by)
+                self.num_bundles = len(bundles)
+            self._references = resident.references
+
+    def draw(
+        self,
+        subject: Subject,
+        camera: Camera | StereoCamera,
+        request: CutRequest,
+        shade: _core.Shade,
+        cut: Selection | None = None,
+        steps: _core.BudgetSteps | None = None,
+        stop: _core.Stop | None = None,
+    ) -> Picture:
+        """Draw the cut that is requested, or the one that is given.
+
+        Args:
+            steps: The pacing of pictures that follow each other; None for a single one.
+            stop: Ends a picture early on the CPU.
+        """
+        if cut is not None:
+            if isinstance(camera, StereoCamera):
+                left, right = (self.draw_cut(subject, eye, request, shade, cut) for eye in camera.eyes)
+                return left, right
+            return self.draw_cut(subject, camera, request, shade, cut)
+        rule = request.rule
+        with residency.turn(self.device):
+            self._resident = resident = residency.scene(subject, self.device, self._resident)
+            self.take(resident)
+            drawing = self.core.draw(resident.core, camera.core, rule, shade, stop, steps)
+            resident.add_drawing(drawing)
+
+        def finish() -> Stats:
+            stats = drawing.finish()
+            if request.budget is None:
+                return stats_of(stats, rule.tolerance_px2)
+            if stats.exceeds_budget:
+                raise over_budget(request.budget, stats.gaussians)
+            return stats_of(stats, stats.tolerance_px2)
+
+        if not self.device.is_cuda:
+            finish()
+        return picture_of(drawing, camera, finish)
+
+    draw_settled = draw
+
+    def settle(
+        self, subject: Subject, camera: Camera | StereoCamera, request: CutRequest, timeout: float
+    ) -> None:
+        """Return at once, for all is resident."""
+
+    def draw_cut(
+        self, subject: Subject, camera: Camera, request: CutRequest, shade: _core.Shade, cut: Selection
+    ) -> RenderedImage:
+        """Draw a cut that was selected before."""
+        with residency.turn(self.device):
+            self._resident = resident = residency.scene(subject, self.device, self._resident)
+            self.take(resident)
+            _check_cut(cut, subject, resident, request)
+            drawing = self.core.draw_cut(
+                resident.core,
+                camera.core,
+                self._on_device(cut.instance_ids),
+                self._on_device(cut.cluster_ids),
+                shade,
+                weights=None if cut.given_weights is None else self._on_device(cut.given_weights),
+            )
+            resident.add_drawing(drawing)
+
+        def finish() -> Stats:
+            return stats_of(drawing.finish(), cut.tolerance)
+
+        if not self.device.is_cuda:
+            finish()
+        return RenderedImage(drawing, finish)
+
+    def _on_device(self, values: Any) -> Any:
+        if not self.device.is_cuda:
+            return values
+        import torch
+
+        return torch.tensor(values, device=str(self.device))
+
+
+def _check_cut(cut: Selection, subject: Subject, resident: ResidentScene, request: CutRequest) -> None:
+    """Refuse a cut that is not of this scene as it is, and whatever else is asked for."""
+    for name, value in request._asdict().items():
+        check(name, not value, f"nothing beside a cut, which has been chosen, got {value}")
+    is_from_bundle = isinstance(subject, Bundle) and cut.scene.bundles == (subject,)
+    check("cut", cut.scene is subject or is_from_bundle, "a selection from this scene, got one from another")
+    if isinstance(subject, Scene):
+        cut.check(resident.revision)
