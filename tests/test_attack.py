@@ -15,6 +15,7 @@ TRIES = {
     "kills": 8,
     "bounded": 6,
     "threads": 30,
+    "settling": 6,
     "memory": 8,
 }
 

@@ -2,7 +2,11 @@
 
 import itertools
 import os
+import signal
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -14,7 +18,7 @@ from frames import Renderer, arrays, render
 from partial import rule
 from random_bundle import random_bundle
 from scenes_lod import blob, lod_bundle
-from v3dg import Bundle, Camera, Scene
+from v3dg import Bundle, Camera, Scene, pick
 from v3dg._device import CPU
 from v3dg.render import CutRequest
 from v3dg.residency import residency
@@ -574,6 +578,111 @@ def test_child_of_a_fork_is_told_to_make_another(path):
                 os._exit(7 if "from before a fork" in str(error) else 8)
             os._exit(9)
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+
+
+@pytest.mark.parametrize("num_threads", [2, 4])
+def test_stills_of_threads_are_settled(path, num_threads):
+    """They share a pool that has room for about one view: no thread draws from what another one brought."""
+    scene = Scene()
+    scene.add(Bundle.open(path), positions=[[-1.0, 0, 0], [1, 0, 0]])
+    cameras = [CAMERA, NEAR, AWAY] * 8
+    expected = [arrays(render(scene, camera, device="cpu", memory=300_000, **FINE)) for camera in cameras[:3]]
+    with ThreadPoolExecutor(num_threads) as threads:
+        images = list(
+            threads.map(lambda camera: render(scene, camera, device="cpu", memory=300_000, **FINE), cameras)
+        )
+    for k, image in enumerate(images):
+        assert image.stats.missing == 0
+        for plane, other in zip(arrays(image), expected[k % 3], strict=True):
+            np.testing.assert_array_equal(plane, other)
+
+
+def test_only_the_last_pool_of_stills_is_kept(path):
+    """A pool has threads and memory, which a bundle that is drawn with many sizes would pile up."""
+    bundle = Bundle.open(path)
+    render(bundle, CAMERA, device="cpu", memory="64MB", **FINE)
+    before = len(os.listdir("/proc/self/task"))
+    for megabytes in range(65, 75):
+        render(bundle, CAMERA, device="cpu", memory=f"{megabytes}MB", **FINE)
+        render(bundle, CAMERA, device="cpu", memory=f"{megabytes}MB", color_by="level", **FINE)
+    assert len(os.listdir("/proc/self/task")) <= before
+
+
+def test_stills_of_one_size_share_a_pool_whatever_its_text(path):
+    bundle = Bundle.open(path)
+    render(bundle, CAMERA, device="cpu", memory="64MiB", **FINE)
+    before = set(os.listdir("/proc/self/task"))
+    render(bundle, CAMERA, device="cpu", memory=64 << 20, **FINE)
+    assert set(os.listdir("/proc/self/task")) <= before  # no thread of another pool
+
+
+def test_children_of_a_fork_draw_stills(path):
+    """They have a pool of their own, though the parent's threads may be at work in the other one."""
+    bundle = Bundle.open(path)
+    expected = arrays(render(bundle, NEAR, device="cpu", memory="64MB", **FINE))
+    is_over = threading.Event()
+
+    def draw():
+        while not is_over.is_set():
+            render(bundle, CAMERA, device="cpu", memory="64MB", **FINE)
+
+    thread = threading.Thread(target=draw)
+    thread.start()
+    try:
+        for _ in range(20):
+            child = os.fork()
+            if child == 0:
+                code = 9
+                with suppress(BaseException):
+                    image = render(bundle, NEAR, device="cpu", memory="64MB", **FINE)
+                    is_same = all(map(np.array_equal, arrays(image), expected))
+                    code = 7 if is_same else 8
+                os._exit(code)
+            assert exit_code(child) == 7
+    finally:
+        is_over.set()
+        thread.join()
+
+
+def test_picking_from_a_pool_of_another_process_is_refused(path):
+    """Also while another thread of the parent draws: it does not wait for that thread's lock for ever."""
+    bundle = Bundle.open(path)
+    renderer = Renderer(bundle, device="cpu", memory="64MB")
+    renderer.settle(CAMERA, **FINE)
+    is_over = threading.Event()
+
+    def draw():
+        while not is_over.is_set():
+            renderer.render(CAMERA, **FINE)
+
+    thread = threading.Thread(target=draw)
+    thread.start()
+    try:
+        for _ in range(20):
+            child = os.fork()
+            if child == 0:
+                code = 9
+                try:
+                    pick(bundle, CAMERA, 40, 30, renderer=renderer)
+                except RuntimeError as error:
+                    code = 7 if "from before a fork" in str(error) else 8
+                os._exit(code)
+            assert exit_code(child) == 7
+    finally:
+        is_over.set()
+        thread.join()
+
+
+def exit_code(child):
+    """Of a child that ends within a minute; -9 of one that does not."""
+    end = time.monotonic() + 60
+    while time.monotonic() < end:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.005)
+    os.kill(child, signal.SIGKILL)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 @pytest.mark.gpu

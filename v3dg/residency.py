@@ -147,7 +147,8 @@ class Residency:
         """
         if last is not None and last.is_of(subject):
             return last
-        assert not isinstance(subject, Gaussians), "an asset has no clusters"
+        if isinstance(subject, Gaussians):
+            raise TypeError("subject: expected a Scene or a Bundle, got Gaussians; build a bundle of them")
         with self.lock:
             resident = self.once(subject, ("scene", device), lambda: ResidentScene(device))
             if resident.is_of(subject):

@@ -29,6 +29,7 @@ KINDS = {
     "kills": 0.1,
     "bounded": 0.05,
     "threads": 0.03,
+    "settling": 0.1,
     "memory": 0.07,
 }
 KEPT = Path(__file__).parents[2] / "build" / "attack"

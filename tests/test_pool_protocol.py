@@ -1,0 +1,210 @@
+"""A model of how a pool settles, of which all interleavings are tried.
+
+The threads of csrc/residency/page_pool.cpp are three here: one that settles a view and then draws it, the
+one that decides, and one that reads. A step is what a thread does while it holds the lock, or what it does
+without it; any thread that can take a step may take the next one. The view needs a page and, below it,
+another one, which its cut asks for only once the first is in the page table of its frame. An earlier frame,
+of another view, may have left needs that are not decided about; deciding about them may bring a page of its
+own, and may raise the tolerance.
+
+`RULES` are what the pool does so that a settled view is drawn complete. Without any one of them the model
+finds an interleaving that draws a picture with a page missing or at a raised tolerance.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import pytest
+
+UPPER, LOWER, OTHER = "upper", "lower", "other"
+SETTLED_VIEW, EARLIER_VIEW = "settled", "earlier"
+# The view is settled once the pool has decided about it and its own frame, whose page table the cut used,
+# missed nothing.
+ABSENT_PAGES = "absent pages"
+# Before it settles, earlier needs are forgotten, and a round that is under way is waited for.
+CLEAN_START = "clean start"
+RULES = frozenset({ABSENT_PAGES, CLEAN_START})
+
+
+@dataclass(frozen=True)
+class Needs:
+    view: str
+    pages: frozenset[str]
+
+
+@dataclass(frozen=True)
+class State:
+    """All that the threads share, and where each of them is."""
+
+    step: str  # of the thread that settles
+    table: frozenset[str] = frozenset()  # pages that its frames draw
+    num_absent: int = 0  # pages that its last cut missed
+    noted: Needs | None = None
+    decided_view: str = ""
+    missing: int = 1
+    has_noted: bool = False
+    is_raised: bool = False
+    ready: frozenset[str] = frozenset()
+    resident: frozenset[str] = frozenset()  # for who decides: in a slot
+    todo: frozenset[str] = frozenset()
+    loading: frozenset[str] = frozenset()
+    read: frozenset[str] = frozenset()
+    wants_round: bool = False
+    is_served: bool = False  # the round that is under way is the one that is waited for
+    round_is_over: bool = False
+    is_deciding: bool = False
+    decides: Needs | None = None
+    loaded: frozenset[str] = frozenset()
+
+
+def cut(table):
+    """Pages that the view asks for with this page table: the lower one only below the upper one."""
+    return frozenset({UPPER, LOWER}) if UPPER in table else frozenset({UPPER})
+
+
+def may_note(state):
+    return state.noted is not None and (not state.has_noted or not state.ready)
+
+
+def settling_steps(state, rules):
+    """What the thread that settles may do next."""
+    if state.step == "start":
+        if CLEAN_START in rules:
+            if not state.is_deciding:
+                yield replace(state, step="begin", noted=None, is_raised=False)
+        else:
+            yield replace(state, step="begin", is_raised=False)
+    elif state.step == "begin":
+        yield replace(state, step="wait to take", wants_round=True, round_is_over=False)
+    elif state.step == "wait to take" and state.round_is_over:
+        table = state.table | state.ready
+        yield replace(
+            state,
+            step="cut",
+            table=table,
+            ready=frozenset(),
+            has_noted=False,
+            round_is_over=False,
+        )
+    elif state.step == "cut":
+        needs = Needs(SETTLED_VIEW, cut(state.table))
+        yield replace(
+            state,
+            step="wait to know",
+            noted=needs,
+            num_absent=len(needs.pages - state.table),
+            wants_round=True,
+            round_is_over=False,
+        )
+    elif state.step == "wait to know" and state.round_is_over:
+        is_known = ABSENT_PAGES not in rules or state.decided_view == SETTLED_VIEW
+        num_missing = state.num_absent if ABSENT_PAGES in rules else state.missing
+        step = "draw" if is_known and num_missing == 0 else "begin"
+        yield replace(state, step=step, round_is_over=False)
+    elif state.step == "draw":
+        yield replace(state, step="drawn", table=state.table | state.ready)
+
+
+def deciding_steps(state):
+    """What the thread that decides may do next: begin a round, or end it."""
+    if state.is_deciding:
+        resident = state.resident | state.loaded
+        after = replace(
+            state,
+            is_deciding=False,
+            decides=None,
+            loaded=frozenset(),
+            resident=resident,
+            ready=state.ready | state.loaded,
+            round_is_over=state.round_is_over or state.is_served,
+            is_served=False,
+        )
+        if state.decides is not None:
+            # What comes in this round is noted as missing, for the needs are looked at first.
+            absent = state.decides.pages - state.resident
+            after = replace(
+                after,
+                decided_view=state.decides.view,
+                missing=len(absent),
+                todo=absent,
+                is_raised=after.is_raised or state.decides.view == EARLIER_VIEW,
+            )
+        yield after
+    elif state.wants_round or may_note(state) or state.read:
+        decides = state.noted if may_note(state) else None
+        yield replace(
+            state,
+            is_deciding=True,
+            decides=decides,
+            noted=None if decides is not None else state.noted,
+            has_noted=state.has_noted or decides is not None,
+            loaded=state.read,
+            read=frozenset(),
+            is_served=state.wants_round,
+            wants_round=False,
+        )
+
+
+def reading_steps(state):
+    """What a thread that reads may do next: begin with a page, or end with one."""
+    for page in state.todo - state.loading - state.read - state.loaded - state.resident:
+        yield replace(state, todo=state.todo - {page}, loading=state.loading | {page})
+    for page in state.loading:
+        yield replace(state, loading=state.loading - {page}, read=state.read | {page})
+
+
+def starts():
+    """What an earlier frame may have left."""
+    earlier = Needs(EARLIER_VIEW, frozenset({OTHER}))
+    pages = [frozenset(), frozenset({UPPER}), frozenset({OTHER}), frozenset({UPPER, OTHER})]
+    for noted, loading in product([None, earlier], pages):
+        yield State("start", noted=noted, loading=loading)
+        for decides in (None, earlier):
+            yield State(
+                "start",
+                noted=noted,
+                loading=loading,
+                is_deciding=True,
+                decides=decides,
+                has_noted=decides is not None,
+            )
+
+
+def faults(rules):
+    """What is wrong in states that can be reached, and how many states there are."""
+    found = set()
+    seen = set(starts())
+    todo = list(seen)
+    while todo:
+        state = todo.pop()
+        if state.step == "drawn":
+            if cut(state.table) - state.table:
+                found.add("a page is missing")
+            if state.is_raised:
+                found.add("the tolerance is raised")
+            continue
+        steps = [*settling_steps(state, rules), *deciding_steps(state), *reading_steps(state)]
+        if not steps:
+            found.add(f"nobody can go on at {state.step!r}")
+        for after in steps:
+            if after not in seen:
+                seen.add(after)
+                todo.append(after)
+    return found, len(seen)
+
+
+def test_a_settled_view_is_drawn_complete_whatever_the_interleaving():
+    found, num_states = faults(RULES)
+    assert found == set()
+    assert num_states > 1000
+
+
+@pytest.mark.parametrize(
+    ("rule", "fault"),
+    [
+        (ABSENT_PAGES, "a page is missing"),
+        (CLEAN_START, "the tolerance is raised"),
+    ],
+)
+def test_no_rule_is_in_vain(rule, fault):
+    assert fault in faults(RULES - {rule})[0]
