@@ -485,7 +485,8 @@ void bind_frame(py::module_& m) {
         .def_readonly("exceeds_budget", &FrameStats::exceeds_budget)
         .def_readonly("select_ms", &FrameStats::select_ms)
         .def_readonly("draw_ms", &FrameStats::draw_ms)
-        .def_readonly("levels", &FrameStats::levels);
+        .def_readonly("levels", &FrameStats::levels)
+        .def_readonly("num_draws", &FrameStats::num_draws);
     py::class_<Shade>(m, "Shade",
                       "What is behind a picture, when its pixels stop, and whether their depth is drawn.")
         .def(py::init([](const std::array<double, 3>& background, float min_transmittance, bool with_depth) {

@@ -55,11 +55,13 @@ struct FrameStats {
     bool exceeds_budget;
     double select_ms, draw_ms;
     std::vector<int64_t> levels;  // on the host, gaussians selected by level
+    int num_draws = 1;            // more where buffers on a device were too small, and it was drawn again
 };
 
 inline FrameStats stats_of(const SceneFrameCounts& c) {
     return {c.gaussians,     c.render.in_frustum, c.render.records,       c.render.entries,     0,
-            c.tolerance_px2, c.exceeds_budget,    1e3 * c.select_seconds, 1e3 * c.draw_seconds, c.levels};
+            c.tolerance_px2, c.exceeds_budget,    1e3 * c.select_seconds, 1e3 * c.draw_seconds, c.levels,
+            1};
 }
 
 // The pictures of a frame: of a camera, or of two eyes, left first.
@@ -110,7 +112,8 @@ class BoundDrawing {
                       exceeds,
                       times.prepare_ms,
                       times.draw_ms,
-                      {}};
+                      {},
+                      drawing_->num_draws()};
         }
 #endif
         return stats_;

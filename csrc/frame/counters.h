@@ -29,6 +29,10 @@ struct FrameCounters {
 struct Capacity {
     unsigned long long items, records, large, entries, spread;
 
+    bool operator==(const Capacity& other) const {
+        return items == other.items && records == other.records && large == other.large &&
+               entries == other.entries && spread == other.spread;
+    }
     // Without branches in these two, so that a kernel loads all counters at once.
     V3DG_HD bool holds_items(unsigned long long num_items, unsigned long long num_gaussians) const {
         return (num_items <= items) & (num_gaussians <= records);

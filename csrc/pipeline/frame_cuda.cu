@@ -77,9 +77,11 @@ void Frame::enlarge(const FrameCounters& counters) {
     if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
-    // Some more, so that a camera on its way does not need a little more every frame.
+    // Some more, so that a camera on its way does not need a little more every frame. A buffer that is nearly
+    // full grows, too: the next frame of a moving camera would exceed it, and be drawn twice.
+    const Capacity before = capacity_;
     const auto grow = [](unsigned long long& capacity, unsigned long long count) {
-        if (count > capacity) capacity = count + count / 16;
+        if (count > capacity - capacity / 32) capacity = std::max(capacity, count + count / 16);
     };
     // What was not projected has no entries yet; most scenes have one or two a gaussian.
     if (counters.gaussians > capacity_.records) grow(capacity_.entries, counters.gaussians);
@@ -92,7 +94,7 @@ void Frame::enlarge(const FrameCounters& counters) {
     capacity_.spread = std::max(capacity_.spread, capacity_.records);  // which share their memory
     // Whoever differentiates is told what was counted before lists are spread.
     if (keeps_ == Keeps::tape) capacity_.spread = std::max(capacity_.spread, capacity_.entries);
-    if (was_captured_) return;
+    if (was_captured_ || capacity_ == before) return;
     // The largest buffers go before larger ones come, and not into the pool: pieces of the old size are of no
     // use.
     records_ = {};
@@ -108,10 +110,10 @@ std::unique_ptr<Drawing> Frame::draw(const FrameBatch& batch, Prepare prepare, c
     drawing->is_captured_ = is_capturing(stream);
     was_captured_ = was_captured_ || drawing->is_captured_;
     drawing->slot_ = take_slot(drawing->is_captured_);
-    // If the frame before is over and was too large, this one is likely to be, too.
+    // If the frame before is over and was too large or nearly so, this one is likely to be too large.
     if (last_ != nullptr && !last_->is_captured_ && !drawing->is_captured_) {
         const cudaError_t over = cudaEventQuery(last_->slot_->done);
-        if (over == cudaSuccess && !last_->was_drawn()) enlarge(*last_->slot_->counters);
+        if (over == cudaSuccess) enlarge(*last_->slot_->counters);
         if (over != cudaSuccess && over != cudaErrorNotReady) check(over, "a frame");
     }
     enqueue(*drawing, place);
@@ -279,6 +281,7 @@ const FrameCounters& Drawing::settle() {
         std::optional<StreamLock> lock;
         if (batch_.guards_models != nullptr) lock.emplace(*batch_.guards_models, stream_);
         frame_.enqueue(*this, {});
+        ++num_draws_;
     }
     return *slot_->counters;
 }

@@ -143,6 +143,8 @@ class Drawing {
     // too small.
     const FrameCounters& finish();
     FrameTimes times() const;
+    // More than 1 where buffers were too small; known once it is finished.
+    int num_draws() const { return num_draws_; }
 
   private:
     friend class Frame;
@@ -157,6 +159,7 @@ class Drawing {
     Capacity capacity_{};  // that it was drawn with
     PicturePlanes planes_[2]{};
     bool is_captured_ = false, is_settled_ = false;
+    int num_draws_ = 1;
 };
 
 }  // namespace cuda
