@@ -68,13 +68,13 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
         os.close(descriptor)
 
 
-def lock(descriptor: int, path: str | os.PathLike[str]) -> None:
-    """Keep other builds from what is open there until it is closed."""
+def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> None:
+    """Keep others that do the same work from what is open there until it is closed."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         advice = "wait for it, or write to another place"
-        raise RuntimeError(f"{os.fspath(path)}: another build is using it; {advice}") from None
+        raise RuntimeError(f"{os.fspath(path)}: another {work} is using it; {advice}") from None
     except OSError as error:
         # Some network file systems have no locks; there, two builds of one output are the user's to avoid.
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
