@@ -98,13 +98,13 @@ def replacing_export(
             place.put(Record.of_files_below(path), path.parent / RECORD)
         finally:
             _restore_and_remove(root, place.hidden, target)
-        place.remove_empty_folders()
 
 
 def _restore_and_remove(root: Folder, hidden: str, folder: Path) -> None:
     """Bring back what an export moved that did not end, and remove its hidden folder, which is its alone."""
     with contextlib.suppress(OSError, ValueError):  # what failed before is told
         if _restore(root, hidden, folder):
+            _remove_unused_folders(root, hidden, folder)
             try:
                 shutil.rmtree(folder / hidden, ignore_errors=True)
             except KeyboardInterrupt:
@@ -181,12 +181,9 @@ class _Place:
         """Have the new files take the place of the earlier ones; `path` is for the new record until then."""
         root, hidden = self._root, self.hidden
         self.check([*record.files, RECORD])
-        self._folders = [
-            name
-            for name in folders_of(record.files)
-            if name in self._record.folders or root.status(name) is None
-        ]
-        path.write_bytes(Record(record.files, self._folders).encode())
+        earlier = self._record.folders
+        folders = [name for name in folders_of(record.files) if name in earlier or root.status(name) is None]
+        path.write_bytes(Record(record.files, folders).encode())
         for name in dict.fromkeys((*self.earlier, *record.files)):
             status = root.status(name)
             is_earlier = status is not None and self.earlier.get(name) == stamp_of_status(status)
@@ -195,12 +192,6 @@ class _Place:
         for name in record.files:
             root.move(f"{hidden}/new/{name}", name)
         root.move(f"{hidden}/{RECORD}", RECORD)
-
-    def remove_empty_folders(self) -> None:
-        """Remove what an earlier export made and this one does not use."""
-        for name in sorted(self._record.folders, reverse=True):
-            if name not in self._folders:
-                self._root.remove_empty_folder(name)
 
 
 def _stamp(root: Folder, name: str) -> Stamp:
@@ -233,22 +224,36 @@ def _restore(root: Folder, hidden: str, folder: Path) -> bool:
     return is_whole
 
 
+def _remove_unused_folders(root: Folder, hidden: str, folder: Path) -> None:
+    """Remove what an earlier export made, if it is empty and the one that replaced it does not use it."""
+    earlier = read_record(root, f"{hidden}/old/{RECORD}", folder / hidden / "old" / RECORD)
+    later = read_record(root, RECORD, folder / RECORD)
+    if earlier is not None and later is not None:
+        for name in sorted(set(earlier.folders) - set(later.folders), reverse=True):
+            root.remove_empty_folder(name)
+
+
 def _clear_up(root: Folder, hidden: str, folder: Path) -> None:
     """After an export that was killed: bring back what it moved, and remove what records say that it wrote.
 
     What it wrote before there was a record stays.
     """
     with contextlib.suppress(OSError, ValueError):
-        for part, name in (("new", RECORD), ("old", f"old/{RECORD}")):
-            if not _restore(root, hidden, folder):
-                return
-            record = read_record(root, f"{hidden}/{name}", folder / hidden / name)
-            if record is None:
-                continue
-            for file in record.unchanged(root, f"{hidden}/{part}/"):
-                root.remove_file(f"{hidden}/{part}/{file}")
-            for below in reversed(folders_of(record.files)):
+        if not _restore(root, hidden, folder):
+            return
+        _remove_unused_folders(root, hidden, folder)
+        # It went back and has a record, or it ended, and that of the earlier one is left.
+        present = read_record(root, RECORD, folder / RECORD)
+        folders = set(folders_of(present.files if present else ()))
+        for part, name in (("new", f"{hidden}/{RECORD}"), ("old", f"{hidden}/old/{RECORD}")):
+            record = read_record(root, name, folder / name)
+            if record is not None:
+                for file in record.unchanged(root, f"{hidden}/{part}/"):
+                    root.remove_file(f"{hidden}/{part}/{file}")
+                folders.update(folders_of(record.files))
+                root.remove_file(name)
+        for below in sorted(folders, reverse=True):
+            for part in ("new", "old"):
                 root.remove_empty_folder(f"{hidden}/{part}/{below}")
-            root.remove_file(f"{hidden}/{name}")
-        for below in (f"{hidden}/new", f"{hidden}/old", hidden):
-            root.remove_empty_folder(below)
+        for name in (f"{hidden}/new", f"{hidden}/old", hidden):
+            root.remove_empty_folder(name)
