@@ -17,6 +17,7 @@ TRIES = {
     "threads": 30,
     "settling": 6,
     "memory": 8,
+    "exports": 40,
 }
 
 

@@ -361,6 +361,25 @@ def test_levels_that_a_kill_left_beside_a_bundle_are_removed(asset, tmp_path):
     assert names_in(tmp_path) == ["asset.ply", "out.v3dg"]
 
 
+def test_what_is_no_levels_stays(asset, tmp_path):
+    """A file of somebody that has the name of an unfinished bundle is neither removed nor written to."""
+    v3dg.write_asset(tmp_path / "asset.ply", asset)
+    (tmp_path / "out.v3dg.partial").write_text("a download that goes on")
+    for resume in (False, True):
+        with pytest.raises(ValueError, match=r"out\.v3dg\.partial: .*(move it elsewhere|something else)"):
+            v3dg.build.build_file(
+                tmp_path / "asset.ply", tmp_path / "out.v3dg", config=QUICK, progress=False, resume=resume
+            )
+    assert (tmp_path / "out.v3dg.partial").read_text() == "a download that goes on"
+
+
+def test_a_bundle_that_was_not_moved_yet_is_discarded(asset, tmp_path):
+    v3dg.build_bundle(asset, config=QUICK, progress=False).write(tmp_path / "out.v3dg")
+    (tmp_path / "out.v3dg").rename(tmp_path / "out.v3dg.partial")
+    v3dg.build.discard_levels(tmp_path / "out.v3dg.partial")
+    assert names_in(tmp_path) == []
+
+
 @contextmanager
 def files_of_at_most(num_bytes):
     """Writing beyond fails, as on a full disk."""

@@ -123,7 +123,7 @@ def test_the_command_says_how_to_look_at_tiles(tmp_path):
     done = run("export", "a.v3dg", "--to", "tiles", "--quiet", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "cp -r node_modules/cesium/Build/Cesium a_web/cesium" in done.stdout
-    assert {"index.html", "tileset.json", "a"} == set(os.listdir(tmp_path / "a_web"))
+    assert {"index.html", "tileset.json", "v3dg-export.json", "a"} == set(os.listdir(tmp_path / "a_web"))
     (tmp_path / "a_web" / "cesium").mkdir()
     (tmp_path / "a_web" / "cesium" / "Cesium.js").touch()
     again = run("export", "a.v3dg", "--to", "tiles", "--quiet", cwd=tmp_path)

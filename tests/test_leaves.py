@@ -1,6 +1,7 @@
 import errno
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -407,8 +408,11 @@ def test_scratch_in_use_and_files_of_others_are_kept(tmp_path, small):
     with pytest.raises(ValueError, match="expected scratch of a build, got 'letter'"), leaves():
         pass
     assert (tmp_path / "s" / "letter").read_text() == "dear"
-    (tmp_path / "s" / "letter").rename(tmp_path / "t")
-    (tmp_path / "s").rmdir()
+    (tmp_path / "s" / "letter").rename(tmp_path / "s" / "order")  # of a name that scratch has, too
+    with pytest.raises(ValueError, match="expected scratch of a build, got 'order'"), leaves():
+        pass
+    assert (tmp_path / "s" / "order").read_text() == "dear"
+    shutil.rmtree(tmp_path / "s")
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "rows").write_text("dear")
     (tmp_path / "s").symlink_to("elsewhere")

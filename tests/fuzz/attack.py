@@ -31,6 +31,7 @@ KINDS = {
     "threads": 0.03,
     "settling": 0.1,
     "memory": 0.07,
+    "exports": 0.05,
 }
 KEPT = Path(__file__).parents[2] / "build" / "attack"
 

@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from v3dg import _files
 
+_MARK = "v3dg-scratch"  # a file by which the folder is known
+
 
 class RowFile(AbstractContextManager["RowFile"]):
     """A file of rows of one width, float32 or uint32, in the byte order of the machine."""
@@ -54,27 +56,31 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         lock(descriptor, folder)
-        others = sorted(set(os.listdir(folder)) - set(names))
+        present = os.listdir(folder)
+        others = sorted(set(present) - {_MARK, *names} if _MARK in present else present)
         if others:
             raise ValueError(f"{folder}: expected scratch of a build, got {others[0]!a}; move it elsewhere")
+        # There before any other file, and until the last has gone: without it none of them is ours.
+        os.close(os.open(folder / _MARK, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600))
         try:
             _remove(folder, names)
             yield
         finally:
             _remove(folder, names)
+            _remove(folder, [_MARK])
             with suppress(OSError):
                 folder.rmdir()
     finally:
         os.close(descriptor)
 
 
-def lock(descriptor: int, path: str | os.PathLike[str]) -> None:
-    """Keep other builds from what is open there until it is closed."""
+def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> None:
+    """Keep others that do the same work from what is open there until it is closed."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         advice = "wait for it, or write to another place"
-        raise RuntimeError(f"{os.fspath(path)}: another build is using it; {advice}") from None
+        raise RuntimeError(f"{os.fspath(path)}: another {work} is using it; {advice}") from None
     except OSError as error:
         # Some network file systems have no locks; there, two builds of one output are the user's to avoid.
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):

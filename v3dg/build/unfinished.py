@@ -237,10 +237,29 @@ def described(device: Device) -> tuple[str, str]:
 
 
 def discard_levels(resume_path: str | os.PathLike[str]) -> None:
-    """Remove what an interrupted build left there, if anything; RuntimeError where a build is using it."""
+    """Remove what an interrupted build left there, if anything.
+
+    Raises:
+        ValueError: There is something else, which stays.
+        RuntimeError: A build is using it.
+        OSError: It cannot be removed.
+    """
     if os.path.lexists(resume_path):
-        with _open_locked(resume_path):
+        with _open_locked(resume_path) as file:
+            head = os.pread(file.fileno(), len(_MAGIC), 0)
+            is_ours = _MAGIC.startswith(head) or _is_bundle(resume_path)
+            got = "something else; move it elsewhere"
+            check(resume_path, is_ours, f"levels of an interrupted build, got {got}")
             os.unlink(resume_path)
+
+
+def _is_bundle(path: str | os.PathLike[str]) -> bool:
+    """Whether a build was killed when all was done but the move."""
+    try:
+        Bundle.open(path)
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _open_locked(path: str | os.PathLike[str]) -> FileIO:

@@ -20,7 +20,10 @@ from v3dg.opening import open_with_cameras
 
 @dataclass
 class Export(_common.Common):
-    """Write a scene or a bundle as a page for the web, as 3D Tiles, or as OpenUSD (docs/formats.md)."""
+    """Write a scene or a bundle as a page for the web, as 3D Tiles, or as OpenUSD (docs/formats.md).
+
+    A folder may be new, empty, or have an earlier export in it. Only files that v3dg-export.json there
+    lists, and that are as they were written, are replaced or removed. What is read may not be in it."""
 
     subject: tyro.conf.Positional[Path]
     """A scene (.json), a bundle (.v3dg), or a world of OpenUSD."""
@@ -33,6 +36,9 @@ class Export(_common.Common):
     """Most gaussians of an asset in a chunk of streamed SOG, for which the viewer chooses a level."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
     """Which way is up; what the file says or what is guessed from it or its cameras if not given."""
+    overwrite: _common.Flag = False
+    """Write to any folder, and replace files there that have the same names. No other file is removed, and no
+    folder or link is replaced."""
 
 
 def run(options: Export) -> None:
@@ -40,6 +46,7 @@ def run(options: Export) -> None:
     _common.check_usage("--chunk", options.chunk >= 1, f"at least 1, got {options.chunk}")
     folder = options.output or beside(options.subject).with_name(f"{options.subject.stem}_web")
     _common.check_output(folder, options.subject)
+    export.check_outside(folder, [options.subject])
     start = time.perf_counter()
     subject, cameras = open_with_cameras(options.subject)
     if isinstance(subject, Gaussians):
@@ -53,7 +60,7 @@ def run(options: Export) -> None:
         line = f"{folder}: {_common.bytes_text(size)}, {written['seconds']:.1f} s"
         _common.print_result(options.json, written, [line, *notes])
         return
-    common: dict[str, Any] = {"up": up, "progress": not options.quiet}
+    common: dict[str, Any] = {"up": up, "progress": not options.quiet, "overwrite": options.overwrite}
     there = shlex.quote(str(folder))
     done: export.Site | export.Tiles
     if options.to == "tiles":

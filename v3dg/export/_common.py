@@ -1,12 +1,8 @@
-"""What exports share: which way is up, turning gaussians, and folders that are complete or not there."""
+"""What exports share: which way is up, turning gaussians, names of bundles, documents."""
 
-import contextlib
 import json
 import math
-import os
-import secrets
-import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -14,8 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _files
-from v3dg._numbers import check, one_of
+from v3dg._numbers import one_of
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
 from v3dg.rotations import rotation_from_quaternion
@@ -34,9 +29,6 @@ _TO_UPRIGHT: dict[Axis, tuple[float, float, float, float]] = {
 # From there to where y is up, as in WebGL, and z, as on a globe.
 _FROM_UPRIGHT = {"y": np.diag([-1.0, -1.0, 1.0]), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
 
-# The file by which an export is known, of each kind: nothing else is replaced by another export.
-MARKS = ("lod-meta.json", "site.json", "tileset.json")
-
 
 def turn_upright(up: Axis) -> Floats:
     """(4,) w x y z that turns what is up in an asset to -y; ValueError for another name."""
@@ -49,14 +41,26 @@ def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
     return np.asarray(_FROM_UPRIGHT[frame] @ rotation_from_quaternion(turn_upright(up))) + 0.0
 
 
-def names_of(scene: Scene) -> list[str]:
-    """A folder for each bundle, after its file."""
-    names: list[str] = []
-    for number, bundle in enumerate(scene.bundles):
-        stem = Path(bundle.path or "bundle").stem
-        name = "".join(c if c.isascii() and c.isalnum() else "_" for c in stem)[:80]
-        names.append(f"{name}_{number}" if name in names else name)
-    return names
+def names_of(scene: Scene, taken: Collection[str] = ()) -> list[str]:
+    """A folder for each bundle, after its file, other than those that are taken."""
+    stems = [Path(bundle.path or "bundle").stem[:80] for bundle in scene.bundles]
+    return distinct(
+        ("".join(c if c.isascii() and c.isalnum() else "_" for c in stem) for stem in stems), taken
+    )
+
+
+def distinct(names: Iterable[str], taken: Collection[str] = ()) -> list[str]:
+    """The names, of which those that are taken by then get a number: also where case makes no difference."""
+    results: list[str] = []
+    used = {name.casefold() for name in taken}
+    for number, name in enumerate(names):
+        result = name
+        while result.casefold() in used:
+            result = f"{name}_{number}"
+            number += 1
+        used.add(result.casefold())
+        results.append(result)
+    return results
 
 
 def rows_by(numbers: NDArray[Any], count: int) -> list[NDArray[np.intp]]:
@@ -91,38 +95,3 @@ def write_page(folder: Path, name: str) -> None:
 
 def bytes_below(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-
-
-@contextlib.contextmanager
-def replacing_folder(folder: Path, keep: str = "") -> Iterator[Path]:
-    """Give a new folder beside `folder` to fill; at the end it takes its place, on failure it is removed.
-
-    What is there by the name `keep` moves along.
-    """
-    has_mark = any((folder / mark).is_file() for mark in MARKS)
-    is_ours = folder.is_dir() and (has_mark or not any(folder.iterdir()))
-    expected = "a new folder, or one with an earlier export, got something else"
-    check(folder, is_ours or not folder.exists(), expected)
-    target = folder.resolve()
-    missing = [parent for parent in target.parents if not parent.exists()]  # the lowest first
-    hidden = f".{target.name[:40]}.{secrets.token_hex(8)}"
-    temporary, old = target.with_name(f"{hidden}.tmp"), target.with_name(f"{hidden}.old")
-    with _files.naming_errors(folder, os.fspath(temporary)):
-        try:
-            temporary.mkdir(parents=True)
-            yield temporary
-            if target.exists():
-                target.rename(old)
-            temporary.rename(target)
-            if keep and (old / keep).exists():
-                (old / keep).rename(target / keep)
-            shutil.rmtree(old, ignore_errors=True)
-        except BaseException:
-            if old.exists() and not target.exists():
-                old.rename(target)
-            for rest in (temporary, old):
-                shutil.rmtree(rest, ignore_errors=True)
-            for parent in missing:
-                with contextlib.suppress(OSError):  # somebody else has put something there
-                    parent.rmdir()
-            raise

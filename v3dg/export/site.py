@@ -19,7 +19,8 @@ from v3dg._progress import Bar, Progress
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Camera, check_cameras
 from v3dg.export import _common
-from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, Plan, write_levels
+from v3dg.export._folder import NewFiles, check_outside, replacing_export
+from v3dg.export.streamed_sog import DEFAULT_CHUNK, INDEX, SETTINGS, Plan, write_levels
 from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Scene
 from v3dg.select import DEFAULT_TOLERANCE
@@ -40,7 +41,7 @@ class Site:
         instances: Instances of them.
         gaussians: Of the finest level, of all instances.
         coarsest: Of the coarsest level, of all instances: the least that a viewer can come down to.
-        bytes: Of all files.
+        bytes: Of all files that were written.
         has_engine: Whether PlayCanvas's engine is beside the page.
     """
 
@@ -60,27 +61,35 @@ def write_site(
     chunk: int = DEFAULT_CHUNK,
     up: Axis | None = None,
     progress: Progress = False,
+    overwrite: bool = False,
 ) -> Site:
-    """Write a scene or a bundle as a web page, replacing an earlier export once all is written.
+    """Write a scene or a bundle as a web page, replacing the files of an earlier export once all is written.
 
     The levels of a bundle alone are in the folder itself, those of a scene's bundles in folders of their own.
-    PlayCanvas's engine is taken from an earlier export, or from `node_modules` here or above.
+    PlayCanvas's engine is that of the folder, or taken from `node_modules` here or above.
 
     Args:
         subject: Or its file, of which a scene's brings cameras.
-        folder: Where to; new, empty, or with an earlier export. Folders above it are made.
+        folder: Where to; new, empty, or with an earlier export. Folders above it are made. `v3dg-export.json`
+            in it says what was written, and nothing else is replaced or removed.
         cameras: From where to look, by name; the page begins with the first.
         chunk: As in `write_streamed_sog`.
         up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
+        progress: As in `v3dg.build_bundle`.
+        overwrite: As in `write_streamed_sog`.
 
     Raises:
         TypeError: Cameras are none, or without names.
         ValueError: As `write_streamed_sog`, or a scene without instances.
+        RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
     """
     if isinstance(subject, str | os.PathLike):
-        found: Any = open_with_cameras(Path(subject))
-        return write_site(found[0], folder, cameras or found[1], chunk=chunk, up=up, progress=progress)
+        check_outside(Path(folder), [subject])
+        opened: Any
+        opened, file_cameras = open_with_cameras(Path(subject))
+        cameras = cameras or file_cameras
+        return write_site(opened, folder, cameras, chunk=chunk, up=up, progress=progress, overwrite=overwrite)
     check_cameras(cameras := cameras or {})
     folder, is_scene, scene = Path(folder), isinstance(subject, Scene), Scene.of(subject)
     axis = up or up_of(subject, cameras)[0]
@@ -88,7 +97,9 @@ def write_site(
     turn = _common.turn_upright("-y" if is_scene else axis)
     check("scene", len(scene), "instances to export, got none")
     plans = [Plan.of(bundle, chunk) for bundle in scene.bundles]
-    with _common.replacing_folder(folder) as place:
+    certain = (SITE, "index.html") if is_scene else (SITE, "index.html", INDEX, SETTINGS)
+    with replacing_export(folder, scene, certain, overwrite=overwrite) as new:
+        place = new.path
         listed, counts = [], []
         with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
             for name, plan in zip(_common.names_of(scene) if is_scene else ["."], plans, strict=True):
@@ -109,9 +120,10 @@ def write_site(
         }
         _common.write_document(place / SITE, document)
         _common.write_page(place, "site.html")
-        has_engine = _bring_engine(folder, place)
+        has_engine = _bring_engine(folder, new)
+        num_bytes = _common.bytes_below(place)
     finest, coarsest = np.array(counts)[scene.instance_bundle].sum(axis=0).tolist()
-    return Site(len(listed), len(scene), finest, coarsest, _common.bytes_below(folder), has_engine)
+    return Site(len(listed), len(scene), finest, coarsest, num_bytes, has_engine)
 
 
 def _instances(scene: Scene) -> dict[str, list[Any]]:
@@ -135,12 +147,18 @@ def _cameras(cameras: Mapping[str, Camera]) -> list[dict[str, Any]]:
     ]
 
 
-def _bring_engine(folder: Path, place: Path) -> bool:
-    """Copy PlayCanvas's engine beside the page, where npm or somebody else has put it."""
-    here = Path.cwd()
-    modules = [parent / "node_modules" / "playcanvas" / "build" for parent in (here, *here.parents)]
-    found = next((file for file in (d / ENGINE for d in (folder, *modules)) if file.is_file()), None)
-    if found is not None:
-        with _files.naming_errors(found):
-            shutil.copyfile(found, place / ENGINE)
-    return found is not None
+def _bring_engine(folder: Path, new: NewFiles) -> bool:
+    """Have PlayCanvas's engine beside the page, if npm or somebody else has put it anywhere.
+
+    One that an earlier export brought is part of this one, too; one that somebody put there stays.
+    """
+    present = folder / ENGINE
+    if present.is_file() and ENGINE not in new.earlier:
+        return True
+    start = Path.cwd()
+    modules = [parent / "node_modules" / "playcanvas" / "build" for parent in (start, *start.parents)]
+    engine = next((file for file in (d / ENGINE for d in (folder, *modules)) if file.is_file()), None)
+    if engine is not None:
+        with _files.naming_errors(engine):
+            shutil.copyfile(engine, new.path / ENGINE)
+    return engine is not None

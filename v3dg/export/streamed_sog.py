@@ -26,12 +26,14 @@ from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
 from v3dg.cleaning import ball_of_most
 from v3dg.export import _common
+from v3dg.export._folder import replacing_export
 from v3dg.export.chunk_errors import ChunkErrors
 from v3dg.formats import sog
 from v3dg.formats._packing import check_writable
 from v3dg.gaussians import Gaussians
 from v3dg.opening import File, opened
 from v3dg.rotations import rotation_from_quaternion
+from v3dg.scene import Scene
 from v3dg.upright import up_of
 
 INDEX = "lod-meta.json"
@@ -66,32 +68,41 @@ def write_streamed_sog(
     chunk: int = DEFAULT_CHUNK,
     up: Axis | None = None,
     progress: Progress = False,
+    overwrite: bool = False,
 ) -> Export:
-    """Write a bundle as streamed SOG, replacing an earlier export in one step once all is written.
+    """Write a bundle as streamed SOG, replacing the files of an earlier export once all is written.
 
     Besides, `settings.json` tells SuperSplat's viewer where to start. Memory is needed for one folder of SOG,
     and for 128 KiB of pictures a chunk.
 
     Args:
         bundle: Or the file of it.
-        folder: Where to; new, empty, or with an earlier export. Folders above it are made.
+        folder: Where to; new, empty, or with an earlier export. Folders above it are made. `v3dg-export.json`
+            in it says what was written, and nothing else is replaced or removed.
         chunk: Most gaussians of the asset in a chunk. Smaller chunks follow the view more closely, and fewer
             of their levels go together exactly, whichever each of them has.
         up: What is up in the asset, which is turned to what viewers take to be up. Trained assets mostly have
             y down, so nothing is turned.
         progress: As in `v3dg.build_bundle`.
+        overwrite: Write to any folder, and replace files of the same names there; all others stay.
 
     Raises:
-        ValueError: There is something else at ``folder``, ``chunk`` is too small for the bundle's groups, or
-            a gaussian has values that SOG cannot hold.
+        ValueError: There is something else at ``folder``, or the bundle's file is in it; a file of the
+            earlier export was changed; ``chunk`` is too small for the bundle's groups; or a gaussian has
+            values that SOG cannot hold.
+        RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
 
     Source: PlayCanvas, the streamed SOG format, version 1.
     """
     found = opened(bundle)
     plan, turn = Plan.of(found, chunk), _common.turn_upright(up or up_of(found)[0])
-    with _common.replacing_folder(Path(folder)) as place, Bar(found.num_gaussians, "export", progress) as bar:
-        return write_levels(plan, place, turn, bar.update)
+    scene, names = Scene.of(found), (INDEX, SETTINGS)
+    with (
+        replacing_export(Path(folder), scene, names, overwrite=overwrite) as new,
+        Bar(found.num_gaussians, "export", progress) as bar,
+    ):
+        return write_levels(plan, new.path, turn, bar.update)
 
 
 def write_levels(plan: "Plan", place: Path, turn: Floats, advance: Callable[[int], Any]) -> Export:

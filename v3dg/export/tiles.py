@@ -6,6 +6,7 @@ which a renderer's screen-space error of 16 px, the usual limit, is v3dg's toler
 """
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from v3dg._version import __version__
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
 from v3dg.export import _common
+from v3dg.export._folder import check_outside, replacing_export
 from v3dg.formats import gltf
 from v3dg.formats._packing import check_writable
 from v3dg.formats._reading import Path as AnyPath
@@ -31,7 +33,7 @@ from v3dg.upright import up_of
 
 TILESET = "tileset.json"
 CESIUM = "cesium"
-"""Folder beside the page with CesiumJS, which stays when an export is replaced."""
+"""Folder beside the page with CesiumJS, which is not part of the export."""
 TILES_NEED = "npm install cesium@1.145.0", f"cp -r node_modules/cesium/Build/Cesium {{}}/{CESIUM}"
 """Commands that bring CesiumJS, in the version that the page is tested with, to a folder."""
 
@@ -61,33 +63,46 @@ class Tiles:
 
 
 def write_tiles(
-    subject: Scene | Bundle | File, folder: AnyPath, *, up: Axis | None = None, progress: Progress = False
+    subject: Scene | Bundle | File,
+    folder: AnyPath,
+    *,
+    up: Axis | None = None,
+    progress: Progress = False,
+    overwrite: bool = False,
 ) -> Tiles:
-    """Write a scene or a bundle as 3D Tiles, replacing an earlier export once all is written.
+    """Write a scene or a bundle as 3D Tiles, replacing the files of an earlier export once all is written.
 
     Tiles are `.glb` files with KHR_gaussian_splatting, compressed as SPZ. The importance of instances is left
     out. The world's origin is at that of the tiles, the Earth's centre; viewers can put it elsewhere.
 
     Args:
         subject: Or the file of it.
-        folder: Where to; new, empty, or with an earlier export. Folders above it are made.
+        folder: Where to; new, empty, or with an earlier export. Folders above it are made. `v3dg-export.json`
+            in it says what was written, and nothing else is replaced or removed.
         up: What is up in the world; as `v3dg.upright.up_of` takes it if None.
+        progress: As in `v3dg.build_bundle`.
+        overwrite: Write to any folder, and replace files of the same names there; all others stay.
 
     Raises:
-        ValueError: There is something else at ``folder``, nothing to export, or a gaussian has values that
-            SPZ cannot hold.
+        ValueError: There is something else at ``folder``, or a file that is read is in it; a file of the
+            earlier export was changed; there is nothing to export; or a gaussian has values that SPZ cannot
+            hold.
+        RuntimeError: Another export is using the folder.
         OSError: A file cannot be written.
 
     Source: OGC, 3D Tiles 1.1; Khronos, KHR_gaussian_splatting and its compression by SPZ.
     """
+    if isinstance(subject, str | os.PathLike):
+        check_outside(Path(folder), [subject])
     found, root = opened(subject), np.eye(4)
     scene = Scene.of(found)
     root[:3, :3] = _common.rotation_to(up or up_of(found)[0], "z")
     check("scene", len(scene), "instances to export, got none")
     for bundle in scene.bundles:
         check("bundle", bundle.num_gaussians, "gaussians to export, got none")
-    names, trees = _common.names_of(scene), []
-    with _common.replacing_folder(Path(folder), keep=CESIUM) as place:
+    names, trees = _common.names_of(scene, taken=[CESIUM]), []
+    with replacing_export(Path(folder), scene, (TILESET, "index.html"), overwrite=overwrite) as new:
+        place = new.path
         with Bar(sum(bundle.num_gaussians for bundle in scene.bundles), "export", progress) as bar:
             for name, bundle in zip(names, scene.bundles, strict=True):
                 (place / name).mkdir()

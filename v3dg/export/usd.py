@@ -54,7 +54,8 @@ def write_usd(subject: Scene | Bundle | File, path: str | os.PathLike[str], *, u
     w, *xyz = quaternion_from_rotation(_common.rotation_to(up or up_of(found)[0], "z"))
     world.AddOrientOp().Set(pxr.Gf.Quatf(w, *xyz))
     above = "/world/instances" if isinstance(found, Scene) else "/world"
-    paths = [f"{above}/{pxr.Tf.MakeValidIdentifier(name)}" for name in _common.names_of(scene)]
+    names = _common.distinct(pxr.Tf.MakeValidIdentifier(name) for name in _common.names_of(scene))
+    paths = [f"{above}/{name}" for name in names]
     if isinstance(found, Scene):
         vectors, quats = pxr.Vt.Vec3fArray.FromNumpy, np.roll(scene.quaternions, -1, axis=1)
         instancer = pxr.UsdGeom.PointInstancer.Define(stage, "/world/instances")

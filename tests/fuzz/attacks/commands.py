@@ -152,7 +152,7 @@ OPTIONS = {
     "view": {"--host": "w", "--port": "n", "--up": "w", "--no-browser": "", **CUT, "--device": "w"},
     "compare": {"-o": "o", "--pictures": "w", **CUT, "--supersample": "n", "--device": "w", **VIEWS},
     "convert": {"--level": "n", **CUT, "--outside": "w", **VIEWS},
-    "export": {"-o": "o", "--chunk": "n", "--up": "w"},
+    "export": {"-o": "o", "--chunk": "n", "--up": "w", "--overwrite": ""},
     "demo": {
         "-o": "o",
         "--gaussians": "n",

@@ -1,0 +1,91 @@
+"""What is below a folder, reached by relative names without following a link on the way."""
+
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+# O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
+_FILE = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+
+
+def folders_above(name: str) -> list[str]:
+    """The folders that a relative name goes through, the highest first."""
+    parts = name.split("/")[:-1]
+    return ["/".join(parts[: count + 1]) for count in range(len(parts))]
+
+
+class Folder(AbstractContextManager["Folder"]):
+    """An open folder. All names are relative to it, with `/` between folders, and no link is followed.
+
+    A folder on the way that is a link or a file is an OSError. Errors have `shown` in place of the path.
+    """
+
+    def __init__(self, path: Path, shown: Path) -> None:
+        self._shown = shown
+        self.descriptor = os.open(path, _FOLDER)
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self.descriptor)
+
+    @contextmanager
+    def _folder_of(self, name: str) -> Iterator[tuple[int, str]]:
+        """A descriptor of the folder that something is in, and its name there."""
+        *folders, last = name.split("/")
+        descriptor = os.dup(self.descriptor)
+        try:
+            for folder in folders:
+                below = os.open(folder, _FOLDER | os.O_NOFOLLOW, dir_fd=descriptor)
+                os.close(descriptor)
+                descriptor = below
+            yield descriptor, last
+        except OSError as error:
+            if error.errno is None:
+                raise
+            raise OSError(error.errno, os.strerror(error.errno), os.fspath(self._shown / name)) from error
+        finally:
+            os.close(descriptor)
+
+    def status(self, name: str) -> os.stat_result | None:
+        """Of what has this name, which may be a link; None where there is nothing."""
+        try:
+            with self._folder_of(name) as (folder, last):
+                return os.stat(last, dir_fd=folder, follow_symlinks=False)
+        except FileNotFoundError:
+            return None
+
+    def open_file(self, name: str) -> int:
+        """A descriptor to read a file; OSError for a link, ValueError for a folder or a device."""
+        with self._folder_of(name) as (folder, last):
+            descriptor = os.open(last, _FILE, dir_fd=folder)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise ValueError(f"{self._shown / name}: expected a file, got a folder or a device")
+        return descriptor
+
+    def make_folder(self, name: str) -> None:
+        """Make a folder unless something has that name."""
+        with self._folder_of(name) as (folder, last), suppress(FileExistsError):
+            os.mkdir(last, dir_fd=folder)
+
+    def move(self, source: str, target: str) -> None:
+        """Rename a file, and make the folders above its new name; FileExistsError where that is taken."""
+        for above in folders_above(target):
+            self.make_folder(above)
+        with self._folder_of(source) as (folder, last), self._folder_of(target) as (new_folder, new_last):
+            with suppress(FileNotFoundError):
+                os.stat(new_last, dir_fd=new_folder, follow_symlinks=False)
+                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), target)
+            os.rename(last, new_last, src_dir_fd=folder, dst_dir_fd=new_folder)
+
+    def remove_file(self, name: str) -> None:
+        with self._folder_of(name) as (folder, last):
+            os.unlink(last, dir_fd=folder)
+
+    def remove_empty_folder(self, name: str) -> None:
+        """Remove a folder with nothing in it; what is not there or is in use stays as it is."""
+        with suppress(OSError), self._folder_of(name) as (folder, last):
+            os.rmdir(last, dir_fd=folder)

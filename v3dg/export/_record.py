@@ -1,0 +1,170 @@
+"""The record of an export: which files and folders it wrote, and what was in the files.
+
+It lies in the folder of the export, so anybody may have written it: only names that an export can have, all
+of them below the folder, are taken from it, and only files with the size and the hash that it gives are ours.
+"""
+
+import hashlib
+import io
+import json
+import os
+import re
+import stat
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+from v3dg._json import Node, parse_json
+from v3dg._numbers import check
+from v3dg.export._below import Folder
+
+RECORD = "v3dg-export.json"
+_FORMAT, _VERSION = "v3dg-export", 1
+_MOST_BYTES = 64 << 20  # of a record: that of a million files
+_PIECE_BYTES = 1 << 20
+_HASH_BYTES = 16
+_FOLDER_NAME = re.compile(r"[A-Za-z0-9_]{1,100}(/[A-Za-z0-9_]{1,100})?")
+_FILE_NAME = re.compile(
+    r"([A-Za-z0-9_]{1,100}/){0,2}[A-Za-z0-9_][A-Za-z0-9_-]{0,99}(\.[a-z]{1,20}){0,2}\.(html|json|mjs|webp|glb)"
+)
+_HASH = re.compile(f"[0-9a-f]{{{2 * _HASH_BYTES}}}")
+
+Stamp: TypeAlias = tuple[int, int, int, int]
+"""Of a file: another one, or one that was written to, has another."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """What was written to a file."""
+
+    num_bytes: int
+    digest: str
+
+
+@dataclass(frozen=True)
+class Record:
+    """Files by their names relative to the folder, and the folders that were made for them."""
+
+    files: dict[str, Content]
+    folders: list[str]
+
+    @classmethod
+    def of_files_below(cls, path: Path) -> "Record":
+        """The record of all files below a folder that nobody else writes to; without folders.
+
+        Files that others refer to come last.
+        """
+        names = [file.relative_to(path).as_posix() for file in path.rglob("*") if not file.is_dir()]
+        assert all(_FILE_NAME.fullmatch(name) and name != RECORD for name in names), names
+        names.sort(key=lambda name: (-name.count("/"), name))
+        return cls({name: _content_of_path(path / name) for name in names}, [])
+
+    def encode(self) -> bytes:
+        files = {name: [content.num_bytes, content.digest] for name, content in self.files.items()}
+        document = {"format": _FORMAT, "version": _VERSION, "folders": self.folders, "files": files}
+        return json.dumps(document, separators=(",", ":")).encode("ascii")
+
+    def unchanged(self, root: Folder, prefix: str = "") -> dict[str, Stamp]:
+        """Of the files that are there, below `prefix`, those that are as they were written."""
+        stamps: dict[str, Stamp] = {}
+        for name, content in self.files.items():
+            stamp = stamp_of_content(root, f"{prefix}{name}", content)
+            if stamp is not None:
+                stamps[name] = stamp
+        return stamps
+
+
+def read_record(root: Folder, name: str, shown: Path) -> Record | None:
+    """Read a record; None where there is none.
+
+    Args:
+        root: The folder that the record is below.
+        name: Of the record, relative to that.
+        shown: The path that errors begin with.
+
+    Raises:
+        ValueError: It is no record, or names what no export writes.
+        OSError: It cannot be read.
+    """
+    status = root.status(name)
+    if status is None:
+        return None
+    check(
+        shown, is_file(status), "the record of an export, got a folder, a link or a device; move it elsewhere"
+    )
+    with open(root.open_file(name), "rb") as file:
+        text = file.read(_MOST_BYTES + 1)
+    check(shown, len(text) <= _MOST_BYTES, f"a record of at most {_MOST_BYTES >> 20} MiB, got more")
+    try:
+        document = Node(parse_json(text), str(shown), "")
+    except ValueError as error:
+        raise ValueError(f"{shown}: expected the record of an export, could not read it ({error})") from None
+    fields = document.fields(("format", "version", "folders", "files"))
+    if fields["format"].value != _FORMAT or fields["version"].value != _VERSION:
+        raise document.problem(
+            f"expected {_FORMAT} version {_VERSION}, got another; remove it to start again"
+        )
+    folders = [_checked_name(node, _FOLDER_NAME) for node in fields["folders"].items()]
+    files: dict[str, Content] = {}
+    for key, node in fields["files"].some_fields(()).items():
+        files[_checked_name(Node(key, node.file, "files"), _FILE_NAME)] = _content_of_node(node)
+    return Record(files, folders)
+
+
+def _checked_name(node: Node, pattern: re.Pattern[str]) -> str:
+    """A name that an export can have written; others lead elsewhere, or to what is not ours."""
+    name = node.value
+    if not isinstance(name, str) or not pattern.fullmatch(name) or name == RECORD:
+        raise node.error("a name that an export writes, below its folder", "remove the record to start again")
+    return name
+
+
+def _content_of_node(node: Node) -> Content:
+    size, digest = node.items("the bytes of a file and their hash", 2, 2)
+    is_size = isinstance(size.value, int) and not isinstance(size.value, bool) and size.value >= 0
+    if not is_size:
+        raise size.error("a whole number, 0 or more")
+    if not (isinstance(digest.value, str) and _HASH.fullmatch(digest.value)):
+        raise digest.error(f"a hash of {2 * _HASH_BYTES} hexadecimal digits")
+    return Content(size.value, digest.value)
+
+
+def stamp_of_content(root: Folder, name: str, content: Content) -> Stamp | None:
+    """The stamp of a file that holds just this; None for any other, or what cannot be read."""
+    try:
+        descriptor = root.open_file(name)
+    except (OSError, ValueError):
+        return None
+    with open(descriptor, "rb", buffering=0) as file:
+        status = os.fstat(descriptor)
+        if status.st_size != content.num_bytes or _digest_of(file) != content.digest:
+            return None
+    return stamp_of_status(status)
+
+
+def stamp_of_status(status: os.stat_result) -> Stamp:
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def is_file(status: os.stat_result) -> bool:
+    """Whether this is of a regular file, and not of a link to one."""
+    return stat.S_ISREG(status.st_mode)
+
+
+def _content_of_path(path: Path) -> Content:
+    with open(path, "rb", buffering=0) as file:
+        return Content(os.fstat(file.fileno()).st_size, _digest_of(file))
+
+
+def _digest_of(file: io.FileIO) -> str:
+    """The hash of all that is left to read."""
+    state = hashlib.blake2b(digest_size=_HASH_BYTES)
+    while piece := file.read(_PIECE_BYTES):
+        state.update(piece)
+    return state.hexdigest()
+
+
+def folders_of(names: Iterable[str]) -> list[str]:
+    """The folders that files are in, the highest first."""
+    return sorted({name[:end] for name in names for end, letter in enumerate(name) if letter == "/"})
