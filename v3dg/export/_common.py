@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from v3dg import _files
 from v3dg._numbers import check, one_of
+from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
 from v3dg.rotations import rotation_from_quaternion
@@ -53,7 +54,7 @@ def names_of(scene: Scene) -> list[str]:
     """A folder for each bundle, after its file."""
     names: list[str] = []
     for number, bundle in enumerate(scene.bundles):
-        stem = Path(bundle.path or "bundle").stem
+        stem = beside(bundle.path or "bundle").stem
         name = "".join(c if c.isascii() and c.isalnum() else "_" for c in stem)[:80]
         names.append(f"{name}_{number}" if name in names else name)
     return names
