@@ -26,6 +26,7 @@ from v3dg.gaussians import Gaussians
 _FIRST_BYTES = 4096  # of the header: what a disk writes at once
 # Of tables at a URL, whose size is a claim until they are here; those of a billion gaussians have less.
 _MOST_FETCHED_TABLE_BYTES = 1 << 30
+_FREE_CLUSTERS = 1 << 18  # that may all be empty; others have a gaussian each
 
 
 class BundlePlan:
@@ -191,10 +192,11 @@ class BundleFile:
         return expected
 
     def _check_counts(self, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int) -> None:
-        """Refuse tables that are larger than the gaussians can need, before memory is taken for them."""
-        most = pages_bytes // self.codec.gaussian_bytes
-        expected = f"at most {most}, one for each gaussian in the pages, got {num_clusters}"
-        self._check("clusters", num_clusters <= most, expected)
+        """Refuse tables at a URL that are larger than the gaussians can need, before they are fetched."""
+        if self._at_url is None:
+            return
+        most = _FREE_CLUSTERS + pages_bytes // self.codec.gaussian_bytes
+        self._check("clusters", num_clusters <= most, f"at most {most} for its pages, got {num_clusters}")
         self._check("groups", num_groups <= num_clusters, f"at most {num_clusters}, got {num_groups}")
         self._check("pages", num_pages <= num_groups + 1, f"at most {num_groups + 1}, got {num_pages}")
 
