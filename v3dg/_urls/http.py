@@ -7,6 +7,7 @@ because a name may resolve to another address by then.
 
 import asyncio
 import atexit
+import base64
 import contextlib
 import os
 import re
@@ -55,12 +56,14 @@ class WebSource:
         url: Any = there.encode_url(place)
         if not url.host:
             raise Problem(ValueError, "expected a URL with a host; check the address")
-        self._auth = self._aiohttp.BasicAuth(url.user, url.password or "") if url.user is not None else None
         self._url: Any = url.with_user(None).with_fragment(None)
         # What users configure for fsspec; only the first host may see the headers.
         session: Mapping[str, Any] = there.client_kwargs
         request: Mapping[str, Any] = there.kwargs
         self._headers = {**session.get("headers", {}), **request.get("headers", {})}
+        if url.user is not None:
+            text = f"{url.user}:{url.password or ''}".encode()
+            self._headers["Authorization"] = f"Basic {base64.b64encode(text).decode()}"
         self._ssl = request.get("ssl", True)
         self._proxy = request.get("proxy")
         self._trust_env = bool(session.get("trust_env", False))
@@ -153,15 +156,12 @@ class WebSource:
             reach = await _checked(url, reach)
             if self._reach is None:
                 self._reach = reach
-            is_first_host = url.origin() == self._url.origin()
-            own = self._headers if is_first_host else {}
-            auth = self._auth if is_first_host else None
+            own = self._headers if url.origin() == self._url.origin() else {}
             session = self._session(reach)
             answer = await session.request(
                 method,
                 url,
                 headers={**own, **headers, **_IDENTITY},
-                auth=auth,
                 allow_redirects=False,
                 ssl=self._ssl,
                 proxy=self._proxy,
