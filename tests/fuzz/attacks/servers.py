@@ -480,7 +480,7 @@ class Attack:
 
     def plan(self, rng, work):
         name = list(BEHAVIOURS)[self.number % len(BEHAVIOURS)]
-        subject, end, behaviour = BEHAVIOURS[name]
+        subject, _, behaviour = BEHAVIOURS[name]
         kind, *how = subject.split()
         as_json = rng.random() < 0.5
         (work / "tmp").mkdir()
