@@ -668,6 +668,14 @@ def test_no_more_is_fetched_than_there_is_room_for(web, tmp_path, monkeypatch):
     assert web.sent == []
 
 
+@pytest.mark.parametrize("host", ["me:hunter2/x@host", "me:hunter2#x@host"])
+def test_a_url_that_is_none_is_an_error_without_its_password(host):
+    pytest.importorskip("aiohttp")
+    with pytest.raises(ValueError, match="expected a URL with a host; check it") as caught:
+        v3dg.open(f"http://{host}/a.ply")
+    assert "hunter2" not in str(caught.value)
+
+
 def test_a_chain_of_places_is_refused():
     with pytest.raises(ValueError, match="got a chain of places; fetch the file"):
         v3dg.open("zip://a.zip::http://127.0.0.1:1/a.ply")

@@ -53,9 +53,12 @@ class WebSource:
 
     def __init__(self, there: Any, place: str) -> None:
         self._aiohttp = _extras.load("aiohttp")
-        url: Any = there.encode_url(place)
+        try:
+            url: Any = there.encode_url(place)
+        except ValueError:  # whose text may have a part of a password
+            raise _wrong_url() from None
         if not url.host:
-            raise Problem(ValueError, "expected a URL with a host; check the address")
+            raise _wrong_url()
         self._url: Any = url.with_user(None).with_fragment(None)
         # What users configure for fsspec; only the first host may see the headers.
         session: Mapping[str, Any] = there.client_kwargs
@@ -240,6 +243,11 @@ async def _checked(url: Any, least: Reach | None) -> Reach:
     if least is not None and reach < least:
         raise _refused()
     return reach
+
+
+def _wrong_url() -> Problem:
+    advice = "check it, and write special characters of a password as %XX"
+    return Problem(ValueError, f"expected a URL with a host; {advice}")
 
 
 def _refused() -> Problem:
