@@ -1,13 +1,18 @@
 """Files at URLs, as fsspec fetches them."""
 
+import gc
 import http.server
 import json
+import os
 import pickle
 import re
+import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +20,13 @@ import pytest
 
 import v3dg
 from command_line import TESTS_ENVIRONMENT
+from fuzz.attacks import servers
 from random_bundle import random_bundle, random_gaussians
 from scenes_lod import blob, lod_bundle
-from v3dg import cli
+from v3dg import _urls, cli
+from v3dg._urls.addresses import Reach, reach_of
+from v3dg._urls.failures import Problem
+from v3dg._urls.http import WebSource
 
 fsspec = pytest.importorskip("fsspec")
 
@@ -30,7 +39,7 @@ URL = "memory://in/many.v3dg"
 @pytest.fixture
 def there(monkeypatch):
     """A place that only fsspec reaches."""
-    monkeypatch.setattr("v3dg._urls._opened", {})
+    monkeypatch.setattr("v3dg._urls.opened._opened", {})
     memory = fsspec.filesystem("memory")
     yield memory
     memory.rm("/", recursive=True)
@@ -133,7 +142,7 @@ def test_pictures_fetch_what_they_need_and_no_part_twice(fetched, many):
 
 
 def test_long_parts_come_in_pieces(fetched, many, monkeypatch):
-    monkeypatch.setattr("v3dg._urls._MOST_BLOCKS", 12)
+    monkeypatch.setattr("v3dg._urls.opened._MOST_BLOCKS", 12)
     np.testing.assert_array_equal(v3dg.open(URL).gaussians.means, v3dg.open(many).gaussians.means)
     assert max(size for _, size in fetched) == 12 * 1024
     assert num_bytes(fetched) == many.stat().st_size
@@ -141,7 +150,7 @@ def test_long_parts_come_in_pieces(fetched, many, monkeypatch):
 
 def test_a_server_that_fails_leaves_the_picture_coarser_and_is_named(there, many, monkeypatch):
     other = v3dg.open(URL)
-    v3dg._urls._opened.clear()
+    v3dg._urls.opened._opened.clear()
     renderer = v3dg.Renderer(v3dg.open(URL), device="cpu", memory="64MB")
 
     def fails(*_, **__):
@@ -149,7 +158,7 @@ def test_a_server_that_fails_leaves_the_picture_coarser_and_is_named(there, many
 
     with monkeypatch.context() as patch:
         patch.setattr(type(there), "cat_file", fails)
-        message = r"^memory://in/many\.v3dg: page \d+: expected a file, got ConnectionError: 503, Service"
+        message = r"^memory://in/many\.v3dg: page \d+: the connection was lost.* \(503, Service"
         with pytest.raises(OSError, match=message):
             renderer.settle(NEAR, **FINE)
         image = renderer.render(NEAR, **FINE)
@@ -279,7 +288,7 @@ class _Handler(http.server.SimpleHTTPRequestHandler):
 def web(tmp_path, monkeypatch):
     """A web server of a folder, its address and the bytes of what it sent."""
     pytest.importorskip("aiohttp")
-    monkeypatch.setattr("v3dg._urls._opened", {})
+    monkeypatch.setattr("v3dg._urls.opened._opened", {})
 
     class Handler(_Handler):
         def __init__(self, *given):
@@ -310,7 +319,7 @@ def test_bundles_of_a_web_server_are_read_in_parts(web, tmp_path, knows_ranges, 
     picture = v3dg.render(url, NEAR, device="cpu", **FINE)
     assert same_picture(picture, v3dg.render("many.v3dg", NEAR, device="cpu", **FINE))
     assert cli.main(["render", url.replace("many", "none"), "--device", "cpu"]) == 1
-    assert f"{web.address}/none.v3dg: expected a file, got FileNotFoundError" in capsys.readouterr().err
+    assert f"{web.address}/none.v3dg: the server answered 404 Not Found; check" in capsys.readouterr().err
 
 
 def test_a_file_here_of_that_name_comes_first(there, asset, tmp_path, monkeypatch):
@@ -337,7 +346,7 @@ def test_commands_take_urls_and_write_into_the_working_folder(
 @pytest.mark.parametrize(
     ("url", "message"),
     [
-        ("memory://in/none.ply", r"memory://in/none\.ply: expected a file, got FileNotFoundError"),
+        ("memory://in/none.ply", r"memory://in/none\.ply: there is no such file; check the address"),
         ("nowhere://in/a.ply", "Protocol not known: nowhere"),
         ("memory://in/scene.json", "expected a scene that is here, got a URL"),
         ("memory://in/lod-meta.json", "got one of a file that names others"),
@@ -359,7 +368,7 @@ def test_scenes_fetch_nothing(there, bundle, tmp_path, monkeypatch):
         Path("a.json").write_text(json.dumps({**document, "bundles": bundles}))
         with pytest.raises((OSError, ValueError), match=r"a\.v3dg"):
             v3dg.open("a.json")
-    assert v3dg._urls._opened == {}
+    assert v3dg._urls.opened._opened == {}
 
 
 def test_no_scene_is_saved_with_what_goes_at_the_end(there, bundle, tmp_path):
@@ -372,3 +381,366 @@ def test_without_fsspec_the_error_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "fsspec", None)
     with pytest.raises(ImportError, match=r"files at URLs: expected fsspec.*pip install 'fsspec\[http\]"):
         v3dg.open("memory://in/b.ply")
+
+
+# ---- Names, and what is shown of them.
+@pytest.mark.parametrize(
+    ("url", "text"),
+    [
+        ("https://me:pw@host:80/a/b.ply?sig=s#f", "https://host:80/a/b.ply"),
+        ("https:/me:pw@host/a.ply", "https://host/a.ply"),
+        ("https://token@host/a.ply?X-Amz-Signature=s", "https://host/a.ply"),
+        ("https://me:p@w@host/a.ply", "https://host/a.ply"),
+        ("https://me:p/w@host/a.ply", "https://host/a.ply"),
+        ("https://me:p?w@host/a.ply", "https://host/a.ply"),
+        ("https://me:p#w@host/a.ply", "https://host/a.ply"),
+        ("https://host/@scope/a.ply", "https://host/@scope/a.ply"),
+        ("https://host:8080/@scope/a.ply", "https://host:8080/@scope/a.ply"),
+        ("https://[::1]:80/@scope/a.ply", "https://[::1]:80/@scope/a.ply"),
+        ("s3://bucket/a.v3dg?versionId=1", "s3://bucket/a.v3dg"),
+        ("file:/a/b.ply", "file:///a/b.ply"),
+        ("a/b?c@d.ply", "a/b?c@d.ply"),
+    ],
+)
+def test_a_url_is_shown_without_what_may_be_secret(url, text):
+    assert _urls.shown(url) == _urls.shown(Path(url)) == text
+
+
+def test_urls_in_other_texts_are_shown_without_secrets():
+    text = "Cannot connect (https://me:pw@host/a.ply?sig=s): see 'http://host/b#x', https://host/c."
+    assert _urls.cleaned(text) == (
+        "Cannot connect (https://host/a.ply): see 'http://host/b', https://host/c."
+    )
+
+
+SECRETS = "me:hunter2@"
+
+
+def secret_url(web, name):
+    return f"{web.address.replace('//', f'//{SECRETS}')}/{name}?sig=s1gnature&token=Zm9v"
+
+
+def test_no_output_has_a_password_or_a_signature(web, tmp_path, monkeypatch, capsys):
+    (tmp_path / "here").mkdir()
+    random_bundle(0).write(tmp_path / "a.v3dg")
+    v3dg.write_asset(tmp_path / "a.ply", random_gaussians(np.random.default_rng(0), 300))
+    monkeypatch.chdir(tmp_path / "here")
+    bundle, asset, none = (secret_url(web, name) for name in ("a.v3dg", "a.ply", "none.ply"))
+    small = ["--size", "16", "16", "--device", "cpu"]
+    for code, command in (
+        (0, ["info", bundle]),
+        (0, ["info", asset, "--json"]),
+        (0, ["render", bundle, *small, "--json"]),
+        (0, ["compare", asset, bundle, *small, "--views", "1", "--json"]),
+        (0, ["build", asset, "--device", "cpu", "--json"]),
+        (0, ["export", bundle]),
+        (0, ["convert", bundle, "b.ply"]),
+        (1, ["info", none]),
+        (1, ["build", none]),
+        (1, ["build", none, asset, "-o", "many", "--device", "cpu", "--json"]),
+        (1, ["info", secret_url(web, "scene.json")]),
+        (1, ["export", asset]),
+        (2, ["info", asset, bundle]),
+        (2, ["convert", asset, "b.ply", "--level", "0"]),
+    ):
+        assert cli.main(command) == code, command
+        told = "".join(capsys.readouterr())
+        assert not re.search("hunter2|s1gnature|Zm9v", told), (command, told)
+    names = sorted(path.name for path in Path().rglob("*"))
+    assert not re.search("hunter2|s1gnature|Zm9v|sig=", " ".join(names))
+    assert {"a.png", "a.v3dg", "a_web", "b.ply"} <= set(names)
+
+
+def test_errors_and_their_causes_have_no_password(web):
+    with pytest.raises(FileNotFoundError) as caught:
+        v3dg.open(secret_url(web, "none.v3dg"))
+    text = "".join(traceback.format_exception_only(caught.value))
+    assert "hunter2" not in text
+    assert caught.value.__suppress_context__
+    assert caught.value.__cause__ is None
+
+
+def test_what_is_shown_of_a_bundle_has_no_password_and_its_copy_knows_it(web, tmp_path):
+    random_bundle(0).write(tmp_path / "a.v3dg")
+    url = secret_url(web, "a.v3dg")
+    bundle = v3dg.open(url)
+    assert "hunter2" not in repr(bundle) + str(bundle.info())
+    assert bundle.path == pickle.loads(pickle.dumps(bundle)).path == url
+
+
+# ---- Addresses.
+@pytest.mark.parametrize(
+    ("reach", "addresses"),
+    [
+        (
+            Reach.PUBLIC,
+            "8.8.8.8 1.1.1.1 172.32.0.1 2606:4700::1111 ::ffff:8.8.8.8 64:ff9b::808:808 2002:808:808::1",
+        ),
+        (Reach.PRIVATE, "10.0.0.1 172.16.0.1 172.31.255.255 192.168.1.1 100.64.0.1 198.18.0.1 203.0.113.9"),
+        (
+            Reach.PRIVATE,
+            "fc00::1 fd12::1 fec0::1 2001:db8::1 ::ffff:10.0.0.1 2002:c0a8:101::1 64:ff9b::a00:1",
+        ),
+        (Reach.PRIVATE, "64:ff9b:1::1 100::1 4000::1"),
+        (
+            Reach.HOST,
+            "127.0.0.1 127.255.0.9 0.0.0.0 0.1.2.3 169.254.169.254 224.0.0.1 255.255.255.255 240.0.0.1",
+        ),
+        (Reach.HOST, "::1 :: fe80::1 fe80::1%eth0 ff02::1 ::ffff:127.0.0.1 ::ffff:0.0.0.0 ::127.0.0.1"),
+        (Reach.HOST, "64:ff9b::7f00:1 2002:7f00:1::1 2001:0:808:808::80ff:fffe"),
+    ],
+)
+def test_addresses_have_a_reach(reach, addresses):
+    assert {address: reach_of(address) for address in addresses.split()} == dict.fromkeys(
+        addresses.split(), reach
+    )
+
+
+def test_what_is_no_address_is_refused():
+    with pytest.raises(ValueError, match="does not appear"):
+        reach_of("example.com")
+
+
+NAMES = {
+    "public.test": ["127.0.0.1"],
+    "also-public.test": ["127.0.0.1"],
+    "private.test": ["127.0.0.2"],
+    "both.test": ["127.0.0.1", "127.0.0.2"],
+}
+
+
+@pytest.fixture
+def names(web, monkeypatch):
+    """Hosts by name, all of which this server is: 127.0.0.1 counts as public, all else as private."""
+    known = dict(NAMES)
+
+    async def resolve(host, port):
+        return known[host]
+
+    monkeypatch.setattr("v3dg._urls.http._sessions", {})
+    monkeypatch.setattr("v3dg._urls.http.resolve", resolve)
+    is_public = ["127.0.0.1", "93.184.216.34"]
+    monkeypatch.setattr(
+        "v3dg._urls.http.reach_of", lambda at: Reach.PUBLIC if at in is_public else Reach.PRIVATE
+    )
+    return known
+
+
+def redirecting(web, places):
+    """Have the server send each path on to a place, of which `{port}` is its own."""
+    answer = web.handler.answer
+
+    def redirected(self, with_body):
+        place = places.get(self.path)
+        if place is None:
+            return answer(self, with_body)
+        self.send_response(302)
+        self.send_header("Location", place.format(port=web.server_port))
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    web.handler.answer = redirected
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        {"/a.ply": "http://private.test:{port}/b.ply"},
+        {"/a.ply": "http://127.0.0.2:{port}/b.ply"},
+        {"/a.ply": "http://[::1]:{port}/b.ply"},
+        {"/a.ply": "http://[::ffff:127.0.0.2]:{port}/b.ply"},
+        {"/a.ply": "http://0.0.0.0:{port}/b.ply"},
+        {"/a.ply": "//private.test:{port}/b.ply"},
+        {"/a.ply": "http://also-public.test:{port}/c.ply", "/c.ply": "http://private.test:{port}/b.ply"},
+    ],
+)
+def test_no_public_server_sends_us_on_to_a_private_address(web, names, tmp_path, places):
+    v3dg.write_asset(tmp_path / "b.ply", random_gaussians(np.random.default_rng(0), 300))
+    redirecting(web, places)
+    message = r"/a\.ply: refused to go on from a public server to a private address"
+    with pytest.raises(PermissionError, match=message):
+        v3dg.open(f"http://public.test:{web.server_port}/a.ply")
+    assert web.sent == []
+
+
+@pytest.mark.parametrize("host", ["also-public.test", "both.test"])
+def test_public_servers_send_us_on_to_public_addresses(web, names, tmp_path, host):
+    v3dg.write_asset(tmp_path / "b.ply", random_gaussians(np.random.default_rng(0), 300))
+    redirecting(web, {"/a.ply": f"http://{host}:{{port}}/b.ply"})
+    assert len(v3dg.open(f"http://public.test:{web.server_port}/a.ply")) == 300
+
+
+def test_a_name_that_becomes_private_is_refused(web, names, tmp_path):
+    random_bundle(0).write(tmp_path / "a.v3dg")
+    source = WebSource(fsspec.filesystem("http"), f"http://public.test:{web.server_port}/a.v3dg")
+    names["public.test"] = ["127.0.0.2"]
+    web.sent.clear()
+    with pytest.raises(Problem, match="refused to go on"):
+        source.read_parts([(0, 8)], lambda data, offset: None)
+    assert web.sent == []
+
+
+def test_an_address_is_checked_once_more_when_a_connection_is_made(web, monkeypatch):
+    monkeypatch.setattr("v3dg._urls.http._sessions", {})
+    monkeypatch.setattr(
+        "v3dg._urls.http.reach_of", lambda at: Reach.PUBLIC if at == "8.8.8.8" else Reach.HOST
+    )
+    answers = iter([["8.8.8.8"], ["127.0.0.1"]])
+
+    async def resolve(host, port):
+        return next(answers)
+
+    monkeypatch.setattr("v3dg._urls.http.resolve", resolve)
+    with pytest.raises(PermissionError, match="refused to go on"):
+        v3dg.open(f"http://public.test:{web.server_port}/a.v3dg")
+    assert web.sent == []
+
+
+# ---- What answers may cost, and what is told of those that are wrong.
+@pytest.mark.parametrize(
+    ("name", "kind", "message"),
+    [
+        ("status 401", PermissionError, "the server answered 401 Unauthorized; check user, password"),
+        ("status 403", PermissionError, "the server answered 403 Forbidden; "),
+        ("status 404", FileNotFoundError, "the server answered 404 Not Found; check the address"),
+        ("status 410", FileNotFoundError, "the server answered 410 Gone; "),
+        ("status 418", ConnectionError, "the server answered 418 "),
+        ("status 503", ConnectionError, "the server answered 503 Service Unavailable; try again later"),
+        ("status 504", TimeoutError, "the server answered 504 Gateway Timeout; "),
+        ("never answers", TimeoutError, "the server did not answer in time; "),
+        ("drips a part", TimeoutError, "the server did not answer in time; "),
+        ("drips the head", TimeoutError, "the server did not answer in time; "),
+        ("reset", ConnectionError, "the connection was lost or could not be made"),
+        ("no HTTP", ConnectionError, "the server's answer is not valid HTTP"),
+        ("redirects to itself", ConnectionError, "expected at most 10 redirects, got more"),
+        ("redirects to a file", ConnectionError, "the server sent us on to what is no address of the web"),
+        ("gzip bomb", ConnectionError, "expected the file as it is, got a compressed answer"),
+        ("404 without end", FileNotFoundError, "the server answered 404"),
+        ("claims 4 TB, honest parts", ValueError, "size: expected "),
+        ("part without end", ValueError, "expected at most 1024 bytes, got more"),
+        ("part longer than asked", ValueError, r"expected 1024 bytes at 0, got \d+; it has changed"),
+        ("parts, then none", ConnectionError, "the server gave parts of the file before and now does not"),
+        ("whole without end", ValueError, r"expected at most \d+ bytes, got more"),
+        ("forged tables of 1 GB", ValueError, "clusters: expected at most 262144"),
+        ("forged tables of 4 TB", ValueError, "clusters: expected at most 39268534564 for its pages"),
+        ("forged tables of 2 TB", ValueError, "tables: expected at most 1073741824 bytes at a URL"),
+        ("unknown size without end", ValueError, "expected at most 1048576 bytes, got more"),
+        ("asset without end", ValueError, r"expected at most \d+ bytes, got more"),
+    ],
+)
+def test_a_server_that_lies_is_an_error_that_says_what_is_wrong(name, kind, message, tmp_path, monkeypatch):
+    pytest.importorskip("aiohttp")
+    monkeypatch.setattr("v3dg._urls.http.PATIENCE_S", 0.5)
+    monkeypatch.setattr("v3dg._urls.opened._MOST_UNKNOWN_BYTES", 1 << 20)
+    suffix, _, behaviour = servers.BEHAVIOURS[name]
+    file = tmp_path / f"x.{suffix}"
+    bundle = random_bundle(0)
+    bundle.write(file) if suffix == "v3dg" else v3dg.write_asset(file, bundle.gaussians)
+    server = servers.Server(file.read_bytes(), behaviour)
+    url = f"http://127.0.0.1:{server.port}/{file.name}"
+    try:
+        with pytest.raises(kind, match=f"^{url}: {message}"):
+            v3dg.open(f"{url}?sig=x")
+    finally:
+        server.close()
+    assert server.sent < len(server.body) + (16 << 20)
+
+
+def test_hosts_that_are_not_there_are_errors_that_say_so(web, monkeypatch):
+    web.shutdown()
+    web.server_close()
+    with pytest.raises(ConnectionRefusedError, match="the connection was refused; check host and port"):
+        v3dg.open(f"{web.address}/a.ply")
+    with pytest.raises(ConnectionError, match="the name of the host is not known"):
+        v3dg.open("http://nowhere.invalid/a.ply")
+
+
+def test_a_server_without_tls_is_an_error_that_says_so(web):
+    with pytest.raises(ConnectionError, match="no secure connection"):
+        v3dg.open(f"{web.address.replace('http', 'https')}/a.ply")
+
+
+def test_no_more_is_fetched_than_there_is_room_for(web, tmp_path, monkeypatch):
+    v3dg.write_asset(tmp_path / "a.ply", random_gaussians(np.random.default_rng(0), 300))
+    monkeypatch.setattr("v3dg._urls.opened._SPARE_BYTES", 1 << 60)
+    with pytest.raises(OSError, match=r"/a\.ply: no room for it in .*; set TMPDIR to a folder with more"):
+        v3dg.open(f"{web.address}/a.ply")
+    assert web.sent == []
+
+
+@pytest.mark.parametrize("host", ["me:hunter2/x@host", "me:hunter2#x@host"])
+def test_a_url_that_is_none_is_an_error_without_its_password(host):
+    pytest.importorskip("aiohttp")
+    with pytest.raises(ValueError, match="expected a URL with a host; check it") as caught:
+        v3dg.open(f"http://{host}/a.ply")
+    assert "hunter2" not in str(caught.value)
+
+
+def test_a_chain_of_places_is_refused():
+    with pytest.raises(ValueError, match="got a chain of places; fetch the file"):
+        v3dg.open("zip://a.zip::http://127.0.0.1:1/a.ply")
+
+
+# ---- What stays, and what is read again.
+@pytest.mark.parametrize("ends_by", ["SIGKILL", "SIGINT", "SIGTERM"])
+def test_nothing_fetched_stays_however_a_process_ends(web, tmp_path, ends_by):
+    (tmp_path / "tmp").mkdir()
+    v3dg.write_asset(tmp_path / "a.ply", random_gaussians(np.random.default_rng(0), 300))
+    code = "import sys, time, v3dg; v3dg.open(sys.argv[1]); print(1, flush=True); time.sleep(60)"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, f"{web.address}/a.ply"],
+        env=TESTS_ENVIRONMENT | {"TMPDIR": str(tmp_path / "tmp")},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    assert process.stdout.readline() == b"1\n"
+    assert list((tmp_path / "tmp").iterdir()) == []
+    process.send_signal(getattr(signal, ends_by))
+    process.wait(30)
+    process.stdout.close()
+    assert list((tmp_path / "tmp").iterdir()) == []
+    assert len(web.sent) == 1
+
+
+@pytest.mark.parametrize("has_tags", [True, False])
+def test_an_asset_that_changed_is_read_anew_and_another_is_not_fetched_twice(web, tmp_path, has_tags):
+    first, second = (random_gaussians(np.random.default_rng(seed), 300) for seed in (0, 1))
+    if not has_tags:
+        web.handler.date_time_string = lambda *_: ""
+    url = f"{web.address}/a.ply"
+    v3dg.write_asset(tmp_path / "a.ply", first)
+    os.utime(tmp_path / "a.ply", (1000, 1000))
+    for _ in range(2):
+        np.testing.assert_array_equal(v3dg.open(url).means, first.means)
+    assert len(web.sent) == (1 if has_tags else 2)
+    v3dg.write_asset(tmp_path / "a.ply", second)
+    np.testing.assert_array_equal(v3dg.open(url).means, second.means)
+
+
+def test_descriptors_of_what_has_changed_are_closed(web, tmp_path):
+    v3dg.write_asset(tmp_path / "a.ply", random_gaussians(np.random.default_rng(0), 300))
+    counts = []
+    for time_s in range(12):
+        os.utime(tmp_path / "a.ply", (time_s, time_s))
+        v3dg.open(f"{web.address}/a.ply")
+        gc.collect()
+        counts.append(sum(os.readlink(f"/proc/self/fd/{n}").endswith("(deleted)") for n in _descriptors()))
+    assert counts[-1] == counts[0]
+
+
+def _descriptors():
+    return [name for name in os.listdir("/proc/self/fd") if os.path.islink(f"/proc/self/fd/{name}")]
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.sog", "a.glb", "a.compressed.ply", "a.usdc", "a.usda"])
+def test_every_format_is_read_from_a_url_and_names_it_in_errors(there, tmp_path, name, capsys):
+    if ".usd" in name:
+        pytest.importorskip("pxr")
+    v3dg.write_asset(tmp_path / name, random_gaussians(np.random.default_rng(0), 300))
+    there.put_file(str(tmp_path / name), f"/in/{name}")
+    np.testing.assert_array_equal(v3dg.open(f"memory://in/{name}").means, v3dg.open(tmp_path / name).means)
+    there.pipe_file(f"/in/{name}", (tmp_path / name).read_bytes()[:200])
+    with pytest.raises(ValueError, match=rf"memory://in/{re.escape(name)}") as caught:
+        v3dg.open(f"memory://in/{name}")
+    assert "/proc/" not in str(caught.value)
+    assert tempfile.gettempdir() not in str(caught.value)

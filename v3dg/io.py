@@ -4,11 +4,12 @@ import os
 import pathlib
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Literal, TypeVar, get_args
 
 from v3dg._numbers import check, check_type, one_of
-from v3dg._urls import beside, local
+from v3dg._urls import FileAtUrl, beside, in_parts, reading, shown
 from v3dg.formats import checkpoint, gltf, hier, ksplat, ply, sog, splat, spz, streamed_sog, usd
 from v3dg.formats._reading import AssetFile, bytes_of
 from v3dg.formats.ply import PlyEncoding
@@ -98,7 +99,24 @@ def open_asset(path: Path) -> AssetFile:
     `.ply`, `.splat` and `.compressed.ply` are read row by row. Of the others, reading the first rows takes
     the memory for all.
     """
-    return _by_name(path, _READERS)(local(path))
+    reader = _by_name(path, _READERS)
+    at_url = in_parts(path)
+    return _open_fetched(at_url, reader) if isinstance(at_url, FileAtUrl) else reader(at_url)
+
+
+def _open_fetched(at_url: FileAtUrl, reader: Callable[[Path], AssetFile]) -> AssetFile:
+    """An asset at a URL, which is whole here as long as this lives; its errors name the URL."""
+    with reading(at_url) as local:
+        file = reader(local)
+        whole = file.read(0, file.num_gaussians) if at_url.needs_name else None
+
+    def read(first: int, last: int) -> Gaussians:
+        if whole is not None:
+            return whole.subset(slice(first, last))
+        with reading(at_url):
+            return file.read(first, last)
+
+    return replace(file, path=os.fspath(at_url), read=read)
 
 
 def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -113,7 +131,9 @@ def run_files(folder: pathlib.Path) -> list[pathlib.Path]:
 
 def asset_bytes(path: Path) -> int:
     """Bytes on disk of an asset that can be read: of all files that it names and that are there."""
-    return bytes_of(_by_name(path, _FILES)(pathlib.Path(local(path))))
+    names = _by_name(path, _FILES)
+    at_url = in_parts(path)
+    return at_url.num_bytes if isinstance(at_url, FileAtUrl) else bytes_of(names(pathlib.Path(path)))
 
 
 def write_asset(
@@ -168,4 +188,4 @@ def _by_name(path: Path, formats: Mapping[str, Format]) -> Format:
         if name.endswith(ending):
             return function
     advice = "; v3dg.open opens bundles (.v3dg) and scenes (.json)" if formats is not _WRITERS else ""
-    raise ValueError(f"{os.fspath(path)}: expected a file name that ends in {', '.join(formats)}{advice}")
+    raise ValueError(f"{shown(path)}: expected a file name that ends in {', '.join(formats)}{advice}")

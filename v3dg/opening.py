@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from v3dg._numbers import check
-from v3dg._urls import beside, is_url, local
+from v3dg._urls import beside, is_url, reading, shown
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera
@@ -40,14 +40,14 @@ def open_with_cameras(path: Path) -> tuple[Subject, dict[str, Camera] | None]:
     """A scene with its cameras, or a bundle or an asset, which have none."""
     if is_scene(path):
         expected = "a scene that is here, got a URL; fetch it with the files that it names"
-        check(path, not is_url(path), expected)
+        check(shown(path), not is_url(path), expected)
         return read_scene(path)
     if beside(path).suffix == ".v3dg":
         return Bundle.open(path), None
-    path = Path(local(path))
-    if path.suffix.lower() in usd.SUFFIXES and usd.has_instances(path):
-        return read_usd_scene(path), None
-    return read_asset(path), None
+    if beside(path).suffix.lower() not in usd.SUFFIXES:
+        return read_asset(path), None
+    with reading(path) as local:
+        return (read_usd_scene(local) if usd.has_instances(local) else read_asset(local)), None
 
 
 def read_usd_scene(
@@ -68,7 +68,8 @@ def read_usd_scene(
             translation and one scale.
         OSError: It cannot be read.
     """
-    assets, which, poses, up = usd.read_world(path)
+    with reading(path) as local:
+        assets, which, poses, up = usd.read_world(local)
     config = config or BuildConfig(steps=0)
     bundles = [build_bundle(asset, config=config, device=device, progress=False) for asset in assets]
     scene = Scene()

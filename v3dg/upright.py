@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from v3dg._numbers import Floats
+from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.cameras import AXES, Axis, Camera
 from v3dg.gaussians import Gaussians
@@ -55,7 +56,7 @@ def up_of(
             return AXES[int(np.argmax(heights))], f"guessed from {len(tops)} cameras"
     if isinstance(subject, Scene):
         return "z", "as scenes have it"
-    if os.fspath(path).lower().endswith(".glb"):
+    if beside(path).name.lower().endswith(".glb"):
         return "y", "as glTF has it"
     flat = _flat_axis(_middles(subject))
     if flat is not None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from v3dg._device import Device
 from v3dg._numbers import one_of
+from v3dg._urls import beside
 from v3dg.cameras import AXES, Axis, VectorLike
 from v3dg.opening import File, open_with_cameras
 from v3dg.scene import Subject
@@ -44,7 +45,7 @@ def view(
     path = Path(subject) if isinstance(subject, str | os.PathLike) else Path()
     if isinstance(subject, str | os.PathLike):
         subject, cameras = open_with_cameras(path)
-        options = {"name": path.stem, "cameras": cameras} | options
+        options = {"name": beside(path).stem, "cameras": cameras} | options
     if up is None:
         up, how = up_of(subject, options.get("cameras"), path)
         options = {"asks_up": how == ASSUMED} | options

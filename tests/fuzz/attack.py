@@ -32,6 +32,7 @@ KINDS = {
     "settling": 0.1,
     "memory": 0.07,
     "exports": 0.05,
+    "servers": 0.05,
 }
 KEPT = Path(__file__).parents[2] / "build" / "attack"
 

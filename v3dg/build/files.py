@@ -10,6 +10,7 @@ from typing import Any, Literal
 from v3dg import _files
 from v3dg._device import Device
 from v3dg._progress import Progress
+from v3dg._urls import shown
 from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import MemoryLeaves, made_with
 from v3dg.build.leaves_on_disk import leaves_on_disk
@@ -91,7 +92,7 @@ def _naming_asset(path: AssetPath) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        place = f"{os.fspath(path)}: " if str(error).startswith("asset: ") else ""
+        place = f"{shown(path)}: " if str(error).startswith("asset: ") else ""
         raise ValueError(f"{place}{error}") from None
 
 

@@ -22,6 +22,7 @@ from v3dg import _core
 from v3dg._device import CPU, Device
 from v3dg._numbers import check
 from v3dg._progress import Bar, Progress
+from v3dg._urls import shown
 from v3dg.build import external_split
 from v3dg.build.config import BuildConfig
 from v3dg.build.digest import PIECE, digest_of_hashes, hash_of, new_pool, pieces_of
@@ -127,7 +128,7 @@ class _Tile(NamedTuple):
     def open(self) -> AssetFile:
         file = open_asset(self.path)
         is_same = (file.num_gaussians, file.sh_degree) == (self.num_gaussians, self.sh_degree)
-        check(self.path, is_same, _CHANGED)
+        check(shown(self.path), is_same, _CHANGED)
         return file
 
 
@@ -147,7 +148,7 @@ class _Sizes(NamedTuple):
         overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
         largest = max(tiles, key=lambda tile: tile.whole_bytes)
         least = reserved + overhead + largest.whole_bytes + PIECE * gaussian
-        why = f" for {os.fspath(largest.path)}, whose format can only be read whole (or convert it to .ply)"
+        why = f" for {shown(largest.path)}, whose format can only be read whole (or convert it to .ply)"
         expected = f"at least {in_mib(least)}{why if largest.whole_bytes else ''}"
         check("memory", memory >= least, f"{expected}, got {memory / (1 << 20):,.1f} MiB")
         memory -= reserved
@@ -226,7 +227,9 @@ def _sort_on_disk(
         blocks = _blocks(tiles, Codec(degree).empty(sizes.in_block), bar)
         again = _write_rows(blocks, order_file, ends, row_file)
     order.unlink()
-    check(tiles[0].path if len(tiles) == 1 else f"one of {len(tiles)} files", again == digest, _CHANGED)
+    check(
+        shown(tiles[0].path) if len(tiles) == 1 else f"one of {len(tiles)} files", again == digest, _CHANGED
+    )
     bar.close()
     bucket_bytes = int(np.diff(offset).max()) * _bytes_in_bucket(degree)
     about = count, tally.num_gaussians, degree, tally.counts, digest, bucket_bytes

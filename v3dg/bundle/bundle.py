@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from v3dg import _core, _files
 from v3dg._json import parse_json
 from v3dg._numbers import check, check_all, check_type
-from v3dg._urls import in_parts, is_url
+from v3dg._urls import in_parts, is_url, shown
 from v3dg.bundle.codec import Codec, codec_of
 from v3dg.bundle.file import BundleFile, BundlePlan, write_pages
 from v3dg.bundle.format import HASH_BYTES, VERSION, config_to_json, page_tables
@@ -166,8 +166,8 @@ class Bundle:
 
     @property
     def path(self) -> str | None:
-        """Name or URL of the file that the bundle was opened from, if it was."""
-        return None if self._file is None else self._file.path
+        """Name of the file that the bundle was opened from, if it was; of one at a URL, the whole URL."""
+        return None if self._file is None else self._file.name
 
     @property
     def num_levels(self) -> int:
@@ -185,7 +185,7 @@ class Bundle:
         return int(self.clusters.offset[-1])
 
     def __repr__(self) -> str:
-        where = "" if self._file is None else f", path={self.path!r}"
+        where = "" if self._file is None else f", path={self._file.path!r}"
         return (
             f"Bundle(num_gaussians={self.num_gaussians}, num_clusters={len(self.clusters)}, "
             f"num_levels={self.num_levels}, sh_degree={self.sh_degree}{where})"
@@ -272,7 +272,7 @@ class Bundle:
         page_sizes = self._layout.page_bytes(self._codec)
         sizes = [int(page_sizes[page_level == level].sum()) for level in range(self.num_levels)]
         return {
-            "path": self.path,
+            "path": None if self.path is None else shown(self.path),
             "version": self._file.version if self._file else VERSION,
             "codec": self.codec,
             "bytes": (self._file or BundlePlan(self._layout, self._codec, self.config)).num_bytes,

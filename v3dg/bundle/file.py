@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg import _core, _files
+from v3dg import _core, _files, _urls
 from v3dg._json import parse_json, shown
 from v3dg._numbers import check
 from v3dg._urls import FileAtUrl
@@ -24,6 +24,9 @@ from v3dg.bundle.tables import Clusters, Groups, check_tables, columns_of
 from v3dg.gaussians import Gaussians
 
 _FIRST_BYTES = 4096  # of the header: what a disk writes at once
+# Of tables at a URL, whose size is a claim until they are here; those of a billion gaussians have less.
+_MOST_FETCHED_TABLE_BYTES = 1 << 30
+_FREE_CLUSTERS = 1 << 18  # that may all be empty; others have a gaussian each
 
 
 class BundlePlan:
@@ -89,15 +92,21 @@ def read_pages(
 class BundleFile:
     """A bundle file: header and tables are read, pages are not; `verify` tells whether they are damaged.
 
-    What is allocated follows from the size of the file, which is closed when this is dropped.
+    What is allocated follows from the size of the file, which is closed when this is dropped; of one at a
+    URL, from what is fetched.
+
+    Attributes:
+        name: The file's name, or its URL, as it was given.
+        path: As messages show that.
     """
 
     def __init__(self, path: str | os.PathLike[str], reader: _core.HashedReader) -> None:
-        self.path = os.fspath(path)
+        self.name = os.fspath(path)
+        self.path = _urls.shown(path)
         self._at_url = path if isinstance(path, FileAtUrl) else None
         self._fd = os.dup(self._at_url.file.fileno()) if self._at_url else _files.open_regular(path)
         weakref.finalize(self, os.close, self._fd)
-        with _files.naming_errors(path):
+        with _files.naming_errors(self.path):
             self._read_header_and_tables(reader)
 
     def _fetch(self, first: int, last: int) -> None:
@@ -111,7 +120,7 @@ class BundleFile:
         check(f"{self.path}: {name}", holds, expected)
 
     def _read_header_and_tables(self, reader: _core.HashedReader) -> None:
-        self.num_bytes = os.fstat(self._fd).st_size
+        self.num_bytes = self._at_url.num_bytes if self._at_url else os.fstat(self._fd).st_size
         check(self.path, self.num_bytes >= 8, f"a bundle, got a file of {self.num_bytes} bytes")
         header_bytes = int.from_bytes(self._read(8, 0), "little")
         check(self.path, header_bytes > 0, "a bundle, got one that is not finished, or another kind of file")
@@ -170,6 +179,7 @@ class BundleFile:
         for name, entry in expected.items():
             if header.get(name) != entry:
                 self._fail(f"{name}: expected {entry}, got {shown(header.get(name))}")
+        self._check_counts(*counts)
         unknown = sorted(set(header) - set(expected))
         if unknown:
             self._fail(f"{shown(unknown[0])}: expected only the tensors of version {self.version}")
@@ -181,10 +191,24 @@ class BundleFile:
         self._check("size", wanted == given, f"{wanted} bytes, got {given}; the file is {problem}")
         return expected
 
+    def _check_counts(self, num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int) -> None:
+        """Refuse tables at a URL that are larger than the gaussians can need, before they are fetched."""
+        if self._at_url is None:
+            return
+        most = _FREE_CLUSTERS + pages_bytes // self.codec.gaussian_bytes
+        self._check("clusters", num_clusters <= most, f"at most {most} for its pages, got {num_clusters}")
+        self._check("groups", num_groups <= num_clusters, f"at most {num_clusters}, got {num_groups}")
+        self._check("pages", num_pages <= num_groups + 1, f"at most {num_groups + 1}, got {num_pages}")
+
     def _read_tables(self, entries: dict[str, Any], text: bytes, reader: _core.HashedReader) -> None:
         place = self._data_start + self.pages_bytes
-        self._fetch(place, self.num_bytes)
         num_bytes = self.num_bytes - place
+        is_small = self._at_url is None or num_bytes <= _MOST_FETCHED_TABLE_BYTES
+        expected = (
+            f"at most {_MOST_FETCHED_TABLE_BYTES} bytes at a URL, got {num_bytes}; fetch the file first"
+        )
+        self._check("tables", is_small, expected)
+        self._fetch(place, self.num_bytes)
         self._reading = reader.read(self.path, self._fd, text, place, num_bytes, self.version > 2)
         data = self._reading.wait()  # with the hash at the end
         self.tables: dict[str, NDArray[Any]] = {}

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import tyro
 
 from v3dg._numbers import check
-from v3dg._urls import beside, is_url, shown
+from v3dg._urls import beside, cleaned, is_url, shown
 from v3dg.bundle import Bundle
 from v3dg.io import SUFFIXES
 
@@ -42,8 +42,8 @@ def printable(line: str) -> str:
 
 
 def tell(text: str) -> None:
-    """Print one line on stderr."""
-    print(printable(" ".join(text.split())), file=sys.stderr)
+    """Print one line on stderr, of URLs only what cannot be secret."""
+    print(printable(" ".join(cleaned(text).split())), file=sys.stderr)
 
 
 def option(metavar: str, *aliases: str) -> Any:
@@ -121,7 +121,9 @@ def check_output(output: Path, *inputs: Path) -> None:
     """Refuse to write over a file that is read: what is written may be less than what is there."""
     for path in inputs:
         is_another = not (output.exists() and path.exists() and output.samefile(path))
-        check_usage(str(output), is_another, f"another file than {path}, which is read; choose another name")
+        check_usage(
+            str(output), is_another, f"another file than {shown(path)}, which is read; choose another name"
+        )
 
 
 def require_subject(path: Path) -> None:

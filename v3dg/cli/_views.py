@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 
 from v3dg._numbers import check
+from v3dg._urls import beside, shown
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
 from v3dg.cameras import AXES, DEFAULT_FOV_X, Axis, Camera, turntable
@@ -74,7 +75,7 @@ class ViewOptions(CameraFile):
         expected = "--cameras or a scene (.json) to take it from; leave it out"
         check_usage("--camera", self.camera is None or file, expected)
         for name, value in self.turntable().items():
-            expected = f"a turntable to set with it, got the cameras of {file}; leave it out"
+            expected = f"a turntable to set with it, got the cameras of {shown(file or '')}; leave it out"
             check_usage(name, value is None or not file, expected)
         check_range("--views", 1 if self.views is None else self.views, 1, _MOST_VIEWS)
         check_range("--elevation", self.elevation or 0, -89.99, 89.99)
@@ -95,7 +96,7 @@ def choose_cameras(
     own = options.read(options.size) or own
     if own is None:
         own = {} if isinstance(subject, Scene) else _around(subject, options, options.views or views, path)
-    check(path, own, "cameras, got a file without any; give some with --cameras")
+    check(shown(path), own, "cameras, got a file without any; give some with --cameras")
     if options.camera is not None:
         names, name = list(own), options.camera
         if name not in own and name.isdecimal() and int(name) < len(names):
@@ -148,7 +149,7 @@ def choose_up(
 
 def lines_of_up(path: Path, axis: Axis, how: str) -> list[str]:
     """What a command says of the axis that it took for up, and how; nothing of one that was given."""
-    return [f"{path.name}: {axis} is up, {how}; --up says otherwise"] if how else []
+    return [f"{beside(path).name}: {axis} is up, {how}; --up says otherwise"] if how else []
 
 
 def is_at_terminal() -> bool:
@@ -160,7 +161,7 @@ def is_at_terminal() -> bool:
 def ask_up(path: Path, axis: Axis) -> Axis:
     """What whoever sits at the terminal says is up; just Enter, or the end of all input, takes the axis."""
     while True:
-        question = printable(f"{path.name}: which way is up, {', '.join(AXES)}? [{axis}] ")
+        question = printable(f"{beside(path).name}: which way is up, {', '.join(AXES)}? [{axis}] ")
         print(question, end="", file=sys.stderr, flush=True)
         answer: Any = sys.stdin.readline().strip() or axis
         if answer in AXES:

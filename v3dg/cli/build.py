@@ -15,7 +15,7 @@ import tyro
 
 from v3dg import _extras
 from v3dg._numbers import check
-from v3dg._urls import beside
+from v3dg._urls import beside, cleaned, shown
 from v3dg.build import BuildConfig, build_file, levels_path
 from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
@@ -120,11 +120,12 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
     results: list[dict[str, Any]] = []
     for asset, output in outputs.items():
         if not options.quiet:
-            _common.tell(f"[{len(results) + 1}/{len(outputs)}] {asset}")
+            _common.tell(f"[{len(results) + 1}/{len(outputs)}] {shown(asset)}")
         try:
             results.append(_build(options, assets[asset], output, executor))
         except _common.FAILURES as error:
-            results.append({"asset": str(asset), "status": "failed", "error": _common.failure_text(error)})
+            failure = cleaned(_common.failure_text(error))
+            results.append({"asset": shown(asset), "status": "failed", "error": failure})
             if not options.quiet:
                 _common.tell(f"failed: {results[-1]['error']}")
         except KeyboardInterrupt:
@@ -137,13 +138,13 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
         "asset = {asset}; bundle = {status}; levels = {levels}; gaussians = {gaussians:,}; "
         "left out = {left_out:,}; size = {size}; time = {seconds:.1f} s"
     )
-    shown = [{**result} for result in results]
-    for row in shown:
+    rows = [{**result} for result in results]
+    for row in rows:
         if "bytes" in row:
             row |= {"left_out": sum(row["dropped"].values()), "size": _common.bytes_text(row["bytes"])}
     last = ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
     result = {**summary, "seconds": seconds, "assets": results}
-    _common.print_result(options.json, result, [*_common.table_lines(columns, shown), "", last])
+    _common.print_result(options.json, result, [*_common.table_lines(columns, rows), "", last])
     if failed := [result for result in results if result["status"] == "failed"]:
         others = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
         raise RuntimeError(f"{len(failed)} of {len(results)} assets failed: {failed[0]['error']}{others}")
@@ -179,7 +180,7 @@ def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
     for asset in assets:
         output = _output_of(asset, folder)
         other = asset_of.setdefault(output, asset)
-        check(output, other == asset, f"one asset for it, got {other} and {asset}; rename one")
+        check(output, other == asset, f"one asset for it, got {shown(other)} and {shown(asset)}; rename one")
     return {asset: output for output, asset in asset_of.items()}
 
 
@@ -208,8 +209,10 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{to_resume()}") from None
     except OSError as error:  # a full disk, say
+        if error.errno is None:  # of a URL, whose text says all
+            raise type(error)(f"{error}{to_resume()}") from None
         raise OSError(error.errno, f"{error.strerror}{to_resume()}", error.filename) from None
-    asset = str(paths[0]) if len(paths) == 1 else [str(path) for path in paths]
+    asset = shown(paths[0]) if len(paths) == 1 else [shown(path) for path in paths]
     status = "built" if is_built else "kept"
     result: dict[str, Any] = {"asset": asset, "output": str(output), "status": status}
     result |= {name: bundle.config[name] for name in ("asset_gaussians", "dropped")}

@@ -14,6 +14,7 @@ from v3dg import _device, pictures
 from v3dg._judges import Judges, mean_of
 from v3dg._numbers import check
 from v3dg._progress import counted
+from v3dg._urls import beside, shown
 from v3dg.bundle import Bundle
 from v3dg.cli import _common
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, picture_paths
@@ -62,7 +63,7 @@ def run(options: Compare) -> None:
     output = pictures.check_picture_path(options.output)
     subjects = (options.reference, options.test)
     _common.check_output(output, *subjects)
-    are_pictures = [path.suffix.lower() in pictures.SUFFIXES for path in subjects]
+    are_pictures = [beside(path).suffix.lower() in pictures.SUFFIXES for path in subjects]
     is_pair = any(are_pictures) == all(are_pictures)
     _common.check_usage("PATH", is_pair, "two pictures, or two subjects to draw, got one of each")
     names, pairs, finest = _read_pictures(options) if all(are_pictures) else _draw(options)
@@ -85,17 +86,17 @@ def run(options: Compare) -> None:
         worst[1]["picture"] = str(output)
         _write(options, *worst)
     mean = mean_of(rows, "flip", "psnr", "ssim", "gaussians_selected")
-    result: dict[str, Any] = {"reference": str(options.reference), "test": str(options.test)}
+    result: dict[str, Any] = {"reference": shown(options.reference), "test": shown(options.test)}
     result |= {"mean": mean, "worst": worst[1]["camera"], "views": rows}
     columns = (
         "view = {camera}; FLIP = {flip:.4f}; PSNR = {psnr:.2f}; SSIM = {ssim:.4f}; "
         "gaussians = {gaussians_selected:,.0f}"
     )
-    shown = "reference and test" if mean["flip"] is None else "reference, test and FLIP"
+    titles = "reference and test" if mean["flip"] is None else "reference, test and FLIP"
     lines = [
         *_common.table_lines(columns, rows if len(rows) == 1 else [*rows, {"camera": "mean", **mean}]),
         "",
-        f"{worst[1]['picture']}: {shown} of view {worst[1]['camera']}, which differs most",
+        f"{worst[1]['picture']}: {titles} of view {worst[1]['camera']}, which differs most",
     ]
     if mean["flip"] is None:
         lines.append(FLIP_MISSING)
@@ -109,7 +110,7 @@ def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair], None]:
     (height, width, _), (test_height, test_width, _) = reference.shape, test.shape
     expected = f"{width} x {height} px like {options.reference}, got {test_width} x {test_height}"
     check(options.test, reference.shape == test.shape, expected)
-    name = options.test.stem
+    name = beside(options.test).stem
     return [name], iter([_Pair(name, reference, test)]), None
 
 
@@ -155,10 +156,10 @@ def _difference(row: dict[str, Any]) -> float:
 
 def _write(options: Compare, pair: _Pair, row: dict[str, Any]) -> None:
     named = ((options.reference, pair.reference), (options.test, pair.test))
-    shown = [(_common.printable(path.name), picture) for path, picture in named]
+    titled = [(_common.printable(beside(path).name), picture) for path, picture in named]
     if row["flip"] is not None:
-        floats = (picture / np.float32(255) for _, picture in shown)
-        shown.append((f"FLIP {row['flip']:.4f}", to_8bit(error_image(*floats))))
+        floats = (picture / np.float32(255) for _, picture in titled)
+        titled.append((f"FLIP {row['flip']:.4f}", to_8bit(error_image(*floats))))
     zoom = max(1, _LEAST_WIDTH // pair.test.shape[1])
-    cells = [(text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1)) for text, picture in shown]
+    cells = [(text, picture.repeat(zoom, axis=0).repeat(zoom, axis=1)) for text, picture in titled]
     pictures.write_picture(row["picture"], pictures.contact_sheet([cells]))

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from v3dg import export
-from v3dg._urls import beside
+from v3dg._urls import beside, shown
 from v3dg.cameras import Axis
 from v3dg.cli import _common
 from v3dg.cli._views import choose_up
@@ -44,14 +44,15 @@ class Export(_common.Common):
 def run(options: Export) -> None:
     _common.require_subject(options.subject)
     _common.check_usage("--chunk", options.chunk >= 1, f"at least 1, got {options.chunk}")
-    folder = options.output or beside(options.subject).with_name(f"{options.subject.stem}_web")
+    folder = options.output or _web_folder(options.subject)
     _common.check_output(folder, options.subject)
     export.check_outside(folder, [options.subject])
     start = time.perf_counter()
     subject, cameras = open_with_cameras(options.subject)
     if isinstance(subject, Gaussians):
-        expected = f"expected a scene or a bundle, got an asset; make one of it: v3dg build {options.subject}"
-        raise ValueError(f"{options.subject}: {expected}")
+        name = shown(options.subject)
+        expected = f"expected a scene or a bundle, got an asset; make one of it: v3dg build {name}"
+        raise ValueError(f"{name}: {expected}")
     up, notes = choose_up(options.up, subject, cameras, options.subject)
     if folder.suffix.lower() in USD_SUFFIXES:
         _common.check_usage("--to", options.to == "sog", f"none for {folder}, got {options.to}; leave it out")
@@ -78,3 +79,9 @@ def run(options: Export) -> None:
         lines += ["it needs its engine beside it, once:", *(f"  {line.format(there)}" for line in needs)]
     lines += [f"to look at it: python -m http.server --bind 127.0.0.1 --directory {there}"]
     _common.print_result(options.json, result, [*lines, "  then open http://127.0.0.1:8000/"])
+
+
+def _web_folder(subject: Path) -> Path:
+    """Where a page goes if nothing else is said."""
+    local = beside(subject)
+    return local.with_name(f"{local.stem}_web")

@@ -93,7 +93,7 @@ def _bundle_info(bundle: Bundle) -> _Description:
     leaves = _leaves(bundle)
     each = f", {result['bytes'] / leaves:.1f} bytes a gaussian of level 0" if leaves else ""
     lines = [
-        f"{bundle.path}: bundle, version {result['version']} ({result['codec']}), "
+        f"{result['path']}: bundle, version {result['version']} ({result['codec']}), "
         f"{_common.bytes_text(result['bytes'])}{each}",
         f"{bundle.num_gaussians:,} gaussians, SH degree {bundle.sh_degree}, "
         f"{len(bundle.clusters):,} clusters, {len(bundle.groups):,} groups, {result['num_pages']:,} pages",
@@ -122,7 +122,7 @@ def _leaves(bundle: Bundle) -> int:
 def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Description:
     counts = np.bincount(scene.instance_bundle, minlength=len(scene.bundles)).tolist()
     bundles: list[dict[str, Any]] = [
-        {"path": bundle.path, "instances": count, "asset_gaussians": _leaves(bundle)}
+        {"path": shown(bundle.path or ""), "instances": count, "asset_gaussians": _leaves(bundle)}
         for bundle, count in zip(scene.bundles, counts, strict=True)
     ]
     total = sum(bundle["instances"] * bundle["asset_gaussians"] for bundle in bundles)

@@ -8,7 +8,7 @@ import tyro
 
 from v3dg import _device
 from v3dg._progress import counted
-from v3dg._urls import shown
+from v3dg._urls import beside, shown
 from v3dg.cli._common import Cut, OnPool, check_usage, finite, option, print_result, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, choose_up, picture_paths
 from v3dg.false_color import ColorBy
@@ -43,7 +43,7 @@ def run(options: Render) -> None:
     options.view.check(options.subject)
     is_color = all(0 <= part <= 1 for part in options.background)
     check_usage("--background", is_color, f"three numbers from 0 to 1, got {options.background}")
-    output = check_picture_path(options.output or Path(options.subject.with_suffix(".png").name))
+    output = check_picture_path(options.output or Path(beside(options.subject).with_suffix(".png").name))
     device = _device.resolve(options.device)
     subject, own_cameras = open_with_cameras(options.subject)
     is_turntable, notes = options.view.cameras is None and own_cameras is None, list[str]()

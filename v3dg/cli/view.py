@@ -17,7 +17,7 @@ from typing import Annotated
 import tyro
 
 from v3dg._start import SIGNALS
-from v3dg._urls import shown
+from v3dg._urls import beside, shown
 from v3dg.cameras import Axis
 from v3dg.cli._common import Cut, Flag, OnPool, check_usage, option, print_result, require_subject, tell
 from v3dg.cli._views import CameraFile, lines_of_up
@@ -59,7 +59,7 @@ def run(options: View) -> None:
     subject, cameras = open_with_cameras(options.subject)
     cameras = options.read() or cameras
     photographs = None if options.cameras is None else _photographs(options.cameras, cameras or {})
-    expected = f"a bundle or a scene, got the asset {options.subject}; build a bundle of it"
+    expected = f"a bundle or a scene, got the asset {shown(options.subject)}; build a bundle of it"
     check_usage("--budget", options.budget is None or not isinstance(subject, Gaussians), expected)
     up, how = (options.up, "") if options.up else up_of(subject, cameras, options.subject)
     lines = lines_of_up(options.subject, up, how)
@@ -69,7 +69,7 @@ def run(options: View) -> None:
     with _interrupts() as interrupts:
         site = Site(
             scene_view,
-            name=options.subject.stem,
+            name=beside(options.subject).stem,
             cameras=cameras,
             photographs=photographs,
             host=options.host,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg._numbers import one_of
+from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.cameras import Axis, Floats
 from v3dg.rotations import rotation_from_quaternion
@@ -43,7 +44,7 @@ def rotation_to(up: Axis, frame: Literal["y", "z"]) -> Floats:
 
 def names_of(scene: Scene, taken: Collection[str] = ()) -> list[str]:
     """A folder for each bundle, after its file, other than those that are taken."""
-    stems = [Path(bundle.path or "bundle").stem[:80] for bundle in scene.bundles]
+    stems = [beside(bundle.path or "bundle").stem[:80] for bundle in scene.bundles]
     return distinct(
         ("".join(c if c.isascii() and c.isalnum() else "_" for c in stem) for stem in stems), taken
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from v3dg._json import Node, read_json, write_json
 from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check
-from v3dg._urls import is_url
+from v3dg._urls import beside, is_url
 from v3dg.bundle import Bundle
 from v3dg.cameras import DEFAULT_FOV_X, Camera, check_cameras
 from v3dg.io import SUFFIXES
@@ -27,7 +27,8 @@ _Instance: TypeAlias = tuple[Bundle, list[float], list[float], float, float]
 
 def is_scene(path: Path) -> bool:
     """Whether a file is a scene by its name: JSON, but not the `meta.json` of an asset in SOG."""
-    return path.suffix == ".json" and not path.name.endswith(SUFFIXES)
+    name = beside(path).name
+    return name.endswith(".json") and not name.endswith(SUFFIXES)
 
 
 def read_scene(

@@ -1,6 +1,5 @@
 """One picture of the viewer: a scene, a view and settings become pixels and figures."""
 
-import os
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -11,6 +10,7 @@ import numpy.typing as npt
 
 from v3dg import _core, _device
 from v3dg._device import CPU, Device
+from v3dg._urls import beside, cleaned, shown
 from v3dg.build import BuildConfig, build_bundle
 from v3dg.cameras import Camera
 from v3dg.cleaning import ball_of_most
@@ -149,8 +149,10 @@ class SceneView:
         """Return an error's line, in which bundles go by names, not paths: the tab may be somebody else's."""
         text = " ".join(str(error).split())
         for path in (bundle.path for bundle in self.scene.bundles):
-            text = text.replace(path, os.path.basename(path)) if path else text
-        return text
+            if path:
+                name = beside(path).name
+                text = text.replace(path, name).replace(shown(path), name)
+        return cleaned(text)
 
     @property
     def modes(self) -> tuple[Shows, ...]:

@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image
 
 from v3dg import _core
+from v3dg._urls import beside
 from v3dg.bundle import Bundle
 from v3dg.camera_file import write_cameras
 from v3dg.io import read_asset
@@ -169,7 +170,7 @@ class Tab:
                 "scale": float(scene.scales[number]),
             },
             "box": [boxes[:, 0].min(axis=0).tolist(), boxes[:, 1].max(axis=0).tolist()],
-            "bundle": Path(bundle.path or "").name,
+            "bundle": beside(bundle.path or "").name,
         }
 
     def _save_picture(self, message: messages.Save, stop: _core.Stop) -> None:

@@ -36,6 +36,7 @@ def main():
         work.mkdir()
         os.ftruncate(2, 0)
         os.lseek(2, 0, os.SEEK_SET)
+        attack.number = number  # for kinds that go through a list
         what, do = attack.plan(random.Random(f"{kind} {seed} {number}"), work)
         print(json.dumps({"what": what}), file=answers, flush=True)
         faulthandler.dump_traceback_later(module.LIMIT_S, exit=True)

@@ -1,0 +1,93 @@
+"""How far away an address is: what a server on the internet may not send us on to."""
+
+import ipaddress
+from enum import IntEnum
+from typing import TypeAlias
+
+_Address: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+class Reach(IntEnum):
+    """From where an address is reached; a redirect may not lead to one that is reached from fewer places."""
+
+    HOST = 0
+    """This machine or its link, also addresses that are no single host's."""
+    PRIVATE = 1
+    """A network that is not part of the internet."""
+    PUBLIC = 2
+    """The internet."""
+
+
+# RFC 6890, RFC 1122, RFC 3927, RFC 4291, RFC 5771. Lists of Python differ between its versions.
+_HOST = [
+    ipaddress.ip_network(text)
+    for text in (
+        "0.0.0.0/8",
+        "127.0.0.0/8",
+        "169.254.0.0/16",
+        "224.0.0.0/4",
+        "240.0.0.0/4",
+        "::/127",
+        "fe80::/10",
+        "ff00::/8",
+    )
+]
+# RFC 1918, RFC 6598, RFC 6890, RFC 2544, RFC 5737.
+_PRIVATE = [
+    ipaddress.ip_network(text)
+    for text in (
+        "10.0.0.0/8",
+        "100.64.0.0/10",
+        "172.16.0.0/12",
+        "192.0.0.0/24",
+        "192.0.2.0/24",
+        "192.168.0.0/16",
+        "198.18.0.0/15",
+        "198.51.100.0/24",
+        "203.0.113.0/24",
+    )
+]
+# Only these are part of the internet, except what is for documentation and protocols.
+_PUBLIC_IPV6 = ipaddress.ip_network("2000::/3")
+_PRIVATE_IPV6 = [ipaddress.ip_network(text) for text in ("2001::/23", "2001:db8::/32", "3fff::/20")]
+# RFC 6052 and RFC 4291: the last 32 bits are an address of IPv4.
+_WITH_IPV4 = [ipaddress.ip_network(text) for text in ("64:ff9b::/96", "::/96")]
+
+
+def reach_of(address: str) -> Reach:
+    """Reach of an IP address; ValueError where the text is none."""
+    parsed = ipaddress.ip_address(address.partition("%")[0])
+    return min(map(_reach_of, _inner(parsed)))
+
+
+def is_address(host: str) -> bool:
+    """Whether this is the number of a host and not its name."""
+    try:
+        ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return False
+    return True
+
+
+def _inner(address: _Address) -> list[_Address]:
+    """Addresses of IPv4 that a gateway makes of one of IPv6; itself where there are none."""
+    if isinstance(address, ipaddress.IPv4Address) or any(address in network for network in _HOST):
+        return [address]
+    if address.ipv4_mapped is not None:
+        return [address.ipv4_mapped]
+    if address.sixtofour is not None:
+        return [address.sixtofour]
+    if address.teredo is not None:
+        return list(address.teredo)
+    if any(address in network for network in _WITH_IPV4):
+        return [ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)]
+    return [address]
+
+
+def _reach_of(address: _Address) -> Reach:
+    if any(address in network for network in _HOST):
+        return Reach.HOST
+    is_private = any(address in network for network in (*_PRIVATE, *_PRIVATE_IPV6))
+    if isinstance(address, ipaddress.IPv6Address):
+        is_private |= address not in _PUBLIC_IPV6
+    return Reach.PRIVATE if is_private else Reach.PUBLIC

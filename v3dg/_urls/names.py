@@ -1,0 +1,71 @@
+"""Which names are URLs, and how one is shown: without what may be secret."""
+
+import os
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+# A `Path` of a URL has one slash where there were two.
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/+(?=.)")
+_URL_IN_TEXT = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/+[^\s'\"<>]+")
+_SECRET = re.compile(r"[@?#]")
+
+
+def is_url(path: str | os.PathLike[str]) -> bool:
+    """Whether this is the name of a file elsewhere: a local file of that name comes first."""
+    return bool(_URL.match(os.fspath(path))) and not os.path.lexists(path)
+
+
+def full(path: str | os.PathLike[str]) -> str:
+    """The URL with all that belongs to it: as a `Path` it has lost a slash."""
+    return _URL.sub(_with_slashes, os.fspath(path), count=1)
+
+
+def shown(path: str | os.PathLike[str]) -> str:
+    """The name of a file as messages and results show it; of a URL, nothing that may be secret."""
+    return _without_secrets(full(path)) if is_url(path) else os.fspath(path)
+
+
+def cleaned(text: str) -> str:
+    """A text of somebody else in which every URL is shown without what may be secret."""
+    return _URL_IN_TEXT.sub(_cleaned_match, text)
+
+
+def beside(path: str | os.PathLike[str]) -> Path:
+    """The file; in place of one at a URL, that of its name in the working folder."""
+    if not is_url(path):
+        return Path(path)
+    return Path(os.path.basename(unquote(_place_of(full(path))[1])))
+
+
+def _with_slashes(match: re.Match[str]) -> str:
+    return match[1] + ("://" if match[1] != "file" else ":///")
+
+
+def _cleaned_match(match: re.Match[str]) -> str:
+    text = match[0]
+    if not _SECRET.search(text):
+        return text
+    url = text.rstrip(":;,.)]}")
+    return _without_secrets(full(url)) + text[len(url) :]
+
+
+def _without_secrets(url: str) -> str:
+    scheme = url.partition("://")[0]
+    host, place = _place_of(url)
+    return f"{scheme}://{host}{place}"
+
+
+def _place_of(url: str) -> tuple[str, str]:
+    """Host with its port, and path, of a URL."""
+    rest = url.partition("://")[2]
+    host = re.split("[/?#]", rest, maxsplit=1)[0]
+    if "@" in host:
+        start = host.rindex("@") + 1
+    elif "@" in rest and not re.fullmatch(r"(\[.*\]|[^:]*)(:[0-9]*)?", host):
+        start = rest.rindex("@") + 1  # a password with a character that ends the host
+    else:
+        start = 0
+    rest = re.split("[?#]", rest[start:], maxsplit=1)[0]
+    host, slash, path = rest.partition("/")
+    return host, slash + path

@@ -1,0 +1,210 @@
+"""Files at URLs that this process reads: what is needed of one comes to a file without a name, once."""
+
+import contextlib
+import os
+import tempfile
+import threading
+import weakref
+from collections.abc import Iterable, Iterator
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3dg import _extras, _files
+from v3dg._numbers import check
+from v3dg._urls.failures import naming_errors, no_room
+from v3dg._urls.http import WebSource
+from v3dg._urls.names import beside, full, is_url, shown
+from v3dg._urls.others import OtherSource
+
+Source: TypeAlias = WebSource | OtherSource
+
+_BLOCK_BYTES = 1024  # that come together; pages have far more
+_MOST_BLOCKS = 1 << 12  # of a piece
+_MOST_PIECES = 8  # that are asked for at once
+# A file whose size no one says is fetched up to this size.
+_MOST_UNKNOWN_BYTES = 2 << 30
+# That stay free on the disk of temporary files.
+_SPARE_BYTES = 256 << 20
+# URLs whose files are known again; a file that is in use stays open anyway.
+_MOST_OPENED = 256
+# USD goes by the end of a name.
+_NEEDS_NAME = (".usd", ".usda", ".usdc")
+
+_opened: dict[str, "FileAtUrl"] = {}
+
+
+def in_parts(path: str | os.PathLike[str]) -> "str | os.PathLike[str] | FileAtUrl":
+    """A local file, or one at a URL, as it is there now, of which nothing is fetched yet.
+
+    A file of which its place says that it is the same as before is not fetched again.
+
+    Raises:
+        ImportError: The extra `fsspec` is not installed, or what it needs for such URLs.
+        ValueError: It is a URL of no file, of one that names others, or of one inside of another.
+        FileNotFoundError, PermissionError, TimeoutError, ConnectionError, OSError: It cannot be had.
+    """
+    if not is_url(path):
+        return path
+    url = full(path)
+    name = beside(path).name
+    expected = "the URL of a bundle, or of an asset in one file"
+    check(shown(url), name and not name.endswith(".json"), f"{expected}, got one of a file that names others")
+    check(shown(url), "::" not in url, f"{expected}, got a chain of places; fetch the file")
+    with naming_errors(url):
+        source = _source_of(url)
+    before = _opened.pop(url, None)
+    is_same = before is not None and bool(source.tag) and source.tag == before.tag
+    file = before if before is not None and is_same else FileAtUrl(url, source)
+    _opened[url] = file
+    while len(_opened) > _MOST_OPENED:
+        del _opened[next(iter(_opened))]
+    return file
+
+
+@contextlib.contextmanager
+def reading(path: "str | os.PathLike[str] | FileAtUrl") -> Iterator[str | os.PathLike[str]]:
+    """A name under which a file, which is fetched whole from a URL, is read; errors inside name the URL."""
+    file = path if isinstance(path, FileAtUrl) else in_parts(path)
+    if not isinstance(file, FileAtUrl):
+        yield file
+        return
+    with file.named() as local, _renaming(local, shown(file)):
+        yield local
+
+
+@contextlib.contextmanager
+def _renaming(local: str, name: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or os.fspath(error.filename or local) != local:
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), name) from None
+    except ValueError as error:
+        raise ValueError(str(error).replace(local, name)) from None
+
+
+def _source_of(url: str) -> Source:
+    there, place = _extras.load("fsspec").core.url_to_fs(url)
+    is_web = url.partition("://")[0].lower() in ("http", "https")
+    return WebSource(there, place) if is_web else OtherSource(there, place)
+
+
+class FileAtUrl(os.PathLike[str]):
+    """A file at a URL, and a file without a name here, to which comes what is needed, once.
+
+    However the process ends, nothing of that file stays.
+
+    Attributes:
+        file: The file here, in which bytes that are not fetched are 0, or missing at the end.
+        num_bytes: Size of the file there.
+        tag: Differs when the content there does; empty if that cannot be known.
+        needs_name: Whether its reader goes by the end of its name.
+    """
+
+    def __init__(self, url: str, source: Source) -> None:
+        self._url = url
+        self._source = source
+        self.tag = source.tag
+        self.needs_name = beside(url).suffix.lower() in _NEEDS_NAME
+        self.file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  # as long as this lives
+        weakref.finalize(self, self.file.close)
+        self._lock = threading.Lock()
+        self._is_whole = False
+        self._is_here: dict[int, NDArray[np.bool_]] = {}  # by piece: which of its blocks are
+        self.num_bytes = -1 if source.num_bytes is None else source.num_bytes
+        if source.num_bytes is None:  # there are no parts of what has no size
+            self._fetch_whole()
+
+    def __fspath__(self) -> str:
+        return self._url
+
+    @contextlib.contextmanager
+    def named(self) -> Iterator[str]:
+        """The name of a file that has all of it, while it is needed; errors as `fetch`.
+
+        The name is of an open file of this process. Where a reader needs the end of a name, it is a link to
+        that, which goes at once afterwards.
+        """
+        self._fetch_whole()
+        name = f"/proc/self/fd/{self.file.fileno()}"
+        if not self.needs_name:
+            yield name
+            return
+        with tempfile.TemporaryDirectory(prefix="v3dg_") as folder:
+            link = os.path.join(folder, f"file{beside(self._url).suffix}")
+            os.symlink(name, link)
+            yield link
+
+    def fetch(self, parts: Iterable[tuple[int, int]]) -> None:
+        """Have the bytes from each first to each last here; on any thread.
+
+        Raises:
+            OSError: They cannot be had, or there is no room for them.
+            ValueError: They are not in the file, or it has changed.
+        """
+        if self._is_whole:
+            return
+        runs = self._missing(parts)
+        for start in range(0, len(runs), _MOST_PIECES):
+            some = runs[start : start + _MOST_PIECES]
+            places = [
+                (first * _BLOCK_BYTES, min(last * _BLOCK_BYTES, self.num_bytes)) for first, last in some
+            ]
+            with naming_errors(self._url):
+                self._check_room(sum(last - first for first, last in places))
+                is_whole = self._source.read_parts(places, self._write)
+            if is_whole:
+                self._is_whole = True
+                return
+            for first, last in some:
+                piece = first // _MOST_BLOCKS
+                here = self._is_here.setdefault(piece, np.zeros(_MOST_BLOCKS, np.bool_))
+                here[first - piece * _MOST_BLOCKS : last - piece * _MOST_BLOCKS] = True
+
+    def _missing(self, parts: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Runs of blocks that parts need and that are not here, none longer than a piece."""
+        wanted: dict[int, NDArray[np.bool_]] = {}
+        for first, last in parts:
+            expected = f"parts of its {self.num_bytes} bytes, got {first} to {last}"
+            check(shown(self), 0 <= first <= last <= self.num_bytes, expected)
+            first_block = first // _BLOCK_BYTES
+            last_block = -(-last // _BLOCK_BYTES)
+            for piece in range(first_block // _MOST_BLOCKS, -(-last_block // _MOST_BLOCKS)):
+                start = piece * _MOST_BLOCKS
+                blocks = wanted.setdefault(piece, np.zeros(_MOST_BLOCKS, np.bool_))
+                blocks[max(first_block - start, 0) : last_block - start] = True
+        runs: list[tuple[int, int]] = []
+        for piece in sorted(wanted):
+            here = self._is_here.get(piece)
+            missing = wanted[piece] if here is None else wanted[piece] & ~here
+            numbers = np.flatnonzero(missing) + piece * _MOST_BLOCKS
+            cuts = np.flatnonzero(np.diff(numbers) > 1) + 1
+            runs += [(int(run[0]), int(run[-1]) + 1) for run in np.split(numbers, cuts) if len(run)]
+        return runs
+
+    def _fetch_whole(self) -> None:
+        with self._lock:
+            if self._is_whole:
+                return
+            is_known = self.num_bytes >= 0
+            with naming_errors(self._url):
+                self._check_room(self.num_bytes if is_known else 0)
+                most = self.num_bytes if is_known else _MOST_UNKNOWN_BYTES
+                self.num_bytes = self._source.read_all(most, self._write)
+            self._is_whole = True
+
+    def _write(self, data: bytes, offset: int) -> None:
+        self._check_room(len(data))
+        try:
+            _files.write_at(self.file.fileno(), data, offset)
+        except OSError as error:
+            raise no_room(tempfile.gettempdir(), error) from None
+
+    def _check_room(self, num_bytes: int) -> None:
+        status = os.fstatvfs(self.file.fileno())
+        free = status.f_bavail * status.f_frsize
+        if num_bytes + _SPARE_BYTES > free:
+            raise no_room(tempfile.gettempdir())
