@@ -7,6 +7,7 @@
 
 #include "base/isa.h"
 #include "bindings/operations.h"
+#include "bindings/python_lock.h"
 #include "math/gaussian.h"
 #include "residency/cluster_table.h"
 
@@ -36,6 +37,7 @@ static int num_cuda_devices() {
 PYBIND11_MODULE(_core, m) {
     if (must_let_threads_go() && pthread_atfork(&let_threads_go, nullptr, nullptr) != 0)
         throw std::bad_alloc();
+    v3dg::watch_end_of_python();
     m.doc() = "Compiled operations of v3dg; the public interface is the package v3dg.";
     m.attr("min_alpha") = v3dg::kMinAlpha;
     m.attr("fade_filter_px2") = v3dg::kFadeFilterPx2;
