@@ -6,6 +6,7 @@
 #include <new>
 
 #include "base/isa.h"
+#include "bindings/array.h"
 #include "bindings/operations.h"
 #include "bindings/python_lock.h"
 #include "math/gaussian.h"
@@ -32,6 +33,21 @@ static int num_cuda_devices() {
 #else
     return 0;
 #endif
+}
+
+// An object that only `__new__` has made holds nothing. When a function is given one, pybind11 asks its class
+// for memory of that size, whose content nobody has made.
+static void* refuse_unmade(size_t) {
+    throw v3dg::py::type_error(
+        "self: expected an object that its class has made, got one of __new__ alone; call the class instead");
+}
+static void refuse_unmade_objects(const v3dg::py::module_& m) {
+    for (const auto& [name, value] : v3dg::py::dict(m.attr("__dict__"))) {
+        if (!v3dg::py::isinstance<v3dg::py::type>(value)) continue;
+        v3dg::py::detail::type_info* const info =
+            v3dg::py::detail::get_type_info(reinterpret_cast<PyTypeObject*>(value.ptr()));
+        if (info != nullptr) info->operator_new = &refuse_unmade;
+    }
 }
 
 PYBIND11_MODULE(_core, m) {
@@ -61,4 +77,5 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_frame(m);
     v3dg::bind_fit_level(m);
     v3dg::bind_first_selected(m);
+    refuse_unmade_objects(m);
 }
