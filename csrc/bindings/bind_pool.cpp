@@ -45,8 +45,8 @@ std::string text_of_error() {
     return problem.empty() ? "the fetch failed" : problem;
 }
 
-// What a function raises that is asked for parts of a file, or nothing. With Python's lock; nothing here has a
-// destructor that needs it, for Python may end the thread in the function.
+// What a function raises that is asked for parts of a file, or nothing. With Python's lock; nothing here has
+// a destructor that needs it, for Python may end the thread in the function.
 std::string told_by(PyObject* function, Span<const int64_t> places) {
     PyObject* const list = PyList_New(static_cast<py::ssize_t>(places.size / 2));
     for (size_t k = 0; list != nullptr && k < places.size / 2; ++k)
@@ -279,8 +279,7 @@ void bind_pool(py::module_& m) {
             "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); }, "seconds"_a,
             py::call_guard<Unlocked>(), "Waits for pages; whether there are any to bring.")
         .def(
-            "read_one", [](BoundPool& p) { return p.pool().read_one(); },
-            py::call_guard<Unlocked>())
+            "read_one", [](BoundPool& p) { return p.pool().read_one(); }, py::call_guard<Unlocked>())
         .def("forget_failures", [](BoundPool& p) { p.pool().forget_failures(); });
 }
 
