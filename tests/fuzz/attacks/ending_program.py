@@ -93,9 +93,9 @@ def pool_of_url():
 
 
 def pick():
-    renderer = v3dg.Renderer("a.v3dg", device="cpu", memory=None)
+    bundle = v3dg.Bundle.open("a.v3dg")
     for camera in itertools.cycle(CAMERAS):
-        yield v3dg.pick(renderer, camera, (60, 45))
+        yield v3dg.pick(bundle, camera, 60, 45)
 
 
 def viewer():
