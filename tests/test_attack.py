@@ -19,6 +19,7 @@ TRIES = {
     "memory": 8,
     "exports": 40,
     "servers": 12,
+    "ends": 12,
 }
 
 

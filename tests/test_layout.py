@@ -156,6 +156,13 @@ def test_kernels_are_started_by_launch_alone():
     assert [str(p) for p in sources if "<<<" in p.read_text(encoding="utf-8")] == []
 
 
+def test_bindings_give_pythons_lock_up_by_a_type_of_ours():
+    """With pybind11's, a thread that Python ends aborts the process (bindings/python_lock.h)."""
+    pythons = re.compile(r"gil_scoped|PyEval_\w+Thread|PyGILState_Ensure|Py_BEGIN_ALLOW_THREADS")
+    users = [p.name for p in CSRC.rglob("*") if p.is_file() and pythons.search(p.read_text(encoding="utf-8"))]
+    assert sorted(users) == ["python_lock.cpp", "python_lock.h"]
+
+
 def imports_of(path, *, inside_functions):
     """Modules that a Python file imports, except for type checkers; and the names that it takes from them."""
     names, todo = set(), [ast.parse(path.read_text(encoding="utf-8"))]

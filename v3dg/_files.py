@@ -6,6 +6,7 @@ import os
 import re
 import secrets
 import stat
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from v3dg._numbers import check
 
 _PIECE_BYTES = 16 << 20
+_MASK_LOCK = threading.Lock()
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 
@@ -54,9 +56,7 @@ def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) 
         with open(private, "rb") as file:
             descriptor = file.fileno()
             if replaced is None:
-                status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
-                found = re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE)
-                os.fchmod(descriptor, 0o666 & ~int(found[1] if found else "077", 8))
+                os.fchmod(descriptor, 0o666 & ~file_mode_mask())
             else:
                 for owner, group in ((-1, replaced.st_gid), (replaced.st_uid, -1)):
                     with contextlib.suppress(OSError):
@@ -64,6 +64,19 @@ def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) 
                 os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
             os.fsync(descriptor)
         os.replace(private, os.path.realpath(path))
+
+
+def file_mode_mask(status_path: str = "/proc/self/status") -> int:
+    """The permissions that new files of this process do not get (umask)."""
+    with contextlib.suppress(OSError):
+        status = Path(status_path).read_text(encoding="ascii", errors="replace")
+        if found := re.search(r"^Umask:\s*([0-7]+)$", status, re.MULTILINE):
+            return int(found[1], 8)
+    # Without /proc it can be read by setting it alone. What another thread makes meanwhile is private.
+    with _MASK_LOCK:
+        mask = os.umask(0o077)
+        os.umask(mask)
+    return mask
 
 
 def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:

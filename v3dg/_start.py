@@ -22,6 +22,23 @@ SIGNALS = (signal.SIGINT, signal.SIGALRM)
 """Of Ctrl-C: the second brings one again that could not be heard when it came, in the midst of an import."""
 
 
+def refuse_sub_interpreter() -> None:
+    """Raise an ImportError in an interpreter that is not the first of its process.
+
+    The compiled module and NumPy know one interpreter alone; elsewhere, loading them waits without end.
+    """
+    for name in ("_interpreters", "_xxsubinterpreters"):  # since Python 3.13, and before
+        try:
+            interpreters = __import__(name)
+        except ImportError:
+            continue
+        if interpreters.get_current() != interpreters.get_main():
+            raise ImportError(
+                "v3dg: expected the main interpreter of a process, got a sub-interpreter; use a process"
+            )
+        return
+
+
 def begin() -> None:
     """Open streams that are closed, to nothing, and have Ctrl-C end the process."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else whoever started it ignores them
@@ -96,6 +113,7 @@ def _is_importing(frame: types.FrameType | None) -> bool:
     return False
 
 
+refuse_sub_interpreter()
 # What stands before the arguments, if anything does.
 if [os.path.basename(name) for name in sys.orig_argv[-len(sys.argv) :][:1]] in (["v3dg"], ["-mv3dg"]):
     begin()

@@ -5,6 +5,7 @@
 #include <cstddef>
 
 #include "base/first_error.h"
+#include "base/threads.h"
 
 namespace v3dg {
 
@@ -19,11 +20,11 @@ void parallel_for(size_t count, size_t chunk, const Body& body) {
             for (size_t i = first; i < last; ++i) body(i);
         });
     };
-    if (omp_get_max_threads() == 1) {
+    if (most_threads() == 1) {
         // Without a team, for want of whose memory OpenMP would end the process.
         for (size_t first = 0; first < count; first += chunk) run(first);
     } else {
-#pragma omp parallel for schedule(dynamic, 1) if (count > chunk)
+#pragma omp parallel for schedule(dynamic, 1) if (count > chunk) num_threads(most_threads())
         for (size_t first = 0; first < count; first += chunk) run(first);
     }
     error.rethrow();

@@ -14,6 +14,7 @@
 
 #include "base/dispatch.h"
 #include "base/span.h"
+#include "bindings/python_lock.h"
 
 namespace v3dg {
 

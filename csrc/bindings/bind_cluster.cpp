@@ -41,7 +41,7 @@ py::tuple median_split(const py::object& means, const py::array& offset, int dep
     const NewArray<int64_t> order(device, {static_cast<py::ssize_t>(points.size)});
     const NewArray<int64_t> leaf_offset({}, {static_cast<py::ssize_t>(((offsets.size - 1) << depth) + 1)});
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         V3DG_DISPATCH(work, median_split, points, offsets, depth, order.span, leaf_offset.span);
     }
     return py::make_tuple(order.object, leaf_offset.object);
@@ -53,7 +53,7 @@ py::object findings_of(const Rows& gaussians) {
         throw py::value_error("gaussians: expected arrays on the host, got others; bring them there");
     const NewArray<uint16_t> findings({}, {static_cast<py::ssize_t>(rows.size)});
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         examine(rows, findings.span);
     }
     return findings.object;
@@ -65,7 +65,7 @@ py::object order_along_curve(const py::array& means) {
     check_finite(values);
     const NewArray<int64_t> order({}, {static_cast<py::ssize_t>(points.size)});
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         morton_order(points, order.span);
     }
     return order.object;
@@ -80,7 +80,7 @@ py::object bound_spheres(const py::object& spheres, const py::array& offset) {
     const NewArray<float> ball(device, {static_cast<py::ssize_t>(offsets.size - 1), 4});
     const Span<Ball> out{reinterpret_cast<Ball*>(ball.span.data), offsets.size - 1};
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         V3DG_DISPATCH(work, bound_spheres, in, offsets, kNestingMargin, out);
     }
     return ball.object;
@@ -93,7 +93,7 @@ py::object bound_by_boxes(const Rows& gaussians, const py::array& offset) {
     const NewArray<float> box(gaussians.device(), {static_cast<py::ssize_t>(in.offset.size - 1), 2, 3});
     const Span<Box> out{reinterpret_cast<Box*>(box.span.data), in.offset.size - 1};
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         V3DG_DISPATCH(work, bound_by_boxes, in, out);
     }
     return box.object;
@@ -120,7 +120,7 @@ void check_bundle_tables(const py::array& offset, const py::array& level, const 
                              span_of<const int32_t>(group_level, "groups.level", {g}),
                              span_of<const float>(error, "groups.error", {g, 2})};
     try {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         check_tables(tables, num_gaussians);
     } catch (const TableFault& fault) {
         const std::map<std::string, py::array> arrays = {

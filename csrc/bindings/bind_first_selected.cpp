@@ -71,7 +71,7 @@ py::array first_selected(const Rows& leaves, const Rows& level, const py::array&
             by_leaves(leaves, camera, own), by_level(level, camera, coarse);
         const NewArray<float> losses({}, {py::ssize_t(height), py::ssize_t(width), 3});
         {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             losses_of_pixels({by_leaves.span, by_level.span, truth.span}, width, height, losses.span);
         }
         // The gradient of the sum of what the leaves show of the losses, by their colours, is their share.

@@ -23,7 +23,7 @@ class BoundTarget {
         : rows_(rows), filter_px2_(filter_px2), antialiased_(antialiased) {
         const GaussianRows<const float> read = rows.read<float>();
         if (!rows.device().is_host()) return;
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         model_ = std::make_unique<Model<float>>(read);
     }
 
@@ -91,13 +91,13 @@ py::object fit_level_arrays(const FitConfig& config, const BoundTarget& target, 
         if (!work.device().is_host()) {
             const cuda::DeviceFitTarget on_device = target.on_device();
             {
-                const py::gil_scoped_release unlocked;
+                const Unlocked unlocked;
                 cuda::fit_level(config, all, on_device, rows, error.span.data, progress, work.stream());
             }
             return error.object;
         }
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         fit_level(config, all, target.on_host(), rows, error.span.data, progress);
     }
     return error.object;
@@ -163,11 +163,11 @@ void refine_cuts_arrays(const FitConfig& config, const BoundTarget& target, cons
     if constexpr (V3DG_WITH_CUDA != 0)
         if (!work.device().is_host()) {
             const cuda::DeviceFitTarget on_device = target.on_device();
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             cuda::refine_cuts(config, on_device, levels, pictures.pictures(), progress, work.stream());
             return;
         }
-    const py::gil_scoped_release unlocked;
+    const Unlocked unlocked;
     refine_cuts(config, target.on_host(), target.size(), levels, pictures.pictures(), progress);
 }
 
@@ -186,13 +186,13 @@ py::tuple weigh_cuts_arrays(const FitConfig& config, const Rows& gaussians, cons
     if constexpr (V3DG_WITH_CUDA != 0)
         if (!work.device().is_host()) {
             {
-                const py::gil_scoped_release unlocked;
+                const Unlocked unlocked;
                 cuda::weigh_cuts(config, rows, pictures.pictures(), seen, progress, work.stream());
             }
             return answer;
         }
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         weigh_cuts(config, rows, pictures.pictures(), seen, progress);
     }
     return answer;
@@ -250,7 +250,7 @@ double mean_ssim_of(const py::array& picture, const py::array& target) {
         throw py::value_error("picture: expected at least " + std::to_string(kSsimRadius + 1) +
                               " px a side, got shape " + shape_text(picture));
     const auto side = [](py::ssize_t size) { return static_cast<size_t>(size); };
-    const py::gil_scoped_release unlocked;
+    const Unlocked unlocked;
     return mean_ssim<T>({p.data, t.data, side(height), side(width), side(channels)});
 }
 

@@ -181,7 +181,7 @@ class BoundSceneFrame {
         ScenePick picked{};
         bool shows_any = false;
         {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             pool.frame_on_host(
                 *state, rule, PoolFrame::aside, [&](auto tables, const SelectRule& raised, auto needs) {
                     const HostScene host{tables, {models.data(), models.size()}, state->instances};
@@ -276,7 +276,7 @@ class BoundSceneFrame {
         ScenePick picked{};
         bool shows_any = false;
         {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             shows_any = cpu::pick_cut(host_scene(*state, models), camera.camera, given, picked);
         }
         if (!shows_any) return py::none();
@@ -328,7 +328,7 @@ class BoundSceneFrame {
             return counts.exceeds_budget ? raised.tolerance_px2 : counts.tolerance_px2;
         };
         {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             pool.frame_on_host(scene, rule, look.is_aside ? PoolFrame::aside : PoolFrame::flight, cut);
         }
         return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
@@ -398,7 +398,7 @@ class BoundSceneFrame {
         const py::list gaussians = models_, colors = palettes_;  // which another thread may replace meanwhile
         SceneFrameCounts counts;
         {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             counts = draw(host_scene(*state, models), out.span());
         }
         return std::make_unique<BoundDrawing>(std::move(out.out), stats_of(counts));
@@ -454,7 +454,7 @@ class BoundAssetFrame {
         HostPictures out(camera.camera, shade);
         SceneFrameCounts counts;
         {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             counts = cpu::draw_model(*model.on_host().planes, model.size(), camera.camera, out.pictures[0],
                                      flag_of(stop));
         }

@@ -30,7 +30,7 @@ py::tuple gathered(const GatherInput& in, Device device, int sh_degree) {
     const Work work(device);
     const NewRows out(device, static_cast<size_t>(in.offset[in.instance.size]), sh_degree);
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         V3DG_DISPATCH(work, gather, in, out.rows());
     }
     return out.arrays();

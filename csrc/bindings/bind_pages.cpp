@@ -33,7 +33,7 @@ PageRun run_of(const py::array& hashes, size_t first_page, const py::array& firs
 template <class Body>
 void naming_file(const py::object& path, const Body& body) {
     try {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         body();
     } catch (const PageError& error) {
         if (error.is_damage)
@@ -93,7 +93,7 @@ std::vector<py::bytes> hash_messages(const std::vector<py::array>& arrays) {
     for (const py::array& array : arrays) messages.push_back(span_of<const uint8_t>(array, "messages", {-1}));
     std::vector<PageHash> hashes(messages.size());
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         blake2b({messages.data(), messages.size()}, hashes.data());
     }
     std::vector<py::bytes> digests;
@@ -170,7 +170,7 @@ py::array BoundHashedRead::wait() {
 }
 
 bool BoundHashedRead::is_sound() {
-    const py::gil_scoped_release unlocked;
+    const Unlocked unlocked;
     return read_->is_sound();
 }
 

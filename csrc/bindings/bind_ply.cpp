@@ -33,7 +33,7 @@ template <class Body>
 auto with_path(const Path& path, const Body& body) {
     const char* name = PyBytes_AS_STRING(path.encoded.ptr());
     try {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         return body(name);
     } catch (const PlyError& error) {
         const py::str message = py::str("{}: {}").format(path.shown, error.what());

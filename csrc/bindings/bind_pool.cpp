@@ -32,9 +32,21 @@ struct GivenSource {
     Span<const uint8_t> hashes;
 };
 
-// What a function raises that is asked for parts of a file, or nothing. With Python's lock; while the
-// function runs there is nothing here to be undone, for Python may end the thread in it when the process
-// ends.
+// The text of what was raised, which is raised no longer; with Python's lock.
+std::string text_of_error() {
+    PyObject *type = nullptr, *value = nullptr, *trace = nullptr;
+    PyErr_Fetch(&type, &value, &trace);
+    PyErr_NormalizeException(&type, &value, &trace);
+    PyObject* const text = value == nullptr ? nullptr : PyObject_Str(value);
+    const char* const bytes = text == nullptr ? nullptr : PyUnicode_AsUTF8(text);
+    std::string problem = bytes == nullptr ? "" : bytes;
+    PyErr_Clear();
+    for (PyObject* object : {type, value, trace, text}) Py_XDECREF(object);
+    return problem.empty() ? "the fetch failed" : problem;
+}
+
+// What a function raises that is asked for parts of a file, or nothing. With Python's lock; nothing here has
+// a destructor that needs it, for Python may end the thread in the function.
 std::string told_by(PyObject* function, Span<const int64_t> places) {
     PyObject* const list = PyList_New(static_cast<py::ssize_t>(places.size / 2));
     for (size_t k = 0; list != nullptr && k < places.size / 2; ++k)
@@ -44,10 +56,7 @@ std::string told_by(PyObject* function, Span<const int64_t> places) {
     PyObject* const done = list == nullptr ? nullptr : PyObject_CallFunctionObjArgs(function, list, nullptr);
     Py_XDECREF(list);
     Py_XDECREF(done);
-    if (done != nullptr) return {};
-    const py::error_already_set error;
-    const std::string problem = py::str(error.value());
-    return problem.empty() ? "the fetch failed" : problem;
+    return done == nullptr ? text_of_error() : std::string();
 }
 
 // Has a function of Python fetch, for threads that have no part in its lock until then: whoever waits for
@@ -57,11 +66,9 @@ Fetch fetch_by(const py::object& function) {
     if (function.is_none()) return {};
     PyObject* const kept = function.inc_ref().ptr();
     return [kept](Span<const int64_t> places) -> std::string {
-        if (Py_IsInitialized() == 0) return "the process ends";
-        const PyGILState_STATE state = PyGILState_Ensure();
-        std::string problem = told_by(kept, places);
-        PyGILState_Release(state);
-        return problem;
+        std::string problem;
+        const bool was_called = call_with_lock([&] { problem = told_by(kept, places); });
+        return was_called ? problem : "the process ends";
     };
 }
 
@@ -126,7 +133,7 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
         given.push_back(given_source(sources[b], bundles[b].table));
     }
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         parallel_for(bundles.size(), 1,
                      [&](size_t b) { bundles[b].source = source_of(given[b], bundles[b].table); });
     }
@@ -162,7 +169,7 @@ BoundPool::BoundPool(const py::list& tables, const py::list& sources, int device
         if (device_.is_host()) limits.memory.most_rows /= std::max(1, max_degree);
     }
     try {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         pool_ = std::make_unique<PagePool>(bundles, limits, std::move(blocks));
     } catch (const PageError& error) {
         raise(error);
@@ -178,7 +185,7 @@ BoundPool::~BoundPool() {
     on_device_.reset();
 #endif
     host_.reset();
-    const py::gil_scoped_release unlocked;  // threads that end may be on their way to ask Python for a page
+    const Unlocked unlocked;  // threads that end may be on their way to ask Python for a page
     pool_.reset();
 }
 
@@ -230,11 +237,11 @@ SettlingStep BoundPool::settle_step(const py::object& scene_object, const BoundE
 #if V3DG_WITH_CUDA
     if (!device_.is_host()) {
         const Work work(device_);
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         return on_device_->settle_step(held_scene.on_device(), eyes, rule, begins, work.stream());
     }
 #endif
-    const py::gil_scoped_release unlocked;
+    const Unlocked unlocked;
     const PoolFrame kind = begins ? PoolFrame::first_look : PoolFrame::look;
     step.noted = frame_on_host(*state, rule, kind, [&](auto tables, const SelectRule& raised, auto needs) {
         SelectOutput out;
@@ -276,10 +283,9 @@ void bind_pool(py::module_& m) {
             "Raises it, unless there is room for what the last view needs; whether it did.")
         .def(
             "wait", [](BoundPool& p, double seconds) { return p.pool().wait(seconds); }, "seconds"_a,
-            py::call_guard<py::gil_scoped_release>(), "Waits for pages; whether there are any to bring.")
+            py::call_guard<Unlocked>(), "Waits for pages; whether there are any to bring.")
         .def(
-            "read_one", [](BoundPool& p) { return p.pool().read_one(); },
-            py::call_guard<py::gil_scoped_release>());
+            "read_one", [](BoundPool& p) { return p.pool().read_one(); }, py::call_guard<Unlocked>());
 }
 
 }  // namespace v3dg

@@ -24,7 +24,7 @@ py::object encode_rows(const Rows& gaussians, const py::array& offset) {
     const Span<const int64_t> clusters = boundaries_of(offset, "offset", in.size);
     const NewArray<int32_t> page({}, {num_words(clusters, in.sh_degree)});
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         cpu::encode_page(in, {clusters, reinterpret_cast<uint32_t*>(page.span.data), in.sh_degree});
     }
     return page.object;
@@ -36,7 +36,7 @@ void decode_rows(const py::array& page, const py::array& offset, const Rows& out
         throw py::value_error("out: expected arrays on the host, got others; bring them there");
     const Span<const int64_t> clusters = boundaries_of(offset, "offset", rows.size);
     const auto words = span_of<const int32_t>(page, "page", {num_words(clusters, rows.sh_degree)});
-    const py::gil_scoped_release unlocked;
+    const Unlocked unlocked;
     cpu::decode_page({clusters, reinterpret_cast<const uint32_t*>(words.data), rows.sh_degree}, rows);
 }
 
@@ -44,7 +44,7 @@ py::object codebook_of(const py::array& values) {
     const auto in = span_of<const double>(values, "values", {-1});
     const NewArray<double> table({}, {static_cast<py::ssize_t>(kCodebookSize)});
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         make_codebook(in, table.span);
     }
     return table.object;
@@ -55,7 +55,7 @@ py::tuple palette_of(const py::array& vectors, size_t size) {
     const auto width = static_cast<size_t>(vectors.shape(1));
     VectorPalette palette;
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         palette = make_palette(in, width, size);
     }
     const py::ssize_t count = width ? palette.vectors.size() / width : 1;

@@ -96,7 +96,7 @@ class HostTape final : public Tape {
             means.span.data, quats.span.data, scales.span.data, opacities.span.data, sh.span.data,
             model_.size(),   degree};
         {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             const Picture<T> picture{{0, 0, width_, height_},
                                      {T(background_[0]), T(background_[1]), T(background_[2])},
                                      nullptr,
@@ -134,7 +134,7 @@ py::tuple rasterize_on_host(const Rows& gaussians, const BoundCamera& camera, co
     std::unique_ptr<HostTape<T>> tape;
     RenderCounts counts;
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         tape = std::make_unique<HostTape<T>>(rows, camera, look);
         counts = tape->draw(picture, keep_tape);
     }
@@ -167,7 +167,7 @@ class DeviceTape final : public Tape {
         const NewArray<float> background(device, {3});
         const NewCenters<float> centers(wanted, device, static_cast<py::ssize_t>(gaussians_.size()));
         {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             frame_->backward(d_picture, gradients.rows(), centers.spans, background.span.data, work.stream());
         }
         return py::tuple(gradients.arrays() + py::make_tuple(background.object, centers.sum, centers.size));
@@ -189,7 +189,7 @@ py::tuple rasterize_on_device(const Rows& gaussians, const BoundCamera& camera, 
         look.antialiased, out.frame_image(camera.camera, Shade{look.background}, out.on_device(device))};
     std::unique_ptr<cuda::DifferentiableFrame> frame;
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         frame = cuda::take_frame();
         frame->draw(in, work.stream());
     }
@@ -215,7 +215,7 @@ py::tuple ellipses_of(const Rows& gaussians, const Camera& camera, double filter
         gaussians.read<T>(), view_of_world<T>(camera), pinhole_of<T>(camera), T(filter_px2), antialiased,
         T(far_depth),        T(min_radius_px)};
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         if constexpr (std::is_same<T, float>::value)
             V3DG_DISPATCH(work, ellipses, in, out);
         else

@@ -53,7 +53,7 @@ py::tuple group_metrics(const Tables& tables, const Instances& instances, const 
     const NewArray<int64_t> offset = offset_of_instances(bundle, counts);
     const NewArray<float> metric({}, {static_cast<py::ssize_t>(offset.span[bundle.size])});
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         cpu::group_metrics(arguments.input, offset.span, metric.span);
     }
     return py::make_tuple(metric.object, offset.object);

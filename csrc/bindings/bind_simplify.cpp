@@ -38,7 +38,7 @@ py::object prune(const Rows& gaussians, const py::array& in_offset, const py::ar
     const Work work(gaussians.device());
     const NewArray<int64_t> kept(gaussians.device(), {static_cast<py::ssize_t>(segments.num_out())});
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         V3DG_DISPATCH(work, prune, in, segments.in, segments.out, kept.span);
     }
     return kept.object;
@@ -50,7 +50,7 @@ py::tuple merge(const Rows& gaussians, const py::array& in_offset, const py::arr
     const Work work(gaussians.device());
     const NewRows merged(gaussians.device(), segments.num_out(), in.sh_degree);
     {
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         V3DG_DISPATCH(work, merge, in, segments.in, segments.out, merged.rows());
     }
     return merged.arrays();

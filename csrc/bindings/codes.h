@@ -46,7 +46,7 @@ class BoundCodes {
             num_bytes != 4 * words.size)
             throw py::value_error("pages: expected " + std::to_string(num_bytes) +
                                   " bytes of all clusters in order, got " + std::to_string(4 * words.size));
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         pages_ = std::make_unique<CodedPages>(reinterpret_cast<const uint32_t*>(words.data), pages_of,
                                               clusters, sh_degree);
     }

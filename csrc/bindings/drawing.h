@@ -39,7 +39,7 @@ class Turn {
         if (mutex == nullptr) return;  // on the host, where frames have nothing that they share
         lock_ = std::unique_lock<std::mutex>(*mutex, std::try_to_lock);
         if (lock_.owns_lock()) return;
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         lock_.lock();
     }
 
@@ -95,7 +95,7 @@ class BoundDrawing {
         if (drawing_ != nullptr) {
             const Work work(device_);
             {
-                const py::gil_scoped_release unlocked;
+                const Unlocked unlocked;
                 drawing_->wait();
             }
             const Turn turn(turns_.get());

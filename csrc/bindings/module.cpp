@@ -6,7 +6,9 @@
 #include <new>
 
 #include "base/isa.h"
+#include "bindings/array.h"
 #include "bindings/operations.h"
+#include "bindings/python_lock.h"
 #include "math/gaussian.h"
 #include "residency/cluster_table.h"
 
@@ -33,9 +35,25 @@ static int num_cuda_devices() {
 #endif
 }
 
+// An object that only `__new__` has made holds nothing. When a function is given one, pybind11 asks its class
+// for memory of that size, whose content nobody has made.
+static void* refuse_unmade(size_t) {
+    throw v3dg::py::type_error(
+        "self: expected an object that its class has made, got one of __new__ alone; call the class instead");
+}
+static void refuse_unmade_objects(const v3dg::py::module_& m) {
+    for (const auto& [name, value] : v3dg::py::dict(m.attr("__dict__"))) {
+        if (!v3dg::py::isinstance<v3dg::py::type>(value)) continue;
+        v3dg::py::detail::type_info* const info =
+            v3dg::py::detail::get_type_info(reinterpret_cast<PyTypeObject*>(value.ptr()));
+        if (info != nullptr) info->operator_new = &refuse_unmade;
+    }
+}
+
 PYBIND11_MODULE(_core, m) {
     if (must_let_threads_go() && pthread_atfork(&let_threads_go, nullptr, nullptr) != 0)
         throw std::bad_alloc();
+    v3dg::watch_end_of_python();
     m.doc() = "Compiled operations of v3dg; the public interface is the package v3dg.";
     m.attr("min_alpha") = v3dg::kMinAlpha;
     m.attr("fade_filter_px2") = v3dg::kFadeFilterPx2;
@@ -59,4 +77,5 @@ PYBIND11_MODULE(_core, m) {
     v3dg::bind_frame(m);
     v3dg::bind_fit_level(m);
     v3dg::bind_first_selected(m);
+    refuse_unmade_objects(m);
 }

@@ -25,7 +25,7 @@ class BoundModel {
         const GaussianRows<const float> read = rows.read<float>();
         const Work work(device_);
         if (device_.is_host()) {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             host_ = std::make_shared<Model<float>>(read);
             return;
         }
@@ -46,7 +46,7 @@ class BoundModel {
             return;
         }
 #if V3DG_WITH_CUDA
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         on_device_.coded = std::make_shared<cuda::CodedModel>(given.pages(), work.stream());
         codes_ = on_device_.coded->codes();
 #endif
@@ -89,7 +89,7 @@ class BoundModel {
         const NewRows out(device_, static_cast<size_t>(offset.back()), codes_.sh_degree);
         const DecodeInput in{codes_, cluster, {offset.data(), offset.size()}};
         {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             V3DG_DISPATCH(work, decode, in, out.rows());
         }
         return out.arrays();
@@ -242,7 +242,7 @@ class BoundScene {
         const std::shared_ptr<const SceneState> state = state_;
         const Work work(device_);
         const auto cut = [&](const SelectRule& paced, uint32_t* last_bin) {
-            const py::gil_scoped_release unlocked;
+            const Unlocked unlocked;
             SelectOutput out;
             if (device_.is_host())
                 cpu::select({{state->tables.data(), state->tables.size()},
@@ -275,7 +275,7 @@ class BoundScene {
             priorities.append(priority.object);
         }
         SelectOutput out;
-        const py::gil_scoped_release unlocked;
+        const Unlocked unlocked;
         cpu::select({{state->tables.data(), state->tables.size()},
                      state->instances,
                      camera.camera,

@@ -1,6 +1,7 @@
 // Median split: segments in parallel, and a task a node, down to a size where tasks cost more than they win.
 // Bounding balls: one thread a segment.
 
+#include "base/threads.h"
 #include "cluster/cluster.h"
 
 #include <algorithm>
@@ -137,7 +138,7 @@ void cpu::median_split(Span<const Point> means, Span<const int64_t> offset, int 
     std::vector<IndexedPoint> points(means.size);
     const ptrdiff_t count = static_cast<ptrdiff_t>(means.size);
     const ptrdiff_t num_segments = static_cast<ptrdiff_t>(offset.size) - 1;
-#pragma omp parallel if (count > kTaskSize)
+#pragma omp parallel if (count > kTaskSize) num_threads(most_threads())
     {
 #pragma omp for
         for (ptrdiff_t i = 0; i < count; ++i)

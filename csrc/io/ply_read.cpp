@@ -14,6 +14,7 @@
 #include <omp.h>
 
 #include "base/first_error.h"
+#include "base/threads.h"
 #include "io/ply.h"
 
 namespace v3dg {
@@ -428,7 +429,7 @@ PlyPlace read_fixed_rows(const PlyFile& ply, PlyPlace at, const PlyGaussians<flo
     const size_t block_rows = std::max<size_t>(1, kBlockBytes / row_bytes);
     const size_t num_rows = out.opacities.size;
     const size_t num_blocks = (num_rows + block_rows - 1) / block_rows;
-    const int num_threads = static_cast<int>(std::min<size_t>(omp_get_max_threads(), num_blocks));
+    const int num_threads = static_cast<int>(std::min<size_t>(most_threads(), num_blocks));
     // Not value-initialised, so a thread that gets no block costs no memory.
     const std::unique_ptr<char[]> buffers(new char[num_threads * block_rows * row_bytes]);
     FirstError error;
@@ -460,7 +461,7 @@ PlyPlace read_rows_with_lists(const PlyFile& ply, PlyPlace at, const PlyGaussian
         for (size_t r = 0; r < count; ++r)
             walk_row(reader, ply.vertex, at.row + first + r, is_swapped(ply.encoding),
                      packed.data() + r * row_bytes);
-#pragma omp parallel for schedule(static)
+#pragma omp parallel for schedule(static) num_threads(most_threads())
         for (size_t r = 0; r < count; ++r) decoder.decode(packed.data() + r * row_bytes, 1, first + r);
     }
     return {at.row + num_rows, reader.offset()};
@@ -471,13 +472,13 @@ PlyPlace read_text(const PlyFile& ply, PlyPlace at, const PlyGaussians<float>& o
     const std::vector<Field> fields = fields_of(ply.vertex, ply.num_sh);
     const size_t num_properties = ply.vertex.properties.size();
     const size_t num_rows = out.opacities.size;
-    std::vector<double> values(omp_get_max_threads() * num_properties);
+    std::vector<double> values(most_threads() * num_properties);
     LineReader reader(ply.file, at.offset, ply.file_bytes);
     for (size_t first = 0; first < num_rows;) {
         const std::vector<Line>& lines = reader.next(num_rows - first);
         if (lines.empty()) throw_too_few(ply.vertex, at.row + first);
         FirstError error;
-#pragma omp parallel for schedule(dynamic, kLinesPerTask)
+#pragma omp parallel for schedule(dynamic, kLinesPerTask) num_threads(most_threads())
         for (size_t r = 0; r < lines.size(); ++r) {
             error.run(r, [&] {
                 double* row = values.data() + omp_get_thread_num() * num_properties;

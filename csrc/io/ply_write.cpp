@@ -14,6 +14,7 @@
 #include <omp.h>
 
 #include "base/first_error.h"
+#include "base/threads.h"
 #include "io/ply.h"
 
 namespace v3dg {
@@ -119,7 +120,7 @@ struct Writer {
 
     void write_binary() const {
         const size_t row_bytes = 4 * num_values();
-        const int num_threads = static_cast<int>(std::min<size_t>(omp_get_max_threads(), num_blocks()));
+        const int num_threads = static_cast<int>(std::min<size_t>(most_threads(), num_blocks()));
         const std::unique_ptr<unsigned char[]> buffers(
             new unsigned char[num_threads * kBlockRows * row_bytes]);
         FirstError error;
@@ -145,7 +146,7 @@ struct Writer {
         for (size_t first = 0; first < num_blocks(); first += kTextBlocks) {
             const size_t count = std::min(kTextBlocks, num_blocks() - first);
             FirstError error;
-#pragma omp parallel for schedule(dynamic, 1)
+#pragma omp parallel for schedule(dynamic, 1) num_threads(most_threads())
             for (size_t b = 0; b < count; ++b) {
                 error.run(b, [&] {
                     texts[b].clear();

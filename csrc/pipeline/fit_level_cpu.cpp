@@ -1,5 +1,6 @@
 // Hands the groups of a level to threads. What is done for one group is in fit_group/fit_group_cpu.cpp.
 
+#include "base/threads.h"
 #include "pipeline/fit_level.h"
 
 #include <omp.h>
@@ -29,10 +30,9 @@ void fit_level(const FitConfig& config, Span<const FitGroup> groups, const FitTa
             const int size = fit_view(config, groups[first], 0).size;
             const size_t tiles = static_cast<size_t>((size + kTileSize - 1) / kTileSize);
             const size_t bytes = num_pictures * tiles * tiles * kTileSize * kTileSize * 4 * sizeof(float);
-            last =
-                std::min(groups.size, first + std::max<size_t>(omp_get_max_threads(), kTargetBytes / bytes));
+            last = std::min(groups.size, first + std::max<size_t>(most_threads(), kTargetBytes / bytes));
             images.resize((last - first) * num_pictures);
-            std::vector<FitScratch> scratch(omp_get_max_threads());
+            std::vector<FitScratch> scratch(most_threads());
             parallel_for(images.size(), 1, [&](size_t i) {
                 if (progress.cancel) return;
                 const FitGroup& group = groups[first + i / num_pictures];

@@ -1,3 +1,4 @@
+#include "base/threads.h"
 #include "pipeline/render.h"
 
 #include <omp.h>
@@ -69,8 +70,7 @@ static std::vector<Chunk> chunks_of(const std::vector<Piece>& pieces, size_t num
 // that the memory that is used has few gaps, and that which no record reaches is never touched.
 class RecordRoom {
   public:
-    RecordRoom(const std::vector<Piece>& pieces, const std::vector<Chunk>& chunks)
-        : mine_(omp_get_max_threads()) {
+    RecordRoom(const std::vector<Piece>& pieces, const std::vector<Chunk>& chunks) : mine_(most_threads()) {
         uint64_t total = 0;
         for (const Chunk& c : chunks) {
             const uint64_t end = pieces[c.last - 1].first + pieces[c.last - 1].count;
@@ -123,7 +123,7 @@ static std::vector<uint32_t> tiles_by_load(const uint64_t* offset, size_t num_ti
 constexpr double kLeastBandBytes = 96 << 20, kMostBandBytes = 768 << 20, kThreadBandBytes = 48 << 20;
 static double band_bytes_of(const std::atomic<bool>* stop) {
     if (stop != nullptr) return kLeastBandBytes;
-    return std::clamp(kThreadBandBytes * omp_get_max_threads(), kLeastBandBytes, kMostBandBytes);
+    return std::clamp(kThreadBandBytes * most_threads(), kLeastBandBytes, kMostBandBytes);
 }
 // So few gaussians need no look at how much they cover.
 constexpr uint64_t kFewGaussians = 65536;
@@ -218,7 +218,7 @@ static void render_band(const std::vector<Draw<T>>& draws, std::vector<Piece>& p
 
     const uint64_t* offset = ws.lists.offset.data();
     const std::vector<uint32_t> order = tiles_by_load(offset, grid.size());
-    std::vector<Buffer<uint64_t>> scratch(omp_get_max_threads());
+    std::vector<Buffer<uint64_t>> scratch(most_threads());
     parallel_for(order.size(), 1, [&](size_t i) {
         if (is_stopped(stop)) return;
         const uint32_t t = order[i];
@@ -292,8 +292,8 @@ void render_backward(const Draw<T>& draw, const Pinhole<T>& camera, const Pictur
     std::vector<CenterSize<T>> size_of_slot(with_size ? num_slots : 0);
     std::vector<T> d_background_of_tile(3 * grid.size(), T(0));
     const std::vector<uint32_t> order = tiles_by_load(offset, grid.size());
-    std::vector<std::vector<RecordGradient<T>>> d_entries(omp_get_max_threads());
-    std::vector<std::vector<CenterSize<T>>> sizes(omp_get_max_threads());
+    std::vector<std::vector<RecordGradient<T>>> d_entries(most_threads());
+    std::vector<std::vector<CenterSize<T>>> sizes(most_threads());
     parallel_for(order.size(), 1, [&](size_t i) {
         const uint32_t t = order[i];
         const size_t count = offset[t + 1] - offset[t];

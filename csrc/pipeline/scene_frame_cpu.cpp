@@ -21,7 +21,8 @@ double now() {
 // Without a lock, which a fork() in the middle would leave closed.
 class SharedWorkspace {
   public:
-    ~SharedWorkspace() { delete kept_.load(); }
+    // Threads may still draw when the process ends.
+    ~SharedWorkspace() { delete kept_.exchange(nullptr); }
     std::unique_ptr<Workspace<float>> take() {
         std::unique_ptr<Workspace<float>> kept(kept_.exchange(nullptr));
         return kept ? std::move(kept) : std::make_unique<Workspace<float>>();

@@ -5,6 +5,7 @@
 
 #include "base/buffer.h"
 #include "base/parallel_for.h"
+#include "base/threads.h"
 #include "quantize/quantize.h"
 
 namespace v3dg {
@@ -38,7 +39,7 @@ static void read_few(const PosixFile& file, const PageRun& run, size_t first, si
 // Calls read(first page, how many) on all threads.
 template <class Read>
 static void for_few_pages(const PageRun& run, const Read& read) {
-    const size_t share = run.size() / static_cast<size_t>(omp_get_max_threads());
+    const size_t share = run.size() / static_cast<size_t>(most_threads());
     const size_t few = std::clamp<size_t>(share, 1, kFew);
     parallel_for((run.size() + few - 1) / few, 1,
                  [&](size_t k) { read(k * few, std::min(few, run.size() - k * few)); });

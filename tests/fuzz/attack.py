@@ -33,6 +33,7 @@ KINDS = {
     "memory": 0.07,
     "exports": 0.05,
     "servers": 0.05,
+    "ends": 0.1,
 }
 KEPT = Path(__file__).parents[2] / "build" / "attack"
 

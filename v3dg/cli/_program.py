@@ -7,10 +7,11 @@ import io
 import operator
 import os
 import re
+import shutil
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
@@ -27,6 +28,7 @@ INTERRUPTED = 130  # exit code
 
 # More than any machine has cores; where the system refuses one, OpenMP ends the process.
 _MOST_THREADS = 1024
+_LEAST_COLUMNS = 40
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Program:
         check_usage("arguments", "" not in arguments, "no empty one, got ''; check what was to stand there")
         caught = io.StringIO()
         try:
-            with contextlib.redirect_stderr(caught):
+            with contextlib.redirect_stderr(caught), _legible_width():
                 return tyro.cli(
                     functools.reduce(operator.or_, subcommands),
                     prog=self.name,
@@ -122,6 +124,22 @@ class Program:
         except FAILURES as error:
             return _fail(failure_text(error), 1)
         return 0
+
+
+@contextlib.contextmanager
+def _legible_width() -> Iterator[None]:
+    """Have a narrow terminal taken for one with room for a few words: in 5 columns, tyro finds no end."""
+    if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
+        yield
+        return
+    columns = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(_LEAST_COLUMNS)
+    try:
+        yield
+    finally:
+        del os.environ["COLUMNS"]
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
 
 
 def _plainly(text: str) -> str:

@@ -6,6 +6,7 @@ import functools
 import io
 import math
 import os
+import resource
 import tempfile
 import threading
 import time
@@ -244,7 +245,10 @@ class Tab:
         self._tell(self.describe_scene())
 
 
-def _resident_bytes() -> int:
-    """Memory that this process holds."""
-    with open("/proc/self/statm", encoding="ascii") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+def _resident_bytes(statm_path: str = "/proc/self/statm") -> int:
+    """Memory that this process holds; without /proc, the most that it has held."""
+    try:
+        with open(statm_path, encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
