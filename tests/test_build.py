@@ -618,6 +618,12 @@ def test_paper_settings_build(asset, group_size, changes, device):
     assert np.isfinite(render(bundle, camera, device="cpu").color).all()
 
 
+def test_settings_for_leaves_only_make_one_level(asset, device):
+    bundle = build(asset, BuildConfig.leaves_only(), device=device)
+    assert bundle.num_levels == 1
+    assert len(bundle.gaussians) == len(asset)
+
+
 def test_paper_fit_reduces_the_error(asset, device):
     config = BuildConfig.paper(cluster_size=300)
     start, fitted = (build(asset, replace(config, steps=steps), device=device) for steps in (0, 100))

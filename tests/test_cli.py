@@ -90,12 +90,12 @@ def test_a_name_that_is_nearly_there_is_proposed(tmp_path):
     (tmp_path / "donut.v3dg").touch()
     fails(
         1,
-        "donut.v3d: expected a file, got a path where there is none; perhaps you meant donut.v3dg",
+        "donut.v3d: expected a file, got a path that does not exist; perhaps you meant donut.v3dg",
         "info",
         "donut.v3d",
         cwd=tmp_path,
     )
-    fails(1, "got a path where there is none; check it", "info", "tree.v3dg", cwd=tmp_path)
+    fails(1, "got a path that does not exist; check it", "info", "tree.v3dg", cwd=tmp_path)
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
@@ -421,7 +421,7 @@ def test_a_file_that_is_read_is_not_written_over(folder, tmp_path):
 def test_an_empty_argument_is_not_the_working_folder(folder):
     """A shell gives one for a variable that is not set, and `build` would take all assets that are there."""
     before = sorted(os.listdir(folder))
-    fails(2, "check what was to stand there", "build", "", "-o", "all.v3dg", cwd=folder)
+    fails(2, "argument 2 is empty; is a shell variable unset", "build", "", "-o", "all.v3dg", cwd=folder)
     assert sorted(os.listdir(folder)) == before
 
 

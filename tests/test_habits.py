@@ -276,7 +276,7 @@ def test_doctor_says_what_is_there_and_how_to_get_the_rest(monkeypatch, capsys, 
     for name in ("CXX", "CUDACXX"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setitem(_extras.EXTRAS, "nowhere", ("nowhere-at-all>=7", "nothing"))
+    monkeypatch.setitem(_extras.EXTRAS, "nowhere", _extras.Extra("nowhere-at-all>=7", "nothing"))
     assert cli.main(["doctor"]) == 0
     lines = capsys.readouterr().out.splitlines()
     told = dict(line.split("  ", 1) for line in lines)

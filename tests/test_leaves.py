@@ -385,7 +385,7 @@ def test_files_that_change_meanwhile_are_found(tmp_path, small, monkeypatch):
 
     monkeypatch.setattr(external_split, "split", meanwhile)
     with (
-        pytest.raises(ValueError, match=r"a.ply: expected the file not to change while it is read"),
+        pytest.raises(ValueError, match=r"a.ply: expected a file that does not change while it is read"),
         leaves_on_disk([path], tmp_path / "s", memory=0, config=CONFIG),
     ):
         pass

@@ -224,7 +224,7 @@ def test_command_ends_at_once_whatever_a_tab_does(blob_bundle, blob_view, tmp_pa
         (["asset.ply", "--port", "70000"], "--port: expected 0 to 65535, got 70000"),
         (["asset.ply", "--tolerance", "inf"], "--tolerance: expected a number, got inf"),
         (["asset.ply", "--host", "192.0.2.1"], "host: expected an address of this machine, got 192.0.2.1"),
-        (["nothing.v3dg"], "nothing.v3dg: expected a file, got a path where there is none"),
+        (["nothing.v3dg"], "nothing.v3dg: expected a file, got a path that does not exist"),
     ],
 )
 def test_command_refuses_what_cannot_be_meant(arguments, message, tmp_path, monkeypatch, capsys):

@@ -28,7 +28,7 @@ class Device:
         return f"cuda:{self.number}" if self.is_cuda else "cpu"
 
     def current(self) -> AbstractContextManager[Any]:
-        """Make it torch's current device meanwhile; the CPU always is one."""
+        """Make it torch's current device inside the context; does nothing for the CPU."""
         if not self.is_cuda:
             return nullcontext()
         import torch
@@ -40,10 +40,13 @@ CPU = Device()
 
 
 def resolve(device: str | Device) -> Device:
-    """The device that "auto", "cpu", "cuda" or "cuda:1" stands for; ValueError where it is none of these.
+    """The device that "auto", "cpu", "cuda" or "cuda:1" stands for.
 
-    "cuda" is torch's current device, "auto" the same where nothing is missing for it, else the CPU. Where
-    something is missing for a CUDA device, that is a RuntimeError, never another device in its place.
+    "cuda" is torch's current device, "auto" the same if nothing is missing for it, else the CPU.
+
+    Raises:
+        ValueError: The name is none of these.
+        RuntimeError: Something is missing for a CUDA device that was asked for; the CPU does not replace it.
     """
     name = str(device)
     kind, _, number = name.partition(":")
@@ -58,14 +61,16 @@ def resolve(device: str | Device) -> Device:
             raise RuntimeError(f"device: expected one of {count} CUDA devices, got {name!r}")
         import torch
 
-        return Device(int(number) if number else int(torch.cuda.current_device()))
+        if number:
+            return Device(int(number))
+        return Device(int(torch.cuda.current_device()))
     if kind == "cuda":
         raise RuntimeError(f"device: {missing}; or use 'cpu'")
     return CPU
 
 
 def missing_for_cuda() -> str | None:
-    """What has to be done before CUDA can be used; None where it can."""
+    """What is missing for CUDA, and what to do; None if CUDA can be used."""
     if not _core.has_cuda:
         return "v3dg was built without CUDA; install it again where nvcc is found"
     if _core.num_cuda_devices() == 0:
@@ -82,7 +87,7 @@ def missing_for_cuda() -> str | None:
 
 
 def describe(device: Device) -> str:
-    """What of a device the last bits of results depend on."""
+    """The kind of a device, on which the last bits of results depend."""
     if not device.is_cuda:
         return _core.isa()
     import torch
@@ -91,7 +96,7 @@ def describe(device: Device) -> str:
 
 
 def of(array: Array) -> Device:
-    """Where an array is; torch's tensors on the host count as the CPU's."""
+    """The device of an array; for a tensor of torch on the host that is the CPU."""
     if isinstance(array, np.ndarray) or not array.is_cuda:
         return CPU
     return Device(array.device.index)
@@ -105,22 +110,26 @@ def place(gaussians: Gaussians, device: Device) -> Gaussians:
 
 
 def place_rows(array: Array, rows: npt.NDArray[np.bool_], device: Device) -> Array:
-    """Those rows of an array as NumPy's (on the CPU) or as a tensor on a CUDA device, without gradients."""
+    """The marked rows of an array, as NumPy's (on the CPU) or as a CUDA tensor, without gradients."""
     if isinstance(array, np.ndarray) and not device.is_cuda:
         return array[rows]
     import torch
 
-    there = torch.as_tensor(array, device=str(device)).detach()
-    there = there[torch.from_numpy(rows).to(there.device)]
-    return there if device.is_cuda else there.numpy()
+    tensor = torch.as_tensor(array, device=str(device)).detach()
+    selected = tensor[torch.from_numpy(rows).to(tensor.device)]
+    if device.is_cuda:
+        return selected
+    return selected.numpy()
 
 
 def all_like(device: Device) -> list[Device]:
-    """All CUDA devices of the kind of one, which is the first; the CPU alone."""
-    if not device.is_cuda:
-        return [device]
-    others = (Device(number) for number in range(_core.num_cuda_devices()) if number != device.number)
-    return [device, *(other for other in others if describe(other) == describe(device))]
+    """A CUDA device and then all others of its kind; the CPU alone."""
+    devices = [device]
+    if device.is_cuda:
+        for number in range(_core.num_cuda_devices()):
+            if number != device.number and describe(Device(number)) == describe(device):
+                devices.append(Device(number))
+    return devices
 
 
 def library_of(array: Array) -> Any:
@@ -134,12 +143,14 @@ def library_of(array: Array) -> Any:
 
 def to_host(array: Array) -> npt.NDArray[Any]:
     """The array as one of NumPy's."""
-    return cast(npt.NDArray[Any], array if isinstance(array, np.ndarray) else array.cpu().numpy())
+    if isinstance(array, np.ndarray):
+        return array
+    return cast(npt.NDArray[Any], array.cpu().numpy())
 
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Turn torch's error about missing device memory into what the core raises, MemoryError."""
+    """Turn torch's error for too little device memory into MemoryError, which the core raises."""
     try:
         yield
     except RuntimeError as error:
@@ -159,7 +170,7 @@ def own_stream(device: Device) -> AbstractContextManager[Any]:
 
 
 def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], None]:
-    """The same work on this thread's stream, whatever thread it will run on."""
+    """Bind work to the stream of this thread, so that it uses that on any thread."""
     if not device.is_cuda:
         return work
     import torch
@@ -174,7 +185,7 @@ def with_this_stream(work: Callable[[], None], device: Device) -> Callable[[], N
 
 
 def spare_memory(device: Device) -> None:
-    """Have torch give back what it keeps for later, where that is much: the core cannot use it."""
+    """Have torch free its cached memory on a device if it is much, because the core cannot use it."""
     if not device.is_cuda:
         return
     import torch

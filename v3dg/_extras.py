@@ -1,31 +1,40 @@
-"""Packages that v3dg can do without: what each is for, and how to get it."""
+"""Optional packages: the purpose of each, and how to install it."""
 
 import importlib
-from typing import Any
+from typing import Any, NamedTuple
+
+
+class Extra(NamedTuple):
+    """An optional package."""
+
+    requirement: str  # as pip takes it
+    purpose: str
+
 
 EXTRAS = {
-    "torch": ("torch>=2.2", "CUDA and gradients"),
-    "msgspec": ("msgspec>=0.18.6", "the viewer"),
-    "websockets": ("websockets>=14.1", "the viewer"),
-    "flip_evaluator": ("flip-evaluator>=1.6", "errors by FLIP"),
-    "av": ("av>=12", "videos"),
-    "pxr": ("usd-core>=26.11", "OpenUSD"),
-    "pycolmap": ("pycolmap>=4.0", "cameras of COLMAP"),
-    "fsspec": ("fsspec[http]>=2024.2", "files at URLs"),
-    "distributed": ("distributed>=2024.1", "builds on many machines"),
+    "torch": Extra("torch>=2.2", "CUDA and gradients"),
+    "msgspec": Extra("msgspec>=0.18.6", "the viewer"),
+    "websockets": Extra("websockets>=14.1", "the viewer"),
+    "flip_evaluator": Extra("flip-evaluator>=1.6", "errors by FLIP"),
+    "av": Extra("av>=12", "videos"),
+    "pxr": Extra("usd-core>=26.11", "OpenUSD"),
+    "pycolmap": Extra("pycolmap>=4.0", "cameras of COLMAP"),
+    "fsspec": Extra("fsspec[http]>=2024.2", "files at URLs"),
+    "distributed": Extra("distributed>=2024.1", "builds on many machines"),
 }
-"""By module: what pip is to install, and what it is for."""
+"""Optional packages by the names of their modules."""
 
 
 def missing(module: str) -> str:
-    """What to say where one is not installed, or too old."""
-    requirement, purpose = EXTRAS[module]
-    needed = " ".join(f"'{other}'" for other, what in EXTRAS.values() if what == purpose)
-    return f"{purpose}: expected {requirement}, got none or an older one; pip install {needed}"
+    """The message for a package that is not installed, or too old."""
+    extra = EXTRAS[module]
+    together = [other.requirement for other in EXTRAS.values() if other.purpose == extra.purpose]
+    needed = " ".join(f"'{requirement}'" for requirement in together)
+    return f"{extra.purpose}: expected {extra.requirement}, got none or an older one; pip install {needed}"
 
 
 def load(module: str) -> Any:
-    """The module; ImportError says how to get it."""
+    """Import a module; ImportError says how to install its package."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Files that are complete or not there, and the first step of reading files of strangers."""
+"""Files that are complete or absent, and the first step of reading untrusted files."""
 
 import contextlib
 import errno
@@ -23,22 +23,25 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
-    """Give an empty file beside `path` to write to; at the end it replaces `path`, on failure it is removed.
+    """Yield the name of an empty file beside `path`; it replaces `path` at the end, or is removed on failure.
 
-    What is written is on the disk before it gets its name, and has the permissions of what it replaces, and
-    the owner and group where the system allows it. A link at `path` stays a link, to the new file; at the
-    name beside it, none is followed.
+    The content is on the disk before the file gets its name. It has the permissions of the file that it
+    replaces, and the owner and group where the system allows it. A link at `path` stays a link, to the new
+    file; a link at the temporary name is not followed.
 
-    A folder is an IsADirectoryError, what may not be written to a PermissionError, a device or a pipe a
-    ValueError; an OSError of writing has `path` for the file's name.
+    Raises:
+        IsADirectoryError: `path` is a folder.
+        PermissionError: `path` may not be written.
+        ValueError: `path` is a device or a pipe.
+        OSError: Writing failed; its file name is `path`.
     """
-    path = os.fspath(path)  # a number would stand for an open file
+    path = os.fspath(path)  # refuses a number, which open() would take for an open file
     status_of_replaced(path)
     folder, name = os.path.split(os.path.realpath(path))
-    # The start of the name only: a name may have 255 bytes, and a character up to four.
+    # Only the start of the name: a name may have at most 255 bytes, and a character has up to four.
     temporary = os.path.join(folder, f".{name[:40]}.{secrets.token_hex(8)}.tmp")
     with naming_errors(path, temporary):
-        # Nobody may read what replaces a private file before it has the permissions of that.
+        # The file is private until it gets the permissions of the file that it replaces.
         os.close(os.open(temporary, _NEW_FILE, 0o600))
         try:
             yield temporary
@@ -50,7 +53,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
 
 
 def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
-    """Bring a file that only its owner may read to the disk and to `path`, with what is permitted there."""
+    """Flush a private file to the disk and move it to `path`, with the permissions of the replaced file."""
     replaced = status_of_replaced(path)
     with naming_errors(path, os.fspath(private)):
         with open(private, "rb") as file:
@@ -58,9 +61,10 @@ def put_in_place(private: str | os.PathLike[str], path: str | os.PathLike[str]) 
             if replaced is None:
                 os.fchmod(descriptor, 0o666 & ~file_mode_mask())
             else:
-                for owner, group in ((-1, replaced.st_gid), (replaced.st_uid, -1)):
-                    with contextlib.suppress(OSError):
-                        os.fchown(descriptor, owner, group)
+                with contextlib.suppress(OSError):
+                    os.fchown(descriptor, -1, replaced.st_gid)
+                with contextlib.suppress(OSError):
+                    os.fchown(descriptor, replaced.st_uid, -1)
                 os.fchmod(descriptor, stat.S_IMODE(replaced.st_mode) & 0o777)
             os.fsync(descriptor)
         os.replace(private, os.path.realpath(path))
@@ -80,7 +84,7 @@ def file_mode_mask(status_path: str = "/proc/self/status") -> int:
 
 
 def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
-    """Of what is to be replaced, if there is something and it may be; errors as `replacing`."""
+    """The status of the file that will be replaced, or None if there is none; raises as `replacing`."""
     try:
         status = os.stat(path)
     except FileNotFoundError:
@@ -88,14 +92,14 @@ def status_of_replaced(path: str | os.PathLike[str]) -> os.stat_result | None:
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
     check(path, stat.S_ISREG(status.st_mode), "the path of a file, got a device or a pipe")
-    # Renaming asks the folder alone; that the file itself may be written to, opening it finds out.
+    # Renaming needs only the permissions of the folder; opening the file checks its own.
     os.close(os.open(path, os.O_WRONLY | os.O_CLOEXEC))
     return status
 
 
 @contextlib.contextmanager
 def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -> Iterator[None]:
-    """Give the system's errors the name of the file: those of an open file have none, or its other name."""
+    """Put the name of the file into the system's errors, which for an open file have none or `other_name`."""
     try:
         yield
     except OSError as error:
@@ -106,7 +110,7 @@ def naming_errors(path: str | os.PathLike[str], other_name: str | None = None) -
 
 @contextlib.contextmanager
 def telling(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
-    """Turn all that a library raises for damaged content, which none documents, into one error."""
+    """Turn every exception of a library into one ValueError: none documents what damaged content raises."""
     try:
         yield
     except MemoryError:
@@ -117,36 +121,38 @@ def telling(path: str | os.PathLike[str], expected: str) -> Iterator[None]:
 
 
 def write_at(descriptor: int, data: bytes | bytearray | memoryview, offset: int) -> None:
-    """Write all of the data to one place of a file; signals are heard now and then."""
+    """Write all data from an offset of a file on, in pieces, so that signals are handled between them."""
     view = memoryview(data)
     while view:
         count = os.pwrite(descriptor, view[:_PIECE_BYTES], offset)
-        view, offset = view[count:], offset + count
+        view = view[count:]
+        offset += count
 
 
 def read_at(descriptor: int, out: npt.NDArray[Any], offset: int) -> bool:
-    """Fill an array with the bytes at one place of a file; False where the file ends before."""
+    """Fill an array with the bytes from an offset of a file on; False if the file ends before."""
     view = out.reshape(-1).view(np.uint8).data
     while view:
         count = os.preadv(descriptor, [view[:_PIECE_BYTES]], offset)
         if count == 0:
             return False
-        view, offset = view[count:], offset + count
+        view = view[count:]
+        offset += count
     return True
 
 
 def check_folder(path: Path) -> None:
-    """Refuse, with ValueError, a place to write to whose folder is not there."""
+    """Refuse an output whose folder does not exist, with ValueError."""
     check(path, path.parent.is_dir(), f"an existing folder, got {path.parent}; create it first")
 
 
 def check_bundle_name(path: str | os.PathLike[str]) -> None:
-    """Refuse, with ValueError, a name by which `v3dg.open` would not know a bundle."""
+    """Refuse a name that `v3dg.open` would not recognise as a bundle's, with ValueError."""
     check(path, Path(path).suffix == ".v3dg", "a file name ending in .v3dg; v3dg.open goes by it")
 
 
 def open_regular(path: str | os.PathLike[str]) -> int:
-    """A descriptor of a file to read; a directory, a device or a pipe is a ValueError, without waiting."""
+    """Open a file to read, and return its descriptor; ValueError for a directory, a device or a pipe."""
     # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):

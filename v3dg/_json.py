@@ -1,4 +1,4 @@
-"""Strict JSON, and values that know where in their file they stand, so that errors can say it."""
+"""Strict JSON, and values that know their place in the file, so that errors can name it."""
 
 from __future__ import annotations
 
@@ -39,14 +39,18 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def shown(value: Any) -> str:
-    """A JSON value as a message shows it: on one line, and not long."""
-    if isinstance(value, dict | list) and len(value) > 8:
-        return f"{'an object' if isinstance(value, dict) else 'an array'} of {len(value)} values"
+    """A JSON value as a short text for a message of one line."""
+    if isinstance(value, dict) and len(value) > 8:
+        return f"an object of {len(value)} values"
+    if isinstance(value, list) and len(value) > 8:
+        return f"an array of {len(value)} values"
     try:
         text = json.dumps(value)
     except RecursionError:
         return "a value that is nested deep"
-    return text if len(text) <= 60 else text[:57] + "..."
+    if len(text) > 60:
+        return text[:57] + "..."
+    return text
 
 
 def is_one_line(text: str) -> bool:
@@ -55,7 +59,7 @@ def is_one_line(text: str) -> bool:
 
 
 def read_json(path: str | os.PathLike[str]) -> Node:
-    """Read a JSON file; ValueError where it is no regular file, or not strict JSON in UTF-8."""
+    """Read a JSON file; ValueError unless it is a regular file with strict JSON in UTF-8."""
     path = Path(path)
     with _files.naming_errors(path), open(_files.open_regular(path), "rb") as file:
         content = file.read()
@@ -66,16 +70,18 @@ def read_json(path: str | os.PathLike[str]) -> Node:
 
 
 def write_json(path: str | os.PathLike[str], document: Any) -> None:
-    """Write a JSON file, which replaces what is there once it is complete."""
+    """Write a JSON file, which replaces an existing one once it is complete."""
     with _files.replacing(path) as temporary:
         Path(temporary).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 class Node:
-    """A JSON value that knows where in the file it stands."""
+    """A JSON value with its place: the name of the file, and its path in the document."""
 
     def __init__(self, value: Any, file: str, path: str) -> None:
-        self.value, self.file, self.path = value, file, path
+        self.value = value
+        self.file = file
+        self.path = path
 
     def problem(self, text: str) -> ValueError:
         """An error that begins with the place."""
@@ -99,20 +105,24 @@ class Node:
             raise self.error("an object")
         if key not in self.value:
             raise self.problem(f"expected the field {key}, got an object without it")
-        name = key if is_one_line(key) and len(key) <= 60 else shown(key)
-        return Node(self.value[key], self.file, f"{self.path}.{name}" if self.path else name)
+        path = key if is_one_line(key) and len(key) <= 60 else shown(key)
+        if self.path:
+            path = f"{self.path}.{path}"
+        return Node(self.value[key], self.file, path)
 
     def has(self, key: str) -> bool:
         return isinstance(self.value, dict) and key in self.value
 
-    def items(self, expected: str = "an array", least: int = 0, most: float = math.inf) -> Iterator[Node]:
-        """An array's values, one at a time: the places of all of a large one take far more than the file."""
-        if not isinstance(self.value, list) or not least <= len(self.value) <= most:
+    def items(
+        self, expected: str = "an array", min_length: int = 0, max_length: float = math.inf
+    ) -> Iterator[Node]:
+        """An array's values, lazily: the nodes of a large array take far more memory than the file."""
+        if not isinstance(self.value, list) or not min_length <= len(self.value) <= max_length:
             raise self.error(expected)
         return (Node(value, self.file, f"{self.path}[{i}]") for i, value in enumerate(self.value))
 
     def some_fields(self, required: tuple[str, ...]) -> dict[str, Node]:
-        """An object's fields, among them the required ones."""
+        """An object's fields, which include the required ones."""
         if not isinstance(self.value, dict):
             raise self.error("an object")
         return {key: self.field(key) for key in dict.fromkeys((*required, *self.value))}
@@ -134,15 +144,16 @@ class Node:
         return self.value
 
     def number(
-        self, expected: str = "a finite number", above: float = -math.inf, below: float = math.inf
+        self, expected: str = "a finite number", lower_bound: float = -math.inf, upper_bound: float = math.inf
     ) -> float:
+        """A number strictly between two bounds."""
         if isinstance(self.value, bool) or not isinstance(self.value, int | float):
             raise self.error("a number")
         try:
             number = float(self.value)
         except OverflowError:
             number = math.inf
-        if not above < number < below:
+        if not lower_bound < number < upper_bound:
             raise self.error(expected)
         return number
 
@@ -153,7 +164,7 @@ class Node:
         return self.number("radians between 0 and pi", 0, math.pi)
 
     def size(self) -> int:
-        """A side of a picture in px; some programs write it as 1920.0."""
+        """A side of a picture in px, also written as 1920.0, as some programs do."""
         side = self.number()
         if side != int(side) or side <= 0:
             raise self.error("a positive whole number")

@@ -1,4 +1,4 @@
-"""How far long work is: a bar of one line in a terminal, a few lines in a log, or told to a function."""
+"""Progress of long work: a bar in a terminal, a few lines in a log, or calls of a function."""
 
 import logging
 import sys
@@ -7,16 +7,16 @@ from typing import Any, TypeAlias, TypeVar
 
 T = TypeVar("T")
 Progress: TypeAlias = bool | Callable[[int, int, str], object]
-"""Whether to show how far work is; or a function that is told what is done, of how much, and in words."""
+"""Whether to show progress; or a function that is called with the work done, the total, and a text."""
 
 _LOG = logging.getLogger("v3dg")
 _LOG.addHandler(logging.NullHandler())
-_LINES = 4  # that a log gets of one piece of work
-_LEAST_SCALED = 10_000  # from so many on, a bar counts in thousands and millions
+_LINES = 4  # lines that a log gets for one piece of work
+_LEAST_SCALED = 10_000  # from this total on, a bar counts in thousands and millions
 
 
 class Bar:
-    """What is done of a total.
+    """The display of the work that is done of a total.
 
     Raises:
         TypeError: ``progress`` is neither a boolean nor a function.
@@ -25,16 +25,25 @@ class Bar:
     def __init__(self, total: int, name: str, progress: Progress, *, initial: int = 0) -> None:
         if not isinstance(progress, bool) and not callable(progress):
             raise TypeError(f"progress: expected True, False or a function, got {progress!r}")
-        self.total, self.done, self._name, self._text = total, initial, name, name
-        self._told = self._num_lines
+        self.total = total
+        self.done = initial
+        self._name = name
+        self._text = name
+        self._num_logged = self._num_lines
         self._call = progress if callable(progress) else None
         self._is_shown = progress is True
         self._bar: Any = None
         if self._is_shown and sys.stderr.isatty():
             from tqdm import tqdm
 
-            scale = {"unit_scale": total >= _LEAST_SCALED, "dynamic_ncols": True}
-            self._bar = tqdm(None, name, total, initial=initial, leave=False, **scale)
+            self._bar = tqdm(
+                desc=name,
+                total=total,
+                initial=initial,
+                leave=False,
+                unit_scale=total >= _LEAST_SCALED,
+                dynamic_ncols=True,
+            )
 
     @property
     def _num_lines(self) -> int:
@@ -50,16 +59,17 @@ class Bar:
     __exit__ = close
 
     def update(self, count: int, text: str = "") -> None:
-        """Count what is done since, and say what is at work."""
+        """Add `count` to the work done, and show `text` about the work in progress."""
         self.done += count
-        self._text = f"{self._name}, {text}" if text else self._text
+        if text:
+            self._text = f"{self._name}, {text}"
         if self._bar is not None:
             self._bar.set_description(self._text, refresh=False)
             self._bar.update(count)
         if self._call is not None:
             self._call(self.done, self.total, self._text)
-        if self._num_lines > self._told:
-            self._told = self._num_lines
+        if self._num_lines > self._num_logged:
+            self._num_logged = self._num_lines
             line = f"{self._text}: {100 * self.done // max(self.total, 1)} %"
             _LOG.info(line)
             if self._is_shown and self._bar is None:

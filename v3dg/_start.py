@@ -1,8 +1,8 @@
-"""What makes a process a command: streams that are open, and Ctrl-C that ends it with one line, however often
-it comes.
+"""The start of a process that is a command: opens closed streams, and handles Ctrl-C.
 
-The package imports this before all that takes long, so it imports next to nothing itself. Until a command
-runs, Ctrl-C has nothing to clean up and ends the process at once; from then on it raises KeyboardInterrupt.
+However often it comes, Ctrl-C ends the process with one line. The package imports this module before
+everything that takes long, so it imports next to nothing itself. Until a command runs, Ctrl-C has nothing to
+clean up and ends the process at once; from then on it raises KeyboardInterrupt.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _AGAIN_AFTER_S = 0.02
 
 SIGNALS = (signal.SIGINT, signal.SIGALRM)
-"""Of Ctrl-C: the second brings one again that could not be heard when it came, in the midst of an import."""
+"""The signals of Ctrl-C; the second repeats one that could not be handled, as in the midst of an import."""
 
 
 def refuse_sub_interpreter() -> None:
@@ -40,21 +40,21 @@ def refuse_sub_interpreter() -> None:
 
 
 def begin() -> None:
-    """Open streams that are closed, to nothing, and have Ctrl-C end the process."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else whoever started it ignores them
+    """Open closed streams on the null device, and have Ctrl-C end the process."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if the parent ignores Ctrl-C
         signal.signal(signal.SIGINT, _end_at_once)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass  # else a file would get the number, and with it all that is printed
+        pass  # otherwise a file would get the number of a stream, and everything that is printed
     os.close(descriptor)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-        getattr(sys, name).reconfigure(errors="backslashreplace")  # what an encoding lacks
+        getattr(sys, name).reconfigure(errors="backslashreplace")  # for characters that an encoding lacks
 
 
 def _end_at_once(number: int, frame: types.FrameType | None) -> None:
-    signal.signal(signal.SIGINT, lambda *_: None)  # another one has nothing to say
+    signal.signal(signal.SIGINT, lambda *_: None)  # another Ctrl-C prints no second line
     try:
         os.write(2, b"v3dg: error: interrupted\n")
     finally:
@@ -62,20 +62,20 @@ def _end_at_once(number: int, frame: types.FrameType | None) -> None:
 
 
 def raise_interrupts() -> None:
-    """Have Ctrl-C raise KeyboardInterrupt from now on, where it has ended the process at once."""
+    """Have Ctrl-C raise KeyboardInterrupt from now on, if it ended the process at once until now."""
     if signal.getsignal(signal.SIGINT) is _end_at_once:
         interrupts = _Interrupts()
         for number in reversed(SIGNALS):
-            signal.signal(number, interrupts.hear)
+            signal.signal(number, interrupts.handle)
         sys.unraisablehook = interrupts.unraisable
 
 
 class _Interrupt(KeyboardInterrupt):
-    """Unlike its base, one that can be referred to weakly."""
+    """A KeyboardInterrupt that can be referred to weakly."""
 
 
 class _Interrupts:
-    """Raises one interrupt, and no other while that is on its way: whoever cleans up is not disturbed."""
+    """Raises one interrupt, and no other while that propagates, so that cleaning up is not disturbed."""
 
     def __init__(self) -> None:
         import weakref
@@ -83,26 +83,27 @@ class _Interrupts:
         self._refer = weakref.ref
         self._raised: weakref.ref[_Interrupt] | None = None
 
-    def hear(self, number: int, frame: types.FrameType | None) -> None:
-        # Later where half of a module would be left, and where another thread got what this one blocks.
+    def handle(self, number: int, frame: types.FrameType | None) -> None:
+        # Postponed during an import, which would leave half a module, and while this thread blocks Ctrl-C,
+        # when another thread received it.
         if _is_importing(frame) or signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()):
             signal.setitimer(signal.ITIMER_REAL, _AGAIN_AFTER_S)
         elif self._raised is None or self._raised() is None:
             raise self._interrupt()
 
     def _interrupt(self) -> _Interrupt:
-        # Not in `hear`, where the exception would hold a frame that holds the exception, and never go.
+        # Not in `handle`: the exception would hold a frame that holds the exception, and stay alive.
         interrupt = _Interrupt()
         self._raised = self._refer(interrupt)
         return interrupt
 
-    def unraisable(self, what: sys.UnraisableHookArgs) -> None:
+    def unraisable(self, arguments: sys.UnraisableHookArgs) -> None:
         """Raise an interrupt again that a destructor or a callback has swallowed."""
-        if isinstance(what.exc_value, _Interrupt):
+        if isinstance(arguments.exc_value, _Interrupt):
             self._raised = None
             signal.setitimer(signal.ITIMER_REAL, _AGAIN_AFTER_S)
         else:
-            sys.__unraisablehook__(what)
+            sys.__unraisablehook__(arguments)
 
 
 def _is_importing(frame: types.FrameType | None) -> bool:
@@ -114,6 +115,6 @@ def _is_importing(frame: types.FrameType | None) -> bool:
 
 
 refuse_sub_interpreter()
-# What stands before the arguments, if anything does.
+# The program's name, which precedes the arguments; there is none in an interactive process.
 if [os.path.basename(name) for name in sys.orig_argv[-len(sys.argv) :][:1]] in (["v3dg"], ["-mv3dg"]):
     begin()

@@ -1,17 +1,17 @@
 """How a bundle is built."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from v3dg._numbers import check
 
-# A target is drawn in one go that cannot be interrupted: in about a second.
+# A target is drawn without a chance to interrupt it: in about a second at most.
 _MOST_SIDE = 8192
-# Samples along a pixel's side, in targets of deep levels; beyond, nothing is gained.
+# Samples along a pixel's side, in targets of deep levels; more samples gain nothing.
 _MOST_SAMPLES = 8
-_DEEP = 64  # a level that has them
-# Of all views of a group: they are kept, by each thread that fits one, in 16 bytes each.
+_DEEP = 64  # a level whose targets have that many samples
+# Pixels of all views of a group together: each thread that fits a group keeps them, 16 bytes each.
 _MOST_PIXELS_KEPT = 1 << 26
 
 _KINDS: dict[Any, tuple[Any, str]] = {
@@ -21,6 +21,7 @@ _KINDS: dict[Any, tuple[Any, str]] = {
 }
 _Weight = Annotated[float, (0, 1_000_000)]
 _StepSize = Annotated[float, (0, 1_000_000_000)]
+_Setting = int | float | bool | str
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class BuildConfig:
     divided by.
 
     Attributes:
-        cluster_size: Most gaussians in a cluster of level 0.
+        cluster_size: Maximum number of gaussians in a cluster of level 0.
         group_size: Clusters that are simplified together, a power of two; 2 makes a tree.
         min_clusters: Levels stop before there are fewer clusters than this ...
         min_gaussians: ... or fewer gaussians than this.
@@ -40,12 +41,13 @@ class BuildConfig:
         prune_growth: Factor for the scales of gaussians that survive pruning.
         targets: What a level is fitted to: the "finest" level below that its views can show, or the
             "previous" one.
-        steps: Most steps of Adam for each group; 0 keeps the start.
+        steps: Maximum number of steps of Adam for each group; 0 keeps the start.
         first_steps: Steps at level 1; each level takes twice as many as the one below, up to `steps`.
         views_per_step: Views that one step looks at.
         num_views: Views of a group, drawn once; 0 draws a fresh random one each time.
-        supersample: Targets of level 1 are drawn this much larger and box-averaged; each two levels take one
-            more, up to 8, for what they show is finer: but for targets of the previous level.
+        supersample: The factor by which targets of level 1 are drawn larger before they are box-averaged. It
+            grows by one every two levels, up to 8, because higher levels show finer gaussians; targets of the
+            previous level keep it.
         image_size: Side of the views in px; 0 shows a group at the size at which it will be selected.
         px2_per_gaussian: That size: px² of the group's footprint for each gaussian that it is simplified to.
         distance: From the camera to the centre of the group, in radii.
@@ -64,7 +66,7 @@ class BuildConfig:
         loss_l1, loss_dssim, loss_alpha: Weights of the parts of the loss.
         step_position: Step size of positions, in radii of the group, or in world units if
             `position_in_world`; the others are of log scales, quaternions, logits and SH coefficients.
-        final_step: What the step sizes have fallen to in the end, exponentially.
+        final_step: The factor that the step sizes have reached in the end, by exponential decay.
         beta2: Decay of Adam's running mean of squared gradients.
 
     Raises:
@@ -108,16 +110,17 @@ class BuildConfig:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            name, value, of = field.name, getattr(self, field.name), get_args(field.type)
+            value = getattr(self, field.name)
+            arguments = get_args(field.type)
             if get_origin(field.type) is Literal:
-                self._require(name, value in of, " or ".join(map(repr, of)))
+                self._require(field.name, value in arguments, " or ".join(map(repr, arguments)))
                 continue
-            kind, *ranges = of or (field.type,)
+            kind, *ranges = arguments or (field.type,)
             classes, expected = _KINDS[kind]
             is_kind = isinstance(value, classes) and isinstance(value, bool) == (kind is bool)
-            self._require(name, is_kind, expected)
-            for least, most in ranges:
-                self._require(name, least <= value <= most, f"{least:,} to {most:,}")
+            self._require(field.name, is_kind, expected)
+            for minimum, maximum in ranges:
+                self._require(field.name, minimum <= value <= maximum, f"{minimum:,} to {maximum:,}")
         self._require("group_size", self.group_size.bit_count() == 1, "a power of two")
         self.check_views(1)
 
@@ -125,66 +128,107 @@ class BuildConfig:
         check(name, is_good, f"{expected}, got {getattr(self, name)!r}")
 
     def check_views(self, most_gaussians: int) -> None:
-        """Refuse, with ValueError, views of too many pixels for groups of at most so many gaussians."""
-        side, name = self.image_size, "image_size"
-        if side == 0:  # as fit_view() of the core has it
-            name, x2 = "px2_per_gaussian", self.distance**-2
-            footprint_of_focal = 2 * math.pi * (1 - math.sqrt(1 - x2))
-            radius2 = most_gaussians * self.px2_per_gaussian / footprint_of_focal * x2 / (1 - x2)
-            side = math.ceil(2 * math.sqrt(radius2)) + 8
+        """Refuse views of groups of at most `most_gaussians` that have too many pixels, with ValueError."""
+        if self.image_size > 0:
+            name = "image_size"
+            side = self.image_size
+        else:
+            name = "px2_per_gaussian"
+            side = self._view_side(most_gaussians)
         fits = side * self.samples_at(_DEEP) <= _MOST_SIDE and side**2 * self.num_views <= _MOST_PIXELS_KEPT
-        most = f"{_MOST_SIDE} px a side with `supersample`, and {_MOST_PIXELS_KEPT} px in all `num_views`"
-        found = f"{side} px a side; reduce one of them, or `cluster_size`"
-        check(name, fits, f"views of at most {most}, got {found}")
+        check(
+            name,
+            fits,
+            f"views of at most {_MOST_SIDE} px a side with `supersample`, and {_MOST_PIXELS_KEPT} px in all "
+            f"`num_views`, got {side} px a side; reduce one of them, or `cluster_size`",
+        )
+
+    def _view_side(self, num_gaussians: int) -> int:
+        """The side, in px, of a view of a group of `num_gaussians`, as fit_view() of the core chooses it."""
+        x2 = self.distance**-2
+        footprint_of_focal = 2 * math.pi * (1 - math.sqrt(1 - x2))
+        radius2 = num_gaussians * self.px2_per_gaussian / footprint_of_focal * x2 / (1 - x2)
+        return math.ceil(2 * math.sqrt(radius2)) + 8
 
     def steps_at(self, level: int) -> int:
         """Steps of the groups of a level."""
         return min(self.steps, self.first_steps << min(max(level - 1, 0), 32))
 
     def samples_at(self, level: int) -> int:
-        """How much larger targets of a level are drawn."""
-        more = 0 if self.targets == "previous" else (level - 1) // 2
-        return max(self.supersample, min(self.supersample + more, _MOST_SAMPLES))
+        """The factor by which the targets of a level are drawn larger."""
+        if self.targets == "previous":
+            return self.supersample
+        return max(self.supersample, min(self.supersample + (level - 1) // 2, _MOST_SAMPLES))
 
     def target_of(self, level: int) -> int:
         """The level that the groups of a level are fitted to.
 
         A level finer than one with two gaussians for each sample of a target picture shows no more.
         """
-        return max(0, level - (1 if self.targets == "previous" else self._visible_levels))
+        if self.targets == "previous":
+            return max(0, level - 1)
+        return max(0, level - self._visible_levels)
 
     def levels_at_once(self, first: int, end: int) -> range:
-        """Which levels before `end` are fitted together with level `first`.
+        """The levels before `end` that are fitted together with level `first`.
 
-        The lowest, of which most is seen, start from the fit below; those above, which have few groups and
-        would be waited for one after another, from what is merged of the fit below them all.
+        The lowest levels, which are seen most, start from the fitted level below. The levels above them have
+        few groups, which would take long one level after another; they start together, by repeated merging
+        of the last fitted level.
         """
-        last, end = first + 1, min(end, first + self._visible_levels)
+        end = min(end, first + self._visible_levels)
+        stop = first + 1
         if self.target_of(first) > 0 and self.targets == "finest":
-            while last < end and self.steps_at(last) == self.steps_at(first):
-                last += 1
-        return range(first, last)
+            while stop < end and self.steps_at(stop) == self.steps_at(first):
+                stop += 1
+        return range(first, stop)
 
     @property
     def _visible_levels(self) -> int:
-        """How far below a level gaussians are about as small as half a sample of its target pictures."""
+        """The number of levels down to gaussians about as small as half a sample of a target picture."""
         px2 = self.px2_per_gaussian
-        if self.image_size > 0:  # of which the ball covers about 0.4
+        if self.image_size > 0:  # the ball covers about 0.4 of the picture
             px2 = 0.4 * self.image_size**2 / (self.cluster_size * self.group_size / 2)
         return 1 + max(1, math.ceil(math.log2(px2 * self.supersample**2)))
 
     @staticmethod
-    def paper(**changes: Any) -> "BuildConfig":
+    def leaves_only() -> "BuildConfig":
+        """Settings that make level 0 the only level."""
+        return BuildConfig(min_clusters=1 << 31)
+
+    @staticmethod
+    def paper(**changes: _Setting) -> "BuildConfig":
         """The settings of the paper and its code (V3DG, section 3.2 and 5.1), with `changes` to them.
 
         4,096 gaussians a cluster, two clusters a group, stop at two clusters; prune, grow scales by 2^(1/6);
         640 fresh random views of 64 x 64 px at four radii, against the previous level, without a filter;
         0.8 L1 + 0.2 D-SSIM + 0.1 alpha.
         """
-        settings: dict[str, Any] = {"cluster_size": 4096, "group_size": 2, "min_clusters": 2, "init": "prune"}
-        settings |= {"targets": "previous", "steps": 640, "first_steps": 640, "views_per_step": 1}
-        settings |= {"num_views": 0, "supersample": 1, "image_size": 64, "filter_px2": 0.0, "smooth": "no"}
-        settings |= {"loss_l1": 0.8, "loss_dssim": 0.2, "loss_alpha": 0.1, "position_in_world": True}
-        settings |= {"step_position": 1.6e-5, "step_log_scale": 5e-3, "step_quat": 1e-3, "step_logit": 5e-2}
-        settings |= {"step_sh0": 2.5e-3, "step_sh_rest": 2.5e-3 / 20, "final_step": 1.0, "beta2": 0.999}
-        return BuildConfig(**settings | changes)
+        config = BuildConfig(
+            cluster_size=4096,
+            group_size=2,
+            min_clusters=2,
+            init="prune",
+            targets="previous",
+            steps=640,
+            first_steps=640,
+            views_per_step=1,
+            num_views=0,
+            supersample=1,
+            image_size=64,
+            filter_px2=0.0,
+            smooth="no",
+            loss_l1=0.8,
+            loss_dssim=0.2,
+            loss_alpha=0.1,
+            step_position=1.6e-5,
+            position_in_world=True,
+            step_log_scale=5e-3,
+            step_quat=1e-3,
+            step_logit=5e-2,
+            step_sh0=2.5e-3,
+            step_sh_rest=2.5e-3 / 20,
+            final_step=1.0,
+            beta2=0.999,
+        )
+        return replace(config, **changes)  # type: ignore[arg-type]  # types are checked as it is made

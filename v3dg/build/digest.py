@@ -10,19 +10,22 @@ from v3dg.bundle.format import page_hash
 from v3dg.gaussians import Gaussians
 
 PIECE = 1 << 16
-"""Gaussians that are read, examined and hashed at a time; the digest of an asset depends on it."""
+"""Number of gaussians that are read, examined and hashed at a time; the digest of an asset depends on it."""
 
 
 def digest_of(asset: Gaussians) -> str:
-    """What tells an asset from others, wherever it was read from."""
+    """The digest of an asset, which does not depend on the file that it was read from."""
     pieces = pieces_of(asset.numpy())
+    # To hash a few pieces is less work than to start threads, which Python does not do safely when memory is
+    # short.
+    if len(pieces) <= 3:
+        return digest_of_hashes(map(hash_of, pieces))
     with new_pool() as pool:
-        # A few are less work than starting threads, which Python does not do safely where memory runs out.
-        return digest_of_hashes(pool.map(hash_of, pieces) if len(pieces) > 3 else map(hash_of, pieces))
+        return digest_of_hashes(pool.map(hash_of, pieces))
 
 
 def pieces_of(gaussians: Gaussians) -> list[Gaussians]:
-    """Pieces of them, sharing their memory."""
+    """Cut gaussians into pieces, which share their memory."""
     return [gaussians.subset(slice(start, start + PIECE)) for start in range(0, len(gaussians), PIECE)]
 
 
@@ -31,7 +34,7 @@ def hash_of(piece: Gaussians) -> bytes:
 
 
 def digest_of_hashes(hashes: Iterable[bytes]) -> str:
-    """Of those of the pieces, so that all cores share the work."""
+    """The digest of an asset from the hashes of its pieces, which all cores can compute together."""
     return page_hash([np.frombuffer(b"".join(hashes), np.uint8)]).hex()
 
 

@@ -18,9 +18,9 @@ Points = npt.NDArray[np.uint32]
 Words = npt.NDArray[np.uint32]
 
 FITTING_BYTES = 48
-"""Memory, for each of its points, that a node takes that is split in memory."""
+"""Memory for each point of a node that is split in memory."""
 
-_AT_ONCE = 1 << 18  # points that are read at a time: with what is computed of them, 16 MB
+_AT_ONCE = 1 << 18  # points that are read at a time: 16 MB, including intermediate arrays
 
 
 def points_of(means: npt.NDArray[np.float32], index: npt.NDArray[np.integer]) -> Points:
@@ -35,16 +35,16 @@ def split(files: tuple[RowFile, RowFile], count: int, depth: int, num_fitting: i
     todo = [(0, count, depth, 0)]
     while todo:
         first, last, left, number = todo.pop()
-        here = files[number]
+        file = files[number]
         if left > 0 and last - first > num_fitting:
             middle = first + (last - first + 1) // 2
-            _partition(here, first, middle, last, files[1 - number])
+            _partition(file, first, middle, last, files[1 - number])
             todo += [(first, middle, left - 1, 1 - number), (middle, last, left - 1, 1 - number)]
         elif left > 0:
-            order.write(first, _split_in_memory(here.read(first, last), left))
+            order.write(first, _split_in_memory(file.read(first, last), left))
         else:
             for start in range(first, last, _AT_ONCE):
-                order.write(start, here.read(start, min(start + _AT_ONCE, last))[:, 3])
+                order.write(start, file.read(start, min(start + _AT_ONCE, last))[:, 3])
 
 
 def _split_in_memory(points: Points, depth: int) -> Words:
@@ -56,7 +56,7 @@ def _split_in_memory(points: Points, depth: int) -> Words:
 
 
 def _partition(source: RowFile, first: int, middle: int, last: int, target: RowFile) -> None:
-    """Bring the lesser half of a node to `first`, the others to `middle`; both keep their order."""
+    """Write the lower half of a node at `first` and the upper half at `middle`, both in the same order."""
     axis = _longest_axis(source, first, last)
     median, num_ties = _median(source, first, middle, last, axis)
     ends = [first, middle]
@@ -72,15 +72,17 @@ def _partition(source: RowFile, first: int, middle: int, last: int, target: RowF
 
 
 def _longest_axis(source: RowFile, first: int, last: int) -> int:
-    low, high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
+    low = np.full(3, np.inf, np.float32)
+    high = np.full(3, -np.inf, np.float32)
     for points in source.blocks(first, last, _AT_ONCE):
         means = points[:, :3].view(np.float32)
-        low, high = np.minimum(low, means.min(axis=0)), np.maximum(high, means.max(axis=0))
-    return int(np.argmax(high - low))  # the lowest of equals; in float32, as the core
+        low = np.minimum(low, means.min(axis=0))
+        high = np.maximum(high, means.max(axis=0))
+    return int(np.argmax(high - low))  # the first of equal sides; in float32, as in the core
 
 
 def _median(source: RowFile, first: int, middle: int, last: int, axis: int) -> tuple[int, int]:
-    """The greatest value of the lesser half, as of `_ordered`, and how many of the lesser half have it."""
+    """The greatest key of the lower half, as of `_ordered`, and how many points of the lower half have it."""
 
     def keys() -> Iterator[Words]:
         return (_ordered(points[:, axis]) for points in source.blocks(first, last, _AT_ONCE))
@@ -92,17 +94,17 @@ def _median(source: RowFile, first: int, middle: int, last: int, axis: int) -> t
 
 
 def _bin_of(rank: int, values: Iterator[Words]) -> tuple[int, int]:
-    """The value of 16 bits that is the so-many-th, counted from 1, and its rank among those equal to it."""
+    """The 16-bit value of a rank, counted from 1, and its rank among the values that are equal to it."""
     counts = np.zeros(1 << 16, np.int64)
     for block in values:
         counts += np.bincount(block, minlength=1 << 16)
     ends = np.cumsum(counts)
-    found = int(np.searchsorted(ends, rank))
-    return found, rank - int(ends[found] - counts[found])
+    value = int(np.searchsorted(ends, rank))
+    return value, rank - int(ends[value] - counts[value])
 
 
 def _ordered(bits: Words) -> Words:
-    """Numbers that compare as the floats with these bits do; zeros of either sign are the same."""
+    """Numbers that compare like the floats with these bits; zeros of both signs are equal."""
     bits = (bits.view(np.float32) + np.float32(0)).view(np.uint32)
     sign = bits >> 31
     return np.asarray(bits ^ ((np.uint32(0) - sign) | np.uint32(1 << 31)))

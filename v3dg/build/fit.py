@@ -1,11 +1,10 @@
-"""The core's fit: its settings, and running it so that Ctrl-C and whoever shows progress stay alive."""
+"""The core's fit: its settings, and running it while Ctrl-C and the display of progress keep working."""
 
 import _thread
 import threading
 import time
 import weakref
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import TypeVar
 
 from v3dg import _core, _device
@@ -15,50 +14,64 @@ from v3dg.build.config import BuildConfig
 _T = TypeVar("_T")
 
 
-# What of a config shapes the levels; all else is the fit's.
-_OF_LEVELS = {
-    *("cluster_size", "group_size", "min_clusters", "min_gaussians", "init", "prune_growth", "targets"),
-    *("first_steps", "smooth", "asset_filter_px2", "asset_antialiased"),
-}
-
-
 def fit_config(config: BuildConfig, seed: int, level: int) -> _core.FitConfig:
-    """The settings of the core's fit, which refuses one that it does not know or misses."""
-    settings = {name: value for name, value in asdict(config).items() if name not in _OF_LEVELS}
-    settings |= {"steps": config.steps_at(level), "supersample": config.samples_at(level)}
-    return _core.FitConfig(**settings, antialiased=True, seed=seed)
+    """The settings of the core's fit for the groups of a level."""
+    return _core.FitConfig(
+        steps=config.steps_at(level),
+        views_per_step=config.views_per_step,
+        num_views=config.num_views,
+        supersample=config.samples_at(level),
+        image_size=config.image_size,
+        px2_per_gaussian=config.px2_per_gaussian,
+        distance=config.distance,
+        filter_px2=config.filter_px2,
+        antialiased=True,
+        loss_l1=config.loss_l1,
+        loss_dssim=config.loss_dssim,
+        loss_alpha=config.loss_alpha,
+        step_position=config.step_position,
+        step_log_scale=config.step_log_scale,
+        step_quat=config.step_quat,
+        step_logit=config.step_logit,
+        step_sh0=config.step_sh0,
+        step_sh_rest=config.step_sh_rest,
+        position_in_world=config.position_in_world,
+        final_step=config.final_step,
+        beta2=config.beta2,
+        seed=seed,
+    )
 
 
 def run_fit(
-    fit: Callable[[_core.FitProgress], _T], where: Device, show: Callable[[_core.FitProgress], None]
+    fit: Callable[[_core.FitProgress], _T], device: Device, show: Callable[[_core.FitProgress], None]
 ) -> _T:
-    """Run `fit` on a thread of its own, and `show` how far it is while it computes; what it returns."""
+    """Run `fit` on a thread of its own, `show` its progress meanwhile, and return its result."""
     state = _core.FitProgress()
     result: list[_T] = []
-    fit_there = _device.with_this_stream(lambda: result.append(fit(state)), where)
+    run = _device.with_this_stream(lambda: result.append(fit(state)), device)
     failure: list[BaseException] = []
     done = threading.Event()
 
     def work(token: _Token) -> None:
-        del token  # the thread itself still has it
+        del token  # the frame of the thread still holds it
         try:
-            fit_there()
+            run()
         except BaseException as error:
             failure.append(error)
         finally:
             done.set()
 
-    # Not threading.Thread: its start waits for ever for a thread that ends, for want of memory, before its
-    # first line; and Ctrl-C during its join can make Python 3.11 take it for finished while it runs.
+    # Not threading.Thread: if the thread ends before its first line because memory is short, start() waits
+    # for ever; and after Ctrl-C during join(), Python 3.11 can take a running thread for finished.
     tokens = [_Token()]
-    runs = weakref.ref(tokens[0])
+    running_token = weakref.ref(tokens[0])
     try:
         _thread.start_new_thread(work, (tokens.pop(),))
-        while runs() is not None and not done.wait(0.1):
+        while running_token() is not None and not done.wait(0.1):
             show(state)
     except BaseException:
         state.cancel()
-        while runs() is not None and not done.is_set():
+        while running_token() is not None and not done.is_set():
             time.sleep(0.01)
         raise
     if failure:
@@ -70,4 +83,4 @@ def run_fit(
 
 
 class _Token:
-    """Goes when whoever holds it does."""
+    """Is destroyed together with the thread that holds it."""

@@ -25,14 +25,14 @@ Unusable = Literal["drop", "refuse"]
 
 @dataclass(eq=False)
 class Leaves(ABC):
-    """Leaves of a build, wherever they are, of an asset that also has what cannot be drawn."""
+    """The drawable gaussians of an asset, in memory or on disk."""
 
     num_gaussians: int
     asset_gaussians: int
     sh_degree: int
     dropped: dict[str, int]
     digest: str
-    resident_bytes: int  # of the host, as long as they are read
+    resident_bytes: int  # memory of the host that they need as long as they are read
 
     @abstractmethod
     def read(self, first: int, last: int) -> Gaussians:
@@ -40,7 +40,7 @@ class Leaves(ABC):
 
 
 class MemoryLeaves(Leaves):
-    """The leaves of an asset in memory, on any device, that are split on another when they are first read."""
+    """The leaves of an asset in memory, on any device; the first `read` splits them, on `device`."""
 
     def __init__(
         self, asset: Gaussians, config: BuildConfig, unusable: Unusable = "drop", device: Device = _device.CPU
@@ -52,50 +52,63 @@ class MemoryLeaves(Leaves):
         host = asset.numpy()
         self._drawable = tally.add(host)
         tally.check(unusable)
-        count, degree = len(asset), asset.sh_degree
-        num_bytes = count * (gaussian_bytes(degree) + 4)
-        super().__init__(tally.num_drawable, count, degree, tally.counts, digest_of(host), num_bytes)
-        asset = _device.place(asset, _device.of(asset.means))  # without gradients
-        self._asset, self._config, self._device = asset, config, device
+        super().__init__(
+            num_gaussians=tally.num_drawable,
+            asset_gaussians=len(asset),
+            sh_degree=asset.sh_degree,
+            dropped=tally.counts,
+            digest=digest_of(host),
+            resident_bytes=len(asset) * (gaussian_bytes(asset.sh_degree) + 4),
+        )
+        self._asset = _device.place(asset, _device.of(asset.means))  # without gradients
+        self._config = config
+        self._device = device
         self._order: npt.NDArray[np.integer[Any]] | None = None
         self._lock = threading.Lock()
 
     def read(self, first: int, last: int) -> Gaussians:
-        """Leaves `first` to `last`, where the asset is."""
+        """Leaves `first` to `last`, on the device of the asset."""
         with self._lock:
             if self._order is None:
                 means = _device.place_rows(self._asset.means, self._drawable, self._device)
                 depth = _core.num_halvings(self.num_gaussians, self._config.cluster_size)
                 order, _ = _core.median_split(means, np.array([0, self.num_gaussians]), depth)
-                kind: Any = np.int32 if self.asset_gaussians < 1 << 31 else np.int64
-                self._order = np.take(np.flatnonzero(self._drawable).astype(kind), _device.to_host(order))
+                rows = np.flatnonzero(self._drawable)
+                if self.asset_gaussians < 1 << 31:
+                    rows = rows.astype(np.int32)
+                self._order = np.take(rows, _device.to_host(order))
         return self._asset.subset(self._order[first:last])
 
 
 def made_with(leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None) -> dict[str, Any]:
-    """What the config of a bundle says of how it was made."""
+    """The config of a bundle: the asset and the settings that it was made with."""
     seed = operator.index(seed)
     check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {seed}")
-    return {
+    result: dict[str, Any] = {
         "build": asdict(config),
         "seed": seed,
         "asset_gaussians": leaves.asset_gaussians,
         "asset_digest": leaves.digest,
         "dropped": leaves.dropped,
-        **({} if codec == Codec.name else {"codec": codec}),
-        **({} if up is None else {"up": up}),
     }
+    if codec != Codec.name:
+        result["codec"] = codec
+    if up is not None:
+        result["up"] = up
+    return result
 
 
 class Tally:
-    """What is found in an asset that is examined a part after the other."""
+    """Counts of the gaussians of an asset, which is examined one part after another."""
 
     def __init__(self) -> None:
-        self.num_gaussians = self.num_drawable = self.num_wrong = 0
+        self.num_gaussians = 0
+        self.num_drawable = 0
+        self.num_wrong = 0
         self._counts: Counter[str] = Counter()
 
     def add(self, part: Gaussians) -> npt.NDArray[np.bool_]:
-        """Which of the part can be drawn."""
+        """Count the gaussians of a part; (N,) whether each can be drawn."""
         findings = cleaning.examine(part)
         self.num_gaussians += len(part)
         self.num_drawable += int(findings.drawable.sum())
@@ -108,7 +121,7 @@ class Tally:
         return {kind: self._counts[kind] for kind in cleaning.KINDS if kind in self._counts}
 
     def check(self, unusable: Unusable) -> None:
-        """Refuse an asset that cannot be built, and warn of what is left out."""
+        """Refuse an asset that cannot be built, and warn of gaussians that are left out."""
         text = cleaning.summary(self.num_gaussians - self.num_drawable, self.num_gaussians, self.counts)
         check("asset", self.num_gaussians, "at least one gaussian, got none")
         is_allowed = not self.num_wrong or unusable != "refuse"

@@ -1,8 +1,8 @@
 """The leaves of an asset in files, one or many, that need not fit in memory.
 
-An asset that does not fit in memory is read twice, in blocks. The first time its means go to scratch files,
-where they are split (`external_split`) as far as into *buckets*, nodes that are small enough to be sorted
-when they are read. The second time every gaussian goes to its bucket. docs/size.md counts the bytes.
+An asset that does not fit in memory is read twice, in blocks. The first pass writes its means to scratch
+files, where they are split (`external_split`) down to *buckets*: nodes that are small enough to be sorted
+when they are read. The second pass writes every gaussian to its bucket. docs/size.md counts the bytes.
 """
 
 import math
@@ -10,10 +10,10 @@ import os
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -35,11 +35,14 @@ from v3dg.formats._reading import AssetFile
 from v3dg.gaussians import Gaussians, gaussian_bytes, put
 from v3dg.io import open_asset
 
-_MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few are read in vain
-_MOST_IN_BLOCK_BYTES = 1 << 28  # more would not be faster: rows are taken from all over a block
-_SENT_AT_ONCE = 1 << 12  # gaussians that a thread brings to a bucket
+MOST_GAUSSIANS = 1 << 32
+"""An asset must have fewer gaussians than this."""
+
+_MOST_IN_BUCKET = 1 << 18  # a quarter of a unit of a build, so that few gaussians are read in vain
+_MOST_IN_BLOCK_BYTES = 1 << 28  # a larger block is not faster: its rows are read in random order
+_SENT_AT_ONCE = 1 << 12  # gaussians that a thread writes to a bucket at a time
 _OVERHEAD_BYTES = 24 << 20
-_CHANGED = "the file not to change while it is read, got another one"
+_CHANGED = "a file that does not change while it is read, got another content; build again"
 _NAMES = ("points", "spare", "order", "rows")
 
 _Blocks = Iterator[tuple[int, Gaussians]]
@@ -47,26 +50,28 @@ _Blocks = Iterator[tuple[int, Gaussians]]
 
 @dataclass(eq=False)
 class DiskLeaves(Leaves):
-    """Leaves in a scratch folder, for as long as that is there; can be pickled and read by many at once."""
+    """Leaves in a scratch folder, while that exists; can be pickled, and read by several threads at once."""
 
     path: Path
-    _bucket_offset: npt.NDArray[np.int64]
-    _depth_left: int  # of the split inside of each bucket
+    bucket_offset: npt.NDArray[np.int64]
+    bucket_depth: int  # of the median split inside each bucket
 
     def read(self, first: int, last: int) -> Gaussians:
         result = Codec(self.sh_degree).empty(last - first)
-        offset = self._bucket_offset
-        of_first = int(np.searchsorted(offset, first, "right")) - 1
-        buckets = range(of_first, int(np.searchsorted(offset, last, "left")))
+        first_bucket = int(np.searchsorted(self.bucket_offset, first, "right")) - 1
+        last_bucket = int(np.searchsorted(self.bucket_offset, last, "left"))
         with RowFile(self.path, gaussian_bytes(self.sh_degree) // 4, np.float32) as file:
-            for begin, end in ((int(offset[b]), int(offset[b + 1])) for b in buckets):
-                low, high = max(first, begin), min(last, end)
-                if self._depth_left == 0:
+            for bucket in range(first_bucket, last_bucket):
+                begin = int(self.bucket_offset[bucket])
+                end = int(self.bucket_offset[bucket + 1])
+                low = max(first, begin)
+                high = min(last, end)
+                if self.bucket_depth == 0:
                     _put_rows(file.read(low, high), result, low - first)
                     continue
                 rows = file.read(begin, end)
                 means = np.ascontiguousarray(rows[:, :3])
-                order, _ = _core.median_split(means, np.array([0, end - begin]), self._depth_left)
+                order, _ = _core.median_split(means, np.array([0, end - begin]), self.bucket_depth)
                 _put_rows(rows[order[low - begin : high - begin]], result, low - first)
         return result
 
@@ -82,24 +87,27 @@ def leaves_on_disk(
     reserved: Callable[[int, int], int] = lambda num_gaussians, sh_degree: 0,
     device: Device = CPU,
     progress: Progress = False,
-    most_in_memory: int = 1 << 32,
+    most_in_memory: int = MOST_GAUSSIANS,
 ) -> Iterator[Leaves]:
-    """The leaves of the asset that some files make together, one after the other, within so much memory.
+    """The leaves of the asset that consists of the gaussians of some files, within `memory` bytes.
 
-    Their order is that of the median split of all of them, whatever the memory, of which `reserved` tells
-    what is for others. The scratch folder is made where it is needed, and removed at the end.
+    Their order is that of the median split of all of them and does not depend on the memory. `reserved` says
+    how much of it other work needs, from the number of gaussians and the SH degree. An asset of more than
+    `most_in_memory` gaussians is sorted on disk even if it fits in memory. The scratch folder is made only if
+    it is needed, and removed at the end.
     """
-    files = map(open_asset, paths)  # one after the other, so that few are open
+    files = map(open_asset, paths)  # lazily, so that few files are open at once
     tiles = [_Tile(file.path, file.num_gaussians, file.sh_degree, file.whole_bytes) for file in files]
     count = sum(tile.num_gaussians for tile in tiles)
-    check("asset", count < 1 << 32, f"fewer than 2^32 gaussians, got {count:,}")
+    check("asset", count < MOST_GAUSSIANS, f"fewer than 2^32 gaussians, got {count:,}")
     degree = max(tile.sh_degree for tile in tiles)
     sizes = _Sizes.of(memory, reserved(count, degree), degree, tiles)
     folder = Path(folder)
     fits = count <= min(sizes.in_memory, most_in_memory)
-    # Where none is needed, what a killed build left is removed.
-    scratch = nullcontext() if fits and not os.path.lexists(folder) else scratch_folder(folder, _NAMES)
-    with scratch, Bar(2 * count, "reading", progress if not fits else False) as bar:
+    scratch: AbstractContextManager[None] = nullcontext()
+    if not fits or os.path.lexists(folder):  # a folder that a killed build left is removed in any case
+        scratch = scratch_folder(folder, _NAMES)
+    with scratch, Bar(2 * count, "reading", False if fits else progress) as bar:
         if fits:
             buffer = Codec(degree).empty(count)
             for _ in _blocks(tiles, buffer, bar):
@@ -109,16 +117,22 @@ def leaves_on_disk(
             del buffer
             yield leaves
         else:
-            needed, free = scratch_bytes(count, degree), shutil.disk_usage(folder).free
-            if free < needed:
-                found = f"{in_mib(needed)} free for scratch, got {in_mib(free)}"
-                advice = "free some, write to another disk, or give so much memory that none is needed"
-                raise OSError(f"{folder}: expected {found}; {advice}")
+            _check_disk(folder, scratch_bytes(count, degree))
             yield _sort_on_disk(tiles, folder, sizes, config, unusable, bar)
 
 
+def _check_disk(folder: Path, num_bytes: int) -> None:
+    """Refuse, with OSError, a folder whose disk has less than `num_bytes` free."""
+    free = shutil.disk_usage(folder).free
+    if free < num_bytes:
+        raise OSError(
+            f"{folder}: expected {in_mib(num_bytes)} free for scratch, got {in_mib(free)}; "
+            "free some, write to another disk, or give enough memory to need no scratch"
+        )
+
+
 class _Tile(NamedTuple):
-    """What the header of one file says."""
+    """The header of one file."""
 
     path: str | os.PathLike[str]
     num_gaussians: int
@@ -133,7 +147,7 @@ class _Tile(NamedTuple):
 
 
 class _Sizes(NamedTuple):
-    """Most gaussians that fit: of the asset at once, in a block, in a node that is split, in a bucket."""
+    """Maximum number of gaussians: in memory at once, in a block, in a node that is split, in a bucket."""
 
     in_memory: int
     in_block: int
@@ -142,15 +156,18 @@ class _Sizes(NamedTuple):
 
     @staticmethod
     def of(memory: int, reserved: int, degree: int, tiles: Sequence[_Tile]) -> "_Sizes":
-        """What fits in so much memory; ValueError where too little does."""
+        """The sizes for `memory` bytes; ValueError if they are too few."""
         gaussian = gaussian_bytes(degree)
-        # Beside the block, a piece of it as it is decoded, in double precision.
+        # A piece of a block is decoded in double precision, in addition to the block.
         overhead = _OVERHEAD_BYTES + 8 * PIECE * gaussian
         largest = max(tiles, key=lambda tile: tile.whole_bytes)
-        least = reserved + overhead + largest.whole_bytes + PIECE * gaussian
-        why = f" for {shown(largest.path)}, whose format can only be read whole (or convert it to .ply)"
-        expected = f"at least {in_mib(least)}{why if largest.whole_bytes else ''}"
-        check("memory", memory >= least, f"{expected}, got {memory / (1 << 20):,.1f} MiB")
+        required = reserved + overhead + largest.whole_bytes + PIECE * gaussian
+        expected = f"at least {in_mib(required)}"
+        if largest.whole_bytes:
+            expected += (
+                f" for {shown(largest.path)}, whose format can only be read whole (or convert it to .ply)"
+            )
+        check("memory", memory >= required, f"{expected}, got {memory / (1 << 20):,.1f} MiB")
         memory -= reserved
         for_block = memory - overhead - largest.whole_bytes
         for_split = memory - _OVERHEAD_BYTES
@@ -163,18 +180,19 @@ class _Sizes(NamedTuple):
 
 
 def _bytes_in_bucket(degree: int) -> int:
-    """Memory, for each gaussian of a bucket, to sort it: as they are in the file, in order, and the split."""
+    """Memory for each gaussian of a bucket that is sorted: two copies of it, and the split."""
     return 2 * gaussian_bytes(degree) + external_split.FITTING_BYTES
 
 
 def scratch_bytes(count: int, degree: int) -> int:
-    """What the scratch of so many gaussians takes on the disk, at most."""
+    """An upper bound of the size on disk of the scratch for `count` gaussians."""
     return count * (4 + max(gaussian_bytes(degree), 2 * 16))
 
 
-def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Any) -> _Blocks:
-    """The asset in blocks as large as the buffer, each with its first row, valid until the next."""
-    first = filled = 0
+def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Bar) -> _Blocks:
+    """The asset in blocks that fill the buffer, each with its first row; one is valid until the next."""
+    first = 0
+    filled = 0
     for tile in tiles:
         file = tile.open()
         row = 0
@@ -186,23 +204,24 @@ def _blocks(tiles: Sequence[_Tile], buffer: Gaussians, bar: Any) -> _Blocks:
             row = last
             if filled == len(buffer):
                 yield first, buffer
-                first, filled = first + filled, 0
-        del file  # what was read whole is gone before the next is opened
+                first += filled
+                filled = 0
+        del file  # a file that was read whole is freed before the next one is opened
     if filled:
         yield first, buffer.subset(slice(0, filled))
 
 
-def _put_rows(rows: npt.NDArray[np.float32], out: Gaussians, at: int) -> None:
-    """Put gaussians that are rows of a file into others."""
+def _put_rows(rows: npt.NDArray[np.float32], out: Gaussians, start: int) -> None:
+    """Copy gaussians that are rows of a file to `out`, from gaussian `start` on."""
     column = 0
     for array in vars(out).values():
         width = math.prod(array.shape[1:])
-        array[at : at + len(rows)] = rows[:, column : column + width].reshape(-1, *array.shape[1:])
+        array[start : start + len(rows)] = rows[:, column : column + width].reshape(-1, *array.shape[1:])
         column += width
 
 
 def _sort_on_disk(
-    tiles: Sequence[_Tile], folder: Path, sizes: _Sizes, config: BuildConfig, unusable: Unusable, bar: Any
+    tiles: Sequence[_Tile], folder: Path, sizes: _Sizes, config: BuildConfig, unusable: Unusable, bar: Bar
 ) -> DiskLeaves:
     degree = max(tile.sh_degree for tile in tiles)
     points, spare, order, rows = (folder / name for name in _NAMES)
@@ -212,8 +231,11 @@ def _sort_on_disk(
         def new(path: Path, width: int, dtype: npt.DTypeLike = np.uint32) -> RowFile:
             return stack.enter_context(RowFile(path, width, dtype, must_be_new=True))
 
-        files, order_file = (new(points, 4), new(spare, 4)), new(order, 1)
-        digest = _write_points(_blocks(tiles, Codec(degree).empty(sizes.in_block), bar), files[0], tally)
+        files = (new(points, 4), new(spare, 4))
+        order_file = new(order, 1)
+        blocks = _blocks(tiles, Codec(degree).empty(sizes.in_block), bar)
+        digest = _write_points(blocks, files[0], tally)
+        del blocks  # and with it the buffer
         tally.check(unusable)
         count = tally.num_drawable
         depth = _core.num_halvings(count, config.cluster_size)
@@ -225,19 +247,26 @@ def _sort_on_disk(
         row_file = new(rows, gaussian_bytes(degree) // 4, np.float32)
         ends = _ends_in_buckets(order_file, offset, sizes.in_block, tally.num_gaussians)
         blocks = _blocks(tiles, Codec(degree).empty(sizes.in_block), bar)
-        again = _write_rows(blocks, order_file, ends, row_file)
+        second_digest = _write_rows(blocks, order_file, ends, row_file)
     order.unlink()
-    check(
-        shown(tiles[0].path) if len(tiles) == 1 else f"one of {len(tiles)} files", again == digest, _CHANGED
-    )
+    name = shown(tiles[0].path) if len(tiles) == 1 else f"one of {len(tiles)} files"
+    check(name, second_digest == digest, _CHANGED)
     bar.close()
-    bucket_bytes = int(np.diff(offset).max()) * _bytes_in_bucket(degree)
-    about = count, tally.num_gaussians, degree, tally.counts, digest, bucket_bytes
-    return DiskLeaves(*about, rows.absolute(), offset, depth - bucket_depth)
+    return DiskLeaves(
+        num_gaussians=count,
+        asset_gaussians=tally.num_gaussians,
+        sh_degree=degree,
+        dropped=tally.counts,
+        digest=digest,
+        resident_bytes=int(np.diff(offset).max()) * _bytes_in_bucket(degree),
+        path=rows.absolute(),
+        bucket_offset=offset,
+        bucket_depth=depth - bucket_depth,
+    )
 
 
 def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
-    """The first pass: the means of all that can be drawn, with their rows in the asset; the digest."""
+    """The first pass: write the means of the drawable gaussians, with their rows in the asset; the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for first, block in blocks:
@@ -251,17 +280,22 @@ def _write_points(blocks: _Blocks, points: RowFile, tally: Tally) -> str:
 
 
 def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], rows: RowFile) -> str:
-    """The second pass: every gaussian to its bucket, where they keep the order of the asset; the digest."""
+    """The second pass: write every gaussian to its bucket, in the order of the asset; the digest."""
     hashes: list[bytes] = []
     with new_pool() as pool:
         for number, (first, block) in enumerate(blocks):
             hashes += pool.map(hash_of, pieces_of(block))
             arrays = [array.reshape(len(block), -1) for array in vars(block).values()]
 
-            def send(begin: int, end: int, first: int = first, arrays: Any = arrays) -> None:
+            def send(
+                begin: int,
+                end: int,
+                first: int = first,
+                arrays: list[npt.NDArray[np.float32]] = arrays,
+            ) -> None:
                 for start in range(begin, end, _SENT_AT_ONCE):
                     index = order.read(start, min(start + _SENT_AT_ONCE, end)).astype(np.int64) - first
-                    # `take`, other than an index in brackets, lets other threads go on.
+                    # Unlike an index in brackets, take() releases the GIL.
                     rows.write(start, np.concatenate([array.take(index, axis=0) for array in arrays], axis=1))
 
             deque(pool.map(send, ends[:, number].tolist(), ends[:, number + 1].tolist()), maxlen=0)
@@ -271,7 +305,7 @@ def _write_rows(blocks: _Blocks, order: RowFile, ends: npt.NDArray[np.int64], ro
 def _ends_in_buckets(
     order: RowFile, offset: npt.NDArray[np.int64], block: int, asset_gaussians: int
 ) -> npt.NDArray[np.int64]:
-    """(B, blocks + 1): in the order, where each bucket begins and what it has of each block ends."""
+    """(B, blocks + 1) places in the order: the start of each bucket, then its end in each block."""
     counts = np.zeros((len(offset) - 1, 1 - (-asset_gaussians // block)), np.int64)
     for bucket, (begin, end) in enumerate(zip(offset[:-1].tolist(), offset[1:].tolist(), strict=True)):
         for index in order.blocks(begin, end, _MOST_IN_BUCKET):

@@ -1,4 +1,4 @@
-"""How much memory of the host a build may use, and what that is enough for."""
+"""How much memory of the host a build may use, and how many units fit into it."""
 
 import os
 import re
@@ -10,10 +10,11 @@ from v3dg.build.whole import UNIT_LEAVES
 from v3dg.gaussians import gaussian_bytes
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
-# What a leaf of a unit takes until its levels are written: arrays of its size, whatever the SH degree, and
-# copies of it. A unit of 1,048,576 leaves took 380 bytes a leaf at SH degree 0, where a gaussian has 56, and
-# 870 at degree 3, where it has 236.
-_LEAF_BYTES, _LEAF_COPIES = 320, 2.5
+# Memory that each leaf of a unit needs until the levels are written: a number of bytes that does not depend
+# on the SH degree, and copies of the gaussian. A unit of 1,048,576 leaves took 380 bytes a leaf at SH degree
+# 0, where a gaussian has 56 bytes, and 870 at degree 3, where it has 236.
+_LEAF_BYTES = 320
+_LEAF_COPIES = 2.5
 
 
 def in_bytes(memory: int | str | None) -> int:
@@ -32,23 +33,24 @@ def most_units(memory: int, leaves: Leaves) -> int:
 
 
 def unit_bytes(num_gaussians: int, sh_degree: int) -> int:
-    """What a unit of an asset takes."""
+    """Memory that a unit of an asset needs, in bytes."""
     return int(min(num_gaussians, UNIT_LEAVES) * (_LEAF_BYTES + _LEAF_COPIES * gaussian_bytes(sh_degree)))
 
 
 def in_mib(num_bytes: int) -> str:
-    """As messages say it."""
+    """A number of bytes as text for messages, rounded up."""
     return f"{-(-num_bytes >> 20):,} MiB"
 
 
 def free_bytes() -> int:
-    """Memory that the system, and the container around the process, can give."""
+    """Free memory, in bytes: of the system, or of the container of the process if that has less."""
     free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with suppress(OSError, ValueError, AttributeError, TypeError):
         text = Path("/proc/meminfo").read_text(encoding="ascii")
         free = int(re.search(r"MemAvailable:\s*(\d+)", text)[1]) << 10  # type: ignore[index]
     with suppress(OSError, ValueError):  # "max" is no number
         group = Path("/sys/fs/cgroup")
-        most, used = (int((group / name).read_text()) for name in ("memory.max", "memory.current"))
-        free = min(free, max(most - used, 0))
+        limit = int((group / "memory.max").read_text())
+        used = int((group / "memory.current").read_text())
+        free = min(free, max(limit - used, 0))
     return free

@@ -42,11 +42,17 @@ class LevelPlan:
 
     def groups(self, first: int, last: int) -> "LevelPlan":
         """A run of the groups, their gaussians counted from 0."""
-        made = self.num_clusters // self.num_groups
-        clusters = self.offset[first * made : last * made + 1]
-        offsets = clusters, self.group_offset[first : last + 1], self.leaf_offset[first : last + 1]
-        own, made_of, leaves = (offset - offset[0] for offset in offsets)
-        return LevelPlan(self.first_group + first, own, made_of, leaves, self.weight[first:last])
+        clusters_made = self.num_clusters // self.num_groups
+        offset = self.offset[first * clusters_made : last * clusters_made + 1]
+        group_offset = self.group_offset[first : last + 1]
+        leaf_offset = self.leaf_offset[first : last + 1]
+        return LevelPlan(
+            first_group=self.first_group + first,
+            offset=offset - offset[0],
+            group_offset=group_offset - group_offset[0],
+            leaf_offset=leaf_offset - leaf_offset[0],
+            weight=self.weight[first:last],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,34 +67,49 @@ class Plan:
 
     @staticmethod
     def of(num_gaussians: int, config: BuildConfig) -> "Plan":
-        """The plan of an asset with so many gaussians."""
+        """The plan of an asset of `num_gaussians`."""
         depth = _core.num_halvings(num_gaussians, config.cluster_size)
         offset = halved(np.array([num_gaussians]), depth)
-        levels = [LevelPlan(0, offset, offset, offset, np.zeros(1 << depth, np.float32))]
+        level_0 = LevelPlan(
+            first_group=0,
+            offset=offset,
+            group_offset=offset,
+            leaf_offset=offset,
+            weight=np.zeros(1 << depth, np.float32),
+        )
+        levels = [level_0]
         while (shape := _next_shape(levels[-1], config)) is not None:
             levels.append(_level_above(levels[-1], *shape))
         return Plan(tuple(levels))
 
     def subtree(self, level: int, first_group: int, last_group: int) -> "Plan":
-        """What is under a run of groups of one level, up to that level."""
-        top = self.levels[level].num_groups
-        levels = ((below, below.num_groups // top) for below in self.levels[: level + 1])
-        return Plan(tuple(below.groups(first_group * n, last_group * n) for below, n in levels))
+        """The levels under a run of groups of one level, and that level."""
+        levels = []
+        for lower in self.levels[: level + 1]:
+            ratio = lower.num_groups // self.levels[level].num_groups
+            levels.append(lower.groups(first_group * ratio, last_group * ratio))
+        return Plan(tuple(levels))
 
     def units(self, most_leaves: int) -> "list[Plan]":
-        """Cut the plan into parts that share no page, each above so many leaves at most where it can."""
-        wanted = 1 << max(0, math.ceil(self.levels[0].num_gaussians / most_leaves) - 1).bit_length()
-        if wanted == 1 or len(self.levels) == 1:
+        """Cut the plan into parts that share no page, each above at most `most_leaves` where possible."""
+        num_units = 1 << max(0, math.ceil(self.levels[0].num_gaussians / most_leaves) - 1).bit_length()
+        if num_units == 1 or len(self.levels) == 1:
             return [self]
-        level = max(n for n, here in enumerate(self.levels) if n < 2 or here.num_groups >= wanted)
-        num_groups = self.levels[level].num_groups
-        each = max(1, num_groups // wanted)
-        trees = (self.subtree(level, first, first + each) for first in range(0, num_groups, each))
-        return [Plan(tree.levels[:-1]) for tree in trees]
+        top = max(n for n, level in enumerate(self.levels) if n < 2 or level.num_groups >= num_units)
+        num_groups = self.levels[top].num_groups
+        unit_groups = max(1, num_groups // num_units)
+        units = []
+        for first in range(0, num_groups, unit_groups):
+            tree = self.subtree(top, first, first + unit_groups)
+            units.append(Plan(tree.levels[:-1]))
+        return units
 
     @property
     def first_page(self) -> list[int]:
-        """Of each level, and the number of pages: a group's page is that of the clusters that it replaces."""
+        """The first page of each level, then the number of pages.
+
+        A group's page is the page of the clusters that it replaces.
+        """
         return list(itertools.accumulate(self._num_pages, initial=0))
 
     @property
@@ -104,25 +125,35 @@ class Plan:
         return PageLayout(offset_of(clusters), offset_of(gaussians))
 
 
-def _next_shape(below: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:
-    """Groups that a level's clusters form, and clusters each makes; None after the last level."""
-    num_groups = max(1, below.num_clusters // config.group_size)
-    made = max(1, below.num_clusters // num_groups // 2)
-    if num_groups * made < config.min_clusters or below.num_gaussians // 2 < config.min_gaussians:
+def _next_shape(lower: LevelPlan, config: BuildConfig) -> tuple[int, int] | None:
+    """The number of groups that a level's clusters form, and of the clusters that each group makes.
+
+    None after the last level.
+    """
+    num_groups = max(1, lower.num_clusters // config.group_size)
+    clusters_made = max(1, lower.num_clusters // num_groups // 2)
+    if num_groups * clusters_made < config.min_clusters or lower.num_gaussians // 2 < config.min_gaussians:
         return None
-    return num_groups, made
+    return num_groups, clusters_made
 
 
-def _level_above(below: LevelPlan, num_groups: int, clusters_made: int) -> LevelPlan:
-    sizes = (np.diff(below.offset[:: below.num_clusters // num_groups]) + 1) // 2
-    group_offset = offset_of(sizes)
-    weight = np.maximum((1 / sizes).astype(np.float32), below.weight.reshape(num_groups, -1).max(axis=1))
-    leaf_offset = np.ascontiguousarray(below.leaf_offset[:: below.num_groups // num_groups])
-    return LevelPlan(0, halved(sizes, clusters_made.bit_length() - 1), group_offset, leaf_offset, weight)
+def _level_above(lower: LevelPlan, num_groups: int, clusters_made: int) -> LevelPlan:
+    sizes = (np.diff(lower.offset[:: lower.num_clusters // num_groups]) + 1) // 2
+    lower_weight = lower.weight.reshape(num_groups, -1).max(axis=1)
+    return LevelPlan(
+        first_group=0,
+        offset=halved(sizes, clusters_made.bit_length() - 1),
+        group_offset=offset_of(sizes),
+        leaf_offset=np.ascontiguousarray(lower.leaf_offset[:: lower.num_groups // num_groups]),
+        weight=np.maximum((1 / sizes).astype(np.float32), lower_weight),
+    )
 
 
 def halved(sizes: npt.NDArray[np.int64], depth: int) -> Offsets:
-    """Where parts begin when nodes are split in two so many times, as the median split does it; the end."""
+    """The first element of each part, and the end, after splitting nodes in two `depth` times.
+
+    The halves have the sizes that the median split gives them.
+    """
     for _ in range(depth):
         sizes = np.stack([(sizes + 1) // 2, sizes // 2], axis=1).ravel()
     return offset_of(sizes)

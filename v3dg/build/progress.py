@@ -13,7 +13,7 @@ class Stopped(Exception):
 
 
 class Bar(_progress.Bar):
-    """One bar over all levels; it advances by fitted gaussians, which is what time goes with."""
+    """One bar over all levels. It advances by fitted gaussians, because the time is proportional to them."""
 
     def __init__(self, plan: Plan, initial: int, progress: Progress) -> None:
         total = sum(level.num_gaussians for level in plan.levels[1:])
@@ -25,16 +25,17 @@ class Bar(_progress.Bar):
         self._is_stopped = False
 
     def stop(self) -> None:
-        """Let every thread that shows something find out that the build has failed."""
+        """Have every thread that shows progress raise `Stopped` from now on."""
         self._is_stopped = True
 
     def show_of(self, part: int) -> Show:
-        """What shows how far the fits of a part are."""
+        """The progress callback of the fits of a part."""
 
         def show(levels: range, num_groups: int, num_gaussians: int, state: _core.FitProgress) -> None:
             if self._is_stopped:
                 raise Stopped
-            text, done = f"level {levels[-1]}/{self._last_level}", state.groups_done
+            text = f"level {levels[-1]}/{self._last_level}"
+            done = state.groups_done
             if done > 0:
                 text += f", groups {done}/{num_groups}, loss {state.loss_sum / done:.4f}"
             self._update((part, levels[0]), num_gaussians * done / num_groups, text)
@@ -42,7 +43,7 @@ class Bar(_progress.Bar):
         return show
 
     def add(self, part: int, level: int, num_gaussians: int) -> None:
-        """Count a level that was made elsewhere."""
+        """Count a level that another process made."""
         if level > 0:
             self._update((part, level), num_gaussians)
 

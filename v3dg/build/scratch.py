@@ -1,4 +1,4 @@
-"""Scratch: a folder of files of rows that is gone when the work is done."""
+"""Scratch: a folder of files of rows, which is removed when the work is done."""
 
 import errno
 import fcntl
@@ -21,9 +21,12 @@ class RowFile(AbstractContextManager["RowFile"]):
 
     def __init__(self, path: Path, width: int, dtype: npt.DTypeLike, *, must_be_new: bool = False) -> None:
         self.path = path
-        self._width, self._dtype = width, np.dtype(dtype)
+        self._width = width
+        self._dtype = np.dtype(dtype)
         self._row_bytes = width * self._dtype.itemsize
-        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL if must_be_new else os.O_RDONLY
+        flags = os.O_RDONLY
+        if must_be_new:
+            flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
         self._descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
 
     def __exit__(self, *_: object) -> None:
@@ -31,14 +34,15 @@ class RowFile(AbstractContextManager["RowFile"]):
 
     def read(self, first: int, last: int) -> npt.NDArray[Any]:
         """Rows `first` to `last`, (M, width); (M,) where the width is 1."""
-        rows = np.empty((last - first, self._width)[: 1 + (self._width > 1)], self._dtype)
+        shape = (last - first,) if self._width == 1 else (last - first, self._width)
+        rows = np.empty(shape, self._dtype)
         with _files.naming_errors(self.path):
             if not _files.read_at(self._descriptor, rows, first * self._row_bytes):
                 raise OSError(f"{self.path}: expected rows {first} to {last} of scratch, got fewer")
         return rows
 
     def blocks(self, first: int, last: int, size: int) -> Iterator[npt.NDArray[Any]]:
-        """Rows `first` to `last`, so many at a time."""
+        """Rows `first` to `last`, at most `size` at a time."""
         for start in range(first, last, size):
             yield self.read(start, min(start + size, last))
 
@@ -51,16 +55,21 @@ class RowFile(AbstractContextManager["RowFile"]):
 
 @contextmanager
 def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
-    """Make a folder for files of these names, empty at first, gone in the end, also after a killed run's."""
+    """Make an empty folder for files of these names, and remove it at the end.
+
+    Files of these names that a killed run left are removed.
+    """
     folder.mkdir(mode=0o700, exist_ok=True)
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         lock(descriptor, folder)
         present = os.listdir(folder)
-        others = sorted(set(present) - {_MARK, *names} if _MARK in present else present)
-        if others:
-            raise ValueError(f"{folder}: expected scratch of a build, got {others[0]!a}; move it elsewhere")
-        # There before any other file, and until the last has gone: without it none of them is ours.
+        foreign_names = sorted(set(present) - {_MARK, *names} if _MARK in present else present)
+        if foreign_names:
+            raise ValueError(
+                f"{folder}: expected scratch of a build, got {foreign_names[0]!a}; move it elsewhere"
+            )
+        # The mark comes before any other file and goes after the last: without it none of them is ours.
         os.close(os.open(folder / _MARK, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600))
         try:
             _remove(folder, names)
@@ -75,14 +84,15 @@ def scratch_folder(folder: Path, names: Collection[str]) -> Iterator[None]:
 
 
 def lock(descriptor: int, path: str | os.PathLike[str], work: str = "build") -> None:
-    """Keep others that do the same work from what is open there until it is closed."""
+    """Lock an open file or folder against others that do the same work, until it is closed."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        advice = "wait for it, or write to another place"
-        raise RuntimeError(f"{os.fspath(path)}: another {work} is using it; {advice}") from None
+        raise RuntimeError(
+            f"{os.fspath(path)}: another {work} is using it; wait for it, or write to another place"
+        ) from None
     except OSError as error:
-        # Some network file systems have no locks; there, two builds of one output are the user's to avoid.
+        # Some network file systems have no locks; users must not start two builds of one output there.
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
             raise
 

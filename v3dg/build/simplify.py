@@ -14,20 +14,20 @@ from v3dg.build.plan import LevelPlan, Offsets, Plan
 from v3dg.bundle.codec import Codec
 from v3dg.gaussians import Array, Gaussians, empty, put
 
-# Groups of which the start is made at once: a second or so in which Ctrl-C has to wait.
+# Groups whose start is computed at once. Ctrl-C waits meanwhile, for about a second.
 _GROUPS_AT_ONCE = 256
 
 Show = Callable[[range, int, int, _core.FitProgress], None]
-"""Is told now and then of a fit: its levels, groups and gaussians, and how far it has come."""
+"""Progress callback: levels, number of groups, number of gaussians, state."""
 
 
 @dataclass(frozen=True, eq=False)
 class LevelTables:
-    """What was measured of a level, on the host; all else follows from the plan."""
+    """The measured values of a level, on the host; everything else follows from the plan."""
 
-    box: npt.NDArray[np.float32]  # (C, 2, 3), of what the clusters draw
+    box: npt.NDArray[np.float32]  # (C, 2, 3), bounds of the drawn clusters
     ball: npt.NDArray[np.float32]  # (G, 4), nested, for selection
-    fit_ball: npt.NDArray[np.float32]  # (G, 4), as small as is known, which the fit looks at
+    fit_ball: npt.NDArray[np.float32]  # (G, 4), as small as is known, framed by the views of the fit
     error: npt.NDArray[np.float32]  # (G, 2), residual of the fits
 
 
@@ -61,74 +61,93 @@ class LevelBuilder:
         show: Show = lambda levels, num_groups, num_gaussians, state: None,
     ) -> Iterator[Level]:
         """Yield all levels, one after another: the leaves first, as level 0; some may be `finished`."""
-        here = self.plan.levels[0]
-        leaves = self.codec.rounded(leaves, here.offset)
-        ball = _device.to_host(_core.bound_spheres(_spheres(leaves), here.leaf_offset))
-        box = _device.to_host(_core.bound_by_boxes(leaves.rows, here.offset))
-        below = {0: Level(leaves, LevelTables(box, ball, ball, np.zeros((here.num_groups, 2), np.float32)))}
+        plan = self.plan.levels[0]
+        leaves = self.codec.rounded(leaves, plan.offset)
+        ball = _device.to_host(_core.bound_spheres(_spheres(leaves), plan.leaf_offset))
+        tables = LevelTables(
+            box=_device.to_host(_core.bound_by_boxes(leaves.rows, plan.offset)),
+            ball=ball,
+            fit_ball=ball,
+            error=np.zeros((plan.num_groups, 2), np.float32),
+        )
+        lower_levels = {0: Level(leaves, tables)}
         del leaves
-        yield below[0]
-        yield from self.levels_above(below, finished, show)
+        yield lower_levels[0]
+        yield from self.levels_above(lower_levels, finished, show)
 
-    def levels_above(self, below: dict[int, Level], finished: Iterable[Level], show: Show) -> Iterator[Level]:
-        """Yield the levels above those of `below`, which keeps those that the next are fitted to."""
-        saved, config, num_levels = iter(finished), self.config, len(self.plan.levels)
-        last = max(below)
-        where = _device.of(below[last].gaussians.means)
+    def levels_above(
+        self, lower_levels: dict[int, Level], finished: Iterable[Level], show: Show
+    ) -> Iterator[Level]:
+        """Yield the levels above `lower_levels`, by number, which keeps those that the next are fitted to."""
+        saved = iter(finished)
+        num_levels = len(self.plan.levels)
+        last = max(lower_levels)
+        device = _device.of(lower_levels[last].gaussians.means)
         while last + 1 < num_levels:
-            levels = config.levels_at_once(last + 1, num_levels)
-            made = list(islice(saved, len(levels)))
-            if len(made) < len(levels):
-                made = self._simplify(below, levels, show)
-            for number, level in zip(levels, made, strict=True):
-                below[number] = Level(_device.place(level.gaussians, where), level.tables)
-            last = levels[-1]
-            for number in [number for number in below if number < min(last, config.target_of(last + 1))]:
-                del below[number]
-            while made:
-                yield made.pop(0)
+            numbers = self.config.levels_at_once(last + 1, num_levels)
+            levels = list(islice(saved, len(numbers)))
+            if len(levels) < len(numbers):
+                levels = self._simplify(lower_levels, numbers, show)
+            for number, level in zip(numbers, levels, strict=True):
+                lower_levels[number] = Level(_device.place(level.gaussians, device), level.tables)
+            last = numbers[-1]
+            first_needed = min(last, self.config.target_of(last + 1))
+            for number in [number for number in lower_levels if number < first_needed]:
+                del lower_levels[number]
+            while levels:  # a level that was yielded is not kept alive
+                yield levels.pop(0)
 
-    def _simplify(self, below: Mapping[int, Level], levels: range, show: Show) -> list[Level]:
+    def _simplify(self, lower_levels: Mapping[int, Level], numbers: range, show: Show) -> list[Level]:
         """Make the next levels, whose groups are fitted together."""
-        plan, config = self.plan, self.config
-        plans = [plan.levels[number] for number in levels]
-        starts, chain = [], below[levels[0] - 1].gaussians
-        for number, here in zip(levels, plans, strict=True):
-            under = plan.levels[number - 1]
-            offset = np.ascontiguousarray(under.offset[:: under.num_clusters // here.num_groups])
-            chain = _start(chain, offset, here.group_offset, config)
-            starts.append(chain)
-        gaussians = starts[0] if len(starts) == 1 else Gaussians.concatenate(starts)
-        del starts, chain
-        targets = range(config.target_of(levels[0]), config.target_of(levels[-1]) + 1)
-        target = _target(below, targets, config)
-        views = [_view(below[config.target_of(number)], plan, number, config) for number in levels]
-        offsets, balls = zip(*views, strict=True)
-        rows = np.cumsum([0, *(here.num_gaussians for here in plans)])
-        groups = np.cumsum([0, *(here.num_groups for here in plans)])
-        where = _device.of(gaussians.means)
-        _device.spare_memory(where)
+        config = self.config
+        plans = [self.plan.levels[number] for number in numbers]
+        gaussians = self._starts(lower_levels[numbers[0] - 1].gaussians, numbers)
+        targets = range(config.target_of(numbers[0]), config.target_of(numbers[-1]) + 1)
+        target = _target(lower_levels, targets, config)
+        target_sizes = [len(lower_levels[number].gaussians) for number in targets]
+        target_offsets: list[Offsets] = []
+        fit_balls: list[npt.NDArray[np.float32]] = []
+        for number in numbers:
+            offset, fit_ball = _view(lower_levels[config.target_of(number)], self.plan, number, config)
+            target_offsets.append(offset)
+            fit_balls.append(fit_ball)
+        first_row = np.cumsum([0, *(plan.num_gaussians for plan in plans)])
+        first_group = np.cumsum([0, *(plan.num_groups for plan in plans)])
+        device = _device.of(gaussians.means)
+        _device.spare_memory(device)
         error = run_fit(
             lambda progress: _core.fit_level(
-                fit_config(config, self.seed, levels[0]),
+                fit_config(config, self.seed, numbers[0]),
                 target,
-                _ranges(offsets, [len(below[number].gaussians) for number in targets]),
-                gaussians.rows,
-                _ranges([here.group_offset for here in plans], np.diff(rows)),
-                np.concatenate(balls),
-                np.concatenate([_streams(*level) for level in zip(levels, plans, strict=True)]),
+                _ranges(target_offsets, target_sizes),
+                gaussians.rows,  # the fit replaces them by its result
+                _ranges([plan.group_offset for plan in plans], np.diff(first_row)),
+                np.concatenate(fit_balls),
+                np.concatenate([_streams(*level) for level in zip(numbers, plans, strict=True)]),
                 progress,
             ),
-            where,
-            lambda state: show(levels, int(groups[-1]), len(gaussians), state),
+            device,
+            lambda state: show(numbers, int(first_group[-1]), len(gaussians), state),
         )
-        made: list[Level] = []
-        ball = below[levels[0] - 1].tables.ball
-        for i, number in enumerate(levels):
-            ball = _core.bound_spheres(ball, _children(plan, number - 1, number))
-            part = gaussians.subset(slice(int(rows[i]), int(rows[i + 1])))
-            made.append(_level(part, plans[i], self.codec, ball, balls[i], error[groups[i] : groups[i + 1]]))
-        return made
+        levels: list[Level] = []
+        ball = lower_levels[numbers[0] - 1].tables.ball
+        for i, number in enumerate(numbers):
+            ball = _core.bound_spheres(ball, _children(self.plan, number - 1, number))
+            part = gaussians.subset(slice(int(first_row[i]), int(first_row[i + 1])))
+            part_error = error[first_group[i] : first_group[i + 1]]
+            levels.append(_level(part, plans[i], self.codec, ball, fit_balls[i], part_error))
+        return levels
+
+    def _starts(self, gaussians: Gaussians, numbers: range) -> Gaussians:
+        """The starts of the groups of some levels, each level halved from the one below it."""
+        starts: list[Gaussians] = []
+        for number in numbers:
+            plan = self.plan.levels[number]
+            lower = self.plan.levels[number - 1]
+            offset = np.ascontiguousarray(lower.offset[:: lower.num_clusters // plan.num_groups])
+            gaussians = _start(gaussians, offset, plan.group_offset, self.config)
+            starts.append(gaussians)
+        return _joined(starts)
 
 
 def _streams(number: int, plan: LevelPlan) -> npt.NDArray[np.int64]:
@@ -136,7 +155,21 @@ def _streams(number: int, plan: LevelPlan) -> npt.NDArray[np.int64]:
     return (number << 40) + np.arange(plan.first_group, plan.first_group + plan.num_groups, dtype=np.int64)
 
 
-def _level(gaussians: Gaussians, plan: LevelPlan, codec: Codec, *tables: npt.NDArray[np.float32]) -> Level:
+def _joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """The gaussians of all parts, without a copy where there is only one."""
+    if len(parts) == 1:
+        return parts[0]
+    return Gaussians.concatenate(parts)
+
+
+def _level(
+    gaussians: Gaussians,
+    plan: LevelPlan,
+    codec: Codec,
+    ball: npt.NDArray[np.float32],
+    fit_ball: npt.NDArray[np.float32],
+    error: npt.NDArray[np.float32],
+) -> Level:
     """A level of fitted groups, each split into its clusters."""
     clusters_made = plan.num_clusters // plan.num_groups
     if clusters_made > 1:
@@ -144,25 +177,26 @@ def _level(gaussians: Gaussians, plan: LevelPlan, codec: Codec, *tables: npt.NDA
         gaussians = gaussians.subset(order)
     gaussians = codec.rounded(gaussians, plan.offset)
     box = _device.to_host(_core.bound_by_boxes(gaussians.rows, plan.offset))
-    return Level(gaussians, LevelTables(box, *tables))
+    return Level(gaussians, LevelTables(box=box, ball=ball, fit_ball=fit_ball, error=error))
 
 
 def _view(
     target: Level, plan: Plan, number: int, config: BuildConfig
 ) -> tuple[Offsets, npt.NDArray[np.float32]]:
-    """Of the groups of a level: (G + 1,) gaussians of their target under each; (G, 4) balls to look at."""
-    source, here = config.target_of(number), plan.levels[number]
+    """The targets of a level's groups: (G + 1,) offsets of their gaussians; (G, 4) balls to look at."""
+    source = config.target_of(number)
+    leaf_offset = plan.levels[number].leaf_offset
     if source == 0:
-        ball = _core.bound_spheres(_spheres(target.gaussians), here.leaf_offset)
-        return here.leaf_offset, _device.to_host(ball)
-    under = _children(plan, source, number)
-    return plan.levels[source].group_offset[under], _core.bound_spheres(target.tables.fit_ball, under)
+        ball = _core.bound_spheres(_spheres(target.gaussians), leaf_offset)
+        return leaf_offset, _device.to_host(ball)
+    children = _children(plan, source, number)
+    return plan.levels[source].group_offset[children], _core.bound_spheres(target.tables.fit_ball, children)
 
 
-def _children(plan: Plan, below: int, number: int) -> Offsets:
-    """(G + 1,) groups of a level below that are under each of a level."""
+def _children(plan: Plan, lower: int, number: int) -> Offsets:
+    """(G + 1,) offsets: the groups of level `lower` that are under each group of level `number`."""
     num_groups = plan.levels[number].num_groups
-    return np.arange(num_groups + 1, dtype=np.int64) * (plan.levels[below].num_groups // num_groups)
+    return np.arange(num_groups + 1, dtype=np.int64) * (plan.levels[lower].num_groups // num_groups)
 
 
 def _spheres(gaussians: Gaussians) -> Array:
@@ -171,40 +205,41 @@ def _spheres(gaussians: Gaussians) -> Array:
     return library.concatenate([gaussians.means, radius], axis=1)
 
 
-def _target(below: Mapping[int, Level], numbers: range, config: BuildConfig) -> _core.FitTarget:
-    """What groups are to look like, drawn as it is drawn when it is selected.
+def _target(lower_levels: Mapping[int, Level], numbers: range, config: BuildConfig) -> _core.FitTarget:
+    """The gaussians that groups are fitted to, drawn as they are drawn when they are selected.
 
-    But for the filter of the asset: that spreads gaussians without taking from their opacity, the more the
+    The filter of the asset is left out: it spreads gaussians without reducing their opacity, the more the
     smaller they are shown, and coarser levels would learn to be too thick.
     """
-    parts = [below[number].gaussians for number in numbers]
-    rows = (parts[0] if len(parts) == 1 else Gaussians.concatenate(parts)).rows
+    rows = _joined([lower_levels[number].gaussians for number in numbers]).rows
     if numbers[0] == 0:
         return _core.FitTarget(rows, 0.0, False)
     return _core.FitTarget(rows, config.filter_px2, True)
 
 
 def _start(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig) -> Gaussians:
-    """What groups start from: their gaussians halved, from `offset` to `out_offset`."""
+    """The start of the fit of groups: their gaussians halved, from `offset` to `out_offset`."""
     if _device.of(gaussians.means).is_cuda:
         return _halved(gaussians, offset, out_offset, config)
     result = empty(int(out_offset[-1]), gaussians.sh_degree)
     for first in range(0, len(offset) - 1, _GROUPS_AT_ONCE):
-        cuts, out_cuts = (o[first : first + _GROUPS_AT_ONCE + 1] for o in (offset, out_offset))
-        part = gaussians.subset(slice(cuts[0], cuts[-1]))
-        put(_halved(part, cuts - cuts[0], out_cuts - out_cuts[0], config), result, out_cuts[0])
+        part_offset = offset[first : first + _GROUPS_AT_ONCE + 1]
+        part_out_offset = out_offset[first : first + _GROUPS_AT_ONCE + 1]
+        part = gaussians.subset(slice(part_offset[0], part_offset[-1]))
+        halved = _halved(part, part_offset - part_offset[0], part_out_offset - part_out_offset[0], config)
+        put(halved, result, part_out_offset[0])
     return result
 
 
 def _halved(gaussians: Gaussians, offset: Offsets, out_offset: Offsets, config: BuildConfig) -> Gaussians:
     if config.init == "merge":
         return Gaussians(*_core.merge(gaussians.rows, offset, out_offset))
-    kept = gaussians.subset(_core.prune(gaussians.rows, offset, out_offset))
-    return replace(kept, scales=kept.scales * np.float32(config.prune_growth))
+    pruned = gaussians.subset(_core.prune(gaussians.rows, offset, out_offset))
+    return replace(pruned, scales=pruned.scales * np.float32(config.prune_growth))
 
 
 def _ranges(offsets: Sequence[Offsets], counts: Sequence[int] | Offsets) -> npt.NDArray[np.int64]:
-    """(S, 2) first and end of each segment of arrays that lie one after another, with so many elements."""
+    """(S, 2) first element and end of each segment of arrays of `counts` elements that are concatenated."""
     first = np.cumsum([0, *counts])
     moved = [offset + start for offset, start in zip(offsets, first[:-1], strict=True)]
     return np.concatenate([np.stack([offset[:-1], offset[1:]], axis=1) for offset in moved])

@@ -11,29 +11,49 @@ from v3dg.build.simplify import LevelBuilder
 from v3dg.bundle.codec import Codec
 from v3dg.gaussians import Gaussians
 
-# Groups of level 1 that are fitted with a filter and without it, the filter, and the most leaves of one; and
-# how much larger the loss of an asset that needs the filter is without it (docs/levels.md).
-_GROUPS, _FILTER_PX2, _MOST_LEAVES, _NEEDED = 32, 0.05, 1 << 15, 1.4
+# Groups of level 1 that are fitted with this filter and without one.
+_GROUPS = 32
+_FILTER_PX2 = 0.05
+# Leaves of a group: larger ones would take too long.
+_MOST_LEAVES = 1 << 15
+# An asset needs the filter if its loss without it is larger by this factor (docs/levels.md).
+_NEEDED = 1.4
 
 
 def measured_config(
-    config: BuildConfig, plan: Plan, leaves: Leaves, seed: int, codec: Codec, where: Device
+    config: BuildConfig, plan: Plan, leaves: Leaves, seed: int, codec: Codec, device: Device
 ) -> BuildConfig:
-    """The config with which levels are built: what it leaves to a measurement is measured."""
-    smooth, steps = replace(config, smooth="yes", filter_px2=0.0), config.steps_at(1)
-    level = plan.levels[:2][-1]
-    count, size = min(_GROUPS, level.num_groups), leaves.num_gaussians // level.num_groups
-    is_fitted = steps > 0 and config.filter_px2 > 0 and len(plan.levels) > 1
-    if config.smooth != "measured" or not is_fitted or size > _MOST_LEAVES:
-        return smooth if config.smooth == "yes" else config
-    stride = level.num_groups // count
-    first = level.leaf_offset[stride // 2 : -1 : stride].tolist()
-    asset = Gaussians.concatenate([_device.place(leaves.read(i, i + size), where) for i in first])
-    # As many groups again, of two clusters, whatever those of the build have.
-    tried = replace(config, init="merge", cluster_size=max(2, -(-size // 2)), group_size=2)
-    tried = replace(tried, min_clusters=1, min_gaussians=1, first_steps=max(1, steps // 2))
-    sample, losses = Plan(Plan.of(len(asset), tried).levels[:2]), []
+    """The config that levels are built with: smooth="measured" becomes "yes" if the asset is smooth."""
+    smooth = replace(config, smooth="yes", filter_px2=0.0)
+    if config.smooth == "yes":
+        return smooth
+    is_fitted = config.steps_at(1) > 0 and config.filter_px2 > 0 and len(plan.levels) > 1
+    if config.smooth == "no" or not is_fitted:
+        return config
+    level_1 = plan.levels[1]
+    size = leaves.num_gaussians // level_1.num_groups
+    if size > _MOST_LEAVES:
+        return config
+    stride = level_1.num_groups // min(_GROUPS, level_1.num_groups)
+    first_leaves = level_1.leaf_offset[stride // 2 : -1 : stride].tolist()
+    parts = [_device.place(leaves.read(first, first + size), device) for first in first_leaves]
+    sample = Gaussians.concatenate(parts)
+    # The sample has as many groups as were read, each of two clusters, whatever the groups of the build have.
+    sample_config = replace(
+        config,
+        init="merge",
+        cluster_size=max(2, -(-size // 2)),
+        group_size=2,
+        min_clusters=1,
+        min_gaussians=1,
+        first_steps=max(1, config.steps_at(1) // 2),
+    )
+    sample_plan = Plan(Plan.of(len(sample), sample_config).levels[:2])
+    losses = []
     for px2 in (_FILTER_PX2, 0.0):
-        *_, made = LevelBuilder(sample, replace(tried, filter_px2=px2), seed, codec).levels(asset)
-        losses.append(made.tables.error.mean(axis=0) @ (config.loss_l1, config.loss_alpha))
-    return smooth if losses[1] < _NEEDED * losses[0] else config
+        builder = LevelBuilder(sample_plan, replace(sample_config, filter_px2=px2), seed, codec)
+        *_, fitted = builder.levels(sample)
+        losses.append(fitted.tables.error.mean(axis=0) @ (config.loss_l1, config.loss_alpha))
+    if losses[1] < _NEEDED * losses[0]:
+        return smooth
+    return config

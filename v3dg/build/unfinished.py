@@ -1,8 +1,8 @@
-"""The unfinished bundle, from which an interrupted build goes on.
+"""The unfinished bundle, from which an interrupted build continues.
 
-It is the file of the bundle, with the pages that are finished at their places. Where the finished file will
-end begins the journal: a record for each finished level of each part, with its tables and the hashes of its
-pages. The first bytes, a header of no length and the digest of what is built, tell it from a bundle.
+It is the file of the bundle, with the finished pages at their places. The journal begins at the end of the
+finished file: a record for each finished level of each part, with its tables and the hashes of its pages. The
+first bytes, a header of length 0 and the digest of the asset and the settings, distinguish it from a bundle.
 """
 
 import json
@@ -33,7 +33,7 @@ from v3dg.bundle.format import HASH_BYTES, page_hash
 from v3dg.bundle.pages import PageRun
 from v3dg.gaussians import Gaussians, put
 
-_RECORD = struct.Struct("<II16s")  # in front of a level: its part, its number, the hash of what follows
+_RECORD = struct.Struct("<II16s")  # precedes a level: its part, its number, the hash of the following arrays
 _MAGIC = bytes(8) + b"unfinished v3dg 1\n"
 
 
@@ -50,12 +50,12 @@ class FinishedLevel:
 
 
 Part = Mapping[int, tuple[LevelPlan, PageRun]]
-"""What is built alone: the plans of its levels by number, and their pages."""
+"""The work of one worker: the plan and the pages of each level, by the number of the level."""
 
 
 @dataclass(frozen=True)
 class PageFile:
-    """The pages of an unfinished bundle, for any process of any machine that can open its file."""
+    """The pages of an unfinished bundle, for every process on every machine that can open its file."""
 
     path: Path
     head: bytes
@@ -73,7 +73,7 @@ class PageFile:
 
     @contextmanager
     def _opened(self, flags: int) -> Iterator[int]:
-        """The file, opened anew: what other machines wrote is seen, what is written is there for them."""
+        """Open the file again, so that writes of other machines are seen, and they see those of this one."""
         with _files.naming_errors(self.path):
             descriptor = os.open(self.path, flags | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
@@ -85,18 +85,21 @@ class PageFile:
 
 
 class Unfinished:
-    """A bundle in the making, in a file that replaces `bundle_path` in the end, or stays where it is.
+    """A bundle that is being built, in a file that replaces `bundle_path` at the end; without, it stays.
 
-    A record that was cut off does not count; a damaged one is an error, as a damaged page is. The file is
-    locked while a build uses it, and is gone after one that finished only leaves.
+    A truncated record is ignored; a damaged record or page is an error. The file is locked while a build uses
+    it, and removed after a build that finished no level but the leaves.
     """
 
     def __init__(
         self, path: Path, plan: BundlePlan, parts: Sequence[Part], device: Device, bundle_path: Path | None
     ) -> None:
-        self._path, self._bundle_path, self._plan, self._parts = path, bundle_path, plan, parts
-        what = [plan.header.decode("latin-1"), *described(device), len(parts)]
-        digest = page_hash([np.frombuffer(json.dumps(what).encode(), np.uint8)])
+        self._path = path
+        self._bundle_path = bundle_path
+        self._plan = plan
+        self._parts = parts
+        description = [plan.header.decode("latin-1"), *described(device), len(parts)]
+        digest = page_hash([np.frombuffer(json.dumps(description).encode(), np.uint8)])
         self.pages = PageFile(Path(os.path.abspath(path)), _MAGIC + digest, plan.codec)
         self.levels: dict[tuple[int, int], FinishedLevel] = {}
         self.is_whole = False
@@ -108,32 +111,34 @@ class Unfinished:
         self._file = _open_locked(self._path)
         try:
             with _files.naming_errors(self._path):
-                self._go_on(self._file.fileno(), self.pages.head)
+                self._continue(self._file.fileno(), self.pages.head)
         except BaseException:
             self._file.close()
             raise
         return self
 
-    def _go_on(self, descriptor: int, own: bytes) -> None:
-        """Find out how far the file is."""
+    def _continue(self, descriptor: int, magic: bytes) -> None:
+        """Read what an interrupted build of the same bundle finished; begin an empty file."""
         head = os.pread(descriptor, len(self._plan.header), 0)
         if head == self._plan.header:
             os.ftruncate(descriptor, self._plan.num_bytes)
             with self._reading():
                 Bundle.open(self._path)
             self.is_whole = True
-        elif head.startswith(own):
+        elif head.startswith(magic):
             with self._reading():
                 self._read_journal()
-        elif own.startswith(head):
+        elif magic.startswith(head):
             try:
-                _files.write_at(descriptor, own, 0)
+                _files.write_at(descriptor, magic, 0)
             except OSError:
                 self._path.unlink()
                 raise
         else:
-            found = "holds something else, or levels of another asset, config, seed, device or version"
-            raise ValueError(f"{self._path}: {found}; remove it to start again")
+            raise ValueError(
+                f"{self._path}: holds something else, or levels of another asset, config, seed, device or "
+                "version; remove it to start again"
+            )
 
     def __exit__(self, *_: object) -> None:
         if not self.is_whole and not any(number > 0 for _, number in self.levels):
@@ -145,71 +150,83 @@ class Unfinished:
         try:
             yield
         except (OSError, ValueError) as error:
-            expected = f"expected levels of an interrupted build, could not read them ({error})"
-            raise ValueError(f"{self._path}: {expected}; remove it to start again") from error
+            raise ValueError(
+                f"{self._path}: expected levels of an interrupted build, could not read them ({error}); "
+                "remove it to start again"
+            ) from error
 
     def _read_journal(self) -> None:
-        """Take the levels up to a record that was cut off, and check their pages."""
-        descriptor, head = self._file.fileno(), np.empty(_RECORD.size, np.uint8)
+        """Read the levels before a truncated record, and check their pages."""
+        descriptor = self._file.fileno()
+        head = np.empty(_RECORD.size, np.uint8)
         while _files.read_at(descriptor, head, self._end):
             part, number, digest = _RECORD.unpack(head.tobytes())
             if not (part < len(self._parts) and number in self._parts[part]):
                 raise ValueError("a level is damaged")
             plan, run = self._parts[part][number]
-            shapes = (plan.num_clusters, 2, 3), *((plan.num_groups, width) for width in (4, 4, 2))
-            floats = [np.empty(shape, np.float32) for shape in shapes]
-            arrays = [*floats, np.empty((len(run), HASH_BYTES), np.uint8)]
-            place = self._end + _RECORD.size
+            tables = LevelTables(
+                box=np.empty((plan.num_clusters, 2, 3), np.float32),
+                ball=np.empty((plan.num_groups, 4), np.float32),
+                fit_ball=np.empty((plan.num_groups, 4), np.float32),
+                error=np.empty((plan.num_groups, 2), np.float32),
+            )
+            hashes = np.empty((len(run), HASH_BYTES), np.uint8)
+            arrays = [*vars(tables).values(), hashes]
+            end = self._end + _RECORD.size
             for array in arrays:
-                if not _files.read_at(descriptor, array, place):
+                if not _files.read_at(descriptor, array, end):
                     return
-                place += array.nbytes
+                end += array.nbytes
             if page_hash(arrays) != digest:
                 raise ValueError("a level is damaged")
-            level = FinishedLevel(LevelTables(*floats), arrays[4])
-            level.read(self.pages, run)  # its pages are as they were
-            self.levels[part, number], self._end = level, place
+            level = FinishedLevel(tables, hashes)
+            level.read(self.pages, run)  # checks the hashes of its pages
+            self.levels[part, number] = level
+            self._end = end
 
     def save(self, part: int, number: int, level: FinishedLevel) -> None:
-        """Add a level to the journal; what a full disk cuts off does not count."""
+        """Append a level to the journal; a record that a full disk truncates is ignored later."""
         arrays = [*vars(level.tables).values(), level.hashes]
         record = _RECORD.pack(part, number, page_hash(arrays))
         with self._lock, _files.naming_errors(self._path):
-            descriptor, end = self._file.fileno(), self._end
+            descriptor = self._file.fileno()
+            end = self._end
             os.ftruncate(descriptor, end)
             for data in (record, *(array.reshape(-1).view(np.uint8).data for array in arrays)):
                 _files.write_at(descriptor, data, end)
                 end += len(data)
-            self.levels[part, number], self._end = level, end
+            self.levels[part, number] = level
+            self._end = end
 
     def finish(self, clusters: Clusters, groups: Groups, hashes: npt.NDArray[np.uint8]) -> None:
-        """Make it a bundle; one that is killed at any moment is gone on with, or whole."""
+        """Complete the bundle. After a kill at any moment the file is whole, or a build can continue it."""
         descriptor = self._file.fileno()
         with _files.naming_errors(self._path):
             self._plan.write_tables(descriptor, clusters, groups, hashes)
-            os.fsync(descriptor)  # the header says that all else is there
+            os.fsync(descriptor)  # the header must not reach the disk before everything else
             try:
                 self._plan.write_header(descriptor)
             except OSError:
-                os.pwrite(descriptor, self.pages.head, 0)  # where something is already
+                os.pwrite(descriptor, self.pages.head, 0)  # needs no space, for it replaces bytes
                 raise
             self.is_whole = True
             os.ftruncate(descriptor, self._plan.num_bytes)
 
     def bundle(self) -> Bundle:
-        """The whole bundle, where it is to be."""
+        """The whole bundle, moved to its final path."""
         if self._bundle_path is not None:
             _files.put_in_place(self._path, self._bundle_path)
         return Bundle.open(self._bundle_path or self._path)
 
 
 class MemoryStore:
-    """What is finished of a build in memory, and its pages; for the rest as `Unfinished` and `PageFile`."""
+    """The finished levels of a build in memory, and their pages: like `Unfinished` and `PageFile` in one."""
 
     is_whole = False
 
     def __init__(self, plan: BundlePlan) -> None:
-        self._plan, self.codec = plan, plan.codec
+        self._plan = plan
+        self.codec = plan.codec
         self._gaussians = plan.codec.empty(int(plan.layout.offset[-1]))
         self.pages = self
         self.levels: dict[tuple[int, int], FinishedLevel] = {}
@@ -225,14 +242,15 @@ class MemoryStore:
         self.levels[part, number] = level
 
     def finish(self, clusters: Clusters, groups: Groups, hashes: npt.NDArray[np.uint8]) -> None:
-        self._tables = clusters, groups
+        self._clusters = clusters
+        self._groups = groups
 
     def bundle(self) -> Bundle:
-        return Bundle(*self._tables, self._gaussians, self._plan.config, self.codec.name)
+        return Bundle(self._clusters, self._groups, self._gaussians, self._plan.config, self.codec.name)
 
 
 def described(device: Device) -> tuple[str, str]:
-    """What the last bits of a build depend on: the kind of a device, and the version."""
+    """The kind of a device and the version of v3dg, on which the last bits of a build depend."""
     return _device.describe(device), __version__
 
 
@@ -263,12 +281,12 @@ def _is_bundle(path: str | os.PathLike[str]) -> bool:
 
 
 def _open_locked(path: str | os.PathLike[str]) -> FileIO:
-    """Open or make a file to read and write; other builds are kept out until it is closed."""
+    """Open or create a file to read and write, locked against other builds until it is closed."""
     # O_NONBLOCK: opening a pipe must not wait for a writer; regular files ignore it.
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
     while True:
         check(path, not os.path.islink(path), "a file of levels, got a link; remove it")
-        # Whoever may see the bundle is settled when it replaces what is there.
+        # The file gets the permissions of the bundle when it replaces that.
         file = FileIO(path, "r+", opener=lambda name, _: os.open(name, flags, 0o600))
         try:
             status = os.fstat(file.fileno())

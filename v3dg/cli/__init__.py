@@ -1,4 +1,4 @@
-"""Command line: parse, call, print; a module a command. What commands do is in the modules that they call.
+"""Command line: parse, call, print. Each command has a module; its work is in the modules that it calls.
 
 Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted. Errors are one line on stderr, results go to
 stdout.
@@ -33,4 +33,5 @@ No asset at hand? `v3dg demo` makes one. `v3dg doctor` says what is installed an
 """
 
 _PROGRAM = Program("v3dg", _DESCRIPTION, COMMANDS)
-parse, main = _PROGRAM.parse, _PROGRAM.main
+parse = _PROGRAM.parse
+main = _PROGRAM.main

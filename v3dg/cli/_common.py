@@ -1,11 +1,11 @@
-"""What several commands do: read files, print results."""
+"""What several commands share: options, checks of paths, and printed results."""
 
 import difflib
 import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -22,14 +22,16 @@ class UsageError(Exception):
     """Arguments that cannot be meant; exit code 2."""
 
 
-# What a command may fail with, in one line on stderr; else there is a mistake of ours to be seen.
+# Exceptions that a command reports in one line on stderr; any other is a bug, whose traceback is shown.
 FAILURES = (OSError, MemoryError, ValueError, RuntimeError, ImportError)
 
 
 def failure_text(error: BaseException) -> str:
     """One line that says what failed."""
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        if error.filename:
+            return f"{error.filename}: {error.strerror}"
+        return error.strerror
     if isinstance(error, MemoryError):
         numbers = f" ({error})" if str(error) else ""
         return f"not enough memory{numbers}; use smaller pictures or a smaller asset"
@@ -37,7 +39,7 @@ def failure_text(error: BaseException) -> str:
 
 
 def printable(line: str) -> str:
-    """A line with escapes for what a terminal would obey: text of files and their names may hold anything."""
+    """A line with its control characters escaped, because file names and texts of files may hold any."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
@@ -47,7 +49,7 @@ def tell(text: str) -> None:
 
 
 def option(metavar: str, *aliases: str) -> Any:
-    """Annotation of an option that is None where it is not given, of which its help says what that means."""
+    """Annotation of an option that is None by default; its help says what None means."""
     return tyro.conf.arg(metavar=metavar, aliases=aliases or None, help_behavior_hint="")
 
 
@@ -70,7 +72,7 @@ class Common:
 @dataclass(kw_only=True)
 class OnDevice(Common):
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute; auto is a CUDA device where there is one and torch can use it."""
+    """Where to compute; auto is a CUDA device if there is one that torch can use, else the CPU."""
 
 
 @dataclass(kw_only=True)
@@ -80,7 +82,10 @@ class OnPool(OnDevice):
     all: from as much as it takes. auto: so if that fits into what is free, else from half of what is free."""
 
     def pool(self) -> str | None:
-        return None if self.memory == "all" else self.memory
+        """The memory of the pool as `Renderer` takes it: None draws without a pool."""
+        if self.memory == "all":
+            return None
+        return self.memory
 
 
 @dataclass(kw_only=True)
@@ -94,7 +99,7 @@ class Cut:
 
 
 def check_usage(name: str, holds: object, expected: str) -> None:
-    """Raise UsageError, which names an option and says what was expected and found, unless it holds."""
+    """Raise UsageError, whose message is ``name: expected ...``, unless ``holds``."""
     if not holds:
         raise UsageError(f"{name}: expected {expected}")
 
@@ -104,21 +109,23 @@ def check_range(name: str, value: float, least: float, most: float) -> None:
 
 
 def require_file(path: Path, *suffixes: str) -> None:
-    check(path, is_url(path) or path.exists(), f"a file, got a path where there is none{_similar(path)}")
+    check(path, is_url(path) or path.exists(), f"a file, got a path that does not exist{_similar(path)}")
     got = "a folder" if path.is_dir() else "another name"
     is_known = beside(path).name.lower().endswith(suffixes)
     check(shown(path), is_known, f"a file ending in {', '.join(suffixes)}, got {got}")
 
 
 def _similar(path: Path) -> str:
-    """What may be meant in place of a file that is not there."""
-    names = os.listdir(path.parent) if path.parent.is_dir() else []
-    meant = difflib.get_close_matches(path.name, names, 1, 0.75)
-    return f"; perhaps you meant {path.with_name(meant[0])}" if meant else "; check it"
+    """The advice for a file that does not exist: a file of a similar name, if there is one."""
+    if path.parent.is_dir():
+        similar = difflib.get_close_matches(path.name, os.listdir(path.parent), 1, 0.75)
+        if similar:
+            return f"; perhaps you meant {path.with_name(similar[0])}"
+    return "; check it"
 
 
 def check_output(output: Path, *inputs: Path) -> None:
-    """Refuse to write over a file that is read: what is written may be less than what is there."""
+    """Refuse to overwrite an input, whose content may be more than that of the output."""
     for path in inputs:
         is_another = not (output.exists() and path.exists() and output.samefile(path))
         check_usage(
@@ -127,7 +134,7 @@ def check_output(output: Path, *inputs: Path) -> None:
 
 
 def require_subject(path: Path) -> None:
-    """Check that a file is there and is a scene, a bundle or an asset by its name."""
+    """Check that a file exists and has the name of a scene, a bundle or an asset."""
     require_file(path, *SUFFIXES, ".v3dg", ".json")
 
 
@@ -137,31 +144,46 @@ def level_size(bundle: Bundle, level: int) -> int:
 
 
 def finite(number: float) -> float | None:
-    """A number as JSON has it, which knows no infinity: that of a budget can be infinite."""
-    return number if math.isfinite(number) else None
+    """A number for JSON, which has no infinity: None for the infinite tolerance of a small budget."""
+    if math.isfinite(number):
+        return number
+    return None
 
 
 def print_result(as_json: bool, result: dict[str, Any], lines: Iterable[str]) -> None:
-    print(json.dumps(result, indent=1) if as_json else "\n".join(map(printable, lines)), flush=True)
+    if as_json:
+        print(json.dumps(result, indent=1), flush=True)
+    else:
+        print("\n".join(map(printable, lines)), flush=True)
 
 
-def table_lines(columns: str, rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Lines of a table: by `HEAD = CELL; ...`, how cells show a row; `-` where that lacks a value.
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: its head, and the format of its cells, as `str.format_map` takes it."""
 
-    The first column is to the left, the others to the right.
-    """
-    forms = dict(column.split(" = ") for column in columns.split("; "))
-    table = [list(forms), *([_cell(form, row) for form in forms.values()] for row in rows)]
-    first, *others = (max(map(len, column)) for column in zip(*table, strict=True))
-    line = "  ".join([f"{{:<{first}}}", *(f"{{:>{width}}}" for width in others)])
-    return [line.format(*row).rstrip() for row in table]
+    head: str
+    form: str
+
+    def cell(self, row: Mapping[str, Any]) -> str:
+        """The cell of a row; `-` if the row lacks a value."""
+        try:
+            return printable(self.form.format_map(row))
+        except (KeyError, TypeError):  # the value is missing, or is None, which takes no format
+            return "-"
 
 
-def _cell(form: str, row: Mapping[str, Any]) -> str:
-    try:
-        return printable(form.format_map(row))
-    except (KeyError, TypeError):  # there is none, or None, which has no format
-        return "-"
+def table_lines(columns: Sequence[Column], rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Lines of a table, whose first column is aligned to the left, the others to the right."""
+    table = [[column.head for column in columns]]
+    for row in rows:
+        table.append([column.cell(row) for column in columns])
+    widths = [max(map(len, cells)) for cells in zip(*table, strict=True)]
+    lines = []
+    for first_cell, *cells in table:
+        aligned = [first_cell.ljust(widths[0])]
+        aligned += [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
+        lines.append("  ".join(aligned).rstrip())
+    return lines
 
 
 def bytes_text(count: int) -> str:

@@ -1,4 +1,4 @@
-"""A program of several commands: parses, runs one, and turns what may fail into one line and an exit code."""
+"""A program of several commands: parses, runs one, and turns failures into one line and an exit code."""
 
 import contextlib
 import difflib
@@ -19,21 +19,21 @@ import tyro
 
 from v3dg import _start
 from v3dg._version import __version__
-from v3dg.cli._common import FAILURES, UsageError, check_range, check_usage, failure_text, tell
+from v3dg.cli._common import FAILURES, UsageError, check_range, failure_text, tell
 
 # Options and what runs on them, by the command's name, in the order of the help.
 Commands: TypeAlias = Mapping[str, tuple[type[Any], Callable[[Any], None]]]
 
 INTERRUPTED = 130  # exit code
 
-# More than any machine has cores; where the system refuses one, OpenMP ends the process.
+# More than any machine has cores. If the system refuses a thread, OpenMP ends the process.
 _MOST_THREADS = 1024
 _LEAST_COLUMNS = 40
 
 
 @dataclass(frozen=True)
 class Program:
-    """What is typed to start it, what its help begins with, and its commands."""
+    """The name that starts the program, the description in its help, and its commands."""
 
     name: str
     description: str
@@ -44,8 +44,9 @@ class Program:
         subcommands: Any = [
             Annotated[options, tyro.conf.subcommand(name)] for name, (options, _) in self.commands.items()
         ]
-        # A shell's variable that is not set; as a path it would be the working folder, and all in it.
-        check_usage("arguments", "" not in arguments, "no empty one, got ''; check what was to stand there")
+        if "" in arguments:  # as a path it would be the working folder, and everything in it
+            place = list(arguments).index("") + 1
+            raise UsageError(f"argument {place} is empty; is a shell variable unset?")
         caught = io.StringIO()
         try:
             with contextlib.redirect_stderr(caught), _legible_width():
@@ -62,26 +63,32 @@ class Program:
             raise UsageError(self._one_line(caught.getvalue(), arguments)) from None
 
     def _one_line(self, boxed: str, arguments: Sequence[str]) -> str:
-        """The text of the first box that tyro drew, or which name is unknown, and what may be meant."""
-        lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
-        rule = next((i for i, line in enumerate(lines) if not line), len(lines))
-        text, asked = _plainly(" ".join(lines[:rule]).rstrip(".")), self.name
-        known, slips = list(self.commands), arguments[:1]
-        if slips and slips[0] not in known:
-            text = f"COMMAND: expected {', '.join(known)}, got {slips[0]}"
-        elif slips:
-            asked, known = f"{self.name} {slips[0]}", self._options(slips[0])
-            names = [name.partition("=")[0].replace("_", "-") for name in arguments[1:]]
-            slips = [name for name in names if name.startswith("--") and name not in known]
-            text = f"{slips[0]}: expected an option of {asked}, got none" if slips else text
-        meant = difflib.get_close_matches(slips[0], known, 1, 0.7) if slips else []
-        return f"{text}{f'; perhaps you meant {meant[0]}' if meant else ''}; run {asked} --help"
+        """The message for a wrong command line: an unknown name, or else the text of tyro's first box."""
+        if not arguments:
+            return f"{_text_of_first_box(boxed)}; run {self.name} --help"
+        command = arguments[0]
+        if command not in self.commands:
+            known = list(self.commands)
+            text = f"COMMAND: expected {', '.join(known)}, got {command}"
+            return f"{text}{_suggestion(command, known)}; run {self.name} --help"
+        text = self._unknown_option(command, arguments[1:]) or _text_of_first_box(boxed)
+        return f"{text}; run {self.name} {command} --help"
+
+    def _unknown_option(self, command: str, arguments: Sequence[str]) -> str | None:
+        """The message for the first option that a command does not have, if there is one."""
+        known = self._options(command)
+        for argument in arguments:
+            name = argument.partition("=")[0].replace("_", "-")
+            if name.startswith("--") and name not in known:
+                text = f"{name}: expected an option of {self.name} {command}, got none"
+                return f"{text}{_suggestion(name, known)}"
+        return None
 
     def _options(self, command: str) -> list[str]:
-        """Names of the options that the help of a command has."""
-        with contextlib.redirect_stdout(io.StringIO()) as told, contextlib.suppress(SystemExit):
+        """Names of the options in the help of a command."""
+        with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
             self.parse([command, "--help"])
-        return re.findall(r"--[a-z][a-z-]*", told.getvalue())
+        return re.findall(r"--[a-z][a-z-]*", printed.getvalue())
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """Run one command, by default the one this program was started with, and return its exit code."""
@@ -91,24 +98,24 @@ class Program:
         try:
             code = self._run(arguments)
             code = _flush(code)
-        except KeyboardInterrupt:  # when the command was over, or had been interrupted before
+        except KeyboardInterrupt:  # after the end of the command, or after an interrupt of it
             if arguments is not None:
                 raise
             code = code or _fail("interrupted", INTERRUPTED)
         if arguments is None:
-            for number in _start.SIGNALS:  # what was to be done is done
+            for number in _start.SIGNALS:  # nothing is left to interrupt
                 signal.signal(number, signal.SIG_IGN)
             if code == INTERRUPTED:
-                os._exit(code)  # whatever threads are still at
+                os._exit(code)  # without waiting for threads that still run
         return code
 
     def _run(self, arguments: Sequence[str] | None) -> int:
-        given = sys.argv[1:] if arguments is None else list(arguments)
+        words = sys.argv[1:] if arguments is None else list(arguments)
         try:
-            if given == ["--version"]:
+            if words == ["--version"]:
                 print(f"v3dg {__version__}")
                 return 0
-            options = self.parse(given)
+            options = self.parse(words)
             if arguments is None:
                 _set_threads(getattr(options, "threads", None))
                 _start.raise_interrupts()
@@ -142,8 +149,23 @@ def _legible_width() -> Iterator[None]:
             os.environ["COLUMNS"] = columns
 
 
+def _suggestion(name: str, known: Sequence[str]) -> str:
+    """The known name that is most like an unknown one, as the end of a message; empty if none is."""
+    similar = difflib.get_close_matches(name, known, 1, 0.7)
+    if similar:
+        return f"; perhaps you meant {similar[0]}"
+    return ""
+
+
+def _text_of_first_box(boxed: str) -> str:
+    """The text of the first of the boxes that tyro draws, in our words."""
+    lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()[1:]]
+    end = next((i for i, line in enumerate(lines) if not line), len(lines))
+    return _plainly(" ".join(lines[:end]).rstrip("."))
+
+
 def _plainly(text: str) -> str:
-    """What tyro says of a value, without types of Python, and its choices in one order, without None."""
+    """A message of tyro without types of Python, with its choices in a fixed order and without None."""
     if match := re.match(r"Error parsing (--[a-z-]+): (.*)", text):
         expected = "numbers" if "float" in match[2].lower() else "whole numbers"
         return f"{match[1]}: expected {expected}, got " + ", ".join(re.findall("'.*?'", match[2]))
@@ -159,27 +181,28 @@ def _plainly(text: str) -> str:
 
 
 def _set_threads(threads: int | None) -> None:
-    """Start this process anew with that many threads: OpenMP reads the number once, when it is loaded."""
+    """Restart this process with that many threads: OpenMP reads the number once, when it is loaded."""
     if threads is None:
         return
     check_range("--threads", threads, 1, _MOST_THREADS)
     if os.environ.get("OMP_NUM_THREADS") != str(threads):
         os.environ["OMP_NUM_THREADS"] = str(threads)
-        # Until the next process is ready to hear Ctrl-C, it waits.
+        # Ctrl-C is blocked until the next process can handle it.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def _flush(code: int) -> int:
-    """Write out what was printed; the exit code, which says if that fails."""
+    """Flush stdout, and return the exit code, which is 1 if that fails."""
     try:
         sys.stdout.flush()
     except OSError as error:
-        # Python flushes once more at its end, and has to find a place for it.
+        # Python flushes again when it exits, which must not fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        # Where the reader of our output has gone, nobody is left to tell.
-        is_to_tell = code == 0 and not isinstance(error, BrokenPipeError)
-        code = _fail(f"stdout: {error.strerror}", 1) if is_to_tell else code or 1
+        # A closed pipe is not reported: its reader has all that it wanted.
+        if code == 0 and not isinstance(error, BrokenPipeError):
+            return _fail(f"stdout: {error.strerror}", 1)
+        return code or 1
     return code
 
 

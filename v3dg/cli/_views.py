@@ -1,9 +1,9 @@
-"""Where commands look from: the cameras of a file, a scene's own, or a turntable around the subject."""
+"""The cameras of commands: those of a file, a scene's own, or a turntable around the subject."""
 
 import math
 import os
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 import tyro
 
-from v3dg._numbers import check
+from v3dg._numbers import check, refuse
 from v3dg._urls import beside, shown
 from v3dg.bundle import Bundle
 from v3dg.camera_file import read_cameras
@@ -24,7 +24,7 @@ from v3dg.scene import Scene, Subject
 from v3dg.scene.file import is_scene
 from v3dg.upright import ASSUMED, direction_of, up_of
 
-# Gaussians of the level that a turntable is centred on: enough to know where things are, quick to read.
+# Gaussians of the level that a turntable is centred on: enough to find the centre, and quick to read.
 _ENOUGH_TO_FRAME = 50_000
 
 # All cameras are made before the first picture is drawn.
@@ -66,7 +66,7 @@ class ViewOptions(CameraFile):
     """The turntable's axis; what the file says or what is guessed from it if not given."""
 
     def check(self, *subjects: Path) -> None:
-        """Refuse, before anything is read, subjects that are none, and what cannot be meant for them."""
+        """Refuse, before anything is read, wrong subjects, and options that do not apply to them."""
         for path in subjects:
             require_subject(path)
         for side in self.size:
@@ -90,27 +90,36 @@ Views: TypeAlias = Annotated[ViewOptions, tyro.conf.OmitArgPrefixes]
 
 
 def choose_cameras(
-    options: ViewOptions, path: Path, subject: Subject, own: dict[str, Camera] | None, views: int = 1
+    options: ViewOptions, path: Path, subject: Subject, own_cameras: dict[str, Camera] | None, views: int = 1
 ) -> dict[str, Camera]:
     """The cameras of --cameras, else the subject's own, else a turntable around it, by default of `views`."""
-    own = options.read(options.size) or own
-    if own is None:
-        own = {} if isinstance(subject, Scene) else _around(subject, options, options.views or views, path)
-    check(shown(path), own, "cameras, got a file without any; give some with --cameras")
+    cameras = options.read(options.size) or own_cameras
+    if cameras is None and not isinstance(subject, Scene):
+        cameras = _around(subject, options, options.views or views, path)
+    if not cameras:
+        refuse(shown(path), "cameras, got a file without any; give some with --cameras")
     if options.camera is not None:
-        names, name = list(own), options.camera
-        if name not in own and name.isdecimal() and int(name) < len(names):
-            name = names[int(name)]
-        known = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
-        check("--camera", name in own, f"one of {known}, or 0 to {len(names) - 1}, got {name}")
-        own = {name: own[name]}
-    for name, camera in own.items():
+        name = _camera_name(options.camera, list(cameras))
+        cameras = {name: cameras[name]}
+    for name, camera in cameras.items():
         check_size(f"camera {name}", camera.width, camera.height)
-    return own
+    return cameras
+
+
+def _camera_name(text: str, names: Sequence[str]) -> str:
+    """The camera that --camera names, or numbers from 0."""
+    if text in names:
+        return text
+    if text.isdecimal() and int(text) < len(names):
+        return names[int(text)]
+    known = ", ".join(names[:8])
+    if len(names) > 8:
+        known += " ..."
+    refuse("--camera", f"one of {known}, or 0 to {len(names) - 1}, got {text}")
 
 
 def _around(subject: Bundle | Gaussians, options: ViewOptions, views: int, path: Path) -> dict[str, Camera]:
-    """Cameras around where most of the gaussians are, at a distance that shows nearly all of it."""
+    """Cameras around the ball of most gaussians, at a distance that shows nearly all of it."""
     if isinstance(subject, Gaussians):
         means = subject.means[examine(subject).drawable]
     else:
@@ -135,31 +144,36 @@ def _around(subject: Bundle | Gaussians, options: ViewOptions, views: int, path:
 
 
 def choose_up(
-    given: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
+    requested: Axis | None, subject: Subject, cameras: Mapping[str, Camera] | None, path: Path
 ) -> tuple[Axis, list[str]]:
-    """The axis that is up: of --up, or else as `up_of` takes it, with a line that says so.
+    """The axis that is up: that of --up, or else as `up_of` finds it, with a line that says so.
 
-    Where nothing tells, whoever sits at a terminal is asked.
+    If nothing tells the axis, a user at a terminal is asked.
     """
-    axis, how = (given, "") if given else up_of(subject, cameras, path)
-    if how == ASSUMED and is_at_terminal():
-        axis, how = ask_up(path, axis), "as you said"
-    return axis, lines_of_up(path, axis, how)
+    if requested:
+        return requested, []
+    axis, reason = up_of(subject, cameras, path)
+    if reason == ASSUMED and is_at_terminal():
+        axis = ask_up(path, axis)
+        reason = "as you said"
+    return axis, lines_of_up(path, axis, reason)
 
 
-def lines_of_up(path: Path, axis: Axis, how: str) -> list[str]:
-    """What a command says of the axis that it took for up, and how; nothing of one that was given."""
-    return [f"{beside(path).name}: {axis} is up, {how}; --up says otherwise"] if how else []
+def lines_of_up(path: Path, axis: Axis, reason: str) -> list[str]:
+    """The line that says which axis is up and why; none without a reason, which is for --up."""
+    if not reason:
+        return []
+    return [f"{beside(path).name}: {axis} is up, {reason}; --up says otherwise"]
 
 
 def is_at_terminal() -> bool:
-    """Whether somebody can answer; a job in the background would be stopped."""
+    """Whether a user can answer; a job in the background, which would be stopped, cannot."""
     is_open = sys.stdin and sys.stdin.isatty() and sys.stderr.isatty()
     return bool(is_open and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp())
 
 
 def ask_up(path: Path, axis: Axis) -> Axis:
-    """What whoever sits at the terminal says is up; just Enter, or the end of all input, takes the axis."""
+    """Ask the user at the terminal which axis is up; Enter, or the end of the input, accepts `axis`."""
     while True:
         question = printable(f"{beside(path).name}: which way is up, {', '.join(AXES)}? [{axis}] ")
         print(question, end="", file=sys.stderr, flush=True)
@@ -169,9 +183,9 @@ def ask_up(path: Path, axis: Axis) -> Axis:
 
 
 def picture_paths(output: Path, cameras: Collection[str]) -> list[Path]:
-    """Where the pictures of cameras go: of several, each has its camera's name in its own.
+    """The paths of the pictures of cameras; if there are several, each path has the name of its camera.
 
-    Where two would have the same, all have their camera's place in the file instead, from 0.
+    If two paths would be the same, all have the number of their camera in the file instead, from 0.
     """
     if len(cameras) == 1:
         return [output]

@@ -25,8 +25,10 @@ from v3dg.gaussians import Gaussians
 from v3dg.io import SUFFIXES, open_asset, run_files
 from v3dg.upright import ASSUMED, up_of
 
-_PATIENCE_S = 20  # for a scheduler's answer
-_SAMPLES, _SAMPLE = 64, 256  # of an asset, and gaussians of each, that tell what is up
+_PATIENCE_S = 20  # time for a scheduler to answer
+# The axis that is up is guessed from so many samples of an asset, of so many gaussians each.
+_NUM_SAMPLES = 64
+_SAMPLE_SIZE = 256
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
 
@@ -42,11 +44,11 @@ class Build(_common.OnDevice):
     config: Literal["default", "paper"] = "default"
     """Settings to start from: ours, or those of the V3DG paper."""
     cluster_size: Annotated[int | None, _common.option("N")] = None
-    """Most gaussians in a cluster; the config's own if not given."""
+    """Maximum number of gaussians in a cluster; the config's own if not given."""
     codec: Literal["float32", "quantized"] = "float32"
     """How gaussians are kept: every bit, or rounded to 16 to 40 bytes (docs/format.md has the error)."""
     up: Annotated[Axis | None, _common.option("{x,y,z,-x,-y,-z}")] = None
-    """What is up in the asset, which the bundle then says; asked for at a terminal where nothing tells it."""
+    """The axis that is up in the asset, which the bundle records; asked for at a terminal if unknown."""
     seed: int = 0
     """The same seed gives the same file, byte for byte, on the same kind of device and any threads."""
     strict: _common.Flag = False
@@ -70,7 +72,8 @@ def run(options: Build) -> None:
         if is_one or list(assets) == list(options.assets[:1]):
             output = options.output or _output_of(options.assets[0], None)
             files = list(dict.fromkeys(file for files in assets.values() for file in files))
-            options.up = options.up or (None if options.resume else _asked_up(files[0]))
+            if options.up is None and not options.resume:
+                options.up = _asked_up(files[0])
             result = _build(options, files, output, executor)
             _common.print_result(options.json, result, _lines(result))
         else:
@@ -78,15 +81,21 @@ def run(options: Build) -> None:
 
 
 def _asked_up(path: Path) -> Axis | None:
-    """What is up in an asset, of who sits at a terminal, where neither its kind nor its gaussians tell."""
+    """The user's answer which axis is up, asked at a terminal if neither format nor gaussians tell it."""
     if not is_at_terminal():
         return None
     _common.require_file(path, *SUFFIXES)
     asset = open_asset(path)
-    starts = range(0, asset.num_gaussians, max(asset.num_gaussians // _SAMPLES, _SAMPLE))
-    parts = [asset.read(start, min(start + _SAMPLE, asset.num_gaussians)) for start in starts]
-    axis, how = up_of(Gaussians.concatenate(parts), path=path) if parts else ("-y", "")
-    return ask_up(path, axis) if how == ASSUMED else None
+    if asset.num_gaussians == 0:
+        return None
+    samples = []
+    stride = max(asset.num_gaussians // _NUM_SAMPLES, _SAMPLE_SIZE)
+    for start in range(0, asset.num_gaussians, stride):
+        samples.append(asset.read(start, min(start + _SAMPLE_SIZE, asset.num_gaussians)))
+    axis, reason = up_of(Gaussians.concatenate(samples), path=path)
+    if reason == ASSUMED:
+        return ask_up(path, axis)
+    return None
 
 
 @contextmanager
@@ -97,19 +106,22 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
         return
     import asyncio
 
-    distributed, comm = (_extras.load(name) for name in ("distributed", "distributed.comm"))
-    for name in ("distributed", "distributed.client"):  # errors are told once, by the command
+    distributed = _extras.load("distributed")
+    comm = _extras.load("distributed.comm")
+    for name in ("distributed", "distributed.client"):  # the command reports errors, once
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
     async def greet() -> None:
         (await asyncio.wait_for(comm.connect(address), _PATIENCE_S)).abort()
 
     try:
-        asyncio.run(greet())  # a client would wait for ever for one that listens and says nothing
+        asyncio.run(greet())  # a client would wait for ever for a server that does not answer
         client = distributed.Client(address, timeout=_PATIENCE_S)
     except (OSError, ValueError, asyncio.TimeoutError) as error:
-        found = f"none ({' '.join(str(error).split()) or 'no answer'})"
-        raise RuntimeError(f"{address}: expected a dask scheduler that answers, got {found}") from None
+        reason = " ".join(str(error).split()) or "no answer"
+        raise RuntimeError(
+            f"{address}: expected a dask scheduler that answers, got none ({reason})"
+        ) from None
     with client:
         yield client.get_executor()
 
@@ -131,27 +143,41 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
         except KeyboardInterrupt:
             done = f"{len(results)} of {len(outputs)} assets done"
             raise KeyboardInterrupt(f"interrupted with {done}; `--resume` continues") from None
+    _print_many(options, results, time.perf_counter() - start)
+    failed = [result for result in results if result["status"] == "failed"]
+    if failed:
+        text = f"{len(failed)} of {len(results)} assets failed: {failed[0]['error']}"
+        if len(failed) > 1:
+            text += f" (and {len(failed) - 1} more)"
+        raise RuntimeError(text)
+
+
+def _print_many(options: Build, results: list[dict[str, Any]], seconds: float) -> None:
+    columns = [
+        _common.Column("asset", "{asset}"),
+        _common.Column("bundle", "{status}"),
+        _common.Column("levels", "{levels}"),
+        _common.Column("gaussians", "{gaussians:,}"),
+        _common.Column("left out", "{left_out:,}"),
+        _common.Column("size", "{size}"),
+        _common.Column("time", "{seconds:.1f} s"),
+    ]
+    rows = []
+    for result in results:
+        row = dict(result)
+        if "bytes" in result:
+            row["left_out"] = sum(result["dropped"].values())
+            row["size"] = _common.bytes_text(result["bytes"])
+        rows.append(row)
     counts = Counter(result["status"] for result in results)
     summary = {name: counts[name] for name in ("built", "kept", "failed")}
-    seconds = time.perf_counter() - start
-    columns = (
-        "asset = {asset}; bundle = {status}; levels = {levels}; gaussians = {gaussians:,}; "
-        "left out = {left_out:,}; size = {size}; time = {seconds:.1f} s"
-    )
-    rows = [{**result} for result in results]
-    for row in rows:
-        if "bytes" in row:
-            row |= {"left_out": sum(row["dropped"].values()), "size": _common.bytes_text(row["bytes"])}
-    last = ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
-    result = {**summary, "seconds": seconds, "assets": results}
-    _common.print_result(options.json, result, [*_common.table_lines(columns, rows), "", last])
-    if failed := [result for result in results if result["status"] == "failed"]:
-        others = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
-        raise RuntimeError(f"{len(failed)} of {len(results)} assets failed: {failed[0]['error']}{others}")
+    last_line = ", ".join(f"{count} {name}" for name, count in summary.items()) + f", {seconds:.1f} s"
+    lines = [*_common.table_lines(columns, rows), "", last_line]
+    _common.print_result(options.json, {**summary, "seconds": seconds, "assets": results}, lines)
 
 
 def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
-    """The files of each asset, by what it is named after: a file, one of a folder, or the folder of a run."""
+    """The files of each asset, by the path that names it: a file, or the folder of a trainer's run."""
     assets: dict[Path, list[Path]] = {}
     for path in paths:
         if not path.is_dir():
@@ -159,33 +185,39 @@ def _assets_of(paths: Sequence[Path]) -> dict[Path, list[Path]]:
         elif files := run_files(path):
             assets[path] = files
         else:
-            found = sorted(p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file())
+            files = sorted(p for p in path.iterdir() if p.name.lower().endswith(SUFFIXES) and p.is_file())
             expected = f"a folder with assets ({', '.join(SUFFIXES)}), or a run of a trainer"
-            check(path, found, f"{expected}, got one without")
-            assets |= {file: [file] for file in found}
+            check(path, files, f"{expected}, got one without")
+            for file in files:
+                assets[file] = [file]
     return assets
 
 
-def _output_of(name: Path, folder: Path | None) -> Path:
-    """Where the bundle of an asset goes that is named after that."""
-    name = name.resolve() if name.is_dir() else beside(name)
-    return (folder or name.parent) / f"{name.name if name.is_dir() else name.stem}.v3dg"
+def _output_of(asset: Path, folder: Path | None) -> Path:
+    """The path of the bundle that is named after an asset."""
+    if asset.is_dir():
+        place = asset.resolve()
+        stem = place.name
+    else:
+        place = beside(asset)
+        stem = place.stem
+    return (folder or place.parent) / f"{stem}.v3dg"
 
 
 def _outputs(assets: Sequence[Path], folder: Path | None) -> dict[Path, Path]:
-    """Where the bundle of each asset goes, by asset."""
+    """The path of the bundle of each asset."""
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    asset_of: dict[Path, Path] = {}
+    asset_from_output: dict[Path, Path] = {}
     for asset in assets:
         output = _output_of(asset, folder)
-        other = asset_of.setdefault(output, asset)
-        check(output, other == asset, f"one asset for it, got {shown(other)} and {shown(asset)}; rename one")
-    return {asset: output for output, asset in asset_of.items()}
+        first = asset_from_output.setdefault(output, asset)
+        check(output, first == asset, f"one asset for it, got {shown(first)} and {shown(asset)}; rename one")
+    return {asset: output for output, asset in asset_from_output.items()}
 
 
 def _build(options: Build, paths: Sequence[Path], output: Path, executor: Executor | None) -> dict[str, Any]:
-    """Build and write one bundle; what was done, as JSON values."""
+    """Build and write one bundle; returns its description, as JSON values."""
     for path in paths:
         _common.require_file(path, *SUFFIXES)
     advice = f", got a folder; {output / paths[0].stem}.v3dg is one" if output.is_dir() else ""
@@ -195,37 +227,59 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
     config = BuildConfig.paper() if options.config == "paper" else BuildConfig()
     if options.cluster_size is not None:
         config = replace(config, cluster_size=options.cluster_size)
-    levels, names = levels_path(output), ("seed", "codec", "up", "device", "resume", "memory")
-    how: dict[str, Any] = {name: getattr(options, name) for name in names}
-    how |= {"progress": not options.quiet, "unusable": "refuse" if options.strict else "drop"}
-
-    def to_resume() -> str:
-        return f"; `--resume` continues from {levels}" if levels.exists() else ""
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AssetWarning)  # the result says it
-            bundle, is_built = build_file(paths, output, config=config, executor=executor, **how)
+            bundle, is_built = build_file(
+                paths,
+                output,
+                config=config,
+                seed=options.seed,
+                progress=not options.quiet,
+                device=options.device,
+                resume=options.resume,
+                unusable="refuse" if options.strict else "drop",
+                memory=options.memory,
+                executor=executor,
+                codec=options.codec,
+                up=options.up,
+            )
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted{to_resume()}") from None
-    except OSError as error:  # a full disk, say
+        raise KeyboardInterrupt(f"interrupted{_resume_advice(output)}") from None
+    except OSError as error:  # for example of a full disk
         if error.errno is None:  # of a URL, whose text says all
-            raise type(error)(f"{error}{to_resume()}") from None
-        raise OSError(error.errno, f"{error.strerror}{to_resume()}", error.filename) from None
-    asset = shown(paths[0]) if len(paths) == 1 else [shown(path) for path in paths]
-    status = "built" if is_built else "kept"
-    result: dict[str, Any] = {"asset": asset, "output": str(output), "status": status}
-    result |= {name: bundle.config[name] for name in ("asset_gaussians", "dropped")}
-    result |= {"gaussians": bundle.num_gaussians, "clusters": len(bundle.clusters)}
-    result |= {"levels": bundle.num_levels, "bytes": output.stat().st_size}
-    return result | {"seconds": time.perf_counter() - start}
+            raise type(error)(f"{error}{_resume_advice(output)}") from None
+        text = f"{error.strerror}{_resume_advice(output)}"
+        raise OSError(error.errno, text, error.filename) from None
+    return {
+        "asset": shown(paths[0]) if len(paths) == 1 else [shown(path) for path in paths],
+        "output": str(output),
+        "status": "built" if is_built else "kept",
+        "asset_gaussians": bundle.config["asset_gaussians"],
+        "dropped": bundle.config["dropped"],
+        "gaussians": bundle.num_gaussians,
+        "clusters": len(bundle.clusters),
+        "levels": bundle.num_levels,
+        "bytes": output.stat().st_size,
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def _resume_advice(output: Path) -> str:
+    """The end of a message about a build that did not finish: where it can continue, if anywhere."""
+    levels = levels_path(output)
+    if levels.exists():
+        return f"; `--resume` continues from {levels}"
+    return ""
 
 
 def _lines(result: dict[str, Any]) -> list[str]:
-    how = "kept as it was" if result["status"] == "kept" else f"{result['seconds']:.1f} s"
-    line = (
+    time_text = "kept as it was" if result["status"] == "kept" else f"{result['seconds']:.1f} s"
+    lines = [
         f"{result['output']}: {result['levels']} levels, {result['clusters']:,} clusters, "
         f"{result['gaussians']:,} gaussians ({result['asset_gaussians']:,} in the asset), "
-        f"{_common.bytes_text(result['bytes'])}, {how}"
-    )
-    return [line, *(["left out: " + describe(result["dropped"])] if result["dropped"] else [])]
+        f"{_common.bytes_text(result['bytes'])}, {time_text}"
+    ]
+    if result["dropped"]:
+        lines.append("left out: " + describe(result["dropped"]))
+    return lines

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -23,10 +23,10 @@ from v3dg.opening import open_with_cameras
 from v3dg.pictures import Picture, to_8bit
 from v3dg.render import render
 
-# Views from which on starting processes to measure them is quicker than doing without.
+# From this number of views on, measuring in other processes is quicker, in spite of starting them.
 _ENOUGH_TO_SHARE = 6
 
-# Smaller pictures are enlarged to about this many px where they are shown side by side.
+# Smaller pictures are enlarged to about this width, in px, when they are shown side by side.
 _LEAST_WIDTH = 300
 
 
@@ -40,7 +40,7 @@ class Compare(_common.Cut, _common.OnDevice):
     reference: tyro.conf.Positional[Path]
     """An asset, a bundle (.v3dg) or a scene (.json), to be drawn with all gaussians; or a picture (.png)."""
     test: tyro.conf.Positional[Path]
-    """What to compare with it: any of those, drawn with a tolerance, or a picture of the same size."""
+    """The subject to compare with it: any of those, drawn with a tolerance, or a picture of the same size."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = Path("compare.png")
     """Picture to write, .png or .jpg: reference, test and, where FLIP is installed, a map of it."""
     pictures: Literal["worst", "all"] = "worst"
@@ -56,7 +56,16 @@ class _Pair(NamedTuple):
     name: str
     reference: Picture
     test: Picture
-    gaussians: int | None = None  # of the test that were selected
+    gaussians: int | None = None  # number that was selected of the test
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """The pairs of pictures to compare, which are made one after another."""
+
+    names: list[str]
+    pairs: Iterator[_Pair]
+    finest: int | None  # gaussians of the test's finest level, if it is a bundle
 
 
 def run(options: Compare) -> None:
@@ -66,14 +75,53 @@ def run(options: Compare) -> None:
     are_pictures = [beside(path).suffix.lower() in pictures.SUFFIXES for path in subjects]
     is_pair = any(are_pictures) == all(are_pictures)
     _common.check_usage("PATH", is_pair, "two pictures, or two subjects to draw, got one of each")
-    names, pairs, finest = _read_pictures(options) if all(are_pictures) else _draw(options)
-    paths = picture_paths(output, names) if options.pictures == "all" else [output] * len(names)
+    pairs = _read_pictures(options) if all(are_pictures) else _draw(options)
+    rows, worst = _measure(options, pairs, output)
+    mean = mean_of(rows, "flip", "psnr", "ssim", "gaussians_selected")
+    result: dict[str, Any] = {
+        "reference": shown(options.reference),
+        "test": shown(options.test),
+        "mean": mean,
+        "worst": worst["camera"],
+        "views": rows,
+    }
+    columns = [
+        _common.Column("view", "{camera}"),
+        _common.Column("FLIP", "{flip:.4f}"),
+        _common.Column("PSNR", "{psnr:.2f}"),
+        _common.Column("SSIM", "{ssim:.4f}"),
+        _common.Column("gaussians", "{gaussians_selected:,.0f}"),
+    ]
+    table_rows = list(rows)
+    if len(rows) > 1:
+        table_rows.append({"camera": "mean", **mean})
+    titles = "reference and test" if mean["flip"] is None else "reference, test and FLIP"
+    lines = [
+        *_common.table_lines(columns, table_rows),
+        "",
+        f"{worst['picture']}: {titles} of view {worst['camera']}, which differs most",
+    ]
+    if mean["flip"] is None:
+        lines.append(FLIP_MISSING)
+    if pairs.finest is not None and all(row["gaussians_selected"] == pairs.finest for row in rows):
+        lines.append("every view needs the finest level; a smaller `--size` shows the test as from far away")
+    _common.print_result(options.json, result, lines)
+
+
+def _measure(options: Compare, pairs: _Pairs, output: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Measure all pairs and write their pictures; the rows of the result, and the one that differs most."""
+    paths = [output] * len(pairs.names)
+    if options.pictures == "all":
+        paths = picture_paths(output, pairs.names)
     rows: list[dict[str, Any]] = []
     worst: tuple[_Pair, dict[str, Any]] | None = None
     with contextlib.closing(Judges()) as judges:
-        is_long = len(names) >= _ENOUGH_TO_SHARE
-        judged = judges.measured(pairs, _errors) if is_long else ((pair, _errors(pair)) for pair in pairs)
-        for pair, errors in counted(judged, len(names), "compare", not options.quiet):
+        measured: Iterable[tuple[_Pair, dict[str, float | None]]]
+        if len(pairs.names) >= _ENOUGH_TO_SHARE:
+            measured = judges.measured(pairs.pairs, _errors)
+        else:
+            measured = ((pair, _errors(pair)) for pair in pairs.pairs)
+        for pair, errors in counted(measured, len(pairs.names), "compare", not options.quiet):
             row = {"camera": pair.name, **errors, "gaussians_selected": pair.gaussians}
             if options.pictures == "all":
                 row["picture"] = str(paths[len(rows)])
@@ -82,65 +130,61 @@ def run(options: Compare) -> None:
                 worst = (pair, row)
             rows.append(row)
     assert worst is not None
+    worst_pair, worst_row = worst
     if options.pictures == "worst":
-        worst[1]["picture"] = str(output)
-        _write(options, *worst)
-    mean = mean_of(rows, "flip", "psnr", "ssim", "gaussians_selected")
-    result: dict[str, Any] = {"reference": shown(options.reference), "test": shown(options.test)}
-    result |= {"mean": mean, "worst": worst[1]["camera"], "views": rows}
-    columns = (
-        "view = {camera}; FLIP = {flip:.4f}; PSNR = {psnr:.2f}; SSIM = {ssim:.4f}; "
-        "gaussians = {gaussians_selected:,.0f}"
-    )
-    titles = "reference and test" if mean["flip"] is None else "reference, test and FLIP"
-    lines = [
-        *_common.table_lines(columns, rows if len(rows) == 1 else [*rows, {"camera": "mean", **mean}]),
-        "",
-        f"{worst[1]['picture']}: {titles} of view {worst[1]['camera']}, which differs most",
-    ]
-    if mean["flip"] is None:
-        lines.append(FLIP_MISSING)
-    if finest is not None and all(row["gaussians_selected"] == finest for row in rows):
-        lines.append("every view needs the finest level; a smaller `--size` shows the test as from far away")
-    _common.print_result(options.json, result, lines)
+        worst_row["picture"] = str(output)
+        _write(options, worst_pair, worst_row)
+    return rows, worst_row
 
 
-def _read_pictures(options: Compare) -> tuple[list[str], Iterator[_Pair], None]:
-    reference, test = map(pictures.read_picture, (options.reference, options.test))
-    (height, width, _), (test_height, test_width, _) = reference.shape, test.shape
+def _read_pictures(options: Compare) -> _Pairs:
+    reference = pictures.read_picture(options.reference)
+    test = pictures.read_picture(options.test)
+    height, width, _ = reference.shape
+    test_height, test_width, _ = test.shape
     expected = f"{width} x {height} px like {options.reference}, got {test_width} x {test_height}"
     check(options.test, reference.shape == test.shape, expected)
     name = beside(options.test).stem
-    return [name], iter([_Pair(name, reference, test)]), None
+    return _Pairs([name], iter([_Pair(name, reference, test)]), finest=None)
 
 
-def _draw(options: Compare) -> tuple[list[str], Iterator[_Pair], int | None]:
-    """The names of the views, pictures of one after the other, gaussians of the test's finest level."""
+def _draw(options: Compare) -> _Pairs:
+    """Draw the pairs of pictures of all cameras."""
     options.view.check(options.reference, options.test)
     _common.check_range("--supersample", options.supersample, 1, 16)
     device = _device.resolve(options.device)
     reference, reference_cameras = open_with_cameras(options.reference)
     test, test_cameras = open_with_cameras(options.test)
-    own, path = reference_cameras, options.reference
-    if own is None and test_cameras is not None:
-        own, path = test_cameras, options.test
-    cameras = choose_cameras(options.view, path, reference, own, views=8)
+    if reference_cameras is None and test_cameras is not None:
+        cameras = choose_cameras(options.view, options.test, reference, test_cameras, views=8)
+    else:
+        cameras = choose_cameras(options.view, options.reference, reference, reference_cameras, views=8)
     for name, camera in cameras.items():
         pictures.check_size(f"camera {name}", camera.width, camera.height, pictures.MOST_PIXELS_COMPARED)
-        sides = (side * options.supersample for side in (camera.width, camera.height))
-        pictures.check_size(f"camera {name}, supersampled", *sides)
+        pictures.check_size(
+            f"camera {name}, supersampled",
+            camera.width * options.supersample,
+            camera.height * options.supersample,
+        )
 
-    finest = _common.level_size(test, 0) if isinstance(test, Bundle) and test.num_levels else None
-    how: Any = {"tolerance": options.tolerance, "budget": options.budget, "device": device}
-    how["min_transmittance"] = MIN_TRANSMITTANCE  # the truth's, so that only the gaussians differ
+    finest = None
+    if isinstance(test, Bundle) and test.num_levels:
+        finest = _common.level_size(test, 0)
 
     def pairs() -> Iterator[_Pair]:
         for name, camera in cameras.items():
             truth = draw_truth(reference, camera, device, options.supersample)
-            image = render(test, camera, **how)
+            image = render(
+                test,
+                camera,
+                tolerance=options.tolerance,
+                budget=options.budget,
+                device=device,
+                min_transmittance=MIN_TRANSMITTANCE,  # the truth's, so that only the gaussians differ
+            )
             yield _Pair(name, truth, to_8bit(image.color), image.stats.gaussians_selected)
 
-    return list(cameras), pairs(), finest
+    return _Pairs(list(cameras), pairs(), finest)
 
 
 def _errors(pair: _Pair) -> dict[str, float | None]:
@@ -148,10 +192,12 @@ def _errors(pair: _Pair) -> dict[str, float | None]:
 
 
 def _difference(row: dict[str, Any]) -> float:
-    """What orders views: FLIP, or PSNR where that is not there."""
+    """The order of views: FLIP, or the negative PSNR if FLIP is missing."""
     if row["flip"] is not None:
         return float(row["flip"])
-    return -math.inf if row["psnr"] is None else -float(row["psnr"])
+    if row["psnr"] is not None:
+        return -float(row["psnr"])
+    return -math.inf
 
 
 def _write(options: Compare, pair: _Pair, row: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ import tyro
 
 from v3dg.cli._common import Common
 
-# What to change in tyro's scripts, so that files are completed where neither a command nor an option fits.
+# Replacements in tyro's scripts that complete file names if neither a command nor an option matches.
 _OR_FILES = {
     "bash": ("complete -F", "complete -o default -F"),
     "zsh": ('[[ "$completions" ==', '[[ -z "$completions" || "$completions" =='),

@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -36,70 +36,122 @@ class Convert(_common.Cut, _common.Common):
     level: Annotated[int | None, _common.option("N")] = None
     """Write this level of a bundle; 0, the asset itself, if no cut is asked for."""
     outside: Literal["drop", "keep"] = "drop"
-    """What becomes of the part of the cut that the camera does not see."""
+    """Whether the part of the cut that the camera does not see is left out."""
     spz_version: Annotated[Literal[2, 3, 4] | None, _common.option("{2,3,4}")] = None
     """Version of a .spz; 3 if not given."""
     view: Views = field(default_factory=ViewOptions)
 
 
+@dataclass(frozen=True)
+class _Part:
+    """The gaussians to write, and the fields of the result that describe them."""
+
+    gaussians: Gaussians
+    description: dict[str, str | int | float | None]
+
+
 def run(options: Convert) -> None:
-    view = options.view
-    view.check(options.subject)
-    output, name = options.output, options.output.name.lower()
-    to_bundle, suffixes = name.endswith(".v3dg"), (*WRITE_SUFFIXES, ".v3dg")
+    options.view.check(options.subject)
+    _check_output(options)
+    part_options = _part_options(options)
+    is_cut = is_scene(options.subject) or any(name != "--level" for name in part_options)
+    expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
+    _common.check_usage("--level", options.level is None or not is_cut, expected)
+    start = time.perf_counter()
+    subject, own_cameras = open_with_cameras(options.subject)
+    output = options.output
+    if _is_bundle(output):
+        if not isinstance(subject, Bundle) or part_options:
+            raise _common.UsageError(
+                f"{output}: expected a bundle to write anew, and no level or cut of it; "
+                "v3dg build makes one of an asset"
+            )
+        part = _Part(subject.gaussians, {"codec": options.codec or subject.codec})
+        _write_bundle(options, subject)
+    else:
+        if isinstance(subject, Gaussians):
+            expected = "a bundle or a scene; build one first"
+            _common.check_usage(", ".join(part_options), not part_options, expected)
+            part = _Part(subject, {})
+        elif isinstance(subject, Bundle) and not is_cut:
+            part = _level(options, subject)
+        else:
+            part = _cut(options, subject, own_cameras)
+        write_asset(output, part.gaussians, version=options.spz_version)
+    num_bytes = output.stat().st_size
+    result = {
+        "output": str(output),
+        "gaussians": len(part.gaussians),
+        "sh_degree": part.gaussians.sh_degree,
+        "bytes": num_bytes,
+        "seconds": time.perf_counter() - start,
+        **part.description,
+    }
+    text = f"{output}: {len(part.gaussians):,} gaussians, SH degree {part.gaussians.sh_degree}"
+    _common.print_result(options.json, result, [f"{text}, {_common.bytes_text(num_bytes)}"])
+
+
+def _is_bundle(path: Path) -> bool:
+    return path.name.lower().endswith(".v3dg")
+
+
+def _check_output(options: Convert) -> None:
+    """Refuse an output that cannot be written, and options that do not apply to its format."""
+    output = options.output
+    name = output.name.lower()
+    suffixes = (*WRITE_SUFFIXES, ".v3dg")
     check(output, name.endswith(suffixes), f"a file name that ends in {', '.join(suffixes)}")
-    fits = options.codec is None or to_bundle
+    fits = options.codec is None or _is_bundle(output)
     _common.check_usage("--codec", fits, f"an output that ends in .v3dg, got {output}")
     fits = not options.spz_version or name.endswith(".spz")
     _common.check_usage("--spz-version", fits, f"a .spz to write, got {output}; leave it out")
     _files.check_folder(output)
     _common.check_output(output, options.subject)
-    part: dict[str, Any] = {"--level": options.level, "--tolerance": options.tolerance}
-    part |= {"--budget": options.budget, "--cameras": view.cameras, **view.turntable()}
-    given = [name for name, value in part.items() if value is not None]
-    is_cut = is_scene(options.subject) or any(name != "--level" for name in given)
-    expected = "no scene, camera, tolerance or budget with it; leave out one or the other"
-    _common.check_usage("--level", options.level is None or not is_cut, expected)
-    start = time.perf_counter()
-    subject, own_cameras = open_with_cameras(options.subject)
-    told: dict[str, Any] = {}
-    if to_bundle:
-        if not isinstance(subject, Bundle) or is_cut or options.level is not None:
-            expected = "a bundle to write anew, and no level or cut of it; v3dg build makes one of an asset"
-            raise _common.UsageError(f"{output}: expected {expected}")
-        gaussians, codec = subject.gaussians, options.codec or subject.codec
-        Bundle(subject.clusters, subject.groups, gaussians, subject.config, codec).write(output)
-        told = {"codec": codec}
-    elif isinstance(subject, Gaussians):
-        _common.check_usage(", ".join(given), not given, "a bundle or a scene; build one first")
-        gaussians = subject
-    elif isinstance(subject, Bundle) and not is_cut:
-        level = options.level or 0
-        _common.check_range("--level", level, 0, max(0, subject.num_levels - 1))
-        gaussians, told = subject.level_gaussians(level), {"level": level}
-    else:
-        cameras = choose_cameras(view, options.subject, subject, own_cameras)
-        expected = f"one camera to look from, got {len(cameras)}; choose one"
-        _common.check_usage("--views" if view.views else "--camera", len(cameras) == 1, expected)
-        gaussians, told = _cut(options, subject, *cameras.items())
-    if not to_bundle:
-        write_asset(output, gaussians, version=options.spz_version)
-    result = {"output": str(output), "gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}
-    result |= {"bytes": output.stat().st_size, "seconds": time.perf_counter() - start, **told}
-    size = _common.bytes_text(output.stat().st_size)
-    text = f"{output}: {len(gaussians):,} gaussians, SH degree {gaussians.sh_degree}, {size}"
-    _common.print_result(options.json, result, [text])
 
 
-def _cut(
-    options: Convert, subject: Scene | Bundle, named_camera: tuple[str, Camera]
-) -> tuple[Gaussians, dict[str, Any]]:
-    name, camera = named_camera
-    how: Any = {"tolerance": options.tolerance, "budget": options.budget, "cull": options.outside == "drop"}
-    selection = select(subject, camera, **how, device=CPU)
-    if isinstance(subject, Bundle) and len(selection):  # its clusters alone are read
+def _part_options(options: Convert) -> list[str]:
+    """The names of the options on the command line that ask for a level or a cut."""
+    values = {
+        "--level": options.level,
+        "--tolerance": options.tolerance,
+        "--budget": options.budget,
+        "--cameras": options.view.cameras,
+        **options.view.turntable(),
+    }
+    return [name for name, value in values.items() if value is not None]
+
+
+def _write_bundle(options: Convert, bundle: Bundle) -> None:
+    codec = options.codec or bundle.codec
+    Bundle(bundle.clusters, bundle.groups, bundle.gaussians, bundle.config, codec).write(options.output)
+
+
+def _level(options: Convert, bundle: Bundle) -> _Part:
+    level = options.level or 0
+    _common.check_range("--level", level, 0, max(0, bundle.num_levels - 1))
+    return _Part(bundle.level_gaussians(level), {"level": level})
+
+
+def _cut(options: Convert, subject: Scene | Bundle, own_cameras: dict[str, Camera] | None) -> _Part:
+    cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
+    expected = f"one camera to look from, got {len(cameras)}; choose one"
+    _common.check_usage("--views" if options.view.views else "--camera", len(cameras) == 1, expected)
+    name, camera = next(iter(cameras.items()))
+    selection = select(
+        subject,
+        camera,
+        tolerance=options.tolerance,
+        budget=options.budget,
+        cull=options.outside == "drop",
+        device=CPU,
+    )
+    if isinstance(subject, Bundle) and len(selection):  # only the clusters of the cut are read
         gaussians = Gaussians.concatenate([subject.cluster_gaussians(int(c)) for c in selection.cluster_ids])
     else:
         gaussians = selection.gaussians(device=CPU)
-    told = {"camera": name, "tolerance": _common.finite(selection.tolerance), "clusters": len(selection)}
-    return gaussians, told
+    description = {
+        "camera": name,
+        "tolerance": _common.finite(selection.tolerance),
+        "clusters": len(selection),
+    }
+    return _Part(gaussians, description)

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from v3dg.cli._common import Common, check_range, print_result, table_lines
+from v3dg.cli._common import Column, Common, check_range, print_result, table_lines
 from v3dg.demo import run_demo
 from v3dg.select import DEFAULT_TOLERANCE, rule_of
 
@@ -36,13 +36,23 @@ def run(options: Demo) -> None:
         check_range("--size", side, 16, 4096)
     check_range("--seed", options.seed, 0, (1 << 58) - 1)
     rule_of(options.tolerance, None, 0, "solid_angle", True)
-    names = ("instances", "size", "tolerance", "seed")
-    how: dict[str, Any] = {name: getattr(options, name) for name in names}
-    result = run_demo(options.output, num_gaussians=options.gaussians, progress=not options.quiet, **how)
-    columns = (
-        "drawn = {name}, distance {distance:g}; gaussians = {gaussians:,}; "
-        "select ms = {select_ms:.1f}; draw ms = {draw_ms:.1f}; FLIP = {flip:.4f}; PSNR = {psnr:.2f}"
+    result = run_demo(
+        options.output,
+        num_gaussians=options.gaussians,
+        instances=options.instances,
+        size=options.size,
+        tolerance=options.tolerance,
+        seed=options.seed,
+        progress=not options.quiet,
     )
+    columns = [
+        Column("drawn", "{name}, distance {distance:g}"),
+        Column("gaussians", "{gaussians:,}"),
+        Column("select ms", "{select_ms:.1f}"),
+        Column("draw ms", "{draw_ms:.1f}"),
+        Column("FLIP", "{flip:.4f}"),
+        Column("PSNR", "{psnr:.2f}"),
+    ]
     panels = [
         {"name": name, "distance": column["distance"], **column[name]}
         for column in result["columns"]

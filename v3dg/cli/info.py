@@ -54,10 +54,21 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
     far = outliers(drawable.means)
     boxes = {"box": _box(drawable.means), "box_without_outliers": _box(drawable.means[~far])}
     values = {"longest_scale": drawable.scales.max(axis=1), "opacity": drawable.opacities}
-    spread = {name: np.percentile(of, (5, 50, 95)).tolist() for name, of in values.items() if len(of)}
-    result: dict[str, Any] = {"path": shown(path), "kind": "asset", "gaussians": len(asset)}
-    result |= {"drawable": len(drawable), "not_drawable": findings.counts, "outliers": int(far.sum())}
-    result |= {"sh_degree": asset.sh_degree, "bytes": num_bytes, **boxes, "percentiles_5_50_95": spread}
+    spread = {
+        name: np.percentile(array, (5, 50, 95)).tolist() for name, array in values.items() if len(array)
+    }
+    result: dict[str, Any] = {
+        "path": shown(path),
+        "kind": "asset",
+        "gaussians": len(asset),
+        "drawable": len(drawable),
+        "not_drawable": findings.counts,
+        "outliers": int(far.sum()),
+        "sh_degree": asset.sh_degree,
+        "bytes": num_bytes,
+        **boxes,
+        "percentiles_5_50_95": spread,
+    }
     lines = [f"{shown(path)}: asset, {_common.bytes_text(num_bytes)}"]
     lines += [f"{len(asset):,} gaussians, SH degree {asset.sh_degree}"]
     if findings.counts:
@@ -66,8 +77,9 @@ def _asset_info(path: Path, asset: Gaussians) -> _Description:
         lines.append("means from {} to {}".format(*map(_point, boxes["box"])))
     if far.any():
         lines.append("without outliers from {} to {}".format(*map(_point, boxes["box_without_outliers"])))
-        how = f"{OUTLIER_DISTANCE:g} median distances from the median or farther"
-        lines.append(f"{far.sum():,} outliers, {how}")
+        lines.append(
+            f"{far.sum():,} outliers, {OUTLIER_DISTANCE:g} median distances from the median or farther"
+        )
     for name, (p5, p50, p95) in spread.items():
         name = name.replace("_", " ")
         lines.append(f"{name}: 5 % below {p5:.3g}, half below {p50:.3g}, 95 % below {p95:.3g}")
@@ -85,10 +97,14 @@ def _point(values: list[float]) -> str:
 
 def _bundle_info(bundle: Bundle) -> _Description:
     result = {**bundle.info(), "kind": "bundle"}
-    columns = (
-        "level = {level}; clusters = {clusters:,}; gaussians = {gaussians:,}; size = {size}; "
-        "colour error = {error_color:.4f}; alpha error = {error_alpha:.4f}"
-    )
+    columns = [
+        _common.Column("level", "{level}"),
+        _common.Column("clusters", "{clusters:,}"),
+        _common.Column("gaussians", "{gaussians:,}"),
+        _common.Column("size", "{size}"),
+        _common.Column("colour error", "{error_color:.4f}"),
+        _common.Column("alpha error", "{error_alpha:.4f}"),
+    ]
     levels = [{**level, "size": _common.bytes_text(level["bytes"])} for level in result["levels"]]
     leaves = _leaves(bundle)
     each = f", {result['bytes'] / leaves:.1f} bytes a gaussian of level 0" if leaves else ""
@@ -126,26 +142,39 @@ def _scene_info(path: Path, scene: Scene, cameras: dict[str, Camera]) -> _Descri
         for bundle, count in zip(scene.bundles, counts, strict=True)
     ]
     total = sum(bundle["instances"] * bundle["asset_gaussians"] for bundle in bundles)
-    sizes = [{"name": name, "width": at.width, "height": at.height} for name, at in cameras.items()]
-    result = {"path": str(path), "kind": "scene", "instances": len(scene)}
-    result |= {"gaussians_at_full_detail": total, "bundles": bundles, "cameras": sizes}
-    columns = "bundle = {path:s}; instances = {instances:,}; asset gaussians = {asset_gaussians:,}"
+    sizes = [
+        {"name": name, "width": camera.width, "height": camera.height} for name, camera in cameras.items()
+    ]
+    result = {
+        "path": str(path),
+        "kind": "scene",
+        "instances": len(scene),
+        "gaussians_at_full_detail": total,
+        "bundles": bundles,
+        "cameras": sizes,
+    }
+    columns = [
+        _common.Column("bundle", "{path:s}"),
+        _common.Column("instances", "{instances:,}"),
+        _common.Column("asset gaussians", "{asset_gaussians:,}"),
+    ]
+    camera_columns = [_common.Column("camera", "{name}"), _common.Column("size", "{width} x {height}")]
     lines = [
         f"{path}: scene, {len(scene):,} instances, {total:,} gaussians at full detail",
         "",
         *_common.table_lines(columns, bundles),
     ]
     if sizes:
-        lines += ["", *_common.table_lines("camera = {name}; size = {width} x {height}", sizes[:_MOST_SHOWN])]
+        lines += ["", *_common.table_lines(camera_columns, sizes[:_MOST_SHOWN])]
     if len(sizes) > _MOST_SHOWN:
         lines += [f"and {len(sizes) - _MOST_SHOWN:,} more; --json has all"]
     return result, lines
 
 
-def _settings(config: dict[str, Any], of: str = "") -> Iterator[tuple[str, Any]]:
-    """Names and values of a bundle's config; names of what is nested, but for the build's, say where."""
+def _settings(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Names and values of a bundle's config; names of nested settings, but for the build's, have a prefix."""
     for name, value in config.items():
         if isinstance(value, dict):
             yield from _settings(value, "" if name == "build" else f"{name} ")
         else:
-            yield f"{of}{name}", value
+            yield f"{prefix}{name}", value

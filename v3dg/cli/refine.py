@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -20,7 +20,7 @@ class Refine(CameraFile, _common.OnDevice):
     building it."""
 
     bundle: tyro.conf.Positional[Path]
-    """What `v3dg build` made (.v3dg)."""
+    """Bundle that `v3dg build` made (.v3dg)."""
     output: tyro.conf.Positional[Path]
     """Bundle to write (.v3dg)."""
     steps: Annotated[int, tyro.conf.arg(metavar="N")] = 30_000
@@ -41,9 +41,17 @@ def run(options: Refine) -> None:
     _common.check_output(options.output, options.bundle)
     cameras = list(options.read().values())
     start = time.perf_counter()
-    how: dict[str, Any] = {name: getattr(options, name) for name in ("steps", "drop", "seed", "device")}
-    refined = refine_bundle(Bundle.open(options.bundle), cameras=cameras, progress=not options.quiet, **how)
+    refined = refine_bundle(
+        Bundle.open(options.bundle),
+        cameras=cameras,
+        steps=options.steps,
+        drop=options.drop,
+        seed=options.seed,
+        device=options.device,
+        progress=not options.quiet,
+    )
     refined.write(options.output)
-    result = {"output": str(options.output), "steps": options.steps, "seconds": time.perf_counter() - start}
-    line = f"{options.output}: {options.steps:,} steps, {result['seconds']:.1f} s"
+    seconds = time.perf_counter() - start
+    result = {"output": str(options.output), "steps": options.steps, "seconds": seconds}
+    line = f"{options.output}: {options.steps:,} steps, {seconds:.1f} s"
     _common.print_result(options.json, result, [line])

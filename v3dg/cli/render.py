@@ -9,7 +9,7 @@ import tyro
 from v3dg import _device
 from v3dg._progress import counted
 from v3dg._urls import beside, shown
-from v3dg.cli._common import Cut, OnPool, check_usage, finite, option, print_result, table_lines
+from v3dg.cli._common import Column, Cut, OnPool, check_usage, finite, option, print_result, table_lines
 from v3dg.cli._views import ViewOptions, Views, choose_cameras, choose_up, picture_paths
 from v3dg.false_color import ColorBy
 from v3dg.opening import open_with_cameras
@@ -46,28 +46,42 @@ def run(options: Render) -> None:
     output = check_picture_path(options.output or Path(beside(options.subject).with_suffix(".png").name))
     device = _device.resolve(options.device)
     subject, own_cameras = open_with_cameras(options.subject)
-    is_turntable, notes = options.view.cameras is None and own_cameras is None, list[str]()
+    is_turntable = options.view.cameras is None and own_cameras is None
+    notes: list[str] = []
     if is_turntable:
         options.view.up, notes = choose_up(options.view.up, subject, None, options.subject)
     cameras = choose_cameras(options.view, options.subject, subject, own_cameras)
-    fade = DEFAULT_FADE if options.fade is None and is_turntable and len(cameras) > 1 else options.fade
+    fade = options.fade
+    if fade is None and is_turntable and len(cameras) > 1:
+        fade = DEFAULT_FADE
     pictures: list[dict[str, Any]] = []
     views = list(zip(picture_paths(output, cameras), cameras.items(), strict=True))
     show = len(views) > 1 and not options.quiet
-    # With a fade, pictures follow each other, and the tolerance of a budget goes in steps.
+    # With a fade the pictures are a sequence, in which the tolerance of a budget changes in steps.
     renderer = Renderer(subject, color_by=options.color_by, device=device, memory=options.pool())
-    cut: CutOptions = {"tolerance": options.tolerance, "budget": options.budget}
-    cut |= {"min_level": options.min_level, "fade": fade}
+    cut = CutOptions(
+        tolerance=options.tolerance, budget=options.budget, min_level=options.min_level, fade=fade
+    )
     for path, (name, camera) in counted(views, len(views), "render", show):
         renderer.settle(camera, **cut)
         image = renderer.render(camera, **cut, background=options.background)
         write_picture(path, _device.to_host(image.color))
-        view = {"camera": name, "width": camera.width, "height": camera.height}
-        cost = image.stats._asdict() | {"tolerance": finite(image.stats.tolerance)}
-        pictures.append({"picture": str(path), **view, **cost})
-    columns = (
-        "picture = {picture}; size = {width} x {height}; selected = {gaussians_selected:,}; "
-        "in frustum = {gaussians_in_frustum:,}; select ms = {select_ms:.1f}; draw ms = {draw_ms:.1f}"
-    )
+        picture: dict[str, Any] = {
+            "picture": str(path),
+            "camera": name,
+            "width": camera.width,
+            "height": camera.height,
+            **image.stats._asdict(),
+        }
+        picture["tolerance"] = finite(image.stats.tolerance)
+        pictures.append(picture)
+    columns = [
+        Column("picture", "{picture}"),
+        Column("size", "{width} x {height}"),
+        Column("selected", "{gaussians_selected:,}"),
+        Column("in frustum", "{gaussians_in_frustum:,}"),
+        Column("select ms", "{select_ms:.1f}"),
+        Column("draw ms", "{draw_ms:.1f}"),
+    ]
     result = {"subject": shown(options.subject), "pictures": pictures}
     print_result(options.json, result, [*table_lines(columns, pictures), *notes])

@@ -24,7 +24,7 @@ from v3dg.cli._views import CameraFile, lines_of_up
 from v3dg.opening import open_with_cameras
 from v3dg.upright import ASSUMED, direction_of, up_of
 
-# Between looks for a signal: a wait without an end misses one that comes just before it.
+# Time between checks for a signal: an endless wait would miss one that comes just before it.
 _SECONDS = 0.1
 
 
@@ -52,19 +52,26 @@ def run(options: View) -> None:
     from v3dg.viewer.frame import SceneView
     from v3dg.viewer.server import Site
 
-    usual = DEFAULT_TOLERANCE if options.budget is None else 0.0
-    tolerance = usual if options.tolerance is None else options.tolerance
+    tolerance = options.tolerance
+    if tolerance is None:
+        tolerance = DEFAULT_TOLERANCE if options.budget is None else 0.0
     rule_of(tolerance, options.budget, 0, "solid_angle", True)
     check_usage("--tolerance", math.isfinite(tolerance), f"a number, got {tolerance}")
     subject, cameras = open_with_cameras(options.subject)
     cameras = options.read() or cameras
-    photographs = None if options.cameras is None else _photographs(options.cameras, cameras or {})
+    photographs = None
+    if options.cameras is not None:
+        photographs = _photographs(options.cameras, cameras or {})
     expected = f"a bundle or a scene, got the asset {shown(options.subject)}; build a bundle of it"
     check_usage("--budget", options.budget is None or not isinstance(subject, Gaussians), expected)
-    up, how = (options.up, "") if options.up else up_of(subject, cameras, options.subject)
-    lines = lines_of_up(options.subject, up, how)
+    if options.up:
+        up = options.up
+        reason = ""
+    else:
+        up, reason = up_of(subject, cameras, options.subject)
+    lines = lines_of_up(options.subject, up, reason)
     scene_view = SceneView(subject, device=options.device, memory=options.pool())
-    with contextlib.suppress(ImportError):  # of which the site tells; it takes long
+    with contextlib.suppress(ImportError):  # imported early because it takes long; the site reports errors
         importlib.import_module("v3dg.viewer.tab")
     with _interrupts() as interrupts:
         site = Site(
@@ -77,13 +84,14 @@ def run(options: View) -> None:
             tolerance=tolerance,
             budget=options.budget,
             up=direction_of(up),
-            asks_up=how == ASSUMED,
+            asks_up=reason == ASSUMED,
         )
         try:
             if options.port not in (0, site.port) and not options.quiet:
                 tell(f"port {options.port} is taken, listening at {site.port}")
-            told = {"url": site.url, "subject": shown(options.subject)}
-            print_result(options.json, told, [f"{site.url} shows {told['subject']}; Ctrl-C ends it", *lines])
+            name = shown(options.subject)
+            result = {"url": site.url, "subject": name}
+            print_result(options.json, result, [f"{site.url} shows {name}; Ctrl-C ends it", *lines])
             if not options.no_browser and not site.is_secret and _has_browser():
                 threading.Thread(target=webbrowser.open, args=(site.url,), daemon=True).start()
             while not interrupts:
@@ -94,7 +102,7 @@ def run(options: View) -> None:
 
 
 def _has_browser() -> bool:
-    """Whether a browser would open: over ssh on the wrong machine, and without a display as text."""
+    """Whether to open a browser: not over ssh, on the wrong machine, nor a text browser without a display."""
     if "SSH_CONNECTION" in os.environ:
         return False
     has_display = any(os.environ.get(name) for name in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY"))
@@ -102,31 +110,33 @@ def _has_browser() -> bool:
 
 
 def _photographs(cameras: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The pictures that cameras took, by name: beside their file, or in a folder `images` there or above."""
+    """The photographs of cameras by name, beside the file of the cameras or in a folder `images` near it."""
     folder = cameras if cameras.is_dir() else cameras.parent
-    near = (folder, *folder.resolve().parents[:2])
-    places = [place / part for place in near for part in ("", "images")]
-    found = {}
+    nearby = (folder, *folder.resolve().parents[:2])
+    places = [place / part for place in nearby for part in ("", "images")]
+    photographs = {}
     for name in names:
         # Names may lack the suffix, as in NeRF's synthetic scenes.
         files = (place / (name + suffix) for place in places for suffix in ("", ".png", ".jpg"))
         with contextlib.suppress(StopIteration, OSError, ValueError):
-            found[name] = next(file for file in files if file.is_file())
-    return found
+            photographs[name] = next(file for file in files if file.is_file())
+    return photographs
 
 
 @contextlib.contextmanager
 def _interrupts() -> Iterator[list[int]]:
-    """Numbers of the signals that came, Ctrl-C and SIGTERM: exceptions would leave threads half started.
+    """Collect the numbers of the received signals, Ctrl-C and SIGTERM, in a list.
 
-    After one they do nothing more, for the process ends. A handler may run inside of any lock's code, so it
-    takes none.
+    Exceptions would leave threads half started. After a signal, further ones are ignored, because the process
+    ends. A handler may run while its thread holds any lock, so it must not take one.
     """
-    came: list[int] = []
+    received: list[int] = []
     numbers = (*SIGNALS, signal.SIGTERM)
-    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in numbers}
+    old_handlers = {}
+    for number in numbers:
+        old_handlers[number] = signal.signal(number, lambda number, _: received.append(number))
     try:
-        yield came
+        yield received
     finally:
-        for number, handler in before.items():
-            signal.signal(number, signal.SIG_IGN if came else handler)
+        for number, handler in old_handlers.items():
+            signal.signal(number, signal.SIG_IGN if received else handler)
