@@ -1,8 +1,8 @@
 """The shape of the library's code: counts over the syntax tree of v3dg/ that may only fall.
 
 A limit on the total of lines can be met by packing, which makes code harder to read. Each of these counts
-falls only when code is unpacked. `LIMITS` holds what each package counts today: a count above its limit fails,
-and so does one that is well below, so that the limit is lowered.
+falls only when code is unpacked. `LIMITS` holds what each package counts today: a count above its limit
+fails, and so does one that is well below, so that the limit is lowered.
 
 `python tests/test_shape.py` prints the counts of all packages, and with files as arguments each place.
 """
@@ -234,7 +234,7 @@ LIMITS = {
     "cli": (18, 65, 64, 34, 0, 3, 0),
     "compat": (2, 11, 6, 43, 2, 0, 1),
     "export": (25, 9, 20, 22, 1, 1, 0),
-    "formats": (41, 33, 33, 54, 0, 3, 0),
+    "formats": (8, 9, 4, 15, 0, 1, 0),
     "scene": (9, 17, 23, 33, 1, 1, 0),
     "viewer": (34, 31, 29, 30, 0, 1, 0),
 }
