@@ -942,9 +942,12 @@ def test_a_ball_that_barely_sticks_out_is_refused():
 
 def test_config_that_no_reader_would_accept_is_refused(saved):
     bundle, path = saved
-    large = Bundle(bundle.clusters, bundle.groups, bundle.gaussians, {"note": "x" * (1 << 20)})
-    with pytest.raises(ValueError, match="config: expected at most 1048576 bytes of JSON"):
+    # The config alone is within the limit, the header is not.
+    large = Bundle(bundle.clusters, bundle.groups, bundle.gaussians, {"note": "x" * ((1 << 20) - 100)})
+    message = r"config: expected at most 1048576 bytes of JSON in the header that contains it, got (\d+); "
+    with pytest.raises(ValueError, match=message) as error:
         large.write(path)
+    assert int(re.search(message, str(error.value))[1]) > 1048576
     assert_same_gaussians(Bundle.open(path).gaussians, bundle.gaussians)
 
 

@@ -344,11 +344,11 @@ class Shutter(Enum):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"camera_model": "fisheye"}, "camera_model: expected no such thing, got 'fisheye'; undistort"),
-        ({"radial_coeffs": torch.zeros(1, 6)}, "radial_coeffs: expected no such thing"),
-        ({"rolling_shutter": Shutter.TOP_TO_BOTTOM}, "rolling_shutter: expected no such thing"),
-        ({"with_ut": True}, "with_ut: expected no such thing, got True"),
-        ({"with_eval3d": True}, "with_eval3d: expected no such thing, got True"),
+        ({"camera_model": "fisheye"}, "camera_model: 'fisheye' is not supported; undistort"),
+        ({"radial_coeffs": torch.zeros(1, 6)}, "radial_coeffs: .* is not supported"),
+        ({"rolling_shutter": Shutter.TOP_TO_BOTTOM}, "rolling_shutter: .* is not supported"),
+        ({"with_ut": True}, "with_ut: True is not supported"),
+        ({"with_eval3d": True}, "with_eval3d: True is not supported"),
         ({"covars": torch.zeros(25, 3, 3)}, "covars: .* pass quats and scales"),
         ({"sparse_grad": True}, "sparse_grad: .* gradients are dense"),
         ({"distributed": True}, "distributed: .* train on one device"),

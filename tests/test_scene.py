@@ -180,5 +180,7 @@ def test_cut_of_instances_that_are_gone_is_refused():
         lambda: cut.filters_px2,
         lambda: cut.antialiased,
     ):
-        with pytest.raises(ValueError, match="cut: expected instances of the scene, got some of before"):
+        with pytest.raises(
+            ValueError, match="cut: instances were removed from the scene after this selection"
+        ):
             use()

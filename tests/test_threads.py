@@ -199,7 +199,7 @@ def test_frames_of_a_scene_that_grows_and_shrinks_are_old_or_new(device, hasty):
             scene.remove([40, 41])
 
     expected = {frame(scene, device), frame_of_grown(scene, other, device)}
-    as_cut, refused = drawn_as_cut(), "cut: expected instances of the scene, got some"
+    as_cut, refused = drawn_as_cut(), "cut: instances were removed from the scene"
     found = while_another_changes(changed, lambda: (frame(scene, device), drawn_as_cut()), 20)
     assert {drawn for drawn, _ in found} <= expected
     assert all(cut == as_cut or cut.startswith(refused) for _, cut in found)

@@ -20,8 +20,8 @@ Axis: TypeAlias = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: tuple[Axis, ...] = get_args(Axis)
 
 DEFAULT_FOV_X = 0.785398163397448  # 45 degrees
-_MOST_CAMERAS = 1_000_000  # of a turntable; more is a slip that would take minutes
-# How far the rows of a rotation may be from orthonormal: matrices are often stored as float32 text.
+_MAX_TURNTABLE_CAMERAS = 1_000_000  # more would take minutes and is most likely a typo
+# Largest deviation of the rows of a rotation from orthonormal: matrices are often stored as float32 text.
 ROTATION_TOLERANCE = 1e-4
 
 
@@ -47,7 +47,7 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
-    # Focal lengths and principal point in px, as K has them.
+    # Focal lengths and principal point in px, from K.
     fx: float = field(init=False)
     fy: float = field(init=False)
     cx: float = field(init=False)
@@ -59,15 +59,24 @@ class Camera:
         if viewmat[3].tolist() != [0, 0, 0, 1]:
             refuse("viewmat", f"the last row 0 0 0 1, got {_text(viewmat[3])}")
         K = vector(self.K, "K", (3, 3))
-        # Numbers of Python's: of nine or sixteen, which every frame of a flight has anew, NumPy takes longer.
-        (fx, skew, cx), (turn, fy, cy), last = K.tolist()
+        # Python numbers, because NumPy is slower for 9 or 16 of them, and every frame may have a new camera.
+        (fx, skew, cx), (skew_y, fy, cy), last_row = K.tolist()
         if not (fx > 0 and fy > 0):
             refuse("K", f"positive focal lengths, got {fx:g} and {fy:g}")
-        is_plain = skew == 0 == turn and last == [0, 0, 1]
+        is_plain = skew == 0 == skew_y and last_row == [0, 0, 1]
         check("K", is_plain, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got a matrix with skew or scale")
-        size = {"width": _side(self.width, "width"), "height": _side(self.height, "height")}
-        near = positive(self.near, "near")
-        self.__dict__.update(size, viewmat=viewmat, K=K, near=near, fx=fx, fy=fy, cx=cx, cy=cy)
+        # One update of the dict is faster than object.__setattr__ for each field of a frozen class.
+        self.__dict__.update(
+            viewmat=viewmat,
+            K=K,
+            width=_side(self.width, "width"),
+            height=_side(self.height, "height"),
+            near=positive(self.near, "near"),
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+        )
 
     @classmethod
     def look_at(
@@ -92,17 +101,19 @@ class Camera:
         Raises:
             ValueError: The target is at the eye, or ``up`` lies along the view direction.
         """
-        position, goal, up_vector = vector(eye, "eye"), vector(target, "target"), vector(up, "up")
+        position = vector(eye, "eye")
+        goal = vector(target, "target")
+        up_vector = vector(up, "up")
         with np.errstate(over="ignore"):
             distance = np.linalg.norm(goal - position)
         check("target", distance > 0, f"a point away from the eye, got {_text(goal)} for both")
         check("eye, target", np.isfinite(distance), f"a distance that a double can hold, got {_text(goal)}")
         forward = (goal - position) / distance
-        upwards = up_vector / (np.abs(up_vector).max() or 1.0)  # so that squares neither overflow nor vanish
+        upwards = up_vector / (np.abs(up_vector).max() or 1.0)  # squares neither overflow nor underflow
         right = np.cross(forward, upwards)
         length = np.linalg.norm(right)
-        is_aside = length > 1e-9 * np.linalg.norm(upwards)
-        check("up", is_aside, f"a direction that is not along the view, got {_text(up_vector)}")
+        is_independent = length > 1e-9 * np.linalg.norm(upwards)
+        check("up", is_independent, f"a direction that is not along the view, got {_text(up_vector)}")
         right /= length
         rotation = np.stack([right, np.cross(forward, right), forward])
         return cls(rigid(rotation, position), intrinsics(fov_x, None, width, height), width, height, near)
@@ -121,7 +132,7 @@ class Camera:
         """Make a camera from a camera-to-world matrix in Blender's convention: x right, y up, z backward.
 
         Args:
-            transform_matrix: (4, 4) camera to world; the nearest rotation is taken.
+            transform_matrix: (4, 4) camera to world; it is replaced by the nearest rotation.
             fov_x: Horizontal field of view in radians.
             fov_y: Vertical field of view in radians; square pixels if None.
         """
@@ -135,11 +146,12 @@ class Camera:
 
     @cached_property
     def core(self) -> _core.Camera:
-        """The same camera as the compiled operations take it."""
-        size = {"width": self.width, "height": self.height}
-        return _core.Camera(viewmat=self.viewmat, K=self.K, **size, near=self.near)
+        """The camera for the compiled operations."""
+        return _core.Camera(
+            viewmat=self.viewmat, K=self.K, width=self.width, height=self.height, near=self.near
+        )
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
         return Camera, (self.viewmat, self.K, self.width, self.height, self.near)
 
     def scaled(self, factor: int) -> "Camera":
@@ -155,26 +167,28 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class StereoCamera:
-    """Two cameras that look the same way, as the eyes in a headset do: one cut serves both.
+    """Two cameras that look the same way, as the eyes in a headset do: they share one cut.
 
     Raises:
-        ValueError: The cameras are not turned alike.
+        ValueError: The cameras have different rotations.
     """
 
     left: Camera
     right: Camera
 
     def __post_init__(self) -> None:
-        rotations = self.left.viewmat[:3, :3], self.right.viewmat[:3, :3]
+        has_same_rotation = np.array_equal(self.left.viewmat[:3, :3], self.right.viewmat[:3, :3])
         expected = "a camera of the same rotation as the left one, got another; draw such cameras one by one"
-        check("right", np.array_equal(*rotations), expected)
+        check("right", has_same_rotation, expected)
 
     @classmethod
     def of(cls, camera: Camera, eye_distance: float) -> "StereoCamera":
-        """Eyes to the left and the right of a camera, so far apart in world units."""
-        aside = np.zeros((4, 4))
-        aside[0, 3] = 0.5 * positive(eye_distance, "eye_distance")
-        return cls(*(replace(camera, viewmat=camera.viewmat + sign * aside) for sign in (1, -1)))
+        """Eyes to the left and the right of a camera, at ``eye_distance`` world units from each other."""
+        shift = np.zeros((4, 4))
+        shift[0, 3] = 0.5 * positive(eye_distance, "eye_distance")
+        left = replace(camera, viewmat=camera.viewmat + shift)
+        right = replace(camera, viewmat=camera.viewmat - shift)
+        return cls(left, right)
 
     @property
     def eyes(self) -> tuple[Camera, Camera]:
@@ -182,27 +196,30 @@ class StereoCamera:
 
     @cached_property
     def core(self) -> _core.Eyes:
-        """The same cameras as the compiled operations take them."""
+        """The cameras for the compiled operations."""
         return _core.Eyes(self.left.core, self.right.core)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
         return StereoCamera, self.eyes
 
 
-def check_camera(camera: Any) -> None:
+def check_camera(camera: object) -> None:
     """Raise TypeError for what is neither a camera nor a stereo camera."""
     if not isinstance(camera, StereoCamera):
         check_type("camera", camera, Camera, "a Camera")
 
 
 def for_each(camera: Any, make: Callable[[Any], T]) -> T | list[T]:
-    """What is made for one camera, or a list of it for each of several."""
-    return [make(view) for view in camera] if hasattr(camera, "__iter__") else make(camera)
+    """The result of ``make`` for one camera, or a list of its results for several."""
+    if hasattr(camera, "__iter__"):
+        return [make(view) for view in camera]
+    return make(camera)
 
 
-def check_cameras(cameras: Any) -> None:
-    """Raise TypeError for what is not a mapping of names to cameras."""
+def check_cameras(cameras: object) -> None:
+    """Raise TypeError unless ``cameras`` is a mapping from names to cameras."""
     check_type("cameras", cameras, Mapping, "cameras by their names, as {'front': camera}")
+    assert isinstance(cameras, Mapping)
     for name, camera in cameras.items():
         check_type(f"cameras[{name!r}]", camera, Camera, "a Camera")
 
@@ -228,17 +245,19 @@ def turntable(
         up: (3,) axis of the turntable.
         fov_x: Horizontal field of view in radians.
     """
-    middle, axis = vector(center, "center"), vector(up, "up")
-    radius, n = positive(radius, "radius"), whole(n, "n", "0 cameras or more", 0, _MOST_CAMERAS)
+    middle = vector(center, "center")
+    axis = vector(up, "up")
+    radius = positive(radius, "radius")
+    n = whole(n, "n", "0 cameras or more", 0, _MAX_TURNTABLE_CAMERAS)
     if not max(1e-150, 1e-12 * np.abs(middle).max()) < radius < 1e150:
         expected = "a circle that double precision resolves"
         raise ValueError(f"center, radius: expected {expected}, got {radius} around {_text(middle)}")
     elevation = real(elevation, "elevation")
     check("elevation", abs(elevation) < math.pi / 2, f"an angle between -pi/2 and pi/2, got {elevation}")
     check("up", axis.any(), f"a direction, got {_text(axis)}")
-    axis /= np.abs(axis).max()  # so that squares neither overflow nor vanish
+    axis /= np.abs(axis).max()  # squares neither overflow nor underflow
     axis /= np.linalg.norm(axis)
-    # The world's axis least along `up`, made perpendicular to it.
+    # The world's axis with the largest angle to `up`, made perpendicular to it.
     start = np.eye(3)[np.argmin(np.abs(axis))]
     start = start - axis * (axis @ start)
     start /= np.linalg.norm(start)
@@ -253,22 +272,28 @@ def turntable(
 
 
 def rigid(rotation: Floats, eye: Floats) -> Floats:
-    """(4, 4) world to camera of an eye, and the rotation from the world to it."""
+    """(4, 4) world to camera, from the rotation from world to camera and the position of the eye."""
     viewmat = np.eye(4)
     viewmat[:3, :3] = rotation
-    with np.errstate(over="ignore", invalid="ignore"):  # the camera refuses what comes of it
+    with np.errstate(over="ignore", invalid="ignore"):  # Camera refuses values that are not finite
         viewmat[:3, 3] = -rotation @ eye
     return viewmat
 
 
 def is_rotation(matrix: Floats) -> bool:
-    """Whether a (3, 3) matrix is a rotation, up to what float32 text loses."""
+    """Whether a (3, 3) matrix is a rotation, up to the rounding of float32 text."""
+    # Written out in Python numbers: every frame of a flight checks a new camera.
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
-    squares = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
-    products = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
-    off: float = max(map(abs, (*(square - 1 for square in squares), *products)))
-    volume: float = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
-    return off <= ROTATION_TOLERANCE and volume > 0
+    deviation: float = max(
+        abs(a * a + b * b + c * c - 1),
+        abs(d * d + e * e + f * f - 1),
+        abs(g * g + h * h + i * i - 1),
+        abs(a * d + b * e + c * f),
+        abs(a * g + b * h + c * i),
+        abs(d * g + e * h + f * i),
+    )
+    determinant: float = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+    return deviation <= ROTATION_TOLERANCE and determinant > 0
 
 
 def _check_rotation(matrix: Floats, name: str, advice: str = "") -> None:
@@ -277,7 +302,7 @@ def _check_rotation(matrix: Floats, name: str, advice: str = "") -> None:
 
 
 def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
-    """(4, 4) world to camera from camera to world in Blender's convention; the nearest rotation is taken."""
+    """(4, 4) world to camera from camera to world in Blender's convention, with the nearest rotation."""
     matrix = vector(transform_matrix, "transform_matrix", (4, 4))
     axes = matrix[:3, :3] * [1.0, -1.0, -1.0]
     _check_rotation(axes, "transform_matrix")
@@ -286,23 +311,29 @@ def viewmat_from_blender(transform_matrix: MatrixLike) -> Floats:
 
 
 def intrinsics(fov_x: float, fov_y: float | None, width: int, height: int) -> Floats:
-    """(3, 3) K of fields of view in radians, its principal point in the middle; None: square pixels."""
-    width, height = _side(width, "width"), _side(height, "height")
+    """(3, 3) K from fields of view in radians, with a central principal point; fov_y None: square pixels."""
+    width = _side(width, "width")
+    height = _side(height, "height")
     fx = _focal(fov_x, "fov_x", width)
-    fy = fx if fov_y is None else _focal(fov_y, "fov_y", height)
+    fy = fx
+    if fov_y is not None:
+        fy = _focal(fov_y, "fov_y", height)
     return np.array([[fx, 0.0, 0.5 * width], [0.0, fy, 0.5 * height], [0.0, 0.0, 1.0]])
 
 
 def _focal(fov: float, name: str, side: int) -> float:
     """Focal length, px, of a field of view in radians across a side in px."""
     fov = real(fov, name, "radians between 0 and pi")
-    tangent = math.tan(0.5 * fov) if 0 < fov < math.pi else 0.0
-    focal = 0.5 * side / tangent if tangent > 0 else math.inf
+    focal = math.inf
+    if 0 < fov < math.pi:
+        tangent = math.tan(0.5 * fov)
+        if tangent > 0:
+            focal = 0.5 * side / tangent
     check(name, focal < math.inf, f"radians between 0 and pi, got {fov}")
     return focal
 
 
-def _side(value: Any, name: str) -> int:
+def _side(value: int, name: str) -> int:
     return whole(value, name, "a positive whole number", 1)
 
 

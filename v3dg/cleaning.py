@@ -1,4 +1,4 @@
-"""What is wrong with an asset: gaussians that cannot be drawn, and such as lie far from all others."""
+"""Faults of an asset: gaussians that cannot be drawn, and gaussians far away from all others."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ from v3dg import _core
 from v3dg.gaussians import Gaussians
 
 LARGEST = _core.most_length
-"""Of a coordinate or a scale, in world units: squares of more are no float32 numbers."""
+"""Largest coordinate or scale, in world units: squares of larger ones overflow float32."""
 SMALLEST_OPACITY = float(np.float32(_core.min_alpha))
-"""A gaussian is drawn where its alpha is this or more, so one whose opacity is below is never drawn."""
+"""Pixels skip contributions with a smaller alpha, so a gaussian with a smaller opacity is never drawn."""
 OUTLIER_DISTANCE = 20.0
-"""From the median of the positions, in median distances; sky and floaters lie there, and slips."""
+"""Distance from the median position, in median distances, beyond which lie sky, floaters and mistakes."""
 
 # Kinds of gaussians that cannot be drawn, in the order of the core's bits.
 _TEXT = {
@@ -30,7 +30,7 @@ _TEXT = {
     "transparent": "with an opacity below 1/255, which no pixel shows",
 }
 KINDS = tuple(_TEXT)
-_WRONG = (1 << KINDS.index("transparent")) - 1  # all that stand before it
+_WRONG = (1 << KINDS.index("transparent")) - 1  # the bits of all kinds before it
 
 
 class AssetWarning(UserWarning):
@@ -75,11 +75,14 @@ def describe(counts: Mapping[str, int]) -> str:
 
 def examine(asset: Gaussians) -> Findings:
     """Find the gaussians that cannot be drawn."""
-    found = _core.examine(asset.numpy().rows)
-    bad = found[found != 0]
-    counts = {kind: int((bad >> bit & 1).sum()) for bit, kind in enumerate(_TEXT)}
-    num_wrong = int((bad & _WRONG != 0).sum())
-    return Findings(found == 0, {kind: count for kind, count in counts.items() if count}, num_wrong)
+    faults = _core.examine(asset.numpy().rows)
+    nonzero = faults[faults != 0]
+    counts = {}
+    for bit, kind in enumerate(KINDS):
+        count = int((nonzero >> bit & 1).sum())
+        if count:
+            counts[kind] = count
+    return Findings(drawable=faults == 0, counts=counts, num_wrong=int((nonzero & _WRONG != 0).sum()))
 
 
 def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
@@ -92,9 +95,9 @@ def outliers(means: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
 
 
 def ball_of_most(points: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.floating[Any]], float]:
-    """Centre (3,) and radius, above 0, of a ball around nearly all of N > 0 points (N, 3): what to look at.
+    """Centre (3,) and radius, above 0, of a ball around nearly all of N > 0 points (N, 3).
 
-    Trained assets have a few gaussians far away from all others.
+    It is the part to look at: trained assets have a few gaussians far away from all others.
     """
     low, high = np.percentile(points, (1, 99), axis=0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)

@@ -11,13 +11,15 @@ from v3dg.bundle import Bundle
 ColorBy: TypeAlias = Literal["appearance", "level", "cluster", "residency"]
 
 
-def palette_of(bundle: Bundle, by: ColorBy) -> npt.NDArray[np.float32] | None:
-    """Constant SH coefficients (C, 3) that clusters are drawn with; None for what they appear as."""
-    if by == "appearance":
+def palette_of(bundle: Bundle, color_by: ColorBy) -> npt.NDArray[np.float32] | None:
+    """Constant SH coefficients (C, 3) that clusters are drawn with; None for their own colours."""
+    if color_by == "appearance":
         return None
     level = bundle.clusters.level
-    if by == "level":
+    if color_by == "level":
         colors = _core.level_colors(bundle.num_levels)[level]
-    else:  # or of what is there, which is all
-        colors = _core.cluster_colors(len(level)) if by == "cluster" else _core.missing_colors(0 * level)
+    elif color_by == "cluster":
+        colors = _core.cluster_colors(len(level))
+    else:  # nothing is missing from a bundle whose pages are all resident
+        colors = _core.missing_colors(np.zeros_like(level))
     return np.ascontiguousarray((colors - 0.5) / _core.sh_base0, np.float32)

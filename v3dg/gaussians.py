@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from v3dg import _core
 from v3dg._numbers import check, check_type, positive, vector
+
+if TYPE_CHECKING:
+    import torch
 
 Array: TypeAlias = Any  # numpy.ndarray or torch.Tensor; a union would make every use of a field a type error
 
@@ -19,7 +23,7 @@ _NUM_SH = {1: 0, 4: 1, 9: 2, 16: 3}  # coefficients a channel -> degree
 
 
 def _is_tensor(value: object) -> bool:
-    """Whether `value` is a torch tensor, found out without importing torch."""
+    """Whether `value` is a torch tensor; does not import torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.Tensor)
 
@@ -27,7 +31,9 @@ def _is_tensor(value: object) -> bool:
 def _kind(value: object) -> str:
     if isinstance(value, np.ndarray):
         return "a NumPy array"
-    return "a torch tensor" if _is_tensor(value) else type(value).__name__
+    if _is_tensor(value):
+        return "a torch tensor"
+    return type(value).__name__
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,22 +66,24 @@ class Gaussians:
     def __post_init__(self) -> None:
         for name, array in vars(self).items():
             _check_kind(name, array, self.means)
-        got = tuple(self.means.shape)
-        check("means", got[1:] == (3,), f"shape (N, 3), got {got}")
-        num = got[0]
-        for name, shape in (("quats", (num, 4)), ("scales", (num, 3)), ("opacities", (num,))):
-            got = tuple(getattr(self, name).shape)
-            check(name, got == shape, f"shape {shape} to go with means {(num, 3)}, got {got}")
-        got = tuple(self.sh.shape)
-        fits = any(got == (num, count, 3) for count in _NUM_SH)
-        check("sh", fits, f"shape ({num}, K, 3) with K 1, 4, 9 or 16, got {got}")
+        shape = tuple(self.means.shape)
+        check("means", shape[1:] == (3,), f"shape (N, 3), got {shape}")
+        num = shape[0]
+        for name, expected in (("quats", (num, 4)), ("scales", (num, 3)), ("opacities", (num,))):
+            shape = tuple(getattr(self, name).shape)
+            check(name, shape == expected, f"shape {expected} to go with means {(num, 3)}, got {shape}")
+        shape = tuple(self.sh.shape)
+        fits = any(shape == (num, count, 3) for count in _NUM_SH)
+        check("sh", fits, f"shape ({num}, K, 3) with K 1, 4, 9 or 16, got {shape}")
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
     def __repr__(self) -> str:
-        where = f"torch {self.means.device}" if _is_tensor(self.means) else "numpy"
-        return f"Gaussians({len(self)}, sh_degree={self.sh_degree}, {where})"
+        kind = "numpy"
+        if _is_tensor(self.means):
+            kind = f"torch {self.means.device}"
+        return f"Gaussians({len(self)}, sh_degree={self.sh_degree}, {kind})"
 
     @property
     def sh_degree(self) -> int:
@@ -84,16 +92,16 @@ class Gaussians:
 
     @property
     def rows(self) -> _core.Rows:
-        """The arrays as the compiled operations take them, without gradients; they share memory.
+        """The arrays for the compiled operations, without gradients; they share memory.
 
-        Tensors on a CUDA device that do not begin where it can be read in words of 16 bytes are copied.
+        Tensors on a CUDA device that are not aligned to 16 bytes are copied.
         """
         if not _is_tensor(self.means):
             return _core.Rows(*vars(self).values())
         tensors = [tensor.detach() for tensor in vars(self).values()]
         if not self.means.is_cuda:
             return _core.Rows(*(tensor.numpy() for tensor in tensors))
-        return _core.Rows(*(tensor if tensor.data_ptr() % 16 == 0 else tensor.clone() for tensor in tensors))
+        return _core.Rows(*map(_aligned, tensors))
 
     def subset(self, index: slice | Sequence[int] | Array) -> Gaussians:
         """Take the gaussians that a slice, an array of M indices or a mask of N booleans names, in its order.
@@ -111,10 +119,12 @@ class Gaussians:
         else:
             index = _checked_index(index)
         if not _is_tensor(self.means):
-            rows: Any = cast(Any, index).cpu().numpy() if _is_tensor(index) else index
+            rows: Array = index
+            if _is_tensor(rows):
+                rows = rows.cpu().numpy()
             if isinstance(rows, slice) or rows.dtype == bool:
                 return self._map(lambda array: np.ascontiguousarray(array[rows]))
-            return self._map(lambda array: array.take(rows, axis=0))  # unlike [rows], lets threads run
+            return self._map(lambda array: array.take(rows, axis=0))  # unlike [rows], releases the GIL
         if not isinstance(index, slice):
             import torch
 
@@ -124,11 +134,14 @@ class Gaussians:
         return self._map(lambda tensor: tensor[index].contiguous())
 
     def transform(
-        self, quaternion: Any = (1.0, 0.0, 0.0, 0.0), position: Any = (0.0, 0.0, 0.0), scale: float = 1.0
+        self,
+        quaternion: Array | npt.ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        position: Array | npt.ArrayLike = (0.0, 0.0, 0.0),
+        scale: float = 1.0,
     ) -> Gaussians:
-        """Return the gaussians in another frame: p goes to scale * rotation p + position, colours turn along.
+        """Return the gaussians in another frame: p goes to scale * rotation p + position; colours rotate.
 
-        They are of the same kind and on the same device, without gradients.
+        The result is of the same kind and on the same device, without gradients.
 
         Args:
             quaternion: (4,) w x y z of any length but zero.
@@ -138,13 +151,15 @@ class Gaussians:
         Raises:
             ValueError: A shape or a value is not as above.
         """
-        turn = vector(quaternion, "quaternion", (4,))
-        check("quaternion", turn.any(), "a rotation, got a quaternion of zeros")
-        turn /= np.abs(turn).max()  # so that squares neither overflow nor vanish
-        turn /= np.linalg.norm(turn)
-        where = vector(position, "position"), positive(scale, "scale")
-        moved = Gaussians(*_core.transform(self.rows, turn, *where))
-        return moved.torch() if _is_tensor(self.means) else moved
+        rotation = vector(quaternion, "quaternion", (4,))
+        check("quaternion", rotation.any(), "a rotation, got a quaternion of zeros")
+        rotation /= np.abs(rotation).max()  # squares neither overflow nor underflow
+        rotation /= np.linalg.norm(rotation)
+        translation = vector(position, "position")
+        moved = Gaussians(*_core.transform(self.rows, rotation, translation, positive(scale, "scale")))
+        if _is_tensor(self.means):
+            return moved.torch()
+        return moved
 
     @staticmethod
     def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
@@ -159,14 +174,15 @@ class Gaussians:
         for i, part in enumerate(parts):
             check_type(f"parts[{i}]", part, Gaussians, "Gaussians")
             _check_kind(f"parts[{i}].means", part.means, parts[0].means)
-            degree, first = part.sh_degree, parts[0].sh_degree
-            check(f"parts[{i}]", degree == first, f"SH degree {first} like parts[0], got {degree}")
-        join: Any = np.concatenate
+            expected = parts[0].sh_degree
+            is_right = part.sh_degree == expected
+            check(f"parts[{i}]", is_right, f"SH degree {expected} like parts[0], got {part.sh_degree}")
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
         if _is_tensor(parts[0].means):
             import torch
 
-            join = torch.cat
-        return Gaussians(*map(join, zip(*(vars(part).values() for part in parts), strict=True)))
+            return Gaussians(*map(torch.cat, columns))
+        return Gaussians(*map(np.concatenate, columns))
 
     def numpy(self) -> Gaussians:
         """Return the same gaussians as NumPy arrays, without gradients; copied only from another device."""
@@ -174,8 +190,8 @@ class Gaussians:
             return self
         return self._map(lambda tensor: tensor.detach().cpu().numpy())
 
-    def torch(self, device: Any = None) -> Gaussians:
-        """Return the same gaussians as torch tensors on `device` (None: where they are, NumPy's on the CPU).
+    def torch(self, device: str | int | torch.device | None = None) -> Gaussians:
+        """Return the same gaussians as torch tensors on `device`; None: on theirs, NumPy arrays on the CPU.
 
         Copied only when they move or when a NumPy array is read-only; gradients flow through a move.
 
@@ -188,84 +204,114 @@ class Gaussians:
         try:
             torch.empty(0, device=device)
         except (AssertionError, RuntimeError, TypeError) as error:
-            kind = RuntimeError if isinstance(error, AssertionError) else ValueError
             reason = str(error).partition("\n")[0][:100]
-            raise kind(f"device: expected one that torch can use, got {device!r} ({reason})") from None
+            text = f"device: expected one that torch can use, got {device!r} ({reason})"
+            if isinstance(error, AssertionError):
+                raise RuntimeError(text) from None
+            raise ValueError(text) from None
 
-        def tensor(array: Any) -> Any:
+        def tensor(array: Array) -> Array:
             if isinstance(array, np.ndarray):
-                array = torch.from_numpy(array if array.flags.writeable else array.copy())
-            return array if device is None else array.to(device)
+                if not array.flags.writeable:
+                    array = array.copy()
+                array = torch.from_numpy(array)
+            if device is None:
+                return array
+            return array.to(device)
 
         return self._map(tensor)
 
-    def _map(self, function: Any) -> Gaussians:
+    def _map(self, function: Callable[[Array], Array]) -> Gaussians:
         return Gaussians(*map(function, vars(self).values()))
 
 
+def _aligned(tensor: Array) -> Array:
+    """The tensor, or a copy if it is not aligned to 16 bytes."""
+    if tensor.data_ptr() % 16 == 0:
+        return tensor
+    return tensor.clone()
+
+
 def shapes_of(count: int, sh_degree: int) -> list[tuple[int, ...]]:
-    """Of the arrays of so many gaussians, in order."""
+    """Shapes of the arrays of ``count`` gaussians, in the order of the fields."""
     return [(count, 3), (count, 4), (count, 3), (count,), (count, (sh_degree + 1) ** 2, 3)]
 
 
 def empty(count: int, sh_degree: int) -> Gaussians:
-    """Gaussians on the host with any values, to be filled."""
+    """Uninitialised gaussians on the host."""
     return Gaussians(*(np.empty(shape, np.float32) for shape in shapes_of(count, sh_degree)))
 
 
 def gaussian_bytes(sh_degree: int) -> int:
-    """Of one gaussian in memory."""
+    """Size of one gaussian in memory."""
     return 4 * sum(map(math.prod, shapes_of(1, sh_degree)))
 
 
-def put(part: Gaussians, out: Gaussians, at: int) -> None:
-    """Put gaussians on the host into others of the same SH degree or a higher one, from row `at` on."""
+def put(part: Gaussians, out: Gaussians, row: int) -> None:
+    """Copy gaussians on the host into others of the same SH degree or a higher one, from ``row`` on."""
     for name, values in vars(part).items():
-        target = getattr(out, name)[at : at + len(part)]
+        target = getattr(out, name)[row : row + len(part)]
         if name == "sh":
             target[:, values.shape[1] :] = 0
             target = target[:, : values.shape[1]]
         target[:] = values
 
 
-def _check_kind(name: str, array: Any, like: Any) -> None:
-    """Raise unless `array` is contiguous, float32 (tensors: or float64), of the kind and device of `like`."""
+def _dtype_name(array: Array) -> str:
+    return str(array.dtype).removeprefix("torch.")
+
+
+def _check_kind(name: str, array: Array, first: Array) -> None:
+    """Raise unless `array` is contiguous, float32 (tensors: or float64), of kind and device of `first`."""
     if not isinstance(array, np.ndarray) and not _is_tensor(array):
         raise TypeError(f"{name}: expected a NumPy array or a torch tensor, got {_kind(array)}")
-    if _is_tensor(array) != _is_tensor(like):
-        raise TypeError(f"{name}: expected {_kind(like)} like the others, got {_kind(array)}")
-    dtype, first = (str(a.dtype).removeprefix("torch.") for a in (array, like))
-    wanted = "float64" if _is_tensor(array) and first == "float64" else "float32"
-    check(name, dtype == wanted, f"dtype {wanted}, got {dtype}; convert it first")
+    if _is_tensor(array) != _is_tensor(first):
+        raise TypeError(f"{name}: expected {_kind(first)} like the others, got {_kind(array)}")
+    expected_dtype = "float32"
+    if _is_tensor(array) and _dtype_name(first) == "float64":
+        expected_dtype = "float64"
+    dtype = _dtype_name(array)
+    check(name, dtype == expected_dtype, f"dtype {expected_dtype}, got {dtype}; convert it first")
     if _is_tensor(array):
-        check(name, array.device == like.device, f"device {like.device} like the others, got {array.device}")
+        is_there = array.device == first.device
+        check(name, is_there, f"device {first.device} like the others, got {array.device}")
         check(name, array.is_contiguous(), "a contiguous tensor, got a strided one; call .contiguous()")
     else:
         expected = "a C-contiguous array, got a strided one; call numpy.ascontiguousarray"
         check(name, array.flags.c_contiguous, expected)
 
 
-def _checked_index(index: Any) -> Array:
-    """A mask or int64 indices: a tensor where it is one, else a NumPy array."""
-    array: Any = index.detach() if _is_tensor(index) else np.asarray(index)
+def _checked_index(index: Array) -> Array:
+    """A mask or int64 indices; a tensor if ``index`` is one, otherwise a NumPy array."""
+    array: Array
+    if _is_tensor(index):
+        array = index.detach()
+    else:
+        array = np.asarray(index)
     if array.ndim == 1 and len(array) == 0 and "float" in str(array.dtype):
-        array = np.zeros(0, np.int64)  # an empty list says nothing about its kind
-    dtype = str(array.dtype).removeprefix("torch.")
-    if array.ndim == 0 or not dtype.startswith(("int", "uint", "bool")):
-        more = f" of dtype {dtype}" if array.ndim else "; for one gaussian use a slice of length 1"
-        raise TypeError(f"index: expected a slice, integers or booleans, got {_kind(index)}{more}")
+        array = np.zeros(0, np.int64)  # an empty list has no dtype
+    dtype = _dtype_name(array)
+    expected = "index: expected a slice, integers or booleans"
+    if array.ndim == 0:
+        raise TypeError(f"{expected}, got {_kind(index)}; for one gaussian use a slice of length 1")
+    if not dtype.startswith(("int", "uint", "bool")):
+        raise TypeError(f"{expected}, got {_kind(index)} of dtype {dtype}")
     is_meta = _is_tensor(array) and array.is_meta
     check("index", not is_meta, "a tensor with data, got one on the device meta")
     check("index", array.ndim == 1, f"one dimension, got shape {tuple(array.shape)}")
     if _is_tensor(array):
-        return array if dtype == "bool" else array.long()
-    return np.ascontiguousarray(array, bool if dtype == "bool" else np.int64)
+        if dtype == "bool":
+            return array
+        return array.long()
+    if dtype == "bool":
+        return np.ascontiguousarray(array, bool)
+    return np.ascontiguousarray(array, np.int64)
 
 
-def _check_range(index: Any, count: int) -> None:
-    """Raise for a tensor of indices out of range; on a CUDA device indexing itself would end the context."""
+def _check_range(index: Array, count: int) -> None:
+    """Raise for a tensor of indices out of range, because on a CUDA device indexing would end the context."""
     if str(index.dtype) == "torch.bool" or len(index) == 0:
         return
-    low, high = int(index.min()), int(index.max())
-    if low < -count or high >= count:
-        raise IndexError(f"index: expected {-count} to {count - 1}, got {high if high >= count else low}")
+    for number in (int(index.max()), int(index.min())):
+        if not -count <= number < count:
+            raise IndexError(f"index: expected {-count} to {count - 1}, got {number}")

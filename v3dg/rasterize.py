@@ -1,18 +1,25 @@
 """Draw gaussians as they are: project, bin, blend; differentiable on torch tensors."""
 
+from __future__ import annotations
+
 import functools
 import os
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import EllipsisType
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from v3dg import _core, _device
 from v3dg._numbers import check_type, color, real
 from v3dg.cameras import Camera
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Array, Gaussians
 from v3dg.image import Image
 from v3dg.io import loaded
+
+if TYPE_CHECKING:
+    import torch
 
 
 def rasterize(
@@ -48,25 +55,34 @@ def rasterize(
         RuntimeError: The gaussians are on a CUDA device, and v3dg was built without CUDA.
     """
     gaussians = loaded(gaussians)
-    if not hasattr(gaussians, "means"):  # whatever has their arrays will do
+    if not hasattr(gaussians, "means"):  # any object with the arrays of Gaussians is accepted
         check_type("gaussians", gaussians, Gaussians, "Gaussians")
     check_type("camera", camera, Camera, "a Camera")
     filter_px2 = real(filter_px2, "filter_px2", "a variance of at least 0 px²", 0)
-    options: dict[str, Any] = {"filter_px2": filter_px2, "antialiased": bool(antialiased), "with_depth": True}
-    shade = color(background, "background")
-    if isinstance(gaussians.means, np.ndarray):
-        planes = _core.rasterize(gaussians.rows, camera.core, background=shade, keep_tape=False, **options)
-        return Image(*planes[:3])
+    background_color = color(background, "background")
+    means = gaussians.means
+    if isinstance(means, np.ndarray):
+        color_plane, alpha, depth, _, _ = _core.rasterize(
+            gaussians.rows,
+            camera.core,
+            filter_px2=filter_px2,
+            antialiased=bool(antialiased),
+            background=background_color,
+            with_depth=True,
+            keep_tape=False,
+        )
+        return Image(color_plane, alpha, depth)
     import torch
 
-    check_device(gaussians.means)
-    arrays = [getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh")]
-    arrays.append(torch.as_tensor(background, dtype=arrays[0].dtype))
-    return Image(*draw_views([camera.core], options, [[array] for array in arrays]))
+    check_device(means)
+    arrays = [means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh]
+    arrays.append(torch.as_tensor(background, dtype=means.dtype))
+    settings = DrawSettings(filter_px2=filter_px2, antialiased=bool(antialiased))
+    return Image(*draw_views([camera.core], settings, [[array] for array in arrays]))
 
 
-def check_device(means: Any) -> None:
-    """Raise unless tensors like these can be drawn where they are."""
+def check_device(means: Array) -> None:
+    """Raise unless tensors of this dtype can be drawn on their device."""
     if means.is_cuda and not _core.has_cuda:
         raise RuntimeError(f"gaussians: {_device.missing_for_cuda()}; or call gaussians.torch('cpu')")
     if means.is_cuda and str(means.dtype) == "torch.float64":
@@ -74,85 +90,183 @@ def check_device(means: Any) -> None:
         raise ValueError(f"gaussians: float64 is computed on the CPU only; {advice}")
 
 
-def joined(parts: Sequence[Any]) -> Any:
+def joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
     """Tensors stacked, a single one without a copy."""
     import torch
 
-    return parts[0].unsqueeze(0) if len(parts) == 1 else torch.stack(list(parts))
+    if len(parts) == 1:
+        return parts[0].unsqueeze(0)
+    return torch.stack(list(parts))
 
 
-def draw_views(cameras: Any, options: dict[str, Any], inputs: Any, centers: Any = None) -> tuple[Any, ...]:
+@dataclass(frozen=True)
+class DrawSettings:
+    """The settings of `_core.rasterize`, by its names."""
+
+    filter_px2: float
+    antialiased: bool
+    with_depth: bool = True
+    plain_colors: bool = False  # sh holds colours, not coefficients
+
+
+@dataclass(eq=False)
+class CenterGradient:
+    """The gradient with respect to centres on the images, once the backward pass has set it."""
+
+    value: torch.Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CenterProbe:
+    """Receives the gradient of pictures with respect to the centres of gaussians on the images.
+
+    Attributes:
+        centers: The centres, (V, N, 2)[pairs]. Nothing flows through them, but autograd gives them the
+            gradient.
+        pairs: The index of the rows that `centers` has.
+        with_sizes: Whether `centers.absgrad` becomes the sum of absolute values of each pixel's share.
+        gradient: Gets the gradient with respect to `centers`. It is an object of its own, because the
+            operation that made the centres keeps it: if it kept the centres, too, that were a cycle.
+    """
+
+    centers: torch.Tensor
+    pairs: tuple[torch.Tensor, torch.Tensor] | EllipsisType
+    with_sizes: bool
+    gradient: CenterGradient
+
+
+def draw_views(
+    cameras: Sequence[_core.Camera],
+    settings: DrawSettings,
+    inputs: Sequence[Sequence[torch.Tensor]],
+    probe: CenterProbe | None = None,
+) -> tuple[torch.Tensor, ...]:
     """Draw tensors; differentiable. Returns colour, alpha and depth (or None) of the first view, the next...
 
     Args:
-        cameras: V, as the core takes them.
-        options: What `_core.rasterize` takes besides.
+        cameras: V cameras.
         inputs: Means, quats, scales, opacities, sh, backgrounds: one tensor of each, or several that views
-            take in turn.
-        centers: A tensor; pairs; whether sizes are wanted; a dict. The tensor is where gaussians lie on the
-            images, (V, N, 2)[pairs]. It passes on no gradient, but takes that of the pictures, which the dict
-            gets as `centers`; its `absgrad` becomes the sum of the sizes of what pixels give to it.
+            use in turn.
+        probe: Receives the gradient with respect to the centres on the images.
     """
     import torch
 
     tensors = [tensor for group in inputs for tensor in group]
-    keep_tape = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+    keep_tape = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     counts = [len(group) for group in inputs]
-    options = {**options, "keep_tape": keep_tape}
-    return tuple(_function().apply(cameras, options, counts, centers, centers and centers[0], *tensors))
+    centers = None
+    if probe is not None:
+        centers = probe.centers
+    return tuple(_function()(cameras, settings, keep_tape, counts, probe, centers, *tensors))
+
+
+def _slots_of_view(counts: list[int], view: int) -> list[int]:
+    """For each kind of input, the number of the tensor that a view uses among all tensors."""
+    return [sum(counts[:kind]) + view % count for kind, count in enumerate(counts)]
+
+
+def _to_core(gradient: torch.Tensor | None) -> Array | None:
+    if gradient is None:
+        return None
+    gradient = gradient.detach().contiguous()
+    if gradient.is_cuda:
+        return gradient
+    return gradient.numpy()
+
+
+def _draw_view(
+    camera: _core.Camera, settings: DrawSettings, inputs: Sequence[torch.Tensor], *, keep_tape: bool
+) -> tuple[list[torch.Tensor | None], _core.Tape | None]:
+    """Colour, alpha and depth of one view, and what its backward pass needs."""
+    import torch
+
+    *arrays, background = (tensor.detach() for tensor in inputs)
+    color_plane, alpha, depth, _, tape = _core.rasterize(
+        Gaussians(*arrays).rows,
+        camera,
+        filter_px2=settings.filter_px2,
+        antialiased=settings.antialiased,
+        background=background.tolist(),
+        with_depth=settings.with_depth,
+        keep_tape=keep_tape,
+        plain_colors=settings.plain_colors,
+    )
+    planes: list[torch.Tensor | None] = []
+    for plane in (color_plane, alpha, depth):
+        if plane is None:
+            planes.append(None)
+        else:
+            planes.append(torch.as_tensor(plane))
+    return planes, tape
+
+
+def _add_to(sums: list[torch.Tensor | None], slot: int, gradient: torch.Tensor) -> None:
+    total = sums[slot]
+    if total is None:
+        sums[slot] = gradient
+    else:
+        sums[slot] = total.add_(gradient)
+
+
+def _set_probe(probe: CenterProbe, gradients: list[list[torch.Tensor]]) -> torch.Tensor:
+    """Store and return the gradient by the centres, from that of each view with its sizes if wanted."""
+    d_centers, *sizes = (joined(parts)[probe.pairs] for parts in zip(*gradients, strict=True))
+    probe.gradient.value = d_centers
+    if probe.with_sizes:
+        cast(Any, probe.centers).absgrad = sizes[0]
+    return d_centers
 
 
 @functools.cache
-def _function() -> Any:
-    """The operation and its gradient, for torch's tensors on any device."""
+def _function() -> Callable[..., tuple[torch.Tensor, ...]]:
+    """The operation and its gradient, for tensors of torch on any device."""
     import torch
-
-    def to_core(gradient: Any) -> Any:
-        gradient = gradient.detach().contiguous()
-        return gradient if gradient.is_cuda else gradient.numpy()
-
-    def slots_of(counts: list[int], view: int) -> list[int]:
-        return [sum(counts[:k]) + view % count for k, count in enumerate(counts)]
 
     class Rasterize(torch.autograd.Function):
         @staticmethod
-        def forward(ctx: Any, cameras: Any, options: Any, counts: Any, centers: Any, *tensors: Any) -> Any:
+        def forward(
+            ctx: Any,
+            cameras: Sequence[_core.Camera],
+            settings: DrawSettings,
+            keep_tape: bool,
+            counts: list[int],
+            probe: CenterProbe | None,
+            *tensors: torch.Tensor,
+        ) -> tuple[torch.Tensor | None, ...]:
+            inputs = tensors[1:]  # the first one is the centres, which only take part in the backward pass
             ctx.set_materialize_grads(False)
-            ctx.counts, ctx.tapes, pictures = counts, [], []
-            ctx.centers = centers or (None, None, False, {})
-            ctx.devices = [tensor.device for tensor in tensors[1:]]
+            ctx.counts = counts
+            ctx.probe = probe
+            ctx.tapes = []
+            ctx.devices = [tensor.device for tensor in inputs]
+            pictures: list[torch.Tensor | None] = []
             for view, camera in enumerate(cameras):
-                *arrays, shade = (tensors[1 + slot].detach() for slot in slots_of(counts, view))
-                rows = Gaussians(*arrays).rows
-                *planes, _, tape = _core.rasterize(rows, camera, background=shade.tolist(), **options)
+                inputs_of_view = [inputs[slot] for slot in _slots_of_view(counts, view)]
+                planes, tape = _draw_view(camera, settings, inputs_of_view, keep_tape=keep_tape)
                 ctx.tapes.append(tape)
-                pictures += [None if plane is None else torch.as_tensor(plane) for plane in planes]
-            if tensors[1].is_cuda:  # backward reads them again, and so has to know of what is written to
-                ctx.save_for_backward(*tensors[1 : -counts[-1]], *pictures)
+                pictures += planes
+            if inputs[0].is_cuda:  # the backward pass reads them again, so autograd must see later writes
+                ctx.save_for_backward(*inputs[: -counts[-1]], *pictures)
             return tuple(pictures)
 
         @staticmethod
-        def backward(ctx: Any, *gradients: Any) -> Any:
-            _ = ctx.saved_tensors  # complains of what was written to since
-            wants_centers, *wanted = ctx.needs_input_grad[4:]
-            sums: list[Any] = [None] * len(wanted)
-            tensor, pairs, with_size, flow = ctx.centers
-            of_views: list[Any] = []
+        def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+            _ = ctx.saved_tensors  # raises if a saved tensor was written to
+            wants_centers, *wants_input = ctx.needs_input_grad[5:]
+            probe: CenterProbe | None = ctx.probe
+            with_sizes = probe is not None and probe.with_sizes
+            sums: list[torch.Tensor | None] = [None] * len(wants_input)
+            center_gradients: list[list[torch.Tensor]] = []
             for view, tape in enumerate(ctx.tapes):
-                planes = gradients[3 * view : 3 * view + 3]
-                d_color, d_alpha, d_depth = (None if d is None else to_core(d) for d in planes)
-                out = _core.rasterize_backward(tape, d_color, d_alpha, d_depth, wants_centers, with_size)
-                of_views.append([torch.as_tensor(part) for part in out[6:] if part is not None])
-                for slot, part in zip(slots_of(ctx.counts, view), out, strict=False):
-                    if wanted[slot]:
-                        part = torch.as_tensor(part).to(ctx.devices[slot])
-                        sums[slot] = part if sums[slot] is None else sums[slot].add_(part)
+                d_color, d_alpha, d_depth = map(_to_core, gradients[3 * view : 3 * view + 3])
+                parts = _core.rasterize_backward(tape, d_color, d_alpha, d_depth, wants_centers, with_sizes)
+                center_gradients.append([torch.as_tensor(part) for part in parts[6:] if part is not None])
+                for slot, part in zip(_slots_of_view(ctx.counts, view), parts, strict=False):
+                    if wants_input[slot]:
+                        _add_to(sums, slot, torch.as_tensor(part).to(ctx.devices[slot]))
             d_centers = None
-            if wants_centers:
-                d_centers, *sizes = (joined(parts)[pairs] for parts in zip(*of_views, strict=True))
-                flow["centers"] = d_centers
-                if with_size:
-                    tensor.absgrad = sizes[0]
-            return None, None, None, None, d_centers, *sums
+            if wants_centers and probe is not None:
+                d_centers = _set_probe(probe, center_gradients)
+            return None, None, None, None, None, d_centers, *sums
 
-    return Rasterize
+    return Rasterize.apply

@@ -21,7 +21,9 @@ def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, flo
     # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinctions, stable for any angle.
     r = np.asarray(rotation, np.float64)
     symmetric = np.full((4, 4), np.trace(r))
-    symmetric[1:, 0] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    symmetric[1:, 0] = [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
     symmetric[1:, 1:] = r + r.T - np.trace(r) * np.eye(3)
     w, x, y, z = np.linalg.eigh(symmetric, UPLO="L")[1][:, -1].tolist()
-    return (-w, -x, -y, -z) if w < 0 else (w, x, y, z)
+    if w < 0:
+        return -w, -x, -y, -z
+    return w, x, y, z

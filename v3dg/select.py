@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, get_args, overload
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict, TypeVar, get_args, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -25,12 +25,13 @@ if TYPE_CHECKING:
 
     from typing_extensions import Unpack
 
+_Value = TypeVar("_Value", bound=np.generic)
 Footprint: TypeAlias = Literal["solid_angle", "paper"]
 
 # px² of screen that one gaussian of a coarser cluster may stand for; docs/levels.md has the error it gives.
 DEFAULT_TOLERANCE = 3.0
 
-# Fade of pictures that follow each other; docs/fades.md has what it costs and what it gains.
+# Fade for pictures of a sequence; docs/fades.md has its cost and its gain.
 DEFAULT_FADE = 1.02
 _FADE_PX2 = np.float32(_core.fade_filter_px2)
 
@@ -41,14 +42,14 @@ class Selection:
 
     Attributes:
         scene: The scene that was selected from. It may have moved and grown since; once instances of it were
-            removed, the cut is of no use, and drawing it is a ValueError.
-        instance_ids: (S,) int32, not to be written to.
-        cluster_ids: (S,) int32, within the instance's bundle, not to be written to.
+            removed, the cut is invalid, and drawing it is a ValueError.
+        instance_ids: (S,) int32, read-only.
+        cluster_ids: (S,) int32, within the instance's bundle, read-only.
         num_gaussians: Gaussians in all selected clusters.
-        tolerance: px² that were used; with a budget, those with which it is met.
+        tolerance: The px² that were used; with a budget, those that meet it.
         seconds: Wall time of the selection.
-        revision: Of the scene, when its instances were looked at; as it is now if None.
-        given_weights: As `weights`, not to be written to; None without a fade, where all are 1.
+        revision: Revision of the scene that was selected from; the present one if None.
+        given_weights: Like `weights`, read-only; None without a fade, when all are 1.
     """
 
     scene: Scene
@@ -64,23 +65,26 @@ class Selection:
         if self.revision is None:
             object.__setattr__(self, "revision", self.scene.revision)
         if self.given_weights is not None:
-            given = np.asarray(self.given_weights)
-            numbers = given if given.dtype.kind in "biuf" else np.full(given.shape, np.nan)
+            numbers = np.asarray(self.given_weights)
+            if numbers.dtype.kind not in "biuf":
+                numbers = np.full(numbers.shape, np.nan)  # which the check below refuses
             object.__setattr__(self, "given_weights", np.ascontiguousarray(numbers, np.float32))
-        weights, expected = self.weights, f"{len(self)} numbers of 0 to 1"
+        weights = self.weights
+        expected = f"{len(self)} numbers of 0 to 1"
         check("given_weights", len(weights) == len(self), f"{expected}, got {len(weights)}")
         check("given_weights", ((weights >= 0) & (weights <= 1)).all(), f"{expected}, got others")
         for values in (self.instance_ids, self.cluster_ids, weights):
             values.flags.writeable = False
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
         return Selection, tuple(getattr(self, field.name) for field in fields(self))
 
     def check(self, revision: tuple[int, int, int]) -> None:
-        """Raise ValueError unless the scene of a revision still has the instances of the cut."""
+        """Raise ValueError unless a scene of this revision still has the instances of the cut."""
         assert self.revision is not None
-        expected = "instances of the scene, got some of before others were removed; select again"
-        check("cut", revision[2] == self.revision[2], expected)
+        if revision[2] != self.revision[2]:
+            problem = "instances were removed from the scene after this selection"
+            raise ValueError(f"cut: {problem}; select again")
 
     def __len__(self) -> int:
         return len(self.instance_ids)
@@ -93,23 +97,26 @@ class Selection:
         every rasterizer fades.
 
         Args:
-            origin: (3,) point in the world that means are relative to; take the camera's position where the
-                scene is so far from zero that float32 would not hold it.
+            origin: (3,) point in the world that means are relative to; use the camera's position if the
+                scene is so far from zero that float32 is not precise enough.
             device: ``"cpu"`` for NumPy arrays, ``"cuda"`` for torch tensors there, ``"auto"`` for the latter
-                where CUDA works. Both hold the same numbers.
+                if CUDA works. Both hold the same numbers.
         """
-        where = _device.resolve(device)
+        target = _device.resolve(device)
         shift = vector(origin, "origin")
-        scene = copy.copy(self.scene)  # which stays as it is
+        scene = copy.copy(self.scene)  # other threads may change the original meanwhile
         ids, instance = np.unique(self.instance_ids, return_inverse=True)
-        used, bundle = np.unique(scene.instance_bundle[ids], return_inverse=True)
-        rows, first_row = [], np.empty(len(self), np.int64)
+        bundle_ids, bundle = np.unique(scene.instance_bundle[ids], return_inverse=True)
+        rows = []
+        first_row = np.empty(len(self), np.int64)
         self.check(scene.revision)
-        with where.current():
-            for number, b in enumerate(used):
-                mine = bundle[instance] == number
-                found, first_row[mine] = residency.rows(scene.bundles[b], self.cluster_ids[mine], where)
-                rows.append(found)
+        with target.current():
+            for number, bundle_id in enumerate(bundle_ids):
+                is_in_bundle = bundle[instance] == number
+                cluster_ids = self.cluster_ids[is_in_bundle]
+                bundle_rows, first_rows = residency.rows(scene.bundles[bundle_id], cluster_ids, target)
+                first_row[is_in_bundle] = first_rows
+                rows.append(bundle_rows)
             world = _core.gather(
                 bundles=rows,
                 instances=_core.Instances(
@@ -123,56 +130,70 @@ class Selection:
                 first_row=first_row,
                 offset=self._first(),
                 weights=self.given_weights,
-                device=where.number,
+                device=target.number,
             )
         return Gaussians(*world)
 
     @property
     def weights(self) -> npt.NDArray[np.float32]:
         """(S,) in [0, 1] with which the clusters are drawn."""
-        return np.ones(len(self), np.float32) if self.given_weights is None else self.given_weights
+        if self.given_weights is None:
+            return np.ones(len(self), np.float32)
+        return self.given_weights
 
     @property
     def filters_px2(self) -> npt.NDArray[np.float32]:
         """(N,) variance of the screen-space filter that each gaussian is drawn with.
 
-        With a fade, a level 0 that has none is drawn with 0.05 px², and with `antialiased`. Of that `render`
-        gives a gaussian at most four times its own variance, so that very many tiny ones stay opaque.
+        With a fade, a level 0 that has none is drawn with 0.05 px², and with `antialiased`. `render` limits
+        that to four times a gaussian's own variance, so that very many tiny ones stay opaque.
         """
-        return self._per_gaussian(lambda of: np.where(self._bare(of), _FADE_PX2, of.filter_px2), np.float32)
+
+        def filter_px2(clusters: Clusters) -> npt.NDArray[np.float32]:
+            has_fade_filter = self._has_only_fade_filter(clusters)
+            return np.where(has_fade_filter, _FADE_PX2, clusters.filter_px2).astype(np.float32)
+
+        return self._per_gaussian(filter_px2, np.float32)
 
     @property
     def antialiased(self) -> npt.NDArray[np.bool_]:
         """(N,) whether each gaussian's opacity is compensated for its filter."""
-        return self._per_gaussian(lambda of: self._bare(of) | (of.antialiased > 0), np.bool_)
 
-    def _bare(self, clusters: Clusters) -> npt.NDArray[np.bool_]:
-        """(C,) whether only the fade gives the clusters a filter."""
+        def antialiased(clusters: Clusters) -> npt.NDArray[np.bool_]:
+            return self._has_only_fade_filter(clusters) | (clusters.antialiased > 0)
+
+        return self._per_gaussian(antialiased, np.bool_)
+
+    def _has_only_fade_filter(self, clusters: Clusters) -> npt.NDArray[np.bool_]:
+        """(C,) whether the fade gives the clusters a filter, because they have none."""
         fades = self.given_weights is not None
         return np.asarray((clusters.level == 0) & (clusters.filter_px2 == 0) & fades)
 
     def _first(self) -> npt.NDArray[np.int64]:
-        """(S + 1,) where each selected cluster's gaussians begin."""
+        """(S + 1,) first gaussian of each selected cluster, and the number of all."""
         return np.concatenate([[0], np.cumsum(self._per_pair(lambda clusters: np.diff(clusters.offset)))])
 
-    def _per_pair(self, column: Callable[[Clusters], npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """(S,) values of the selected clusters from a column of (C,) of their bundle."""
+    def _per_pair(self, column: Callable[[Clusters], npt.NDArray[_Value]]) -> npt.NDArray[_Value]:
+        """(S,) values of the selected clusters from a column (C,) of the tables of their bundles."""
         scene = copy.copy(self.scene)
         self.check(scene.revision)
-        values = np.zeros(len(self), np.int64)
-        bundle_of_pair = scene.instance_bundle[self.instance_ids]
-        for b, bundle in enumerate(scene.bundles):
-            mine, table = bundle_of_pair == b, column(bundle.clusters)
-            values = values.astype(table.dtype, copy=False)
-            values[mine] = table[self.cluster_ids[mine]]
+        columns = [column(bundle.clusters) for bundle in scene.bundles]
+        values = np.zeros(len(self), np.result_type(np.bool_, *columns))
+        bundle_from_pair = scene.instance_bundle[self.instance_ids]
+        for number, table in enumerate(columns):
+            is_in_bundle = bundle_from_pair == number
+            values[is_in_bundle] = table[self.cluster_ids[is_in_bundle]]
         return values
 
-    def _per_gaussian(self, column: Callable[[Clusters], npt.NDArray[Any]], dtype: Any) -> npt.NDArray[Any]:
+    def _per_gaussian(
+        self, column: Callable[[Clusters], npt.NDArray[_Value]], dtype: type[_Value]
+    ) -> npt.NDArray[_Value]:
+        # The dtype is given, because a scene without bundles has no column.
         return np.repeat(self._per_pair(column).astype(dtype), np.diff(self._first()))
 
 
 class CutOptions(TypedDict, total=False):
-    """What tells a cut of a view."""
+    """The options that determine the cut of a view."""
 
     tolerance: float | None
     budget: int | None
@@ -241,8 +262,9 @@ def select(
     Source: Yang et al., Virtualized 3D Gaussians, SIGGRAPH 2025, online selection; the budget is ours.
     """
     rule = rule_of(tolerance, budget, min_level, footprint, cull, fade)
-    where, place = _device.resolve(device), opened(subject)
-    return for_each(camera, lambda view: select_by(rule, place, view, budget, where))
+    target = _device.resolve(device)
+    scene = opened(subject)
+    return for_each(camera, lambda view: select_by(rule, scene, view, budget, target))
 
 
 def select_by(
@@ -253,7 +275,7 @@ def select_by(
     device: Device,
     steps: _core.BudgetSteps | None = None,
 ) -> Selection:
-    """Select for one view; with `steps`, for the next of views that follow each other."""
+    """Select for one view; with `steps`, which holds the state of the budget, for the next of a sequence."""
     check_camera(camera)
     start = time.perf_counter()
     with residency.turn(device):
@@ -263,9 +285,19 @@ def select_by(
         assert budget is not None
         raise over_budget(budget, cut.num_gaussians)
     seconds = time.perf_counter() - start
-    chosen = cut.instance_ids, cut.cluster_ids, cut.num_gaussians, cut.tolerance_px2
-    weights = cut.weights if len(cut.weights) else None
-    return Selection(Scene.of(subject), *chosen, seconds, resident.revision, weights)
+    weights = None
+    if len(cut.weights):
+        weights = cut.weights
+    return Selection(
+        scene=Scene.of(subject),
+        instance_ids=cut.instance_ids,
+        cluster_ids=cut.cluster_ids,
+        num_gaussians=cut.num_gaussians,
+        tolerance=cut.tolerance_px2,
+        seconds=seconds,
+        revision=resident.revision,
+        given_weights=weights,
+    )
 
 
 def rule_of(
@@ -276,20 +308,26 @@ def rule_of(
     cull: bool = True,
     fade: float | None = None,
 ) -> _core.Rule:
-    """What to choose, as the core takes it; ValueError where a number is not as `select` has it."""
+    """The rule of a selection for the core; ValueError for a number that `select` does not accept."""
     if tolerance is None:
-        tolerance = DEFAULT_TOLERANCE if budget is None else 0.0
+        tolerance = 0.0
+        if budget is None:
+            tolerance = DEFAULT_TOLERANCE
     tolerance = real(tolerance, "tolerance", "0 px² or more", 0)
+    if tolerance != np.inf:
+        tolerance = min(tolerance, MOST_FLOAT)
     if budget is not None:
         budget = whole(budget, "budget", "a whole number of gaussians, 0 or more", 0, most=(1 << 63) - 1)
     one_of(footprint, "footprint", get_args(Footprint))
-    factor = 1.0 if fade is None else real(fade, "fade", "None or a factor of 1 to 1000", 1, 1000)
+    factor = 1.0
+    if fade is not None:
+        factor = real(fade, "fade", "None or a factor of 1 to 1000", 1, 1000)
     if factor != 1 and footprint == "paper":
         refuse(
             "fade", f"None with the paper's footprint, which can decrease towards the root, got {factor:g}"
         )
     return _core.Rule(
-        tolerance_px2=tolerance if tolerance == np.inf else min(tolerance, MOST_FLOAT),
+        tolerance_px2=tolerance,
         budget=budget,
         min_level=whole(min_level, "min_level", "a level, 0 or more", 0),
         footprint=footprint,
@@ -299,6 +337,6 @@ def rule_of(
 
 
 def over_budget(budget: int, least: int) -> ValueError:
-    """The error that says so."""
+    """The error for a budget that the coarsest cut exceeds; ``least`` is the size of that cut."""
     expected = f"at least {least} gaussians, which the coarsest cut of this view has"
     return ValueError(f"budget: expected {expected}, got {budget}")

@@ -1,8 +1,7 @@
-"""Which axis is up: what a file says, or else a guess from cameras, from a ground plane, or by custom."""
+"""The axis that is up: from a file, or guessed from cameras, from a ground plane, or by convention."""
 
 import os
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -14,42 +13,47 @@ from v3dg.gaussians import Gaussians
 from v3dg.scene import Scene, Subject
 
 ASSUMED = "as most trained assets have it"
-"""What `up_of` says where nothing tells."""
+"""The reason that `up_of` returns if nothing is known."""
 
-# Fewer cameras may all lie on their sides.
-_FEWEST_CAMERAS = 3
-# Cosine of the angle to an axis, within which a direction is taken to mean it: 26 degrees.
+# With fewer cameras, all of them may be tilted.
+_MIN_CAMERAS = 3
+# Cosine of the largest angle, 26 degrees, between an axis and a direction that is taken for it.
 _NEAR_AN_AXIS = 0.9
-# A ground is at most so thick, as standard deviations, beside how far it reaches in its narrower direction.
+# Largest ratio of the thickness of a ground to its smaller extent, as standard deviations.
 _FLAT = 0.55
 
 
 def direction_of(axis: Axis) -> tuple[float, float, float]:
     """The unit vector along an axis."""
-    x, y, z = ((-1.0 if axis[0] == "-" else 1.0) * (axis[-1] == name) for name in "xyz")
+    sign = 1.0
+    if axis[0] == "-":
+        sign = -1.0
+    x, y, z = (sign * (axis[-1] == name) for name in "xyz")
     return x, y, z
 
 
 def up_of(
     subject: Subject, cameras: Mapping[str, Camera] | None = None, path: str | os.PathLike[str] = ""
 ) -> tuple[Axis, str]:
-    """Return the axis that is up in a subject, and how that is known, as a phrase.
+    """Return the axis that is up in a subject, and the reason, as a phrase.
 
-    In this order: what the file of a scene or a bundle says; where the tops of three or more cameras point
-    together; z for other scenes; y for glTF; the plane in which the gaussians of level 0 mostly lie, if it is
-    across y or z; else -y, which is what most trained assets have. Planes are taken to be up as custom has
-    it: z, or -y.
+    The first of these that applies: the axis in the file of a scene or a bundle; the direction in which the
+    tops of three or more cameras point; z for other scenes; y for glTF; the normal of the plane in which the
+    gaussians of level 0 mostly lie, if it is along y or z, as -y or z; else -y, as in most trained assets.
 
     Args:
-        cameras: That look at it, by name.
-        path: Of its file, whose kind may tell.
+        cameras: Cameras that look at the subject, by name.
+        path: Its file, whose format may determine the axis.
     """
-    config = subject.config if isinstance(subject, Bundle) else {}
-    noted: Any = subject.up if isinstance(subject, Scene) else config.get("up")
-    if noted in AXES:
-        return noted, "as its file says"
+    recorded: object = None
+    if isinstance(subject, Scene):
+        recorded = subject.up
+    elif isinstance(subject, Bundle):
+        recorded = subject.config.get("up")
+    if isinstance(recorded, str) and recorded in AXES:
+        return recorded, "as its file says"
     tops = np.array([-camera.viewmat[1, :3] for camera in (cameras or {}).values()]).reshape(-1, 3)
-    if len(tops) >= _FEWEST_CAMERAS:
+    if len(tops) >= _MIN_CAMERAS:
         top = tops.mean(axis=0)
         heights = [float(np.dot(top, direction_of(axis))) for axis in AXES]
         if max(heights) > _NEAR_AN_AXIS * max(float(np.linalg.norm(top)), 0.5):
@@ -65,7 +69,7 @@ def up_of(
 
 
 def _middles(subject: Bundle | Gaussians) -> Floats:
-    """(N, 3) where the gaussians of level 0 are: of a bundle, its clusters, which need no pages."""
+    """(N, 3) centres of gaussians of level 0, or of the clusters of a bundle, for which no page is read."""
     if isinstance(subject, Gaussians):
         return np.asarray(subject.means[:: max(len(subject) // 100_000, 1)], np.float64)
     if not subject.num_levels:
@@ -74,7 +78,7 @@ def _middles(subject: Bundle | Gaussians) -> Floats:
 
 
 def _flat_axis(points: Floats) -> Axis | None:
-    """The axis across the plane that points lie in, if they do; far outliers do not count."""
+    """The axis along the normal of the plane that the points lie in, ignoring outliers; None without one."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 16:
         return None
@@ -85,4 +89,6 @@ def _flat_axis(points: Floats) -> Axis | None:
     is_flat = variances[0] < _FLAT**2 * variances[1]
     if axis == 0 or not is_flat or abs(directions[axis, 0]) < _NEAR_AN_AXIS:
         return None
-    return "z" if axis == 2 else "-y"
+    if axis == 2:
+        return "z"
+    return "-y"

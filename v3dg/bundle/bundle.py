@@ -23,11 +23,11 @@ from v3dg.bundle.tables import Clusters, Groups, check_index, check_tables
 from v3dg.gaussians import Gaussians
 
 _Pages: TypeAlias = MemoryPages | CodePages | FilePages
-_BYTES_AT_ONCE = 64 << 20
+_RUN_BYTES = 64 << 20  # of pages that are written together
 
 
 class Bundle:
-    """All clusters of all levels of one asset. In memory, or a file of which pages are read when needed.
+    """All clusters of all levels of one asset, in memory, or in a file of which pages are read on demand.
 
     Attributes:
         config: How it was built, as JSON values.
@@ -53,22 +53,28 @@ class Bundle:
         check_type("clusters", clusters, Clusters, "Clusters")
         check_type("groups", groups, Groups, "Groups")
         check_type("gaussians", gaussians, Gaussians, "Gaussians")
-        # Made anew, because unpickling leaves out what making does: checks, and that arrays are read-only.
-        clusters, groups = replace(clusters), replace(groups)
+        # Constructed again, because unpickled tables were not checked and their arrays are writable.
+        clusters = replace(clusters)
+        groups = replace(groups)
         check_tables(clusters, groups, len(gaussians))
-        kept = codec_of(codec, gaussians.sh_degree)
-        gaussians = kept.rounded(gaussians.numpy(), clusters.offset)
+        page_codec = codec_of(codec, gaussians.sh_degree)
+        gaussians = page_codec.rounded(gaussians.numpy(), clusters.offset)
         if codec != Codec.name:
             clusters = clusters.around(gaussians)
         layout = PageLayout.of(clusters)
-        in_memory = MemoryPages if codec == Codec.name else CodePages.of
-        told = parse_json(config_to_json(config or {}))
-        self._set(clusters, groups, told, in_memory(layout, gaussians, kept))
+        pages: _Pages
+        if codec == Codec.name:
+            pages = MemoryPages(layout, gaussians, page_codec)
+        else:
+            pages = CodePages.of(layout, gaussians, page_codec)
+        self._set(clusters, groups, parse_json(config_to_json(config or {})), pages)
 
     def _set(self, clusters: Clusters, groups: Groups, config: dict[str, Any], pages: _Pages) -> None:
         self.config = config
-        self._clusters, self._groups = clusters, groups
-        self._codec, self.codec = pages.codec, pages.codec.name
+        self._clusters = clusters
+        self._groups = groups
+        self._codec = pages.codec
+        self.codec = pages.codec.name
         self.sh_degree = pages.codec.sh_degree
         self._layout = pages.layout
         self._pages = pages
@@ -94,13 +100,14 @@ class Bundle:
         Raises:
             FileNotFoundError, ValueError: As `open`, for the first file with which something is wrong.
         """
-        reader, paths = _core.HashedReader(), list(paths)
+        reader = _core.HashedReader()
+        paths = list(paths)
         try:
-            # Also where there are fewer processors: a disk answers several at once.
-            return on_threads(lambda path: cls._open(BundleFile(path, reader)), paths, most=8)
+            # More threads than processors are useful: a disk serves several requests at a time.
+            return on_threads(lambda path: cls._open(BundleFile(path, reader)), paths, max_threads=8)
         except (OSError, ValueError):
             for path in paths[:-1]:
-                cls.open_all([path])  # where one before has a fault as well, that is told
+                cls.open_all([path])  # raises the error of an earlier file, if it has one
             raise
 
     @classmethod
@@ -110,10 +117,10 @@ class Bundle:
             clusters = Clusters(**{f.name: tables[f"clusters.{f.name}"] for f in fields(Clusters)})
             groups = Groups(**{f.name: tables[f"groups.{f.name}"] for f in fields(Groups)})
             num_gaussians = int(clusters.offset[-1])
-            most = file.pages_bytes // file.codec.gaussian_bytes
-            # Before anything is computed from it.
-            expected = f"at most {most} gaussians, got {num_gaussians}"
-            check("clusters.offset[-1]", num_gaussians <= most, expected)
+            # Checked before any size is derived from the number.
+            max_gaussians = file.pages_bytes // file.codec.gaussian_bytes
+            expected = f"at most {max_gaussians} gaussians, got {num_gaussians}"
+            check("clusters.offset[-1]", num_gaussians <= max_gaussians, expected)
             check_tables(clusters, groups, num_gaussians)
             pages = FilePages(PageLayout.of(clusters), file)
             _check_page_tables(pages, file)
@@ -121,16 +128,16 @@ class Bundle:
             bundle._set(clusters, groups, file.config, pages)
             bundle._file = file
         except ValueError as error:
-            file.verify()  # for what is wrong with the tables is mostly damage
+            file.verify()  # wrong tables are mostly damage, which this reports instead
             raise ValueError(f"{file.path}: {error}") from None
-        file.verify()  # after the checks, for tables are hashed meanwhile
+        file.verify()  # after the checks, because the tables are hashed at the same time
         return bundle
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the bundle to a file; the same bundle gives the same bytes.
 
-        The file appears at ``path`` when it is complete and not before: on an error or an interrupt, what was
-        there stays and nothing else is left.
+        The file appears at ``path`` when it is complete and not before: on an error or an interrupt, a file
+        that existed stays as it was, and no other file remains.
 
         Raises:
             ValueError: The name does not end in `.v3dg`, or is of a device or a pipe.
@@ -141,17 +148,20 @@ class Bundle:
         plan = BundlePlan(self._layout, self._codec, self.config)
         with _files.replacing(path) as temporary, open(temporary, "wb", buffering=0) as file:
             hashes = [np.empty((0, HASH_BYTES), np.uint8)]
-            for pages in runs_of_pages(0, self.num_pages, page_bytes, _BYTES_AT_ONCE):
+            for pages in runs_of_pages(0, self.num_pages, page_bytes, _RUN_BYTES):
                 gaussians = self._pages.read(pages.start, pages.stop)
                 run = plan.run(pages.start, pages.stop)
                 hashes.append(write_pages(file.fileno(), run, self._codec, gaussians))
             plan.write_tables(file.fileno(), self.clusters, self.groups, np.concatenate(hashes))
             plan.write_header(file.fileno())
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle what is in memory, and of a file its path: the copy opens it again."""
-        if self.path is not None:
-            return Bundle.open, (self.path if is_url(self.path) else os.path.abspath(self.path),)
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        """Pickle a bundle in memory whole, and a bundle of a file as its path, which the copy opens."""
+        path = self.path
+        if path is not None:
+            if not is_url(path):
+                path = os.path.abspath(path)
+            return Bundle.open, (path,)
         return Bundle, (self.clusters, self.groups, self.gaussians, self.config, self.codec)
 
     @property
@@ -167,12 +177,16 @@ class Bundle:
     @property
     def path(self) -> str | None:
         """Name of the file that the bundle was opened from, if it was; of one at a URL, the whole URL."""
-        return None if self._file is None else self._file.name
+        if self._file is None:
+            return None
+        return self._file.name
 
     @property
     def num_levels(self) -> int:
         """Number of levels; 0 for a bundle without clusters."""
-        return int(self.clusters.level[-1]) + 1 if len(self.clusters) else 0
+        if not len(self.clusters):
+            return 0
+        return int(self.clusters.level[-1]) + 1
 
     @property
     def num_pages(self) -> int:
@@ -185,14 +199,16 @@ class Bundle:
         return int(self.clusters.offset[-1])
 
     def __repr__(self) -> str:
-        where = "" if self._file is None else f", path={self._file.path!r}"
+        path = ""
+        if self._file is not None:
+            path = f", path={self._file.path!r}"
         return (
             f"Bundle(num_gaussians={self.num_gaussians}, num_clusters={len(self.clusters)}, "
-            f"num_levels={self.num_levels}, sh_degree={self.sh_degree}{where})"
+            f"num_levels={self.num_levels}, sh_degree={self.sh_degree}{path})"
         )
 
     def _repr_html_(self) -> str:
-        """What it is and a table of its levels, for notebooks."""
+        """A summary and a table of the levels, for notebooks."""
         names = ("level", "clusters", "gaussians", "bytes")
         rows = [names, *([f"{level[name]:,}" for name in names] for level in self.info()["levels"])]
         cells = "".join(f"<tr><td>{'<td>'.join(row)}" for row in rows)
@@ -212,18 +228,23 @@ class Bundle:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All gaussians, in the order of the clusters; read and verified on first use, then kept.
+        """All gaussians, in the order of the clusters; read and verified on first use, then cached.
 
-        Of a quantised bundle, codes are kept: each use makes new rows of them.
+        A quantised bundle caches its codes: each use decodes them to new rows.
         """
         pages = self._in_memory()
-        return pages.gaussians if isinstance(pages, MemoryPages) else pages.read(0, self.num_pages)
+        if isinstance(pages, MemoryPages):
+            return pages.gaussians
+        return pages.read(0, self.num_pages)
 
     @property
     def codes(self) -> _core.Codes | None:
-        """What is drawn of a quantised bundle, for the compiled operations; read and verified like them."""
-        pages = None if self.codec == Codec.name else self._in_memory()
-        return pages.codes if isinstance(pages, CodePages) else None
+        """All codes of a quantised bundle, for the compiled operations; read, verified and cached."""
+        if self.codec == Codec.name:
+            return None
+        pages = self._in_memory()
+        assert isinstance(pages, CodePages)
+        return pages.codes
 
     def _in_memory(self) -> MemoryPages | CodePages:
         if isinstance(self._pages, FilePages):
@@ -232,17 +253,17 @@ class Bundle:
 
     @property
     def page_bytes(self) -> int:
-        """What all pages take together, in memory as in the file."""
+        """Size of all pages together, in memory and in the file."""
         return int(self._layout.page_bytes(self._codec).sum())
 
     @property
     def is_in_memory(self) -> bool:
-        """Whether all gaussians are, and not only those that are read page by page."""
+        """Whether all gaussians are in memory; otherwise they are read page by page."""
         return not isinstance(self._pages, FilePages)
 
     @property
     def page_source(self) -> Any:
-        """What the core reads single pages from: the file, or all gaussians where they are in memory."""
+        """The source of single pages for the core: the file, or all gaussians if they are in memory."""
         if self._file is None or isinstance(self._pages, MemoryPages):
             return self.gaussians.rows
         return self._file.source
@@ -253,11 +274,12 @@ class Bundle:
         return self._pages.read(page, page + 1)
 
     def cluster_gaussians(self, cluster: int) -> Gaussians:
-        """Gaussians of one cluster; reads its page and keeps it until another is read."""
+        """Gaussians of one cluster; reads its page and caches it until another page is read."""
         check_index("cluster", cluster, len(self.clusters))
         page = int(np.searchsorted(self._layout.first_cluster, cluster, side="right")) - 1
         first = int(self._layout.first_gaussian[page])
-        start, stop = (int(offset) - first for offset in self.clusters.offset[cluster : cluster + 2])
+        start = int(self.clusters.offset[cluster]) - first
+        stop = int(self.clusters.offset[cluster + 1]) - first
         return self.read_page(page).subset(slice(start, stop))
 
     def level_gaussians(self, level: int) -> Gaussians:
@@ -271,11 +293,17 @@ class Bundle:
         page_level = self.clusters.level[self._layout.first_cluster[:-1]]
         page_sizes = self._layout.page_bytes(self._codec)
         sizes = [int(page_sizes[page_level == level].sum()) for level in range(self.num_levels)]
+        if self._file is not None:
+            version = self._file.version
+            num_bytes = self._file.num_bytes
+        else:
+            version = VERSION
+            num_bytes = BundlePlan(self._layout, self._codec, self.config).num_bytes
         return {
             "path": None if self.path is None else shown(self.path),
-            "version": self._file.version if self._file else VERSION,
+            "version": version,
             "codec": self.codec,
-            "bytes": (self._file or BundlePlan(self._layout, self._codec, self.config)).num_bytes,
+            "bytes": num_bytes,
             "sh_degree": self.sh_degree,
             "num_gaussians": self.num_gaussians,
             "num_clusters": len(self.clusters),
@@ -287,28 +315,38 @@ class Bundle:
         }
 
     def _level_info(self, level: int, size: int) -> dict[str, Any]:
-        clusters, error = self.level_range(level), self.groups.error[self.groups.level == level]
+        clusters = self.level_range(level)
         first, last = self.clusters.offset[[clusters.start, clusters.stop]].tolist()
+        error_color: float | None = 0.0
+        error_alpha: float | None = 0.0
+        if level:
+            errors = self.groups.error[self.groups.level == level]
+            error_color = _mean_of_known(errors[:, 0])
+            error_alpha = _mean_of_known(errors[:, 1])
         return {
             "level": level,
             "clusters": len(clusters),
             "gaussians": last - first,
-            "error_color": _mean(error[:, 0]) if level else 0.0,
-            "error_alpha": _mean(error[:, 1]) if level else 0.0,
+            "error_color": error_color,
+            "error_alpha": error_alpha,
             "bytes": size,
         }
 
 
 def _check_page_tables(pages: FilePages, file: BundleFile) -> None:
-    tables, expected = file.tables, page_tables(pages.layout, pages.codec)
-    num_pages, expected_num_pages = len(tables["pages.offset"]), pages.layout.num_pages
+    num_pages = len(file.tables["pages.offset"])
+    expected_num_pages = pages.layout.num_pages
     check("pages", num_pages == expected_num_pages, f"{expected_num_pages} for the clusters, got {num_pages}")
-    for name, values in expected.items():
-        check_all(name, tables[name], tables[name] == values, lambda i, v=values: f"{v[i]} for its clusters")
+    for name, expected in page_tables(pages.layout, pages.codec).items():
+        values = file.tables[name]
+        check_all(name, values, values == expected, lambda row, e=expected: f"{e[row]} for its clusters")
     total = int(pages.layout.page_bytes(pages.codec).sum())
     check("pages", total == file.pages_bytes, f"{total} bytes for the gaussians, got {file.pages_bytes}")
 
 
-def _mean(values: NDArray[np.float32]) -> float | None:
-    known = values[~np.isnan(values)]
-    return float(known.mean(dtype=np.float64)) if known.size else None
+def _mean_of_known(values: NDArray[np.float32]) -> float | None:
+    """The mean without NaN, which stands for unknown; None if all are unknown."""
+    numbers = values[~np.isnan(values)]
+    if not numbers.size:
+        return None
+    return float(numbers.mean(dtype=np.float64))

@@ -1,11 +1,11 @@
-"""The codecs: what the bytes of a page are.
+"""Codecs, which define the bytes of a page.
 
-They are written here and read in the core, which knows each by its `PageCodec`
-(csrc/residency/page_source.h). CONTRIBUTING.md says what one more takes.
+Pages are encoded here and decoded in the core, which has a `PageCodec` for each codec
+(csrc/residency/page_source.h). CONTRIBUTING.md says how to add one.
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,12 @@ from v3dg.gaussians import Gaussians, empty, gaussian_bytes
 
 
 class Codec:
-    """Gaussians of one SH degree as bytes, and back: the arrays of a page, float32, one after another.
+    """Gaussians of one SH degree as bytes: the float32 arrays of a page, one after another.
 
     Attributes:
-        name: As users and files have it.
-        alignment: Where a page begins in the file: at a multiple of so many bytes.
-        gaussian_bytes, cluster_bytes: What a page holds for each.
+        name: The name for users and in files.
+        alignment: A page begins in the file at a multiple of so many bytes.
+        gaussian_bytes, cluster_bytes: Bytes of a page for each gaussian and each cluster.
     """
 
     name: ClassVar[str] = "float32"
@@ -29,25 +29,26 @@ class Codec:
 
     def __init__(self, sh_degree: int) -> None:
         self.sh_degree = sh_degree
-        self.gaussian_bytes, self.cluster_bytes = gaussian_bytes(sh_degree), 0
+        self.gaussian_bytes = gaussian_bytes(sh_degree)
+        self.cluster_bytes = 0
 
     def page_bytes(
         self, num_gaussians: NDArray[np.int64], num_clusters: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Sizes of pages of so many, with what they are filled up with."""
+        """Sizes of pages with so many gaussians and clusters, including padding."""
         num_bytes = num_gaussians * self.gaussian_bytes + num_clusters * self.cluster_bytes
         return (num_bytes + self.alignment - 1) & -self.alignment  # a power of two
 
-    def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
-        """Arrays whose bytes, one after another, are the page of the clusters that begin at these rows."""
+    def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[np.generic]]:
+        """The page of the clusters that begin at these rows, as arrays whose bytes follow each other."""
         return [array[offset[0] : offset[-1]] for array in vars(gaussians).values()]
 
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
-        """The gaussians of these clusters as they come back from pages, where they are."""
+        """The gaussians of these clusters after encoding and decoding, on the device where they are."""
         return gaussians
 
     def empty(self, count: int) -> Gaussians:
-        """Gaussians on the host to decode to, with any values."""
+        """Uninitialised gaussians on the host, to decode into."""
         return empty(count, self.sh_degree)
 
 
@@ -60,12 +61,12 @@ class Quantized(Codec):
         self.sh_degree = sh_degree
         self.gaussian_bytes, self.cluster_bytes, self.alignment = _core.page_code_bytes(sh_degree)
 
-    def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[Any]]:
+    def encode(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Sequence[NDArray[np.generic]]:
         return [_core.encode_page(gaussians.rows, offset)]
 
     def rounded(self, gaussians: Gaussians, offset: NDArray[np.int64]) -> Gaussians:
         result = self.empty(len(gaussians))
-        (page,) = self.encode(gaussians.numpy(), offset)
+        page = _core.encode_page(gaussians.numpy().rows, offset)
         _core.decode_page(page, offset, result.rows)
         return _device.place(result, _device.of(gaussians.means))
 

@@ -1,4 +1,4 @@
-"""What a bundle file is made of: its tables, its header, its hashes. docs/format.md says why."""
+"""The parts of a bundle file: its tables, its header and its hashes. docs/format.md says why."""
 
 import hashlib
 import json
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from v3dg.bundle.pages import PageLayout
 
 FORMAT = "v3dg"
-VERSION = 3  # the newest, which is written
+VERSION = 3  # the newest one, which is written
 HASH_BYTES = 16
-MAX_HEADER_BYTES = 1 << 20  # the header holds 20 entries and the config; more is damage or an attack
+MAX_HEADER_BYTES = 1 << 20  # the header holds 20 entries and the config; a longer one is damage or an attack
 
 DTYPES = {"I64": "<i8", "F32": "<f4", "I32": "<i4", "U8": "|u1"}
 SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
@@ -45,7 +45,7 @@ SCHEMA: tuple[tuple[str, str, str, tuple[int, ...]], ...] = (
 )
 
 
-_ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")  # of codes they follow from the others
+_ONLY_OF_FLOATS = ("pages.bytes", "pages.num_clusters")  # with codes, they follow from the other tables
 
 
 def schema_of(codec: "Codec") -> list[tuple[str, str, str, tuple[int, ...]]]:
@@ -53,9 +53,9 @@ def schema_of(codec: "Codec") -> list[tuple[str, str, str, tuple[int, ...]]]:
     return [table for table in SCHEMA if codec.name == "float32" or table[0] not in _ONLY_OF_FLOATS]
 
 
-def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[Any]]:
-    """The tables of the pages except the hashes; all follow from what is in each page."""
-    tables = {
+def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[np.generic]]:
+    """The tables of the pages except the hashes; they follow from the clusters of each page."""
+    tables: dict[str, NDArray[np.generic]] = {
         "pages.offset": offset_of(layout.page_bytes(codec))[:-1],
         "pages.bytes": np.diff(layout.first_gaussian) * codec.gaussian_bytes,
         "pages.first_cluster": layout.first_cluster[:-1].astype(np.int32),
@@ -65,11 +65,11 @@ def page_tables(layout: "PageLayout", codec: "Codec") -> dict[str, NDArray[Any]]
 
 
 def offset_of(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N + 1,) where each of N parts that lie one after another begins, and the end of the last."""
+    """(N + 1,) start of each of N parts that follow each other, and the end of the last."""
     return np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
 
 
-def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
+def page_hash(pieces: Iterable[NDArray[np.generic]]) -> bytes:
     """BLAKE2b-128 of the bytes of the pieces, one after another."""
     digest = hashlib.blake2b(digest_size=HASH_BYTES)
     for piece in pieces:
@@ -79,7 +79,8 @@ def page_hash(pieces: Iterable[NDArray[Any]]) -> bytes:
 
 def hash_of_pieces(message: bytes) -> bytes:
     """BLAKE2b-128 of the digests of the message's pieces, which are hashed side by side."""
-    data, size = np.frombuffer(message, np.uint8), _core.HASH_PIECE_BYTES
+    data = np.frombuffer(message, np.uint8)
+    size = _core.HASH_PIECE_BYTES
     digests = _core.blake2b(np.split(data, range(size, len(data), size)))
     return hashlib.blake2b(b"".join(digests), digest_size=HASH_BYTES).digest()
 
@@ -87,30 +88,43 @@ def hash_of_pieces(message: bytes) -> bytes:
 def entries_of(
     codec: "Codec", num_clusters: int, num_groups: int, num_pages: int, pages_bytes: int
 ) -> dict[str, Any]:
-    """Every tensor of the file, in file order, as the header describes it."""
-    rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
-    tables = ((name, dtype, [rows[count], *rest]) for name, dtype, count, rest in schema_of(codec))
+    """The entries of the header: dtype, shape and place of every tensor of the file, in file order."""
+    num_rows = {"C": num_clusters, "C+1": num_clusters + 1, "G": num_groups, "P": num_pages}
+    tensors = [("pages", "U8", [pages_bytes])]
+    for name, dtype, rows, row_shape in schema_of(codec):
+        tensors.append((name, dtype, [num_rows[rows], *row_shape]))
+    tensors.append(("hash", "U8", [HASH_BYTES]))
     entries: dict[str, Any] = {}
-    end = 0
-    for name, dtype, shape in (("pages", "U8", [pages_bytes]), *tables, ("hash", "U8", [HASH_BYTES])):
-        start, end = end, end + math.prod(shape) * np.dtype(DTYPES[dtype]).itemsize
+    start = 0
+    for name, dtype, shape in tensors:
+        end = start + math.prod(shape) * np.dtype(DTYPES[dtype]).itemsize
         entries[name] = {"dtype": dtype, "shape": shape, "data_offsets": [start, end]}
+        start = end
     return entries
 
 
 def header_of(entries: dict[str, Any], codec: "Codec", config: dict[str, Any]) -> bytes:
-    """The length and the JSON, filled up with spaces so that the data starts aligned."""
-    metadata = {"format": FORMAT, "version": str(VERSION), "sh_degree": str(codec.sh_degree)}
-    metadata |= {"codec": codec.name, "config": config_to_json(config)}
+    """The length and the JSON of the header, padded with spaces so that the data starts aligned.
+
+    Raises:
+        ValueError: The config is so long that the header exceeds its limit.
+    """
+    metadata = {
+        "format": FORMAT,
+        "version": str(VERSION),
+        "sh_degree": str(codec.sh_degree),
+        "codec": codec.name,
+        "config": config_to_json(config),
+    }
     text = json.dumps({"__metadata__": metadata, **entries}, sort_keys=True, separators=(",", ":")).encode()
     text += b" " * (-(8 + len(text)) % codec.alignment)
-    found = f"{len(metadata['config'])}; shorten it"
-    check("config", len(text) <= MAX_HEADER_BYTES, f"at most {MAX_HEADER_BYTES} bytes of JSON, got {found}")
+    expected = f"at most {MAX_HEADER_BYTES} bytes of JSON in the header that contains it"
+    check("config", len(text) <= MAX_HEADER_BYTES, f"{expected}, got {len(text)}; shorten it")
     return len(text).to_bytes(8, "little") + text
 
 
 def config_to_json(config: dict[str, Any]) -> str:
-    """The text that a bundle keeps of its config; TypeError or ValueError where JSON cannot hold it."""
+    """The config as JSON; TypeError unless it is a dict, ValueError if JSON cannot hold a value."""
     check_type("config", config, dict, "a dict")
     try:
         return json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)

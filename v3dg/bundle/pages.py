@@ -1,4 +1,4 @@
-"""Pages: which clusters lie together, and where the gaussians of a page come from. Bytes are codec.py's."""
+"""Pages: the clusters of each, and the sources of their gaussians. codec.py defines their bytes."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
-_MOST = min(8, os.cpu_count() or 1)  # threads
+_MAX_THREADS = min(8, os.cpu_count() or 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,19 +55,23 @@ class PageLayout:
         return self.offset[self.first_cluster[page] : self.first_cluster[page + 1] + 1]
 
     def page_bytes(self, codec: Codec) -> NDArray[np.int64]:
-        """(P,) of each page, with what it is filled up with."""
+        """(P,) size of each page, including padding."""
         return codec.page_bytes(np.diff(self.first_gaussian), np.diff(self.first_cluster))
 
     def run(self, first_page: int, last_page: int, places: NDArray[np.int64]) -> "PageRun":
-        """A run of the pages, of which all begin at these bytes of a file, and end."""
-        clusters, places = (a[first_page : last_page + 1] for a in (self.first_cluster, places))
-        offset = self.offset[clusters[0] : clusters[-1] + 1]
-        return PageRun(first_page, clusters - clusters[0], offset, places)
+        """A run of the pages; ``places`` has the first byte of every page in a file, and the end."""
+        clusters = self.first_cluster[first_page : last_page + 1]
+        return PageRun(
+            first_page=first_page,
+            first_cluster=clusters - clusters[0],
+            offset=self.offset[clusters[0] : clusters[-1] + 1],
+            places=places[first_page : last_page + 1],
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class PageRun:
-    """Neighbouring pages, as much as is known of them before they are written."""
+    """Neighbouring pages: their clusters, the rows of their gaussians and their place in the file."""
 
     first_page: int  # number in the bundle
     first_cluster: NDArray[np.int64]  # (n+1,) of each page, in the run, and the end
@@ -92,7 +96,9 @@ class MemoryPages:
     """Pages of float32 whose gaussians are all in memory, on the host."""
 
     def __init__(self, layout: PageLayout, gaussians: Gaussians, codec: Codec) -> None:
-        self.layout, self.gaussians, self.codec = layout, gaussians, codec
+        self.layout = layout
+        self.gaussians = gaussians
+        self.codec = codec
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Gaussians of a run of pages; they share memory with `gaussians`."""
@@ -101,20 +107,22 @@ class MemoryPages:
 
 
 class CodePages:
-    """Quantised pages that are all in memory, as codes; rows are made of them where they are asked for."""
+    """Quantised pages that are all in memory as codes, which are decoded on demand."""
 
     def __init__(self, layout: PageLayout, words: NDArray[np.int32], codec: Codec) -> None:
-        self.layout, self.codec = layout, codec
+        self.layout = layout
+        self.codec = codec
         self.codes = _core.Codes(words, layout.first_cluster, layout.offset, codec.sh_degree)
 
     @staticmethod
     def of(layout: PageLayout, gaussians: Gaussians, codec: Codec) -> "CodePages":
         """The pages of gaussians on the host."""
-        places = offset_of(layout.page_bytes(codec) // 4)  # of the words of each page
+        places = offset_of(layout.page_bytes(codec) // 4)  # in words
         words = np.empty(int(places[-1]), np.int32)
 
         def encode(page: int) -> None:
-            (words[places[page] : places[page + 1]],) = codec.encode(gaussians, layout.clusters_of(page))
+            (encoded,) = codec.encode(gaussians, layout.clusters_of(page))
+            words[places[page] : places[page + 1]] = encoded
 
         on_threads(encode, range(layout.num_pages))
         return CodePages(layout, words, codec)
@@ -126,27 +134,29 @@ class CodePages:
 
 
 class FilePages:
-    """Pages that are read from a file when they are asked for; a single one is kept until the next."""
+    """Pages that are read from a file on demand; the last single page that was read is cached."""
 
     def __init__(self, layout: PageLayout, file: "BundleFile") -> None:
-        self.layout, self.codec = layout, file.codec
+        self.layout = layout
+        self.codec = file.codec
         self._file = file
-        self._last_page: tuple[int, Gaussians | None] = -1, None
+        # Replaced as a whole, because threads read it without a lock.
+        self._last_page: tuple[int, Gaussians | None] = (-1, None)
 
     def read(self, first_page: int, last_page: int) -> Gaussians:
         """Gaussians of a run of pages, on the host; verified."""
-        number, kept = self._last_page
-        if first_page == number == last_page - 1 and kept is not None:
-            return kept
+        cached_page, cached = self._last_page
+        if first_page == cached_page == last_page - 1 and cached is not None:
+            return cached
         run = self.layout.run(first_page, last_page, self._file.places)
-        kept = self.codec.empty(run.rows.stop - run.rows.start)
-        self._file.read(run, kept.rows)
+        gaussians = self.codec.empty(run.rows.stop - run.rows.start)
+        self._file.read(run, gaussians.rows)
         if last_page - first_page == 1:
-            self._last_page = first_page, kept
-        return kept
+            self._last_page = (first_page, gaussians)
+        return gaussians
 
     def in_memory(self) -> MemoryPages | CodePages:
-        """All of them; read and verified."""
+        """The same pages, all read into memory and verified."""
         if self.codec.name == Codec.name:
             return MemoryPages(self.layout, self.read(0, self.layout.num_pages), self.codec)
         run = self.layout.run(0, self.layout.num_pages, self._file.places)
@@ -158,18 +168,20 @@ class FilePages:
             raise ValueError(f"{self._file.path}: {error}; {_core.DAMAGED}") from None
 
 
-def on_threads(work: Callable[[_Item], _Result], items: Sequence[_Item], most: int = _MOST) -> list[_Result]:
-    """What work makes of all items, on so many threads at most if there are several."""
+def on_threads(
+    work: Callable[[_Item], _Result], items: Sequence[_Item], max_threads: int = _MAX_THREADS
+) -> list[_Result]:
+    """The results of ``work`` for all items, computed by several threads if there are several items."""
     if len(items) < 2:
         return list(map(work, items))
-    with ThreadPoolExecutor(most) as pool:
+    with ThreadPoolExecutor(max_threads) as pool:
         return list(pool.map(work, items))
 
 
 def runs_of_pages(
     first_page: int, last_page: int, page_bytes: NDArray[np.int64], num_bytes: int
 ) -> Iterator[range]:
-    """Cut a run of pages into runs of about so many bytes: enough work, and little memory."""
+    """Split a run of pages into runs of about ``num_bytes``, which bounds the memory that a run takes."""
     ends = np.cumsum(page_bytes[first_page:last_page]) // num_bytes
     cuts = (np.flatnonzero(np.diff(ends)) + first_page + 1).tolist()
     for start, stop in zip([first_page, *cuts], [*cuts, last_page], strict=True):

@@ -1,4 +1,4 @@
-"""The tables of a bundle, which selection reads, and the checks that make its cut exact."""
+"""The tables of a bundle, which selection reads, and the checks that guarantee an exact cut."""
 
 import operator
 from dataclasses import dataclass, replace
@@ -47,9 +47,9 @@ class Clusters:
         return len(self.level)
 
     def around(self, gaussians: Gaussians) -> "Clusters":
-        """The same clusters with boxes around other gaussians."""
-        is_filled = np.diff(self.offset)[:, None, None] > 0
-        box = np.where(is_filled, _core.bound_by_boxes(gaussians.rows, self.offset), self.box)
+        """The same clusters with boxes around other gaussians; those of empty clusters stay."""
+        has_gaussians = np.diff(self.offset)[:, None, None] > 0
+        box = np.where(has_gaussians, _core.bound_by_boxes(gaussians.rows, self.offset), self.box)
         return replace(self, box=box)
 
 
@@ -84,25 +84,28 @@ def check_index(name: str, index: int, count: int) -> None:
 
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:
-    """Check kinds and shapes, and take copies of arrays that could be changed after all checks."""
+    """Check dtypes and shapes, and replace writable arrays by read-only copies, so that the checks hold."""
     count = np.size(part.level)
-    for name, kind, rows, rest in [column for column in SCHEMA if column[0].startswith(prefix)]:
+    for name, kind, rows, row_shape in [column for column in SCHEMA if column[0].startswith(prefix)]:
         array = getattr(part, name.removeprefix(prefix))
         check_type(name, array, np.ndarray, "a NumPy array")
-        dtype, shape = np.dtype(DTYPES[kind]), (count + (rows == "C+1"), *rest)
+        dtype = np.dtype(DTYPES[kind])
+        num_rows = count + (rows == "C+1")
+        shape = (num_rows, *row_shape)
         if array.dtype != dtype or array.shape != shape:
             refuse(name, f"{dtype} {shape}, got {array.dtype} {array.shape}")
         check(name, array.flags.c_contiguous, "a C-contiguous array; use np.ascontiguousarray")
         if array.flags.writeable:
-            own = array.copy()
-            own.flags.writeable = False
-            object.__setattr__(part, name.removeprefix(prefix), own)
+            copy = array.copy()
+            copy.flags.writeable = False
+            object.__setattr__(part, name.removeprefix(prefix), copy)
 
 
 def columns_of(clusters: Clusters, groups: Groups) -> dict[str, NDArray[Any]]:
-    """All tables, by the names that files have for them."""
-    parts = {"clusters": clusters, "groups": groups}
-    return {f"{part}.{name}": array for part, of in parts.items() for name, array in vars(of).items()}
+    """All tables, by their names in files."""
+    columns = {f"clusters.{name}": array for name, array in vars(clusters).items()}
+    columns.update({f"groups.{name}": array for name, array in vars(groups).items()})
+    return columns
 
 
 def check_tables(clusters: Clusters, groups: Groups, num_gaussians: int) -> None:

@@ -12,6 +12,7 @@ from v3dg._numbers import check_all
 from v3dg.gaussians import Gaussians, empty
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
+Integers: TypeAlias = NDArray[np.integer[Any]]
 
 SQRT2 = math.sqrt(2.0)
 SH_C0 = _core.sh_base0
@@ -22,10 +23,10 @@ DEGREES = {0: 0, 3: 1, 8: 2, 15: 3}
 
 _BLOCK = 1 << 16  # gaussians decoded at once: the double precision of a block stays in the cache's reach
 _MIN_LOG_SCALE = -20.0  # 2e-9: stands for scales of 0, whose log no quantised format can hold
-_LEAST_SEEN = np.float32(_core.min_alpha)
+_LEAST_VISIBLE_OPACITY = np.float32(_core.min_alpha)
 
-# The components that stay when one is left out, in ascending order.
-_KEPT = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+# The components of a quaternion that are stored, in ascending order, by the one that is omitted.
+_STORED_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def blocks(count: int) -> Iterator[slice]:
@@ -34,30 +35,30 @@ def blocks(count: int) -> Iterator[slice]:
 
 
 def assemble(count: int, degree: int, decode: Callable[[slice], tuple[Floats, ...]]) -> Gaussians:
-    """Gaussians of what ``decode`` gives for a block: means, quats, scales, opacities and sh."""
+    """Decode gaussians by blocks: ``decode`` returns means, quats, scales, opacities and sh of one."""
     gaussians = empty(count, degree)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is passed on
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are passed on
         for block in blocks(count):
             for array, values in zip(vars(gaussians).values(), decode(block), strict=True):
                 array[block] = values
     return gaussians
 
 
-def quats_from_three(three: Floats, left_out: NDArray[Any]) -> Floats:
-    """Unit quaternions (N, 4) of their three other components and the index of the one left out, >= 0."""
-    rest = np.sqrt(np.maximum(0.0, 1.0 - np.square(three).sum(axis=1)))
+def quats_from_three(three: Floats, omitted: Integers) -> Floats:
+    """Unit quaternions (N, 4) from three components and the index of the omitted one, which is >= 0."""
+    omitted_component = np.sqrt(np.maximum(0.0, 1.0 - np.square(three).sum(axis=1)))
     quats = np.empty((len(three), 4))
-    np.put_along_axis(quats, _KEPT[left_out], three, axis=1)
-    np.put_along_axis(quats, left_out[:, None].astype(np.intp), rest[:, None], axis=1)
+    np.put_along_axis(quats, _STORED_COMPONENTS[omitted], three, axis=1)
+    np.put_along_axis(quats, omitted[:, None].astype(np.intp), omitted_component[:, None], axis=1)
     return quats
 
 
 def three_of_quats(quats: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """The inverse: three components (N, 3) within ±√½ and the index (N,) of the largest, left out."""
+    """The inverse: three components (N, 3) within ±√½ and the index (N,) of the largest, which is omitted."""
     unit = normalised(quats)
     largest = np.abs(unit).argmax(axis=1)
     sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
-    return np.take_along_axis(unit, _KEPT[largest], axis=1) * sign, largest
+    return np.take_along_axis(unit, _STORED_COMPONENTS[largest], axis=1) * sign, largest
 
 
 def normalised(quats: Floats) -> Floats:
@@ -80,8 +81,8 @@ def to_integers(values: Floats, largest: int) -> NDArray[np.uint32]:
 
 
 def opacity_bytes(opacities: Floats) -> NDArray[np.uint32]:
-    """The nearest of 255 steps, but 0 for what no pixel shows: rounded up, it would be seen."""
-    return np.where(opacities < _LEAST_SEEN, 0, to_integers(opacities * 255.0, 255))
+    """The nearest of 255 steps, but 0 for opacities that are invisible: rounded up, they would be visible."""
+    return np.where(opacities < _LEAST_VISIBLE_OPACITY, 0, to_integers(opacities * 255.0, 255))
 
 
 def check_writable(gaussians: Gaussians) -> Gaussians:

@@ -1,4 +1,4 @@
-"""What readers of strangers' files share: assets that are read in parts, and how much claims may cost."""
+"""Shared by the readers of untrusted files: assets that are read in parts, and bounds on memory."""
 
 import contextlib
 import os
@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from typing import IO, Any, TypeAlias
+from typing import IO, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,12 @@ from v3dg._json import Node
 from v3dg._numbers import check as check
 from v3dg.gaussians import Gaussians, gaussian_bytes
 
-_FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: that many may all be equal, in a file of any size
-_FREE_BYTES = 1 << 20  # that a member of a zip may have whatever the size of the zip
+_FREE_GAUSSIANS = 1 << 18  # 15 to 62 MB: a file of any size may claim this many
+_FREE_BYTES = 1 << 20  # a member of a zip may have this size, whatever the size of the zip
 
 
 Path: TypeAlias = str | os.PathLike[str]
+_Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,22 +44,28 @@ class AssetFile:
 
 
 def bytes_of(files: Iterable[Path]) -> int:
-    """On disk, of those that are there."""
+    """Size on disk of the files that exist, together."""
     return sum(os.stat(file).st_size for file in set(files) if os.path.exists(file))
 
 
 def whole_file(
     path: Path, count: int, sh_degree: int, read: Callable[[Path], Gaussians], files: Iterable[Path] = ()
 ) -> AssetFile:
-    """A file, and others that it names, that can only be read whole: on the first read, and then kept."""
-    whole = cache(lambda: read(path))
-    # While it is read: what is on the disk, and on the way to the gaussians no more than twice those.
+    """A file, and others that it names, that can only be read whole: on the first read, and then cached."""
+    read_once = cache(lambda: read(path))
+    # While it is read: the content of the files, and at most twice the gaussians.
     memory = bytes_of([path, *files]) + 2 * count * gaussian_bytes(sh_degree)
-    return AssetFile(path, count, sh_degree, lambda first, last: whole().subset(slice(first, last)), memory)
+    return AssetFile(
+        path,
+        num_gaussians=count,
+        sh_degree=sh_degree,
+        read=lambda first, last: read_once().subset(slice(first, last)),
+        whole_bytes=memory,
+    )
 
 
 class File:
-    """A file that is read in places, closed when it is dropped; ValueError where it is no regular one."""
+    """A file with random access, closed when it is dropped; ValueError if it is not a regular file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -67,8 +74,8 @@ class File:
         weakref.finalize(self, os.close, self._descriptor)
         self.num_bytes = os.fstat(self._descriptor).st_size
 
-    def rows(self, dtype: np.dtype[Any], offset: int, count: int) -> NDArray[Any]:
-        """`count` records of a kind from an offset on; ValueError where the file has become shorter."""
+    def rows(self, dtype: np.dtype[_Scalar], offset: int, count: int) -> NDArray[_Scalar]:
+        """Read `count` records from an offset on; ValueError if the file has become shorter."""
         rows = np.empty(count, dtype)
         with _files.naming_errors(self.path):
             is_whole = _files.read_at(self._descriptor, rows, offset)
@@ -77,7 +84,7 @@ class File:
 
 
 def least_bytes(count: int) -> int:
-    """Bytes that a file of so many gaussians needs to be believed: one for each, from a number on."""
+    """Smallest size of a file that may claim `count` gaussians: a byte for each beyond a free number."""
     return max(0, count - _FREE_GAUSSIANS)
 
 
@@ -100,12 +107,12 @@ class Claims:
             return file.read()
 
     def add(self, path: Path, count: int) -> None:
-        """Believe that a file has so many gaussians, or raise ValueError: call it before memory is taken."""
+        """Accept that a file has so many gaussians, or raise ValueError; to be called before allocation."""
         self._gaussians += count
         num_bytes = sum(self._files.values())
-        found = f"{self._gaussians} gaussians in {num_bytes} bytes"
-        is_believed = least_bytes(self._gaussians) <= num_bytes
-        check(path, is_believed, f"a byte a gaussian beyond {_FREE_GAUSSIANS}, got {found}")
+        is_plausible = least_bytes(self._gaussians) <= num_bytes
+        claim = f"{self._gaussians} gaussians in {num_bytes} bytes"
+        check(path, is_plausible, f"a byte a gaussian beyond {_FREE_GAUSSIANS}, got {claim}")
 
 
 class Archive:
@@ -113,29 +120,30 @@ class Archive:
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self._path = path
-        start = file.read(4)  # zipfile would look for a zip anywhere in the file
+        start = file.read(4)  # zipfile accepts a zip that begins anywhere in the file
         check(path, start == b"PK\3\4", f"a zip, got a file that begins with {start!r}")
         with telling(path, "a zip that is not damaged"):
             self._zip = zipfile.ZipFile(file)
-            self._most = max(_FREE_BYTES, file.seek(0, os.SEEK_END))
+            self._max_bytes = max(_FREE_BYTES, file.seek(0, os.SEEK_END))
         self.names = self._zip.namelist()
 
     def read(self, name: str) -> bytes:
         check(self._path, name in self._zip.NameToInfo, f"{name!a} in the zip, got none")
         member = self._zip.getinfo(name)
-        size, is_known = member.file_size, member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-        check(self._path, size <= self._most, f"{name!a} no larger than the zip, got {size} bytes")
-        check(self._path, is_known, f"{name!a} stored or deflated in the zip, got neither")
-        if getattr(member, "CRC", None) == 0:  # torch can be told to compute none
-            del member.CRC  # then zipfile does not ask for it
+        size = member.file_size
+        check(self._path, size <= self._max_bytes, f"{name!a} no larger than the zip, got {size} bytes")
+        is_readable = member.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+        check(self._path, is_readable, f"{name!a} stored or deflated in the zip, got neither")
+        if getattr(member, "CRC", None) == 0:  # torch writes no checksum if it is configured so
+            del member.CRC  # without the attribute, zipfile does not compare it
         with telling(self._path, "a zip that is not damaged"), self._zip.open(member) as file:
-            content = file.read(size)  # without a limit, zipfile expands first and cuts off then
+            content = file.read(size)  # without a limit, zipfile expands everything before it truncates
         check(self._path, len(content) == size, f"{size} bytes in {name!a}, got {len(content)}")
         return content
 
 
 def whole(node: Node, expected: str, low: int, high: int) -> int:
-    """A whole number of JSON, within bounds."""
+    """A JSON value that must be a whole number of ``low`` to ``high``."""
     if not isinstance(node.value, int) or isinstance(node.value, bool) or not low <= node.value <= high:
         raise node.error(expected)
     return node.value

@@ -10,7 +10,7 @@ bytes for the range in the header), band by band and there channel by channel. S
 import math
 import os
 import struct
-from typing import Any, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,32 @@ _SECTION_BYTES = 1024
 _MAX_SECTIONS = 1 << 16
 # By compression: types of a mean's coordinates, of scales and quaternions, and of higher SH.
 _TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
-_SH_RANGE = (-1.5, 1.5)  # where the header gives none
-_DEFAULT_STEPS = 32767  # of a bucket's half side
+_SH_RANGE = (-1.5, 1.5)  # if the header has none
+_DEFAULT_STEPS = 32767  # per half side of a bucket
 _SECTION = struct.Struct("<IIIIfH2xI4xIIH")
-# Of each gaussian's bucket (N, 3), world units of a step, and steps from a corner to the centre.
-_Centers: TypeAlias = tuple[NDArray[Any], float, int]
+
+
+class _Section(NamedTuple):
+    """The header of a section, in the order of its fields in the file."""
+
+    num_gaussians: int
+    max_gaussians: int
+    bucket_size: int  # gaussians in a full bucket
+    num_buckets: int
+    bucket_side: float  # world units
+    bucket_bytes: int
+    num_steps: int  # from a corner of a bucket to its centre; 0: the default
+    num_full_buckets: int
+    num_partial_buckets: int
+    sh_degree: int
+
+
+class _Buckets(NamedTuple):
+    """What a mean is relative to."""
+
+    centers: NDArray[np.float32]  # (N, 3) of each gaussian's bucket
+    step_world: float
+    num_steps: int  # from a corner to the centre
 
 
 def open_file(path: Path) -> AssetFile:
@@ -36,83 +57,102 @@ def open_file(path: Path) -> AssetFile:
     with Claims().open(path) as file:
         size = os.fstat(file.fileno()).st_size
         start = file.read(min(size, _HEADER_BYTES + _MAX_SECTIONS * _SECTION_BYTES))
-    headers, degree, _ = _headers(path, start)
-    return whole_file(path, sum(header[0] for header in headers), degree, read)
+    sections, degree, _ = _headers(path, start)
+    return whole_file(path, sum(section.num_gaussians for section in sections), degree, read)
 
 
 def read(path: Path) -> Gaussians:
     """Read a `.ksplat` file of version 0.1 and later, of SH degree 0 to 2."""
     content = Claims().read(path)
-    headers, degree, compression = _headers(path, content)
+    sections, degree, compression = _headers(path, content)
     low, high = struct.unpack_from("<ff", content, 36)
-    sh_range = (low, high) if low < high else _SH_RANGE
-    offset = _HEADER_BYTES + len(headers) * _SECTION_BYTES
+    sh_range = _SH_RANGE
+    if low < high:
+        sh_range = (low, high)
+    start = _HEADER_BYTES + len(sections) * _SECTION_BYTES
     parts = []
-    for i, header in enumerate(headers):
-        rows, centers, offset = _section(path, content, i, header, offset, compression)
-        parts.append(_decoded(rows, centers, degree, sh_range))
-    return parts[0] if len(parts) == 1 else Gaussians.concatenate(parts or [assemble(0, 0, lambda rows: ())])
+    for i, section in enumerate(sections):
+        rows, buckets, start = _section(path, content, start, i, section, compression)
+        parts.append(_decoded(rows, buckets, degree, sh_range))
+    if not parts:
+        return assemble(0, 0, lambda rows: ())
+    if len(parts) == 1:
+        return parts[0]
+    return Gaussians.concatenate(parts)
 
 
-def _headers(path: Path, content: bytes) -> tuple[list[tuple[Any, ...]], int, int]:
-    """Those of the sections, which are at the start; the SH degree, and the compression."""
-    given = len(content)
-    check(path, given >= _HEADER_BYTES, f"a header of {_HEADER_BYTES} bytes, got {given}")
+def _headers(path: Path, content: bytes) -> tuple[list[_Section], int, int]:
+    """The headers of all sections, the SH degree and the compression; ``content`` is the start of a file."""
+    num_bytes = len(content)
+    check(path, num_bytes >= _HEADER_BYTES, f"a header of {_HEADER_BYTES} bytes, got {num_bytes}")
     major, minor, num_sections, count, compression = struct.unpack_from("<BB2xI8xIH", content)
-    is_known, found = major == 0 < minor and compression <= 2, f"{major}.{minor}, {compression}"
-    check(path, is_known, f".ksplat 0.1 or later and compression 0 to 2, got {found}")
-    has_headers = num_sections <= min(_MAX_SECTIONS, (given - _HEADER_BYTES) // _SECTION_BYTES)
-    check(path, has_headers, f"headers of {num_sections} sections, got {given} bytes")
+    is_known = major == 0 < minor and compression <= 2
+    kind = f"{major}.{minor}, {compression}"
+    check(path, is_known, f".ksplat 0.1 or later and compression 0 to 2, got {kind}")
+    has_headers = num_sections <= min(_MAX_SECTIONS, (num_bytes - _HEADER_BYTES) // _SECTION_BYTES)
+    check(path, has_headers, f"headers of {num_sections} sections, got {num_bytes} bytes")
     end = _HEADER_BYTES + num_sections * _SECTION_BYTES
-    headers = [_SECTION.unpack_from(content, start) for start in range(_HEADER_BYTES, end, _SECTION_BYTES)]
-    total, degree = sum(header[0] for header in headers), max((header[-1] for header in headers), default=0)
+    starts = range(_HEADER_BYTES, end, _SECTION_BYTES)
+    sections = [_Section(*_SECTION.unpack_from(content, start)) for start in starts]
+    total = sum(section.num_gaussians for section in sections)
     check(path, total == count, f"{count} gaussians in the sections, got {total}")
+    degree = max((section.sh_degree for section in sections), default=0)
     check(path, degree <= 2, f"SH degree 0 to 2, got {degree}")
-    return headers, degree, compression
+    return sections, degree, compression
 
 
 def _section(
-    path: Path, content: bytes, i: int, header: tuple[Any, ...], offset: int, compression: int
-) -> tuple[NDArray[np.void], _Centers | None, int]:
-    """A section's rows, where their buckets are, and its end; sections follow each other."""
-    position, parts, higher = _TYPES[compression]
-    count, room, capacity, num_buckets, side, bucket_bytes, steps, num_full, num_partial, degree = header
-    check(path, count <= room, f"at most {room} gaussians in section {i}, got {count}")
-    formats = [(position, 3), (parts, 3), (parts, 4), ("u1", 4), (higher, 3 * ((degree + 1) ** 2 - 1))]
-    record = np.dtype({"names": ("mean", "scale", "quat", "rgba", "sh"), "formats": formats})
-    buckets = offset + 4 * num_partial
-    first = buckets + bucket_bytes * num_buckets
-    end = first + record.itemsize * room
-    check(path, end <= len(content), f"section {i} to end within {len(content)} bytes, got {end}")
-    rows = np.frombuffer(content, record, count, first)
+    path: Path, content: bytes, start: int, number: int, section: _Section, compression: int
+) -> tuple[NDArray[np.void], _Buckets | None, int]:
+    """The rows of a section, the buckets that their means are relative to, and the end of the section."""
+    mean_type, shape_type, sh_type = _TYPES[compression]
+    count = section.num_gaussians
+    max_count = section.max_gaussians
+    check(path, count <= max_count, f"at most {max_count} gaussians in section {number}, got {count}")
+    record = np.dtype(
+        [
+            ("mean", mean_type, 3),
+            ("scale", shape_type, 3),
+            ("quat", shape_type, 4),
+            ("rgba", "u1", 4),
+            ("sh", sh_type, (3 * ((section.sh_degree + 1) ** 2 - 1),)),
+        ]
+    )
+    buckets_start = start + 4 * section.num_partial_buckets
+    rows_start = buckets_start + section.bucket_bytes * section.num_buckets
+    end = rows_start + record.itemsize * max_count
+    check(path, end <= len(content), f"section {number} to end within {len(content)} bytes, got {end}")
+    rows = np.frombuffer(content, record, count, rows_start)
     if not compression:
         return rows, None, end
-    partial = np.frombuffer(content, "<u4", num_partial, offset).astype(np.int64)
-    used = num_full + num_partial
-    fits = bucket_bytes >= 12 and used <= num_buckets
-    check(path, fits, f"{num_buckets} buckets in section {i}, got {used}")
-    sizes = np.concatenate([np.full(num_full, capacity, np.int64), partial])
-    ends = np.cumsum(np.minimum(sizes, count))
-    is_filled = not count or (len(ends) and ends[-1] >= count)
-    check(path, is_filled, f"buckets for {count} gaussians in section {i}, got fewer")
-    bucket = np.searchsorted(ends, np.arange(count), side="right")
-    points = np.frombuffer(content, np.dtype((np.void, bucket_bytes)), num_buckets, buckets)
-    centers = np.ndarray((num_buckets, 3), "<f4", points, strides=(bucket_bytes, 4))[bucket]
-    steps = steps or _DEFAULT_STEPS
-    return rows, (centers, side / 2 / steps, steps), end
+    partial_sizes = np.frombuffer(content, "<u4", section.num_partial_buckets, start).astype(np.int64)
+    num_used = section.num_full_buckets + section.num_partial_buckets
+    fits = section.bucket_bytes >= 12 and num_used <= section.num_buckets
+    check(path, fits, f"{section.num_buckets} buckets in section {number}, got {num_used}")
+    full_sizes = np.full(section.num_full_buckets, section.bucket_size, np.int64)
+    ends = np.cumsum(np.minimum(np.concatenate([full_sizes, partial_sizes]), count))
+    is_enough = not count or (len(ends) and ends[-1] >= count)
+    check(path, is_enough, f"buckets for {count} gaussians in section {number}, got fewer")
+    bucket_from_row = np.searchsorted(ends, np.arange(count), side="right")
+    bucket = np.dtype((np.void, section.bucket_bytes))
+    stored = np.frombuffer(content, bucket, section.num_buckets, buckets_start)
+    strides = (section.bucket_bytes, 4)
+    centers: NDArray[np.float32] = np.ndarray((section.num_buckets, 3), "<f4", stored, strides=strides)
+    num_steps = section.num_steps or _DEFAULT_STEPS
+    step_world = section.bucket_side / 2 / num_steps
+    return rows, _Buckets(centers[bucket_from_row], step_world, num_steps), end
 
 
 def _decoded(
-    records: NDArray[np.void], centers: _Centers | None, degree: int, sh_range: tuple[float, float]
+    records: NDArray[np.void], buckets: _Buckets | None, degree: int, sh_range: tuple[float, float]
 ) -> Gaussians:
-    """The gaussians of a section, with zeros for the coefficients that others have beyond its degree."""
+    """The gaussians of a section, padded with zeros to the coefficients of ``degree``."""
 
     def decode(block: slice) -> tuple[Floats, ...]:
         rows = records[block]
         means = rows["mean"].astype(np.float64)
-        if centers is not None:
-            of_buckets, scale, steps = centers
-            means = (means - steps) * scale + of_buckets[block]
+        if buckets is not None:
+            means = (means - buckets.num_steps) * buckets.step_world + buckets.centers[block]
         rgba = rows["rgba"] / 255.0
         higher = rows["sh"].astype(np.float64)
         if rows.dtype["sh"].base == np.uint8:
@@ -120,9 +160,10 @@ def _decoded(
         sh = np.zeros((len(rows), (degree + 1) ** 2, 3))
         sh[:, 0] = (rgba[:, :3] - 0.5) / SH_C0
         for band in range(1, math.isqrt(1 + higher.shape[1] // 3)):
-            first, last = band**2, (band + 1) ** 2
-            of_band = higher[:, 3 * (first - 1) : 3 * (last - 1)]  # channel by channel
-            sh[:, first:last] = of_band.reshape(-1, 3, last - first).transpose(0, 2, 1)
+            first = band**2
+            last = (band + 1) ** 2
+            coefficients = higher[:, 3 * (first - 1) : 3 * (last - 1)]  # channel by channel
+            sh[:, first:last] = coefficients.reshape(-1, 3, last - first).transpose(0, 2, 1)
         return means, normalised(rows["quat"]), rows["scale"], rgba[:, 3], sh
 
     return assemble(len(records), degree, decode)

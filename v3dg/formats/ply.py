@@ -13,13 +13,17 @@ PlyEncoding = Literal["binary_little_endian", "binary_big_endian", "ascii"]
 
 
 def open_file(path: Path) -> AssetFile:
-    """A `.ply` file; one that has packed positions as a compressed one, whatever its name."""
+    """Open a `.ply` file; one with packed positions is a compressed one, whatever its name."""
     name = os.fspath(path)
     _, _, elements = _core.ply_header(name)
     if any("packed_position" in dict(properties) for _, _, properties in elements):
         return compressed_ply.open_file(path)
     file = _core.PlyFile(name)
-    return AssetFile(path, file.num_gaussians, file.sh_degree, lambda a, b: Gaussians(*file.read(a, b)))
+
+    def read(first: int, last: int) -> Gaussians:
+        return Gaussians(*file.read(first, last))
+
+    return AssetFile(path, file.num_gaussians, file.sh_degree, read)
 
 
 def write(path: Path, gaussians: Gaussians, encoding: PlyEncoding = "binary_little_endian") -> None:

@@ -12,7 +12,7 @@ import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,27 +27,33 @@ from v3dg.gaussians import Gaussians
 
 _Pixels: TypeAlias = NDArray[np.uint8]
 _MAX_GAUSSIANS = 1 << 28  # pixels of the largest WebP
-# A picture may have this many times the pixels that are needed, and some: writers round up differently.
-_SPARE, _FREE_PIXELS = 4, 1 << 16
+# A picture may have up to so many pixels: a multiple of what is needed, because writers round up differently,
+# and a constant.
+_MAX_PIXELS_FACTOR = 4
+_FREE_PIXELS = 1 << 16
 _PALETTE_COLUMNS = 64  # entries of the palette side by side in its picture
-_MAX_LOG = 88.0  # of a float32
+_MAX_LOG = 88.0  # about the log of the largest float32
 
-# Parts of meta.json, and how many pictures each has.
+# Number of pictures of each part of meta.json.
 _PARTS = {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}
 
 
 def open_file(path: str | os.PathLike[str]) -> AssetFile:
     """Open a `.sog` file or a `meta.json`; all is read with its first rows."""
-    path, claims = Path(path), Claims()
-    with claims.open(path) as file:
-        text = file.read() if path.suffix == ".json" else Archive(path, file).read("meta.json")
+    path = Path(path)
+    with Claims().open(path) as file:
+        if path.suffix == ".json":
+            text = file.read()
+        else:
+            text = Archive(path, file).read("meta.json")
     count, degree = _size(_meta(path, text))
     return whole_file(path, count, degree, read, files(path))
 
 
 def read(path: str | os.PathLike[str], claims: Claims | None = None) -> Gaussians:
     """Read a `.sog` file, or the `meta.json` of a folder with its pictures."""
-    path, claims = Path(path), claims or Claims()
+    path = Path(path)
+    claims = claims or Claims()
     if path.suffix == ".json":
         return _read(path, claims.read(path), lambda name: claims.read(path.with_name(name)), claims)
     with claims.open(path) as file:
@@ -68,32 +74,28 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
     count, degree = _size(meta)
     names = _names(meta)
     pictures = {name: load(name) for part in names.values() for name in part}
-    claims.add(path, count)  # all that it has on disk is known now
+    claims.add(path, count)  # after all files are open, because their sizes bound the claim
 
     def pixels(name: str) -> _Pixels:
-        """(N, 4) red, green, blue and alpha of the gaussians."""
+        """(N, 4) red, green, blue and alpha, a pixel for each gaussian."""
         return _decoded(path, name, pictures[name], count).reshape(-1, 4)[:count]
 
     low, high = (np.array(meta["means"].field(name).vector(3)) for name in ("mins", "maxs"))
     lower, upper = map(pixels, names["means"])
     scales, quats, color = (pixels(names[part][0]) for part in ("scales", "quats", "sh0"))
-    scale_table, color_table = _codebook(meta["scales"]), _codebook(meta["sh0"])
+    scale_table = _codebook(meta["scales"])
+    color_table = _codebook(meta["sh0"])
     tags = quats[:, 3]
     smallest = tags.min(initial=255)
     check(path, smallest >= 252, f"quaternions tagged 252 to 255, got {smallest}")
-    table: Floats = np.zeros(1)
-    palette: NDArray[Any] = np.zeros((1, 0, 3), np.uint8)
-    labels: NDArray[Any] = np.zeros(count, np.uint8)
+    higher = _NO_HIGHER_SH
+    labels: _packing.Integers = np.zeros(count, np.uint16)
     if "shN" in meta:
-        num_entries = whole(meta["shN"].field("count"), "1 to 65536 entries", 1, 65536)
-        table = _codebook(meta["shN"])
-        num_rows, width = -(-num_entries // _PALETTE_COLUMNS), _PALETTE_COLUMNS * ((degree + 1) ** 2 - 1)
-        centroids = _decoded(path, names["shN"][0], pictures[names["shN"][0]], num_rows * width, width)
-        palette = centroids[:num_rows, :, :3].reshape(num_rows * _PALETTE_COLUMNS, -1, 3)
-        places = pixels(names["shN"][1])
-        labels = places[:, 0] | (places[:, 1].astype(np.uint16) << 8)
+        higher = _palette(path, meta["shN"], names["shN"][0], pictures, degree)
+        label_pixels = pixels(names["shN"][1])
+        labels = label_pixels[:, 0] | (label_pixels[:, 1].astype(np.uint16) << 8)
         largest = labels.max(initial=0)
-        check(path, largest < len(palette), f"labels below {num_entries}, got {largest}")
+        check(path, largest < len(higher.entries), f"labels below {higher.num_entries}, got {largest}")
 
     def decode(rows: slice) -> tuple[Floats, ...]:
         steps = lower[rows, :3] | (upper[rows, :3].astype(np.uint16) << 8)
@@ -101,10 +103,32 @@ def _read(path: Path, text: bytes, load: Callable[[str], bytes], claims: Claims)
         means = np.sign(logs) * np.expm1(np.abs(logs))
         three = (quats[rows, :3] / 255.0 * 2.0 - 1.0) / SQRT2
         widths = np.exp(scale_table[scales[rows, :3]])
-        sh = np.concatenate([color_table[color[rows, :3]][:, None], table[palette[labels[rows]]]], axis=1)
+        base = color_table[color[rows, :3]][:, None]
+        sh = np.concatenate([base, higher.table[higher.entries[labels[rows]]]], axis=1)
         return means, _packing.quats_from_three(three, tags[rows] - 252), widths, color[rows, 3] / 255.0, sh
 
     return assemble(count, degree, decode)
+
+
+class _Palette(NamedTuple):
+    """The higher SH that gaussians refer to by label."""
+
+    table: Floats  # (256,) values
+    entries: _Pixels  # (P, K, 3) indices into the table; P is num_entries rounded up to full rows
+    num_entries: int
+
+
+_NO_HIGHER_SH = _Palette(np.zeros(1), np.zeros((1, 0, 3), np.uint8), 1)
+
+
+def _palette(path: Path, part: Node, name: str, pictures: dict[str, bytes], degree: int) -> _Palette:
+    num_entries = whole(part.field("count"), "1 to 65536 entries", 1, 65536)
+    table = _codebook(part)
+    num_rows = -(-num_entries // _PALETTE_COLUMNS)
+    width = _PALETTE_COLUMNS * ((degree + 1) ** 2 - 1)
+    centroids = _decoded(path, name, pictures[name], num_rows * width, width)
+    entries = centroids[:num_rows, :, :3].reshape(num_rows * _PALETTE_COLUMNS, -1, 3)
+    return _Palette(table, entries, num_entries)
 
 
 def _meta(path: Path, text: bytes) -> dict[str, Node]:
@@ -119,7 +143,7 @@ def _meta(path: Path, text: bytes) -> dict[str, Node]:
 
 
 def _size(meta: dict[str, Node]) -> tuple[int, int]:
-    """How many gaussians there are, and their SH degree."""
+    """Number of gaussians, and their SH degree."""
     count = whole(meta["count"], "a number of gaussians", 0, _MAX_GAUSSIANS)
     if "shN" not in meta:
         return count, 0
@@ -146,7 +170,7 @@ def _beside(node: Node) -> str:
 def _codebook(part: Node) -> Floats:
     """A table of 256 values."""
     entries = list(part.field("codebook").items("1 to 256 numbers", 1, 256))
-    # Some versions of splat-transform wrote null for the first value, which continues the others.
+    # Some versions of splat-transform wrote null for the first value, which is extrapolated.
     has_null = entries[0].value is None and len(entries) == 256
     values = [entry.number() for entry in entries[has_null:]]
     if has_null:
@@ -155,22 +179,24 @@ def _codebook(part: Node) -> Floats:
 
 
 def _decoded(path: Path, name: str, content: bytes, num_pixels: int, row: int | None = None) -> _Pixels:
-    """(H, W, 4) of a picture that has the pixels that are needed, and not many more."""
-    from PIL.WebPImagePlugin import WebPImageFile  # Image.open would ask what other format it is
+    """(H, W, 4) pixels of a picture, of at least ``num_pixels`` and not many more, in rows of ``row``."""
+    from PIL.WebPImagePlugin import WebPImageFile  # Image.open would also try other formats
 
-    size = width, height = _size_of_webp(content)
+    width, height = _size_of_webp(content)
     check(path, width, f"a WebP picture in {name!a}, got another file")
-    fits = num_pixels <= width * height <= _SPARE * num_pixels + _FREE_PIXELS and row in (None, width)
-    shape = f"{num_pixels} pixels" + ("" if row is None else f" in rows of {row}")
-    check(path, fits, f"{shape} in {name!a}, got {width} x {height}")
+    has_size = num_pixels <= width * height <= _MAX_PIXELS_FACTOR * num_pixels + _FREE_PIXELS
+    expected = f"{num_pixels} pixels"
+    if row is not None:
+        expected += f" in rows of {row}"
+    check(path, has_size and row in (None, width), f"{expected} in {name!a}, got {width} x {height}")
     with telling(path, f"a WebP picture in {name!a}"), WebPImageFile(io.BytesIO(content)) as picture:
-        if picture.size != size:
+        if picture.size != (width, height):
             raise ValueError(f"one of {picture.size}")
         return np.asarray(picture.convert("RGBA"))
 
 
 def _size_of_webp(content: bytes) -> tuple[int, int]:
-    """Width and height as its first chunk says, before a decoder takes memory for them; else 0."""
+    """Width and height from the first chunk, known before a decoder allocates; 0, 0 for another file."""
 
     def number(first: int, size: int) -> int:
         return int.from_bytes(content[first : first + size], "little")
@@ -189,34 +215,39 @@ def write(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.sog` file; gaussians are put in an order that keeps neighbours together."""
     host = _packing.check_writable(gaussians)
     contents = encode(host.subset(_core.morton_order(host.means)))
-    # Gaussians that are all alike take too little to be believed.
+    # Readers refuse files that are too small for what they claim; equal gaussians compress to almost nothing.
     missing = least_bytes(len(host)) - sum(map(len, contents.values()))
     if missing > 0:
         contents["padding"] = bytes(missing)
     with _files.replacing(path) as temporary, zipfile.ZipFile(temporary, "w") as bundle:
         for name, content in contents.items():
-            bundle.writestr(zipfile.ZipInfo(name), content)  # of 1980: the same gaussians, the same file
+            bundle.writestr(zipfile.ZipInfo(name), content)  # dated 1980, so that files are reproducible
 
 
 def encode(gaussians: Gaussians) -> dict[str, bytes]:
-    """The files of a SOG, by name: NumPy gaussians with values that can be held, in their order."""
+    """The files of a SOG by name; ``gaussians`` have passed `check_writable`, and their order stays."""
     count = len(gaussians)
     width = 4 * max(1, math.ceil(math.sqrt(count) / 4))
     height = 4 * max(1, math.ceil(count / width / 4))
 
-    def picture(*columns: NDArray[Any]) -> bytes:
+    def picture(*columns: _packing.Integers) -> bytes:
         return _webp(np.stack(columns, axis=1), width, height)
 
     means = gaussians.means.astype(np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
-    low, high = (logs.min(axis=0), logs.max(axis=0)) if count else (np.zeros(3), np.zeros(3))
-    whole = _packing.to_integers((logs - low) / np.where(high > low, high - low, 1.0) * 65535.0, 65535)
+    low = np.zeros(3)
+    high = np.zeros(3)
+    if count:
+        low = logs.min(axis=0)
+        high = logs.max(axis=0)
+    steps = _packing.to_integers((logs - low) / np.where(high > low, high - low, 1.0) * 65535.0, 65535)
     three, largest = _packing.three_of_quats(gaussians.quats)
     log_widths = _packing.log_scales(gaussians.scales)
-    scale_table, color_table = _table_of(log_widths), _table_of(gaussians.sh[:, 0])
+    scale_table = _table_of(log_widths)
+    color_table = _table_of(gaussians.sh[:, 0])
     contents = {
-        "means_l.webp": picture(*(whole & 255).T),
-        "means_u.webp": picture(*(whole >> 8).T),
+        "means_l.webp": picture(*(steps & 255).T),
+        "means_u.webp": picture(*(steps >> 8).T),
         "scales.webp": picture(*_nearest(scale_table, log_widths).T),
         "quats.webp": picture(*_packing.to_integers((three * SQRT2 + 1.0) * 127.5, 255).T, largest + 252),
         "sh0.webp": picture(*_nearest(color_table, gaussians.sh[:, 0]).T, opacity_bytes(gaussians.opacities)),
@@ -231,23 +262,31 @@ def encode(gaussians: Gaussians) -> dict[str, bytes]:
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
     }
     if gaussians.sh_degree:
-        coefficients = (gaussians.sh_degree + 1) ** 2 - 1
-        # A quarter of the gaussians, but enough for a small asset to keep all its coefficients, and 16 bits.
-        size = min(max(1024, count // 4), 65536)
-        vectors = np.ascontiguousarray(gaussians.sh[:, 1:]).reshape(count, 3 * coefficients)
-        palette, labels = _core.palette_of(vectors, size)
-        table = _table_of(palette)
-        rows = -(-len(palette) // _PALETTE_COLUMNS)
-        colors = _nearest(table, palette).reshape(-1, 3)
-        contents["shN_centroids.webp"] = _webp(colors, _PALETTE_COLUMNS * coefficients, rows)
+        part, centroids, labels = _encoded_palette(gaussians)
+        meta["shN"] = part
+        contents["shN_centroids.webp"] = centroids
         contents["shN_labels.webp"] = picture(labels & 255, labels >> 8, np.zeros(count, np.uint8))
-        meta["shN"] = {
-            "count": len(palette),
-            "bands": gaussians.sh_degree,
-            "codebook": table.tolist(),
-            "files": ["shN_centroids.webp", "shN_labels.webp"],
-        }
     return {"meta.json": json.dumps(meta, separators=(",", ":")).encode(), **contents}
+
+
+def _encoded_palette(gaussians: Gaussians) -> tuple[dict[str, object], bytes, _packing.Integers]:
+    """The part of meta.json for higher SH, the picture of its palette, and a label for each gaussian."""
+    count = len(gaussians)
+    num_coefficients = (gaussians.sh_degree + 1) ** 2 - 1
+    # A quarter of the gaussians; at least 1024, so that a small asset loses nothing, and at most 16 bits.
+    size = min(max(1024, count // 4), 65536)
+    vectors = np.ascontiguousarray(gaussians.sh[:, 1:]).reshape(count, 3 * num_coefficients)
+    palette, labels = _core.palette_of(vectors, size)
+    table = _table_of(palette)
+    num_rows = -(-len(palette) // _PALETTE_COLUMNS)
+    colors = _nearest(table, palette).reshape(-1, 3)
+    part = {
+        "count": len(palette),
+        "bands": gaussians.sh_degree,
+        "codebook": table.tolist(),
+        "files": ["shN_centroids.webp", "shN_labels.webp"],
+    }
+    return part, _webp(colors, _PALETTE_COLUMNS * num_coefficients, num_rows), labels
 
 
 def _table_of(values: Floats) -> Floats:
@@ -260,13 +299,13 @@ def _nearest(table: Floats, values: Floats) -> NDArray[np.uint8]:
     return np.searchsorted((table[1:] + table[:-1]) / 2, values).astype(np.uint8)
 
 
-def _webp(values: NDArray[Any], width: int, height: int) -> bytes:
-    """A picture that begins with pixels of these values (N, C), and is 255 elsewhere."""
+def _webp(values: _packing.Integers, width: int, height: int) -> bytes:
+    """A picture whose first pixels have these values (N, C), padded with 255."""
     from PIL import Image
 
     pixels = np.full((height, width, 4), 255, np.uint8)
     pixels.reshape(-1, 4)[: len(values), : values.shape[1]] = values
     stream = io.BytesIO()
-    # exact: without it, colours of pixels whose alpha is 0 are lost.
+    # Without exact, pixels whose alpha is 0 lose their colours.
     Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True, quality=50, method=4)
     return stream.getvalue()

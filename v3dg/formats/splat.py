@@ -15,7 +15,8 @@ _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), 
 
 def open_file(path: Path) -> AssetFile:
     """Open a `.splat` file."""
-    file, size = File(path), _RECORD.itemsize
+    file = File(path)
+    size = _RECORD.itemsize
     is_whole = file.num_bytes % size == 0
     check(path, is_whole, f"a multiple of 32 bytes, got {file.num_bytes}; is the file complete?")
 
@@ -26,7 +27,8 @@ def open_file(path: Path) -> AssetFile:
             block = records[rows]
             rgba = block["rgba"] / 255.0
             quats = normalised((block["quat"].astype(np.float64) - 128.0) / 128.0)
-            return block["mean"], quats, block["scale"], rgba[:, 3], (rgba[:, None, :3] - 0.5) / SH_C0
+            sh = (rgba[:, None, :3] - 0.5) / SH_C0
+            return block["mean"], quats, block["scale"], rgba[:, 3], sh
 
         return assemble(len(records), 0, decode)
 

@@ -10,7 +10,7 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,30 @@ _MAGIC = 0x5053474E  # NGSP
 _HEADER = struct.Struct("<IIIBBBB")
 _ZSTD_HEADER_BYTES = 32
 _STREAM_SIZES = struct.Struct("<QQ")
-_MAX_TRAILER = 1 << 20  # bytes after the attributes, which vendors' extensions may take
-_MAX_START = 1 << 16  # bytes in which the header is found, also behind the fields of a gzip stream
+_MAX_TRAILER = 1 << 20  # bytes after the attributes, for extensions of vendors
+_MAX_START = 1 << 16  # bytes that contain the header, also after the optional fields of a gzip header
 _COLOR_SCALE = 0.15
 _LARGEST_FIXED = (1 << 23) - 1
+
+
+class _Header(NamedTuple):
+    version: int
+    sh_degree: int
+    fraction_bits: int  # of the fixed-point positions
+    num_gaussians: int
+
+    @property
+    def section_bytes(self) -> list[int]:
+        """Size of positions, opacities, colours, scales, rotations and higher SH."""
+        position_bytes = 9
+        if self.version == 1:
+            position_bytes = 6
+        rotation_bytes = 3
+        if self.version >= 3:
+            rotation_bytes = 4
+        sh_bytes = 3 * ((self.sh_degree + 1) ** 2 - 1)
+        widths = (position_bytes, 1, 3, 3, rotation_bytes, sh_bytes)
+        return [self.num_gaussians * width for width in widths]
 
 
 def open_file(path: Path) -> AssetFile:
@@ -39,8 +59,8 @@ def open_file(path: Path) -> AssetFile:
     if header[:2] == b"\x1f\x8b":
         with telling(path, "a gzip stream that is not damaged"):
             header = zlib.decompressobj(31).decompress(header, _HEADER.size)
-    _, degree, _, sizes = _checked_header(path, header, claims)
-    return whole_file(path, sizes[1], degree, read)
+    checked = _checked_header(path, header, claims)
+    return whole_file(path, checked.num_gaussians, checked.sh_degree, read)
 
 
 def read(path: Path) -> Gaussians:
@@ -65,16 +85,18 @@ def write(path: Path, gaussians: Gaussians, version: int = 3) -> None:
     with _files.replacing(path) as temporary, open(temporary, "wb") as file:
         for part in encode(host, version):
             file.write(part)
-        # Gaussians that are all alike take too little to be believed; readers pass over zeros at the end.
+        # Readers refuse files that are too small for what they claim, and ignore zeros at the end.
         file.write(bytes(max(0, least_bytes(len(host)) - file.tell())))
 
 
 def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
-    """Parts of a `.spz` file, of NumPy gaussians with values that can be held."""
+    """Parts of a `.spz` file; ``host`` has passed `check_writable`."""
     reach = float(np.abs(host.means).max(initial=0.0))
-    whole = math.ceil(math.log2(reach)) if reach > 0 else 0
-    # After the point: 12, as Niantic's writer has it, but 2^-17 of the largest coordinate at most.
-    bits = max(0, min(max(12, 17 - whole), 22 - whole, 24))
+    integer_bits = 0
+    if reach > 0:
+        integer_bits = math.ceil(math.log2(reach))
+    # Fraction bits: 12, as in Niantic's writer, or more if a step were above 2^-17 of the largest coordinate.
+    bits = max(0, min(max(12, 17 - integer_bits), 22 - integer_bits, 24))
     fits = reach * 2**bits <= _LARGEST_FIXED
     check("means", fits, f"coordinates within ±{_LARGEST_FIXED} for .spz, got {reach:g}")
 
@@ -82,7 +104,9 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
         numbers = np.rint(host.means[rows].astype(np.float64) * 2**bits).astype("<i4")
         return bytes(numbers.view(np.uint8).reshape(-1, 4)[:, :3].tobytes())
 
-    rotations = _rotation_bytes if version == 2 else _rotation_words
+    rotations = _rotation_words
+    if version == 2:
+        rotations = _rotation_bytes
     sections: list[Callable[[slice], bytes]] = [
         fixed,
         lambda rows: _packing.opacity_bytes(host.opacities[rows]).astype(np.uint8).tobytes(),
@@ -93,7 +117,9 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
     ]
     header = _HEADER.pack(_MAGIC, version, len(host), host.sh_degree, bits, 0, 0)
     if version == 4:
-        yield from _zstd_parts(header, len(host), sections if host.sh_degree else sections[:-1])
+        if not host.sh_degree:
+            del sections[-1]
+        yield from _zstd_parts(header, len(host), sections)
         return
     compressor = zlib.compressobj(6, zlib.DEFLATED, 31)
     yield compressor.compress(header)
@@ -104,13 +130,14 @@ def encode(host: Gaussians, version: int = 3) -> Iterator[bytes]:
 
 
 def _zstd_parts(header: bytes, count: int, sections: list[Callable[[slice], bytes]]) -> Iterator[bytes]:
-    """The header with the number of streams and the place of the table of their sizes, the table, streams."""
+    """The header, with number of streams and offset of their table; the table of sizes; the streams."""
     import zstandard
 
     raw = [b"".join(map(section, _packing.blocks(count))) for section in sections]
     packed = [zstandard.ZstdCompressor(level=12).compress(stream) for stream in raw]
     yield header[:15] + struct.pack("<BI12x", len(raw), _ZSTD_HEADER_BYTES)
-    yield b"".join(_STREAM_SIZES.pack(len(a), len(b)) for a, b in zip(packed, raw, strict=True))
+    for compressed, stream in zip(packed, raw, strict=True):
+        yield _STREAM_SIZES.pack(len(compressed), len(stream))
     yield from packed
 
 
@@ -125,7 +152,7 @@ def _rotation_bytes(quats: Floats) -> bytes:
 
 
 def _rotation_words(quats: Floats) -> bytes:
-    # Components are numbered x y z w here.
+    # This format numbers components x y z w.
     three, largest = _packing.three_of_quats(np.roll(quats, -1, axis=1))
     magnitude = _packing.to_integers(np.abs(three) * SQRT2 * 511.0, 511)
     fields = magnitude | ((three < 0).astype(np.uint32) << 9)
@@ -133,32 +160,32 @@ def _rotation_words(quats: Floats) -> bytes:
     return words.astype("<u4").tobytes()
 
 
-def _decode(version: int, degree: int, fraction_bits: int, sections: list[memoryview]) -> Gaussians:
-    count = len(sections[1])
+def _decode(header: _Header, sections: list[memoryview]) -> Gaussians:
+    count = header.num_gaussians
     positions = np.frombuffer(sections[0], "u1")
-    opacities, colors, scales, rotations, rest = (
+    opacities, colors, scales, rotations, higher_sh = (
         np.frombuffer(section, "u1").reshape(count, len(section) // max(1, count)) for section in sections[1:]
     )
 
     def means(block: slice) -> Floats:
-        if version == 1:
+        if header.version == 1:
             return positions.view("<f2").reshape(-1, 3)[block].astype(np.float64)
         three = positions.reshape(-1, 3, 3)[block].astype(np.int32)
         fixed = three[:, :, 0] | (three[:, :, 1] << 8) | (three[:, :, 2] << 16)
-        return ((fixed ^ 0x800000) - 0x800000) / float(1 << fraction_bits)
+        return ((fixed ^ 0x800000) - 0x800000) / float(1 << header.fraction_bits)
 
     def decode(block: slice) -> tuple[Floats, ...]:
         color = (colors[block] / 255.0 - 0.5) / _COLOR_SCALE
-        higher = (rest[block].astype(np.float64) - 128.0) / 128.0
+        higher = (higher_sh[block].astype(np.float64) - 128.0) / 128.0
         sh = np.concatenate([color[:, None], higher.reshape(len(color), -1, 3)], axis=1)
-        log = scales[block] / 16.0 - 10.0
-        return means(block), _quats(rotations[block]), np.exp(log), opacities[block, 0] / 255.0, sh
+        log_scales = scales[block] / 16.0 - 10.0
+        return means(block), _quats(rotations[block]), np.exp(log_scales), opacities[block, 0] / 255.0, sh
 
-    return assemble(count, degree, decode)
+    return assemble(count, header.sh_degree, decode)
 
 
-def _quats(rotations: NDArray[Any]) -> Floats:
-    """w x y z of the words of version 3 and later, or of x y z as bytes."""
+def _quats(rotations: NDArray[np.uint8]) -> Floats:
+    """Quaternions w x y z from words (version 3 and later), or from x y z as bytes."""
     if rotations.shape[1] == 3:
         xyz = rotations / 127.5 - 1.0
         return _packing.normalised(_packing.quats_from_three(xyz, np.zeros(len(xyz), np.intp)))
@@ -168,8 +195,7 @@ def _quats(rotations: NDArray[Any]) -> Floats:
     return np.roll(_packing.quats_from_three(three, words >> 30), 1, axis=1)
 
 
-def _checked_header(path: Path, header: bytes, claims: Claims) -> tuple[int, int, int, list[int]]:
-    """Version, SH degree, fraction bits, and the bytes of each section."""
+def _checked_header(path: Path, header: bytes, claims: Claims) -> _Header:
     check(path, len(header) >= _HEADER.size, f"a header of {_HEADER.size} bytes, got {len(header)}")
     magic, version, count, degree, fraction_bits, _, _ = _HEADER.unpack_from(header)
     check(path, magic == _MAGIC, f".spz, which begins with NGSP, got {header[:4].hex(' ')}")
@@ -177,45 +203,49 @@ def _checked_header(path: Path, header: bytes, claims: Claims) -> tuple[int, int
     check(path, degree <= 3, f"SH degree 0 to 3, got {degree}")
     check(path, fraction_bits <= 24, f"at most 24 fraction bits, got {fraction_bits}")
     claims.add(path, count)
-    widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * ((degree + 1) ** 2 - 1))
-    return version, degree, fraction_bits, [count * width for width in widths]
+    return _Header(version, degree, fraction_bits, count)
 
 
-def _sections_of_gzip(path: Path, content: bytes, claims: Claims) -> tuple[int, int, int, list[memoryview]]:
+def _sections_of_gzip(path: Path, content: bytes, claims: Claims) -> tuple[_Header, list[memoryview]]:
     stream = zlib.decompressobj(31)
     with telling(path, "a gzip stream that is not damaged"):
-        header = stream.decompress(content, _HEADER.size)
-    version, degree, fraction_bits, sizes = _checked_header(path, header, claims)
-    check(path, version <= 3, f"version 1 to 3 in gzip, got {version}")
+        start = stream.decompress(content, _HEADER.size)
+    header = _checked_header(path, start, claims)
+    check(path, header.version <= 3, f"version 1 to 3 in gzip, got {header.version}")
+    sizes = header.section_bytes
     total = sum(sizes)
     with telling(path, "a gzip stream that is not damaged"):
-        # More than needed: a length of 0 would mean no limit.
+        # The limit is never 0, which would mean none.
         body = stream.decompress(stream.unconsumed_tail, total + _MAX_TRAILER)
         if not stream.eof and len(body) >= total:
-            stream.decompress(stream.unconsumed_tail, 1)  # the checksum may be all that is left
+            stream.decompress(stream.unconsumed_tail, 1)  # reads the checksum if nothing else follows
     is_whole = len(body) >= total and stream.eof
     check(path, is_whole, f"a gzip stream that ends after {total} bytes of gaussians, got another")
     ends = np.cumsum(sizes).tolist()
     sections = [memoryview(body)[end - size : end] for size, end in zip(sizes, ends, strict=True)]
-    return version, degree, fraction_bits, sections
+    return header, sections
 
 
-def _sections_of_zstd(path: Path, content: bytes, claims: Claims) -> tuple[int, int, int, list[memoryview]]:
+def _sections_of_zstd(path: Path, content: bytes, claims: Claims) -> tuple[_Header, list[memoryview]]:
     import zstandard
 
-    size, given = _ZSTD_HEADER_BYTES, len(content)
-    check(path, given >= size, f"a header of {size} bytes, got {given}")
-    version, degree, fraction_bits, sizes = _checked_header(path, content, claims)
-    check(path, version == 4, f"version {version} in a gzip stream, got it outside of one")
-    num_streams, table = content[15], int.from_bytes(content[16:20], "little")
-    wanted = sizes if degree else sizes[:-1]
+    num_bytes = len(content)
+    has_header = num_bytes >= _ZSTD_HEADER_BYTES
+    check(path, has_header, f"a header of {_ZSTD_HEADER_BYTES} bytes, got {num_bytes}")
+    header = _checked_header(path, content, claims)
+    check(path, header.version == 4, f"version {header.version} in a gzip stream, got it outside of one")
+    sizes = header.section_bytes
+    if not header.sh_degree:
+        del sizes[-1]
+    num_streams = content[15]
+    table = int.from_bytes(content[16:20], "little")
     first = table + num_streams * _STREAM_SIZES.size
-    is_there = num_streams == len(wanted) and table >= _ZSTD_HEADER_BYTES and first <= given
-    check(path, is_there, f"a table of {len(wanted)} streams after the header, got {num_streams} at {table}")
+    has_table = num_streams == len(sizes) and table >= _ZSTD_HEADER_BYTES and first <= num_bytes
+    check(path, has_table, f"a table of {len(sizes)} streams after the header, got {num_streams} at {table}")
     sections = []
-    for i, size in enumerate(wanted):
+    for i, size in enumerate(sizes):
         packed, expanded = _STREAM_SIZES.unpack_from(content, table + i * _STREAM_SIZES.size)
-        fits = expanded == size and packed <= given - first
+        fits = expanded == size and packed <= num_bytes - first
         check(path, fits, f"{size} bytes in stream {i}, got {expanded} of {packed} in the file")
         with telling(path, "a zstd stream that is not damaged"):
             reader = zstandard.ZstdDecompressor().stream_reader(content[first : first + packed])
@@ -223,4 +253,6 @@ def _sections_of_zstd(path: Path, content: bytes, claims: Claims) -> tuple[int, 
         check(path, len(section) == size, f"{size} bytes in stream {i}, got another number")
         sections.append(memoryview(section))
         first += packed
-    return version, degree, fraction_bits, [*sections, memoryview(b"")][:6]
+    if not header.sh_degree:
+        sections.append(memoryview(b""))
+    return header, sections

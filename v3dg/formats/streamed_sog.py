@@ -1,6 +1,6 @@
 """Streamed SOG, of PlayCanvas: `lod-meta.json` and folders of SOG; v3dg.export writes it.
 
-The leaves of a tree say for each level which gaussians of which folder stand for what is in their bounds.
+Each leaf of a tree lists, for each level, which gaussians of which folder represent what is in its bounds.
 """
 
 import os
@@ -31,16 +31,17 @@ def open_file(path: str | os.PathLike[str]) -> AssetFile:
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read the finest level of each leaf, and the environment, of a `lod-meta.json`."""
-    path, claims = Path(path), Claims()
+    path = Path(path)
+    claims = Claims()
     finest, environment = _used(path, claims)
     parts = []
     for name, rows in finest.items():
         gaussians = sog.read(path.parent / name, claims)
-        # No more than it has: else a small file could ask for any number.
+        # Otherwise a small file could repeat rows any number of times.
         count = len(gaussians)
-        fits = sum(len(r) for r in rows) <= count and max(r.stop for r in rows) <= count
+        fits = sum(len(run) for run in rows) <= count and max(run.stop for run in rows) <= count
         check(path, fits, f"at most {count} gaussians of {str(name)!a}, got more")
-        parts.append(gaussians.subset(np.concatenate([np.arange(r.start, r.stop) for r in rows])))
+        parts.append(gaussians.subset(np.concatenate([np.arange(run.start, run.stop) for run in rows])))
     if environment is not None:
         parts.append(sog.read(path.parent / environment, claims))
     degrees = sorted({part.sh_degree for part in parts})
@@ -49,35 +50,36 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def files(path: Path) -> list[Path]:
-    """The index and the files of all levels and of the environment, as far as they are there."""
+    """The index and the files of all levels and of the environment that exist."""
     _, names, environment = _index(path, Claims().read(path))
     parts = [path.parent / name for name in dict.fromkeys([*names, environment]) if name is not None]
     return [path, *(file for part in parts if part.exists() for file in sog.files(part))]
 
 
 def _used(path: Path, claims: Claims) -> tuple[dict[PurePosixPath, list[range]], PurePosixPath | None]:
-    """The rows of each file, in their order, that are read, and the file of the environment."""
+    """The rows to read of each file, in their order, and the file of the environment."""
     tree, names, environment = _index(path, claims.read(path))
     finest = _finest(tree, names)
     check(path, finest or environment is not None, "gaussians in the tree, got none")
-    # A name that is there twice is read once.
+    # A file that is listed twice is read once.
     return {name: finest[name] for name in dict.fromkeys(names) if name in finest}, environment
 
 
 def _index(path: Path, text: bytes) -> tuple[Node, list[PurePosixPath], PurePosixPath | None]:
-    """The tree, the names of the files, and of the environment."""
+    """The tree, the names of the files, and the name of the environment's file if there is one."""
     with telling(path, "JSON"):
         index = Node(parse_json(text.decode("utf-8")), os.fspath(path), "")
     if index.has("version") and index.field("version").value != 1:
         raise index.field("version").error("streamed SOG version 1")
     names = [_inside(name) for name in index.field("filenames").items()]
-    has_environment = index.has("environment") and index.field("environment").value is not None
-    environment = _inside(index.field("environment")) if has_environment else None
+    environment = None
+    if index.has("environment") and index.field("environment").value is not None:
+        environment = _inside(index.field("environment"))
     return index.field("tree"), names, environment
 
 
 def _inside(node: Node) -> PurePosixPath:
-    """The path of a file in the folder of the index, or below it."""
+    """The path of a file in the folder of the index or below it; ValueError for any other."""
     path = PurePosixPath(node.text())
     if path.is_absolute() or ".." in path.parts or "\\" in node.text():
         raise node.error("a path below that of lod-meta.json")
@@ -86,8 +88,8 @@ def _inside(node: Node) -> PurePosixPath:
 
 def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[range]]:
     """For each file, the runs of gaussians that are the finest level of a leaf."""
-    found: dict[PurePosixPath, list[range]] = {}
-    todo = [iter([tree])]  # not a list of nodes: a million empty ones would take as much as a scene
+    runs: dict[PurePosixPath, list[range]] = {}
+    todo = [iter([tree])]  # iterators, because a list of a million empty nodes would be as large as a scene
     while todo:
         node = next(todo[-1], None)
         if node is None:
@@ -105,9 +107,9 @@ def _finest(tree: Node, names: list[PurePosixPath]) -> dict[PurePosixPath, list[
         for level in sorted(levels.value, key=int):
             lod = levels.field(level)
             file = whole(lod.field("file"), f"0 to {len(names) - 1}", 0, len(names) - 1)
-            run = (lod.field(name) for name in ("offset", "count"))
-            offset, count = (whole(number, "a whole number, 0 or more", 0, 1 << 32) for number in run)
+            offset = whole(lod.field("offset"), "a whole number, 0 or more", 0, 1 << 32)
+            count = whole(lod.field("count"), "a whole number, 0 or more", 0, 1 << 32)
             if count:
-                found.setdefault(names[file], []).append(range(offset, offset + count))
+                runs.setdefault(names[file], []).append(range(offset, offset + count))
                 break
-    return found
+    return runs

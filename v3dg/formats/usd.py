@@ -1,9 +1,10 @@
 """OpenUSD: gaussians as prims `ParticleField3DGaussianSplat`, with Pixar's usd-core.
 
-Written is one prim; read are all prims that are there, where their transforms put them: as one asset, or
-each of them once and where it stands. Of levels of detail, the first is read. Coordinates are passed on as
-they are stored.
+One prim is written. All prims are read and transformed, into one asset, or into an asset each with the
+poses of its instances. Of levels of detail, the first is read. Coordinates are passed on as they are stored.
 """
+
+from __future__ import annotations
 
 import contextlib
 import os
@@ -12,9 +13,11 @@ import tempfile
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from types import ModuleType
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg import _extras, _files
 from v3dg._numbers import check
@@ -25,6 +28,9 @@ from v3dg.formats._reading import Path as AnyPath
 from v3dg.gaussians import Gaussians
 from v3dg.rotations import quaternion_from_rotation
 
+if TYPE_CHECKING:
+    from pxr import Sdf, Usd
+
 SUFFIXES = (".usd", ".usda", ".usdc")
 _Pose: TypeAlias = tuple[tuple[float, float, float, float], Floats, float]
 _SH = "radiance:sphericalHarmonics"
@@ -33,17 +39,22 @@ _COLUMNS = (f"{_SH}Degree", *_HALVES, *(f"{name}h" for name in _HALVES))
 
 
 @cache
-def pxr() -> Any:
+def pxr() -> ModuleType:
     """The package `pxr`; ImportError says how to get it."""
-    for part in ("Usd", "UsdGeom", "UsdLod", "UsdVol", "Vt"):  # which become its attributes
+    for part in ("Usd", "UsdGeom", "UsdLod", "UsdVol", "Vt"):  # importing them makes them attributes
         _extras.load(f"pxr.{part}")
-    return _extras.load("pxr")
+    package: ModuleType = _extras.load("pxr")
+    return package
 
 
 def open_file(path: AnyPath) -> AssetFile:
     """Open a USD file, which is read whole."""
     gaussians = read(path)
-    return AssetFile(path, len(gaussians), gaussians.sh_degree, lambda a, b: gaussians.subset(slice(a, b)))
+
+    def read_rows(first: int, last: int) -> Gaussians:
+        return gaussians.subset(slice(first, last))
+
+    return AssetFile(path, len(gaussians), gaussians.sh_degree, read_rows)
 
 
 def read(path: AnyPath) -> Gaussians:
@@ -55,8 +66,9 @@ def read(path: AnyPath) -> Gaussians:
         parts = []
         for prim, matrix in _placed(usd, root):
             gaussians = _gaussians_of(prim)
-            is_moved = not np.array_equal(matrix, np.eye(4))
-            parts.append(gaussians.transform(*_similarity(prim, matrix)) if is_moved else gaussians)
+            if not np.array_equal(matrix, np.eye(4)):
+                gaussians = gaussians.transform(*_similarity(prim, matrix))
+            parts.append(gaussians)
         return Gaussians.concatenate(parts)
 
 
@@ -68,31 +80,36 @@ def has_instances(path: AnyPath) -> bool:
 
 
 def read_world(path: AnyPath) -> tuple[list[Gaussians], list[int], list[_Pose], Axis]:
-    """Read what is in a USD file once each; which of it has an instance where; and what is up.
+    """Read the distinct assets of a USD file, asset and pose of each instance, and the axis that is up.
 
     Prims whose values come from the same place are one asset, as references to it are.
     """
-    numbers: dict[Any, int] = {}  # by path, and by where values come from
-    assets, which, poses = list[Gaussians](), list[int](), list[_Pose]()
+    asset_from_path: dict[Sdf.Path, int] = {}
+    asset_from_source: dict[tuple[object, ...], int] = {}
+    assets: list[Gaussians] = []
+    asset_from_instance: list[int] = []
+    poses: list[_Pose] = []
     with _opened(path, "OpenUSD with gaussians and instances of them") as (usd, root):
         for prim, matrix in _placed(usd, root):
-            if prim.GetPath() not in numbers:
+            path_of_prim = prim.GetPath()
+            if path_of_prim not in asset_from_path:
                 stacks = [prim.GetAttribute(name).GetPropertyStack() for name in _COLUMNS]
                 source = tuple((stack[0].layer.identifier, stack[0].path) for stack in stacks if stack)
-                if source not in numbers:
-                    numbers[source] = len(assets)
+                if source not in asset_from_source:
+                    asset_from_source[source] = len(assets)
                     assets.append(_gaussians_of(prim))
-                numbers[prim.GetPath()] = numbers[source]
-            which.append(numbers[prim.GetPath()])
+                asset_from_path[path_of_prim] = asset_from_source[source]
+            asset_from_instance.append(asset_from_path[path_of_prim])
             poses.append(_similarity(prim, matrix))
         if not assets:
             raise ValueError("no instances")
-        return assets, which, poses, usd.UsdGeom.GetStageUpAxis(root.GetStage()).lower()
+        up = usd.UsdGeom.GetStageUpAxis(root.GetStage()).lower()
+        return assets, asset_from_instance, poses, up
 
 
 @contextlib.contextmanager
-def _opened(path: AnyPath, expected: str) -> Iterator[tuple[Any, Any]]:
-    """The package, and the root of a file's prims, of which some must be gaussians."""
+def _opened(path: AnyPath, expected: str) -> Iterator[tuple[ModuleType, Usd.Prim]]:
+    """The package `pxr`, and the root of the prims of a file; ValueError unless some are gaussians."""
     check(path, Path(path).suffix.lower() in SUFFIXES, f"a file name ending in {', '.join(SUFFIXES)}")
     usd = pxr()
     os.close(_files.open_regular(path))
@@ -103,23 +120,25 @@ def _opened(path: AnyPath, expected: str) -> Iterator[tuple[Any, Any]]:
         yield usd, stage.GetPseudoRoot()
 
 
-def _prims(usd: Any, root: Any) -> Iterator[Any]:
-    """Gaussians and instancers of the prims from a root on."""
+def _prims(usd: ModuleType, root: Usd.Prim) -> Iterator[Usd.Prim]:
+    """Prims of gaussians and instancers at and below a root, without those of coarser levels."""
     walk = iter(usd.Usd.PrimRange(root, usd.Usd.TraverseInstanceProxies()))
     for prim in walk:
-        parent, is_instancer = prim.GetParent(), prim.IsA(usd.UsdGeom.PointInstancer)
+        parent = prim.GetParent()
+        is_instancer = prim.IsA(usd.UsdGeom.PointInstancer)
         is_coarse = parent and parent.HasAPI(usd.UsdLod.RootAPI) and prim != parent.GetChildren()[0]
-        if is_instancer or is_coarse:  # what is below an instancer is drawn where its instances are
+        if is_instancer or is_coarse:  # prims below an instancer are only drawn as its instances
             walk.PruneChildren()
         if not is_coarse and (is_instancer or prim.IsA(usd.UsdVol.ParticleField3DGaussianSplat)):
             yield prim
 
 
-def _placed(usd: Any, root: Any) -> Iterator[tuple[Any, Floats]]:
-    """Prims of gaussians, and what takes each, or an instance of it, to the frame of the root."""
-    from_root, time = np.linalg.inv(_to_world(usd, root)), usd.Usd.TimeCode.EarliestTime()
+def _placed(usd: ModuleType, root: Usd.Prim) -> Iterator[tuple[Usd.Prim, Floats]]:
+    """Prims of gaussians, each with the (4, 4) matrix from it, or from an instance of it, to the root."""
+    root_from_world = np.linalg.inv(_to_world(usd, root))
+    time = usd.Usd.TimeCode.EarliestTime()
     for prim in _prims(usd, root):
-        matrix = from_root @ _to_world(usd, prim)
+        matrix = root_from_world @ _to_world(usd, prim)
         if not prim.IsA(usd.UsdGeom.PointInstancer):
             yield prim, matrix
             continue
@@ -130,15 +149,16 @@ def _placed(usd: Any, root: Any) -> Iterator[tuple[Any, Floats]]:
         kinds = kinds[np.array(instancer.ComputeMaskAtTime(time) or np.ones(len(kinds)), bool)]
         poses = np.array(instancer.ComputeInstanceTransformsAtTime(time, time)).reshape(-1, 4, 4)
         for kind, pose in zip(kinds.tolist(), poses.transpose(0, 2, 1), strict=True):
-            yield from ((inside, matrix @ pose @ of) for inside, of in prototypes[kind])
+            for part, part_matrix in prototypes[kind]:
+                yield part, matrix @ pose @ part_matrix
 
 
-def _to_world(usd: Any, prim: Any) -> Floats:
-    # USD has vectors as rows.
+def _to_world(usd: ModuleType, prim: Usd.Prim) -> Floats:
+    # USD multiplies row vectors by matrices.
     return np.transpose(np.array(usd.UsdGeom.XformCache().GetLocalToWorldTransform(prim)))
 
 
-def _similarity(prim: Any, matrix: Floats) -> _Pose:
+def _similarity(prim: Usd.Prim, matrix: Floats) -> _Pose:
     """Quaternion, translation and scale of a (4, 4) matrix that places a prim."""
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not (scale > 0 and is_rotation(matrix[:3, :3] / scale)):
@@ -146,14 +166,15 @@ def _similarity(prim: Any, matrix: Floats) -> _Pose:
     return quaternion_from_rotation(matrix[:3, :3] / scale), matrix[:3, 3], scale
 
 
-def _gaussians_of(prim: Any) -> Gaussians:
-    def column(name: str) -> Any:
+def _gaussians_of(prim: Usd.Prim) -> Gaussians:
+    def column(name: str) -> NDArray[np.float32]:
         values = prim.GetAttribute(name).Get()
-        if values is None:  # in half precision
+        if values is None:  # stored in half precision, under another name
             values = prim.GetAttribute(f"{name}h").Get()
         return np.array(values, np.float32)
 
-    means, degree = column("positions"), prim.GetAttribute(f"{_SH}Degree").Get()
+    means = column("positions")
+    degree = prim.GetAttribute(f"{_SH}Degree").Get()
     return Gaussians(
         means=means,
         quats=normalised(np.roll(column("orientations"), 1, axis=1)).astype(np.float32),
@@ -165,13 +186,14 @@ def _gaussians_of(prim: Any) -> Gaussians:
 
 def write(path: AnyPath, gaussians: Gaussians) -> None:
     """Write a USD file of one prim; the order stays."""
-    host, stage = check_writable(gaussians), new_stage("Y")
+    host = check_writable(gaussians)
+    stage = new_stage("Y")
     stage.SetDefaultPrim(define(stage, "/gaussians", host))
     export(stage, path)
 
 
-def new_stage(up: Literal["Y", "Z"]) -> Any:
-    """An empty stage in metres; Y is up where nothing is known, as USD has it."""
+def new_stage(up: Literal["Y", "Z"]) -> Usd.Stage:
+    """An empty stage in metres; Y is USD's default for the axis that is up."""
     usd = pxr()
     stage = usd.Usd.Stage.CreateInMemory()
     usd.UsdGeom.SetStageUpAxis(stage, up)
@@ -179,21 +201,24 @@ def new_stage(up: Literal["Y", "Z"]) -> Any:
     return stage
 
 
-def export(stage: Any, path: AnyPath) -> None:
-    """Write a stage to a file, in the encoding that the name stands for, once all of it is there."""
+def export(stage: Usd.Stage, path: AnyPath) -> None:
+    """Write a stage to a file in one step, in the encoding that belongs to the suffix."""
     with _files.replacing(path) as temporary, tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"stage{Path(path).suffix.lower()}"  # whose name tells USD the encoding
+        file = Path(folder) / f"stage{Path(path).suffix.lower()}"  # USD takes the encoding from the suffix
         stage.GetRootLayer().Export(os.fspath(file))
         shutil.copyfile(file, temporary)
 
 
-def define(stage: Any, path: str, host: Gaussians) -> Any:
-    """Define a prim of a stage that is gaussians, of NumPy and with values that can be held."""
+def define(stage: Usd.Stage, path: str, host: Gaussians) -> Usd.Prim:
+    """Define a prim of gaussians on a stage; ``host`` has passed `check_writable`."""
     usd = pxr()
     prim = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, path).GetPrim()
     reach = 3 * host.scales.max(axis=1, keepdims=True, initial=0.0)
-    extent = [(host.means - reach).min(axis=0), (host.means + reach).max(axis=0)] if len(host) else []
-    vectors, quats = usd.Vt.Vec3fArray.FromNumpy, np.roll(normalised(host.quats), -1, axis=1)
+    extent = np.zeros((0, 3), np.float32)
+    if len(host):
+        extent = np.array([(host.means - reach).min(axis=0), (host.means + reach).max(axis=0)], np.float32)
+    vectors = usd.Vt.Vec3fArray.FromNumpy
+    quats = np.roll(normalised(host.quats), -1, axis=1)
     values = {
         "positions": vectors(host.means),
         "orientations": usd.Vt.QuatfArray.FromNumpy(quats.astype(np.float32)),
@@ -201,7 +226,7 @@ def define(stage: Any, path: str, host: Gaussians) -> Any:
         "opacities": usd.Vt.FloatArray.FromNumpy(host.opacities),
         f"{_SH}Degree": host.sh_degree,
         f"{_SH}Coefficients": vectors(host.sh.reshape(-1, 3)),
-        "extent": vectors(np.array(extent, np.float32).reshape(-1, 3)),
+        "extent": vectors(extent),
     }
     for name, value in values.items():
         prim.GetAttribute(name).Set(value)

@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -12,48 +12,55 @@ from v3dg import _device
 from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, check_type, floats, one_of
 from v3dg.bundle import Bundle
 from v3dg.cameras import AXES, Axis, Camera
-from v3dg.gaussians import Gaussians
+from v3dg.gaussians import Array, Gaussians
 from v3dg.rotations import rotation_from_quaternion
 
-# Held by whoever changes a scene, and by fork(), so that a child finds it free.
+# Held during every change of a scene. Also held during fork(), so that it is never locked in the child.
 _lock = threading.RLock()
 os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
 class _State(NamedTuple):
-    """A scene at one moment, which nobody writes to: a change makes another."""
+    """A scene at one moment. It is immutable: a change replaces it by another."""
 
     bundles: tuple[Bundle, ...]
     bundle: npt.NDArray[np.int32]
     importance: npt.NDArray[np.float32]
-    positions: Any  # poses are NumPy arrays or tensors on a CUDA device
-    quaternions: Any
-    scales: Any
+    positions: Array  # poses are NumPy arrays, or tensors on a CUDA device
+    quaternions: Array
+    scales: Array
     revision: tuple[int, int, int]
 
 
 class Scene:
     """Instances of bundles: each bundle is stored once, an instance takes p to scale * rotation p + position.
 
-    Instances are numbered from 0 in the order in which they were added; `remove` closes the gaps. What is
-    added, removed or moved counts from the next picture on. Any threads may change a scene and draw it: each
-    change happens at once. A copy has the same bundles and goes its own way.
+    Instances are numbered from 0 in the order in which they were added; `remove` closes the gaps. Changes are
+    visible in the next picture. Any thread may change a scene and draw it: each change is atomic. A copy has
+    the same bundles, and later changes of one do not affect the other.
 
-    Poses may be given as NumPy arrays, or as torch tensors on the host or on a CUDA device. Those of a device
-    stay there, without a look at their values: an instance whose pose is not finite, or of no size, is not
-    drawn.
+    Poses may be NumPy arrays, or torch tensors on the host or on a CUDA device. Those on a device stay there
+    and their values are not checked: an instance whose pose is not finite, or whose scale is not positive, is
+    not drawn.
     """
 
     _up: Axis | None = None
 
     def __init__(self) -> None:
-        poses = np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)
-        self._state = _State((), np.zeros(0, np.int32), np.zeros(0, np.float32), *poses, (0, 0, 0))
-        self._publish()
+        empty = _State(
+            bundles=(),
+            bundle=np.zeros(0, np.int32),
+            importance=np.zeros(0, np.float32),
+            positions=np.zeros((0, 3)),
+            quaternions=np.zeros((0, 4)),
+            scales=np.zeros(0),
+            revision=(0, 0, 0),
+        )
+        self._state = _read_only(empty)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state)
-        self._publish()  # for arrays that were unpickled can be written to
+        self._state = _read_only(self._state)  # unpickled arrays are writable
 
     @classmethod
     def of(cls, subject: "Scene | Bundle") -> "Scene":
@@ -81,9 +88,9 @@ class Scene:
     def add(
         self,
         bundle: Bundle | str | os.PathLike[str] | Sequence[Bundle],
-        positions: Any = (0.0, 0.0, 0.0),
-        quaternions: Any = None,
-        scales: Any = None,
+        positions: Array | npt.ArrayLike = (0.0, 0.0, 0.0),
+        quaternions: Array | npt.ArrayLike | None = None,
+        scales: Array | npt.ArrayLike | None = None,
         importance: npt.ArrayLike = 1.0,
     ) -> range:
         """Place a bundle I times and return the ids of the new instances.
@@ -102,43 +109,74 @@ class Scene:
         """
         if isinstance(bundle, str | os.PathLike):
             bundle = Bundle.open(bundle)
-        given = bundle if isinstance(bundle, list | tuple) else [bundle]
-        for one in given:
-            check_type("bundle", one, Bundle, "a Bundle")
-        if not getattr(positions, "is_cuda", False):
-            positions = floats(positions, "positions")
-        if len(positions.shape) == 1:
-            positions = positions[None]
-        shape = tuple(positions.shape)
+        is_one_for_each = isinstance(bundle, list | tuple)
+        bundles: list[Bundle] = []
+        if isinstance(bundle, list | tuple):
+            bundles.extend(bundle)
+        else:
+            bundles.append(cast(Bundle, bundle))
+        for item in bundles:
+            check_type("bundle", item, Bundle, "a Bundle")
+        points: Array = positions
+        if not getattr(points, "is_cuda", False):
+            points = floats(points, "positions")
+        if len(points.shape) == 1:
+            points = points[None]
+        shape = tuple(points.shape)
         check("positions", shape[1:] == (3,), f"shape (I, 3), got {shape}")
         count = shape[0]
-        fits = len(given) == count or given is not bundle
-        check("bundle", fits, f"one for all or {count}, got {len(given)}")
-        quaternions = (1.0, 0.0, 0.0, 0.0) if quaternions is None else quaternions
-        scales = 1.0 if scales is None else scales
-        values = positions, quaternions, scales, importance
-        new = {name: _rows(of, name, count) for name, of in zip(_ROW, values, strict=True)}
+        if is_one_for_each:
+            check("bundle", len(bundles) == count, f"one for all or {count}, got {len(bundles)}")
+        if quaternions is None:
+            quaternions = (1.0, 0.0, 0.0, 0.0)
+        if scales is None:
+            scales = 1.0
+        position_rows = _rows(points, "positions", count)
+        quaternion_rows = _rows(quaternions, "quaternions", count)
+        scale_rows = _rows(scales, "scales", count)
+        importance_rows = _rows(importance, "importance", count)
         with _lock:
-            place = {known: b for b, known in enumerate(dict.fromkeys((*self.bundles, *given)))}
-            new["bundle"] = np.broadcast_to(np.array([place[one] for one in given], np.int32), count)
+            state = self._state
+            number_of = {
+                item: number for number, item in enumerate(dict.fromkeys((*state.bundles, *bundles)))
+            }
+            numbers = np.array([number_of[item] for item in bundles], np.int32)
             first = len(self)
-            joined = {name: _joined(getattr(self._state, name), rows) for name, rows in new.items()}
-            self._publish(bundles=tuple(place), changes=1, **joined)
+            state = state._replace(
+                bundles=tuple(number_of),
+                bundle=np.concatenate([state.bundle, np.broadcast_to(numbers, count)]),
+                positions=_joined(state.positions, position_rows),
+                quaternions=_joined(state.quaternions, quaternion_rows),
+                scales=_joined(state.scales, scale_rows),
+                importance=_joined(state.importance, importance_rows),
+            )
+            self._publish(state, changes=1)
         return range(first, first + count)
 
-    def remove(self, ids: Any) -> None:
-        """Take instances away; those that follow move down, as `numpy.delete` does it."""
+    def remove(self, ids: Array | npt.ArrayLike) -> None:
+        """Remove instances; the ids of those that follow decrease, as in `numpy.delete`."""
         with _lock:
-            keep = np.ones(len(self), bool)
-            keep[self._ids(ids)] = False
-            columns = {name: getattr(self._state, name) for name in ("bundle", *_ROW)}
-            left = {name: rows[_like(rows, keep)] for name, rows in columns.items()}
-            self._publish(changes=1, removals=int(not keep.all()), **left)
+            state = self._state
+            is_left = np.ones(len(self), bool)
+            is_left[self._ids(ids)] = False
+            state = state._replace(
+                bundle=state.bundle[is_left],
+                importance=state.importance[is_left],
+                positions=state.positions[_on_device_of(state.positions, is_left)],
+                quaternions=state.quaternions[_on_device_of(state.quaternions, is_left)],
+                scales=state.scales[_on_device_of(state.scales, is_left)],
+            )
+            self._publish(state, changes=1, removals=int(not is_left.all()))
 
     def move(
-        self, ids: Any = None, *, positions: Any = None, quaternions: Any = None, scales: Any = None
+        self,
+        ids: Array | npt.ArrayLike | None = None,
+        *,
+        positions: Array | npt.ArrayLike | None = None,
+        quaternions: Array | npt.ArrayLike | None = None,
+        scales: Array | npt.ArrayLike | None = None,
     ) -> None:
-        """Give instances new poses; what is None stays.
+        """Give instances new poses; a part that is None stays.
 
         Args:
             ids: (M,) which instances; all if None.
@@ -150,34 +188,36 @@ class Scene:
             IndexError: There is no such instance.
             ValueError: A shape or a value is not as in `add`.
         """
-        given = {"positions": positions, "quaternions": quaternions, "scales": scales}
+        parts = {"positions": positions, "quaternions": quaternions, "scales": scales}
         with _lock:
             rows = self._ids(ids)
-            moved = {name: _rows(of, name, len(rows)) for name, of in given.items() if of is not None}
-            if ids is not None:
-                moved = {name: _replaced(getattr(self._state, name), rows, of) for name, of in moved.items()}
-            self._publish(moves=1, **moved)
+            state = self._state
+            for name, part in parts.items():
+                if part is None:
+                    continue
+                values = _rows(part, name, len(rows))
+                if ids is not None:
+                    values = _replaced(getattr(state, name), rows, values)
+                state = state._replace(**{name: values})
+            self._publish(state, moves=1)
 
-    def set_importance(self, importance: npt.ArrayLike, ids: Any = None) -> None:
+    def set_importance(self, importance: npt.ArrayLike, ids: Array | npt.ArrayLike | None = None) -> None:
         """Give instances another importance, as in `add`; all of them if ``ids`` is None."""
         with _lock:
             rows = self._ids(ids)
-            new = _rows(importance, "importance", len(rows))
-            self._publish(importance=_replaced(self.importance, rows, new), changes=1)
+            values = _rows(importance, "importance", len(rows))
+            state = self._state._replace(importance=_replaced(self.importance, rows, values))
+            self._publish(state, changes=1)
 
-    def _publish(self, changes: int = 0, moves: int = 0, removals: int = 0, **new: Any) -> None:
-        """Put what is new in place of what was, all at once."""
-        before = self.revision
-        revision = before[0] + changes, before[1] + moves, before[2] + removals
-        state = self._state._replace(revision=revision, **new)
-        for rows in state:
-            if isinstance(rows, np.ndarray):
-                rows.flags.writeable = False
-        self._state = state
+    def _publish(self, state: _State, changes: int = 0, moves: int = 0, removals: int = 0) -> None:
+        """Replace the state in one step and count the revision up; the lock must be held."""
+        num_changes, num_moves, num_removals = self.revision
+        revision = (num_changes + changes, num_moves + moves, num_removals + removals)
+        self._state = _read_only(state._replace(revision=revision))
 
     @property
     def up(self) -> Axis | None:
-        """The axis that is up, or None where nobody said: for viewers and exports, which may guess it."""
+        """The axis that is up; None if it is not known, so that viewers and exports may guess it."""
         return self._up
 
     @up.setter
@@ -193,20 +233,20 @@ class Scene:
 
     @property
     def revision(self) -> tuple[int, int, int]:
-        """Counted up when instances come, go or get another importance; when they move; and when they go.
+        """Numbers of changes so far: instances added, removed or given another importance; moves; removals.
 
-        Whoever keeps a copy of the scene knows by it when to look again.
+        A program that caches something of the scene compares them to find out when it is stale.
         """
         return self._state.revision
 
     @property
     def instance_bundle(self) -> npt.NDArray[np.int32]:
-        """(I,) int32, which bundle an instance shows; not to be written to."""
+        """(I,) int32, the number of each instance's bundle; read-only."""
         return self._state.bundle
 
     @property
     def importance(self) -> npt.NDArray[np.float32]:
-        """(I,) float32; not to be written to."""
+        """(I,) float32; read-only."""
         return self._state.importance
 
     @property
@@ -221,7 +261,7 @@ class Scene:
         if isinstance(rows, np.ndarray):
             return rows
         quaternions = _device.to_host(rows)
-        with np.errstate(invalid="ignore"):  # what is no rotation becomes no number, and is not drawn
+        with np.errstate(invalid="ignore"):  # an invalid rotation becomes NaN and is not drawn
             return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
 
     @property
@@ -235,17 +275,19 @@ class Scene:
         return rotation_from_quaternion(self.quaternions)
 
     @property
-    def poses(self) -> tuple[Any, Any, Any]:
-        """Positions, quaternions and scales where they are: NumPy arrays, or tensors on a CUDA device."""
+    def poses(self) -> tuple[Array, Array, Array]:
+        """Positions, quaternions and scales, not copied: NumPy arrays, or tensors on a CUDA device."""
         state = self._state
         return state.positions, state.quaternions, state.scales
 
-    def _ids(self, ids: Any) -> npt.NDArray[np.int64]:
-        """Ids of instances; of all where it is None."""
+    def _ids(self, ids: Array | None) -> npt.NDArray[np.int64]:
+        """Checked ids of instances; those of all instances for None."""
         count = len(self)
         if ids is None:
             return np.arange(count)
-        rows = np.atleast_1d(ids.numpy(force=True) if hasattr(ids, "detach") else np.asarray(ids))
+        if hasattr(ids, "detach"):
+            ids = ids.numpy(force=True)
+        rows = np.atleast_1d(np.asarray(ids))
         if rows.size == 0:
             return np.zeros(0, np.int64)
         fits = rows.ndim == 1 and np.issubdtype(rows.dtype, np.integer)
@@ -259,13 +301,13 @@ class Scene:
         return len(self._state.bundle)
 
     def __repr__(self) -> str:
-        instances, bundles = len(self), len(self.bundles)
-        of = f"{bundles} bundle{'s' * (bundles != 1)}"
-        return f"Scene({instances} instance{'s' * (instances != 1)} of {of})"
+        num_bundles = len(self.bundles)
+        instances = f"{len(self)} instance{'s' * (len(self) != 1)}"
+        return f"Scene({instances} of {num_bundles} bundle{'s' * (num_bundles != 1)})"
 
 
 Subject: TypeAlias = Scene | Bundle | Gaussians
-"""What can be drawn."""
+"""A value that can be drawn."""
 
 _ROW = {"positions": (3,), "quaternions": (4,), "scales": (), "importance": ()}
 _POSITIVE = {
@@ -274,8 +316,15 @@ _POSITIVE = {
 }
 
 
-def _rows(values: Any, name: str, count: int) -> Any:
-    """(count, ...) as scenes keep them, contiguous, ours alone; one row stands for all but of positions."""
+def _read_only(state: _State) -> _State:
+    for column in state:
+        if isinstance(column, np.ndarray):
+            column.flags.writeable = False
+    return state
+
+
+def _rows(values: Array, name: str, count: int) -> Array:
+    """A contiguous (count, ...) copy of a column; one row stands for all, except of positions."""
     row = _ROW[name]
     is_on_device = getattr(values, "is_cuda", False) and name != "importance"
     if is_on_device:
@@ -285,50 +334,60 @@ def _rows(values: Any, name: str, count: int) -> Any:
     else:
         array = floats(values, name)
     if name != "positions" and tuple(array.shape) == row:
-        array = array.expand(count, *row) if is_on_device else np.broadcast_to(array, (count, *row))
-    shape, wanted = tuple(array.shape), (count, *row)
-    check(name, shape == wanted, f"shape {wanted}, got {shape}")
+        if is_on_device:
+            array = array.expand(count, *row)
+        else:
+            array = np.broadcast_to(array, (count, *row))
+    shape = tuple(array.shape)
+    check(name, shape == (count, *row), f"shape {(count, *row)}, got {shape}")
     if is_on_device:
         return array.contiguous()
     if name in _POSITIVE:
-        least, most, expected = _POSITIVE[name]
-        wrong = (array < least) | (array > most)
+        low, high, expected = _POSITIVE[name]
+        wrong = (array < low) | (array > high)
         if wrong.any():
             raise ValueError(f"{name}: expected {expected}, got {array[wrong][0]:g}")
     if name == "quaternions":
         largest = np.abs(array).max(axis=1, keepdims=True)
         check("quaternions", largest.all(), "a rotation, got a quaternion of zeros")
-        array = array / largest  # so that squares neither overflow nor vanish
+        array = array / largest  # so that squares neither overflow nor underflow
         array /= np.linalg.norm(array, axis=1, keepdims=True)
-    return np.ascontiguousarray(array, np.float32 if name == "importance" else np.float64)
+    if name == "importance":
+        return np.ascontiguousarray(array, np.float32)
+    return np.ascontiguousarray(array, np.float64)
 
 
-def _like(array: Any, values: Any) -> Any:
-    """The values on the device of a tensor; as they are, on the host, for an array of NumPy's."""
+def _on_device_of(array: Array, values: Array) -> Array:
+    """The values as a tensor on the device of ``array``; unchanged if that is a NumPy array."""
     if isinstance(array, np.ndarray):
         return values
     import torch
 
-    # Copied, for torch warns of arrays that are not to be written to.
-    values = np.array(values) if isinstance(values, np.ndarray) else values
+    if isinstance(values, np.ndarray):
+        values = np.array(values)  # a copy, because torch warns of arrays that are read-only
     return torch.as_tensor(values, device=array.device)
 
 
-def _alike(first: Any, second: Any) -> tuple[Any, Any]:
-    """Both as they are on the host, or on a device where one of them is."""
-    there = second if isinstance(first, np.ndarray) else first
-    return _like(there, first), _like(there, second)
+def _on_one_device(first: Array, second: Array) -> tuple[Array, Array]:
+    """Both arrays on the device of either that is a tensor; on the host if neither is."""
+    target = first
+    if isinstance(first, np.ndarray):
+        target = second
+    return _on_device_of(target, first), _on_device_of(target, second)
 
 
-def _joined(first: Any, second: Any) -> Any:
-    """One after the other."""
-    first, second = _alike(first, second)
+def _joined(first: Array, second: Array) -> Array:
+    """The concatenation, on the device of either."""
+    first, second = _on_one_device(first, second)
     return _device.library_of(first).concatenate([first, second])
 
 
-def _replaced(values: Any, rows: npt.NDArray[np.int64], new: Any) -> Any:
+def _replaced(values: Array, rows: npt.NDArray[np.int64], row_values: Array) -> Array:
     """A copy with other values in some rows."""
-    values, new = _alike(values, new)
-    values = values.copy() if isinstance(values, np.ndarray) else values.clone()
-    values[_like(values, rows)] = new
+    values, row_values = _on_one_device(values, row_values)
+    if isinstance(values, np.ndarray):
+        values = values.copy()
+    else:
+        values = values.clone()
+    values[_on_device_of(values, rows)] = row_values
     return values
