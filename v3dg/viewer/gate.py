@@ -1,9 +1,9 @@
 """Who may talk to the viewer's server: what a request has to say of where it comes from.
 
 Any web page can have its visitor's browser connect to this machine. The browser then says which name it
-looked up (Host), whose page asks (Origin, which the pictures, scripts and links of a page leave out) and how that page
-is related to the server (Sec-Fetch-Site, which browsers leave out where the server is another machine and the
-connection is not encrypted). No page can change any of them.
+looked up (Host), whose page asks (Origin, which the pictures, scripts and links of a page leave out) and how
+that page is related to the server (Sec-Fetch-Site, which browsers leave out where the server is another
+machine and the connection is not encrypted). No page can change any of them.
 """
 
 import errno
