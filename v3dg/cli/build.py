@@ -17,6 +17,7 @@ from v3dg import _extras
 from v3dg._numbers import check
 from v3dg._urls import beside
 from v3dg.build import BuildConfig, build_file, levels_path
+from v3dg.build.scheduler import SchedulerError
 from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
@@ -26,6 +27,7 @@ from v3dg.io import SUFFIXES, open_asset, run_files
 from v3dg.upright import ASSUMED, up_of
 
 _PATIENCE_S = 20  # for a scheduler's answer
+_MOST_REASON = 200  # characters of an error of dask's
 _SAMPLES, _SAMPLE = 64, 256  # of an asset, and gaussians of each, that tell what is up
 _SEVERAL = tyro.conf.arg(metavar="PATH...", help_behavior_hint="(at least one)")
 
@@ -95,23 +97,52 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
     if address is None:
         yield None
         return
-    import asyncio
-
-    distributed, comm = (_extras.load(name) for name in ("distributed", "distributed.comm"))
+    distributed = _extras.load("distributed")
     for name in ("distributed", "distributed.client"):  # errors are told once, by the command
         logging.getLogger(name).setLevel(logging.CRITICAL)
-
-    async def greet() -> None:
-        (await asyncio.wait_for(comm.connect(address), _PATIENCE_S)).abort()
-
+    _greet(address)
+    expected = f"{address}: expected a dask scheduler"
     try:
-        asyncio.run(greet())  # a client would wait for ever for one that listens and says nothing
         client = distributed.Client(address, timeout=_PATIENCE_S)
-    except (OSError, ValueError, asyncio.TimeoutError) as error:
-        found = f"none ({' '.join(str(error).split()) or 'no answer'})"
-        raise RuntimeError(f"{address}: expected a dask scheduler that answers, got {found}") from None
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split()) or "no answer"
+        raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
+    except Exception as error:  # of any kind, as of one that speaks of other things, or another version
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:_MOST_REASON]
+        raise RuntimeError(f"{expected}, got something else ({reason})") from None
     with client:
         yield client.get_executor()
+
+
+def _greet(address: str) -> None:
+    """Say hello to a scheduler; RuntimeError unless something of dask's answers in time.
+
+    A client would wait for ever for one that listens and says nothing.
+    """
+    import asyncio
+
+    distributed = _extras.load("distributed")
+    comm = _extras.load("distributed.comm")
+    expected = f"{address}: expected a dask scheduler"
+
+    async def connect() -> None:
+        security = distributed.Security().get_connection_args("client")
+        (await asyncio.wait_for(comm.connect(address, **security), _PATIENCE_S)).abort()
+
+    try:
+        comm.get_address_host_port(address)
+    except ValueError as error:
+        raise RuntimeError(f"{expected}, as tcp://host:8786, got no address ({error})") from None
+    try:
+        asyncio.run(connect())
+    except (OSError, asyncio.TimeoutError) as error:
+        reason = " ".join(str(error).split()) or "no answer"
+        raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
+    except TypeError as error:  # TLS without certificates
+        raise RuntimeError(f"{expected} that can be asked, got none ({error}); set dask's security") from None
+    except Exception:  # what dask makes of another protocol, whose first eight bytes it takes for a size
+        advice = "give the address that `dask scheduler` prints"
+        raise RuntimeError(f"{expected}, got a server that speaks another protocol; {advice}") from None
 
 
 def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor | None) -> None:
@@ -123,6 +154,9 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
             _common.tell(f"[{len(results) + 1}/{len(outputs)}] {asset}")
         try:
             results.append(_build(options, assets[asset], output, executor))
+        except SchedulerError as error:  # which the others would wait for, too
+            done = f"{len(results)} of {len(outputs)} assets done"
+            raise SchedulerError(f"{error}; {done}") from None
         except _common.FAILURES as error:
             results.append({"asset": str(asset), "status": "failed", "error": _common.failure_text(error)})
             if not options.quiet:
@@ -207,6 +241,8 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
             bundle, is_built = build_file(paths, output, config=config, executor=executor, **how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{to_resume()}") from None
+    except SchedulerError as error:
+        raise SchedulerError(f"{error}{to_resume()}") from None
     except OSError as error:  # a full disk, say
         raise OSError(error.errno, f"{error.strerror}{to_resume()}", error.filename) from None
     asset = str(paths[0]) if len(paths) == 1 else [str(path) for path in paths]
