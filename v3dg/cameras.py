@@ -197,7 +197,8 @@ def check_camera(camera: Any) -> None:
 
 def for_each(camera: Any, make: Callable[[Any], T]) -> T | list[T]:
     """What is made for one camera, or a list of it for each of several."""
-    return [make(view) for view in camera] if hasattr(camera, "__iter__") else make(camera)
+    is_several = hasattr(camera, "__iter__") and getattr(camera, "ndim", 1) > 0
+    return [make(view) for view in camera] if is_several else make(camera)
 
 
 def check_cameras(cameras: Any) -> None:

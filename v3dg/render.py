@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast, get_args, overload
 
 from v3dg import _core, _device
 from v3dg._device import Device
-from v3dg._numbers import check, color, one_of, real
-from v3dg.build.memory import in_bytes, in_mib
+from v3dg._numbers import check, check_type, color, one_of, real
+from v3dg.build.memory import in_bytes, in_mib, pool_bytes
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, StereoCamera, check_camera, for_each
 from v3dg.false_color import ColorBy
@@ -107,6 +107,8 @@ def render(
         RuntimeError: `device` is "cuda" and something is missing for it.
     """
     where, shown = _device.resolve(device), opened(subject)
+    one_of(color_by, "color_by", get_args(ColorBy))
+    memory = pool_bytes(memory)
     make, key = partial(_Frame, shown, color_by, where, memory), ("frame", color_by, where, memory)
     frame = make() if isinstance(shown, Gaussians) else residency.once(shown, key, make)
     options: Any = {"tolerance": tolerance, "budget": budget, "min_level": min_level, "fade": fade}
@@ -160,7 +162,7 @@ class Renderer:
         memory: int | str | None = "auto",
     ) -> None:
         self._subject: Subject = opened(subject)
-        self._frame = _Frame(self._subject, color_by, _device.resolve(device), memory)
+        self._frame = _Frame(self._subject, color_by, _device.resolve(device), pool_bytes(memory))
         self._steps = _core.BudgetSteps()
 
     @property
@@ -392,6 +394,7 @@ _check_known_asset = lru_cache(64, typed=True)(_check_asset)  # as _known_rule
 
 def _check_cut(cut: Selection, subject: Scene | Bundle, resident: ResidentScene, **options: Any) -> None:
     """Refuse a cut that is not of this scene as it is, and whatever else is asked for."""
+    check_type("cut", cut, Selection, "a Selection of v3dg.select")
     for name, value in options.items():
         check(name, not value, f"nothing beside a cut, which has been chosen, got {value}")
     mine = cut.scene is subject or (isinstance(subject, Bundle) and cut.scene.bundles == (subject,))

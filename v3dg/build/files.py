@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from v3dg import _files
 from v3dg._device import Device
+from v3dg._numbers import check_type
 from v3dg._progress import Progress
 from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import MemoryLeaves, made_with
@@ -59,7 +60,9 @@ def build_file(
         ValueError, RuntimeError, OSError, MemoryError, KeyboardInterrupt: As `read_asset` and `build_bundle`.
     """
     paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
-    bundle_path, levels, config = Path(bundle_path), levels_path(bundle_path), config or BuildConfig()
+    bundle_path, levels = Path(bundle_path), levels_path(bundle_path)
+    config = BuildConfig() if config is None else config
+    check_type("config", config, BuildConfig, "a BuildConfig")
     _files.check_bundle_name(bundle_path)
     _files.check_folder(bundle_path)
     _files.status_of_replaced(bundle_path)

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from v3dg._json import Node, read_json, write_json
-from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check, check_type
 from v3dg._urls import is_url
 from v3dg.bundle import Bundle
 from v3dg.cameras import DEFAULT_FOV_X, Camera, check_cameras
@@ -46,6 +46,8 @@ def read_scene(
         FileNotFoundError: The file, or a bundle that it names, does not exist.
     """
     path = Path(path)
+    if bundles is not None:
+        check_type("bundles", bundles, Mapping, "bundles by their paths")
     root = read_json(path)
     known = dict(bundles or {})
     if root.has("layouts"):
@@ -72,6 +74,7 @@ def write_scene(
             name is not of a scene.
     """
     check(path, is_scene(Path(path)), "a file name ending in .json, not meta.json; v3dg.open goes by it")
+    check_type("scene", scene, Scene, "a Scene")
     check_cameras(cameras := cameras or {})
     if bundle_paths is None:
         found = "one in memory or at a URL; write it and open that"
