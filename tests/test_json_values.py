@@ -117,10 +117,11 @@ def read_both(path):
     return v3dg.read_asset(path)
 
 
-@pytest.fixture(
-    params=["glb", "glb of spz", "sog", "sog_folder", "streamed", "scene 0", "scene 1", "scene 2"]
-    + ["cameras 0", "cameras 1", "cameras 2"]
-)
+KINDS = ["glb", "glb of spz", "sog", "sog_folder", "streamed", "scene 0", "scene 1", "scene 2"]
+KINDS += ["cameras 0", "cameras 1", "cameras 2"]
+
+
+@pytest.fixture(params=KINDS)
 def kind(request, tmp_path):
     if request.param.startswith("glb"):
         return glb_kind(tmp_path, "spz" in request.param)

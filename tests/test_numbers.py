@@ -13,6 +13,7 @@ import v3dg
 from random_bundle import random_bundle
 from v3dg import _core
 from v3dg.build.fit import fit_config
+from v3dg.build.memory import in_bytes
 
 CAMERA = v3dg.Camera.look_at((0.5, -9, 4), (3, 4, 5), width=24, height=16)
 BUNDLE = random_bundle(1)
@@ -264,7 +265,7 @@ def test_memory_is_a_number_or_a_text(memory):
 @pytest.mark.parametrize("color_by", [["level"], {}, np.array("level"), None, 3])
 def test_a_colour_of_another_kind_is_refused_by_its_name(color_by):
     camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
-    with pytest.raises(ValueError, match="^color_by: expected 'appearance' or "):
+    with pytest.raises(ValueError, match=r"^color_by: expected 'appearance' or "):
         v3dg.render(random_bundle(1, num_levels=2), camera, color_by=color_by, device="cpu")
 
 
@@ -289,7 +290,7 @@ def test_values_of_another_kind_are_refused_by_their_names(tmp_path):
         for odd in (1.5, np.float32(2), object()):
             with pytest.raises(TypeError, match=f"^{name}: expected "):
                 call(odd)
-    with pytest.raises(TypeError, match="^camera: expected "):
+    with pytest.raises(TypeError, match=r"^camera: expected "):
         v3dg.render(bundle, np.array(2), device="cpu")
 
 
@@ -300,7 +301,9 @@ def test_a_renderer_of_another_subject_cannot_pick():
     camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
     for subject, drawn in ((small, large), (large, small), (small, several), (several, small)):
         renderer = v3dg.Renderer(drawn, memory="64MiB", device="cpu")
-        with pytest.raises(ValueError, match="^renderer: expected one of this subject, got one of another; "):
+        with pytest.raises(
+            ValueError, match=r"^renderer: expected one of this subject, got one of another; "
+        ):
             v3dg.pick(subject, camera, 4, 3, renderer=renderer)
         v3dg.pick(drawn, camera, 4, 3, renderer=renderer)
         v3dg.pick(v3dg.Scene.of(drawn), camera, 4, 3, renderer=renderer)
