@@ -20,6 +20,7 @@ TRIES = {
     "exports": 40,
     "servers": 12,
     "ends": 12,
+    "headers": 60,
 }
 
 

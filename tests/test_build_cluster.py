@@ -1,5 +1,6 @@
 """Builds on executors: processes, and a dask cluster of which a worker is killed."""
 
+import asyncio
 import multiprocessing
 import os
 import signal
@@ -9,7 +10,7 @@ import sys
 import threading
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ import v3dg
 from benchmarks.worlds.procedural import make_asset
 from command_line import ENVIRONMENT, PACKAGE, fails, run
 from v3dg import BuildConfig, _core, build_bundle
-from v3dg.build import build_file, levels_path
+from v3dg.build import build_file, levels_path, scheduler
 
 CONFIG = BuildConfig(cluster_size=32, steps=150, first_steps=150)
 OPTIONS = {"config": CONFIG, "progress": False, "device": "cpu"}
@@ -261,6 +262,200 @@ def test_a_dask_cluster_builds_the_same_bytes_though_a_worker_is_killed(folder, 
             done = run("build", folder / "a.ply", "-o", tmp_path / f"{name}.v3dg", "--quiet", *options)
             assert done.returncode == 0, done.stderr
         assert (tmp_path / "dask.v3dg").read_bytes() == (tmp_path / "here.v3dg").read_bytes()
+
+
+class Meddler(threading.Thread):
+    """Does something to a scheduler as soon as a unit is finished."""
+
+    def __init__(self, output, folder, action):
+        super().__init__(daemon=True)
+        self._is_time = lambda: is_journal_longer(output, folder)
+        self._action = action
+
+    def run(self):
+        while not self._is_time():
+            time.sleep(0.005)
+        self._action()
+
+
+@pytest.fixture
+def meddled_build(folder, tmp_path):
+    """Builds on a cluster to whose scheduler something is done in the midst; also gives its address."""
+    distributed = pytest.importorskip("distributed")
+    (tmp_path / "dask").mkdir()
+    (tmp_path / "out").mkdir()
+    output = tmp_path / "out" / "out.v3dg"
+    with cluster(tmp_path / "dask", 1) as file:
+        client = distributed.Client(scheduler_file=str(file), timeout=PATIENCE)
+        client.wait_for_workers(1, timeout=PATIENCE)
+        pid, address = client.run_on_scheduler(os.getpid), client.scheduler.address
+
+        def build(action):
+            Meddler(output, folder, lambda: action(pid)).start()
+            build_on(client.get_executor(), folder, output)
+
+        yield build, output, address
+        begin = time.monotonic()
+        client.close()
+        assert time.monotonic() - begin < 30  # also with a scheduler that says nothing
+
+
+def goes_on_alone(folder, output):
+    """Whether finished units are there, from which a build goes on without the scheduler."""
+    assert levels_path(output).exists()
+    with ThreadPoolExecutor(2) as executor:
+        build_on(executor, folder, output, resume=True)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_stops_in_the_midst_is_not_waited_for(meddled_build, folder, monkeypatch):
+    build, output, address = meddled_build
+    monkeypatch.setattr("v3dg.build.scheduler._MOST_SILENCE_S", 4)
+    monkeypatch.setattr("v3dg.build.scheduler._TICK_S", 0.5)
+    with pytest.raises(RuntimeError, match=rf"^scheduler {address}: no answer for 4 s; .*units are kept"):
+        build(lambda pid: os.kill(pid, signal.SIGSTOP))
+    goes_on_alone(folder, output)
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_is_slow_to_answer_is_waited_for(meddled_build, monkeypatch):
+    monkeypatch.setattr("v3dg.build.scheduler._MOST_SILENCE_S", 30)
+    monkeypatch.setattr("v3dg.build.scheduler._TICK_S", 0.2)
+    build, _, _ = meddled_build
+    went_on = threading.Event()
+
+    def stop_for_a_while(pid):
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(6)
+        os.kill(pid, signal.SIGCONT)
+        went_on.set()
+
+    build(stop_for_a_while)
+    assert went_on.is_set()
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_in_the_midst_is_named(meddled_build, folder):
+    build, output, address = meddled_build
+    with pytest.raises(RuntimeError, match=rf"^scheduler {address}: connection lost"):
+        build(lambda pid: os.kill(pid, signal.SIGKILL))
+    goes_on_alone(folder, output)
+
+
+class Client:
+    """A client whose scheduler answers as often as it is told to."""
+
+    status = "running"
+
+    def __init__(self, answers):
+        self.scheduler = self
+        self.address = "tcp://127.0.0.1:1"
+        self.num_asked = 0
+        self._answers = iter(answers)
+        self.loop = self
+        self.asyncio_loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.asyncio_loop.run_forever)
+        self._thread.start()
+
+    async def ncores(self, workers):
+        self.num_asked += 1
+        if not next(self._answers):
+            raise OSError("no answer")
+
+    def close(self):
+        self.asyncio_loop.call_soon_threadsafe(self.asyncio_loop.stop)
+        self._thread.join()
+        self.asyncio_loop.close()
+
+
+def test_only_silence_without_a_break_ends_a_wait():
+    """Of a scheduler that answers every tenth question, say, no matter for how long."""
+    client = Client([number % 10 == 9 for number in range(40)] + [False] * 100)
+    try:
+        watch = scheduler.Watch(client)
+
+        def wait_for_long():
+            for _ in range(100):
+                watch.tick()
+                while watch._question is not None and not watch._question.done():
+                    time.sleep(0.001)
+
+        with pytest.raises(scheduler.SchedulerError, match=r"^scheduler tcp://127.0.0.1:1: no answer for"):
+            wait_for_long()
+        assert 40 <= client.num_asked <= 40 + 2 + scheduler._MOST_SILENCE_S / scheduler._TICK_S
+    finally:
+        client.close()
+
+
+@contextmanager
+def serving(answer):
+    """The address of something that says this to whoever connects."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            with suppress(OSError):
+                while True:
+                    connection, _ = server.accept()
+                    with connection:
+                        connection.recv(8)
+                        connection.sendall(answer)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        finally:
+            server.shutdown(socket.SHUT_RDWR)
+            thread.join()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\n\r\n",
+        b"SSH-2.0-OpenSSH_9.2\r\n",
+        b"\x15\x03\x01\x00\x02\x02\x46" * 9,
+        bytes(100),
+    ],
+    ids=["web", "ssh", "tls", "zeros"],
+)
+def test_a_server_of_another_kind_is_no_scheduler(tmp_path, answer):
+    pytest.importorskip("distributed")
+    v3dg.write_asset(tmp_path / "a.ply", make_asset(num_gaussians=1000, seed=0))
+    with serving(answer) as address:
+        expected = (
+            f"{address}: expected a dask scheduler, got a server that speaks another protocol; give the"
+        )
+        fails(1, expected, "build", "a.ply", "--scheduler", address, cwd=tmp_path)
+
+
+@pytest.mark.parametrize("address", ["", "nowhere", "http://127.0.0.1:80", "tcp://127.0.0.1", "tcp://["])
+def test_what_is_no_address_is_told_so(address):
+    pytest.importorskip("distributed")
+    from v3dg.cli import build
+
+    with (
+        pytest.raises(RuntimeError, match=r"expected a dask scheduler, as tcp://host:8786, got no address"),
+        build._executor_at(address),
+    ):
+        pass
+
+
+def test_a_lost_scheduler_ends_a_run_over_many_assets(tmp_path, monkeypatch):
+    """Each of the others would wait for it as long."""
+    from v3dg.cli import main
+
+    built = []
+
+    def fail(paths, *_, **__):
+        built.append(paths)
+        raise scheduler.SchedulerError("scheduler tcp://a:1: no answer for 120 s")
+
+    monkeypatch.setattr("v3dg.cli.build.build_file", fail)
+    for name in ("a", "b", "c"):
+        v3dg.write_asset(tmp_path / f"{name}.ply", make_asset(num_gaussians=1000, seed=0))
+    assert main(["build", str(tmp_path), "-o", str(tmp_path / "out"), "--quiet"]) == 1
+    assert len(built) == 1
 
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ import v3dg
 from random_bundle import random_bundle
 from v3dg import _core
 from v3dg.build.fit import fit_config
+from v3dg.build.memory import in_bytes
 
 CAMERA = v3dg.Camera.look_at((0.5, -9, 4), (3, 4, 5), width=24, height=16)
 BUNDLE = random_bundle(1)
@@ -221,3 +222,88 @@ def test_the_core_refuses_them_too(setting):
             np.zeros(1, np.int64),
             progress,
         )
+
+
+# ---- arguments of other kinds
+
+ODD = (
+    [64],
+    (64,),
+    {"a": 1},
+    {64},
+    b"64",
+    np.array([64]),
+    np.zeros(0),
+    True,
+    float("nan"),
+    -1,
+    0,
+    10**5000,
+    "x",
+    object(),
+)
+
+
+@pytest.mark.parametrize("memory", ODD, ids=lambda value: f"{type(value).__name__}")
+def test_memory_of_another_kind_is_refused_by_its_name(memory):
+    bundle = random_bundle(1, num_levels=2)
+    camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
+    expected = r"^memory: expected bytes, or text like '8GiB', got "
+    with pytest.raises(ValueError, match=expected):
+        v3dg.render(bundle, camera, memory=memory, device="cpu")
+    with pytest.raises(ValueError, match=expected):
+        v3dg.Renderer(bundle, memory=memory, device="cpu")
+    with pytest.raises(ValueError, match=expected):
+        in_bytes(memory)
+
+
+@pytest.mark.parametrize("memory", ["64MiB", 1 << 26, float(1 << 26), np.int64(1 << 26)])
+def test_memory_is_a_number_or_a_text(memory):
+    assert in_bytes(memory) == 1 << 26
+
+
+@pytest.mark.parametrize("color_by", [["level"], {}, np.array("level"), None, 3])
+def test_a_colour_of_another_kind_is_refused_by_its_name(color_by):
+    camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
+    with pytest.raises(ValueError, match=r"^color_by: expected 'appearance' or "):
+        v3dg.render(random_bundle(1, num_levels=2), camera, color_by=color_by, device="cpu")
+
+
+def test_values_of_another_kind_are_refused_by_their_names(tmp_path):
+    bundle = random_bundle(1, num_levels=2)
+    asset = bundle.gaussians
+    camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
+    file = tmp_path / "a.json"
+    calls = {
+        "config": lambda odd: v3dg.build_bundle(asset, config=odd, device="cpu", progress=False),
+        "seed": lambda odd: v3dg.build_bundle(asset, seed=odd, device="cpu", progress=False),
+        "level": bundle.level_range,
+        "cluster": bundle.cluster_gaussians,
+        "cut": lambda odd: v3dg.render(bundle, camera, cut=odd, device="cpu"),
+        "renderer": lambda odd: v3dg.pick(bundle, camera, 1, 1, renderer=odd),
+        "scene": lambda odd: v3dg.write_scene(file, odd, []),
+        "bundles": lambda odd: v3dg.read_scene(file, bundles=odd),
+        "parts": lambda odd: v3dg.Gaussians.concatenate(odd),
+        "camera": lambda odd: v3dg.render(bundle, odd, device="cpu"),
+    }
+    for name, call in calls.items():
+        for odd in (1.5, np.float32(2), object()):
+            with pytest.raises(TypeError, match=f"^{name}: expected "):
+                call(odd)
+    with pytest.raises(TypeError, match=r"^camera: expected "):
+        v3dg.render(bundle, np.array(2), device="cpu")
+
+
+def test_a_renderer_of_another_subject_cannot_pick():
+    small, large = random_bundle(1, num_levels=2), random_bundle(2, num_levels=3)
+    several = v3dg.Scene()
+    several.add(small, positions=np.zeros((3, 3)))
+    camera = v3dg.Camera.look_at((0, -9, 0), (0, 0, 0), width=8, height=6)
+    for subject, drawn in ((small, large), (large, small), (small, several), (several, small)):
+        renderer = v3dg.Renderer(drawn, memory="64MiB", device="cpu")
+        with pytest.raises(
+            ValueError, match=r"^renderer: expected one of this subject, got one of another; "
+        ):
+            v3dg.pick(subject, camera, 4, 3, renderer=renderer)
+        v3dg.pick(drawn, camera, 4, 3, renderer=renderer)
+        v3dg.pick(v3dg.Scene.of(drawn), camera, 4, 3, renderer=renderer)

@@ -94,6 +94,14 @@ def whole(value: Any, name: str, expected: str, least: int, most: int = MOST_INT
     return number
 
 
+def whole_number(value: Any, name: str) -> int:
+    """One whole number of any size; TypeError for what is none."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name}: expected a whole number, got {shown(value)}") from None
+
+
 def check(name: str | os.PathLike[str], holds: object, expected: str) -> None:
     """Raise ValueError, whose message is ``name: expected ...``, unless ``holds``."""
     if not holds:

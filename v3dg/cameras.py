@@ -211,7 +211,7 @@ def check_camera(camera: object) -> None:
 
 def for_each(camera: Any, make: Callable[[Any], T]) -> T | list[T]:
     """The result of ``make`` for one camera, or a list of its results for several."""
-    if hasattr(camera, "__iter__"):
+    if hasattr(camera, "__iter__") and getattr(camera, "ndim", 1) > 0:
         return [make(view) for view in camera]
     return make(camera)
 

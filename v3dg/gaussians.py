@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -169,6 +169,7 @@ class Gaussians:
             ValueError: no parts, or parts of different degrees.
             TypeError: a part is not Gaussians, or NumPy and torch are mixed.
         """
+        check_type("parts", parts, Iterable, "a list of Gaussians")
         parts = list(parts)
         check("parts", parts, "at least one Gaussians, got none")
         for i, part in enumerate(parts):

@@ -10,6 +10,7 @@ from v3dg._device import CPU
 from v3dg._numbers import check, check_type, refuse, whole
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, Floats
+from v3dg.gaussians import Gaussians
 from v3dg.opening import File, opened
 from v3dg.render import Renderer
 from v3dg.residency import residency
@@ -74,6 +75,9 @@ def pick(
     rule = rule_of(tolerance, None, min_level, "solid_angle", True)
     pixel = camera.core.window(x, y, x + 1, y + 1)
     if renderer is not None:
+        check_type("renderer", renderer, Renderer, "a Renderer")
+        expected = "one of this subject, got one of another; make a renderer of what is picked from"
+        check("renderer", _is_of(renderer, scene), expected)
         pool = renderer.pool_frame
         if pool is None or pool.device.is_cuda:
             refuse("renderer", f"one with a pool on the CPU, got {renderer}")
@@ -91,3 +95,15 @@ def pick(
     ray = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
     position = camera.position + depth * ray @ camera.viewmat[:3, :3]
     return Pick(instance, cluster, level, weight, depth, position)
+
+
+def _is_of(renderer: Renderer, scene: Scene) -> bool:
+    """Whether a renderer draws the instances of this scene, from the same bundles or the same files."""
+    if isinstance(renderer.subject, Gaussians):
+        return False
+    drawn = Scene.of(renderer.subject)
+    if not np.array_equal(drawn.instance_bundle, scene.instance_bundle):
+        return False
+    pairs = zip(drawn.bundles, scene.bundles, strict=False)
+    is_same = (one is other or (one.path is not None and one.path == other.path) for one, other in pairs)
+    return len(drawn.bundles) == len(scene.bundles) and all(is_same)

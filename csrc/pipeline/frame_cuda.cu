@@ -77,11 +77,20 @@ void Frame::enlarge(const FrameCounters& counters) {
     if (counters.gaussians > kMostFrameRecords)
         throw std::length_error("gaussians: expected at most " + std::to_string(kMostFrameRecords) +
                                 " in one frame, got " + std::to_string(counters.gaussians));
-    // Some more, so that a camera on its way does not need a little more every frame. A buffer that is nearly
-    // full grows, too: the next frame of a moving camera would exceed it, and be drawn twice.
+    // Growing takes as long as several frames. So buffers grow seldom, all that are nearly full together, by
+    // some more than was counted, and before the next frame of a moving camera exceeds one and is drawn twice.
+    const auto is_full = [](unsigned long long capacity, unsigned long long count, unsigned free_part) {
+        return count > capacity - capacity / free_part;
+    };
+    const bool grows = is_full(capacity_.items, counters.items, 32) ||
+                       is_full(capacity_.records, counters.gaussians, 32) ||
+                       is_full(capacity_.large, counters.large, 32) ||
+                       is_full(capacity_.entries, counters.entries, 32) ||
+                       is_full(capacity_.spread, counters.spread, 32);
+    if (!grows) return;
     const Capacity before = capacity_;
-    const auto grow = [](unsigned long long& capacity, unsigned long long count) {
-        if (count > capacity - capacity / 32) capacity = std::max(capacity, count + count / 16);
+    const auto grow = [is_full](unsigned long long& capacity, unsigned long long count) {
+        if (is_full(capacity, count, 8)) capacity = std::max(capacity, count + count / 8);
     };
     // What was not projected has no entries yet; most scenes have one or two a gaussian.
     if (counters.gaussians > capacity_.records) grow(capacity_.entries, counters.gaussians);

@@ -34,6 +34,7 @@ KINDS = {
     "exports": 0.05,
     "servers": 0.05,
     "ends": 0.1,
+    "headers": 0.03,
 }
 KEPT = Path(__file__).parents[2] / "build" / "attack"
 

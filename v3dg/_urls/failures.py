@@ -82,13 +82,21 @@ def _problem_of(url: str, error: Exception) -> Problem:
         return Problem(TimeoutError, f"the server did not answer in time; {_AGAIN}")
     if isinstance(cause, ConnectionRefusedError):
         return Problem(ConnectionRefusedError, "the connection was refused; check host and port")
+    answer = _problem_of_answer(names)
+    if answer is not None:
+        return answer
+    if isinstance(cause, ConnectionError) or "ClientError" in names:
+        return Problem(ConnectionError, f"the connection was lost or could not be made ({text}); {_AGAIN}")
+    return _problem_elsewhere(cause, text)
+
+
+def _problem_of_answer(names: set[str]) -> Problem | None:
+    """The problem of an answer that came, by the names of an error's types; None for other errors."""
     if "ClientPayloadError" in names:
         return Problem(ConnectionError, f"the server's answer was not complete; {_AGAIN}")
     if names & {"ClientResponseError", "BadHttpMessage"}:
         return Problem(ConnectionError, "the server's answer is not valid HTTP; check the address")
-    if isinstance(cause, ConnectionError) or "ClientError" in names:
-        return Problem(ConnectionError, f"the connection was lost or could not be made ({text}); {_AGAIN}")
-    return _problem_elsewhere(cause, text)
+    return None
 
 
 def _problem_elsewhere(error: Exception, text: str) -> Problem:

@@ -68,7 +68,8 @@ def build_bundle(
     """
     asset = loaded(asset)
     check_type("asset", asset, Gaussians, "Gaussians")
-    config = config or BuildConfig()
+    config = BuildConfig() if config is None else config
+    check_type("config", config, BuildConfig, "a BuildConfig")
     devices = devices_for(device, asset)
     leaves = MemoryLeaves(asset, config, unusable, devices[0])
     has_place = executor is None or resume_path is not None

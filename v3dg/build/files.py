@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from v3dg import _files
 from v3dg._device import Device
+from v3dg._numbers import check_type
 from v3dg._progress import Progress
 from v3dg._urls import shown
 from v3dg.build.config import BuildConfig
@@ -65,7 +66,9 @@ def build_file(
     paths = [asset_path] if isinstance(asset_path, str | os.PathLike) else list(asset_path)
     bundle_path = Path(bundle_path)
     levels = levels_path(bundle_path)
-    config = config or BuildConfig()
+    if config is None:
+        config = BuildConfig()
+    check_type("config", config, BuildConfig, "a BuildConfig")
     _files.check_bundle_name(bundle_path)
     _files.check_folder(bundle_path)
     _files.status_of_replaced(bundle_path)

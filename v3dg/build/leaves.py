@@ -1,6 +1,5 @@
 """The leaves of a build: the gaussians of an asset that can be drawn, in the order of the median split."""
 
-import operator
 import threading
 import warnings
 from abc import ABC, abstractmethod
@@ -13,7 +12,7 @@ import numpy.typing as npt
 
 from v3dg import _core, _device, cleaning
 from v3dg._device import Device
-from v3dg._numbers import check, one_of
+from v3dg._numbers import check, one_of, shown, whole_number
 from v3dg.build.config import BuildConfig
 from v3dg.build.digest import digest_of
 from v3dg.bundle.codec import Codec
@@ -82,8 +81,8 @@ class MemoryLeaves(Leaves):
 
 def made_with(leaves: Leaves, config: BuildConfig, seed: int, codec: str, up: Axis | None) -> dict[str, Any]:
     """The config of a bundle: the asset and the settings that it was made with."""
-    seed = operator.index(seed)
-    check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {seed}")
+    seed = whole_number(seed, "seed")
+    check("seed", 0 <= seed < 2**58, f"0 to 2^58 - 1, got {shown(seed)}")
     result: dict[str, Any] = {
         "build": asdict(config),
         "seed": seed,

@@ -4,7 +4,11 @@ import os
 import re
 from contextlib import suppress
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
+
+from v3dg._numbers import refuse, shown
 from v3dg.build.leaves import Leaves
 from v3dg.build.whole import UNIT_LEAVES
 from v3dg.gaussians import gaussian_bytes
@@ -21,10 +25,22 @@ def in_bytes(memory: int | str | None) -> int:
     """An amount of memory: bytes, or text like "8GiB"; None is half of what is free."""
     if memory is None:
         return free_bytes() // 2
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", str(memory), re.IGNORECASE)
-    if isinstance(memory, bool) or match is None or not float(match[1]) > 0:
-        raise ValueError(f"memory: expected bytes, or text like '8GiB', got {memory!r}")
+    is_amount = isinstance(memory, str | int | float | np.number) and not isinstance(memory, bool)
+    is_long = isinstance(memory, int) and memory.bit_length() > 128  # which Python may refuse to print
+    text = str(memory) if is_amount and not is_long else ""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
+    if match is None or not float(match[1]) > 0:
+        refuse("memory", f"bytes, or text like '8GiB', got {shown(memory)}")
     return int(min(float(match[1]) * _UNITS[match[2].upper()], 2.0**62))
+
+
+def pool_bytes(memory: int | str | None) -> int | Literal["auto"] | None:
+    """What a renderer is given as its memory: bytes, "auto", or None; ValueError for anything else."""
+    if memory is None:
+        return None
+    if isinstance(memory, str) and memory == "auto":
+        return "auto"
+    return in_bytes(memory)
 
 
 def most_units(memory: int, leaves: Leaves) -> int:

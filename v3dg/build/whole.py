@@ -3,7 +3,7 @@
 import os
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,6 +21,7 @@ from v3dg.build.config import BuildConfig
 from v3dg.build.leaves import Leaves, MemoryLeaves, made_with
 from v3dg.build.plan import Plan
 from v3dg.build.progress import Bar
+from v3dg.build.scheduler import Watch, completed, watch_over
 from v3dg.build.simplify import Level, LevelBuilder, LevelTables, Show
 from v3dg.build.smooth import measured_config
 from v3dg.build.unfinished import FinishedLevel, MemoryStore, PageFile, Part, Unfinished, described
@@ -198,21 +199,23 @@ class _Build:
                 task = replace(task, leaves=task.leaves().numpy)
             return executor.submit(build_elsewhere, task, like, nonce)
 
+        watch = watch_over(executor)
         try:
-            self._collect(submit)
+            self._collect(submit, watch)
         except (OSError, ValueError, RuntimeError, MemoryError):
             raise
         except Exception as error:
+            name = "executor" if watch is None else watch.name
             reason = f"{type(error).__name__}: {error}".rstrip(": ")
-            raise RuntimeError(f"executor: expected all units to be built, got {reason}") from error
+            raise RuntimeError(f"{name}: expected all units to be built, got {reason}") from error
 
-    def _collect(self, submit: Callable[[int], Future[_Levels]]) -> None:
+    def _collect(self, submit: Callable[[int], Future[_Levels]], watch: Watch | None = None) -> None:
         """Have units built, and save what comes back; what fails, or an interrupt, ends the others."""
         units: dict[Future[_Levels], int] = {}
         try:
             for unit in self._todo:
                 units[submit(unit)] = unit
-            for future in as_completed(units):
+            for future in completed(units, watch):
                 for number, level in future.result().items():
                     self.store.save(units[future], number, level)
                     self.bar.add(units[future], number, self.parts[units[future]][number][0].num_gaussians)

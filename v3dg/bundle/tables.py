@@ -1,6 +1,5 @@
 """The tables of a bundle, which selection reads, and the checks that guarantee an exact cut."""
 
-import operator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg import _core
-from v3dg._numbers import check, check_type, refuse
+from v3dg._numbers import check, check_type, refuse, shown, whole_number
 from v3dg.bundle.format import DTYPES, SCHEMA
 from v3dg.gaussians import Gaussians
 
@@ -80,7 +79,8 @@ class Groups:
 
 
 def check_index(name: str, index: int, count: int) -> None:
-    check(name, 0 <= operator.index(index) < count, f"0 to {count - 1}, got {index}")
+    number = whole_number(index, name)
+    check(name, 0 <= number < count, f"0 to {count - 1}, got {shown(number)}")
 
 
 def _check_arrays(prefix: str, part: Clusters | Groups) -> None:

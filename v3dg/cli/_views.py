@@ -115,7 +115,7 @@ def _camera_name(text: str, names: Sequence[str]) -> str:
     known = ", ".join(names[:8])
     if len(names) > 8:
         known += " ..."
-    refuse("--camera", f"one of {known}, or 0 to {len(names) - 1}, got {text}")
+    raise ValueError(f"--camera: expected one of {known}, or 0 to {len(names) - 1}, got {text}")
 
 
 def _around(subject: Bundle | Gaussians, options: ViewOptions, views: int, path: Path) -> dict[str, Camera]:

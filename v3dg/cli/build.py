@@ -17,6 +17,7 @@ from v3dg import _extras
 from v3dg._numbers import check
 from v3dg._urls import beside, cleaned, shown
 from v3dg.build import BuildConfig, build_file, levels_path
+from v3dg.build.scheduler import SchedulerError
 from v3dg.cameras import Axis
 from v3dg.cleaning import AssetWarning, describe
 from v3dg.cli import _common
@@ -26,6 +27,7 @@ from v3dg.io import SUFFIXES, open_asset, run_files
 from v3dg.upright import ASSUMED, up_of
 
 _PATIENCE_S = 20  # time for a scheduler to answer
+_MOST_REASON = 200  # characters of an error of dask's
 # The axis that is up is guessed from so many samples of an asset, of so many gaussians each.
 _NUM_SAMPLES = 64
 _SAMPLE_SIZE = 256
@@ -104,26 +106,52 @@ def _executor_at(address: str | None) -> Iterator[Executor | None]:
     if address is None:
         yield None
         return
+    distributed = _extras.load("distributed")
+    for name in ("distributed", "distributed.client"):  # the command reports errors, once
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    _greet(address)
+    expected = f"{address}: expected a dask scheduler"
+    try:
+        client = distributed.Client(address, timeout=_PATIENCE_S)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split()) or "no answer"
+        raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
+    except Exception as error:  # of any kind, as of one that speaks of other things, or another version
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:_MOST_REASON]
+        raise RuntimeError(f"{expected}, got something else ({reason})") from None
+    with client:
+        yield client.get_executor()
+
+
+def _greet(address: str) -> None:
+    """Say hello to a scheduler; RuntimeError unless something of dask's answers in time.
+
+    A client would wait for ever for one that listens and says nothing.
+    """
     import asyncio
 
     distributed = _extras.load("distributed")
     comm = _extras.load("distributed.comm")
-    for name in ("distributed", "distributed.client"):  # the command reports errors, once
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    expected = f"{address}: expected a dask scheduler"
 
-    async def greet() -> None:
-        (await asyncio.wait_for(comm.connect(address), _PATIENCE_S)).abort()
+    async def connect() -> None:
+        security = distributed.Security().get_connection_args("client")
+        (await asyncio.wait_for(comm.connect(address, **security), _PATIENCE_S)).abort()
 
     try:
-        asyncio.run(greet())  # a client would wait for ever for a server that does not answer
-        client = distributed.Client(address, timeout=_PATIENCE_S)
-    except (OSError, ValueError, asyncio.TimeoutError) as error:
+        comm.get_address_host_port(address)
+    except ValueError as error:
+        raise RuntimeError(f"{expected}, as tcp://host:8786, got no address ({error})") from None
+    try:
+        asyncio.run(connect())
+    except (OSError, asyncio.TimeoutError) as error:
         reason = " ".join(str(error).split()) or "no answer"
-        raise RuntimeError(
-            f"{address}: expected a dask scheduler that answers, got none ({reason})"
-        ) from None
-    with client:
-        yield client.get_executor()
+        raise RuntimeError(f"{expected} that answers, got none ({reason})") from None
+    except TypeError as error:  # TLS without certificates
+        raise RuntimeError(f"{expected} that can be asked, got none ({error}); set dask's security") from None
+    except Exception:  # what dask makes of another protocol, whose first eight bytes it takes for a size
+        advice = "give the address that `dask scheduler` prints"
+        raise RuntimeError(f"{expected}, got a server that speaks another protocol; {advice}") from None
 
 
 def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor | None) -> None:
@@ -135,6 +163,9 @@ def _run_many(options: Build, assets: dict[Path, list[Path]], executor: Executor
             _common.tell(f"[{len(results) + 1}/{len(outputs)}] {shown(asset)}")
         try:
             results.append(_build(options, assets[asset], output, executor))
+        except SchedulerError as error:  # which the others would wait for, too
+            done = f"{len(results)} of {len(outputs)} assets done"
+            raise SchedulerError(f"{error}; {done}") from None
         except _common.FAILURES as error:
             failure = cleaned(_common.failure_text(error))
             results.append({"asset": shown(asset), "status": "failed", "error": failure})
@@ -246,6 +277,8 @@ def _build(options: Build, paths: Sequence[Path], output: Path, executor: Execut
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted{_resume_advice(output)}") from None
+    except SchedulerError as error:
+        raise SchedulerError(f"{error}{_resume_advice(output)}") from None
     except OSError as error:  # for example of a full disk
         if error.errno is None:  # of a URL, whose text says all
             raise type(error)(f"{error}{_resume_advice(output)}") from None

@@ -188,7 +188,7 @@ class _Glb:
     def _column(self, accessor: Node, count: int, width: int) -> Callable[[slice], Floats]:
         """What gives an attribute's rows, in double precision."""
         kind, view = accessor.field("componentType"), self._item("bufferViews", accessor, "bufferView")
-        if kind.value not in _DTYPES:
+        if not isinstance(kind.value, int) or kind.value not in _DTYPES:
             raise kind.error(f"one of {', '.join(map(str, _DTYPES))}")
         if accessor.field("type").value != _TYPES[width]:
             raise accessor.field("type").error(_TYPES[width])

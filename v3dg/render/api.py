@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast, overload
+from typing import TYPE_CHECKING, Literal, cast, get_args, overload
 
 from v3dg import _device
 from v3dg._device import Device
-from v3dg.build.memory import in_bytes
+from v3dg._numbers import one_of
+from v3dg.build.memory import pool_bytes
 from v3dg.cameras import Camera, StereoCamera, check_camera, for_each
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
@@ -96,7 +97,8 @@ def render(
     """
     chosen_device = _device.resolve(device)
     shown = opened(subject)
-    frame = _still_frame(shown, color_by, chosen_device, memory)
+    one_of(color_by, "color_by", get_args(ColorBy))
+    frame = _still_frame(shown, color_by, chosen_device, pool_bytes(memory))
     request = CutRequest(tolerance, budget, min_level, fade)
     shade = shade_of(background, min_transmittance, isinstance(shown, Gaussians), depth)
 
@@ -108,20 +110,21 @@ def render(
     return cast("RenderedImage | tuple[RenderedImage, RenderedImage] | list[RenderedImage]", pictures)
 
 
-def _still_frame(subject: Subject, color_by: ColorBy, device: Device, memory: int | str | None) -> Frame:
+def _still_frame(
+    subject: Subject, color_by: ColorBy, device: Device, memory: int | Literal["auto"] | None
+) -> Frame:
     """The frame that stills of a subject are drawn with, which is kept with a scene or a bundle.
 
     All colours share a pool. Of pools of a given size, only the last one is kept.
     """
     if isinstance(subject, Gaussians):
         return frame_of(subject, color_by, device, memory, PoolSlot())
-    is_sized = memory is not None and memory != "auto"
-    size = in_bytes(memory) if is_sized else memory
+    is_sized = isinstance(memory, int)
     slot = residency.once(subject, ("pool", device, is_sized), PoolSlot)
 
     def make() -> Frame:
-        return frame_of(subject, color_by, device, size, slot)
+        return frame_of(subject, color_by, device, memory, slot)
 
     if is_sized:
-        return residency.last(subject, ("frame", color_by, device), size, make)
-    return residency.once(subject, ("frame", color_by, device, size), make)
+        return residency.last(subject, ("frame", color_by, device), memory, make)
+    return residency.once(subject, ("frame", color_by, device, memory), make)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, get_args
+from typing import TYPE_CHECKING, Literal, Protocol, get_args
 
 from v3dg import _core
 from v3dg._device import Device
 from v3dg._numbers import check, one_of
-from v3dg.build.memory import in_bytes
 from v3dg.cameras import Camera, StereoCamera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
@@ -132,12 +131,16 @@ class AutoFrame:
 
 
 def frame_of(
-    subject: Subject, color_by: ColorBy, device: Device, memory: int | str | None, slot: PoolSlot
+    subject: Subject,
+    color_by: ColorBy,
+    device: Device,
+    memory: int | Literal["auto"] | None,
+    slot: PoolSlot,
 ) -> Frame:
     """A new frame for pictures of a subject.
 
     Args:
-        memory: As in `v3dg.Renderer`.
+        memory: Bytes of a pool; "auto" and None as in `v3dg.Renderer`.
         slot: Where its pool is kept, if it gets one.
 
     Raises:
@@ -152,7 +155,7 @@ def frame_of(
     if memory is None:
         frame = SceneFrame(color_by, device)
     elif memory != "auto":
-        frame = PoolFrame(color_by, device, in_bytes(memory), slot)
+        frame = PoolFrame(color_by, device, memory, slot)
     elif device.is_cuda and color_by != "appearance":  # A pool on a GPU has no other colours.
         frame = SceneFrame(color_by, device)
     else:

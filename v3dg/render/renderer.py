@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, overload
 from v3dg import _core, _device
 from v3dg._device import Device
 from v3dg._numbers import real
-from v3dg.build.memory import in_mib
+from v3dg.build.memory import in_mib, pool_bytes
 from v3dg.cameras import Camera, StereoCamera, check_camera
 from v3dg.false_color import ColorBy
 from v3dg.gaussians import Gaussians
@@ -73,7 +73,9 @@ class Renderer:
         memory: int | str | None = "auto",
     ) -> None:
         self._subject: Subject = opened(subject)
-        self._frame = frame_of(self._subject, color_by, _device.resolve(device), memory, PoolSlot())
+        self._frame = frame_of(
+            self._subject, color_by, _device.resolve(device), pool_bytes(memory), PoolSlot()
+        )
         self._steps = _core.BudgetSteps()
 
     @property

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from v3dg import _core
 from v3dg._device import Device
-from v3dg._numbers import check
+from v3dg._numbers import check, check_type
 from v3dg.bundle import Bundle
 from v3dg.cameras import Camera, StereoCamera
 from v3dg.false_color import ColorBy
@@ -136,6 +136,7 @@ class SceneFrame:
 
 def _check_cut(cut: Selection, subject: Subject, resident: ResidentScene, request: CutRequest) -> None:
     """Refuse a cut that is not of this scene as it is, and whatever else is asked for."""
+    check_type("cut", cut, Selection, "a Selection of v3dg.select")
     for name, value in request._asdict().items():
         check(name, not value, f"nothing beside a cut, which has been chosen, got {value}")
     is_from_bundle = isinstance(subject, Bundle) and cut.scene.bundles == (subject,)

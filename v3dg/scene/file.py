@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from v3dg._json import Node, read_json, write_json
-from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check, refuse
+from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, check, check_type, refuse
 from v3dg._urls import beside, is_url
 from v3dg.bundle import Bundle
 from v3dg.cameras import DEFAULT_FOV_X, Camera, check_cameras
@@ -53,6 +53,8 @@ def read_scene(
         FileNotFoundError: The file, or a bundle that it names, does not exist.
     """
     path = Path(path)
+    if bundles is not None:
+        check_type("bundles", bundles, Mapping, "bundles by their paths")
     root = read_json(path)
     opened = dict(bundles or {})
     if root.has("layouts"):
@@ -79,6 +81,7 @@ def write_scene(
             that); or the name is not one of a scene.
     """
     check(path, is_scene(Path(path)), "a file name ending in .json, not meta.json; v3dg.open goes by it")
+    check_type("scene", scene, Scene, "a Scene")
     cameras = cameras or {}
     check_cameras(cameras)
     if bundle_paths is None:

@@ -126,7 +126,7 @@ class SceneView:
         self, subject: Subject, *, device: str | Device = "auto", memory: int | str | None = "auto"
     ) -> None:
         if isinstance(subject, Gaussians):
-            only_leaves = BuildConfig(min_clusters=1 << 31)
+            only_leaves = BuildConfig.leaves_only()
             subject = build_bundle(subject, config=only_leaves, device="cpu", progress=False)
         self.scene = Scene.of(subject)
         self.device = _device.resolve(device)

@@ -1,19 +1,29 @@
 """Who may talk to the viewer's server: what a request has to say of where it comes from.
 
-Any web page can have its visitor's browser connect to this machine. The browser then says whose page it is
-(Origin) and which name it looked up (Host), and no page can change that.
+Any web page can have its visitor's browser connect to this machine. The browser then says which name it
+looked up (Host), whose page asks (Origin, which the pictures, scripts and links of a page leave out) and how
+that page is related to the server (Sec-Fetch-Site, which browsers leave out where the server is another
+machine and the connection is not encrypted). No page can change any of them.
 """
 
 import errno
 import hmac
 import ipaddress
+import re
 import secrets
 import socket
-from urllib.parse import urlsplit
 
 from websockets.http11 import Request
 
 _MOST_PORTS = 1000
+# A name or an address, and perhaps a port, as browsers write them: without a user, in lower case.
+_HOST = re.compile(
+    r"(?:\[(?P<address>[0-9a-f:.]+(?:%[a-z0-9._~-]+)?)\]|(?P<name>[a-z0-9._-]+))(?::[0-9]{0,5})?"
+)
+# Sec-Fetch-Site of the viewer's own page, and of an address that a person typed or opened from a bookmark.
+_OWN_SITES = ("same-origin", "none")
+# Paths of the page, which links of other sites may open.
+_PAGE_PATHS = ("/", "/index.html")
 
 
 class Gate:
@@ -50,28 +60,46 @@ class Gate:
     def refusal(self, request: Request) -> str | None:
         """Why a request gets no answer; the token is taken off the path of one that does."""
         headers = request.headers
-        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        texts = (request.path, *(value for _, value in headers.raw_items()))
+        if not all(text.isascii() for text in texts):
+            return "The viewer answers requests in ASCII alone.\n"
+        hosts = [host.lower() for host in headers.get_all("Host")]
         if len(hosts) != 1 or not self._knows(hosts[0]):
             return "The viewer does not go by this name.\n"
-        if any(urlsplit(origin).netloc.lower() != hosts[0].lower() for origin in origins):
+        own_origins = (f"http://{hosts[0]}", f"https://{hosts[0]}")
+        if any(origin.lower() not in own_origins for origin in headers.get_all("Origin")):
             return "Other web pages may not use the viewer.\n"
         request.path = request.path.partition("?")[0]
         if self._token:
             token, slash, path = request.path.removeprefix("/").partition("/")
-            if not slash or not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
+            if not slash or not hmac.compare_digest(token.encode(), self._token.encode()):
                 return "Open the whole address that the viewer printed, to the slash at its end.\n"
             request.path = f"/{path}"
+        is_own = all(site in _OWN_SITES for site in headers.get_all("Sec-Fetch-Site"))
+        if not is_own and not _opens_the_page(request):
+            return "Other web pages may not show what the viewer serves.\n"
         return None
 
     def _knows(self, host: str) -> bool:
         """Whether a Host is loopback or was asked for: other names can be led here by those who own them."""
-        name = urlsplit(f"//{host}").hostname or ""
+        match = _HOST.fullmatch(host)
+        if match is None:
+            return False
+        name = match["address"] or match["name"]
         if self._has_any_name or name in self._names:
             return True
         try:
-            return ipaddress.ip_address(name).is_loopback
+            return "%" not in name and ipaddress.ip_address(name).is_loopback
         except ValueError:
             return False
+
+
+def _opens_the_page(request: Request) -> bool:
+    """Whether a request is of a tab that a link leads to the page; frames have another destination."""
+    headers = request.headers
+    is_navigation = headers.get_all("Sec-Fetch-Mode") == ["navigate"]
+    is_tab = headers.get_all("Sec-Fetch-Dest") == ["document"]
+    return is_navigation and is_tab and request.path in _PAGE_PATHS and "Upgrade" not in headers
 
 
 def _listening_socket(host: str, port: int) -> socket.socket:

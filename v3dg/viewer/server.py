@@ -42,10 +42,14 @@ _PHOTOGRAPH_PIXELS = {"photograph": 1600, "thumbnail": 240}
 _LOG = logging.getLogger(__name__)
 _LOG.addHandler(logging.NullHandler())
 _KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
-# The page is shown in no other page, runs nothing but its own files, and talks to no other server.
+# Of every answer, refusals and errors too. The page is shown in no other page, runs nothing but its own
+# files, and talks to no other server; other pages show nothing of it, and have no handle on its window.
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
@@ -136,8 +140,11 @@ class Site:
             "max_size": MOST_BYTES,
             "compression": None,  # pictures are compressed
             "close_timeout": 0.5,  # a client that does not answer does not hold up the end
+            "server_header": None,  # which versions answer is nobody's concern
+            "process_request": self._answer,
+            "process_response": _add_headers,
         }
-        async with serve(self._talk, sock=self._gate.socket, process_request=self._answer, **options):
+        async with serve(self._talk, sock=self._gate.socket, **options):
             is_serving.set()
             await self._closing.wait()
         await asyncio.to_thread(self._end_tabs)
@@ -195,7 +202,7 @@ class Site:
         response = connection.respond(http.HTTPStatus.OK, "")
         for header in ("Content-Type", "Content-Length"):
             del response.headers[header]
-        response.headers.update({**_HEADERS, "Content-Type": kind, "Content-Length": str(len(body))})
+        response.headers.update({"Content-Type": kind, "Content-Length": str(len(body))})
         response.body = body
         return response
 
@@ -210,8 +217,13 @@ class Site:
                 file = io.BytesIO()
                 picture.convert("RGB").save(file, "jpeg", quality=85)
                 return file.getvalue()
-        except (IndexError, OSError, ValueError, Image.DecompressionBombError):
+        except Exception:  # of whatever kind Pillow raises for a damaged file
             return None
+
+
+def _add_headers(_connection: ServerConnection, _request: Request, response: Response) -> None:
+    """Give an answer of any kind the headers that all have."""
+    response.headers.update(_HEADERS)
 
 
 def start_view(scene_view: SceneView, up: VectorLike, aspect: float = 16 / 9) -> View:

@@ -76,7 +76,7 @@ def _formats(folder):
         yield Good(kind, {f"a{suffix}": path.read_bytes()}, is_hashed=suffix in (".spz", ".sog"))
     for path in sorted(FIXTURES.iterdir()):
         kind = path.suffix[1:]
-        if kind in ("splat", "ksplat", "spz", "sog"):
+        if kind in ("splat", "ksplat", "spz", "sog", "glb"):
             is_hashed = kind == "sog" or path.read_bytes()[:2] == b"\x1f\x8b"
             yield Good(kind, {f"a.{kind}": path.read_bytes()}, is_hashed=is_hashed)
     parts = sog.encode(random_gaussians(np.random.default_rng(1), 40, 1))
