@@ -399,6 +399,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     Loaded loaded;
     Source::prepare();
     space.tiles.count = 0;
+    __syncwarp();  // A warp without an item reads it next.
     // Items differ much in what is seen of them, so a warp asks for another one as it begins with one.
     for (unsigned i = blockIdx.x * kWarps + threadIdx.x / 32; i < num_items;) {
         const uint32_t item_word = load_word(in.items.items[i]);
@@ -431,6 +432,7 @@ __global__ void __launch_bounds__(32 * kWarps, kBlocks)
     Loaded loaded;
     Source::prepare();
     space.tiles.count = 0;
+    __syncwarp();  // A warp without an item reads it next.
     for (unsigned first = blockIdx.x * kWarps + threadIdx.x / 32; first < num_items; first += 32 * stride) {
         const unsigned mine = first + threadIdx.x % 32 * stride;
         unsigned todo = __ballot_sync(kAllLanes, mine < num_items && in.items.items[mine].sharers != 0);

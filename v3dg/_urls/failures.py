@@ -80,14 +80,18 @@ def _problem_of(url: str, error: Exception) -> Problem:
     # Before 3.11, the timeout of asyncio is another type than that of the system.
     if isinstance(cause, TimeoutError) or "TimeoutError" in names:
         return Problem(TimeoutError, f"the server did not answer in time; {_AGAIN}")
-    if isinstance(cause, ConnectionRefusedError):
-        return Problem(ConnectionRefusedError, "the connection was refused; check host and port")
     answer = _problem_of_answer(names)
     if answer is not None:
         return answer
     if isinstance(cause, ConnectionError) or "ClientError" in names:
-        return Problem(ConnectionError, f"the connection was lost or could not be made ({text}); {_AGAIN}")
+        return _problem_of_connection(cause, text)
     return _problem_elsewhere(cause, text)
+
+
+def _problem_of_connection(error: Exception, text: str) -> Problem:
+    if isinstance(error, ConnectionRefusedError):
+        return Problem(ConnectionRefusedError, "the connection was refused; check host and port")
+    return Problem(ConnectionError, f"the connection was lost or could not be made ({text}); {_AGAIN}")
 
 
 def _problem_of_answer(names: set[str]) -> Problem | None:
