@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.formats._packing import assemble, normalised
+from v3dg.formats._packing import assemble
 from v3dg.formats._reading import AssetFile, File, Path, check
 from v3dg.gaussians import Gaussians
+from v3dg.rotations import normalised
 
 _INT = np.dtype("<i4")
 _WIDTHS = (3, 4, 3, 1, 48)
