@@ -16,6 +16,7 @@ TRIES = {
     "bounded": 6,
     "threads": 30,
     "memory": 8,
+    "extreme_numbers": 40,
 }
 
 

@@ -30,6 +30,7 @@ KINDS = {
     "bounded": 0.05,
     "threads": 0.03,
     "memory": 0.07,
+    "extreme_numbers": 0.05,
 }
 KEPT = Path(__file__).parents[2] / "build" / "attack"
 
