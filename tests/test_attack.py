@@ -21,6 +21,7 @@ TRIES = {
     "servers": 12,
     "ends": 12,
     "headers": 60,
+    "extreme_numbers": 40,
 }
 
 

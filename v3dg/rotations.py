@@ -1,8 +1,42 @@
 """Rotations and quaternions."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg.cameras import Floats
+
+# The squares of components beyond these overflow a double, or lose digits to denormal numbers.
+_LEAST = 1e-140
+_MOST = 1e140
+
+
+def in_range(quaternions: NDArray[np.floating[Any]]) -> Floats:
+    """Return quaternions (..., 4) as doubles whose squares neither vanish nor overflow.
+
+    The shortest and the longest are multiplied by a power of two, which rounds nothing. Others stay, and so
+    do zero quaternions and those that are not finite.
+    """
+    scaled = np.array(quaternions, np.float64)
+    largest = np.abs(scaled).max(axis=-1)
+    is_extreme = ((largest < _LEAST) & (largest > 0)) | ((largest > _MOST) & (largest < np.inf))
+    if is_extreme.any():
+        exponents = np.frexp(largest[is_extreme])[1]
+        scaled[is_extreme] = np.ldexp(scaled[is_extreme], -exponents[..., None])
+    return scaled
+
+
+def normalised(quaternions: NDArray[np.floating[Any]]) -> Floats:
+    """Return quaternions (..., 4) of length one, in double precision.
+
+    Those of length zero stay, and those that are not finite contain NaN. No length is too short or too long.
+    """
+    unit = in_range(quaternions)
+    length = np.linalg.norm(unit, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        np.divide(unit, length, out=unit, where=length != 0)
+    return unit
 
 
 def rotation_from_quaternion(quaternions: Floats) -> Floats:

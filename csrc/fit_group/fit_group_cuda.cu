@@ -54,7 +54,7 @@ __device__ bool project_one(const Fit& fit, uint32_t i, const ModelView<float>& 
     float half_x, half_y;
     if (!(e.depth >= camera.near_depth) || !extent_of(g.opacity, e, p, half_x, half_y)) return false;
     if (!meets_image(e.u, half_x, camera.width) || !meets_image(e.v, half_y, camera.height)) return false;
-    const PixelBox<int> box = pixel_box(e, half_x, half_y, camera, fit.job.size, fit.job.size);
+    const PixelBox<int> box = pixel_box(e, half_x, half_y, camera);
     if (!box.holds_pixels()) return false;
     set_ellipse(e, box, r);
     const float* sh = fit.at(fit.layout.value) + 11 * fit.n + fit.num_sh * i;

@@ -7,6 +7,7 @@
 
 #include "fit_group/fit_group_math.h"
 #include "fit_group/team.cuh"
+#include "math/quat.h"
 
 namespace v3dg {
 namespace cuda {
@@ -53,17 +54,15 @@ __device__ bool write_parameters(const Fit& fit) {
     const GaussianRows<float>& rows = fit.in.rows;
     const FitGroup& group = fit.job.group;
     for (uint32_t i = fit.first(); i < fit.n; i += fit.stride()) {
-        const Gaussian3d<float> g = gaussian_of(fit, i);
+        Gaussian3d<float> g = gaussian_of(fit, i);
         const size_t to = group.first + i;
-        const float length = sqrt_of(g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] +
-                                     g.quat[3] * g.quat[3]);
+        normalise_quat(g.quat);
         for (int k = 0; k < 3; ++k) {
             rows.means[3 * to + k] =
                 static_cast<float>(group.center[k] + static_cast<double>(group.radius) * g.mean[k]);
             rows.scales[3 * to + k] = group.radius * g.scale[k];
         }
-        for (int k = 0; k < 4; ++k)
-            rows.quats[4 * to + k] = length > 0 ? g.quat[k] / length : static_cast<float>(k == 0);
+        for (int k = 0; k < 4; ++k) rows.quats[4 * to + k] = g.quat[k];
         rows.opacities[to] = g.opacity;
     }
     for (uint32_t k = fit.first(); k < fit.num_sh * fit.n; k += fit.stride())

@@ -5,6 +5,7 @@
 #include "base/host_device.h"
 #include "gather/gather.h"
 #include "gather/sh_rotation.h"
+#include "math/quat.h"
 
 namespace v3dg {
 
@@ -27,19 +28,24 @@ V3DG_HD inline void gather_shape(const GatherInput& in, const Rotations& rotatio
     const int64_t from = in.first_row[s] + within, to = in.offset[s] + within;
     const size_t i = in.instance[s];
     const GaussianRows<const float>& rows = in.bundles[in.bundle[i]];
-    const double *r = rotations.rotation + 9 * i, *q = in.quaternion.data + 4 * i, scale = in.scale[i];
+    const double *r = rotations.rotation + 9 * i, scale = in.scale[i];
     const double x = rows.means[3 * from], y = rows.means[3 * from + 1], z = rows.means[3 * from + 2];
     for (int k = 0; k < 3; ++k) {
         const double rotated = r[3 * k] * x + r[3 * k + 1] * y + r[3 * k + 2] * z;
         out.means[3 * to + k] = static_cast<float>(scale * rotated + in.position[3 * i + k]);
         out.scales[3 * to + k] = static_cast<float>(scale * rows.scales[3 * from + k]);
     }
+    double q[4];
+    for (int k = 0; k < 4; ++k) q[k] = in.quaternion[4 * i + k];
+    if (is_out_of_range(length2_of_quat(q))) bring_into_range(q);
     const float* p = rows.quats + 4 * from;
-    float* product = out.quats + 4 * to;
-    product[0] = static_cast<float>(q[0] * p[0] - q[1] * p[1] - q[2] * p[2] - q[3] * p[3]);
-    product[1] = static_cast<float>(q[0] * p[1] + q[1] * p[0] + q[2] * p[3] - q[3] * p[2]);
-    product[2] = static_cast<float>(q[0] * p[2] - q[1] * p[3] + q[2] * p[0] + q[3] * p[1]);
-    product[3] = static_cast<float>(q[0] * p[3] + q[1] * p[2] - q[2] * p[1] + q[3] * p[0]);
+    double product[4] = {
+        q[0] * p[0] - q[1] * p[1] - q[2] * p[2] - q[3] * p[3],
+        q[0] * p[1] + q[1] * p[0] + q[2] * p[3] - q[3] * p[2],
+        q[0] * p[2] - q[1] * p[3] + q[2] * p[0] + q[3] * p[1],
+        q[0] * p[3] + q[1] * p[2] - q[2] * p[1] + q[3] * p[0],
+    };
+    round_quat(product, out.quats + 4 * to);
     const float opacity = rows.opacities[from];
     out.opacities[to] = in.weight.size == 0 ? opacity : opacity * in.weight[s];
 }

@@ -21,6 +21,8 @@ namespace v3dg {
 
 namespace {
 
+constexpr double kLeastSquared = 1e-140,
+                 kMostSquared = 1e140;  // numbers whose squares are exact to the last digit
 constexpr size_t kBlockBytes = size_t(1)
                                << 18;  // what one thread reads and converts at a time: fits its cache
 constexpr size_t kChunkBytes = size_t(1) << 22;  // what all threads convert together when one has to cut rows
@@ -127,6 +129,16 @@ bool is_swapped(PlyEncoding encoding) {
     return (encoding == PlyEncoding::binary_big_endian) == (first == 1);
 }
 
+// Multiplies what doubles do not hold the squares of by a power of two; zeros and what is not finite stay.
+void scale_extreme(double quat[4]) {
+    double largest = 0;
+    for (size_t j = 0; j < 4; ++j) largest = std::max(largest, std::abs(quat[j]));
+    const bool is_usual = largest > kLeastSquared && largest < kMostSquared;
+    if (is_usual || largest == 0 || !std::isfinite(largest)) return;
+    const int exponent = std::ilogb(largest);
+    for (size_t j = 0; j < 4; ++j) quat[j] = std::ldexp(quat[j], -exponent);
+}
+
 // Stores gaussian i; load(slot) is the number that the file holds for a slot.
 template <class Load>
 void store_gaussian(const Load& load, size_t i, size_t num_sh, const PlyGaussians<float>& out) {
@@ -138,11 +150,10 @@ void store_gaussian(const Load& load, size_t i, size_t num_sh, const PlyGaussian
     for (size_t j = 0; j < 3 * num_sh; ++j) sh[j] = static_cast<float>(load(kSh + j));
 
     double quat[4];
+    for (size_t j = 0; j < 4; ++j) quat[j] = load(kQuat + j);
+    scale_extreme(quat);
     double norm2 = 0;
-    for (size_t j = 0; j < 4; ++j) {
-        quat[j] = load(kQuat + j);
-        norm2 += quat[j] * quat[j];
-    }
+    for (const double component : quat) norm2 += component * component;
     const bool keeps_length = !(norm2 > 0 && std::isfinite(norm2)) || std::abs(norm2 - 1) < kUnitTolerance;
     const double factor = keeps_length ? 1 : 1 / std::sqrt(norm2);
     for (size_t j = 0; j < 4; ++j) out.quats[4 * i + j] = static_cast<float>(quat[j] * factor);

@@ -314,6 +314,16 @@ V3DG_INLINE Vec<float> min_of(Vec<float> a, Vec<float> b) {
 }
 #endif
 
+// Whether a comparison holds, in any lane.
+template <class Mask>
+V3DG_HD V3DG_INLINE bool is_any(Mask holds) {
+    if constexpr (std::is_arithmetic<Mask>::value) return holds != 0;
+#ifdef V3DG_ISA
+    else
+        return bits_of(holds) != 0;
+#endif
+}
+
 // a / b of numbers that are neither tiny nor huge.
 template <class V>
 V3DG_HD V3DG_INLINE V quotient_of(V a, V b) {

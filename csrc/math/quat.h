@@ -1,10 +1,64 @@
 #pragma once
 
-// Rotations from quaternions (w, x, y, z) of any length but zero.
+// Rotations from quaternions (w, x, y, z) of any length, which is not part of what they say. A zero
+// quaternion is no rotation; one that is not finite gives a matrix that is not a number.
 
 #include "math/lanes.h"
 
 namespace v3dg {
+
+// Squared lengths from `least2` to `most2` are computed without a product that vanishes or overflows. A
+// quaternion of any other length, down to the least denormal number, comes between them when it is multiplied
+// by `up` or `down`, powers of two that round nothing.
+template <class T>
+struct QuatRange {
+    static constexpr T least2 = T(0x1p-80), most2 = T(0x1p100), up = T(0x1p100), down = T(0x1p-100);
+};
+template <>
+struct QuatRange<double> {
+    static constexpr double least2 = 0x1p-600, most2 = 0x1p700, up = 0x1p800, down = 0x1p-600;
+};
+
+template <class V>
+V3DG_HD V3DG_INLINE V length2_of_quat(const V q[4]) {
+    return q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+}
+
+// Whether a squared length is outside of its range; one that is not a number is not.
+template <class V>
+V3DG_HD V3DG_INLINE auto is_out_of_range(V length2) {
+    using Range = QuatRange<Lane<V>>;
+    return (length2 < all_lanes<V>(Range::least2)) | (length2 > all_lanes<V>(Range::most2));
+}
+
+// Multiplies a quaternion, where its squared length is outside of its range, by the power of two that brings
+// it inside, and returns that, elsewhere 1.
+template <class V>
+V3DG_HD V3DG_INLINE V bring_into_range(V q[4]) {
+    using Range = QuatRange<Lane<V>>;
+    const V length2 = length2_of_quat(q), one = all_lanes<V>(Lane<V>(1));
+    const V up = length2 < all_lanes<V>(Range::least2) ? all_lanes<V>(Range::up) : one;
+    const V factor = length2 > all_lanes<V>(Range::most2) ? all_lanes<V>(Range::down) : up;
+    for (int k = 0; k < 4; ++k) q[k] *= factor;
+    return factor;
+}
+
+// Makes the length one; a zero quaternion becomes the identity.
+template <class T>
+V3DG_HD V3DG_INLINE void normalise_quat(T q[4]) {
+    if (is_out_of_range(length2_of_quat(q))) bring_into_range(q);
+    const T length2 = length2_of_quat(q);
+    const T length = sqrt_of(length2);
+    for (int k = 0; k < 4; ++k) q[k] = length2 == 0 ? static_cast<T>(k == 0) : q[k] / length;
+}
+
+// Rounds a quaternion to float32. One that float32 would not hold, or without squares, becomes of length one.
+V3DG_HD V3DG_INLINE void round_quat(double q[4], float out[4]) {
+    const double length2 = length2_of_quat(q);
+    const bool is_held = length2 >= QuatRange<float>::least2 && length2 <= QuatRange<float>::most2;
+    if (!is_held && length2 != 0) normalise_quat(q);
+    for (int k = 0; k < 4; ++k) out[k] = static_cast<float>(q[k]);
+}
 
 // Rotation matrix, row major, of a quaternion of which 2 over its squared length is `s`.
 template <class V>
@@ -21,18 +75,30 @@ V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V s, V r[9]) {
     r[8] = 1 - s * (x * x + y * y);
 }
 
-// That of the normalised quaternion. A zero quaternion gives the identity.
+// That of the normalised quaternion. Lengths out of range are rare, and what belongs to them is computed
+// again. The other lanes keep their first result: so its rounding depends neither on their neighbours nor on
+// how the compiler contracts it when it is moved behind the branch.
 template <class V>
 V3DG_HD V3DG_INLINE void rotation_of_quat(const V q[4], V r[9]) {
-    const V n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+    const V n2 = length2_of_quat(q);
     const V s = n2 > V{} ? 2 / n2 : V{};
     rotation_of_quat(q, s, r);
+    const auto is_again = is_out_of_range(n2);
+    if (is_any(is_again)) {
+        V p[4] = {q[0], q[1], q[2], q[3]};
+        bring_into_range(p);
+        const V p2 = length2_of_quat(p);
+        const V of_p = p2 > V{} ? 2 / p2 : V{};
+        V again[9];
+        rotation_of_quat(p, of_p, again);
+        for (int k = 0; k < 9; ++k) r[k] = is_again ? again[k] : r[k];
+    }
 }
 
-// Gradient of the quaternion, through its normalisation, from that of the rotation matrix.
+// Gradient of a quaternion whose squared length is in range, through its normalisation, from that of the
+// rotation matrix.
 template <class V>
-V3DG_HD V3DG_INLINE void rotation_of_quat_vjp(const V q[4], const V g[9], V g_q[4]) {
-    const V n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+V3DG_HD V3DG_INLINE void rotation_of_quat_in_range_vjp(const V q[4], V n2, const V g[9], V g_q[4]) {
     const V s = n2 > V{} ? 2 / n2 : V{};
     const V w = q[0], x = q[1], y = q[2], z = q[3];
     const V d_w = s * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]));
@@ -45,6 +111,25 @@ V3DG_HD V3DG_INLINE void rotation_of_quat_vjp(const V q[4], const V g[9], V g_q[
     g_q[1] = d_x - along * x;
     g_q[2] = d_y - along * y;
     g_q[3] = d_z - along * z;
+}
+
+// The same for any length. It grows as one over the length, up to the largest number.
+template <class V>
+V3DG_HD V3DG_INLINE void rotation_of_quat_vjp(const V q[4], const V g[9], V g_q[4]) {
+    const V n2 = length2_of_quat(q);
+    rotation_of_quat_in_range_vjp(q, n2, g, g_q);
+    const auto is_again = is_out_of_range(n2);
+    if (is_any(is_again)) {
+        using T = Lane<V>;
+        V p[4] = {q[0], q[1], q[2], q[3]};
+        const V factor = bring_into_range(p);
+        V again[4];
+        rotation_of_quat_in_range_vjp(p, length2_of_quat(p), g, again);
+        for (int k = 0; k < 4; ++k) {
+            const V finite = cut_to(-kLargest<T>, kLargest<T>, again[k] * factor);
+            g_q[k] = is_again ? finite : g_q[k];
+        }
+    }
 }
 
 }  // namespace v3dg

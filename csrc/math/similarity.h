@@ -17,13 +17,17 @@ struct Pose {
     double scale;
 };
 
-// Whether a pose is one: what is not finite, or of no size, is not drawn.
+// Whether a pose is one: what is not finite, of no size, or turned by a quaternion of zeros, is not drawn.
 V3DG_HD inline bool is_placed(const Pose& pose) {
     double sum = pose.scale;
     for (int k = 0; k < 3; ++k) sum += fabs(pose.position[k]);
-    double length2 = 0.0;
-    for (int k = 0; k < 4; ++k) length2 += pose.quaternion[k] * pose.quaternion[k];
-    return pose.scale > 0.0 && sum <= DBL_MAX && length2 > 0.0 && length2 <= DBL_MAX;
+    bool is_zero = true;
+    bool is_finite = true;
+    for (int k = 0; k < 4; ++k) {
+        is_zero = is_zero && pose.quaternion[k] == 0.0;
+        is_finite = is_finite && fabs(pose.quaternion[k]) <= DBL_MAX;
+    }
+    return pose.scale > 0.0 && sum <= DBL_MAX && !is_zero && is_finite;
 }
 
 // The camera in the frame of an instance.

@@ -7,6 +7,7 @@
 
 #include "fit_group/fit_group_math.h"
 #include "math/camera.h"
+#include "math/quat.h"
 #include "pipeline/refine_cuts.h"
 
 namespace v3dg {
@@ -65,12 +66,10 @@ V3DG_HD inline void move_gaussian(const GaussianRows<float>& rows, size_t i,
     for (int k = 0; k < 3; ++k)
         rows.means[3 * i + k] =
             moved(rows.means[3 * i + k], gradient.means[3 * g + k], step.position * radius);
-    float quat[4], length2 = 0;
-    for (int k = 0; k < 4; ++k) {
-        quat[k] = moved(rows.quats[4 * i + k], gradient.quats[4 * g + k], step.quat);
-        length2 += quat[k] * quat[k];
-    }
-    for (int k = 0; k < 4 && length2 > 0; ++k) rows.quats[4 * i + k] = quat[k] / sqrt_of(length2);
+    float quat[4];
+    for (int k = 0; k < 4; ++k) quat[k] = moved(rows.quats[4 * i + k], gradient.quats[4 * g + k], step.quat);
+    normalise_quat(quat);
+    for (int k = 0; k < 4; ++k) rows.quats[4 * i + k] = quat[k];
     for (int k = 0; k < 3; ++k) {
         const float scale = rows.scales[3 * i + k], slope = gradient.scales[3 * g + k] * scale;
         rows.scales[3 * i + k] =

@@ -118,7 +118,6 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
     using V = Vec<T>;
     using I = decltype(V{} < V{});
     constexpr int kWidth = kLanes<T>;
-    const int width = static_cast<int>(camera.width), height = static_cast<int>(camera.height);
     I top = I{} + INT_MAX, bottom = I{} - 1, entries = I{};
     size_t num_records = 0;
     for (uint64_t done = 0; done < count; done += kWidth) {
@@ -141,7 +140,7 @@ static size_t project_rows(const Source& from, const Draw<T>& draw, uint64_t fir
         reach.in_frustum += __builtin_popcount(meets_bits);
         if (meets_bits == 0) continue;
 
-        PixelBox<I> box = pixel_box(e, half_x, half_y, camera, width, height);
+        PixelBox<I> box = pixel_box(e, half_x, half_y, camera);
         const auto drawn = meets & box.holds_pixels();
         const unsigned drawn_bits = bits_of(drawn) & lanes;
         reach.drawn += __builtin_popcount(drawn_bits);

@@ -121,7 +121,7 @@ __device__ bool project_one(const ItemTables<typename Source::Model>& in, const 
     bool is_in_frustum = is_one & extent_of(1.0f, e, s, half_x, half_y);
     is_in_frustum &= meets_image(e.u, half_x, cam.width) & meets_image(e.v, half_y, cam.height);
     num_in_frustum += is_in_frustum;
-    box = pixel_box(e, half_x, half_y, cam, in.image.width, in.image.height);
+    box = pixel_box(e, half_x, half_y, cam);
     if (traits.are_small) drop_missed_rows(e, s, cam.width, box);
     set_ellipse(e, r);
     const bool reaches_pixel = is_in_frustum & box.holds_pixels();

@@ -96,7 +96,7 @@ V3DG_HD V3DG_INLINE void fade(Lane<V> weight, Ellipse<V>& e) {
 }
 
 // How far from its centre, px, alpha is 1/255 or more: where |L d|² = log2 of alpha at the centre over 1/255.
-// Returns whether it is anywhere; the extent means nothing where it is not.
+// Returns whether it is anywhere, at a depth that is finite; the extent means nothing where it is not.
 template <class V>
 V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Projection<V>& s, V& half_x,
                                    V& half_y) {
@@ -106,7 +106,7 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
     half_x = sqrt_of(reach * s.c11) * T(1 / kFalloffScale);
     half_y = sqrt_of(reach * s.c22) * T(1 / kFalloffScale);
     return (opacity >= all_lanes<V>(T(kMinAlpha))) & (reach >= V{}) & (s.det > V{}) & (s.det < huge) &
-           (half_x < huge) & (half_y < huge);
+           (half_x < huge) & (half_y < huge) & (e.depth < huge);
 }
 
 // As project_gaussian(); s.p is set, s.linear_rs is left alone.
@@ -159,25 +159,25 @@ V3DG_HD V3DG_INLINE auto meets_image(V center, V half, Lane<V> size) {
 }
 
 // The pixels from ceil(low) to floor(high) have their centres within `half` of `center`, or within a margin
-// of that, so that the blend step alone decides. From -1 or 0 to size - 1 or size.
+// of that, so that the blend step alone decides. `low` is from 0 to size and `high` from -1 to size - 1,
+// whatever the arguments, not a number included: none of them overflows an integer.
 template <class V>
 V3DG_HD V3DG_INLINE void pixel_span(V center, V half, Lane<V> size, V& low, V& high) {
     using T = Lane<V>;
     const V margin = half * T(1e-5) + T(2e-3);
-    low = max_of(all_lanes<V>(T(-1)), center - half - margin - T(0.5));
-    high = min_of(all_lanes<V>(size), center + half + margin - T(0.5));
+    // The second argument is what is left of one that is not a number.
+    low = min_of(max_of(center - half - margin - T(0.5), V{}), all_lanes<V>(size));
+    high = max_of(min_of(center + half + margin - T(0.5), all_lanes<V>(size - 1)), all_lanes<V>(T(-1)));
 }
 
-// The pixels of an image of width x height whose centres lie in the box of an ellipse of this extent.
+// The pixels of an image of the camera's size whose centres lie in the box of an ellipse of this extent.
 template <class V>
-V3DG_HD V3DG_INLINE auto pixel_box(const Ellipse<V>& e, V half_x, V half_y, const Pinhole<Lane<V>>& camera,
-                                   int width, int height) {
+V3DG_HD V3DG_INLINE auto pixel_box(const Ellipse<V>& e, V half_x, V half_y, const Pinhole<Lane<V>>& camera) {
     V low_x, high_x, low_y, high_y;
     pixel_span(e.u, half_x, camera.width, low_x, high_x);
     pixel_span(e.v, half_y, camera.height, low_y, high_y);
     using I = decltype(ceil_to_int(low_x));
-    return PixelBox<I>{max_of(ceil_to_int(low_x), I{}), min_of(floor_to_int(high_x), I{} + (width - 1)),
-                       max_of(ceil_to_int(low_y), I{}), min_of(floor_to_int(high_y), I{} + (height - 1))};
+    return PixelBox<I>{ceil_to_int(low_x), floor_to_int(high_x), ceil_to_int(low_y), floor_to_int(high_y)};
 }
 
 // Gradients of the gaussian's mean, quaternion, scales and opacity from those of its ellipse.

@@ -145,7 +145,10 @@ ClusterCode ranges_of(const std::vector<Prepared>& cluster) {
         out.mean_first[k] = static_cast<float>(mean[k].first);
         const double finest = 2 * float_spacing(mean[k].magnitude());
         double step = std::max(step_of(mean[k], mean[k].first, kMostMean), finest);
-        step = std::ldexp(std::floor(std::ldexp(step, 11 - std::ilogb(step))), std::ilogb(step) - 11);
+        if (step > 0) {  // it is zero where all of them are
+            const int exponent = std::ilogb(step);
+            step = std::ldexp(std::floor(std::ldexp(step, 11 - exponent)), exponent - 11);
+        }
         // A step below 2^-100 is nothing; products with it would not be normal numbers.
         const bool is_point = code_of(mean[k].last, mean[k].first, step, 1) == 0 || step < 0x1p-100;
         out.mean_step[k] = is_point ? 0 : static_cast<float>(step);

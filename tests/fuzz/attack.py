@@ -35,6 +35,7 @@ KINDS = {
     "servers": 0.05,
     "ends": 0.1,
     "headers": 0.03,
+    "extreme_numbers": 0.05,
 }
 KEPT = Path(__file__).parents[2] / "build" / "attack"
 

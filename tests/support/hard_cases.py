@@ -133,12 +133,12 @@ def shapes() -> dict[str, HardCase]:
             crowd(4, scales=(1e6, 2e6, 5e7), opacities=0.1),
         ),
         "quaternions of length 10¹⁵": HardCase(
-            "Normalised. Past 10¹⁸ the square overflows, and the quaternion counts as no rotation.",
+            "Normalised, as is any length.",
             crowd(5, quats=1e15 * crowd(5).quats),
             mode=FILTER,
         ),
         "quaternions of length 10⁻¹⁵": HardCase(
-            "Normalised. Below 10⁻¹⁸ the square vanishes, and the quaternion counts as no rotation.",
+            "Normalised, as is any length.",
             crowd(5, quats=1e-15 * crowd(5).quats),
             mode=FILTER,
         ),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from v3dg import _core
 from v3dg._numbers import check_all
 from v3dg.gaussians import Gaussians, empty
+from v3dg.rotations import normalised
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Integers: TypeAlias = NDArray[np.integer[Any]]
@@ -59,14 +60,6 @@ def three_of_quats(quats: Floats) -> tuple[Floats, NDArray[np.intp]]:
     largest = np.abs(unit).argmax(axis=1)
     sign = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1.0, 1.0)
     return np.take_along_axis(unit, _STORED_COMPONENTS[largest], axis=1) * sign, largest
-
-
-def normalised(quats: Floats) -> Floats:
-    """Quaternions of length one, in double precision; those of length zero stay."""
-    quats = quats.astype(np.float64)
-    length = np.linalg.norm(quats, axis=1, keepdims=True)
-    np.divide(quats, length, out=quats, where=length > 0)
-    return quats
 
 
 def log_scales(scales: Floats) -> Floats:

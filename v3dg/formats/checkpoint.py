@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3dg._numbers import refuse
-from v3dg.formats._packing import DEGREES, Floats, assemble, normalised
+from v3dg.formats._packing import DEGREES, Floats, assemble
 from v3dg.formats._reading import Archive, AssetFile, Claims, Path, check, telling, whole_file
 from v3dg.gaussians import Gaussians
+from v3dg.rotations import normalised
 
 _FIELDS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 _NERFSTUDIO = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")

@@ -18,10 +18,11 @@ from v3dg._json import Node, parse_json
 from v3dg._numbers import Floats
 from v3dg._version import __version__
 from v3dg.formats import spz
-from v3dg.formats._packing import SH_C0, assemble, check_writable, normalised
+from v3dg.formats._packing import SH_C0, assemble, check_writable
 from v3dg.formats._reading import AssetFile, Claims, check, telling, whole, whole_file
 from v3dg.formats._reading import Path as AnyPath
 from v3dg.gaussians import Gaussians
+from v3dg.rotations import normalised
 
 _NAME = "KHR_gaussian_splatting"
 _SPZ = "KHR_gaussian_splatting_compression_spz_2"

@@ -8,9 +8,10 @@ positions is in half precision.
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.formats._packing import Floats, assemble, normalised
+from v3dg.formats._packing import Floats, assemble
 from v3dg.formats._reading import AssetFile, File, Path, check
 from v3dg.gaussians import Gaussians
+from v3dg.rotations import normalised
 
 _INT = np.dtype("<i4")
 _WIDTHS = (3, 4, 3, 1, 48)

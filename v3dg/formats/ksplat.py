@@ -15,9 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
+from v3dg.formats._packing import SH_C0, Floats, assemble
 from v3dg.formats._reading import AssetFile, Claims, Path, check, whole_file
 from v3dg.gaussians import Gaussians
+from v3dg.rotations import normalised
 
 _HEADER_BYTES = 4096
 _SECTION_BYTES = 1024

@@ -6,9 +6,10 @@ and the quaternion w x y z (a byte each, 128 for 0). There is no header.
 
 import numpy as np
 
-from v3dg.formats._packing import SH_C0, Floats, assemble, normalised
+from v3dg.formats._packing import SH_C0, Floats, assemble
 from v3dg.formats._reading import AssetFile, File, Path, check
 from v3dg.gaussians import Gaussians
+from v3dg.rotations import normalised
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 

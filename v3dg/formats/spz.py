@@ -20,6 +20,7 @@ from v3dg.formats import _packing
 from v3dg.formats._packing import SQRT2, Floats, assemble
 from v3dg.formats._reading import AssetFile, Claims, Path, check, least_bytes, telling, whole_file
 from v3dg.gaussians import Gaussians
+from v3dg.rotations import normalised
 
 _MAGIC = 0x5053474E  # NGSP
 _HEADER = struct.Struct("<IIIBBBB")
@@ -147,7 +148,7 @@ def _bytes(values: Floats) -> bytes:
 
 def _rotation_bytes(quats: Floats) -> bytes:
     """x y z of the quaternion whose w is not negative."""
-    unit = _packing.normalised(quats)
+    unit = normalised(quats)
     return _bytes((unit[:, 1:] * np.where(unit[:, :1] < 0, -1.0, 1.0) + 1.0) * 127.5)
 
 
@@ -188,7 +189,7 @@ def _quats(rotations: NDArray[np.uint8]) -> Floats:
     """Quaternions w x y z from words (version 3 and later), or from x y z as bytes."""
     if rotations.shape[1] == 3:
         xyz = rotations / 127.5 - 1.0
-        return _packing.normalised(_packing.quats_from_three(xyz, np.zeros(len(xyz), np.intp)))
+        return normalised(_packing.quats_from_three(xyz, np.zeros(len(xyz), np.intp)))
     words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     fields = np.stack([(words >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
     three = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / (511.0 * SQRT2)

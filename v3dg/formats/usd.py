@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from v3dg import _extras, _files
 from v3dg._numbers import check
 from v3dg.cameras import Axis, Floats, is_rotation
-from v3dg.formats._packing import check_writable, normalised
+from v3dg.formats._packing import check_writable
 from v3dg.formats._reading import AssetFile, telling
 from v3dg.formats._reading import Path as AnyPath
 from v3dg.gaussians import Gaussians
-from v3dg.rotations import quaternion_from_rotation
+from v3dg.rotations import normalised, quaternion_from_rotation
 
 if TYPE_CHECKING:
     from pxr import Sdf, Usd

@@ -13,7 +13,7 @@ from v3dg._numbers import LEAST_FLOAT, MOST_FLOAT, Floats, check, check_type, fl
 from v3dg.bundle import Bundle
 from v3dg.cameras import AXES, Axis, Camera
 from v3dg.gaussians import Array, Gaussians
-from v3dg.rotations import rotation_from_quaternion
+from v3dg.rotations import normalised, rotation_from_quaternion
 
 # Held during every change of a scene. Also held during fork(), so that it is never locked in the child.
 _lock = threading.RLock()
@@ -260,9 +260,9 @@ class Scene:
         rows = self._state.quaternions
         if isinstance(rows, np.ndarray):
             return rows
-        quaternions = _device.to_host(rows)
-        with np.errstate(invalid="ignore"):  # an invalid rotation becomes NaN and is not drawn
-            return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
+        quaternions = normalised(_device.to_host(rows))
+        quaternions[~quaternions.any(axis=1)] = np.nan  # an instance with a zero quaternion is not drawn
+        return quaternions
 
     @property
     def scales(self) -> Floats:

@@ -8,6 +8,7 @@ import numpy as np
 
 from v3dg._numbers import check
 from v3dg.cameras import Camera, Floats
+from v3dg.rotations import normalised
 from v3dg.viewer.view import View
 
 
@@ -68,7 +69,7 @@ class CameraPath:
 def _rows(views: list[View]) -> Floats:
     """(K, 9): quaternion of the sign that is next to the one before, position, field of view, aspect."""
     rows = np.array([(*v.wxyz, *v.position, v.fov_y, v.aspect) for v in views], np.float64)
-    rows[:, :4] /= np.linalg.norm(rows[:, :4], axis=1, keepdims=True)
+    rows[:, :4] = normalised(rows[:, :4])
     for before, row in itertools.pairwise(rows):
         if before[:4] @ row[:4] < 0:
             row[:4] *= -1

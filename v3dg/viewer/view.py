@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from v3dg.cameras import Camera, VectorLike, rigid
-from v3dg.rotations import quaternion_from_rotation, rotation_from_quaternion
+from v3dg.rotations import in_range, quaternion_from_rotation, rotation_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class View:
 
     def camera(self, width: int, height: int, near: float) -> Camera:
         """Return the camera whose picture of that size fills the view; its pixels need not be square."""
-        quaternion = np.asarray(self.wxyz, np.float64)
+        quaternion = in_range(np.asarray(self.wxyz, np.float64))
         rotation = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion)).T
         viewmat = rigid(rotation, np.asarray(self.position, np.float64))
         half_y = math.tan(self.fov_y / 2)
