@@ -1,6 +1,9 @@
 """Rotations and quaternions."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from v3dg.cameras import Floats
 
@@ -9,7 +12,7 @@ _LEAST = 1e-140
 _MOST = 1e140
 
 
-def in_range(quaternions: Floats) -> Floats:
+def in_range(quaternions: NDArray[np.floating[Any]]) -> Floats:
     """Return quaternions (..., 4) as doubles whose squares neither vanish nor overflow.
 
     The shortest and the longest are multiplied by a power of two, which rounds nothing. Others stay, and so
@@ -24,7 +27,7 @@ def in_range(quaternions: Floats) -> Floats:
     return scaled
 
 
-def normalised(quaternions: Floats) -> Floats:
+def normalised(quaternions: NDArray[np.floating[Any]]) -> Floats:
     """Return quaternions (..., 4) of length one, in double precision.
 
     Those of length zero stay, and those that are not finite contain NaN. No length is too short or too long.
