@@ -29,6 +29,8 @@ def planes_of(gaussians, device, mode):
 @pytest.mark.parametrize("mode", [{}, hard_cases.ANTIALIASED], ids=["plain", "antialiased"])
 @pytest.mark.parametrize("exponent", EXPONENTS)
 def test_length_changes_no_bit_of_a_picture(device, exponent, mode):
+    if device == "cuda" and exponent < -120:
+        pytest.skip("kernels take the denormal components as 0 (docs/numerics.md)")
     expected = planes_of(crowd_turned_by(1), device, mode)
     got = planes_of(crowd_turned_by(2.0**exponent), device, mode)
     assert expected[1].any()

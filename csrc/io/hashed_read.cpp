@@ -72,6 +72,7 @@ bool HashedRead::hash() {
         end = num_before + std::min(wait_for_more(done - num_before), message_.size - num_before);
         if (end == done) break;  // the file ended, of which wait() tells
     }
+    wait_for_more(bytes_.size - 1);  // The hash to compare with may be all that is still to be read.
     const PageHash found = how_ == HashOf::bytes ? of_bytes.digest() : of_pieces.digest();
     return std::equal(found.begin(), found.end(), message_.end());
 }

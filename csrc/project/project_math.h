@@ -105,8 +105,8 @@ V3DG_HD V3DG_INLINE auto extent_of(V opacity, const Ellipse<V>& e, const Project
     const V reach = e.log2_opacity - all_lanes<V>(T(kLog2MinAlpha));
     half_x = sqrt_of(reach * s.c11) * T(1 / kFalloffScale);
     half_y = sqrt_of(reach * s.c22) * T(1 / kFalloffScale);
-    return (opacity >= all_lanes<V>(T(kMinAlpha))) & (reach >= V{}) & (s.det > V{}) & (s.det < huge) &
-           (half_x < huge) & (half_y < huge) & (e.depth < huge);
+    return (opacity >= all_lanes<V>(T(kMinAlpha))) & (opacity < huge) & (reach >= V{}) & (s.det > V{}) &
+           (s.det < huge) & (half_x < huge) & (half_y < huge) & (e.depth < huge);
 }
 
 // As project_gaussian(); s.p is set, s.linear_rs is left alone.
